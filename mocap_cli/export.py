@@ -1,7 +1,5 @@
 """`mocap export`: a session in the formats of other programs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

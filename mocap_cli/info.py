@@ -1,7 +1,5 @@
 """`mocap info`: the content of a file or folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`mocap init`: the draft of a flight.yaml for the files of a flight."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The `mocap` command: its group, and the only place that turns errors into a line and an exit status."""
 
-from __future__ import annotations
-
 import os
 import sys
 from importlib import import_module

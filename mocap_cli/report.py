@@ -1,7 +1,5 @@
 """`mocap report`: a page about a session, and one about several."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

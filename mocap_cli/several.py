@@ -1,7 +1,5 @@
 """Commands for one flight or session, applied to several in turn; a failure does not stop the others."""
 
-from __future__ import annotations
-
 import functools
 import glob
 from collections.abc import Callable, Collection, Iterable, Sequence

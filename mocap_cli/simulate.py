@@ -1,7 +1,5 @@
 """`mocap simulate`: a flight with known truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -5,8 +5,6 @@ every method, compute errors on the joint-frames that all methods have, and repo
 intervals. Everything here is simulated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial

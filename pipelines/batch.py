@@ -4,8 +4,6 @@ A flight is one task. If a worker dies, only its current flight is interrupted; 
 this flight where the stages stopped. Sessions are the same as those of single runs, byte for byte.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import logging

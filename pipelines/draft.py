@@ -1,7 +1,5 @@
 """Stage `draft`: write a flight.yaml for files and folders; it can be ingested or says what is missing."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ are counted and reported. Unusable data are refused, with the file at fault. Eac
 own: an interrupted ingest continues with the cameras that it had not finished.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -5,8 +5,6 @@ block; join the blocks to one video for each camera, with the stamps of its pict
 the videos. They are removed when the skeleton that they show is replaced.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

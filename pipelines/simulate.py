@@ -4,8 +4,6 @@ Read the scenario; fly it; write logs, calibration, map and truth; film it, or w
 detector's errors instead of videos; write a flight.yaml that names all of these files.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

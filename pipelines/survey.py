@@ -1,7 +1,5 @@
 """Stage `survey`: description of a file or folder, for `mocap info`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields

@@ -5,8 +5,6 @@ A name is split into words with their numbers (drone_1_poses: drone 1, poses). W
 `/drone1/odometry` and `drone-01/calib.yaml` all have the label drone 1.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections import Counter

@@ -4,8 +4,6 @@ Names come from file systems and logs, and may hold any character. A value is al
 and a comment always ends at the end of its line.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence

@@ -6,8 +6,6 @@ camera, the one that overlaps in time with its film is taken, then the one of th
 are kept and listed as alternatives.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

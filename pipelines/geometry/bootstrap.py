@@ -8,8 +8,6 @@ are the same in all trials or constant during the flight, such as a constant pos
 this flight, not for the next.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Camera intrinsics with distortion: from points in the camera's frame to pixels and back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

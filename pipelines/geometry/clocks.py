@@ -7,8 +7,6 @@ without knowing the scene: by the distance of points from the segment of that li
 the nearest possible depth. If the camera only rotates, the segment is a point.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ again if the file of the outermost function changed. With this module, it does s
 helper changed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps

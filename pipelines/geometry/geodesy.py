@@ -9,8 +9,6 @@ Heights are metres above the ellipsoid. Heights above sea level may be given whe
 everything up or down together, and stretch horizontal distances by less than 2e-5.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ A gimbal's frame is FLU too: its x axis is the direction of the camera's view.
 Quaternions are xyzw and unit; NaN in gives NaN out.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -4,8 +4,6 @@ Quaternions are xyzw and unit; NaN in gives NaN out. A pose `target_from_source`
 (the source's origin in the target) and a quaternion [..., 4].
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Every link is target_from_source over time; it can be used in both directions.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping

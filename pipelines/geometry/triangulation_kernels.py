@@ -7,8 +7,6 @@ Symmetric 3x3 matrices are passed as the six numbers xx, xy, xz, yy, yz, zz. All
 moved to the mean camera centre, so that an origin kilometres away costs no precision.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

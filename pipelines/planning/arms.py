@@ -4,8 +4,6 @@ All share forecast, local planner and tracking. An arm is one object with a name
 `FormationPlanner` for a flight; a package adds one by an entry point in `mocap.planner_arms`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

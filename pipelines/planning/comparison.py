@@ -4,8 +4,6 @@ Intervals are those of `geometry.bootstrap`: over the trials for errors, which a
 stretches of the flight for figures that depend on the flight's course.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Settings of a planner: weights, distances, rates. docs/planner.md explains them."""
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Mapping

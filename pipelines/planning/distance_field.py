@@ -3,8 +3,6 @@
 The kernels have no threads and no fastmath: the same numbers give the same bytes.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Slots about the actor: yaw, tilt and range of every camera, and the motion of a formation between them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ ever leaves free space, for any plan. Three cases cannot be guaranteed and are r
 `scores`: an actor who walks at a drone, a map that changes, a start inside the radius.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Information of cameras before they have seen anything: the ray model."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipelines.geometry.arrays import Float

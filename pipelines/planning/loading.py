@@ -1,7 +1,5 @@
 """Inputs of a replay from a session: the actor, the maps, the cameras, and a skeleton."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal

@@ -15,8 +15,6 @@ the cost that is compared. In the limit they are the functional gradients of the
 threads and no fastmath: the same numbers give the same bytes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

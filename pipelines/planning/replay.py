@@ -3,8 +3,6 @@
 Equal arguments give equal replays, but for the measured times. No measurement or map is used before its time.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

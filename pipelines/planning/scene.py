@@ -1,7 +1,5 @@
 """Data that all arms of a comparison share: settings, the actor, the maps, the cameras and the times."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Scores of a flight from positions over time: the same figures for every arm, replayed or flown."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

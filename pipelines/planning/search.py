@@ -5,8 +5,6 @@ time of the costs. Here V[T] = C[T] and V[t, i] = C[t, i] + min over neighbours 
 The kernels have no threads and no fastmath: the same numbers give the same bytes.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -9,8 +9,6 @@ than half of every planned turn. Acceleration, jerk and speed keep to their limi
     |v + a LOOKAHEAD_S| <= V        by turning the acceleration before the speed is reached
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

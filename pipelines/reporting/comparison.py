@@ -8,8 +8,6 @@ of the two flights are then resampled independently. In both cases the intervals
 `geometry.bootstrap`, and are valid for these flights only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The page that compares sessions, as one self-contained file, and its verdict in plain sentences."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The table of many flights: the status of each, and its figures."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A view drawn into its picture, for videos: bones, joints, keypoints and a caption as pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page of one session: numbers and figures in the template, as one self-contained file."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The terrain around a flight, from its voxel map: heights for the top view, points for the 3D viewer."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Judgement of a session in plain sentences: quality, certainty and doubts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Poses are interpolated as far as the manifest trusts the logs. Their uncertainty
 line, flight.yaml, or the log itself; the first of these that states one is used, and all three may be silent.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

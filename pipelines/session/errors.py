@@ -3,8 +3,6 @@
 The command line prints the line and exits 1. Any other exception that escapes is a bug of this program.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 

@@ -1,7 +1,5 @@
 """Positions of people that are known without a reconstruction: the logged actor, and true joints."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

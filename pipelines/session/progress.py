@@ -3,8 +3,6 @@
 The terminal's bar is one implementation of progress, silence another.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event

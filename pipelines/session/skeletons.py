@@ -9,8 +9,6 @@ place some of these joints at slightly different points; the differences are con
   mouth corners are `left_mouth` and `right_mouth`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

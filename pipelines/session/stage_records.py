@@ -4,8 +4,6 @@
 the stamps of sources.
 """
 
-from __future__ import annotations
-
 import platform
 import time
 from collections.abc import Mapping

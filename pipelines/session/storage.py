@@ -1,7 +1,5 @@
 """Files that survive a kill, reproducible JSON, and hashes of files that were read or written."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Records of drones' own logs: positions on Earth or in metres, attitudes, gimbal angles, triggers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -11,8 +11,6 @@ Parts are stored by key, so a run with other settings does not use them. Session
 them, their stages; they use the lock and the parts of this module, and `stages` publishes them.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress

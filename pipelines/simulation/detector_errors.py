@@ -4,8 +4,6 @@ The size of a detector's errors was measured by tilt (`data/<detector>_errors.cs
 correlation in time, behind obstacles and between left and right is modelled here, by the constants below.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """One simulated flight: the truth and the contents of its logs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

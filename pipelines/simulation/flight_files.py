@@ -5,8 +5,6 @@ those of ROS 2, their fields plain numbers by name; a stamp is nanoseconds since
 are zero may be left out. Axes are the world's, east-north-up.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Recorders of a flight: their own stamps, and poses with the errors of an estimator."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

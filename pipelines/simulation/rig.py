@@ -5,8 +5,6 @@ ahead, soles flat on the ground. Body axes are x forward, y left, z up, so that 
 all turned by the identity looks east.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

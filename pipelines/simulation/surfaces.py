@@ -1,7 +1,5 @@
 """Surfaces of triangles, for bodies, worlds and rendering."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pictures of a camera: the times at which they were taken, and intrinsics for their size."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Callable

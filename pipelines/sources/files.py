@@ -1,7 +1,5 @@
 """Readers of the files that a manifest names for one flight, in the axes and at the times of the files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

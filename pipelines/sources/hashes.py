@@ -1,7 +1,5 @@
 """Hashes of all files that a manifest names, and the check of the files' own checksums."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256

@@ -4,8 +4,6 @@ If no topic is stated, the only candidate of its kind is taken, and a note names
 is one pass over the messages of one topic: logs of any size stream.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

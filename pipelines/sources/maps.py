@@ -1,7 +1,5 @@
 """Maps of obstacles, from a file or from a log in which they replace each other, in the world."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Parts of a flight as they were read, and as a session stores them: tables, entries, doubts."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace

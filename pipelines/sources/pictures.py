@@ -1,7 +1,5 @@
 """Pictures of a camera by frame number, from a video file or from a topic of a log."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache

@@ -4,8 +4,6 @@ A drone's own log has its position and the attitudes of its body and gimbal sepa
 They are joined here, in ENU axes about one origin on Earth.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@
 Pose2Sim and caliscope, the unit of the board for anipose.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -4,8 +4,6 @@ A matrix counts pixels as we do, the centre of the top left one at (0, 0), which
 Readers of files that count otherwise (COLMAP) shift (cx, cy) before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

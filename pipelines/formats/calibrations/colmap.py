@@ -6,8 +6,6 @@ version from 3.0 to 4 carry their own pose (camera_from_world).
 COLMAP puts (0, 0) at the corner of the top left pixel, we at its centre: cx and cy lose half a pixel.
 """
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Reader of Kalibr's camera chains: the intrinsics of cam0, cam1, ..."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """ROS camera calibrations: the YAML of camera_info_manager, read and written, and the older INI (ost.txt)."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Parts that exports share: names of files, tables, chosen times, maps and covariances for viewers."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

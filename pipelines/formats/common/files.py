@@ -1,7 +1,5 @@
 """Reading of whole files as bytes, text or YAML, and of their beginnings, by which formats are recognised."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Collection
 from pathlib import Path

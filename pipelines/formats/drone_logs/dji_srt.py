@@ -13,8 +13,6 @@ Generations have only the form of subtitles in common. All of these are read:
 Angles are those of an FRD body and gimbal in NED (docs/drones.md).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import replace

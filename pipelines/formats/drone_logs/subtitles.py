@@ -1,7 +1,5 @@
 """Subtitles that DJI's drones write beside a video: display times, clock times and texts."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta

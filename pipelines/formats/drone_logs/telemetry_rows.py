@@ -1,7 +1,5 @@
 """Cleaning of telemetry rows into tracks: one set of rules for every drone's log."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, MutableMapping
 from dataclasses import replace
 from pathlib import Path

@@ -6,8 +6,6 @@ a number, `[n]`, or `[[n], [m]]` if AlphaPose merged poses (the first is used). 
 AlphaPose writes 0 for everybody; then people are numbered by their position within the frame.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipelines.formats.keypoint_files.keypoint_people import (

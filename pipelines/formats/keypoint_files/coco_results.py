@@ -8,8 +8,6 @@ third value is a visibility: 0 is missing, 1 (hidden, but placed) and 2 (seen) b
 AlphaPose's; `format: coco` reads it too.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -8,8 +8,6 @@ People are `{"keypoints": [[x, y], ...], "keypoint_scores": [...], "bbox": ...}`
 * either of these under `instance_info`, beside `meta_info` with the joint names (the demos).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -7,8 +7,6 @@ keypoints). It writes `{}` for a person who was not seen, so that `people[0]` st
 position in the list is the person's number, unless OpenPose tracked people and gives `person_id`s.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

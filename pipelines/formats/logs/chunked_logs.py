@@ -5,8 +5,6 @@ and one that ends early. Chunks are skipped, because the index after each gives 
 messages. Only a chunk without an index is decompressed to find them.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from abc import abstractmethod

@@ -5,8 +5,6 @@ is valid from its first point to the first point of the next. mavros_msgs/Positi
 the log's axes, as `setpoint_raw` expects it.
 """
 
-from __future__ import annotations
-
 from array import array
 from bisect import bisect_left
 from collections import Counter

@@ -9,8 +9,6 @@ holds all points up to one of a few times of the flight. Moving things, above al
 occupied voxels.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace

@@ -5,8 +5,6 @@ slightly different names. This module alone handles the differences. A sample wh
 comes from a message without a header stamp: it has only the time of its receipt.
 """
 
-from __future__ import annotations
-
 import base64
 import operator
 from collections.abc import Callable, Iterable, Iterator

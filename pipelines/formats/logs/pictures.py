@@ -4,8 +4,6 @@ Names and layouts of raw pixels are those of ROS' sensor_msgs/image_encodings.hp
 also uses.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterator
 from pathlib import Path

@@ -4,8 +4,6 @@ rosbags decodes the messages. But its reader refuses bags without an index and b
 So this module walks the records itself.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Sequence

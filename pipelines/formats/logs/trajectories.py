@@ -4,8 +4,6 @@ Numbers are gathered into flat arrays (72 bytes a pose, 288 more with a covarian
 streams through.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@
 `pipelines.session.maps` documents each array; this module makes it a format for `map:`.
 """
 
-from __future__ import annotations
-
 import math
 import zipfile
 from pathlib import Path

@@ -12,8 +12,6 @@ Child i lies on the upper side of x, y, z if its bits 0, 1, 2 are set. The root 
 wide and centred on the world's origin; a leaf above the finest depth stands for all voxels within it.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Module `octomap` explains the formats. All kernels are in this one module, becau
 file of the outermost function only.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ binary_compressed: two uint32, bytes compressed and uncompressed, and an LZF str
 field, all of the second, and so on. VIEWPOINT, the pose of the sensor, is not applied to the points.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable

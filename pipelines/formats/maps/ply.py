@@ -5,8 +5,6 @@ its `property` lines, `end_header`, then the elements one after the other. Only 
 gives its corners only: sample its faces densely before use as a map.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -8,8 +8,6 @@ proportion, transparent pixels unknown; raw - values 0 to 100 are percent, other
 A plan has no heights: it is extruded from z = 0 to `HEIGHT_M`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import struct

@@ -1,7 +1,5 @@
 """Poses as CSV with a header that names the columns; EuRoC's ground truth is one of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

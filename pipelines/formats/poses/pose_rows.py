@@ -1,7 +1,5 @@
 """Poses in text: names of columns, and cleaning into a trajectory by one set of rules for every format."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Some writers keep the layout but change the order. They name it in a line above 
 `# timestamp tx ty tz qw qx qy qz`. Such a line is followed.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

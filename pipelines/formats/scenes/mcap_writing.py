@@ -16,8 +16,6 @@ ones if there are any. A missing joint is not in its message. The same recording
 bytes; frames are written one after the other and are never all in memory.
 """
 
-from __future__ import annotations
-
 import heapq
 import re
 from collections.abc import Iterator, Mapping

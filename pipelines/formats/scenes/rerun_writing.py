@@ -13,8 +13,6 @@ are left out. The viewer's pinhole has no distortion, but the pictures keep the 
 Recordings of the same session differ in their bytes (rerun numbers its chunks at random).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -12,8 +12,6 @@ person who faces the file's +z, with the left hand towards +x, faces the world's
 towards +y.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import dataclass, field

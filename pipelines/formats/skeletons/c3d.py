@@ -10,8 +10,6 @@ LAST_T_NS, as text because C3D's numbers are too short. Other files begin at the
 number.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Files of joints: their unit and axes, the names of their markers, and a constant rate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Export to parquet: the skeleton's table and the cameras' poses, for pandas, polars and DuckDB."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -6,8 +6,6 @@ Coordinates are y up by OpenSim's convention. A marker that was not seen has bla
 because OpenSim 4.6 ignores blank cells at the end of a line and refuses a file whose last marker is missing.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Times at which a video's frames were taken: a CSV, or DJI drones' subtitles beside the video."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Points that are tracked through the pictures of a video, as a measure of its camera's motion."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

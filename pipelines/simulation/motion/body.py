@@ -1,7 +1,5 @@
 """Bones at every moment of a plan: pelvis, trunk, legs and arms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

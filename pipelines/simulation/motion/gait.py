@@ -8,8 +8,6 @@ Posture 1998). The keys of walking feet and knees were fitted: with them hip, kn
 the mean curves of Perry & Burnfield and of Winter at 1.3 m/s (least squares).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

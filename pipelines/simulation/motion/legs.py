@@ -6,8 +6,6 @@ sole is flat, then, once the heel rises, the joint of the toes, which stay flat 
 as far as they go and the foot tips over their end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Plan of a motion: the body's way, times and places of the footsteps, and the keys of every curve."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

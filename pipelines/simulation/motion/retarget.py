@@ -1,7 +1,5 @@
 """Recorded motion of a foreign skeleton, put on the actor's bones, matched by name and hierarchy."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Steps of a script, performed one after the other: walks, actions on one spot, and the kick."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The camera: a lens with distortion, the exposure of rows, and the sensor from light to bytes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

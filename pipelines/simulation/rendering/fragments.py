@@ -1,7 +1,5 @@
 """Fragments: the pieces of surface that make up a pixel, each to be shaded once, gathered from samples."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -6,8 +6,6 @@ vertical, where a regular 2 x 2 grid shows two steps, get four. With one sample 
 samples are the pixel centres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Pictures of people in a world, as a camera in daylight takes them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ ground is grass with bare soil between: a tile that repeats seamlessly, its mip 
 site.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

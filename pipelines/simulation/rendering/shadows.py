@@ -1,7 +1,5 @@
 """Depth maps of the sun, orthographic along its rays (Williams, "Casting curved shadows", 1978)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

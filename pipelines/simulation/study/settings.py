@@ -1,7 +1,5 @@
 """Settings of a study: formations, pose noise, methods."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Mapping, Sequence

@@ -7,8 +7,6 @@ camera i has the same random numbers in every formation and for every size of th
 between formations are not due to chance. Stage `film` measures the arms of a comparison in the same way.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

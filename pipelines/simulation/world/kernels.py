@@ -12,8 +12,6 @@ Shapes are rows of numbers, all in metres of the world:
 Solids are open sets: a point that only touches them is neither inside nor hidden.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A world that was built: one truth for pictures, occlusion and maps."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The ground with its mounds, trees and walls: exact solids, their places, and their visible surfaces."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
