@@ -14,7 +14,7 @@ What this rests on:
   the calibration that comes with it is 0.5 to 0.9 deg off for two cameras).
 - There is no truth of the person. The reference is the result of `robust` from the still cameras, with the
   same detector and calibration. It has errors of its own, and shares part of the detector's with what is
-  compared to it. The row "true attitudes" is what remains without any error in the log: the floor.
+  compared to it. The rows without attitude errors are the floor.
 - `NEES` takes the distance as if the reference were exact (strict); `NEES both` adds its covariance (lenient:
   errors that both share count as independent).
 - Jitter is the length of the second difference of a joint's path, over sqrt(3): that of white noise has the
@@ -33,7 +33,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from itertools import product
@@ -49,7 +49,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from benchmarks.detectors import CAMERAS, PEER, REAL
-from benchmarks.results_page import markdown_table
+from benchmarks.results import keep_numbers
+from benchmarks.results_page import gimbal_table
 from pipelines.formats.skeletons.trc import FORMAT as TRC
 from pipelines.geometry.arrays import Float
 from pipelines.ingest import ingest
@@ -108,7 +109,7 @@ class Figures:
     constant_deg: float
     nees: float
     nees_both: float
-    share: float
+    share_percent: float
     cpu_s: float
 
 
@@ -123,6 +124,7 @@ def main() -> None:
     parser.add_argument("--detectors", nargs="+", default=["blazepose"])
     parser.add_argument("--paths", nargs="+", help="some of the paths only")
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"of the log's errors (default {DRAWS})")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/results.md")
     arguments = parser.parse_args()
     if not REAL.is_dir():
         raise SystemExit(f"{REAL} is not here: MOCAP_REAL_DATA names the folder of pose2sim_single")
@@ -137,7 +139,13 @@ def main() -> None:
             cases += list(product(paths, logs, (True, False)))
             one = partial(measured, folder, detector, arguments.methods)
             found = dict(zip(cases, pool.map(one, cases, chunksize=1), strict=True))
-            print_table(detector, paths, arguments.methods, found)
+            entries = entries_of(found)
+            print(f"\n{detector}, paths {', '.join(paths)}; mean over paths and draws")
+            print("\n".join(gimbal_table(entries)), flush=True)
+            if arguments.write:
+                keep_numbers(
+                    "gimbals", {f"{detector}, {'kept aside' if arguments.kept else 'tuned on'}": entries}
+                )
 
 
 # --- films and flights -----------------------------------------------------------------------------------
@@ -166,11 +174,19 @@ def prepare_path(folder: Path, detector: str, logs: Sequence[Log], path: str) ->
     for log in (Log(0.0), *logs):
         write_flight(place, log, path, shots)
     for name, shot in shots.items():
-        if not (place / f"{name}.mp4").exists():
+        if not _holds(place / f"{name}.shot", repr(shot)):
             _film(name, shot, attitudes(path, name, shot), place / f"{name}.mp4")
+            for sessions in place.glob("*/"):  # they hold keypoints of the film before
+                shutil.rmtree(sessions)
+            _write(place / f"{name}.shot", repr(shot))
     session = _session(place, detector, Log(0.0))
     ingest(place / "true.yaml", session)
     reconstruct(session, Settings(method="robust", detector=detector))
+    for log, given in product(logs, (True, False)):
+        copied = _session(place, detector, log, given=given)
+        if not copied.exists():  # with the keypoints
+            shutil.copytree(session, copied, ignore=shutil.ignore_patterns("reconstruct"))
+        ingest(place / copied.with_suffix(".yaml").name, copied)
 
 
 def _shots(still: Path) -> dict[str, Shot]:
@@ -268,8 +284,12 @@ def _film(name: str, shot: Shot, world_from_virtual: Float, out: Path) -> None:
 
 def _write(path: Path, text: str) -> None:
     """Write a file unless it holds this text already, so that ingest finds it unchanged."""
-    if not path.exists() or path.read_text(encoding="utf-8") != text + "\n":
+    if not _holds(path, text):
         path.write_text(text + "\n", encoding="utf-8")
+
+
+def _holds(path: Path, text: str) -> bool:
+    return path.exists() and path.read_text(encoding="utf-8") == text + "\n"
 
 
 def _session(place: Path, detector: str, log: Log, *, given: bool = False) -> Path:
@@ -287,10 +307,6 @@ def measured(
     path, log, given = case
     place = folder / path
     session = _session(place, detector, log, given=given)
-    if not session.exists():
-        shutil.copytree(_session(place, detector, Log(0.0)), session)
-        shutil.rmtree(session / "reconstruct")
-    ingest(place / session.with_suffix(".yaml").name, session)
     reference = pd.read_parquet(folder / "still" / f"{detector}.session" / "reconstruct" / "skeleton.parquet")
     shots = _shots(folder / "still" / f"{detector}.session")
     true = {name: attitudes(path, name, shot) for name, shot in shots.items()}
@@ -319,7 +335,7 @@ def _figures(session: Path, reference: pd.DataFrame, true: dict[str, Float], tak
         constant_deg=constant,
         nees=_nees(apart[both], ours.covariance[both]),
         nees_both=_nees(apart[both], ours.covariance[both] + theirs.covariance[both]),
-        share=float(both.sum() / np.isfinite(theirs.position).all(axis=-1).sum()),
+        share_percent=100 * float(both.sum() / np.isfinite(theirs.position).all(axis=-1).sum()),
         cpu_s=taken_s,
     )
 
@@ -366,52 +382,17 @@ def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, 
 # --- the table -------------------------------------------------------------------------------------------
 
 
-def print_table(
-    detector: str,
-    paths: Sequence[str],
-    methods: Sequence[str],
-    found: dict[tuple[str, Log, bool], dict[str, Figures]],
-) -> None:
-    """Print the mean of each figure over paths and draws, by level, statement and method."""
-    print(f"\n{detector}, paths {', '.join(paths)}; mean over paths and draws")
-    header = [
-        "logged attitudes",
-        "stated",
-        "method",
-        "distance mm",
-        "jitter mm",
-        "changing deg",
-        "constant deg",
+def entries_of(found: dict[tuple[str, Log, bool], dict[str, Figures]]) -> list[dict[str, Any]]:
+    """Take the mean of each figure over paths and draws, by level, whether noise is given, and method."""
+    groups: dict[tuple[float, bool, str], list[Figures]] = {}
+    for (_, log, given), by_method in found.items():
+        for method, figures in by_method.items():
+            groups.setdefault((log.level_deg, not given, method), []).append(figures)
+    return [
+        {"level_deg": level, "noise_given": not without, "method": method}
+        | {field.name: float(np.mean([getattr(of, field.name) for of in own])) for field in fields(Figures)}
+        for (level, without, method), own in sorted(groups.items(), key=lambda group: group[0][:2])
     ]
-    print(
-        "\n".join(
-            markdown_table([*header, "NEES", "NEES both", "measured %", "CPU s"], list(_rows(methods, found)))
-        )
-    )
-
-
-def _rows(
-    methods: Sequence[str], found: dict[tuple[str, Log, bool], dict[str, Figures]]
-) -> Iterator[list[str]]:
-    levels = sorted({(log.level_deg, given) for _, log, given in found}, key=lambda key: (key[0], not key[1]))
-    for level, given in levels:
-        own = [of for (_, log, stated), of in found.items() if (log.level_deg, stated) == (level, given)]
-        for method in methods:
-            values = np.array([[getattr(of[method], field.name) for field in fields(Figures)] for of in own])
-            distance, jitter, changing, constant, nees, both, share, cpu_s = values.mean(axis=0)
-            yield [
-                f"{level:g} deg" if level else "true",
-                ("yes" if given else "no") if level else "",
-                method,
-                f"{distance:.1f}",
-                f"{jitter:.2f}",
-                f"{changing:.3f}",
-                f"{constant:.3f}",
-                f"{nees:.1f}",
-                f"{both:.1f}",
-                f"{100 * share:.1f}",
-                f"{cpu_s:.1f}",
-            ]
 
 
 if __name__ == "__main__":

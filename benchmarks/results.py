@@ -57,19 +57,32 @@ def main() -> None:
     parser.add_argument("--only", choices=SECTIONS, help="measure one section again, keep the others")
     arguments = parser.parse_args()
     if not arguments.page:
-        numbers: Numbers = {}
-        if arguments.only:
-            numbers = json.loads((DOCS / "results.json").read_text(encoding="utf-8"))
-        elif not arguments.resume:
+        if not arguments.only and not arguments.resume:
             shutil.rmtree(ROOT / PLACE, ignore_errors=True)
-        numbers |= _rounded(measured([arguments.only] if arguments.only else list(SECTIONS)))
-        (DOCS / "results.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
-    numbers = json.loads((DOCS / "results.json").read_text(encoding="utf-8"))
-    page = render(numbers)
+        _store(_stored() | _rounded(measured([arguments.only] if arguments.only else list(SECTIONS))))
+    page = render(_stored())
     (DOCS / "results.md").write_text(page, encoding="utf-8")
     for old in {path.name for path in (DOCS / "figures").iterdir()} - set(figures_of(page)):
         (DOCS / "figures" / old).unlink()
     print(f"written: {DOCS / 'results.md'}")
+
+
+def keep_numbers(section: str, parts: Numbers) -> None:
+    """Replace these parts of a section that a command of its own measures, and write the page."""
+    numbers = _stored()
+    numbers[section] = numbers.get(section, {}) | _rounded(parts)
+    _store(numbers)
+    (DOCS / "results.md").write_text(render(numbers), encoding="utf-8")
+
+
+def _stored() -> Numbers:
+    """Read the numbers; those of sections that other commands measure stay what they are."""
+    numbers: Numbers = json.loads((DOCS / "results.json").read_text(encoding="utf-8"))
+    return numbers
+
+
+def _store(numbers: Numbers) -> None:
+    (DOCS / "results.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
 
 
 def measured(sections: Sequence[str]) -> Numbers:

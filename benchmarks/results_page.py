@@ -113,7 +113,14 @@ STILL = "e2-filmed.jpg"
 def render(numbers: Numbers) -> str:
     """Write the page as text; the same numbers give the same text."""
     return "\n".join(
-        [*_head(numbers), *_poses(numbers), *_studies(numbers), *_arms(numbers), *_filming(numbers)]
+        [
+            *_head(numbers),
+            *_poses(numbers),
+            *_studies(numbers),
+            *_arms(numbers),
+            *_filming(numbers),
+            *_gimbals(numbers),
+        ]
     )
 
 
@@ -134,9 +141,9 @@ def _head(numbers: Numbers) -> list[str]:
             "filmed ones by up to 8 %."
         ),
         *_words(
-            "**Everything here is simulated**: body, flights, logs and pictures are made by "
-            "`mocap simulate`. The detector that looks at the pictures of the sample flight and of the last "
-            "section is the real one."
+            "**Everything here is simulated**, except for the last section: body, flights, logs and "
+            "pictures are made by `mocap simulate`. The detector that looks at the pictures of the sample "
+            "flight and of filmed planners is the real one."
         ),
     ]
 
@@ -249,6 +256,61 @@ def _filming(numbers: Numbers) -> list[str]:
             STILL, "Both cameras of adaptive (above) and fixed (below), when fixed measured the fewest joints"
         ),
     ]
+
+
+def _gimbals(numbers: Numbers) -> list[str]:
+    lines = [
+        "## Real pictures that move: virtual gimbals",
+        "",
+        *_words(
+            "A person filmed by four still cameras (Pose2Sim's demo, 1.7 s): crops of the videos pan, "
+            "tilt, roll and shake along known paths. Pictures and detector are real, paths and errors of "
+            "the logged attitudes are drawn: the same standard deviation per axis for a constant part and "
+            "for one that is new in every picture. Positions are exact. `noise` says if flight.yaml gives "
+            "the size of the errors. The tables have a command of their own, which needs the recording:"
+        ),
+        *_code(
+            [
+                "python -m benchmarks.gimbals FOLDER --write           # tuned on",
+                "python -m benchmarks.gimbals FOLDER --write --kept    # kept aside",
+            ]
+        ),
+        *_words(
+            "There is no truth of the person. Distance (median) is that from the result of `robust` from "
+            "the still cameras, which errs too; the rows without attitude errors are the floor. NEES takes "
+            "that result for exact, the second one adds its covariance. Jitter contains the person's own "
+            "acceleration. The constant part of the attitudes is as good as the calibration. The docstring "
+            "of `benchmarks/gimbals.py` has more."
+        ),
+    ]
+    for title, entries in numbers.get("gimbals", {}).items():
+        lines += [f"{title}:", "", *gimbal_table(entries)]
+    return lines
+
+
+def gimbal_table(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Format the figures of `benchmarks.gimbals`."""
+    columns = {
+        "distance_mm": ("distance mm", 1),
+        "jitter_mm": ("jitter mm", 1),
+        "changing_deg": ("attitudes, changing deg", 3),
+        "constant_deg": ("constant deg", 2),
+        "nees": ("NEES", 1),
+        "nees_both": ("NEES, both", 1),
+        "share_percent": ("measured %", 1),
+        "cpu_s": ("CPU s", 1),
+    }
+    rows = [
+        [
+            f"{entry['level_deg']:g} deg" if entry["level_deg"] else "none",
+            ("given" if entry["noise_given"] else "not given") if entry["level_deg"] else "",
+            entry["method"],
+            *(_fixed(entry[key], digits) for key, (_, digits) in columns.items()),
+        ]
+        for entry in entries
+    ]
+    header = ["attitude errors", "noise", "method", *(name for name, _ in columns.values())]
+    return markdown_table(header, rows)
 
 
 def _words(text: str) -> list[str]:
