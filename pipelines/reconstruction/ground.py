@@ -1,0 +1,638 @@
+"""Constant position errors between cameras, found in patches of ground that two of them see.
+
+The background determines a moving camera's attitudes and leaves its whole path free to shift
+(`reconstruction.background`). Its followed points are a cloud that shifts with it. A patch of ground about
+a point of one camera's cloud is cut out of both cameras' stills as an orthophoto, and the second one is
+searched for the first. The displacement across the second camera's ray is the difference of the two
+position errors. The ground does not move, so the two stills may be of different times: those are taken that
+see the patch from the most similar directions.
+
+Only differences are found. The mean error of all bound cameras keeps its prior; it moves cameras and people
+together and is given apart as a covariance that all joints share.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+
+from pipelines.geometry.arrays import Bool, Float, Int64, Picture
+from pipelines.geometry.cameras import project, row_delay_s, undistort
+from pipelines.geometry.noise import EXACT, ROTATION, SHIFT_IN_WORLD, Process
+from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector
+from pipelines.reconstruction.background_tracks import Tracks, people_boxes
+from pipelines.reconstruction.observations import Camera
+from pipelines.session.description import Interpolation
+
+_FEWEST_SIGHTINGS = 5  # of a point of the cloud
+_PIXEL_SIGMA = 0.5  # of a followed point
+_POINT_SIGMA_M = 0.15  # the largest: of a point's place, all axes together
+_WORST_PX = 1.5  # mean residual of a point
+_NEAREST_M, _FARTHEST_M = 1.5, 40.0
+
+_GRID_M = 0.8  # of patches: at most one point of a cloud in a cube of this size
+_MOST_PATCHES = 3000  # of all pairs together
+_MOST_OF_PAIR = 250
+_AROUND_M = 1.5  # of a point, where its ground plane is fitted
+_NEIGHBOURS = 6  # needed there
+_ROUGH_M = 0.05  # rms of the neighbours about the plane, at most
+_STEEPEST = 0.6  # cosine of the slope
+_GRAZING = 0.12  # sine of the angle between ray and ground, at least
+
+_PAIRS_OF_STILLS = 4  # in which a patch is compared
+_HALF_CELLS = 20  # of a patch, on each side of its centre
+_CELL_M = 0.03
+_BLUR_CELLS = 3.0
+_FLAT = 2.5  # grey levels: a patch whose standard deviation is smaller shows nothing
+_ALIKE, _CLEARER = 0.75, 0.08  # correlation, and by how much it must exceed that of any other place
+_PEAK_CELLS = 4
+_EDGE_PX = 40
+
+_LEVELS = 3  # of the stills' pyramids
+_SIGMAS = 3.0  # of where a patch should be, that are searched
+_MOST_REACH_CELLS = 12  # beyond that, cells get larger
+_MOST_SIGHTINGS = 500_000  # of a cloud
+_MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
+_AGREEING = 9.2  # 99 % of it
+_PAIR_SIGMA_M = 0.012  # of an error that all patches of a pair share: clouds and paths are bent a little
+
+_MATCH_SIGMA_M = 0.03  # of one comparison
+_TURN_SIGMA = np.radians(0.1)  # of attitudes from the background, at least: followed points drift alike
+_REPEATED = 0.5  # correlation of the errors of comparisons of the same patch
+_LOSS = 2.0  # standard deviations at which a patch counts half
+_ROUNDS = 8
+_FEWEST_PATCHES = 10  # of a pair of cameras, distinct and in agreement
+_AGREE = 0.5  # share of a pair's patches that must agree
+_GAIN = 0.7  # of the prior sigma: a camera with more left is not bound
+
+
+@dataclass(frozen=True)
+class Stills:
+    """Some pictures of one camera."""
+
+    rows: Int64  # [S] of its frames
+    pictures: Sequence[Picture]  # grey
+
+
+@dataclass(frozen=True)
+class GroundBinding:
+    """Cameras after their position errors were bound to each other."""
+
+    cameras: list[Camera]  # all of them; moved, and with narrower errors, where bound
+    bound: tuple[str, ...]  # their names
+    reasons: dict[str, str]  # why each of the others is not, in one line
+    common: Float  # [3, 3] m^2, covariance of the position error that all bound cameras share
+    entry: dict[str, Any]  # for metrics.json
+
+
+@dataclass(frozen=True)
+class _View:
+    """Camera with its cloud and its stills."""
+
+    camera: Camera
+    between: Interpolation
+    points: Float  # [N, 3] in the world of the camera's own poses
+    covariance: Float  # [N, 3, 3]
+    by_turn: Float  # [N, 3, 3] derivative of a point by a constant attitude error
+    normal: Float  # [N, 3] of the ground about each point
+    still_t_ns: Int64  # [S]
+    stills: list[list[Picture]]  # [S] pyramids
+    boxes: Float  # [S, D, 4] px of people
+
+    def seen(self, points: Float, normal: Float) -> tuple[Bool, Float, Float, Float]:
+        """Find where stills show points [N, 3] of ground: usable [S, N], pose [S, N, ...], and rays.
+
+        Returns:
+            Usable [S, N]; position [S, N, 3] and rotation [S, N, 3, 3] at the time of the points' rows; unit
+            rays [S, N, 3].
+        """
+        position, rotation = self._poses(np.zeros((len(self.still_t_ns), len(points))))
+        pixels, depth = _pixels(points, position, rotation, self.camera)
+        if self.camera.intrinsics.readout_s:
+            delay_s = np.nan_to_num(row_delay_s(pixels[..., 1], self.camera.intrinsics))
+            position, rotation = self._poses(np.clip(delay_s, *_readout(self.camera)))
+            pixels, depth = _pixels(points, position, rotation, self.camera)
+        ray = points - position
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+        size = np.array([self.camera.intrinsics.width, self.camera.intrinsics.height])
+        with np.errstate(invalid="ignore"):
+            usable = (depth > _NEAREST_M) & (depth < _FARTHEST_M)
+            usable &= ((pixels > _EDGE_PX) & (pixels < size - _EDGE_PX)).all(axis=-1)
+            usable &= np.abs((ray * normal).sum(axis=-1)) > _GRAZING
+            for box in np.moveaxis(self.boxes, 1, 0):
+                low, high = box[:, None, :2] - _EDGE_PX / 2, box[:, None, 2:] + _EDGE_PX / 2
+                usable &= ~((pixels > low) & (pixels < high)).all(axis=-1)
+        return usable, position, rotation, ray
+
+    def _poses(self, delay_s: Float) -> tuple[Float, Float]:
+        t_ns = self.still_t_ns[:, None] + np.round(1e9 * delay_s).astype(np.int64)
+        if not delay_s.any():
+            position, rotation = self.camera.poses_at(self.still_t_ns, self.between)
+            return np.repeat(position[:, None], t_ns.shape[1], 1), np.repeat(
+                rotation[:, None], t_ns.shape[1], 1
+            )
+        position, rotation = self.camera.poses_at(t_ns.ravel(), self.between)
+        return position.reshape(*t_ns.shape, 3), rotation.reshape(*t_ns.shape, 3, 3)
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """Comparisons: K of them, of P patches."""
+
+    patch: Int64  # [K] number of the patch
+    pair: Int64  # [P] number of the pair of cameras of each patch
+    covariance: Float  # [P, 3, 3] of each patch's place
+    across: Float  # [K, 2, 3] two directions across the second camera's ray
+    shift: Float  # [K, 3] m, where the second camera sees the patch, against where it should be
+    design: Float  # [K, 3, 6 C] derivative of this shift by the errors of all cameras
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Constant errors of all cameras: 3 C positions, then 3 C attitudes."""
+
+    errors: Float  # [6 C]
+    covariance: Float  # [6 C, 6 C]
+
+
+def bind_positions(
+    cameras: Sequence[Camera],
+    tracks: Mapping[str, Tracks],
+    stills: Mapping[str, Stills],
+    constant_m: Float,
+    *,
+    between: Interpolation,
+) -> GroundBinding:
+    """Bind the constant position errors of cameras to each other by the ground that they see.
+
+    Args:
+        cameras: all of them, with poses refined by their backgrounds where that was possible.
+        tracks: background of each camera whose poses were refined by it, in its frames; others give no cloud.
+        stills: some pictures of each camera; a camera without them takes no part.
+        constant_m: [C] prior standard deviation per axis of the constant position errors.
+        between: rules for interpolating between logged poses.
+    """
+    views = [_view(camera, tracks.get(camera.name), stills.get(camera.name), between) for camera in cameras]
+    prior = _prior_sigma(cameras, constant_m)
+    pairs = [
+        (a, b)
+        for a, b in permutations(range(len(cameras)), 2)
+        if len(views[a].points) and len(views[a].stills) and len(views[b].stills)
+    ]
+    solution = _Solution(np.zeros(6 * len(cameras)), np.diag(prior**2))
+    counts, used = np.zeros((len(pairs), 2), dtype=np.int64), np.zeros(len(pairs), dtype=np.bool_)
+    if pairs:
+        most = min(_MOST_OF_PAIR, _MOST_PATCHES // len(pairs))
+        first = _compare(views, pairs, solution, most)
+        rough, agree = _solve(first, prior) if len(first.pair) else (solution, np.empty(0, np.bool_))
+        counts = np.stack(
+            [np.bincount(pair, minlength=len(pairs)) for pair in (first.pair, first.pair[agree])], 1
+        )
+        used = (counts[:, 1] >= _FEWEST_PATCHES) & (counts[:, 1] > _AGREE * counts[:, 0])
+        if used.any():
+            chosen = [pair for pair, use in zip(pairs, used, strict=True) if use]
+            solution, _ = _solve(_compare(views, chosen, rough, most), prior)
+    return _bound(cameras, pairs, counts, used, prior, solution)
+
+
+# --- clouds ----------------------------------------------------------------------------------------------
+
+
+def _view(camera: Camera, tracks: Tracks | None, stills: Stills | None, between: Interpolation) -> _View:
+    import cv2
+
+    if stills is None or not len(stills.rows):
+        stills = Stills(np.empty(0, np.int64), [])
+    if tracks is not None and len(stills.rows):
+        points, covariance, by_turn = _cloud(camera, tracks, stills.rows, between)
+    else:
+        points, covariance, by_turn = np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
+    chosen, normal = _ground(points, covariance)
+    pyramids = []
+    for picture in stills.pictures:
+        levels = [picture]
+        for _ in range(_LEVELS):
+            levels.append(np.asarray(cv2.pyrDown(levels[-1]), dtype=np.uint8))
+        pyramids.append(levels)
+    return _View(
+        camera,
+        between,
+        points[chosen],
+        covariance[chosen],
+        by_turn[chosen],
+        normal,
+        camera.frame_t_ns[stills.rows],
+        pyramids,
+        people_boxes(camera)[stills.rows],
+    )
+
+
+def _readout(camera: Camera) -> tuple[float, float]:
+    return -camera.intrinsics.readout_s / 2, camera.intrinsics.readout_s / 2
+
+
+def _cloud(camera: Camera, tracks: Tracks, rows: Int64, between: Interpolation) -> tuple[Float, Float, Float]:
+    """Triangulate the points that stills show.
+
+    Returns:
+        Place [N, 3], covariance [N, 3, 3], and derivative by a constant attitude error [N, 3, 3].
+    """
+    followed = np.unique(tracks.picture)
+    shown = np.isin(tracks.picture, followed[np.clip(np.searchsorted(followed, rows), 0, len(followed) - 1)])
+    mine = np.flatnonzero(np.isin(tracks.point, np.unique(tracks.point[shown])))
+    mine = mine[:: max(1, -(-len(mine) // _MOST_SIGHTINGS))]
+    xy, t_ns = tracks.xy[mine], camera.frame_t_ns[tracks.picture[mine]]
+    delay_s = np.clip(row_delay_s(xy[:, 1], camera.intrinsics), *_readout(camera))
+    when, place = np.unique(t_ns + np.round(1e9 * delay_s).astype(np.int64), return_inverse=True)
+    position, rotation = (each[place] for each in camera.poses_at(when, between))
+    ray = np.append(undistort(xy, camera.intrinsics), np.ones((len(xy), 1)), axis=1)
+    ray = np.einsum("kij,kj->ki", rotation, ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    known = np.isfinite(ray).all(axis=1)
+    ray, position, rotation = ray[known], position[known], rotation[known]
+    names, number = np.unique(tracks.point[mine][known], return_inverse=True)
+    points = len(names)
+    count = np.bincount(number, minlength=points)
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    weight = np.ones(len(ray))
+    for _ in range(_ROUNDS // 2):
+        normal = _sums(across * weight[:, None, None], number, points) + 1e-12 * np.eye(3)
+        right = _sums(np.einsum("kij,kj->ki", across, position) * weight[:, None], number, points)
+        place3 = np.linalg.solve(normal, right[..., None])[..., 0]
+        arm = place3[number] - position
+        distance = np.linalg.norm(arm, axis=1)
+        missed = np.linalg.norm(np.einsum("kij,kj->ki", across, arm), axis=1) / distance * camera.focal_px
+        weight = 1 / np.maximum(distance, 0.5) ** 2 / (1 + missed**2)
+    inverse = np.linalg.inv(_sums(across * weight[:, None, None], number, points) + 1e-12 * np.eye(3))
+    turned = -_cross(arm) @ rotation
+    by_turn = inverse @ _sums(across @ turned * weight[:, None, None], number, points)
+    covariance = inverse * (_PIXEL_SIGMA / camera.focal_px) ** 2
+    far, off = (np.bincount(number, each, points) / np.maximum(count, 1) for each in (distance, missed))
+    kept = (count >= _FEWEST_SIGHTINGS) & (np.trace(covariance, axis1=1, axis2=2) < _POINT_SIGMA_M**2)
+    kept &= (off < _WORST_PX) & (far > _NEAREST_M) & (far < _FARTHEST_M)
+    kept &= np.bincount(number, (ray * arm).sum(axis=1) > 0, points) == count
+    return place3[kept], covariance[kept], by_turn[kept]
+
+
+def _ground(points: Float, covariance: Float) -> tuple[Int64, Float]:
+    """Choose points on level ground, the best one of each cube: their numbers [N] and normals [N, 3]."""
+    from scipy.spatial import cKDTree
+
+    if not len(points):
+        return np.empty(0, np.int64), np.empty((0, 3))
+    best = np.argsort(np.trace(covariance, axis1=1, axis2=2), kind="stable")
+    _, first = np.unique(np.floor(points[best] / _GRID_M).astype(np.int64), axis=0, return_index=True)
+    chosen, normals = [], []
+    tree = cKDTree(points)
+    for number in np.sort(best[first]).tolist():
+        near = points[tree.query_ball_point(points[number], _AROUND_M)]
+        if len(near) < _NEIGHBOURS:
+            continue
+        middle = np.median(near, axis=0)
+        _, size, axes = np.linalg.svd(near - middle, full_matrices=False)
+        normal = axes[2] * np.sign(axes[2, 2])
+        rough, wide = size[2] / np.sqrt(len(near)), size[1] / np.sqrt(len(near))
+        on_it = abs(float(normal @ (points[number] - middle))) < _ROUGH_M
+        if rough < _ROUGH_M and wide > 4 * _ROUGH_M and normal[2] > _STEEPEST and on_it:
+            chosen.append(number)
+            normals.append(normal)
+    return np.array(chosen, dtype=np.int64), np.array(normals).reshape(-1, 3)
+
+
+def _sums(values: Float, number: Int64, count: int) -> Float:
+    """Sum values [K, ...] of the same number: [count, ...]."""
+    flat = values.reshape(len(values), -1)
+    sums = np.stack([np.bincount(number, weights=column, minlength=count) for column in flat.T], axis=-1)
+    return np.asarray(sums, dtype=np.float64).reshape(count, *values.shape[1:])
+
+
+def _cross(vectors: Float) -> Float:
+    """Build matrices [..., 3, 3] that multiply from the left as the cross product does."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    o = np.zeros_like(x)
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*vectors.shape[:-1], 3, 3)
+
+
+# --- patches -----------------------------------------------------------------------------------------------
+
+
+def _pixels(points: Float, position: Float, rotation: Float, camera: Camera) -> tuple[Float, Float]:
+    own = np.einsum("...ji,...j->...i", rotation, points - position)
+    return project(own, camera.intrinsics), own[..., 2]
+
+
+def _compare(
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], known: _Solution, most: int
+) -> _Matches:
+    """Look for patches about points of the first camera of each pair in stills of the second.
+
+    Args:
+        views: all cameras.
+        pairs: first and second camera.
+        known: what is known of the errors: where to look, and how far around.
+        most: patches of a pair.
+    """
+    patch: list[int] = []
+    pair: list[int] = []
+    covariance, across, shift, design = [], [], [], []
+    for number, (a, b) in enumerate(pairs):
+        first, second = views[a], views[b]
+        seen_a, position_a, rotation_a, ray_a = first.seen(first.points, first.normal)
+        seen_b, position_b, rotation_b, ray_b = second.seen(first.points, first.normal)
+        shown = np.flatnonzero(seen_a.any(axis=0) & seen_b.any(axis=0))
+        for i in shown[np.unique(np.linspace(0, len(shown) - 1, min(most, len(shown))).astype(int))].tolist():
+            found = 0
+            for s, t in _alike(seen_a[:, i], seen_b[:, i], ray_a[:, i], ray_b[:, i]):
+                row = np.zeros((3, 6 * len(views)))
+                row[:, 3 * b : 3 * b + 3], row[:, 3 * a : 3 * a + 3] = np.eye(3), -np.eye(3)
+                turns = 3 * len(views)
+                arm = first.points[i] - position_b[t, i]
+                row[:, turns + 3 * b : turns + 3 * b + 3] = -_cross(arm) @ rotation_b[t, i]
+                row[:, turns + 3 * a : turns + 3 * a + 3] = -first.by_turn[i]
+                expected = row @ known.errors
+                spread = row @ known.covariance @ row.T + first.covariance[i]
+                reach = _SIGMAS * float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
+                moved = _displacement(
+                    _Cut(first.stills[s], position_a[s, i], rotation_a[s, i], first.camera),
+                    _Cut(second.stills[t], position_b[t, i], rotation_b[t, i], second.camera),
+                    first.points[i],
+                    first.normal[i],
+                    expected,
+                    reach,
+                )
+                if moved is None:
+                    continue
+                patch.append(len(pair))
+                across.append(np.linalg.svd(ray_b[t, i][None])[2][1:])
+                shift.append(moved)
+                design.append(row)
+                found += 1
+            if found:
+                pair.append(number)
+                covariance.append(first.covariance[i])
+    return _Matches(
+        np.array(patch, dtype=np.int64),
+        np.array(pair, dtype=np.int64),
+        np.array(covariance).reshape(-1, 3, 3),
+        np.array(across).reshape(-1, 2, 3),
+        np.array(shift).reshape(-1, 3),
+        np.array(design).reshape(-1, 3, 6 * len(views)),
+    )
+
+
+def _alike(seen_a: Bool, seen_b: Bool, ray_a: Float, ray_b: Float) -> list[tuple[int, int]]:
+    """Choose pairs of stills that see a patch from similar directions, each still at most once."""
+    cosine = ray_a @ ray_b.T
+    cosine[~seen_a] = cosine[:, ~seen_b] = -np.inf
+    chosen: list[tuple[int, int]] = []
+    for _ in range(_PAIRS_OF_STILLS):
+        s, t = divmod(int(np.argmax(cosine)), cosine.shape[1])
+        if cosine[s, t] == -np.inf:
+            break
+        chosen.append((s, t))
+        cosine[s], cosine[:, t] = -np.inf, -np.inf
+    return chosen
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Still that orthophotos are cut out of."""
+
+    pyramid: list[Picture]
+    position: Float  # [3]
+    rotation: Float  # [3, 3]
+    camera: Camera
+
+    def orthophoto(self, centre: Float, axes: Float, half: int, cell_m: float) -> Picture | None:
+        """Cut out [2 half + 1]^2 cells about a point, along two axes [2, 3]; None if they are not inside."""
+        import cv2
+
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
+        xy, depth = _pixels(centre + corners * cell_m @ axes, self.position, self.rotation, self.camera)
+        width, height = self.camera.intrinsics.width, self.camera.intrinsics.height
+        inside = (xy > 0).all() and (xy < [width - 1, height - 1]).all() and (depth > 0).all()
+        if not inside:
+            return None
+        span_px = float(np.abs(xy - np.roll(xy, 1, axis=0)).max()) / (2 * half)
+        level = int(np.clip(np.log2(max(span_px, 1.0)), 0, _LEVELS))
+        to_still = cv2.getPerspectiveTransform(
+            (corners + half).astype(np.float32), (xy / 2**level).astype(np.float32)
+        )
+        size = (2 * half + 1, 2 * half + 1)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        cut = cv2.warpPerspective(self.pyramid[level], to_still, size, flags=flags)
+        return np.asarray(cv2.GaussianBlur(cut.astype(np.float32), (0, 0), _BLUR_CELLS))
+
+
+def _displacement(
+    a: _Cut, b: _Cut, point: Float, normal: Float, expected: Float, reach_m: float
+) -> Float | None:
+    """Find a patch of one still in another: its shift [3] in the plane beyond `point`; None if not clear."""
+    import cv2
+
+    first = np.cross([0.0, 1.0, 0.0], normal)
+    first /= np.linalg.norm(first)
+    axes = np.stack([first, np.cross(normal, first)])
+    cell_m = max(_CELL_M, reach_m / _MOST_REACH_CELLS)
+    reach = max(int(np.ceil(reach_m / cell_m)), _PEAK_CELLS + 2)
+    searched = b.orthophoto(point + expected, axes, _HALF_CELLS + reach, cell_m)
+    wanted = a.orthophoto(point, axes, _HALF_CELLS, cell_m)
+    if wanted is None or searched is None or wanted.std() < _FLAT:
+        return None
+    alike = cv2.matchTemplate(searched, wanted, cv2.TM_CCOEFF_NORMED)
+    y, x = np.unravel_index(int(alike.argmax()), alike.shape)
+    if not (0 < x < 2 * reach and 0 < y < 2 * reach) or alike[y, x] < _ALIKE:
+        return None
+    other = alike.copy()
+    other[max(0, y - _PEAK_CELLS) : y + _PEAK_CELLS + 1, max(0, x - _PEAK_CELLS) : x + _PEAK_CELLS + 1] = -1
+    if alike[y, x] - other.max() < _CLEARER:
+        return None
+    right = _vertex(*alike[y, x - 1 : x + 2]) + x - reach
+    down = _vertex(*alike[y - 1 : y + 2, x]) + y - reach
+    moved: Float = expected + cell_m * (right * axes[0] + down * axes[1])
+    return moved
+
+
+def _vertex(before: float, top: float, after: float) -> float:
+    """Find the highest point of the parabola through values at -1, 0 and 1."""
+    return float((after - before) / (2 * (2 * top - after - before)))
+
+
+# --- the errors --------------------------------------------------------------------------------------------
+
+
+def _prior_sigma(cameras: Sequence[Camera], constant_m: Float) -> Float:
+    """Build the prior standard deviations [6 C] of constant errors: positions, then attitudes."""
+    turns = []
+    for camera in cameras:
+        turn = 0.0
+        if camera.errors is not None:
+            turn = float(np.sqrt(sum(p.sigma0**2 for p in camera.errors.processes if p.number == ROTATION)))
+        elif camera.sigma is not None:
+            turn = float(np.median(camera.sigma[:, 1]))
+        turns.append(turn)
+    moving = [not camera.static for camera in cameras]
+    least = np.concatenate([np.zeros(len(cameras)), np.where(moving, _TURN_SIGMA, 0.0)])
+    sigma: Float = np.maximum(np.concatenate([constant_m, turns]), least)
+    return np.maximum(np.repeat(sigma, 3), EXACT)
+
+
+def _solve(matches: _Matches, prior: Float) -> tuple[_Solution, Bool]:
+    """Solve for constant errors; return also which patches [P] agree."""
+    cut = matches.across
+    spread = (
+        cut @ (matches.covariance[matches.patch] + _MATCH_SIGMA_M**2 * np.eye(3)) @ np.swapaxes(cut, 1, 2)
+    )
+    count = np.bincount(matches.patch, minlength=len(matches.pair))
+    share = 1 / (1 + (count - 1) * _REPEATED)
+    pairs = np.eye(int(matches.pair.max()) + 1)
+    shared = pairs[matches.pair[matches.patch]]
+    of_pair = (shared[:, None, :, None] * np.eye(3)[:, None]).reshape(len(cut), 3, -1)
+    design = cut @ np.concatenate([matches.design, of_pair], axis=2)
+    every = np.concatenate([prior, np.full(of_pair.shape[2], _PAIR_SIGMA_M)])
+    errors = np.zeros(len(every))
+    seen, back_cut = np.einsum("kij,kj->ki", cut, matches.shift), np.swapaxes(cut, 1, 2)
+    for k in range(_ROUNDS):
+        loss = max(_LOSS, 16.0 / 2**k)
+        residual = seen - design @ errors
+        square = np.einsum("ki,kij,kj->k", residual, np.linalg.inv(spread), residual)
+        scale = (1 / _excess(square, matches))[matches.pair]
+        weight = (share * scale)[matches.patch] / (1 + square / loss**2) / _MATCH_SIGMA_M**2
+        # The error of a patch's place is common to its comparisons: it is eliminated.
+        by_place = _sums(back_cut @ cut * weight[:, None, None], matches.patch, len(count))
+        mixed = _sums(np.swapaxes(design, 1, 2) @ cut * weight[:, None, None], matches.patch, len(count))
+        pull = _sums(np.einsum("kji,kj->ki", cut, seen) * weight[:, None], matches.patch, len(count))
+        back = mixed @ np.linalg.inv(by_place + np.linalg.inv(matches.covariance) * scale[:, None, None])
+        normal = np.einsum("kji,k,kjl->il", design, weight, design) - np.einsum("pij,pkj->ik", back, mixed)
+        right = np.einsum("kji,k,kj->i", design, weight, seen) - np.einsum("pij,pj->i", back, pull)
+        covariance = np.linalg.inv(normal + np.diag(every**-2.0))
+        errors = covariance @ right
+    residual = seen - design @ errors
+    square = np.einsum("ki,kij,kj->k", residual, np.linalg.inv(spread), residual)
+    agree = np.bincount(matches.patch, square < _AGREEING, len(count)) > count / 2
+    own = slice(len(prior))
+    return _Solution(errors[own], covariance[own, own]), agree
+
+
+def _excess(square: Float, matches: _Matches) -> Float:
+    """Compute the factor of each pair's median squared residual on the expected one, at least 1."""
+    pair = matches.pair[matches.patch]
+    factor = np.ones(int(matches.pair.max(initial=-1)) + 1)
+    for number in np.unique(pair).tolist():
+        factor[number] = max(1.0, float(np.median(square[pair == number])) / _MEDIAN_OF_TWO)
+    return factor
+
+
+# --- cameras -----------------------------------------------------------------------------------------------
+
+
+def _bound(
+    cameras: Sequence[Camera],
+    pairs: Sequence[tuple[int, int]],
+    counts: Int64,
+    used: Bool,
+    prior: Float,
+    solution: _Solution,
+) -> GroundBinding:
+    """Move the largest group of cameras that are bound to each other, and narrow their errors."""
+    total = len(cameras)
+    group = _largest_group(total, [pair for pair, use in zip(pairs, used, strict=True) if use])
+    position, turn = solution.errors[: 3 * total].reshape(-1, 3), solution.errors[3 * total :].reshape(-1, 3)
+    columns = np.array([3 * c + k for c in group for k in range(3)], dtype=np.int64)
+    joint = solution.covariance[np.ix_(columns, columns)]
+    every = np.tile(np.eye(3), (len(group), 1))
+    common = np.zeros((3, 3))
+    if group:
+        common = np.asarray(np.linalg.inv(every.T @ np.linalg.inv(joint) @ every), dtype=np.float64)
+    moved, left_m, reasons = list(cameras), {}, {}
+    for c, camera in enumerate(cameras):
+        if c not in group:
+            reasons[camera.name] = _reason(c, cameras, pairs, counts)
+            # Against the group's common error it is as uncertain as both together.
+            if group:
+                wider = float(np.sqrt(prior[3 * c] ** 2 + np.trace(common) / 3))
+                moved[c] = _narrowed(camera, wider, None, float(prior[3 * c]))
+            continue
+        place = slice(3 * c, 3 * c + 3)
+        own = float(np.trace(solution.covariance[place, place] - common)) / 3
+        relative = own * len(group) / (len(group) - 1)
+        sigma = float(np.sqrt(max(relative, EXACT**2)))
+        left_m[camera.name] = sigma
+        turned = slice(3 * (total + c), 3 * (total + c) + 3)
+        turn_sigma = float(np.sqrt(np.trace(solution.covariance[turned, turned]) / 3))
+        log = camera.trajectory
+        trajectory = replace(
+            log,
+            position=log.position - position[c],
+            quaternion_xyzw=multiply(log.quaternion_xyzw, quaternion_from_rotation_vector(-turn[c][None])),
+        )
+        moved[c] = _narrowed(replace(camera, trajectory=trajectory), sigma, turn_sigma, float(prior[3 * c]))
+    entry = {
+        "patches": [
+            {
+                "from": cameras[a].name,
+                "in": cameras[b].name,
+                "compared": int(n),
+                "agree": int(good),
+                "used": bool(use),
+            }
+            for (a, b), (n, good), use in zip(pairs, counts, used, strict=True)
+        ],
+        "position_sigma_m": {
+            camera.name: {"before": float(prior[3 * c]), "against_the_others": left_m.get(camera.name)}
+            for c, camera in enumerate(cameras)
+        },
+        "moved_m": {cameras[c].name: (-position[c]).tolist() for c in group},
+        "turned_deg": {cameras[c].name: np.degrees(-turn[c]).tolist() for c in group},
+        "common_sigma_m": float(np.sqrt(np.trace(common) / 3)) if group else None,
+        "reasons": reasons,
+    }
+    return GroundBinding(moved, tuple(cameras[c].name for c in group), reasons, common, entry)
+
+
+def _largest_group(total: int, edges: Sequence[tuple[int, int]]) -> list[int]:
+    """List the largest group of cameras that edges connect; empty without any."""
+    group = list(range(total))
+    for a, b in [*edges, *edges]:
+        low = min(group[a], group[b])
+        group = [low if each in (group[a], group[b]) else each for each in group]
+    best = max(range(total), key=lambda c: (group.count(c), -c), default=0)
+    members = [c for c in range(total) if group[c] == best]
+    return members if len(members) > 1 else []
+
+
+def _reason(c: int, cameras: Sequence[Camera], pairs: Sequence[tuple[int, int]], counts: Int64) -> str:
+    """Say in one line why a camera is not bound."""
+    mine = [n for n, pair in enumerate(pairs) if c in pair]
+    if not mine:
+        return "no pictures, or no camera with a known background, to compare its ground with"
+    best = max(mine, key=lambda n: (counts[n, 1], counts[n, 0]))
+    a, b = pairs[best]
+    other = cameras[b if a == c else a].name
+    return (
+        f"{counts[best, 1]} of {counts[best, 0]} patches of ground agree with {other}; "
+        f"{_FEWEST_PATCHES} and more than {_AGREE:.0%} are needed"
+    )
+
+
+def _narrowed(camera: Camera, position_m: float, turn: float | None, prior_m: float) -> Camera:
+    """State other constant errors of a camera: m, and rad where known, instead of the prior's."""
+    change = position_m**2 - prior_m**2
+    covariance, sigma, errors = camera.covariance, camera.sigma, camera.errors
+    if covariance is not None:
+        covariance = covariance.copy()
+        variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2)[:, :3] + change, EXACT**2)
+        covariance[:, range(3), range(3)] = variance
+    if sigma is not None:
+        sigma = np.stack([np.sqrt(np.maximum(sigma[:, 0] ** 2 + change, EXACT**2)), sigma[:, 1]], axis=1)
+    if errors is not None:
+        processes = [p for p in errors.processes if not (p.number == SHIFT_IN_WORLD and p.constant)]
+        processes = [Process(SHIFT_IN_WORLD, position_m), *processes]
+        if turn is not None:
+            processes = [
+                replace(p, sigma0=min(p.sigma0, turn)) if p.number == ROTATION and p.constant else p
+                for p in processes
+            ]
+        errors = replace(errors, processes=tuple(processes))
+    return replace(camera, covariance=covariance, sigma=sigma, errors=errors)

@@ -1,0 +1,194 @@
+"""Position errors between cameras, from pictures of a textured plane that are known in closed form."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.cameras import Intrinsics, camera_matrix
+from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, PoseErrors, Process
+from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.reconstruction.background_tracks import Tracks
+from pipelines.reconstruction.ground import Stills, bind_positions
+from pipelines.reconstruction.observations import Camera
+from pipelines.session.description import Interpolation
+from pipelines.session.records import Detections, Trajectory
+
+LENS = Intrinsics(640, 360, 400.0, 400.0, 319.5, 179.5)
+BETWEEN = Interpolation(max_gap_s=1.0, max_extrapolation_s=0.0)
+CONSTANT_M = 0.05
+PICTURES, STILLS = 40, 5
+TEXEL_M, SIDE_M = 0.02, 24.0
+
+
+def texture(contrast: float) -> NDArray[np.uint8]:
+    """Draw the ground: noise at several scales, 128 grey in the mean."""
+    rng = np.random.default_rng(3)
+    size = round(SIDE_M / TEXEL_M)
+    grey = np.zeros((size, size))
+    for blur_m in (0.04, 0.1, 0.3):
+        layer = cv2.GaussianBlur(rng.standard_normal((size, size)), (0, 0), blur_m / TEXEL_M)
+        grey += layer / layer.std()
+    return np.clip(128 + contrast * grey, 0, 255).astype(np.uint8)
+
+
+def flown(azimuth_deg: float, way_m: float) -> tuple[Float, Float]:
+    """Fly past the origin, 7 m away and 4 m high, looking at it: position [T, 3], rotation [T, 3, 3]."""
+    azimuth = np.radians(azimuth_deg)
+    away, along = (
+        np.array([np.cos(azimuth), np.sin(azimuth), 0]),
+        np.array([-np.sin(azimuth), np.cos(azimuth), 0]),
+    )
+    position = 7 * away + np.linspace(-0.5, 0.5, PICTURES)[:, None] * way_m * along + [0, 0, 4]
+    forward = -position / np.linalg.norm(position, axis=1, keepdims=True)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return position, np.stack([right, np.cross(forward, right), forward], axis=2)
+
+
+def filmed(position: Float, rotation: Float, ground: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Render the plane z = 0 by the homography from its texels to the picture."""
+    to_world = np.array([[TEXEL_M, 0, -SIDE_M / 2], [0, TEXEL_M, -SIDE_M / 2], [0, 0, 0], [0, 0, 1.0]])
+    pose = np.concatenate([rotation.T, -(rotation.T @ position)[:, None]], axis=1)
+    size = (LENS.width, LENS.height)
+    return np.asarray(cv2.warpPerspective(ground, camera_matrix(LENS) @ pose @ to_world, size), np.uint8)
+
+
+def camera(
+    name: str, azimuth_deg: float, error_m: Float, ground: NDArray[np.uint8], way_m: float = 4.0
+) -> tuple[Camera, Tracks, Stills]:
+    """Film the ground; the log's positions have a constant error."""
+    t_ns = np.arange(PICTURES) * 50_000_000
+    position, rotation = flown(azimuth_deg, way_m)
+    points = np.stack(np.meshgrid(np.arange(-4, 4.1, 0.4), np.arange(-4, 4.1, 0.4), [0.0]), axis=-1).reshape(
+        -1, 3
+    )
+    own = np.einsum("tji,tnj->tni", rotation, points - position[:, None])
+    xy = LENS.fx * own[..., :2] / own[..., 2:] + [LENS.cx, LENS.cy]
+    picture, point = np.nonzero(((xy > 0) & (xy < [LENS.width - 1, LENS.height - 1])).all(axis=2))
+    rows = np.linspace(0, PICTURES - 1, STILLS).astype(np.int64)
+    made = Camera(
+        name,
+        LENS,
+        np.arange(PICTURES),
+        t_ns,
+        np.ones(PICTURES, dtype=np.bool_),
+        Trajectory(t_ns, position + error_m, quaternion_from_matrix(rotation)),
+        static=False,
+        sigma=None,
+        detections=Detections(
+            ("nose",),
+            np.empty(0, np.int64),
+            np.empty(0, np.int64),
+            np.empty((0, 1, 2)),
+            np.empty((0, 1)),
+            np.empty(0, np.int64),
+        ),
+        errors=PoseErrors((1e-3, 1e-4), (Process(SHIFT_IN_WORLD, CONSTANT_M), Process(ROTATION, 1e-3))),
+    )
+    return (
+        made,
+        Tracks(picture, point, xy[picture, point]),
+        Stills(rows, [filmed(position[r], rotation[r], ground) for r in rows]),
+    )
+
+
+ERRORS_M = {"north": np.array([0.06, -0.04, 0.05]), "east": np.array([-0.05, 0.03, -0.06])}
+
+
+def scene(contrast: float = 25.0) -> tuple[list[Camera], dict[str, Tracks], dict[str, Stills]]:
+    """Film the same ground by two cameras 60 degrees apart."""
+    ground = texture(contrast)
+    made = [
+        camera(name, turn, error, ground)
+        for (name, error), turn in zip(ERRORS_M.items(), (90, 30), strict=True)
+    ]
+    return (
+        [each for each, _, _ in made],
+        {each.name: tracks for each, tracks, _ in made},
+        {each.name: stills for each, _, stills in made},
+    )
+
+
+def shift_sigma(camera: Camera) -> float:
+    """Return the standard deviation that is stated of the constant position error."""
+    assert camera.errors is not None
+    return next(process.sigma0 for process in camera.errors.processes if process.number == SHIFT_IN_WORLD)
+
+
+def test_offset_between_two_cameras_is_found() -> None:
+    cameras, tracks, stills = scene()
+    binding = bind_positions(cameras, tracks, stills, np.full(2, CONSTANT_M), between=BETWEEN)
+    assert binding.bound == ("north", "east")
+    assert not binding.reasons
+    left = [
+        (moved.trajectory.position - flown(turn, 4.0)[0]).mean(axis=0)
+        for moved, turn in zip(binding.cameras, (90, 30), strict=True)
+    ]
+    sigma = [shift_sigma(moved) for moved in binding.cameras]
+    assert max(sigma) < CONSTANT_M / 3
+    # Three axes of the difference of two cameras: four standard deviations.
+    assert np.linalg.norm(left[0] - left[1]) < 4 * np.linalg.norm(sigma)
+    assert np.linalg.norm(left[0] - left[1]) < 0.25 * np.linalg.norm(ERRORS_M["north"] - ERRORS_M["east"])
+    # With equal priors the mean of both stays as logged, and as uncertain as a mean of two.
+    assert sum(left) == pytest.approx(sum(ERRORS_M.values()), abs=2e-3)
+    assert binding.common == pytest.approx(CONSTANT_M**2 / 2 * np.eye(3), rel=1e-6, abs=1e-9)
+
+
+def test_exact_camera_leaves_no_common_offset() -> None:
+    cameras, tracks, stills = scene()
+    exact = replace(cameras[1], trajectory=replace(cameras[1].trajectory, position=flown(30, 4.0)[0]))
+    binding = bind_positions(
+        [cameras[0], exact], tracks, stills, np.array([CONSTANT_M, 0.0]), between=BETWEEN
+    )
+    assert binding.bound == ("north", "east")
+    assert np.trace(binding.common) < 1e-9
+    moved = binding.cameras[0]
+    error = (moved.trajectory.position - flown(90, 4.0)[0]).mean(axis=0)
+    assert np.linalg.norm(error) < 4 * shift_sigma(moved)
+    assert binding.cameras[1].trajectory.position == pytest.approx(exact.trajectory.position, abs=1e-6)
+
+
+def test_ground_without_texture_binds_nothing() -> None:
+    cameras, tracks, stills = scene(contrast=0.0)
+    binding = bind_positions(cameras, tracks, stills, np.full(2, CONSTANT_M), between=BETWEEN)
+    assert binding.bound == ()
+    assert set(binding.reasons) == {"north", "east"}
+    assert binding.cameras == cameras
+    assert not binding.common.any()
+
+
+def test_camera_with_other_ground_is_not_bound() -> None:
+    """Two cameras film the same ground, the third other ground: the two are bound, the third is not."""
+    cameras, tracks, stills = scene()
+    elsewhere, its_tracks, its_stills = camera("west", 150, np.zeros(3), texture(25.0)[::-1, ::-1].copy())
+    binding = bind_positions(
+        [*cameras, elsewhere],
+        {**tracks, "west": its_tracks},
+        {**stills, "west": its_stills},
+        np.full(3, CONSTANT_M),
+        between=BETWEEN,
+    )
+    assert binding.bound == ("north", "east")
+    assert set(binding.reasons) == {"west"}
+    # Against the common error of the two it is as uncertain as both together.
+    assert shift_sigma(binding.cameras[2]) == pytest.approx(CONSTANT_M * np.sqrt(1.5), rel=1e-6)
+
+
+@pytest.mark.parametrize("missing", ["stills", "tracks", "camera"])
+def test_one_camera_alone_is_not_bound(missing: str) -> None:
+    cameras, tracks, stills = scene()
+    if missing == "stills":
+        del stills["east"]
+    elif missing == "tracks":
+        tracks.clear()
+    else:
+        del cameras[1]
+    prior = np.full(len(cameras), CONSTANT_M)
+    binding = bind_positions(cameras, tracks, stills, prior, between=BETWEEN)
+    assert binding.bound == ()
+    assert set(binding.reasons) == {each.name for each in cameras}
+    assert binding.cameras == cameras
