@@ -3,10 +3,12 @@
 python -m benchmarks.house            # prints the table
 python -m benchmarks.house --write    # and puts it into CONTRIBUTING.md
 python -m benchmarks.house --worst    # and names what makes each figure what it is
+python -m benchmarks.house --beside evo rosbags FOLDER ...    # lines by kind, beside other packages
 """
 
 import argparse
 import ast
+import importlib.util
 import re
 import statistics
 import sys
@@ -59,6 +61,44 @@ def code_lines(path: Path, tree: ast.Module) -> int:
             for line in range(token.start[0], token.end[0] + 1)
         }
     return len(held - documented)
+
+
+def statements(tree: ast.Module) -> int:
+    """Count the statements of a module, docstrings among them."""
+    return sum(isinstance(node, ast.stmt) for node in ast.walk(tree))
+
+
+def lines_by_kind(folder: Path) -> str:
+    """Count the lines of a package by kind, and its statements; return a row of the table of decision 10.
+
+    Tests within the package are left out. Words and formatting decide how many lines a statement has.
+    """
+    lines = code = documented = blank = stated = modules = 0
+    for path in sorted(folder.rglob("*.py")):
+        if "tests" in path.relative_to(folder).parts:
+            continue
+        text = path.read_text(encoding="utf-8")
+        tree = ast.parse(text)
+        within = {n for d in docstrings(tree) for n in range(d.lineno, (d.end_lineno or d.lineno) + 1)}
+        modules += path.name != "__init__.py"
+        lines += len(text.splitlines())
+        code += code_lines(path, tree)
+        documented += len(within)
+        blank += sum(not line.strip() for n, line in enumerate(text.splitlines(), 1) if n not in within)
+        stated += statements(tree)
+    kinds = (lines, code, documented, blank, lines - code - documented - blank, stated)
+    thousands = " | ".join(f"{count / 1000:.1f}" for count in kinds)
+    return f"| {folder.name} | {modules} | {thousands} | {lines / stated:.2f} |"
+
+
+def folder_of(package: str) -> Path:
+    """Find the folder of an installed package, or take a path as it is."""
+    if Path(package).is_dir():
+        return Path(package)
+    found = importlib.util.find_spec(package)
+    if found is None or not found.submodule_search_locations:
+        sys.exit(f"{package}: neither a folder nor an installed package")
+    return Path(found.submodule_search_locations[0])
 
 
 def name_of(path: Path) -> str:
@@ -138,7 +178,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Measure the house.")
     parser.add_argument("--write", action="store_true", help="Put the table into CONTRIBUTING.md.")
     parser.add_argument("--worst", action="store_true", help="Name what makes each figure what it is.")
+    parser.add_argument(
+        "--beside", nargs="+", metavar="PACKAGE", help="Print lines by kind of these as well."
+    )
     options = parser.parse_args()
+    if options.beside:
+        print("| package | modules | k lines | code | docstrings | blank | comments | k statements |", end="")
+        print(" lines a statement |\n|" + " --- |" * 9)
+        for folder in (ROOT / "pipelines", *map(folder_of, options.beside)):
+            print(lines_by_kind(folder))
+        return
 
     house = {path: tree for package in PACKAGES for path, tree in parsed(package).items()}
     rooms = {path: tree for path, tree in house.items() if path.is_relative_to(ROOT / "pipelines")}
@@ -171,6 +220,7 @@ def main() -> None:
             f"{sum(lines.values()) / 1000:.1f} k "
             f"({sum(code_lines(path, tree) for path, tree in rooms.items()) / 1000:.1f} k)"
         ),
+        "lines for a statement": f"{sum(lines.values()) / sum(map(statements, rooms.values())):.2f}",
         "modules without `__init__`; median lines": (
             f"{len(modules)}; {statistics.median(lines[path] for path in modules):.0f}"
         ),

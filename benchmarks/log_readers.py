@@ -8,6 +8,7 @@ Of a folder the largest file is damaged. Counted are the messages whose bytes a 
 or fails.
 
 Then poses and the stamps of pictures are read one by one by the decoder of all messages, and many at a time.
+The last line is the time of a picture's pixels, which are decoded wherever single pictures are read.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TypeVar
 
+import cv2
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
@@ -30,6 +34,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.registries import LogFormat, recognise
 from tests.real_data import real_data
 
+T = TypeVar("T")
 REAL = (
     "logs/ros1/husky_gps_imu_odom.bag",
     "logs/ros1/foxglove_example-bz2.bag",
@@ -69,6 +74,11 @@ def main() -> None:
             ):
                 slow, fast = (1e6 * fastest(reading, log) for reading in readings)
                 print(f"| {container} | {what} | {slow:.1f} | {fast:.1f} | {slow / fast:.0f} |", flush=True)
+        jpeg = picture()
+        pixels_us = 1e6 * fastest(pixels, jpeg)
+        print(
+            f"\nthe pixels of a picture, 1280 x 720 in a JPEG of {len(jpeg) / 1e3:.0f} kB: {pixels_us:.0f} us"
+        )
 
 
 def generated(folder: Path, container: str) -> Path:
@@ -139,7 +149,7 @@ def counted(read: Callable[[Path], Iterable[object]], log: Path) -> str:
     return str(count)
 
 
-def fastest(reading: Callable[[Path], int], log: Path) -> float:
+def fastest(reading: Callable[[T], int], log: T) -> float:
     """Return the processor seconds of a message, in the fastest of seven readings."""
     times = []
     for _ in range(7):
@@ -173,6 +183,18 @@ def together(log: Path) -> int:
     """Read the stamps of all pictures at once."""
     with recognise(log, LogFormat, "log").open_log([log]) as recording:
         return len(picture_stamps(recording, PICTURE, log)[0])
+
+
+def picture() -> bytes:
+    """Make a JPEG of smooth noise."""
+    noise = np.random.default_rng(0).integers(0, 256, (36, 64, 3), dtype=np.uint8)
+    smooth = cv2.resize(noise, (1280, 720), interpolation=cv2.INTER_CUBIC)
+    return cv2.imencode(".jpg", smooth, [cv2.IMWRITE_JPEG_QUALITY, 50])[1].tobytes()
+
+
+def pixels(jpeg: bytes) -> int:
+    """Decode a picture ten times."""
+    return sum(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) is not None for _ in range(10))
 
 
 if __name__ == "__main__":
