@@ -87,12 +87,9 @@ def ablate(
     """Run a study; conditions that an interrupted run finished are kept.
 
     Args:
-        settings: the study.
         folder: the output folder; an earlier study there is replaced.
         workers: the number of conditions in parallel; the results do not depend on it.
         overwrite: replace a folder that is no study.
-        force: run it again even if nothing changed.
-        progress: receives the progress.
 
     Raises:
         DataError: the folder cannot be written or is a session's, the detector is missing, or nothing was

@@ -110,16 +110,12 @@ def batch(
     A flight that fails does not stop the others. It still gets its report if it was ingested.
 
     Args:
-        flights: manifests.
         output: the folder of the sessions and the summary. By default sessions lie beside their manifests,
             and the summary in `batch/` of the working directory.
-        settings: the settings that determine the results.
         workers: the number of processes on this machine, one flight each; by default one for each core. Not
             used with `scheduler`. If there are fewer flights than workers, a flight gets more threads.
         scheduler: the address of a Dask cluster, which reads and writes the same folders by the same paths.
-        force: run everything again even if nothing changed.
         overwrite: replace files that have the names of the summary's but are not of a batch.
-        progress: receives the progress.
 
     Raises:
         DataError: Dask is not installed, no scheduler answers, sessions would have the same name, or the

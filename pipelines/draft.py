@@ -83,10 +83,8 @@ def draft(
     comments of the manifest, beside the line that they concern.
 
     Args:
-        paths: the files and folders of the flight.
         output: the manifest; by default flight.yaml in the folder that all paths share.
         overwrite: replace an existing file.
-        progress: receives the progress.
 
     Raises:
         DataError: nothing was recognised, a path is missing, or the output exists or cannot be written.

@@ -67,14 +67,11 @@ def export(
     since are replaced. Half-written files of a killed export are removed.
 
     Args:
-        folder: the session.
-        formats: registered names.
         output: the output folder; by default beside the session, with `.export` instead of `.session`.
         unit: of lengths, for formats that have a choice; by default that of each format.
         axes: z-up or y-up, for formats that have a choice; by default those of each format.
         pictures_hz: pictures of each camera per second, for recordings that hold pictures; 0 is none.
         overwrite: replace existing files that no export wrote, or that were changed since.
-        progress: receives the progress.
 
     Raises:
         DataError: no such format, a format without a choice of unit or axes, nothing to export, tables or

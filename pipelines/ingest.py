@@ -95,14 +95,12 @@ def ingest(
     """Read a flight into a session.
 
     Args:
-        flight_path: the manifest.
         session: the output folder; by default `<name of the manifest>.session` beside it.
         max_pose_gap_s: frames between two logged poses further apart than this have no pose.
         max_extrapolation_s: frames further than this before or after all logged poses have none.
         strict: refuse a flight if any part of it could not be read or used.
         overwrite: write also to a target that holds something else.
         force: read everything again even if nothing changed.
-        progress: receives the progress.
 
     Raises:
         DataError: something cannot be used, or was changed while it was read; the session stays as it was.

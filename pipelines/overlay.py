@@ -50,13 +50,11 @@ def write_overlays(
     exist any more are left out, with a note.
 
     Args:
-        folder: the session.
         cameras: names of cameras; by default all that have pictures.
         start_s: use only pictures at or after this time, in seconds since the flight's first frame.
         end_s: use only pictures before this time.
         workers: the number of blocks in parallel; the pictures do not depend on it.
         force: run it again even if nothing changed, and replace a folder that is no overlay.
-        progress: receives the progress.
 
     Returns:
         The videos, in the order of the session's cameras.

@@ -63,9 +63,7 @@ def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -
     """Write report/index.html of a session.
 
     Args:
-        folder: the session.
         studies: folders of `mocap ablate` that the page shows as well.
-        force: run it again even if nothing changed.
 
     Raises:
         DataError: not a session, or damaged; a table of it, or pictures, were changed; a folder that holds no
@@ -150,7 +148,6 @@ def write_figures_of(
         target: the folder; figures that an earlier run wrote there are replaced.
         studies: folders of `mocap ablate` that the page of a single session shows as well.
         overwrite: replace also a folder with other things in it, but never a session.
-        force: run it again even if nothing changed.
 
     Raises:
         DataError: not a session, or damaged; a table of it, or pictures, were changed; the folder holds

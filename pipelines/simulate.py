@@ -68,13 +68,10 @@ def simulate(
     """Simulate a flight.
 
     Args:
-        scenario_path: the scenario.
         folder: the output folder; an earlier simulation there is replaced if it holds no other files.
         video: render videos; else write keypoints with the errors of a detector instead.
         workers: the number of blocks in parallel; logs, truth and pictures do not depend on it.
         overwrite: replace a folder that is no simulation, or that holds other files as well.
-        force: run it again even if nothing changed.
-        progress: receives the progress.
 
     Raises:
         DataError: the scenario cannot be used, or the folder cannot be written.

@@ -484,7 +484,6 @@ def write_manifest(draft: Draft, name: str, relative: Callable[[Path], str]) -> 
 
     Args:
         draft: the flight with its cameras and sources.
-        name: of the flight.
         relative: converts a path to the form in the manifest.
     """
     remarks = Remarks()

@@ -49,7 +49,6 @@ def intervals(
     Args:
         series: by name, [T] each; nothing may be NaN.
         t_ns: [T] strictly increasing; None for independent trials.
-        seed: of the draws.
 
     Returns:
         By name; None with fewer than ten samples or two trials, or if a draw has no data for the figure.

@@ -81,7 +81,6 @@ def project(points_camera: Float, intrinsics: Intrinsics) -> Float:
 
     Args:
         points_camera: [..., 3] m, x right, y down, z forward.
-        intrinsics: the camera.
 
     Returns:
         [..., 2] px; NaN for points that are NaN, behind the camera (z <= 0) or outside the model's
@@ -101,7 +100,6 @@ def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
 
     Args:
         pixels: [..., 2] px.
-        intrinsics: the camera.
 
     Returns:
         [..., 2] normalised coordinates, solved to 1e-10 (relative above 1); NaN for pixels that are NaN
@@ -121,7 +119,6 @@ def row_delay_s(row_px: Float, intrinsics: Intrinsics) -> Float:
 
     Args:
         row_px: [...] px from the centre of the first row, which is read first; NaN stays.
-        intrinsics: the camera.
 
     Returns:
         [...] s, from -readout_s / 2 in the first row to readout_s / 2 in the last and on beyond them.
@@ -167,7 +164,6 @@ def fit_to_size(
 
     Args:
         intrinsics: the calibration.
-        width: of the pictures, px.
         height: of the pictures, px.
         bars: black columns at the left, rows at the top, columns at the right, rows at the bottom, px. They
             are whole pixels, so each side of the part between them is known to a pixel.

@@ -366,26 +366,6 @@ class Alignment:
         return moved
 
 
-def align(source: Float, target: Float, *, with_scale: bool) -> Alignment:
-    """Align two point sets.
-
-    Args:
-        source: [J, 3].
-        target: [J, 3], the same points in the same order; rows with NaN on either side are left out.
-        with_scale: find a similarity instead of a rigid motion.
-
-    Raises:
-        ValueError: fewer than 3 common points, or points on a line: the rotation is not determined.
-    """
-    common = int((np.isfinite(source) & np.isfinite(target)).all(axis=-1).sum())
-    if common < 3:
-        raise ValueError(f"{common} common points: an alignment needs 3")
-    alignment = align_each(source, target, with_scale=with_scale)
-    if not np.isfinite(alignment.rotation).all():
-        raise ValueError(f"the {common} common points lie on a line: their rotation is not determined")
-    return alignment
-
-
 def align_each(source: Float, target: Float, *, with_scale: bool) -> Alignment:
     """Align many pairs of point sets, each pair separately.
 

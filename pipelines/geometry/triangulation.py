@@ -149,7 +149,6 @@ def triangulate(
       its cameras (`dlt` and `midpoint`, which reject no view).
 
     Args:
-        views: the observations.
         method: see the module; `min_views` and the parallax apply to all three, `gate` to `robust`.
         min_views: views needed, and inliers needed; at least 2.
         gate: in standard deviations of a view's image point, pixel and pose noise together.
@@ -214,7 +213,6 @@ def reprojection_px(views: Views, points: Float) -> Float:
     """Compute the reprojection distance [N, C] in px of views; NaN for absent views, inf behind a camera.
 
     Args:
-        views: the observations.
         points: [N, 3] m; NaN gives NaN.
     """
     rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
@@ -353,7 +351,6 @@ def triangulate_pictures(
         picture: [N] rows with the same number (not negative) are the joints of one person in one picture of
             every camera. If a camera shows fewer than five of them, its views are not judged.
         pixel_sigma: [C] px, that of the detector alone; `views.pixel_sigma` includes unexplained pose errors.
-        threads: see `triangulate`.
 
     Returns:
         As `triangulate`. Views that are left out are not inliers but have their residuals. A joint-frame with

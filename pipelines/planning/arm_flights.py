@@ -242,7 +242,6 @@ class Detect(Protocol):
             free: [T, J] True where nothing hides the joint.
             camera: [T, 3] m, world.
             target: [T, 3] m, world, the person's middle.
-            focal_px: of the camera.
             rng: draws as many numbers for any visibility.
         """
 

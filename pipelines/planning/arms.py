@@ -50,10 +50,8 @@ class FormationPlanner(Protocol):
         `yaw_frame` is `heading`. A planner that samples the field must add it; others can ignore it.
 
         Args:
-            t_s: now.
             commanded: [n, 3] the slots that are commanded now (yaw rad, tilt rad, range m).
             actor: forecast at the knots t_s + knot_s, t_s + 2 knot_s, ...
-            field: the distance field of the obstacles.
         """
 
 

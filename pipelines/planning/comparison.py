@@ -49,7 +49,6 @@ def mean_over_time(values: Float, counted: Bool, t_ns: Int64, seed: int) -> Esti
         values: [T] or [N, T].
         counted: [T].
         t_ns: [T] strictly increasing.
-        seed: of the resampling.
     """
     return _mean(np.atleast_2d(values).mean(axis=0)[counted], t_ns[counted], seed)
 

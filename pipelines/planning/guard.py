@@ -79,7 +79,6 @@ class Guard:
 
     Args:
         position: [N, 3] m, the drones at rest.
-        config: distances, limits, gains and rates.
         exactly: drones are exactly where plans are (`plan-only`). Then the accelerations and jerks are those
             of the plans, and are not limited.
     """

@@ -90,8 +90,6 @@ def load_flight(
     """Read the flight, cut to the time in which the actor and all moving cameras are known.
 
     Args:
-        folder: the session.
-        description: its session.json.
         reconstructed: the record of stage `reconstruct`, None where that has not run.
         pose_noise: errors of the poses, in place of those stated in the session.
 

@@ -368,13 +368,11 @@ class LocalPlanner:
         """Plan from the drone's place and velocity.
 
         Args:
-            t_s: now.
             position: [3] metres, world.
             velocity: [3] m/s.
             slots: [N, 3] wanted places of the drone at each waypoint's time.
             actor: [N, 3] forecast of the actor then.
             others: the latest plans of the other drones.
-            field: the distance field of the obstacles.
             previous: this drone's previous plan, the initial guess; without one it is the slots.
         """
         config = self._config

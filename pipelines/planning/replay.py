@@ -214,7 +214,6 @@ def replay(
         config: weights and rates, the same for all arms of a comparison.
         mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones exactly
             on their local plans.
-        seed: of the noise.
         clock: seconds, to measure planning times.
 
     Raises:

@@ -156,7 +156,6 @@ def roll_out(
     Args:
         path: [N + 1, 3] m, of the plan, as the next two.
         start_velocity: [3] m/s.
-        step_s: between its waypoints.
         after_s: time from the start of the plan to the drone's first state.
         ticks: number of periods for which the plan is followed.
         exactly: be exactly on the plan, without the limits, in place of tracking it.

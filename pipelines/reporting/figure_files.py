@@ -42,7 +42,6 @@ def write_figures(
 
     Args:
         folder: an existing, empty folder.
-        plates: by their keys.
         contents: the sessions that they are of, by label; the mark names their flights.
         key: equal for equal figures; it is stored in the mark.
     """

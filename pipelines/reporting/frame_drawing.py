@@ -82,9 +82,7 @@ def caption_of(view: View, status: NDArray[np.int8], method: str) -> tuple[str, 
     """Write the caption of a frame: camera, frame, time, and the number of joints by status.
 
     Args:
-        view: the frame.
         status: [P, J] index into triangulation.STATUS, -1 where the skeleton has no row.
-        method: of the reconstruction.
     """
     counts = np.bincount(status[status >= 0].ravel(), minlength=len(STATUS))
     words = [f"{count} {word}" for word, count in zip(STATUS, counts, strict=True) if count]

@@ -101,7 +101,6 @@ def collect_moments(
 
     Args:
         content: with `frames` and `keypoints` of the cameras that have them.
-        summary: of the same content.
         read_frame: reads the pictures, where there are any.
     """
     motion = summary.motion
@@ -153,7 +152,6 @@ def choose_moments(motion: Motion, error_mm: Float | None = None) -> tuple[list[
     just before and after as well: one wrong joint does not make a moment.
 
     Args:
-        motion: the skeleton.
         error_mm: [T, P, J] its distance from truth; None where there is none.
     """
     count = motion.measured.sum(axis=(1, 2))
@@ -281,7 +279,6 @@ def views_of(
     """Reproject the skeleton into frames of a camera, beside the detections there; no pictures.
 
     Args:
-        camera: the camera.
         at: [N] rows of its frames.
         motion: the skeleton; interpolated to the frames' times, never across a gap or a missing joint.
         status: [N, P, J] of the joints at these frames, index into triangulation.STATUS.
@@ -386,8 +383,6 @@ def read_filmed(
     """Read cameras with logged or refined poses, and frames by the estimated clocks.
 
     Args:
-        folder: the session.
-        description: its session.json.
         record: of its reconstruction: keypoints below its least confidence are left out.
         frames: the frame tables of the cameras that are wanted.
     """

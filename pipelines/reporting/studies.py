@@ -77,9 +77,7 @@ def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, A
     Intervals are those of `geometry.bootstrap` over trials.
 
     Args:
-        rows: of every trial.
         study: tilt, robots or noise: the condition that the ratio compares.
-        seed: of the resampling.
 
     Returns:
         In the order of the rows, each with the condition and method, and with

@@ -59,11 +59,6 @@ class StatedNoise(NamedTuple):
 def stated_models(name: str, entry: CameraEntry, pose_noise: str | None) -> list[NoiseModel] | None:
     """Return the models of a camera's pose errors; None if neither command line nor flight.yaml names any.
 
-    Args:
-        name: of the camera.
-        entry: its entry in session.json.
-        pose_noise: the value of `--pose-noise`, if any.
-
     Raises:
         DataError: a model is not known.
     """
@@ -80,10 +75,7 @@ def stated_noise(
     """Compute the uncertainty of each pose of a camera's log, from models or else from its covariances.
 
     Args:
-        name: of the camera.
-        entry: its entry in session.json.
         trajectory: its N logged poses.
-        pose_noise: the value of `--pose-noise`, if any.
 
     Raises:
         DataError: a model is not known.

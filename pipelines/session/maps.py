@@ -78,9 +78,7 @@ def check_size(source: Path | str, shape: Sequence[float], resolution_m: float, 
     """Refuse a grid that would not fit, before anything is allocated for it.
 
     Args:
-        source: the file, for the message.
         shape: voxels along each axis; floats where they come from unchecked coordinates.
-        resolution_m: the side of a voxel.
         remedy: what the user can do to make it smaller.
 
     Raises:
@@ -119,7 +117,6 @@ def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> list[HeldMap]:
     The maps are taken one at a time, so that a log's many maps need not be in memory together.
 
     Args:
-        folder: the session or stage.
         occupancies: at least one, in the order of the times from which they hold.
 
     Returns:

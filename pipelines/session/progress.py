@@ -67,7 +67,6 @@ def side_by_side(work: Callable[[T], R], parts: Iterable[T], *, workers: int, ha
     Args:
         work: called with one part; it checks `halt` from time to time.
         parts: the arguments of `work`.
-        workers: the number of threads.
         halt: set when one part fails or the user interrupts; the exception is raised when all have stopped.
     """
     with ThreadPoolExecutor(workers) as pool:

@@ -419,7 +419,6 @@ def need(module: str, extra: str) -> Any:
     """Import an optional library.
 
     Args:
-        module: the name of the module.
         extra: the extra of this package that lists it.
 
     Raises:

@@ -120,7 +120,6 @@ class WritableSession(Session):
         """Begin a stage, or find it finished with the same settings and inputs, and undamaged.
 
         Args:
-            stage: the stage to run.
             settings: everything that determines the result, with defaults filled in, of types that
                 `jsonable` accepts; no paths, no thread counts.
             inputs: the SHA-256 of everything read, by a name that is the same on every machine.
@@ -221,7 +220,6 @@ class Run:
 
         Args:
             counts: numbers of things found, used and dropped, of types that `jsonable` accepts.
-            warnings: warnings for the user, one line each.
         """
         sync_tree(self.folder)
         self._record = StageRecord(
@@ -306,7 +304,6 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
     An exception inside leaves every stage as it was. Errors of the operating system become DataError.
 
     Args:
-        folder: the session's.
         create: allow a folder that does not exist yet (ingest); if the ingest fails, a new folder is removed.
         overwrite: with `create`, write also into a folder with other files in it. Those stay, unless they
             have the name of one of the session's own files.

@@ -74,7 +74,6 @@ def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sh
     Empty folders and the content of linked folders are ignored.
 
     Args:
-        path: the file or folder.
         hash_for: makes the object that receives the bytes of a file and has their SHA-256 as its digest.
 
     Raises:

@@ -133,7 +133,6 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
     """Make a folder. Parts are kept after an interrupt, and removed after success or a DataError.
 
     Args:
-        target: the folder.
         key: equal for equal results.
         mark: a file that every such folder has; a target without it holds something else.
         overwrite: replace also a target that holds something else.

@@ -68,7 +68,6 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
     """Read and validate a file.
 
     Args:
-        path: the file.
         model: the model of its content; the schema's version is the value of the key `schema`.
         noun: the name of such a file ("flight manifest").
         newest: the newest version of the schema.
@@ -148,10 +147,6 @@ _MOST_BITS = 1024  # a float holds integers of fewer
 
 def plain_yaml(path: Path, text: str) -> object:
     """Parse YAML into plain types only.
-
-    Args:
-        path: the file of the text, for messages.
-        text: of the whole file.
 
     Raises:
         DataError: no valid YAML; the message names the line if it is known. Or a value that no program

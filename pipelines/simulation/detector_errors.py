@@ -134,7 +134,6 @@ def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intr
         joints: [T, J, 3] metres, world.
         position: [T, 3] metres, world_from_camera; or [T, J, 3] of each joint (or [T, 1, 3]).
         quaternion_xyzw: [T, 4] unit, or as many as positions.
-        intrinsics: the camera.
 
     Returns:
         [T, J, 2] px; NaN behind the camera and outside the picture, whose corner pixels have their
@@ -195,7 +194,6 @@ def detect_keypoints(
         apparent_height_px: [T] (`view_of`).
         errors: the scenario's; its shares hold for visible joints.
         rng: draws as many numbers for visible joints as for others.
-        joints: the joints' names.
         table: measured errors; by default those of `errors.detector`.
 
     Returns:

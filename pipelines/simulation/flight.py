@@ -115,7 +115,6 @@ def build_set(scenario: Scenario, *, bvh: Mapping[str, SkeletalMotion] | None = 
     """Build a scenario's world and let its actors move there.
 
     Args:
-        scenario: who and where.
         bvh: recorded motions by the name of the actor whose scenario names one.
 
     Raises:
@@ -141,8 +140,6 @@ def fly_scenario(
     """Let the actors move, the drones fly, and the recorders run.
 
     Args:
-        scenario: the actor, the world and the drones.
-        noise: the errors of the logged poses.
         bvh: recorded motions by the name of the actor whose scenario names one.
         planner: makes a planner for a world; without one drones fly on a ring about where the first actor
             truly is, whatever stands in the way.

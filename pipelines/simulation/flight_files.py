@@ -156,7 +156,6 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
     """Write the manifest, which ties the files together.
 
     Args:
-        flight: the flight.
         video: True for videos; False for keypoints in their place.
         true_poses: take the true poses for logged ones. Otherwise the manifest states only what a user would
             know; the truth is only under `truth`.

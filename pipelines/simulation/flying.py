@@ -51,7 +51,6 @@ def orbit(
         t_s: [T] seconds.
         target: [T, 3] metres, world: a smooth point of the actor at those times.
         cameras: number of cameras, at least 1.
-        range_m: distance from the target.
         tilt_deg: elevation of the cameras above the target, below 90.
         yaw_deg: yaw of the first camera at time 0, counterclockwise from east.
         yaw_rate_deg_per_s: angular speed of the ring.
@@ -140,7 +139,6 @@ def ring_slots(formation: Formation, count: int, actor: Float, t_s: Float) -> Fl
 
     Args:
         formation: the ring; its `planner` does not matter here.
-        count: number of drones.
         actor: [T, 3] m, a smooth point of the actor.
         t_s: [T] seconds.
     """
@@ -202,7 +200,6 @@ def fly_with(
         limits: of speed and acceleration; neither is ever exceeded.
         actor_t_s: [M] seconds, increasing: times of the actor's position estimates.
         actor: [M, 3] m, the estimates.
-        rate_hz: rate of the planner's calls.
 
     Raises:
         ValueError: times that do not increase strictly, numbers that are not finite, or slots of

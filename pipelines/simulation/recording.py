@@ -146,7 +146,6 @@ def estimate(truth: DronePoses, models: Sequence[NoiseModel], rng: np.random.Gen
     Args:
         truth: the true poses, stamps strictly increasing.
         models: the errors, drawn in this order.
-        rng: source of random numbers.
 
     Returns:
         Poses whose covariances [M, 6, 6] (position in world, rotation vector in the body or the camera)
@@ -190,7 +189,6 @@ def estimate_actor(
         sigma_m: of the error, per axis.
         rate_hz: rate of the logged estimates.
         span_s: first and last second of the log, within `t_s`.
-        rng: source of random numbers.
 
     Returns:
         Stamps [M], ns since the flight's start, and positions [M, 3]; never NaN.

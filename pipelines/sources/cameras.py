@@ -47,9 +47,6 @@ class FlightCameras:
     """Reader of the frame times and the intrinsics of one flight.
 
     Args:
-        manifest: the path of the manifest.
-        logs: of the flight.
-        files: of the flight.
         poses: read the poses of a camera, and trigger times from a drone's own log.
         max_gap_ns: the longest gap between two poses that is interpolated.
         note: receives each choice and each doubt, one line each.

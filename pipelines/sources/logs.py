@@ -128,7 +128,6 @@ class FlightLogs:
     Logs of our own formats stay open between readings, within bounds, so that their indices are read once.
 
     Args:
-        flight: the manifest.
         base: the folder that its paths are relative to.
         note: receives each choice and each doubt, one line each.
     """

@@ -211,7 +211,6 @@ def unmirrored(detections: Detections, mirrored: bool | str, width: int) -> Dete
     Args:
         detections: as the file has them.
         mirrored: True, or of what: "x" alone counts from the right, or "names" alone have left for right.
-        width: of the pictures, px.
     """
     if mirrored in (True, "x"):
         xy = detections.xy.copy()

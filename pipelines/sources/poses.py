@@ -78,10 +78,6 @@ class FlightPoses:
     """Reader of the poses of one flight, in the world's axes and at its times.
 
     Args:
-        flight: the manifest.
-        manifest: its path.
-        logs: of the flight.
-        files: of the flight.
         max_gap_ns: the longest gap between two poses or angles that is interpolated.
         note: receives each choice and each doubt, one line each.
     """

@@ -93,9 +93,7 @@ def refuse_projected(source: Path | str, position: Float, origin: Place) -> None
     """Refuse coordinates of a map projection, such as UTM, in a world whose origin on Earth is known.
 
     Args:
-        source: the file or log, for the message.
         position: [N, 3] m in the world; rows of NaN are ignored.
-        origin: the world's origin on Earth.
 
     Raises:
         DataError: the median position is more than 100 km from the origin.

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.metrics import align, align_each
+from pipelines.geometry.metrics import align_each
 
 
 def cloud(count: int = 17, seed: int = 0) -> Float:
@@ -37,7 +37,7 @@ def test_a_known_similarity_is_found(
     source = cloud(count, seed)
     rotation = rotation_of(vector)
     target = scale * source @ rotation.T + shift
-    found = align(source, target, with_scale=True)
+    found = align_each(source, target, with_scale=True)
     # Coordinates of 1e3 carry 1e-13 of rounding; narrow triangles multiply it by at most some 1e4.
     np.testing.assert_allclose(found.apply(source), target, rtol=0, atol=1e-9 * scale + 1e-9)
     np.testing.assert_allclose(found.scale, scale, rtol=1e-7)
@@ -47,10 +47,10 @@ def test_a_known_similarity_is_found(
 def test_a_rigid_alignment_keeps_the_size() -> None:
     source = cloud()
     rotation = rotation_of((0.3, -1.0, 2.0))
-    found = align(source, source @ rotation.T + [1, 2, 3], with_scale=False)
+    found = align_each(source, source @ rotation.T + [1, 2, 3], with_scale=False)
     assert found.scale == 1
     np.testing.assert_allclose(found.rotation, rotation, atol=1e-12)
-    doubled = align(source, 2 * source, with_scale=False)
+    doubled = align_each(source, 2 * source, with_scale=False)
     # The mean goes onto the mean, whatever the size.
     np.testing.assert_allclose(doubled.apply(source).mean(axis=0), 2 * source.mean(axis=0), atol=1e-12)
 
@@ -60,7 +60,7 @@ def test_no_motion_nearby_fits_better(with_scale: bool) -> None:
     rng = np.random.default_rng(5)
     source = cloud()
     target = 1.3 * source @ rotation_of((0.5, 0.1, -0.7)).T + rng.normal(size=source.shape) * 0.1
-    found = align(source, target, with_scale=with_scale)
+    found = align_each(source, target, with_scale=with_scale)
     best = np.sum((found.apply(source) - target) ** 2)
     for _ in range(50):
         scale = found.scale * (1 + with_scale * rng.normal() * 1e-3)
@@ -74,14 +74,14 @@ def test_a_triangle_mirrored_in_its_plane_is_turned_over_in_space() -> None:
     # about y maps (1, 0, 0) to (-1, 0, 0) and keeps (0, 2, 0), which is exact.
     source = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0]])
     target = np.array([[0.0, 0, 0], [-1, 0, 0], [0, 2, 0]])
-    found = align(source, target, with_scale=True)
+    found = align_each(source, target, with_scale=True)
     np.testing.assert_allclose(found.apply(source), target, atol=1e-12)
     np.testing.assert_allclose(found.rotation, np.diag([-1.0, 1, -1]), atol=1e-12)
 
 
 def test_a_mirror_image_is_not_matched_by_a_reflection() -> None:
     source = cloud()
-    found = align(source, source * [-1, 1, 1], with_scale=True)
+    found = align_each(source, source * [-1, 1, 1], with_scale=True)
     assert np.linalg.det(found.rotation) == pytest.approx(1)
     assert np.abs(found.apply(source) - source * [-1, 1, 1]).max() > 0.05
 
@@ -91,7 +91,7 @@ def test_points_missing_on_either_side_are_left_out() -> None:
     target = 0.7 * source @ rotation_of((1.0, 0.2, 0.3)).T - 5
     source[3] = np.nan
     target[8, 1] = np.nan
-    found = align(source, target, with_scale=True)
+    found = align_each(source, target, with_scale=True)
     assert found.scale == pytest.approx(0.7)
     moved = found.apply(source)
     assert np.isnan(moved[3]).all()
@@ -111,20 +111,18 @@ def test_a_batch_is_its_members_and_nan_where_there_is_no_answer() -> None:
             assert np.isnan(batch.rotation[i, j]).all()
             assert np.isnan(batch.apply(source)[i, j]).all()
         else:
-            one = align(source[i, j], target[i, j], with_scale=True)
+            one = align_each(source[i, j], target[i, j], with_scale=True)
             np.testing.assert_allclose(batch.apply(source)[i, j], one.apply(source[i, j]), atol=1e-12)
 
 
-def test_too_few_points_are_refused() -> None:
+def test_too_few_points_have_no_alignment() -> None:
     source = cloud(4)
     source[:2] = np.nan
-    with pytest.raises(ValueError, match=r"^2\b.*\b3$"):
-        align(source, cloud(4), with_scale=True)
+    assert np.isnan(align_each(source, cloud(4), with_scale=True).rotation).all()
 
 
 @pytest.mark.parametrize("origin", [0.0, 1000.0])
 @pytest.mark.parametrize("step", [0.0, 0.3])
-def test_points_on_a_line_or_a_spot_are_refused(origin: float, step: float) -> None:
+def test_points_on_a_line_or_a_spot_have_no_alignment(origin: float, step: float) -> None:
     line = origin + np.arange(5.0)[:, None] * step * np.array([0.3, -0.7, 0.2])
-    with pytest.raises(ValueError, match="on a line"):
-        align(line, line + 1, with_scale=True)
+    assert np.isnan(align_each(line, line + 1, with_scale=True).rotation).all()

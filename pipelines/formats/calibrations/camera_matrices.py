@@ -31,7 +31,6 @@ def intrinsics(
     """Build intrinsics from a camera matrix and OpenCV's coefficients, all in pixels.
 
     Args:
-        source: the file, for messages.
         camera: the camera's name, for messages.
         size: width, height.
         matrix: [3, 3], last row 0 0 1, without skew.

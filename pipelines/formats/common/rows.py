@@ -62,10 +62,8 @@ def parse_table(
     `truncated`.
 
     Args:
-        path: the file, for messages.
         body: its text below the header.
         delimiter: one character.
-        columns: number of cells in every row.
         text: columns to keep as text, name to index.
         numbers: columns to read as numbers, name to index. Blank, "nan" and the like become NaN.
         first_line: the number of the body's first line in the file, for messages.

@@ -241,8 +241,6 @@ class Gathering:
 
         Args:
             frame: result of `frame_of`.
-            rows: the keypoints.
-            where: name of the entry for messages.
             rank: position within the frame, if the file groups people by frame; else the next one.
             own_id: the tracker's id of the person.
 

@@ -77,7 +77,6 @@ def build(store: Typestore, type_: str, fields: Mapping[str, Any]) -> Any:
     """Build a message of a ROS type.
 
     Args:
-        store: the type definitions.
         type_: in the spelling of ROS 2.
         fields: all fields that are not zero, in ROS 2 spelling. A stamp is a plain number of nanoseconds.
     """

@@ -185,9 +185,6 @@ def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gath
     by `clean_poses`, every loss counted. A covariance that is zero throughout is unknown and left out.
 
     Args:
-        recording: the log.
-        topic: of poses.
-        source: the log, for messages.
         stamps: which stamp is the time of a pose. A pose without a header stamp (0) takes that of receipt.
 
     Raises:
@@ -271,7 +268,6 @@ def attitudes_of(
 
     Args:
         samples: angles or quaternions in the order of receipt.
-        source: the log and topic, for messages.
         stamps: as in `poses_of`.
         order: order of the angles in the log (`attitude_from_angles`); ignored for quaternions.
         units: of the angles.
@@ -344,8 +340,6 @@ def chained(
     Stamps at which another transform on the route is unknown are counted under "no transform".
 
     Args:
-        transforms: the transforms of the log.
-        source: the log, for messages.
         parent: the frame in which the poses are wanted; a leading slash is ignored.
         child: the frame whose poses are wanted.
         stamps: as in `poses_of`.
@@ -392,8 +386,6 @@ def frames_of_poses(recording: Log, source: str, taken: Iterable[tuple[str | Non
     """Return the frames of a log's poses, each once, without the leading slash of ROS 1.
 
     Args:
-        recording: the log.
-        source: its name, for messages.
         taken: topic and parent of each; a parent names the frame itself, and a missing topic means the
             only one. Entries that do not fit the log are ignored; reading the poses reports them.
     """
@@ -429,9 +421,6 @@ def place_of_frame(
     the frame of the poses, both are taken for one frame, and a note says so.
 
     Args:
-        recording: the log.
-        source: its name, for messages.
-        place: log and topic, for messages.
         frame: the frame to find; an empty name means the world.
         parent: the world's frame, if it is stated.
         poses_in: the frames of the poses.

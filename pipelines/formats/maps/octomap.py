@@ -133,7 +133,6 @@ def occupancy_from(
     """Build the dense grid of a tree's box.
 
     Args:
-        source: the file or topic, for messages.
         leaves: at least one.
         finest_m: the side of the tree's finest voxel.
         resolution_m: the side of the grid's voxels, `finest_m` times a power of two; None for the finest.

@@ -262,9 +262,7 @@ def extruded(
     """Convert a floor plan to the world's axes, extruded upwards from its own plane.
 
     Args:
-        source: the log and topic, for messages.
         plan: probabilities [X, Y], the corner of the first at the plan's origin.
-        resolution_m: the side of its cells.
         world_from_plan: the pose of its origin.
         side_m: of the voxels.
         height_m: height of the cells, rounded up to whole voxels.
@@ -345,7 +343,6 @@ def sampled(
     voxel has half its side as radius. So every voxel is met if p is at most 1 / sqrt(2) of a voxel.
 
     Args:
-        grid: its origin and axes are those of its frame.
         world_from_plane: rotation [2, 2] about the vertical axis through the origin of that frame.
         low: [2] the lowest corner of the result, in the world's axes from that origin.
         shape: voxels of the result along x and y.

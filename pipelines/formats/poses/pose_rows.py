@@ -78,7 +78,6 @@ def clean_poses(
     - "duplicate stamp", "stamp out of order" as in `kept_rows`.
 
     Args:
-        source: the file, for messages.
         t_ns: [N] stamps.
         readable: [N] True if the stamp could be read.
         position: [N, 3] m.

@@ -35,7 +35,6 @@ def write_h264(
     """Encode pictures [height, width, 3] BGR as an H.264 MP4, 4:2:0, in one thread.
 
     Args:
-        path: the file to write.
         pictures: as many as stamps.
         pts_ns: [N] strictly increasing times of showing, at least 0.
         width: of the pictures, even.

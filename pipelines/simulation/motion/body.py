@@ -43,9 +43,6 @@ def bodies(
     """Pose all bones.
 
     Args:
-        rig: the person's bones.
-        plan: the actions.
-        style: the person's habits.
         t_s: [T]
         start: [2] m, the place where the plan began.
         heading: rad, at the start of the plan.

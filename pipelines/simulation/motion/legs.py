@@ -47,7 +47,6 @@ def foot_over_time(
     """Compute the place and the attitude of a foot over time.
 
     Args:
-        rig: the person's bones.
         side: 0 is left.
         t_s: [T]
         steps: in the order of time; the first only gives the foot's place at the beginning.
@@ -277,7 +276,6 @@ def pelvis_height(
     """Return the wanted height, or as much of it as the carrying legs allow with their least knee flexion.
 
     Args:
-        rig: the person's bones.
         place: [T, 2] m of the pelvis's joint.
         pelvis: [T, 4] its rotation.
         feet: left, right.

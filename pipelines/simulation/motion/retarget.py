@@ -170,8 +170,6 @@ def retarget(
     frame at the beginning from which the pose jumps (a T-pose for calibration) is left out.
 
     Args:
-        source: the recording.
-        rig: the bones to be moved.
         t_s: [T] seconds; beyond the end of the recording its last pose is held, or it begins again.
         ground: heights of places [N, 2].
         start: [2] m.

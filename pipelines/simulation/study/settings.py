@@ -85,10 +85,8 @@ def settings_for(
         methods: side by side.
         keypoints: with the errors of a detector (by default), or exact.
         detector: one that looks at rendered pictures instead.
-        seconds: length of the walk.
         rate_hz: of the pictures; 30, or 1 where they are rendered.
         trials: independent draws of all noise.
-        seed: where they come from.
 
     Raises:
         DataError: an unknown name, a value given twice, or a number out of range.
