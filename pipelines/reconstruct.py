@@ -26,7 +26,7 @@ from pipelines.geometry.triangulation import (
 from pipelines.keypoints.association import Association, associate
 from pipelines.keypoints.calibration import measured_for, read_calibration
 from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
-from pipelines.reconstruction.background import Followed, prior_of, refine_cameras, rows_to_follow
+from pipelines.reconstruction.background import Followed, refine_cameras, rows_to_follow
 from pipelines.reconstruction.background_tracks import follow, people_boxes
 from pipelines.reconstruction.doubts.diagnosis import Doubt, doubts_of, said_doubts
 from pipelines.reconstruction.finishing import finish
@@ -49,7 +49,6 @@ from pipelines.reconstruction.observations import (
 from pipelines.reconstruction.results import assess, camera_poses_table, skeleton_table
 from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import (
-    UNKNOWN_SIGMA,
     noise_text,
     ray_sigma,
     refused_people,
@@ -73,7 +72,7 @@ if TYPE_CHECKING:
 
     from pipelines.reconstruction.refining import RefinedFlight
 
-RECONSTRUCT = Stage("reconstruct", revision=15)
+RECONSTRUCT = Stage("reconstruct", revision=16)
 
 _LONGEST_FILL_S = 10.0
 
@@ -575,19 +574,9 @@ def _refine_cameras(
     description: Description,
     settings: Settings,
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
-    stated = load_pose_errors(description, cameras, settings.pose_noise)
-    levels = [
-        np.array(UNKNOWN_SIGMA) if camera.sigma is None else np.median(camera.sigma, axis=0)
-        for camera in cameras
-    ]
-    each = [None] * len(cameras) if stated is None else stated
-    return refine_cameras(
-        cameras,
-        followed,
-        [prior_of(errors, level) for errors, level in zip(each, levels, strict=True)],
-        stated=stated is not None,
-        between=description.pose_interpolation,
-    )
+    stated = [load_pose_errors(description, [camera], settings.pose_noise) for camera in cameras]
+    errors = [None if of is None else of[0] for of in stated]
+    return refine_cameras(cameras, followed, errors, between=description.pose_interpolation)
 
 
 def _poses_stored(

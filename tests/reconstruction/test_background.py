@@ -1,4 +1,4 @@
-"""Attitudes from a static background: against true poses, without parallax, with people in the pictures."""
+"""Attitudes from a static background: hovering and flying cameras against true poses, levels, covariances."""
 
 from __future__ import annotations
 
@@ -18,15 +18,9 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
 )
-from pipelines.reconstruction import background
-from pipelines.reconstruction.background import (
-    Adjusted,
-    Followed,
-    PosePrior,
-    adjust,
-    prior_of,
-    refine_cameras,
-)
+from pipelines.reconstruction import background_adjustment
+from pipelines.reconstruction.background import Followed, refine_cameras
+from pipelines.reconstruction.background_adjustment import Adjusted, PosePrior, SeenPoints, adjust
 from pipelines.reconstruction.background_tracks import Tracks, follow
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
@@ -35,7 +29,10 @@ from pipelines.session.records import Detections, Trajectory
 Int64 = NDArray[np.int64]
 
 FOCAL = 760.0
-PRIOR = PosePrior((0.02, np.radians(0.2)), (0.05, np.radians(0.3)))
+ERRORS = PoseErrors(
+    (0.02, np.radians(0.2)), (Process(SHIFT_IN_WORLD, 0.05), Process(ROTATION, np.radians(0.3)))
+)
+PRIOR = PosePrior.of(ERRORS)
 
 
 def flown(pictures: int, way_m: float, turn_deg: float = 90.0) -> tuple[Float, Float]:
@@ -50,20 +47,22 @@ def flown(pictures: int, way_m: float, turn_deg: float = 90.0) -> tuple[Float, F
     return position, np.stack([right, np.cross(forward, right), forward], axis=2)
 
 
-def sighted(position: Float, rotation: Float, rng: np.random.Generator) -> tuple[Int64, Int64, Float]:
-    """Project points of the ground and of trees that fall into the picture, with 0.3 px of noise."""
+def sighted(
+    position: Float, rotation: Float, rng: np.random.Generator, noise_px: float = 0.3
+) -> tuple[Int64, Int64, Float]:
+    """Project points of the ground and of trees that fall into the picture, with noise."""
     points = rng.uniform([-40, -20, 0], [30, 40, 0.2], (900, 3))
     points[::4, 2] = rng.uniform(0, 5, len(points[::4]))
     away = np.einsum("tji,tnj->tni", rotation, points[None] - position[:, None])
     xy = away[..., :2] / away[..., 2:]
     inside = (away[..., 2] > 1) & (np.abs(xy) < [0.84, 0.47]).all(axis=-1)
     picture, point = np.nonzero(inside)
-    return picture, point, xy[inside] + rng.normal(0, 0.3 / FOCAL, (len(point), 2))
+    return picture, point, xy[inside] + rng.normal(0, noise_px / FOCAL, (len(point), 2))
 
 
 def logged(position: Float, rotation: Float, rng: np.random.Generator) -> tuple[Float, Float]:
     """Add errors drawn from the prior to poses."""
-    constant = rng.normal(0, 1, 6) * np.repeat(PRIOR.constant, 3)
+    constant = rng.normal(0, 1, 6) * np.repeat(PRIOR.constant[:2], 3)
     error = constant + rng.normal(0, 1, (len(position), 6)) * np.repeat(PRIOR.white, 3)
     turned = matrix_from_quaternion(quaternion_from_rotation_vector(error[:, 3:]))
     return position + error[:, :3], rotation @ turned
@@ -76,6 +75,18 @@ def turns_deg(one: Float, other: Float) -> Float:
     return angle
 
 
+def adjusted(
+    picture: Int64,
+    point: Int64,
+    xy: Float,
+    logged_poses: tuple[Float, Float],
+    prior: PosePrior = PRIOR,
+) -> Adjusted:
+    """Adjust poses of pictures 30 times a second."""
+    t_s = np.arange(len(logged_poses[0])) / 30
+    return adjust(SeenPoints(picture, point, xy, FOCAL, t_s), *logged_poses, prior)
+
+
 def refined(way_m: float, seed: int, lost: float = 0.0) -> tuple[Adjusted, Float, Float, Float, Float]:
     """Return the adjustment, true and logged attitudes, true and logged positions."""
     rng = np.random.default_rng(seed)
@@ -84,7 +95,121 @@ def refined(way_m: float, seed: int, lost: float = 0.0) -> tuple[Adjusted, Float
     wrong = rng.random(len(xy)) < lost
     xy[wrong] += rng.normal(0, 20 / FOCAL, (int(wrong.sum()), 2))
     at, turned = logged(position, rotation, rng)
-    return adjust(picture, point, xy, FOCAL, at, turned, PRIOR), rotation, turned, position, at
+    return adjusted(picture, point, xy, (at, turned)), rotation, turned, position, at
+
+
+def turning(pictures: int) -> tuple[Float, Float]:
+    """Simulate a camera on a tripod that pans by 20 deg, and shakes by 0.1 deg at 7 Hz about each axis."""
+    t_s = np.arange(pictures) / 30
+    pan = np.radians(20) * np.sin(2 * np.pi * 0.2 * t_s)
+    shake = np.radians(0.1) * np.sin(2 * np.pi * 7 * t_s[:, None] + [0.0, 1.0, 2.0])
+    _, start = flown(1, 0.0)
+    up = quaternion_from_rotation_vector(pan[:, None] * [0.0, 0.0, 1.0])
+    turned = (
+        matrix_from_quaternion(up) @ start @ matrix_from_quaternion(quaternion_from_rotation_vector(shake))
+    )
+    return np.tile([0.0, 0.0, 3.0], (pictures, 1)), turned
+
+
+def errors_deg(found: Float, truth: Float) -> Float:
+    """Compute the rotation vectors [T, 3] (deg) by which attitudes err, in the camera."""
+    turned = quaternion_from_matrix(np.swapaxes(truth, 1, 2) @ found)
+    errors: Float = np.degrees(rotation_vector_from_quaternion(turned))
+    return errors
+
+
+def nees(found: Adjusted, position: Float, rotation: Float) -> float:
+    """Compute the mean of e' C^-1 e over the six numbers of all poses."""
+    errors = np.append(found.position - position, np.radians(errors_deg(found.rotation, rotation)), axis=1)
+    whitened = np.linalg.solve(found.covariance, errors[..., None])[..., 0]
+    return float(np.einsum("ti,ti->t", errors, whitened).mean()) / 6
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_camera_that_only_turns_gets_the_changing_part_of_its_attitudes(known: bool) -> None:
+    """Expect the constant part of the log, and beside it what 0.3 px of 100 points say.
+
+    A pan of 20 deg changes the camera's axes: a rotation of the whole world by 0.3 deg that is left appears
+    as up to 0.3 sin 20 deg = 0.1 deg that changes, and is part of the constant part's error. It is measured
+    in the world. Pictures err by 0.3 px / 760 / sqrt(100) = 0.002 deg then, points that are followed for 30
+    pictures drift by some such steps.
+    """
+    rng = np.random.default_rng(2)
+    position, rotation = turning(150)
+    picture, point, xy = sighted(position, rotation, rng)
+    at, turned = logged(position, rotation, rng)
+    found = adjusted(picture, point, xy, (at, turned), PRIOR if known else PosePrior.of(None))
+    assert found.refused is None
+    assert found.left is not None
+    before, after = (
+        np.einsum("tij,tj->ti", rotation, errors_deg(of, rotation)) for of in (turned, found.rotation)
+    )
+    assert np.sqrt(np.mean((before - before.mean(axis=0)) ** 2)) > 0.15
+    assert np.sqrt(np.mean((after - after.mean(axis=0)) ** 2)) < 0.01
+    assert np.sqrt(np.mean((found.rotation - rotation) ** 2)) < np.sqrt(np.mean((turned - rotation) ** 2))
+    (sigma,) = [of.sigma0 for of in found.left.processes if of.number == ROTATION and of.constant]
+    # The pan tells the log's error in the camera from a turn of the world, but for its own axis.
+    level = 0.3 if known else 1.0
+    assert 0.9 * level / np.sqrt(3) < np.degrees(sigma) < 1.1 * level
+
+
+@pytest.mark.parametrize("pictures", [60, 150])
+def test_levels_that_nobody_stated_are_estimated(pictures: int) -> None:
+    """Compare with the errors drawn: their standard deviations are known to 1 / sqrt(6 pictures).
+
+    Positions are compared in flight. A camera that stands on a tripod sees no points near enough.
+    """
+    rng = np.random.default_rng(3)
+    position, rotation = flown(pictures, 0.2 * pictures)
+    picture, point, xy = sighted(position, rotation, rng)
+    found = adjusted(picture, point, xy, logged(position, rotation, rng), PosePrior.of(None))
+    assert found.refused is None
+    assert found.prior.estimated
+    scatter = 1 / np.sqrt(6 * pictures)
+    assert found.prior.white[0] == pytest.approx(PRIOR.white[0], rel=0.1 + 3 * scatter)
+    assert found.prior.white[1] == pytest.approx(PRIOR.white[1], rel=0.1 + 3 * scatter)
+
+
+@pytest.mark.parametrize("way_m", [0.0, 0.3, 12.0])
+def test_covariances_hold_for_hovering_and_flying_cameras(way_m: float) -> None:
+    """Compare e' C^-1 e / 6 with its mean 1.
+
+    A flight's constant errors are 6 numbers, so the mean over flights scatters by sqrt(2 / 6 / flights) at
+    most. Points err by the 1 px that is assumed.
+    """
+    flights = 8
+    values = []
+    for seed in range(flights):
+        rng = np.random.default_rng(seed)
+        position, rotation = flown(60, way_m, turn_deg=60.0)
+        picture, point, xy = sighted(position, rotation, rng, noise_px=1.0)
+        found = adjusted(picture, point, xy, logged(position, rotation, rng))
+        assert found.refused is None
+        values.append(nees(found, position, rotation))
+    assert np.mean(values) == pytest.approx(1.0, abs=3 * np.sqrt(2 / 6 / flights))
+
+
+def test_the_errors_that_remain_are_described_over_time() -> None:
+    """Compare the parts with errors of many flights: constant, and new in every picture, of attitudes.
+
+    Points err by the 1 px that is assumed. The constants of six flights are 18 numbers.
+    """
+    constant, fresh, stated = [], [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        position, rotation = flown(90, 12.0, turn_deg=60.0)
+        picture, point, xy = sighted(position, rotation, rng, noise_px=1.0)
+        found = adjusted(picture, point, xy, logged(position, rotation, rng))
+        assert found.left is not None
+        errors = errors_deg(found.rotation, rotation)
+        constant.append(errors.mean(axis=0))
+        fresh.append(np.diff(errors, axis=0))
+        (steady,) = [of.sigma0 for of in found.left.processes if of.number == ROTATION and of.constant]
+        stated.append(np.degrees([steady, found.left.white[1]]))
+    sizes = np.sqrt([np.mean(np.square(constant)), np.mean(np.square(fresh)) / 2])
+    ratio = np.mean(stated, axis=0) / sizes
+    assert ratio[0] == pytest.approx(1.0, abs=3 / np.sqrt(2 * 18))
+    assert ratio[1] == pytest.approx(1.0, abs=0.3)
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.1])
@@ -94,29 +219,14 @@ def test_attitudes_come_out_of_the_background(lost: float) -> None:
     Over half of the 12 m of way, positions err by 0.02 m / sqrt(10) at each end, so its course is known to
     0.1 deg. Points lost on the way change little.
     """
-    found, truth, before, _, _ = refined(12.0, 1, lost)
+    found, truth, before, _, at = refined(12.0, 1, lost)
     assert found.refused is None
     assert found.reprojection_px < 0.6
     logged_deg, left_deg = (np.sqrt(np.mean(turns_deg(of, truth) ** 2)) for of in (before, found.rotation))
     assert left_deg < logged_deg / 3
-
-
-def test_the_stated_covariance_of_attitudes_is_what_they_have() -> None:
-    """Compare e' C^-1 e with its mean 3; a flight's attitudes are nearly one draw, with variance 6."""
-    squared = []
-    flights = 5
-    for seed in range(flights):
-        found, truth, _, _, at = refined(12.0, seed)
-        turned = quaternion_from_matrix(np.swapaxes(truth, 1, 2) @ found.rotation)
-        error = rotation_vector_from_quaternion(turned)
-        whitened = np.linalg.solve(found.covariance[:, 3:, 3:], error[..., None])[..., 0]
-        squared.append(float(np.einsum("ti,ti->t", error, whitened).mean()))
-        # Paths are not moved: the constant part of the positions' errors stays.
-        moved = (found.position - at).mean(axis=0)
-        np.testing.assert_allclose(moved, 0, atol=0.02)
-        assert (found.covariance[:, range(3), range(3)] >= PRIOR.constant[0] ** 2).all()
-    # The stated noise of points (0.5 px) is larger than the true one (0.3), and the loss keeps 10 % fewer.
-    assert 0.5 < np.mean(squared) < 3 + 2 * np.sqrt(6 / flights)
+    # Paths are not moved: the constant part of the positions' errors stays.
+    np.testing.assert_allclose((found.position - at).mean(axis=0), 0, atol=0.02)
+    assert (found.covariance[:, range(3), range(3)] >= PRIOR.constant[0] ** 2).all()
 
 
 def test_a_straight_way_tells_nothing_of_a_turn_about_itself() -> None:
@@ -124,8 +234,7 @@ def test_a_straight_way_tells_nothing_of_a_turn_about_itself() -> None:
     rng = np.random.default_rng(7)
     position, rotation = flown(40, 12.0, turn_deg=0.0)
     picture, point, xy = sighted(position, rotation, rng)
-    at, turned = logged(position, rotation, rng)
-    found = adjust(picture, point, xy, FOCAL, at, turned, PRIOR)
+    found = adjusted(picture, point, xy, logged(position, rotation, rng))
     assert found.refused is None
     sigma = np.sqrt(np.diagonal(found.covariance[:, 3:, 3:], axis1=1, axis2=2).mean(axis=0))
     # Over 40 poses the white part averages out (0.2 deg / sqrt(40)), the constant part does not.
@@ -133,49 +242,51 @@ def test_a_straight_way_tells_nothing_of_a_turn_about_itself() -> None:
     assert np.degrees(sigma[1:]).max() < 0.15
 
 
-def test_a_camera_that_hovers_keeps_its_logged_poses() -> None:
-    found, _, before, _, at = refined(0.0, 3)
-    assert found.refused is not None
-    assert "parallax" in found.refused
-    np.testing.assert_array_equal(found.rotation, before)
-    np.testing.assert_array_equal(found.position, at)
-    np.testing.assert_allclose(found.covariance, PRIOR.covariance(40))
-
-
 def test_a_log_that_the_pictures_contradict_is_kept_and_named() -> None:
     rng = np.random.default_rng(4)
     position, rotation = flown(40, 12.0)
     picture, point, xy = sighted(position, rotation, rng)
     askew = matrix_from_quaternion(quaternion_from_rotation_vector(np.radians([[0.0, 5.0, 0.0]])))
-    found = adjust(picture, point, xy, FOCAL, position, rotation @ askew, PRIOR)
+    found = adjusted(picture, point, xy, (position, rotation @ askew))
     assert found.refused is not None
     assert "standard deviations from the log" in found.refused
+
+
+def test_points_that_move_against_each_other_are_refused() -> None:
+    rng = np.random.default_rng(4)
+    position, rotation = flown(40, 12.0)
+    picture, point, xy = sighted(position, rotation, rng)
+    xy += rng.normal(0, 4 / FOCAL, xy.shape)
+    found = adjusted(picture, point, xy, logged(position, rotation, rng))
+    assert found.refused is not None
+    assert "px" in found.refused
 
 
 @pytest.mark.parametrize("pictures", [41, 60, 83])
 def test_a_few_pictures_more_than_a_stretch_cost_nothing(
     pictures: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(background, "STRETCH", 40)
+    monkeypatch.setattr(background_adjustment, "STRETCH", 40)
     rng = np.random.default_rng(6)
     position, rotation = flown(pictures, 0.3 * pictures)
     picture, point, xy = sighted(position, rotation, rng)
     at, turned = logged(position, rotation, rng)
-    found = adjust(picture, point, xy, FOCAL, at, turned, PRIOR)
+    found = adjusted(picture, point, xy, (at, turned))
     assert found.refused is None
     assert np.median(turns_deg(found.rotation, rotation)) < np.median(turns_deg(turned, rotation))
 
 
-@pytest.mark.parametrize(("posed", "reason"), [(True, "0 points of the background"), (False, "a pose")])
+@pytest.mark.parametrize(("posed", "reason"), [(True, "share fewer"), (False, "a pose")])
 def test_a_camera_of_which_nothing_is_seen_keeps_its_logged_poses(posed: bool, reason: str) -> None:
     """Keep logged poses in fog or at night, or for a video taken before the log began."""
     position, rotation = flown(40, 12.0)
     position = position if posed else np.full_like(position, np.nan)
     nothing = np.empty(0, np.int64)
-    found = adjust(nothing, nothing, np.empty((0, 2)), FOCAL, position, rotation, PRIOR)
+    found = adjusted(nothing, nothing, np.empty((0, 2)), (position, rotation))
     assert found.refused is not None
     assert reason in found.refused
     np.testing.assert_array_equal(found.position, position)
+    np.testing.assert_allclose(found.covariance, PRIOR.covariance(40))
 
 
 def test_pictures_without_a_pose_stay_without() -> None:
@@ -184,10 +295,16 @@ def test_pictures_without_a_pose_stay_without() -> None:
     picture, point, xy = sighted(position, rotation, rng)
     at, turned = logged(position, rotation, rng)
     at[10], turned[10] = np.nan, np.nan
-    found = adjust(picture, point, xy, FOCAL, at, turned, PRIOR)
+    found = adjusted(picture, point, xy, (at, turned))
     assert found.refused is None
     assert np.isnan(found.position[10]).all()
     assert np.isfinite(np.delete(found.position, 10, axis=0)).all()
+
+
+def test_the_same_points_give_the_same_bytes() -> None:
+    first, second = (refined(12.0, 1)[0] for _ in range(2))
+    assert first.position.tobytes() == second.position.tobytes()
+    assert first.covariance.tobytes() == second.covariance.tobytes()
 
 
 def test_points_are_followed_and_people_left_out() -> None:
@@ -221,13 +338,13 @@ def _reversed(tracks: object) -> tuple[list[int], list[int], Float]:
     return picture.tolist(), point.tolist(), xy
 
 
-def test_stated_models_say_what_is_new_and_what_lasts() -> None:
-    errors = PoseErrors((0.02, 0.003), (Process(SHIFT_IN_WORLD, 0.3), Process(ROTATION, 0.04, rate=0.01)))
-    prior = prior_of(errors, np.zeros(2))
-    assert prior.white == (0.02, 0.003)
-    assert prior.constant == pytest.approx((0.3, np.sqrt(0.04**2 + 0.01**2 * 10)))
-    np.testing.assert_allclose(prior_of(None, np.array([0.3, 0.02])).level, [0.3, 0.02])
-    assert replace(prior, white=(0.0, 0.0)).level == pytest.approx(prior.constant)
+def test_stated_models_say_what_is_new_what_changes_and_what_is_constant() -> None:
+    wander = Process(ROTATION, 0.01, correlation_s=5.0)
+    errors = PoseErrors((0.02, 0.003), (Process(SHIFT_IN_WORLD, 0.3), Process(ROTATION, 0.04), wander))
+    prior = PosePrior.of(errors)
+    assert (prior.white, prior.constant) == ((0.02, 0.003), (0.3, 0.04, 0.0))
+    assert prior.slow[1] == wander
+    np.testing.assert_allclose(prior.level, [np.hypot(0.02, 0.3), np.sqrt(0.003**2 + 0.04**2 + 0.01**2)])
 
 
 @pytest.mark.parametrize("shutter", ["global", "rolling", "rolling, not stated"])
@@ -235,7 +352,8 @@ def test_a_rolling_shutter_does_not_bend_the_background(shutter: str) -> None:
     """A camera that turns and nods at up to 34 and 26 deg/s, read in 30 ms: rows differ by up to 1.4 deg.
 
     Unstated, the picture is stretched and compressed by up to 26 deg/s x 15 ms = 0.4 deg at its edges. With
-    the readout, attitudes are as sharp as a global shutter's, within the scatter of one draw.
+    the readout, what changes of the attitudes' errors is as small as with a global shutter, beside the way's
+    positions that err by 0.02 m / sqrt(30) in a second of 4 m: 0.05 deg.
     """
     readout_s = 0.0 if shutter == "global" else 0.03
     lens = Intrinsics(1280, 720, FOCAL, FOCAL, 639.5, 359.5, readout_s=readout_s)
@@ -246,7 +364,7 @@ def test_a_rolling_shutter_does_not_bend_the_background(shutter: str) -> None:
     way, turned = flown(fine, 12.0)
     nod = np.radians(6.0) * np.sin(2 * np.pi * 0.7 * np.arange(fine) / 1e3)
     turned = turned @ matrix_from_quaternion(quaternion_from_rotation_vector(nod[:, None] * [1.0, 0.0, 0.0]))
-    stamps = np.arange(100, 2900, 66)
+    stamps = np.arange(100, 2900, 33)
     delay_s = np.zeros((len(stamps), len(points)))
     for _ in range(6):
         at = stamps[:, None] + 1e3 * delay_s
@@ -281,8 +399,8 @@ def test_a_rolling_shutter_does_not_bend_the_background(shutter: str) -> None:
     )
     between = Interpolation(max_gap_s=1.0, max_extrapolation_s=0.0)
     followed = {"drone1": Followed(np.arange(len(t_ns)), tracks)}
-    (found,), entries, _ = refine_cameras([camera], followed, [PRIOR], between=between, stated=True)
-    left = turns_deg(matrix_from_quaternion(found.trajectory.quaternion_xyzw), turned[stamps])
+    (found,), entries, _ = refine_cameras([camera], followed, [ERRORS], between=between)
+    left = errors_deg(matrix_from_quaternion(found.trajectory.quaternion_xyzw), turned[stamps])
     assert entries["drone1"]["used"]
-    left_deg = float(np.sqrt(np.mean(left**2)))
-    assert left_deg > 0.2 if shutter == "rolling, not stated" else left_deg < 0.15
+    changing_deg = float(np.std(left - left.mean(axis=0)))
+    assert changing_deg > 0.08 if shutter == "rolling, not stated" else changing_deg < 0.04

@@ -1,0 +1,548 @@
+"""Adjustment of the poses of one camera by points of the static background.
+
+One estimate serves far and near points, hovering and flying cameras. A point is a direction and an inverse
+depth, which may be 0, so it needs no parallax. A camera that only turns gets the changing part of its
+attitudes from directions, and their constant part stays at the log's. Where a camera flies, an attitude error
+also changes the motion of the background against the logged path. That determines the constant part too,
+except about a straight path. The position of the whole path is never determined.
+
+Unknowns are the error of every logged pose and, as its prior, the constant, slow and white errors of the log.
+Points are eliminated (Schur complement). A point is followed for about a second and then counts as another
+one, so that the normal matrix has a band: the work grows linearly with the pictures. Cauchy's loss handles
+points off the background and lost tracks.
+
+Levels of errors that nobody stated are estimated by MacKay's rule, as in `refinement.estimate`. A constant
+error is always possible, and one draw of it says little of its level, which therefore stays wide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.noise import (
+    EXACT,
+    ROTATION,
+    SHIFT_IN_CAMERA,
+    SHIFT_IN_WORLD,
+    PoseErrors,
+    Process,
+)
+from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.reconstruction.background_kernels import (
+    Points,
+    Sightings,
+    Ties,
+    add_ties,
+    eliminate_points,
+    factorise,
+    inverse_in_band,
+    move_points,
+    settle_points,
+    solve_lower,
+    solve_upper,
+)
+from pipelines.reconstruction.solving import UNKNOWN_SIGMA
+
+STRETCH = 1500
+"""Most pictures adjusted together: memory stays bounded, and so many poses average their white errors."""
+
+_PIXEL_SIGMA = (
+    1.0  # px, of a followed point: 0.15 are seen, but neighbouring pictures and points share their errors
+)
+_LOSS = 1.0  # standard deviations at which a sighting counts half
+_FEWEST_SIGHTINGS = 3  # of a point
+_LONGEST_S, _LONGEST = 1.0, (12, 30)  # sightings of a point: time, and at least and at most these pictures
+_POINTS = 120  # in a picture: relative attitudes are known to 0.003 deg with them
+_FEWEST_SHARED = 8  # points that bind a picture to the one before
+_MOST_UNBOUND = 0.2  # share of the pictures
+_INVERSE_DEPTH = np.array([0.0, 0.01])  # mean (1/m) and precision (m^2) of the prior: farther than 1 m
+_WORST_PX = 2.0
+_ROUNDS, _CONVERGED = 8, 1e-5  # m and rad
+_SIGMAS = 4.0
+_KNOT_S = 1.0  # between the knots of slow errors
+_SLOW_S = 10.0  # over which slow errors are counted in the level of all errors
+_UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.005, UNKNOWN_SIGMA[1] / 10)
+"""Start of estimated levels. With positions free by more, far and near points can be confused at first."""
+
+_DRAWS = 32  # of the posterior
+_LEVEL_ROUNDS = 6
+_LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; below it stays
+_LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
+_SMALL = 0.1  # share of the constant variance below which a slow error counts as a part of it
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Standard deviations per axis of logged pose errors."""
+
+    white: tuple[float, float]  # m, rad: new in every pose
+    constant: tuple[float, float, float]  # m in the world, rad, m in the camera
+    slow: tuple[Process, Process]  # shift in the world and rotation
+    estimated: bool = False  # the levels of white and slow errors are only the start of an estimate
+
+    @classmethod
+    def of(cls, errors: PoseErrors | None) -> PosePrior:
+        """Build the prior from stated pose errors; None for unknown ones."""
+        if errors is None:
+            position, rotation = _UNKNOWN_RATE
+            slow = Process(SHIFT_IN_WORLD, EXACT, position), Process(ROTATION, EXACT, rotation)
+            return cls(_UNKNOWN_WHITE, (*UNKNOWN_SIGMA, 0.0), slow, estimated=True)
+        constant = dict.fromkeys((SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA), 0.0)
+        changing: dict[int, list[Process]] = {SHIFT_IN_WORLD: [], ROTATION: []}
+        for process in errors.processes:
+            if process.constant:
+                constant[process.number] = float(np.hypot(constant[process.number], process.sigma0))
+            else:
+                changing[ROTATION if process.number == ROTATION else SHIFT_IN_WORLD].append(process)
+        whole = (constant[SHIFT_IN_WORLD], constant[ROTATION], constant[SHIFT_IN_CAMERA])
+        slow = (_sum(SHIFT_IN_WORLD, changing[SHIFT_IN_WORLD]), _sum(ROTATION, changing[ROTATION]))
+        return cls(errors.white, whole, slow)
+
+    @property
+    def level(self) -> Float:
+        """Standard deviation of all parts together [2] (m, rad), slow ones over some seconds."""
+        slow = [process.sigma0**2 + process.rate**2 * _SLOW_S for process in self.slow]
+        constant = np.square([np.hypot(self.constant[0], self.constant[2]), self.constant[1]])
+        level: Float = np.sqrt(np.square(self.white) + constant + slow)
+        return level
+
+    def covariance(self, times: int) -> Float:
+        """Return the covariance [times, 6, 6] of the logged poses."""
+        return np.tile(np.diag(np.repeat(self.level**2, 3)), (times, 1, 1))
+
+
+def _sum(number: int, processes: Sequence[Process]) -> Process:
+    """Build one process for the sum of several; that of different kinds is a random walk."""
+    if len(processes) == 1:
+        return replace(processes[0], number=number)
+    sigma2 = sum(process.sigma0**2 for process in processes)
+    rate2 = sum(process.rate**2 + 2 * process.sigma0**2 / process.correlation_s for process in processes)
+    return Process(number, max(float(np.sqrt(sigma2)), EXACT), float(np.sqrt(rate2)))
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Poses after adjustment of T pictures."""
+
+    position: Float  # [T, 3] m
+    rotation: Float  # [T, 3, 3] world_from_camera
+    covariance: Float  # [T, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2)
+    left: PoseErrors | None  # errors that remain; None where refused
+    prior: PosePrior  # with levels as estimated
+    points: int  # that were used
+    reprojection_px: float  # median; NaN where refused
+    refused: str | None  # reason why the logged poses stay, in one line
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """K sightings of points of the background in the T pictures of a camera."""
+
+    picture: Int64  # [K] row of the pictures
+    point: Int64  # [K]
+    rays: Float  # [K, 2] undistorted normalised image coordinates
+    focal_px: float
+    t_s: Float  # [T]
+
+
+def adjust(seen: SeenPoints, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
+    """Refine the poses of one camera by its background.
+
+    Args:
+        seen: the background.
+        position: [T, 3] m, logged; NaN without a pose.
+        rotation: [T, 3, 3] logged world_from_camera.
+        prior: standard deviations of the log's errors.
+
+    Returns:
+        Adjusted poses, in stretches of some hundred pictures. If one stretch is refused, all logged poses
+        stay and `refused` gives the reason. Pictures without a pose stay without one.
+    """
+    new_position, new_rotation = position.copy(), rotation.copy()
+    covariance = prior.covariance(len(position))
+    posed = np.flatnonzero(np.isfinite(position[:, 0]))
+
+    def refused(reason: str) -> Adjusted:
+        stays = prior.covariance(len(position))
+        return Adjusted(position, rotation, stays, None, prior, 0, np.nan, reason)
+
+    if not len(posed):
+        return refused("none of its pictures has a pose")
+    stretches = [
+        _Stretch.of(seen, rows, position, rotation)
+        for rows in np.array_split(posed, -(-len(posed) // STRETCH))
+    ]
+    unbound = sum(stretch.unbound for stretch in stretches)
+    if unbound > _MOST_UNBOUND * (len(posed) - 1) or len(posed) < 2:
+        return refused(
+            f"{unbound} of {len(posed)} pictures share fewer than {_FEWEST_SHARED} points of the background"
+            " with the one before"
+        )
+    results = []
+    for stretch in stretches:
+        found = stretch.solve_with_levels(prior)
+        if found is None:
+            return refused("the adjustment did not converge")
+        results.append(found)
+    pixels = float(np.median(np.concatenate([found.missed for found in results])))
+    if pixels > _WORST_PX:
+        return refused(f"the background moves by {pixels:.1f} px against itself")
+    level = np.repeat(prior.level, 3)
+    surprise = max(float((np.sqrt(np.mean(found.errors**2, axis=0)) / level).max()) for found in results)
+    if surprise > _SIGMAS:
+        return refused(f"its poses would be {surprise:.0f} standard deviations from the log")
+    for stretch, found in zip(stretches, results, strict=True):
+        new_position[stretch.rows], new_rotation[stretch.rows] = stretch.poses(found.errors)
+        covariance[stretch.rows] = found.covariance
+        covariance[stretch.rows[:, None], range(3), range(3)] += prior.constant[0] ** 2
+    priors = [found.prior for found in results]
+    return Adjusted(
+        new_position,
+        new_rotation,
+        covariance,
+        _remaining(
+            [found.draws for found in results], float(np.median(np.diff(seen.t_s))), prior.constant[0]
+        ),
+        replace(prior, white=_rms([p.white for p in priors]), slow=_rms_slow(priors)),
+        sum(len(stretch.points.inverse_depth) for stretch in stretches),
+        pixels,
+        None,
+    )
+
+
+def _rms(levels: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    position, rotation = np.sqrt(np.mean(np.square(levels), axis=0)).tolist()
+    return position, rotation
+
+
+def _rms_slow(priors: Sequence[PosePrior]) -> tuple[Process, Process]:
+    rate = _rms([(prior.slow[0].rate, prior.slow[1].rate) for prior in priors])
+    return replace(priors[0].slow[0], rate=rate[0]), replace(priors[0].slow[1], rate=rate[1])
+
+
+def _remaining(draws: Sequence[Float], period_s: float, shift: float) -> PoseErrors:
+    """Describe errors [M, T, 6] drawn from the posterior as white, constant and slow ones.
+
+    The shift of the whole path, of this standard deviation (m), is not in the draws.
+
+    Differences of neighbours that are not explained by those of pictures two apart are white. The mean over
+    the flight is constant. The rest is a Gauss-Markov process with the lag at which it has lost 1 / e.
+    """
+    white, processes = [0.0, 0.0], []
+    for kind, number in enumerate((SHIFT_IN_WORLD, ROTATION)):
+        parts = [draw[..., 3 * kind : 3 * kind + 3] for draw in draws]
+        whole = _mean([float(np.mean(part**2)) for part in parts])
+        constant = _mean([float(np.mean(part.mean(axis=1) ** 2)) for part in parts])
+        near, next_ = (_structure(parts, lag) for lag in (1, 2))
+        fresh = min(max(2 * near - next_, 0.0), near)
+        slow = max(whole - constant - fresh, 0.0)
+        constant += 0.0 if kind else shift**2
+        white[kind] = max(float(np.sqrt(fresh)), EXACT)
+        if slow > _SMALL * constant:
+            most = max(part.shape[1] for part in parts)
+            lags = np.unique(np.geomspace(1, max(most // 2, 1), 24).astype(np.int64))
+            grown = np.array([_structure(parts, int(lag)) for lag in lags]) - fresh
+            reached = np.flatnonzero(grown >= (1 - np.exp(-1)) * slow)
+            lag = lags[reached[0]] if len(reached) else lags[-1]
+            processes.append(Process(number, float(np.sqrt(slow)), correlation_s=float(lag * period_s)))
+        else:
+            constant += slow
+        processes.append(Process(number, max(float(np.sqrt(constant)), EXACT)))
+    return PoseErrors((white[0], white[1]), tuple(processes))
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values))
+
+
+def _structure(parts: Sequence[Float], lag: int) -> float:
+    """Compute half of the mean square of differences over a number of pictures."""
+    steps = [part[:, lag:] - part[:, :-lag] for part in parts if part.shape[1] > lag]
+    return _mean([float(np.mean(step**2)) / 2 for step in steps]) if steps else 0.0
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Result of one stretch of T pictures."""
+
+    errors: Float  # [T, 6] of the logged poses
+    covariance: Float  # [T, 6, 6] of them
+    draws: Float  # [M, T, 6] of what the errors may be more, from the posterior
+    missed: Float  # [K] residuals, px
+    prior: PosePrior
+
+
+@dataclass(frozen=True)
+class _State:
+    """Estimates of the unknowns."""
+
+    errors: Float  # [T, 6]
+    knots: Float  # [N, 6] slow errors
+    constant: Float  # [9]: shift in the world, rotation, shift in the camera
+
+
+@dataclass(frozen=True)
+class _Factored:
+    """Normal equations of the last step, factored: of pictures and knots, and of the constant errors."""
+
+    band: Float  # [n, width] Cholesky factor
+    border: Float  # [n, 9] inverse of the band's matrix times the constant errors' columns
+    corner: Float  # [9, 9] covariance of the constant errors
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """Pictures that are adjusted together, and the points seen in them."""
+
+    rows: Int64  # [T] of the camera's pictures
+    position: Float  # [T, 3]
+    rotation: Float  # [T, 3, 3]
+    seen: Sightings
+    points: Points
+    place: Int64  # [T] first unknown of each picture
+    knot_place: Int64  # [N]
+    knot_t_s: Float  # [N]
+    knot: Int64  # [T] the knot before each picture
+    share: Float  # [T] of the knot after it
+    focal_px: float
+    unbound: int  # pictures that share too few points with the one before
+
+    @classmethod
+    def of(cls, seen: SeenPoints, rows: Int64, position: Float, rotation: Float) -> _Stretch:
+        """Build a stretch of some pictures."""
+        t_s = seen.t_s[rows]
+        period_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 1.0
+        longest = int(np.clip(round(_LONGEST_S / max(period_s, 1e-3)), *_LONGEST))
+        row_of = np.full(len(position), -1)
+        row_of[rows] = np.arange(len(rows))
+        mine = row_of[seen.picture] >= 0
+        picture, point, rays = row_of[seen.picture[mine]], seen.point[mine], seen.rays[mine]
+        order = np.lexsort((picture, point))
+        picture, point, rays = picture[order], point[order], rays[order]
+        kept, first = _pieces(picture, point, longest)
+        picture, rays = picture[kept], rays[kept]
+        steps = (t_s[-1] - t_s[0]) / _KNOT_S if len(t_s) else 0.0
+        knot_t_s = np.linspace(t_s[0], t_s[-1], max(int(np.ceil(steps)), 1) + 1)
+        knot = np.clip(np.searchsorted(knot_t_s, t_s, side="right") - 1, 0, len(knot_t_s) - 2)
+        share = (t_s - knot_t_s[knot]) / np.maximum(knot_t_s[knot + 1] - knot_t_s[knot], 1e-9)
+        place, knot_place = _places(t_s, knot_t_s)
+        middle = picture[(first[:-1] + first[1:]) // 2] if len(first) > 1 else first[:0]
+        return cls(
+            rows,
+            position[rows],
+            rotation[rows],
+            Sightings(first, picture, rays, _PIXEL_SIGMA / seen.focal_px),
+            _far_points(first, picture, rays, position[rows][middle], rotation[rows]),
+            place,
+            knot_place,
+            knot_t_s,
+            knot,
+            share,
+            seen.focal_px,
+            int((_shared(first, picture, len(rows)) < _FEWEST_SHARED).sum()),
+        )
+
+    def poses(self, errors: Float) -> tuple[Float, Float]:
+        """Remove errors from the logged poses: (p - e, R exp(-w))."""
+        back = matrix_from_quaternion(quaternion_from_rotation_vector(-errors[:, 3:]))
+        return self.position - errors[:, :3], self.rotation @ back
+
+    def solve_with_levels(self, prior: PosePrior) -> _Solved | None:
+        """Solve, with levels of errors estimated if they are unknown; None without convergence."""
+        state = _State(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), np.zeros(9))
+        settle_points(self.seen, self.points, self.position, self.rotation, _LOSS, _INVERSE_DEPTH, 8)
+        for _ in range(_LEVEL_ROUNDS if prior.estimated else 0):
+            found = self._solve(state, prior, rounds=2)
+            if found is None:
+                return None
+            state, factored, _ = found
+            prior = self._estimated(state, self._draws(factored, 8), prior)
+        found = self._solve(state, prior, rounds=_ROUNDS)
+        if found is None:
+            return None
+        state, factored, missed = found
+        errors = self._draws(factored, _DRAWS)[0]
+        return _Solved(state.errors, self._covariance(factored), errors, _PIXEL_SIGMA * missed, prior)
+
+    def _solve(self, state: _State, prior: PosePrior, rounds: int) -> tuple[_State, _Factored, Float] | None:
+        """Make Gauss-Newton steps; return the estimate, the last equations, and residuals [K] in sigmas."""
+        turned = np.concatenate([np.tile(np.eye(3), (len(self.rows), 1, 1)), self.rotation], axis=2)
+        ties = self._ties(prior)
+        # A shift of the whole path causes no residual: the path stays where the log has it.
+        steady = 1 / np.maximum(np.repeat([0.0, *prior.constant[1:]], 3), EXACT) ** 2
+        kept = np.zeros((len(self.points.inverse_depth), 12))
+        missed = np.full(len(self.seen.picture), np.nan)
+        size = int(max(self.place[-1], self.knot_place[-1])) + 6
+        for _ in range(rounds):
+            at, turn = self.poses(state.errors)
+            band, force, border = np.zeros((size, self._width())), np.zeros(size), np.zeros((size, 9))
+            corner, pull = np.diag(steady), -steady * state.constant
+            eliminate_points(
+                self.seen, self.points, at, turn, _LOSS, _INVERSE_DEPTH, self.place, band, force, missed, kept
+            )
+            add_ties(ties, turned, *_parts(state), band, force, border, corner, pull)
+            if not factorise(band):
+                return None
+            both = np.concatenate([border, force[:, None]], axis=1)
+            solve_lower(band, both)
+            solve_upper(band, both)
+            covariance = np.linalg.inv(corner - border.T @ both[:, :9])
+            shift = covariance @ (pull - border.T @ both[:, 9])
+            step = both[:, 9] - both[:, :9] @ shift
+            if not (np.isfinite(step).all() and (np.diagonal(covariance) > 0).all()):
+                return None
+            move_points(self.seen, self.points, at, turn, _LOSS, kept, self.place, step)
+            state = _State(
+                state.errors + step[self.place[:, None] + np.arange(6)],
+                state.knots + step[self.knot_place[:, None] + np.arange(6)],
+                state.constant + shift,
+            )
+            if np.abs(step).max() < _CONVERGED:
+                break
+        return state, _Factored(band, both[:, :9], covariance), missed[np.isfinite(missed)]
+
+    def _ties(self, prior: PosePrior) -> Ties:
+        """Build the prior of errors about slow and constant ones, and of slow ones over time."""
+        white = 1 / np.maximum(np.repeat(prior.white, 3), EXACT) ** 2
+        steps = np.diff(self.knot_t_s)
+        left, added = np.empty((len(steps), 6)), np.empty((len(steps), 6))
+        for k, step in enumerate(steps):
+            both = [process.step(float(step)) for process in prior.slow]
+            left[k] = np.repeat([one[0] for one in both], 3)
+            added[k] = 1 / np.maximum(np.repeat([one[1] for one in both], 3), EXACT**2)
+        start = 1 / np.maximum(np.repeat([process.sigma0 for process in prior.slow], 3), EXACT) ** 2
+        return Ties(self.place, self.knot_place, self.knot, self.share, white, start, left, added)
+
+    def _width(self) -> int:
+        """Compute the width of the band: the farthest pair of unknowns that meet in an equation."""
+        last = self.seen.picture[self.seen.first[1:] - 1]
+        first = self.seen.picture[self.seen.first[:-1]]
+        widest = (self.place[last] - self.place[first]).max(initial=0)
+        widest = max(widest, np.diff(self.knot_place).max(initial=0))
+        before = np.abs(self.place - self.knot_place[self.knot]).max()
+        after = np.abs(self.place - self.knot_place[self.knot + 1]).max()
+        return int(max(widest, before, after)) + 6
+
+    def _draws(self, factored: _Factored, count: int) -> tuple[Float, Float, Float]:
+        """Draw deviations from the posterior: of errors [M, T, 6], knots [M, N, 6] and constants [M, 9]."""
+        rng = np.random.default_rng(0)
+        free = rng.standard_normal((len(factored.band), count))
+        solve_upper(factored.band, free)
+        values, vectors = np.linalg.eigh(factored.corner)
+        constant = rng.standard_normal((count, 9)) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+        free -= factored.border @ constant.T
+        errors, knots = (
+            np.moveaxis(free[place[:, None] + np.arange(6)], 2, 0) for place in (self.place, self.knot_place)
+        )
+        return errors, knots, constant
+
+    def _covariance(self, factored: _Factored) -> Float:
+        """Compute the posterior covariance [T, 6, 6] of each picture's error."""
+        inverse = inverse_in_band(factored.band)
+        row, column = np.tril_indices(6)
+        own = np.zeros((len(self.rows), 6, 6))
+        own[:, row, column] = inverse[self.place[:, None] + column, row - column]
+        own[:, column, row] = own[:, row, column]
+        border = factored.border[self.place[:, None] + np.arange(6)]
+        return np.asarray(own + border @ factored.corner @ np.swapaxes(border, 1, 2))
+
+    def _estimated(self, state: _State, draws: tuple[Float, Float, Float], prior: PosePrior) -> PosePrior:
+        """Estimate the levels of white and slow errors again by MacKay's rule."""
+        fresh = self._fresh(state)
+        spread = np.stack([self._fresh(_State(*draw)) for draw in zip(*draws, strict=True)])
+        white = [
+            _level(fresh[:, of], spread[..., of], sigma, least)
+            for of, sigma, least in zip(_KINDS, prior.white, _LEAST_WHITE, strict=True)
+        ]
+        scale = 1 / np.sqrt(np.diff(self.knot_t_s))[:, None]
+        steps, spread = np.diff(state.knots, axis=0) * scale, np.diff(draws[1], axis=1) * scale
+        rate = [
+            _level(steps[:, of], spread[..., of], process.rate, least)
+            for of, process, least in zip(_KINDS, prior.slow, _LEAST_RATE, strict=True)
+        ]
+        slow = replace(prior.slow[0], rate=rate[0]), replace(prior.slow[1], rate=rate[1])
+        return replace(prior, white=(white[0], white[1]), slow=slow)
+
+    def _fresh(self, state: _State) -> Float:
+        """Compute the white part [T, 6] of the errors."""
+        share = self.share[:, None]
+        slow = (1 - share) * state.knots[self.knot] + share * state.knots[self.knot + 1]
+        steady = np.tile(state.constant[:6], (len(self.rows), 1))
+        steady[:, :3] += self.rotation @ state.constant[6:]
+        return np.asarray(state.errors - slow - steady)
+
+
+_KINDS = (slice(0, 3), slice(3, 6))
+
+
+def _parts(state: _State) -> tuple[Float, Float, Float]:
+    return state.errors, state.knots, state.constant
+
+
+def _level(estimates: Float, draws: Float, sigma: float, least: float) -> float:
+    """Estimate a standard deviation: squares of estimates over the number that the data determine."""
+    determined = 1 - np.mean(draws**2) / sigma**2
+    if determined < _LEAST_DETERMINED:
+        return sigma
+    variance = np.mean(estimates**2) / determined
+    return max(float(np.sqrt(np.clip(variance, 0.04 * sigma**2, 6.0 * sigma**2))), least)
+
+
+# --- points ---------------------------------------------------------------------------------------------
+
+
+def _pieces(picture: Int64, point: Int64, longest: int) -> tuple[Bool, Int64]:
+    """Cut tracks, sorted by point and picture, into pieces; choose as many as are needed in a picture.
+
+    Returns:
+        The sightings [K] that are used, and the first of each piece among these and their number [N + 1].
+    """
+    if not len(picture):
+        return np.zeros(0, dtype=np.bool_), np.zeros(1, dtype=np.int64)
+    begins = np.append(True, (np.diff(point) != 0) | (np.diff(picture) != 1))
+    start = np.maximum.accumulate(np.where(begins, np.arange(len(point)), 0))
+    # Tracks that begin together are cut at different times.
+    phase = (longest * ((0.6180339887498949 * point) % 1.0)).astype(np.int64)
+    part = (np.arange(len(point)) - start + phase) // longest
+    begins[1:] |= np.diff(part) != 0
+    piece = np.cumsum(begins) - 1
+    length = np.bincount(piece)
+    long = length >= _FEWEST_SIGHTINGS
+    mean = length[long].sum() / max(len(np.unique(picture)), 1)
+    chosen = long & ((0.7548776662466927 * np.arange(len(length))) % 1.0 < _POINTS / max(mean, 1.0))
+    first = np.concatenate([[0], np.cumsum(length[chosen])])
+    return np.asarray(chosen[piece]), first.astype(np.int64)
+
+
+def _shared(first: Int64, picture: Int64, pictures: int) -> Int64:
+    """Count the points [T - 1] that are seen in each picture and in the one after it."""
+    ends = np.zeros(len(picture), dtype=np.bool_)
+    ends[first[1:] - 1] = True
+    return np.bincount(picture[~ends], minlength=pictures)[: pictures - 1]
+
+
+def _far_points(first: Int64, picture: Int64, rays: Float, origin: Float, rotation: Float) -> Points:
+    """Place each piece's point far away, in the mean direction of its rays."""
+    ray = np.einsum("kij,kj->ki", rotation[picture], np.append(rays, np.ones((len(rays), 1)), axis=1))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    if not len(origin):
+        return Points(origin, origin.copy(), np.zeros(0), np.zeros((0, 2, 3)))
+    direction = np.add.reduceat(ray, first[:-1], axis=0)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    least = np.eye(3)[np.abs(direction).argmin(axis=1)]
+    side = np.cross(direction, least)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    across = np.stack([side, np.cross(direction, side)], axis=1)
+    return Points(np.ascontiguousarray(origin), direction, np.full(len(origin), 0.05), across)
+
+
+def _places(t_s: Float, knot_t_s: Float) -> tuple[Int64, Int64]:
+    """Give every picture and knot six unknowns in the order of time; return the first of each."""
+    order = np.argsort(np.concatenate([t_s, knot_t_s]), kind="stable")
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = 6 * np.arange(len(order))
+    return place[: len(t_s)], place[len(t_s) :]

@@ -1,0 +1,469 @@
+"""Compiled kernels of the adjustment by the background; `background` is their only user and explains it.
+
+Unknowns of pictures and knots stand in the order of time, so that the normal matrix has a band: row `j` of
+the array `band` [n, width] holds the entries (j, j), (j + 1, j), ... of its lower triangle. Everything runs
+in one thread and in a fixed order, so that the same input gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.compilation import cached, helper
+
+_BEHIND = 0.05  # least depth of a direction of unit length in front of the camera
+
+
+class Sightings(NamedTuple):
+    """Sightings of points, sorted by point; point `n` has those from `first[n]` to `first[n + 1]`."""
+
+    first: Int64  # [N + 1]
+    picture: Int64  # [K] rows of the poses
+    rays: Float  # [K, 2] undistorted normalised image coordinates
+    sigma: float  # of one
+
+
+class Points(NamedTuple):
+    """Points X as homogeneous world coordinates: direction + inverse depth * (origin - place)."""
+
+    origin: Float  # [N, 3] place from which direction and inverse depth are counted
+    direction: Float  # [N, 3] of about unit length
+    inverse_depth: Float  # [N] 1/m; 0 for a point at infinity
+    across: Float  # [N, 2, 3] unit vectors across the direction, along which it is moved
+
+
+class Ties(NamedTuple):
+    """Prior of the errors of T pictures, about slow errors at N knots in time and constant errors."""
+
+    place: Int64  # [T] first unknown of each picture
+    knot_place: Int64  # [N]
+    knot: Int64  # [T] the knot before each picture
+    share: Float  # [T] of the knot after it
+    white: Float  # [6] precisions of white errors
+    start: Float  # [6] precisions of the first knot
+    left: Float  # [N - 1, 6] share of a knot's error that is left at the next one
+    added: Float  # [N - 1, 6] precisions of what is added to it
+
+
+@helper
+def _sighting(
+    place: Float, turned: Float, origin: Float, direction: Float, inverse: float, across: Float, ray: Float
+) -> tuple[Float, Float, Float, bool]:
+    """Compute derivatives by pose error [2, 6] and point [2, 3], the residual [2], and if it is in front."""
+    by_pose, by_point, residual = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros(2)
+    seen, moved = np.zeros(3), np.zeros((3, 3))
+    for i in range(3):
+        for k in range(3):
+            base = origin[k] - place[k]
+            seen[i] += turned[k, i] * (direction[k] + inverse * base)
+            moved[i, 0] += turned[k, i] * across[0, k]
+            moved[i, 1] += turned[k, i] * across[1, k]
+            moved[i, 2] += turned[k, i] * base
+    x, y, z = seen[0], seen[1], seen[2]
+    if z < _BEHIND:
+        return by_pose, by_point, residual, False
+    u, v = x / z, y / z
+    for k in range(3):
+        by_point[0, k] = (moved[0, k] - u * moved[2, k]) / z
+        by_point[1, k] = (moved[1, k] - v * moved[2, k]) / z
+        by_pose[0, k] = inverse * (turned[k, 0] - u * turned[k, 2]) / z
+        by_pose[1, k] = inverse * (turned[k, 1] - v * turned[k, 2]) / z
+    # A rotation error w turns the point in the camera by w x seen.
+    by_pose[0, 3], by_pose[0, 4], by_pose[0, 5] = -u * v, 1 + u * u, -v
+    by_pose[1, 3], by_pose[1, 4], by_pose[1, 5] = -1 - v * v, u * v, u
+    residual[0], residual[1] = ray[0] - u, ray[1] - v
+    return by_pose, by_point, residual, True
+
+
+@helper
+def _factor3(a: Float) -> None:
+    """Replace a symmetric 3x3 matrix by its lower Cholesky factor."""
+    for j in range(3):
+        for k in range(j):
+            a[j, j] -= a[j, k] * a[j, k]
+        a[j, j] = math.sqrt(a[j, j])
+        for i in range(j + 1, 3):
+            for k in range(j):
+                a[i, j] -= a[i, k] * a[j, k]
+            a[i, j] /= a[j, j]
+
+
+@cached
+def settle_points(
+    seen: Sightings, points: Points, place: Float, turned: Float, loss: float, prior: Float, rounds: int
+) -> None:
+    """Move every point to where the cameras see it, their poses held.
+
+    Args:
+        seen: the sightings.
+        points: changed in place.
+        place: [T, 3] m.
+        turned: [T, 3, 3] world_from_camera.
+        loss: standard deviations at which a sighting counts half.
+        prior: [2] mean and precision of the inverse depth (1/m, m^2).
+        rounds: Gauss-Newton steps.
+    """
+    for n in range(len(seen.first) - 1):
+        for _ in range(rounds):
+            normal, force = np.zeros((3, 3)), np.zeros(3)
+            normal[2, 2] = prior[1]
+            force[2] = prior[1] * (prior[0] - points.inverse_depth[n])
+            for s in range(seen.first[n], seen.first[n + 1]):
+                t = seen.picture[s]
+                _, by_point, residual, front = _sighting(
+                    place[t],
+                    turned[t],
+                    points.origin[n],
+                    points.direction[n],
+                    points.inverse_depth[n],
+                    points.across[n],
+                    seen.rays[s],
+                )
+                if not front:
+                    continue
+                missed = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2
+                weight = 1 / (1 + missed / loss**2) / seen.sigma**2
+                for i in range(3):
+                    for a in range(2):
+                        force[i] += weight * by_point[a, i] * residual[a]
+                        for k in range(3):
+                            normal[i, k] += weight * by_point[a, i] * by_point[a, k]
+            for i in range(3):
+                normal[i, i] += 1e-9 * (normal[0, 0] + normal[1, 1])
+            _factor3(normal)
+            _move(points, n, _solve3(normal, force))
+
+
+@helper
+def _solve3(factor: Float, force: Float) -> Float:
+    """Solve by a lower Cholesky factor."""
+    step = np.zeros(3)
+    for i in range(3):
+        step[i] = force[i]
+        for k in range(i):
+            step[i] -= factor[i, k] * step[k]
+        step[i] /= factor[i, i]
+    for i in range(2, -1, -1):
+        for k in range(i + 1, 3):
+            step[i] -= factor[k, i] * step[k]
+        step[i] /= factor[i, i]
+    return step
+
+
+@helper
+def _move(points: Points, n: int, step: Float) -> None:
+    for k in range(3):
+        points.direction[n, k] += step[0] * points.across[n, 0, k] + step[1] * points.across[n, 1, k]
+    points.inverse_depth[n] += min(max(step[2], -0.2), 0.2)
+
+
+@cached
+def eliminate_points(
+    seen: Sightings,
+    points: Points,
+    place: Float,
+    turned: Float,
+    loss: float,
+    prior: Float,
+    offset: Int64,
+    band: Float,
+    force: Float,
+    missed: Float,
+    kept: Float,
+) -> None:
+    """Add the sightings to the normal equations of the poses, the points eliminated.
+
+    Args:
+        seen: the sightings.
+        points: where they are.
+        place: [T, 3] m.
+        turned: [T, 3, 3] world_from_camera.
+        loss: as in `settle_points`.
+        prior: as in `settle_points`.
+        offset: [T] first of each picture's six unknowns.
+        band: [n, width] is added to.
+        force: [n] is added to.
+        missed: [K] receives the residuals in standard deviations; NaN behind the camera.
+        kept: [N, 12] receives each point's Cholesky factor (9) and whitened force (3).
+    """
+    longest = 0
+    for n in range(len(seen.first) - 1):
+        longest = max(longest, seen.first[n + 1] - seen.first[n])
+    half = np.zeros((longest, 6, 3))
+    for n in range(len(seen.first) - 1):
+        start, stop = seen.first[n], seen.first[n + 1]
+        normal, pull = np.zeros((3, 3)), np.zeros(3)
+        normal[2, 2] = prior[1]
+        pull[2] = prior[1] * (prior[0] - points.inverse_depth[n])
+        for s in range(start, stop):
+            t = seen.picture[s]
+            mixed = half[s - start]
+            mixed[:] = 0.0
+            by_pose, by_point, residual, front = _sighting(
+                place[t],
+                turned[t],
+                points.origin[n],
+                points.direction[n],
+                points.inverse_depth[n],
+                points.across[n],
+                seen.rays[s],
+            )
+            if not front:
+                missed[s] = math.nan
+                continue
+            square = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2
+            missed[s] = math.sqrt(square)
+            weight = 1 / (1 + square / loss**2) / seen.sigma**2
+            at = offset[t]
+            for a in range(2):
+                for i in range(3):
+                    pull[i] += weight * by_point[a, i] * residual[a]
+                    for k in range(3):
+                        normal[i, k] += weight * by_point[a, i] * by_point[a, k]
+                for i in range(6):
+                    share = weight * by_pose[a, i]
+                    force[at + i] += share * residual[a]
+                    for k in range(3):
+                        mixed[i, k] += share * by_point[a, k]
+                    for k in range(i + 1):
+                        band[at + k, i - k] += share * by_pose[a, k]
+        for i in range(3):
+            normal[i, i] += 1e-9 * (normal[0, 0] + normal[1, 1])
+        _factor3(normal)
+        # Whitened: mixed F^-T, and F^-1 pull.
+        for i in range(3):
+            for k in range(i):
+                pull[i] -= normal[i, k] * pull[k]
+            pull[i] /= normal[i, i]
+        kept[n, :9] = normal.copy().reshape(9)
+        kept[n, 9:12] = pull
+        for s in range(start, stop):
+            mixed = half[s - start]
+            at = offset[seen.picture[s]]
+            for i in range(6):
+                for k in range(3):
+                    for m in range(k):
+                        mixed[i, k] -= normal[k, m] * mixed[i, m]
+                    mixed[i, k] /= normal[k, k]
+                force[at + i] -= mixed[i, 0] * pull[0] + mixed[i, 1] * pull[1] + mixed[i, 2] * pull[2]
+        for s in range(start, stop):
+            later = half[s - start]
+            after = offset[seen.picture[s]]
+            for r in range(start, s + 1):
+                earlier = half[r - start]
+                before = offset[seen.picture[r]]
+                away = after - before
+                for k in range(6):
+                    e0, e1, e2 = earlier[k, 0], earlier[k, 1], earlier[k, 2]
+                    for i in range(k if away == 0 else 0, 6):
+                        band[before + k, away + i - k] -= (
+                            later[i, 0] * e0 + later[i, 1] * e1 + later[i, 2] * e2
+                        )
+
+
+@cached
+def move_points(
+    seen: Sightings,
+    points: Points,
+    place: Float,
+    turned: Float,
+    loss: float,
+    kept: Float,
+    offset: Int64,
+    step: Float,
+) -> None:
+    """Move the points by what the step [n] of the poses leaves to them; `kept` is of `eliminate_points`."""
+    for n in range(len(seen.first) - 1):
+        force = np.zeros(3)
+        for s in range(seen.first[n], seen.first[n + 1]):
+            t = seen.picture[s]
+            by_pose, by_point, residual, front = _sighting(
+                place[t],
+                turned[t],
+                points.origin[n],
+                points.direction[n],
+                points.inverse_depth[n],
+                points.across[n],
+                seen.rays[s],
+            )
+            if not front:
+                continue
+            square = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2
+            weight = 1 / (1 + square / loss**2) / seen.sigma**2
+            for a in range(2):
+                along = 0.0
+                for i in range(6):
+                    along += by_pose[a, i] * step[offset[t] + i]
+                for i in range(3):
+                    force[i] -= weight * by_point[a, i] * along
+        factor = kept[n, :9].copy().reshape(3, 3)
+        for i in range(3):
+            for k in range(i):
+                force[i] -= factor[i, k] * force[k]
+            force[i] /= factor[i, i]
+            # force now holds F^-1 of the poses' part; the points' own part is added whitened
+        for i in range(3):
+            force[i] += kept[n, 9 + i]
+        moves = np.zeros(3)
+        for i in range(2, -1, -1):
+            moves[i] = force[i]
+            for k in range(i + 1, 3):
+                moves[i] -= factor[k, i] * moves[k]
+            moves[i] /= factor[i, i]
+        _move(points, n, moves)
+
+
+@helper
+def _tie(band: Float, one: int, other: int, value: float) -> None:
+    """Add to the entry of two unknowns."""
+    first, second = min(one, other), max(one, other)
+    band[first, second - first] += value
+
+
+@cached
+def add_ties(
+    ties: Ties,
+    turned: Float,
+    errors: Float,
+    knots: Float,
+    constant: Float,
+    band: Float,
+    force: Float,
+    border: Float,
+    corner: Float,
+    pull: Float,
+) -> None:
+    """Add the prior to the normal equations.
+
+    Args:
+        ties: the prior.
+        turned: [T, 3, 6] derivatives of a position by the shift in the world and in the camera.
+        errors: [T, 6] estimates, of pictures.
+        knots: [N, 6].
+        constant: [9] shift in the world, rotation, shift in the camera.
+        band: as in `eliminate_points`, as is `force`.
+        force: [n].
+        border: [n, 9] entries of pictures and knots with constant errors; is added to.
+        corner: [9, 9] of constant errors; is added to.
+        pull: [9] right side of these; is added to.
+    """
+    row = np.zeros(9)
+    for t in range(len(ties.place)):
+        before, after = ties.knot[t], ties.knot[t] + 1
+        share = ties.share[t]
+        for a in range(6):
+            row[:] = 0.0
+            if a < 3:
+                for k in range(3):
+                    row[k], row[6 + k] = turned[t, a, k], turned[t, a, 3 + k]
+            else:
+                row[a] = 1.0
+            left = errors[t, a] - (1 - share) * knots[before, a] - share * knots[after, a]
+            for k in range(9):
+                left -= row[k] * constant[k]
+            own, old, new = ties.place[t] + a, ties.knot_place[before] + a, ties.knot_place[after] + a
+            w = ties.white[a]
+            band[own, 0] += w
+            band[old, 0] += (1 - share) ** 2 * w
+            band[new, 0] += share**2 * w
+            _tie(band, own, old, -(1 - share) * w)
+            _tie(band, own, new, -share * w)
+            _tie(band, old, new, share * (1 - share) * w)
+            force[own] -= w * left
+            force[old] += (1 - share) * w * left
+            force[new] += share * w * left
+            for k in range(9):
+                border[own, k] -= w * row[k]
+                border[old, k] += (1 - share) * w * row[k]
+                border[new, k] += share * w * row[k]
+                pull[k] += w * row[k] * left
+                for m in range(9):
+                    corner[k, m] += w * row[k] * row[m]
+    for a in range(6):
+        band[ties.knot_place[0] + a, 0] += ties.start[a]
+        force[ties.knot_place[0] + a] -= ties.start[a] * knots[0, a]
+        for k in range(len(ties.left)):
+            old, new = ties.knot_place[k] + a, ties.knot_place[k + 1] + a
+            kept, w = ties.left[k, a], ties.added[k, a]
+            left = knots[k + 1, a] - kept * knots[k, a]
+            band[new, 0] += w
+            band[old, 0] += kept**2 * w
+            _tie(band, old, new, -kept * w)
+            force[new] -= w * left
+            force[old] += kept * w * left
+
+
+@cached
+def factorise(band: Float) -> bool:
+    """Replace a banded matrix by its lower Cholesky factor; return False if it is not positive definite."""
+    count, width = band.shape
+    for j in range(count):
+        own = band[j]
+        for k in range(max(0, j - width + 1), j):
+            left = band[k]
+            away = j - k
+            share = left[away]
+            if share != 0.0:
+                for i in range(width - away):
+                    own[i] -= share * left[away + i]
+        if not own[0] > 0:
+            return False
+        pivot = math.sqrt(own[0])
+        for i in range(width):
+            own[i] /= pivot
+    return True
+
+
+@cached
+def solve_lower(band: Float, sides: Float) -> None:
+    """Replace right sides [n, m] by F^-1 of them, F the factor."""
+    count, width = band.shape
+    for j in range(count):
+        for m in range(sides.shape[1]):
+            sides[j, m] /= band[j, 0]
+        for i in range(1, min(width, count - j)):
+            for m in range(sides.shape[1]):
+                sides[j + i, m] -= band[j, i] * sides[j, m]
+
+
+@cached
+def solve_upper(band: Float, sides: Float) -> None:
+    """Replace right sides [n, m] by F^-T of them, F the factor."""
+    count, width = band.shape
+    for j in range(count - 1, -1, -1):
+        for i in range(1, min(width, count - j)):
+            for m in range(sides.shape[1]):
+                sides[j, m] -= band[j, i] * sides[j + i, m]
+        for m in range(sides.shape[1]):
+            sides[j, m] /= band[j, 0]
+
+
+@cached
+def inverse_in_band(band: Float) -> Float:
+    """Compute the entries of the inverse that lie in the band, from the factor (Takahashi et al. 1973)."""
+    count, width = band.shape
+    inverse = np.zeros((count, width))
+    sums = np.zeros(width)
+    for j in range(count - 1, -1, -1):
+        reach = min(width, count - j)
+        sums[:] = 0.0
+        for k in range(1, reach):
+            share = band[j, k] / band[j, 0]
+            row = inverse[j + k]
+            for i in range(k, reach):
+                sums[i] += row[i - k] * share
+        for i in range(1, reach):
+            row = inverse[j + i]
+            total = 0.0
+            for k in range(i + 1, reach):
+                total += row[k - i] * (band[j, k] / band[j, 0])
+            inverse[j, i] = -(sums[i] + total)
+        total = 1 / band[j, 0] ** 2
+        for k in range(1, reach):
+            total -= inverse[j, k] * band[j, k] / band[j, 0]
+        inverse[j, 0] = total
+    return inverse
