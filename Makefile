@@ -55,6 +55,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.arms
 	$(BIN)/python -m benchmarks.rendering
 	$(BIN)/python -m benchmarks.detection
+	$(BIN)/python -m benchmarks.no_people
 	$(BIN)/python -m benchmarks.detectors
 	$(BIN)/python -m benchmarks.detector_by_tilt
 	$(BIN)/python -m benchmarks.legs

@@ -7,7 +7,7 @@ could not be measured is NaN with a status that gives the reason.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,10 +25,12 @@ from pipelines.geometry.triangulation import (
 )
 from pipelines.keypoints.association import Association, associate
 from pipelines.keypoints.calibration import measured_for, read_calibration
+from pipelines.keypoints.no_people import Ground, Scene, level_of
 from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
 from pipelines.reconstruction.background import Followed, refine_cameras, rows_to_follow
 from pipelines.reconstruction.background_tracks import follow, people_boxes
 from pipelines.reconstruction.doubts.diagnosis import Doubt, doubts_of, said_doubts
+from pipelines.reconstruction.doubts.scene import Ground as GroundOfMap
 from pipelines.reconstruction.finishing import finish
 from pipelines.reconstruction.loading import (
     load_cameras,
@@ -58,6 +60,7 @@ from pipelines.reconstruction.solving import (
 from pipelines.reconstruction.trials import disturbances, disturbed, summary_of_trials
 from pipelines.session.description import Description, Interpolation, read_description, said_assumptions
 from pipelines.session.errors import DataError
+from pipelines.session.maps import each_map
 from pipelines.session.people import LoggedActor, logged_actor, true_joints_at
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
@@ -173,10 +176,12 @@ def reconstruct(
         followed = {}
         if settings.refine_cameras == "background":
             followed = _follow_backgrounds(folder, description, cameras, progress)
+        actor = logged_actor(folder, description)
         flight = _Flight(
             description,
             followed,
-            logged_actor(folder, description),
+            actor,
+            ground_of(folder, description, actor),
             load_truth(folder, description, cameras[0].detections.joints),
         )
         attempts = (
@@ -219,6 +224,14 @@ def reconstruct(
         )
         _note_replaced(run, progress)
     return Reconstructed(folder, record, metrics, skipped=False)
+
+
+def ground_of(folder: Path, description: Description, actor: LoggedActor | None) -> Ground | None:
+    """Return the ground of the last map, else the level of the logged actor; None without either."""
+    if description.map is not None:
+        last = deque(each_map(folder), maxlen=1)
+        return GroundOfMap.of(last[0]).about if last else None
+    return None if actor is None else level_of(actor.hips)
 
 
 def _detected(
@@ -302,6 +315,7 @@ def _counts(metrics: Mapping[str, Any], attempt: _Attempt, swaps: Mapping[str, o
     events = ("views", "ambiguous", "switches", "refused", "resumed")
     return {
         **metrics["status_counts"],
+        "no_people": metrics["people"]["no_people"],
         "association": {name: getattr(attempt.association, name).tolist() for name in events},
         "left_right_swaps": {"undone_over_time": swaps, "between_views": attempt.between_views},
         "filled": metrics["filled"],
@@ -327,6 +341,7 @@ class _Flight:
     description: Description
     followed: Mapping[str, Followed | str]  # the backgrounds of the cameras that are refined by them
     actor: LoggedActor | None
+    ground: Ground | None
     truth: JointMotion | None
 
 
@@ -424,7 +439,12 @@ def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _See
     """Associate people, interpolate their keypoints to common times, and correct left-right swaps."""
     between, pixel_sigma = flight.description.pose_interpolation, settings.pixel_sigma
     found, association, sigma = find_people(
-        cameras, between, flight.actor, people=settings.people, pixel_sigma=pixel_sigma
+        cameras,
+        between,
+        flight.actor,
+        people=settings.people,
+        pixel_sigma=pixel_sigma,
+        scene=Scene(flight.ground, np.array([camera.field for camera in cameras])),
     )
     base = time_base(cameras, settings.rate_hz)
     observations = observe(cameras, found, association.choice, base, between)
@@ -443,8 +463,11 @@ def find_people(
     *,
     people: int = Settings.people,
     pixel_sigma: float = Settings.pixel_sigma,
+    scene: Scene | None = None,
 ) -> tuple[Candidates, Association, Float]:
     """Collect all detections at common times, and associate them with people; person 0 is the actor.
+
+    With a scene, things that are no people by the ground and by the other cameras are left out.
 
     The last result is the uncertainty of rays, see `ray_sigma`.
     """
@@ -459,6 +482,7 @@ def find_people(
         sigma,
         actor=None if actor is None else actor.hips_at(found.t_ns),
         people=people,
+        scene=scene,
     )
     return found, association, sigma
 
@@ -495,10 +519,34 @@ def _people_seen(cameras: Sequence[Camera], association: Association) -> dict[st
         "detections_not_used": dict(
             zip([camera.name for camera in cameras], association.unused.tolist(), strict=True)
         ),
+        "no_people": {
+            cause: {camera.name: count for camera, count in zip(cameras, of, strict=True) if count}
+            for cause, of in {c: n.tolist() for c, n in association.no_people.items()}.items()
+        },
     }
 
 
 def _people_warnings(people: Mapping[str, Any]) -> list[str]:
+    """Write warnings on things that are no people, unused detections, and more people than requested."""
+    return [*_no_people_warnings(people["no_people"]), *_unused_warnings(people)]
+
+
+def _no_people_warnings(no_people: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """Write which detections were taken for no people, by cause, and which were kept all the same."""
+    words = {
+        "ground": "no people: nobody who stands on the ground is there or so large: {}",
+        "alone": "no people: another camera looks there and sees nobody: {}",
+        "kept": "nobody on the ground is there or so large, but the surest person of the camera is not"
+        " either: detections are kept, the poses or the ground may be wrong: {}",
+    }
+    return [
+        words[cause].format(", ".join(f"{name} {count}" for name, count in cameras.items()))
+        for cause, cameras in no_people.items()
+        if cameras
+    ]
+
+
+def _unused_warnings(people: Mapping[str, Any]) -> list[str]:
     """Write a warning on unused detections, and on more people than requested."""
     unused = [f"{name} {count}" for name, count in people["detections_not_used"].items() if count]
     if not unused:

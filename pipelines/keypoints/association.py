@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.keypoints.grouping import Followed, follow
+from pipelines.keypoints.no_people import Scene, tell_no_people
 
 Int64 = NDArray[np.int64]
 
@@ -33,6 +34,9 @@ class Association:
     resumed: Int64  # [P] times the person was lost by all and taken up again
     people: Int64  # [T] people whom at least two cameras see
     unused: Int64  # [C] usable detections, over all times, that belong to none of the chosen people
+    no_people: dict[
+        str, Int64
+    ]  # [C] detections by the causes of `NoPeople`, which are not used; and those kept
     reasons: tuple[str, ...]  # messages for the user, one line each
 
 
@@ -59,6 +63,7 @@ def associate(
     actor: Float | None = None,
     actor_sigma_m: float = 1.0,
     people: int = 1,
+    scene: Scene | None = None,
 ) -> Association:
     """Choose the detections of the actor, then of other people, most seen first.
 
@@ -80,6 +85,7 @@ def associate(
         actor: [T, 3] m, the logged actor, NaN where unknown.
         actor_sigma_m: standard deviation of the log on each axis.
         people: number of people to choose.
+        scene: the surroundings, by which things are told from people; by default nothing is.
 
     Returns:
         The choice and its counts. A lone view is kept where its picture continues the person's last one.
@@ -89,6 +95,13 @@ def associate(
         confidence = np.zeros(xy.shape[:-1])
     logged = None if actor is None else np.c_[actor, np.full(len(actor), actor_sigma_m)]
     seen = follow(time_s, xy, confidence, position, rotation, sigma, logged)
+    told: dict[str, Int64] = {}
+    if scene is not None:
+        things = tell_no_people(seen, xy, confidence, position, rotation, sigma, scene)
+        told = {cause: which.sum((0, 2)) for cause, which in things._asdict().items()}
+        if (out := things.ground | things.alone).any():
+            confidence = np.where(out[..., None], 0.0, confidence)
+            seen = follow(time_s, xy, confidence, position, rotation, sigma, logged)
     tracks = _tracks(seen, np.where(np.isfinite(xy).all(-1) & (confidence > 0), confidence, 0.0))
     chosen = np.full((*seen.track.shape[:2], people), -1, np.int64)
     resumed = np.zeros(people, np.int64)
@@ -104,7 +117,7 @@ def associate(
         tracks = [one for one in tracks if one.identity not in taken]
     if not np.any(chosen >= 0):
         reasons.append(_nobody(seen.nearest))
-    return _counted(chosen, seen, resumed, tuple(reasons))
+    return _counted(chosen, seen, resumed, told, tuple(reasons))
 
 
 def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
@@ -223,7 +236,9 @@ def _nobody(nearest: Float) -> str:
     )
 
 
-def _counted(chosen: Int64, seen: Followed, resumed: Int64, reasons: tuple[str, ...]) -> Association:
+def _counted(
+    chosen: Int64, seen: Followed, resumed: Int64, told: dict[str, Int64], reasons: tuple[str, ...]
+) -> Association:
     """Build the result: the choice with its counts."""
     at = np.maximum(chosen.transpose(2, 0, 1), 0)[..., None]  # [P, T, C, 1]
     present = (chosen >= 0).transpose(2, 0, 1)
@@ -246,5 +261,6 @@ def _counted(chosen: Int64, seen: Followed, resumed: Int64, reasons: tuple[str, 
         resumed=resumed,
         people=np.rint(standing.sum((1, 2))).astype(np.int64),
         unused=(seen.track >= 0).sum((0, 2)) - present.sum((0, 1)),
+        no_people=told,
         reasons=reasons,
     )

@@ -56,6 +56,14 @@ class Camera:
         return (self.intrinsics.fx + self.intrinsics.fy) / 2
 
     @cached_property
+    def field(self) -> Float:
+        """Left, top, right and bottom of its picture [4] as undistorted normalised image coordinates."""
+        right, bottom = self.intrinsics.width - 1.0, self.intrinsics.height - 1.0
+        x, y = right / 2, bottom / 2
+        middles = undistort(np.array([[0.0, y], [x, 0.0], [right, y], [x, bottom]]), self.intrinsics)
+        return middles[np.arange(4), [0, 1, 0, 1]]
+
+    @cached_property
     def rays(self) -> Float:
         """Keypoints [F, D, J, 2] as undistorted normalised image coordinates; NaN where nothing was found."""
         found = self.detections

@@ -198,7 +198,7 @@ class Measured:
     """Accuracy and time of a detector, measured as docs/detector.md describes."""
 
     sample_mpjpe_mm: float  # of the sample flight with true poses
-    person_ms: float  # its networks' time for each person in each picture, on one thread
+    person_ms: float  # processor time for one person in one picture, on one thread of a busy machine
 
 
 @runtime_checkable

@@ -183,6 +183,10 @@ class Ground(NamedTuple):
         index = np.where(inside[:, None], cell, 0).astype(np.intp)
         return np.where(inside, self.height[index[:, 0], index[:, 1]], np.nan)
 
+    def about(self, points: Float) -> tuple[Float, Float]:
+        """Return the ground's height [N] under points [N, 3], NaN beside the map, and its error [N]."""
+        return self.under(points), np.full(len(points), self.side_m)
+
 
 def sample(
     cameras: Sequence[Camera],

@@ -1,0 +1,224 @@
+"""Things that are no people among the detections of all cameras, by the ground and by the other cameras.
+
+A body has a size, so its extent in a picture says how far away it can be, and people stand on the ground:
+somewhere within that distance the line of sight must be near the ground. A tree's crown is too high there,
+or too large. What several cameras see has a place, which is near the ground or not.
+
+What one camera follows alone, although another one looks wherever somebody of usual size could stand, is
+nobody who can be reconstructed. Nothing is lost with it, so this test allows less than the first.
+
+Tracks are judged whole, camera by camera. Poses may be wrong: a camera whose surest person fails a test
+loses nobody by that test.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.arrays import Bool, Float
+from pipelines.keypoints.grouping import Followed
+
+Int64 = NDArray[np.int64]
+Ground = Callable[[Float], tuple[Float, Float]]
+"""Function from points [N, 3] to the heights (m) [N] of the ground there and their errors; NaN if unknown."""
+
+_EXTENT_M = (0.4, 2.6)  # diagonal of the box about a body's joints: curled up, and arms stretched upwards
+_HEIGHT_M = (-1.0, 2.0)  # of the middle of a body above the ground: lying in a hollow, and jumping
+_USUAL_EXTENT_M = (0.8, 2.2)  # crouching, and a tall person
+_USUAL_HEIGHT_M = (-0.3, 1.6)
+_SIGMAS = 3.0
+_JUDGED = 5  # pictures before a track is judged, as in `tracking`
+_MOST = 0.5  # of the pictures that can be judged must be refused
+_COMPANY = 0.05  # of the pictures: another camera that sees a track more rarely does not see it
+_PLACED_M = 1.0  # a group's place counts if its standard deviation is smaller
+_STEPS = 48  # places along a line of sight: at 60 m, and 45 degrees from above, one in each 1.7 m of height
+_EDGE = 0.1  # of a picture: a body so near its edge may not be found
+_BETWEEN = 8  # points on the way from another camera to a place
+_SLOPE = 0.3  # by which the ground may rise from where somebody went
+_HIP_M = 0.95  # above the ground, of a standing actor
+_BESIDE_M = 1.0  # error of the ground under a person: posture and log
+_AT_ONCE = 20_000  # detections whose places are in memory
+
+
+class Scene(NamedTuple):
+    """Surroundings of the people, as far as they are known."""
+
+    ground: Ground | None  # of a map or a log; without either it is that under who is seen most
+    fields: Float  # [C, 4] left, top, right, bottom of each camera's picture, normalised
+
+
+class NoPeople(NamedTuple):
+    """Detections [T, C, D] that are no people, by cause."""
+
+    ground: Bool  # too large, too small or too high for somebody on the ground
+    alone: Bool  # another camera looks there and sees nobody
+    kept: Bool  # refused by the ground, and kept because the camera's surest person is refused, too
+
+
+def level_of(hips: Float) -> Ground:
+    """Return the ground at the level of somebody who walks there, less certain the further away.
+
+    Args:
+        hips: [A, 3] m, where the person was; at least one is finite.
+    """
+    way = hips[np.isfinite(hips).all(axis=1)]
+    way = way[:: max(1, len(way) // 100)]
+
+    def ground(points: Float) -> tuple[Float, Float]:
+        away = np.stack([np.hypot(*(points[:, :2] - place[:2]).T) for place in way])
+        nearest = away.argmin(axis=0)
+        return way[nearest, 2] - _HIP_M, _BESIDE_M + _SLOPE * away.min(axis=0)
+
+    return ground
+
+
+def tell_no_people(
+    seen: Followed,
+    xy: Float,
+    confidence: Float,
+    position: Float,
+    rotation: Float,
+    sigma: Float,
+    scene: Scene,
+) -> NoPeople:
+    """Tell which detections are no people.
+
+    Args:
+        seen: the tracks and groups of these detections.
+        xy: [T, C, D, J, 2] undistorted normalised picture coordinates, NaN where nothing is.
+        confidence: [T, C, D, J]; joints at 0 or NaN are not used.
+        position: [T, C, 3] m, world_from_camera, NaN without a pose.
+        rotation: [T, C, 3, 3] world_from_camera.
+        sigma: [T, C] rad, standard deviation of a viewing ray on each axis.
+        scene: the surroundings.
+    """
+    found = NoPeople(*(np.zeros(seen.track.shape, np.bool_) for _ in NoPeople._fields))
+    if scene.ground is None:
+        scene = scene._replace(ground=_ground_under_most_seen(seen))
+    for c in range(seen.track.shape[1]):
+        at = np.nonzero(seen.track[:, c] >= 0)
+        if not len(at[0]):
+            continue
+        parts = [
+            _verdicts(seen, (at[0][rows], c, at[1][rows]), (xy, confidence, position, rotation, sigma), scene)
+            for rows in (slice(k, k + _AT_ONCE) for k in range(0, len(at[0]), _AT_ONCE))
+        ]
+        refused, judged, looked = (np.concatenate(each) for each in zip(*parts, strict=True))
+        weight = np.nan_to_num(confidence[:, c][at]).sum(axis=-1)
+        _, track = np.unique(seen.track[:, c][at], return_inverse=True)
+        surest = np.bincount(track, weight).argmax()
+
+        off = _shares(track, refused, judged) > _MOST
+        company = seen.views[:, c][at] > 1
+        share = _shares(track, company, looked | company)
+        alone = (share < _COMPANY) & bool(share[surest] > _MOST)
+        ground = off & (not off[surest])
+        found.ground[at[0], c, at[1]] = ground[track]
+        found.alone[at[0], c, at[1]] = (alone & ~ground)[track]
+        found.kept[at[0], c, at[1]] = (off & ~ground & ~alone)[track]
+    return found
+
+
+def _ground_under_most_seen(seen: Followed) -> Ground | None:
+    """Return the level of the person whom several cameras see most; None without one."""
+    placed = seen.spread < _PLACED_M
+    people, views = np.unique(seen.track[placed], return_counts=True)
+    if not len(people):
+        return None
+    return level_of(seen.middle[placed & (seen.track == people[views.argmax()])])
+
+
+def _shares(track: NDArray[np.intp], said: Bool, judged: Bool) -> Float:
+    """Return the share of each track's judged pictures that say so, NaN for fewer than five of them."""
+    count = np.bincount(track, judged).astype(np.float64)
+    return np.bincount(track, said & judged) / np.where(count >= _JUDGED, count, np.nan)
+
+
+def _verdicts(
+    seen: Followed,
+    at: tuple[Int64, int, Int64],
+    seen_by: tuple[Float, Float, Float, Float, Float],
+    scene: Scene,
+) -> tuple[Bool, Bool, Bool]:
+    """Judge detections of one camera.
+
+    Args:
+        seen: their groups.
+        at: their indices.
+        seen_by: the arrays of `tell_no_people`.
+        scene: the surroundings.
+
+    Returns:
+        Three arrays [N]. The ground refuses it; the ground is known; if another camera has every place in its
+        picture, and in sight, where somebody of usual size could be.
+    """
+    xy, confidence, position, rotation, sigma = seen_by
+    time, camera, _ = at
+    points = np.where((confidence[at] > 0)[..., None], xy[at], np.nan)
+    reach, places = _line_of_sight(points, position[time, camera], rotation[time, camera])
+    error = _SIGMAS * sigma[time, camera, None] * reach
+    extent = np.geomspace(*_EXTENT_M, _STEPS)
+    usual = np.tile((extent >= _USUAL_EXTENT_M[0]) & (extent <= _USUAL_EXTENT_M[1]), (len(places), 1))
+    if scene.ground is None:
+        nothing = np.zeros(len(places), np.bool_)
+        return nothing, nothing, _others_look(places, usual, time, camera, position, rotation, scene)
+    height, doubt = _heights(scene.ground, places)
+    above, off_by = _heights(scene.ground, seen.middle[at])
+    off_by = off_by + _SIGMAS * seen.spread[at]
+    with np.errstate(invalid="ignore"):
+        placed = (seen.spread[at] < _PLACED_M) & np.isfinite(above)
+        known = np.isfinite(height).all(axis=1)
+        low, high = height - error - doubt, height + error + doubt
+        nowhere = (low.min(axis=1) > _HEIGHT_M[1]) | (high.max(axis=1) < _HEIGHT_M[0])
+        elsewhere = (above - off_by > _HEIGHT_M[1]) | (above + off_by < _HEIGHT_M[0])
+        usual &= ~((height - error > _USUAL_HEIGHT_M[1]) | (height + error < _USUAL_HEIGHT_M[0]))
+    looked = _others_look(places, usual, time, camera, position, rotation, scene)
+    return np.where(placed, elsewhere, nowhere & known), placed | known, looked
+
+
+def _line_of_sight(points: Float, position: Float, rotation: Float) -> tuple[Float, Float]:
+    """Return the distances [N, K] m at which a body may be, by its extent, and the places [N, K, 3] there."""
+    low, high = np.nanmin(points, axis=1), np.nanmax(points, axis=1)
+    middle = np.column_stack([np.nanmedian(points, axis=1), np.ones(len(points))])
+    depth = np.geomspace(*_EXTENT_M, _STEPS) / np.maximum(np.hypot(*(high - low).T), 1e-6)[:, None]
+    places = position[:, None] + depth[..., None] * np.einsum("nij,nj->ni", rotation, middle)[:, None]
+    return depth * np.linalg.norm(middle, axis=1)[:, None], places
+
+
+def _heights(ground: Ground, points: Float) -> tuple[Float, Float]:
+    """Return the heights [...] of points [..., 3] above the ground, and its errors; NaN if unknown."""
+    level, doubt = ground(points.reshape(-1, 3))
+    return points[..., 2] - level.reshape(points.shape[:-1]), doubt.reshape(points.shape[:-1])
+
+
+def _others_look(
+    places: Float, usual: Bool, time: Int64, camera: int, position: Float, rotation: Float, scene: Scene
+) -> Bool:
+    """Test if one other camera has every usual place of [N, K, 3] in its picture, and in sight."""
+    looked = np.zeros(len(places), np.bool_)
+    for c in range(position.shape[1]):
+        if c == camera:
+            continue
+        origin, turned = position[time, c], rotation[time, c]
+        u, v, depth = np.einsum("nij,nki->jnk", turned, places - origin[:, None])
+        left, top, right, bottom = scene.fields[c]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            across, along = (u / depth - left) / (right - left), (v / depth - top) / (bottom - top)
+            inside = (np.minimum(across, along) > _EDGE) & (np.maximum(across, along) < 1 - _EDGE)
+        whole = (inside & (depth > 0) | ~usual).all(axis=1) & np.isfinite(depth).all(axis=1)
+        rows = np.flatnonzero(whole & ~looked)
+        looked[rows] = ~_hidden(origin[rows], places[rows], usual[rows], scene.ground)
+    return looked
+
+
+def _hidden(origin: Float, places: Float, usual: Bool, ground: Ground | None) -> Bool:
+    """Test if the ground may be between a camera [N, 3] and any usual place of [N, K, 3]."""
+    hidden = np.zeros(places.shape[:2], np.bool_)
+    if ground is not None:
+        row, step = np.nonzero(usual)
+        for share in np.arange(1, _BETWEEN) / _BETWEEN:
+            height, _ = _heights(ground, origin[row] + share * (places[row, step] - origin[row]))
+            hidden[row, step] |= height < 0
+    return np.asarray(hidden.any(axis=1))
