@@ -120,6 +120,7 @@ def render(numbers: Numbers) -> str:
             *_arms(numbers),
             *_filming(numbers),
             *_gimbals(numbers),
+            *_accuracy(numbers),
         ]
     )
 
@@ -285,6 +286,23 @@ def _gimbals(numbers: Numbers) -> list[str]:
     ]
     for title, entries in numbers.get("gimbals", {}).items():
         lines += [f"{title}:", "", *gimbal_table(entries)]
+    return lines
+
+
+def _accuracy(numbers: Numbers) -> list[str]:
+    if "accuracy" not in numbers:
+        return []
+    lines = [
+        "## Methods on rendered flights",
+        "",
+        *_words(
+            "Rendered pictures and real detectors. Flights with odd numbers, and the sample, were tuned "
+            "on; even ones are kept aside. `benchmarks/corpus/README.md` describes each of them, the "
+            "docstring of `benchmarks/accuracy.py` the figures."
+        ),
+    ]
+    for detector, own in numbers["accuracy"].items():
+        lines += [*_code([f"python -m benchmarks.accuracy --detector {detector} --write"]), *own, ""]
     return lines
 
 

@@ -1,0 +1,126 @@
+"""Make the corpus: film, detect with both networks, follow the background, and keep what that gives.
+
+    python -m benchmarks.corpus [--films FOLDER] [--workers N] [--refollow] [--keep-films] [FLIGHT ...]
+
+What exists is kept, so an interrupted run goes on. `--refollow` follows the backgrounds anew, with the films
+that are in the folder. A film is removed once all of its flight is kept, unless `--keep-films`. The detectors
+must be there (`mocap models fetch`), and the recorded motions (MOCAP_REAL_DATA).
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.corpus.stored import (
+    DETECTORS,
+    RECORDED,
+    SAMPLE,
+    Flight,
+    Keypoints,
+    flights,
+    write_keypoints,
+    write_tracks,
+)
+from pipelines.detect import detect
+from pipelines.ingest import ingest
+from pipelines.reconstruction.background_tracks import Tracks, follow, people_boxes
+from pipelines.reconstruction.loading import load_cameras
+from pipelines.session.description import read_description
+from pipelines.session.stage_records import StageRecord
+from pipelines.session.stages import locked
+from pipelines.session.tables import KEYPOINTS, read_table
+from pipelines.simulate import simulate
+from pipelines.sources.pictures import open_pictures
+
+
+def main() -> None:
+    """Make the flights that are not complete."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("flights", nargs="*", metavar="FLIGHT", help="names; all by default")
+    parser.add_argument("--films", type=Path, default=Path("build/corpus_films"))
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--refollow", action="store_true", help="follow the backgrounds anew")
+    parser.add_argument("--keep-films", action="store_true")
+    arguments = parser.parse_args()
+    for flight in flights():
+        if arguments.flights and flight.name not in arguments.flights:
+            continue
+        began, spent = time.perf_counter(), time.process_time()
+        if _make(flight, arguments.films, arguments.workers, again=arguments.refollow):
+            took, cpu = time.perf_counter() - began, time.process_time() - spent
+            print(f"{flight.name}: {took:.0f} s, {cpu:.0f} s of the processor", flush=True)
+        if not arguments.keep_films:
+            for path in arguments.films.glob(f"{flight.name}*"):
+                shutil.rmtree(path)
+
+
+def _make(flight: Flight, films: Path, workers: int, *, again: bool) -> bool:
+    """Make what is missing of a flight; return False if nothing is."""
+    missing = [name for name in DETECTORS if not flight.keypoints_path(name).is_file()]
+    follows = flight.with_pictures and (again or not flight.tracks_path.is_file())
+    if not missing and not follows:
+        return False
+    flight.folder.mkdir(parents=True, exist_ok=True)
+    film = _film(flight, films, workers)
+    session = ingest(film / "flight.yaml", films / f"{flight.name}.session").folder
+    for detector in missing:
+        record = _detected(session, detector, workers)
+        counts = {
+            camera: {key: value for key, value in counted.items() if isinstance(value, int)}
+            for camera, counted in record.counts["cameras"].items()
+        }
+        tables = {
+            camera: read_table(session / "detect" / camera / "keypoints.parquet", KEYPOINTS)
+            for camera in counts
+        }
+        found = Keypoints(tuple(record.counts["joints"]), counts, tables)
+        write_keypoints(flight.keypoints_path(detector), found)
+    if follows:
+        record = _detected(session, DETECTORS[0], workers)
+        write_tracks(flight.tracks_path, _follow(session, record))
+    return True
+
+
+def _film(flight: Flight, films: Path, workers: int) -> Path:
+    """Film the flight, or find its film; the sample's is in the repository."""
+    if flight.folder.name == SAMPLE.name:
+        return SAMPLE
+    named = films / f"{flight.name}.scenario"
+    named.mkdir(parents=True, exist_ok=True)
+    scenario = Path(shutil.copy(flight.scenario_path, named))
+    for file, _ in flight.scenario.motion_files(RECORDED).values():
+        shutil.copy(file, named)
+    return simulate(scenario, films / flight.name, workers=workers).folder
+
+
+def _detected(session: Path, detector: str, workers: int) -> StageRecord:
+    with locked(session) as writable:
+        record = detect(writable, detector=detector, workers=workers)
+    assert record is not None, "a film was ingested without pictures"
+    return record
+
+
+def _follow(session: Path, record: StageRecord) -> dict[str, Tracks]:
+    """Follow the background through all pictures of every camera, with the people's boxes left out."""
+    description = read_description(session)
+    cameras, _ = load_cameras(session, description, record, min_confidence=0.3, pose_noise=None)
+    tracks = {}
+    for camera in cameras:
+        with open_pictures(session, description, camera.name) as pictures:
+            read = (pictures.read(number) for number in camera.frame_number.tolist())
+            grey = (
+                None if each is None else np.asarray(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), np.uint8)
+                for each in read
+            )
+            tracks[camera.name] = follow(grey, people_boxes(camera))
+    return tracks
+
+
+if __name__ == "__main__":
+    main()

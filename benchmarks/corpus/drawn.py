@@ -1,0 +1,196 @@
+"""Sessions of the corpus: a flight's logs with errors drawn anew, and the keypoints that are kept.
+
+The flight, its map and its truth come from the scenario. A session is ingested from the same files as any
+other. The stages `detect` and the background's following find what is kept in the place of pictures: the
+videos are grey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+from unittest.mock import patch
+
+import numpy as np
+
+from benchmarks.corpus.stored import RECORDED, Flight, read_keypoints, read_tracks
+from pipelines.detect import Block
+from pipelines.formats.calibrations.ros_camera_info import write_camera_info
+from pipelines.formats.logs.ros2_writing import Ros2Recording
+from pipelines.formats.maps.octomap import write_octomap
+from pipelines.formats.skeletons.bvh import read_motion
+from pipelines.formats.videos.video_writing import write_h264
+from pipelines.geometry.noise import GaussMarkov
+from pipelines.ingest import ingest
+from pipelines.reconstruction.background import Followed, rows_to_follow
+from pipelines.reconstruction.background_tracks import Tracks
+from pipelines.reconstruction.observations import Camera
+from pipelines.session.registries import noise_models
+from pipelines.session.storage import write_json
+from pipelines.session.tables import KEYPOINTS, write_table
+from pipelines.simulate import _planner
+from pipelines.simulation.flight import SimulatedFlight, fly_scenario
+from pipelines.simulation.flight_files import (
+    Sighting,
+    logged_messages,
+    manifest_text,
+    write_alphapose,
+    write_keypoints,
+    write_truth,
+)
+from pipelines.simulation.recording import ACTOR_CORRELATION_S, estimate
+
+Given = Literal["model", "nothing"]
+"""Knowledge of the poses' errors: their model in flight.yaml, or nothing there and no covariances in logs."""
+
+_DRAWS = 100  # first of the numbers that name a draw's random numbers; the flight has those below
+_GREY = 128
+
+
+@dataclass(frozen=True)
+class DrawnFlight:
+    """A flight of the corpus whose logs are drawn as often as wanted.
+
+    `folder` receives the files that all draws share.
+    """
+
+    flight: Flight
+    folder: Path
+
+    @cached_property
+    def simulated(self) -> SimulatedFlight:
+        """The flight with its first logs."""
+        scenario, path = self.flight.scenario, self.flight.scenario_path
+        motions = {
+            name: read_motion(file, unit=motion.unit, axes=motion.axes)
+            for name, (file, motion) in scenario.motion_files(RECORDED).items()
+        }
+        models = noise_models(str(path), scenario.drones.pose_noise)
+        return fly_scenario(scenario, models, bvh=motions, planner=_planner(scenario, path))
+
+    def write_shared(self) -> None:
+        """Write what all draws share: truth, map, calibration, and grey videos."""
+        if (self.folder / "truth").is_dir():
+            return
+        self.folder.mkdir(parents=True)
+        flight = self.simulated
+        spec = flight.scenario.world.map
+        write_octomap(self.folder / "site.bt", flight.world.occupancy(spec.resolution_m, spec.height_m))
+        for drone in flight.drones:
+            lens = drone.intrinsics
+            write_camera_info(self.folder / f"{drone.name}_camera.yaml", drone.name, lens)
+            grey = np.full((lens.height, lens.width, 3), _GREY, np.uint8)
+            stamps = drone.at_frames.t_ns
+            pictures = (grey for _ in stamps)
+            video = self.folder / f"{drone.name}.mp4"
+            write_h264(video, pictures, stamps - stamps[0], width=lens.width, height=lens.height)
+        write_truth(self.folder, flight)
+
+    def session(
+        self, place: Path, draw: int, given: Given, detector: str, *, true_poses: bool = False
+    ) -> Path:
+        """Write the files of one draw, ingest them, and return the session.
+
+        Args:
+            place: a folder for these files and the session.
+            draw: the number of the draw.
+            given: what flight.yaml and the logs give of the poses' errors.
+            detector: the keypoints of a flight without pictures.
+            true_poses: take the true poses in place of logged ones.
+        """
+        place.mkdir(parents=True)
+        for path in self.folder.iterdir():
+            (place / path.name).symlink_to(path.resolve())
+        flight = self._with_logs(draw, given)
+        for drone in flight.drones:
+            with Ros2Recording(place / f"{drone.name}.mcap") as log:
+                for message in logged_messages(flight, drone):
+                    log.write(message.topic, message.type, message.received_ns, message.fields)
+        if not self.flight.with_pictures:
+            self._write_keypoint_files(place, detector)
+        text = manifest_text(flight, video=self.flight.with_pictures, true_poses=true_poses)
+        (place / "flight.yaml").write_text(text, encoding="utf-8")
+        return ingest(place / "flight.yaml", place / "session").folder
+
+    def _with_logs(self, draw: int, given: Given) -> SimulatedFlight:
+        """Draw the errors of poses and of the actors' estimates."""
+        first = self.simulated
+        scenario = first.scenario
+        models = noise_models("pose_noise", scenario.drones.pose_noise)
+        drones = []
+        for index, drone in enumerate(first.drones):
+            rng = np.random.default_rng([scenario.seed, _DRAWS + draw, index])
+            log = estimate(drone.at_log, models, rng)
+            if given == "nothing":
+                log = replace(log, body=replace(log.body, covariance=None))
+            drones.append(replace(drone, log=log))
+        people = []
+        for index, person in enumerate(first.people):
+            rng = np.random.default_rng([scenario.seed, _DRAWS + draw, len(drones) + index])
+            hip = person.moving(person.estimate_ns / 1e9).root
+            error = GaussMarkov(position_m=person.look.estimate_sigma_m, correlation_s=ACTOR_CORRELATION_S)
+            level = np.tile([0.0, 0.0, 0.0, 1.0], (len(hip), 1))
+            drawn = hip + error.errors(person.estimate_ns, hip, level, rng)[:, :3]
+            people.append(replace(person, estimate=drawn))
+        stating = scenario.drones.model_copy(update={"state_pose_noise": given == "model"})
+        scenario = scenario.model_copy(update={"drones": stating})
+        return replace(first, scenario=scenario, drones=drones, people=people)
+
+    def _write_keypoint_files(self, place: Path, detector: str) -> None:
+        """Write the detector's keypoints as AlphaPose does, with the joints of the truth (COCO's)."""
+        kept, flight = read_keypoints(self.flight.keypoints_path(detector)), self.simulated
+        joints = flight.people[0].person.joints
+        for drone in flight.drones:
+            write_keypoints(place, flight, drone)  # for the times of the pictures
+            table, frames = kept.tables[drone.name], len(drone.at_frames.t_ns)
+            table = table[table["joint"].isin(joints)]
+            people = []
+            for track, (_, rows) in enumerate(table.groupby("person"), 1):
+                xy, confidence = np.full((frames, len(joints), 2), np.nan), np.zeros((frames, len(joints)))
+                where = rows["frame"].to_numpy(), [joints.index(name) for name in rows["joint"]]
+                xy[where], confidence[where] = rows[["x", "y"]], rows["confidence"]
+                xy[np.isnan(xy).all(axis=-1).any(axis=-1)] = np.nan
+                people.append(Sighting(track, xy, confidence))
+            write_alphapose(place / f"{drone.name}_keypoints.json", people)
+
+
+@contextmanager
+def kept_in_place_of_pictures(flight: Flight, detector: str) -> Iterator[None]:
+    """Let `reconstruct` find the keypoints and tracks that are kept, in the place of its pictures."""
+    kept = read_keypoints(flight.keypoints_path(detector))
+    tracks = read_tracks(flight.tracks_path) if flight.tracks_path.is_file() else {}
+
+    def produce(work: Any, *others: Any) -> None:
+        block: Block = others[-2]
+        folder: Path = others[-1]
+        frame, t_ns = work.frames(block)
+        table = kept.tables[block.camera]
+        table = table[table["frame"].isin(frame)]
+        times = t_ns[np.searchsorted(frame, table["frame"].to_numpy())]
+        write_table(folder / "keypoints.parquet", table.assign(t_ns=times), KEYPOINTS)
+        counts = kept.counts[block.camera] if not block.first else dict.fromkeys(kept.counts[block.camera], 0)
+        write_json(folder / "counts.json", {"joints": list(kept.joints), "counts": counts})
+
+    def follow(*given: Any) -> dict[str, Any]:
+        cameras: Sequence[Camera] = given[2]
+        return {camera.name: _followed(camera, tracks.get(camera.name)) for camera in cameras}
+
+    with (
+        patch("pipelines.detect._produce", produce),
+        patch("pipelines.detect.hashes_of_models", lambda _: {}),
+        patch("pipelines.reconstruct._follow_backgrounds", follow),
+    ):
+        yield
+
+
+def _followed(camera: Camera, tracks: Tracks | None) -> Followed | str:
+    if tracks is None:
+        return "it came without pictures"
+    rows = rows_to_follow(camera)
+    used = np.isin(tracks.picture, rows)
+    picture = np.searchsorted(rows, tracks.picture[used])
+    return Followed(rows, Tracks(picture, tracks.point[used], tracks.xy[used]))

@@ -1,0 +1,213 @@
+"""Files of the corpus: one folder for each flight, with what took hours to make.
+
+`tuning/` and `kept/` hold a folder for each flight: its scenario, the keypoints of both detectors in its
+pictures, and the tracks of the background. Pixels are rounded (0.1 px for keypoints, 0.05 px for tracks).
+Everything else is made again from the scenario in seconds (`benchmarks.corpus.drawn`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipelines.reconstruction.background_tracks import Tracks
+from pipelines.simulation.scenario import Scenario, read_scenario
+
+Half = Literal["tuning", "kept"]
+HALVES: tuple[Half, ...] = ("tuning", "kept")
+DETECTORS = ("blazepose", "blazepose-heavy")
+
+CORPUS = Path(__file__).parent
+SAMPLE = CORPUS.parents[1] / "sample_data" / "mound_walk"
+RECORDED = Path(os.environ.get("MOCAP_REAL_DATA", CORPUS.parents[2] / "shared" / "data")) / "motion"
+"""Folder of the recorded motions, which are no part of the repository."""
+
+WITHOUT_PICTURES = ("09-crouch", "11-turn", "12-kick", "22-jog")
+"""Flights that come with keypoint files in place of pictures: 17 joints and no background."""
+
+_KEYPOINT_STEP_PX, _TRACK_STEP_PX, _CONFIDENCE_STEP = 0.1, 0.05, 1e-3
+_TRACKS = "background.parquet"
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One flight of the corpus; the sample flight is one of them, for tuning."""
+
+    half: Half
+    folder: Path  # of what is kept
+
+    @property
+    def name(self) -> str:
+        """The folder's name, which begins with the flight's number."""
+        return self.folder.name
+
+    @property
+    def scenario_path(self) -> Path:
+        """The scenario; the sample's lies with its other files."""
+        return (SAMPLE if self.name == SAMPLE.name else self.folder) / "scenario.yaml"
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario."""
+        return read_scenario(self.scenario_path)
+
+    @property
+    def with_pictures(self) -> bool:
+        """True if the flight is reconstructed as one with videos."""
+        return self.name not in WITHOUT_PICTURES
+
+    @property
+    def missing_motions(self) -> list[Path]:
+        """Recorded motions that the scenario names and that are not on this machine."""
+        files = self.scenario.motion_files(RECORDED).values()
+        return [path for path, _ in files if not path.is_file()]
+
+    def keypoints_path(self, detector: str) -> Path:
+        """The file of a detector's keypoints."""
+        return self.folder / f"{detector}.parquet"
+
+    @property
+    def tracks_path(self) -> Path:
+        """The file of the background's tracks."""
+        return self.folder / _TRACKS
+
+
+def flights(halves: Sequence[Half] = HALVES) -> list[Flight]:
+    """List the flights of these halves in the order of their numbers, the sample flight last."""
+    found = [Flight(half, path.parent) for half in halves for path in CORPUS.glob(f"{half}/*/scenario.yaml")]
+    if "tuning" in halves:
+        found.append(Flight("tuning", CORPUS / "tuning" / SAMPLE.name))
+    return sorted(found, key=lambda flight: flight.name)
+
+
+# --- keypoints -----------------------------------------------------------------------------------------
+
+_KEYPOINTS = pa.schema(
+    [
+        ("camera", pa.dictionary(pa.int8(), pa.string())),
+        ("person", pa.int16()),
+        ("joint", pa.int8()),
+        ("frame", pa.int16()),
+        ("x", pa.int16()),
+        ("y", pa.int16()),
+        ("confidence", pa.int16()),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Result of the detection in the pictures of all cameras."""
+
+    joints: tuple[str, ...]
+    counts: dict[str, Any]  # of the stage `detect`, by camera
+    tables: dict[str, pd.DataFrame]  # rows of `tables.KEYPOINTS` without times, by camera
+
+
+def write_keypoints(path: Path, keypoints: Keypoints) -> None:
+    """Write keypoints, rounded."""
+    parts = []
+    for camera, table in keypoints.tables.items():
+        joint = table["joint"].map({name: number for number, name in enumerate(keypoints.joints)})
+        rounded = {
+            "camera": camera,
+            "person": table["person"],
+            "joint": joint,
+            "frame": table["frame"],
+            "x": _steps(table["x"], _KEYPOINT_STEP_PX),
+            "y": _steps(table["y"], _KEYPOINT_STEP_PX),
+            "confidence": _steps(table["confidence"], _CONFIDENCE_STEP),
+        }
+        parts.append(pd.DataFrame(rounded).sort_values(["person", "joint", "frame"]))
+    said = {"joints": json.dumps(keypoints.joints), "counts": json.dumps(keypoints.counts)}
+    _write(path, pd.concat(parts), _KEYPOINTS, said)
+
+
+def read_keypoints(path: Path) -> Keypoints:
+    """Read keypoints in the order in which the detector writes them."""
+    stored = pq.read_table(path)
+    said = {key.decode(): json.loads(value) for key, value in (stored.schema.metadata or {}).items()}
+    joints = tuple(said["joints"])
+    tables = {}
+    ordered = stored.to_pandas().sort_values(["frame", "person", "joint"])
+    for camera, rows in ordered.groupby("camera", observed=True):
+        tables[str(camera)] = pd.DataFrame(
+            {
+                "frame": rows["frame"].to_numpy(np.int64),
+                "person": rows["person"].to_numpy(np.int64),
+                "joint": np.array(joints, dtype=object)[rows["joint"].to_numpy(np.int64)],
+                "x": rows["x"].to_numpy(np.float64) * _KEYPOINT_STEP_PX,
+                "y": rows["y"].to_numpy(np.float64) * _KEYPOINT_STEP_PX,
+                "confidence": rows["confidence"].to_numpy(np.float64) * _CONFIDENCE_STEP,
+            }
+        )
+    return Keypoints(joints, said["counts"], tables)
+
+
+# --- background ----------------------------------------------------------------------------------------
+
+_SIGHTINGS = pa.schema(
+    [
+        ("camera", pa.dictionary(pa.int8(), pa.string())),
+        ("point", pa.int32()),
+        ("picture", pa.int32()),
+        ("x", pa.int16()),
+        ("y", pa.int16()),
+    ]
+)
+
+
+def write_tracks(path: Path, tracks: dict[str, Tracks]) -> None:
+    """Write the tracks of all cameras, rounded; `picture` is the row of the camera's pictures."""
+    parts = [
+        pd.DataFrame(
+            {
+                "camera": camera,
+                "point": seen.point,
+                "picture": seen.picture,
+                "x": _steps(seen.xy[:, 0], _TRACK_STEP_PX),
+                "y": _steps(seen.xy[:, 1], _TRACK_STEP_PX),
+            }
+        ).sort_values(["point", "picture"])
+        for camera, seen in tracks.items()
+    ]
+    _write(path, pd.concat(parts), _SIGHTINGS, {})
+
+
+def read_tracks(path: Path) -> dict[str, Tracks]:
+    """Read the tracks of all cameras in the order in which the follower gives them."""
+    tracks = {}
+    ordered = pq.read_table(path).to_pandas().sort_values(["picture", "point"])
+    for camera, rows in ordered.groupby("camera", observed=True):
+        xy = rows[["x", "y"]].to_numpy(np.float64) * _TRACK_STEP_PX
+        tracks[str(camera)] = Tracks(rows["picture"].to_numpy(np.int64), rows["point"].to_numpy(np.int64), xy)
+    return tracks
+
+
+def _steps(values: Any, step: float) -> Any:
+    return np.rint(np.asarray(values, dtype=np.float64) / step).astype(np.int64)
+
+
+def _write(path: Path, rows: pd.DataFrame, schema: pa.Schema, said: dict[str, str]) -> None:
+    table = pa.Table.from_pandas(rows, schema=schema.with_metadata(said), preserve_index=False)
+    table = table.replace_schema_metadata(said)  # without the note of pandas
+    numbers = [field.name for field in schema if field.name != "camera"]
+    partial = path.with_suffix(".part")
+    pq.write_table(
+        table,
+        partial,
+        compression="zstd",
+        compression_level=19,
+        use_dictionary=["camera"],
+        column_encoding=dict.fromkeys(numbers, "DELTA_BINARY_PACKED"),
+    )
+    partial.replace(path)

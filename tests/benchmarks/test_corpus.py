@@ -1,0 +1,150 @@
+"""Tests of the corpus: valid scenarios, all parts in both halves, and one flight that is measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks.accuracy import FLOOR, Case, _measure, nees, peak_ratio
+from benchmarks.corpus.stored import (
+    CORPUS,
+    HALVES,
+    SAMPLE,
+    Flight,
+    Half,
+    Keypoints,
+    flights,
+    read_keypoints,
+    read_tracks,
+    write_keypoints,
+    write_tracks,
+)
+from pipelines.reconstruction.background_tracks import Tracks
+from pipelines.session.registries import noise_models
+from pipelines.simulation.scenario import Scenario
+
+_MOST_BYTES = 30 * 2**20
+
+
+def _own(half: Half) -> list[Flight]:
+    return [flight for flight in flights([half]) if flight.name != SAMPLE.name]
+
+
+def _motions(scenario: Scenario) -> set[str]:
+    found = set()
+    for person in scenario.people.values():
+        steps = person.motion.steps or []
+        found |= {name for step in steps for name in step.model_fields_set}
+        if person.motion.bvh is not None:
+            found.add("recorded")
+    return found
+
+
+@pytest.mark.parametrize("half", HALVES)
+def test_each_half_holds_all_parts(half: Half) -> None:
+    own = _own(half)
+    scenarios = [flight.scenario for flight in own]
+    assert len(own) == 12
+    assert {scenario.drones.count for scenario in scenarios} == {2, 3, 4}
+    together = set[str]().union(*map(_motions, scenarios))
+    assert together >= {"walk", "jog", "kick", "crouch", "reach", "turn", "stand", "recorded"}
+    assert sum(scenario.schema_version == 2 for scenario in scenarios) == 6
+    assert sum(any(scenario.drones.clock_offsets_s) for scenario in scenarios) == 2
+    assert sum(scenario.actors is not None for scenario in scenarios) >= 1
+    assert sum(not flight.with_pictures for flight in own) == 2
+    rates = {scenario.drones.formation.yaw_rate_deg_per_s == 0 for scenario in scenarios}
+    assert rates == {True, False}, "hovering and moving formations"
+
+
+@pytest.mark.parametrize("half", HALVES)
+def test_each_half_has_every_kind_of_pose_error_at_two_levels(half: Half) -> None:
+    kinds = []
+    for flight in _own(half):
+        stated = flight.scenario.drones.pose_noise
+        noise_models(flight.name, stated)
+        (first, *more) = stated.items()
+        frame = first[1].get("frame", "")
+        kinds.append("mixture" if more else f"{first[0]} {frame}")
+    assert sorted(kinds) == sorted(
+        2 * ["white ", "bias world", "bias body", "drift ", "gauss-markov ", "mixture"]
+    )
+
+
+def test_three_flights_have_a_second_person() -> None:
+    assert sum(flight.scenario.actors is not None for flight in flights()) == 3
+
+
+def test_no_flight_is_in_both_halves_and_each_is_described() -> None:
+    names = [flight.name for flight in flights()]
+    assert len(names) == len(set(names)) == 25
+    text = (CORPUS / "README.md").read_text(encoding="utf-8")
+    assert [name for name in names if name not in text] == []
+
+
+def test_the_corpus_is_at_most_30_mb() -> None:
+    assert sum(path.stat().st_size for path in CORPUS.rglob("*") if path.is_file()) <= _MOST_BYTES
+
+
+def test_keypoints_and_tracks_come_back_rounded(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    joints = ("nose", "left_hip")
+    table = pd.DataFrame(
+        {
+            "frame": np.repeat(np.arange(50), 2),
+            "person": 0,
+            "joint": np.tile(np.array(joints, dtype=object), 50),
+            "x": rng.uniform(-80, 1500, 100),
+            "y": rng.uniform(-80, 900, 100),
+            "confidence": rng.uniform(0, 1, 100),
+        }
+    )
+    write_keypoints(tmp_path / "k.parquet", Keypoints(joints, {"drone1": {"frames": 50}}, {"drone1": table}))
+    back = read_keypoints(tmp_path / "k.parquet")
+    assert back.joints == joints
+    assert back.counts == {"drone1": {"frames": 50}}
+    pd.testing.assert_frame_equal(back.tables["drone1"], table, check_exact=False, atol=0.05001, rtol=0)
+    tracks = Tracks(np.repeat(np.arange(20), 3), np.tile(np.arange(3), 20), rng.uniform(0, 1500, (60, 2)))
+    write_tracks(tmp_path / "t.parquet", {"drone1": tracks})
+    (followed,) = read_tracks(tmp_path / "t.parquet").values()
+    np.testing.assert_array_equal(followed.picture, tracks.picture)
+    np.testing.assert_array_equal(followed.point, tracks.point)
+    np.testing.assert_allclose(followed.xy, tracks.xy, atol=0.02501, rtol=0)
+
+
+def test_robust_is_measured_on_a_flight() -> None:
+    """Errors of a few centimetres in the poses: more than with true poses, less than half a metre."""
+    flight = next(each for each in flights(["tuning"]) if each.name == "01-walk")
+    found = {}
+    for method in ("robust", FLOOR):
+        ((case, outcome),) = _measure(flight, [Case(flight.name, method, "blazepose")])
+        found[case.method] = outcome
+    robust, floor = found["robust"], found[FLOOR]
+    assert robust.error is None
+    assert floor.mpjpe_mm is not None
+    assert robust.mpjpe_mm is not None
+    assert floor.mpjpe_mm < 60 < robust.mpjpe_mm < 500
+    assert robust.measured_share is not None
+    assert robust.measured_share > 0.9
+    assert robust.nees is not None
+
+
+def test_the_squared_error_has_three_degrees_of_freedom() -> None:
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(20_000, 3, 3))
+    error = np.einsum("nij,nj->ni", root, rng.normal(size=(20_000, 3)))
+    squared = nees(error, root @ np.swapaxes(root, 1, 2))
+    # The mean of 20,000 chi-square values with 3 degrees of freedom has a deviation of sqrt(6 / 20,000).
+    assert np.mean(squared) == pytest.approx(3, abs=5 * np.sqrt(6 / 20_000))
+
+
+def test_the_peak_speed_of_a_shrunk_swing_is_as_much_smaller() -> None:
+    t_ns = np.arange(0, 6 * 10**9, 4 * 10**7)
+    swing = np.sin(2 * np.pi * t_ns / 1e9)
+    truth = np.zeros((len(t_ns), 2, 3))
+    truth[:, 0, 0] = swing
+    joints = ("left_wrist", "nose")
+    assert peak_ratio(0.8 * truth, truth, joints, t_ns) == pytest.approx(0.8)
+    assert peak_ratio(truth, 0.01 * truth, joints, t_ns) is None, "slower than 1 m/s"
