@@ -161,21 +161,20 @@ def bind_positions(
     cameras: Sequence[Camera],
     tracks: Mapping[str, Tracks],
     stills: Mapping[str, Stills],
-    constant_m: Float,
     *,
     between: Interpolation,
 ) -> GroundBinding:
     """Bind the constant position errors of cameras to each other by the ground that they see.
 
     Args:
-        cameras: all of them, with poses refined by their backgrounds where that was possible.
-        tracks: background of each camera whose poses were refined by it, in its frames; others give no cloud.
+        cameras: all of them. Moving ones take part whose poses were refined by their backgrounds (`errors`
+            state what is left); still ones are exact unless `sigma` says otherwise.
+        tracks: background of each such camera, in its frames; others give no cloud.
         stills: some pictures of each camera; a camera without them takes no part.
-        constant_m: [C] prior standard deviation per axis of the constant position errors.
         between: rules for interpolating between logged poses.
     """
     views = [_view(camera, tracks.get(camera.name), stills.get(camera.name), between) for camera in cameras]
-    prior = _prior_sigma(cameras, constant_m)
+    prior = _prior_sigma(cameras)
     pairs = [
         (a, b)
         for a, b in permutations(range(len(cameras)), 2)
@@ -203,7 +202,7 @@ def bind_positions(
 def _view(camera: Camera, tracks: Tracks | None, stills: Stills | None, between: Interpolation) -> _View:
     import cv2
 
-    if stills is None or not len(stills.rows):
+    if stills is None or not (camera.static or camera.errors):
         stills = Stills(np.empty(0, np.int64), [])
     if tracks is not None and len(stills.rows):
         points, covariance, by_turn = _cloud(camera, tracks, stills.rows, between)
@@ -462,20 +461,19 @@ def _vertex(before: float, top: float, after: float) -> float:
 # --- the errors --------------------------------------------------------------------------------------------
 
 
-def _prior_sigma(cameras: Sequence[Camera], constant_m: Float) -> Float:
+def _prior_sigma(cameras: Sequence[Camera]) -> Float:
     """Build the prior standard deviations [6 C] of constant errors: positions, then attitudes."""
-    turns = []
-    for camera in cameras:
-        turn = 0.0
+    sigma = np.zeros((2, len(cameras)))
+    for c, camera in enumerate(cameras):
         if camera.errors is not None:
-            turn = float(np.sqrt(sum(p.sigma0**2 for p in camera.errors.processes if p.number == ROTATION)))
+            for kind, number in enumerate((SHIFT_IN_WORLD, ROTATION)):
+                mine = [p.sigma0 for p in camera.errors.processes if p.number == number and p.constant]
+                sigma[kind, c] = np.linalg.norm(mine)
         elif camera.sigma is not None:
-            turn = float(np.median(camera.sigma[:, 1]))
-        turns.append(turn)
-    moving = [not camera.static for camera in cameras]
-    least = np.concatenate([np.zeros(len(cameras)), np.where(moving, _TURN_SIGMA, 0.0)])
-    sigma: Float = np.maximum(np.concatenate([constant_m, turns]), least)
-    return np.maximum(np.repeat(sigma, 3), EXACT)
+            sigma[:, c] = np.median(camera.sigma, axis=0)
+        if not camera.static:
+            sigma[1, c] = max(sigma[1, c], _TURN_SIGMA)
+    return np.maximum(np.repeat(sigma.ravel(), 3), EXACT)
 
 
 def _solve(matches: _Matches, prior: Float) -> tuple[_Solution, Bool]:

@@ -121,7 +121,7 @@ def shift_sigma(camera: Camera) -> float:
 
 def test_offset_between_two_cameras_is_found() -> None:
     cameras, tracks, stills = scene()
-    binding = bind_positions(cameras, tracks, stills, np.full(2, CONSTANT_M), between=BETWEEN)
+    binding = bind_positions(cameras, tracks, stills, between=BETWEEN)
     assert binding.bound == ("north", "east")
     assert not binding.reasons
     left = [
@@ -140,10 +140,9 @@ def test_offset_between_two_cameras_is_found() -> None:
 
 def test_exact_camera_leaves_no_common_offset() -> None:
     cameras, tracks, stills = scene()
-    exact = replace(cameras[1], trajectory=replace(cameras[1].trajectory, position=flown(30, 4.0)[0]))
-    binding = bind_positions(
-        [cameras[0], exact], tracks, stills, np.array([CONSTANT_M, 0.0]), between=BETWEEN
-    )
+    log = replace(cameras[1].trajectory, position=flown(30, 4.0)[0])
+    exact = replace(cameras[1], trajectory=log, errors=PoseErrors((0.0, 0.0), ()))
+    binding = bind_positions([cameras[0], exact], tracks, stills, between=BETWEEN)
     assert binding.bound == ("north", "east")
     assert np.trace(binding.common) < 1e-9
     moved = binding.cameras[0]
@@ -154,7 +153,7 @@ def test_exact_camera_leaves_no_common_offset() -> None:
 
 def test_ground_without_texture_binds_nothing() -> None:
     cameras, tracks, stills = scene(contrast=0.0)
-    binding = bind_positions(cameras, tracks, stills, np.full(2, CONSTANT_M), between=BETWEEN)
+    binding = bind_positions(cameras, tracks, stills, between=BETWEEN)
     assert binding.bound == ()
     assert set(binding.reasons) == {"north", "east"}
     assert binding.cameras == cameras
@@ -169,7 +168,6 @@ def test_camera_with_other_ground_is_not_bound() -> None:
         [*cameras, elsewhere],
         {**tracks, "west": its_tracks},
         {**stills, "west": its_stills},
-        np.full(3, CONSTANT_M),
         between=BETWEEN,
     )
     assert binding.bound == ("north", "east")
@@ -187,8 +185,7 @@ def test_one_camera_alone_is_not_bound(missing: str) -> None:
         tracks.clear()
     else:
         del cameras[1]
-    prior = np.full(len(cameras), CONSTANT_M)
-    binding = bind_positions(cameras, tracks, stills, prior, between=BETWEEN)
+    binding = bind_positions(cameras, tracks, stills, between=BETWEEN)
     assert binding.bound == ()
     assert set(binding.reasons) == {each.name for each in cameras}
     assert binding.cameras == cameras
