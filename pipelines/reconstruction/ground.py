@@ -22,7 +22,8 @@ from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.cameras import project, row_delay_s, undistort
 from pipelines.geometry.noise import EXACT, ROTATION, SHIFT_IN_WORLD, Process
 from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector
-from pipelines.reconstruction.background_tracks import Tracks, people_boxes
+from pipelines.reconstruction.background import Followed
+from pipelines.reconstruction.background_tracks import people_boxes
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 
@@ -50,6 +51,8 @@ _ALIKE, _CLEARER = 0.75, 0.08  # correlation, and by how much it must exceed tha
 _PEAK_CELLS = 4
 _EDGE_PX = 40
 
+_MOST_STILLS = 40  # of a camera
+_MOST_PIXELS = 2_500_000  # of a still: larger ones are halved
 _LEVELS = 3  # of the stills' pyramids
 _SIGMAS = 3.0  # of where a patch should be, that are searched
 _MOST_REACH_CELLS = 12  # beyond that, cells get larger
@@ -98,7 +101,7 @@ class _View:
     by_turn: Float  # [N, 3, 3] derivative of a point by a constant attitude error
     normal: Float  # [N, 3] of the ground about each point
     still_t_ns: Int64  # [S]
-    stills: list[list[Picture]]  # [S] pyramids
+    stills: list[dict[int, Picture]]  # [S] pyramids
     boxes: Float  # [S, D, 4] px of people
 
     def seen(self, points: Float, normal: Float) -> tuple[Bool, Float, Float, Float]:
@@ -159,7 +162,7 @@ class _Solution:
 
 def bind_positions(
     cameras: Sequence[Camera],
-    tracks: Mapping[str, Tracks],
+    followed: Mapping[str, Followed | str],
     stills: Mapping[str, Stills],
     *,
     between: Interpolation,
@@ -169,11 +172,11 @@ def bind_positions(
     Args:
         cameras: all of them. Moving ones take part whose poses were refined by their backgrounds (`errors`
             state what is left); still ones are exact unless `sigma` says otherwise.
-        tracks: background of each such camera, in its frames; others give no cloud.
+        followed: background of each camera by its name, or the reason why there is none.
         stills: some pictures of each camera; a camera without them takes no part.
         between: rules for interpolating between logged poses.
     """
-    views = [_view(camera, tracks.get(camera.name), stills.get(camera.name), between) for camera in cameras]
+    views = [_view(camera, followed.get(camera.name), stills.get(camera.name), between) for camera in cameras]
     prior = _prior_sigma(cameras)
     pairs = [
         (a, b)
@@ -199,22 +202,20 @@ def bind_positions(
 # --- clouds ----------------------------------------------------------------------------------------------
 
 
-def _view(camera: Camera, tracks: Tracks | None, stills: Stills | None, between: Interpolation) -> _View:
-    import cv2
-
-    if stills is None or not (camera.static or camera.errors):
-        stills = Stills(np.empty(0, np.int64), [])
-    if tracks is not None and len(stills.rows):
-        points, covariance, by_turn = _cloud(camera, tracks, stills.rows, between)
-    else:
-        points, covariance, by_turn = np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
+def _view(
+    camera: Camera, followed: Followed | str | None, stills: Stills | None, between: Interpolation
+) -> _View:
+    rows, pyramids = np.empty(0, np.int64), []
+    if stills is not None and (camera.static or camera.errors is not None):
+        used = np.unique(
+            np.linspace(0, len(stills.rows) - 1, min(_MOST_STILLS, len(stills.rows))).astype(int)
+        )
+        rows = stills.rows[used]
+        pyramids = [_pyramid(stills.pictures[k]) for k in used.tolist()]
+    points, covariance, by_turn = np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
+    if isinstance(followed, Followed) and len(rows):
+        points, covariance, by_turn = _cloud(camera, followed, rows, between)
     chosen, normal = _ground(points, covariance)
-    pyramids = []
-    for picture in stills.pictures:
-        levels = [picture]
-        for _ in range(_LEVELS):
-            levels.append(np.asarray(cv2.pyrDown(levels[-1]), dtype=np.uint8))
-        pyramids.append(levels)
     return _View(
         camera,
         between,
@@ -222,27 +223,40 @@ def _view(camera: Camera, tracks: Tracks | None, stills: Stills | None, between:
         covariance[chosen],
         by_turn[chosen],
         normal,
-        camera.frame_t_ns[stills.rows],
+        camera.frame_t_ns[rows],
         pyramids,
-        people_boxes(camera)[stills.rows],
+        people_boxes(camera)[rows],
     )
+
+
+def _pyramid(picture: Picture) -> dict[int, Picture]:
+    """Halve a picture several times: levels by how often. A large picture's own level is left out."""
+    import cv2
+
+    levels = {0: picture}
+    for level in range(_LEVELS):
+        levels[level + 1] = np.asarray(cv2.pyrDown(levels[level]), dtype=np.uint8)
+    return {level: each for level, each in levels.items() if each.size <= _MOST_PIXELS or level == _LEVELS}
 
 
 def _readout(camera: Camera) -> tuple[float, float]:
     return -camera.intrinsics.readout_s / 2, camera.intrinsics.readout_s / 2
 
 
-def _cloud(camera: Camera, tracks: Tracks, rows: Int64, between: Interpolation) -> tuple[Float, Float, Float]:
+def _cloud(
+    camera: Camera, followed: Followed, rows: Int64, between: Interpolation
+) -> tuple[Float, Float, Float]:
     """Triangulate the points that stills show.
 
     Returns:
         Place [N, 3], covariance [N, 3, 3], and derivative by a constant attitude error [N, 3, 3].
     """
-    followed = np.unique(tracks.picture)
-    shown = np.isin(tracks.picture, followed[np.clip(np.searchsorted(followed, rows), 0, len(followed) - 1)])
+    tracks = followed.tracks
+    pictures = np.clip(np.searchsorted(followed.rows, rows), 0, len(followed.rows) - 1)
+    shown = np.isin(tracks.picture, pictures)
     mine = np.flatnonzero(np.isin(tracks.point, np.unique(tracks.point[shown])))
     mine = mine[:: max(1, -(-len(mine) // _MOST_SIGHTINGS))]
-    xy, t_ns = tracks.xy[mine], camera.frame_t_ns[tracks.picture[mine]]
+    xy, t_ns = tracks.xy[mine], camera.frame_t_ns[followed.rows[tracks.picture[mine]]]
     delay_s = np.clip(row_delay_s(xy[:, 1], camera.intrinsics), *_readout(camera))
     when, place = np.unique(t_ns + np.round(1e9 * delay_s).astype(np.int64), return_inverse=True)
     position, rotation = (each[place] for each in camera.poses_at(when, between))
@@ -251,6 +265,8 @@ def _cloud(camera: Camera, tracks: Tracks, rows: Int64, between: Interpolation) 
     known = np.isfinite(ray).all(axis=1)
     ray, position, rotation = ray[known], position[known], rotation[known]
     names, number = np.unique(tracks.point[mine][known], return_inverse=True)
+    if not len(names):
+        return np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
     points = len(names)
     count = np.bincount(number, minlength=points)
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
@@ -398,7 +414,7 @@ def _alike(seen_a: Bool, seen_b: Bool, ray_a: Float, ray_b: Float) -> list[tuple
 class _Cut:
     """Still that orthophotos are cut out of."""
 
-    pyramid: list[Picture]
+    pyramid: dict[int, Picture]
     position: Float  # [3]
     rotation: Float  # [3, 3]
     camera: Camera
@@ -414,7 +430,7 @@ class _Cut:
         if not inside:
             return None
         span_px = float(np.abs(xy - np.roll(xy, 1, axis=0)).max()) / (2 * half)
-        level = int(np.clip(np.log2(max(span_px, 1.0)), 0, _LEVELS))
+        level = int(np.clip(np.log2(max(span_px, 1.0)), min(self.pyramid), _LEVELS))
         to_still = cv2.getPerspectiveTransform(
             (corners + half).astype(np.float32), (xy / 2**level).astype(np.float32)
         )

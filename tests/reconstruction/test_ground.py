@@ -11,6 +11,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, PoseErrors, Process
 from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.reconstruction.background import Followed
 from pipelines.reconstruction.background_tracks import Tracks
 from pipelines.reconstruction.ground import Stills, bind_positions
 from pipelines.reconstruction.observations import Camera
@@ -59,7 +60,7 @@ def filmed(position: Float, rotation: Float, ground: NDArray[np.uint8]) -> NDArr
 
 def camera(
     name: str, azimuth_deg: float, error_m: Float, ground: NDArray[np.uint8], way_m: float = 4.0
-) -> tuple[Camera, Tracks, Stills]:
+) -> tuple[Camera, Followed, Stills]:
     """Film the ground; the log's positions have a constant error."""
     t_ns = np.arange(PICTURES) * 50_000_000
     position, rotation = flown(azimuth_deg, way_m)
@@ -91,7 +92,7 @@ def camera(
     )
     return (
         made,
-        Tracks(picture, point, xy[picture, point]),
+        Followed(np.arange(PICTURES), Tracks(picture, point, xy[picture, point])),
         Stills(rows, [filmed(position[r], rotation[r], ground) for r in rows]),
     )
 
@@ -99,7 +100,7 @@ def camera(
 ERRORS_M = {"north": np.array([0.06, -0.04, 0.05]), "east": np.array([-0.05, 0.03, -0.06])}
 
 
-def scene(contrast: float = 25.0) -> tuple[list[Camera], dict[str, Tracks], dict[str, Stills]]:
+def scene(contrast: float = 25.0) -> tuple[list[Camera], dict[str, Followed | str], dict[str, Stills]]:
     """Film the same ground by two cameras 60 degrees apart."""
     ground = texture(contrast)
     made = [
@@ -108,7 +109,7 @@ def scene(contrast: float = 25.0) -> tuple[list[Camera], dict[str, Tracks], dict
     ]
     return (
         [each for each, _, _ in made],
-        {each.name: tracks for each, tracks, _ in made},
+        {each.name: followed for each, followed, _ in made},
         {each.name: stills for each, _, stills in made},
     )
 
@@ -120,8 +121,8 @@ def shift_sigma(camera: Camera) -> float:
 
 
 def test_offset_between_two_cameras_is_found() -> None:
-    cameras, tracks, stills = scene()
-    binding = bind_positions(cameras, tracks, stills, between=BETWEEN)
+    cameras, followed, stills = scene()
+    binding = bind_positions(cameras, followed, stills, between=BETWEEN)
     assert binding.bound == ("north", "east")
     assert not binding.reasons
     left = [
@@ -139,10 +140,10 @@ def test_offset_between_two_cameras_is_found() -> None:
 
 
 def test_exact_camera_leaves_no_common_offset() -> None:
-    cameras, tracks, stills = scene()
+    cameras, followed, stills = scene()
     log = replace(cameras[1].trajectory, position=flown(30, 4.0)[0])
     exact = replace(cameras[1], trajectory=log, errors=PoseErrors((0.0, 0.0), ()))
-    binding = bind_positions([cameras[0], exact], tracks, stills, between=BETWEEN)
+    binding = bind_positions([cameras[0], exact], followed, stills, between=BETWEEN)
     assert binding.bound == ("north", "east")
     assert np.trace(binding.common) < 1e-9
     moved = binding.cameras[0]
@@ -152,8 +153,8 @@ def test_exact_camera_leaves_no_common_offset() -> None:
 
 
 def test_ground_without_texture_binds_nothing() -> None:
-    cameras, tracks, stills = scene(contrast=0.0)
-    binding = bind_positions(cameras, tracks, stills, between=BETWEEN)
+    cameras, followed, stills = scene(contrast=0.0)
+    binding = bind_positions(cameras, followed, stills, between=BETWEEN)
     assert binding.bound == ()
     assert set(binding.reasons) == {"north", "east"}
     assert binding.cameras == cameras
@@ -162,11 +163,11 @@ def test_ground_without_texture_binds_nothing() -> None:
 
 def test_camera_with_other_ground_is_not_bound() -> None:
     """Two cameras film the same ground, the third other ground: the two are bound, the third is not."""
-    cameras, tracks, stills = scene()
-    elsewhere, its_tracks, its_stills = camera("west", 150, np.zeros(3), texture(25.0)[::-1, ::-1].copy())
+    cameras, followed, stills = scene()
+    elsewhere, its_followed, its_stills = camera("west", 150, np.zeros(3), texture(25.0)[::-1, ::-1].copy())
     binding = bind_positions(
         [*cameras, elsewhere],
-        {**tracks, "west": its_tracks},
+        {**followed, "west": its_followed},
         {**stills, "west": its_stills},
         between=BETWEEN,
     )
@@ -176,16 +177,16 @@ def test_camera_with_other_ground_is_not_bound() -> None:
     assert shift_sigma(binding.cameras[2]) == pytest.approx(CONSTANT_M * np.sqrt(1.5), rel=1e-6)
 
 
-@pytest.mark.parametrize("missing", ["stills", "tracks", "camera"])
+@pytest.mark.parametrize("missing", ["stills", "followed", "camera"])
 def test_one_camera_alone_is_not_bound(missing: str) -> None:
-    cameras, tracks, stills = scene()
+    cameras, followed, stills = scene()
     if missing == "stills":
         del stills["east"]
-    elif missing == "tracks":
-        tracks.clear()
+    elif missing == "followed":
+        followed.clear()
     else:
         del cameras[1]
-    binding = bind_positions(cameras, tracks, stills, between=BETWEEN)
+    binding = bind_positions(cameras, followed, stills, between=BETWEEN)
     assert binding.bound == ()
     assert set(binding.reasons) == {each.name for each in cameras}
     assert binding.cameras == cameras
