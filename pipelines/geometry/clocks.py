@@ -104,6 +104,7 @@ def _median_slope(t_s: Float, lead_s: Float) -> float:
 # --- start of a video ----------------------------------------------------------------------------------
 
 
+_WITHIN_S = 1.0  # largest distance of a start from the approximate one
 _STEP_S = 0.02
 _SMOOTHED_S = 0.1  # standard deviation of the window: a log's poses are noisy from row to row
 _LEAST_WEIGHT = 0.9  # known share of a window: next to gaps and ends its mean is biased
@@ -181,7 +182,6 @@ def fit_start(
     *,
     max_gap_ns: int,
     near_ns: int | None = None,
-    within_s: float = 1.0,
 ) -> StartFit:
     """Find the time at which the video's stamps are 0, such that the points move as the poses predict.
 
@@ -197,8 +197,7 @@ def fit_start(
         quaternion_xyzw: [N, 4] world_from_camera.
         followed: the points.
         max_gap_ns: there is no interpolation between poses further apart than this.
-        near_ns: the approximate start; None for any time that the poses cover.
-        within_s: the largest distance of the start from `near_ns`.
+        near_ns: the start, right to 1 s; None for any time that the poses cover.
 
     Raises:
         ValueError: points and poses agree at no time or at several times; the message explains the reason.
@@ -209,19 +208,19 @@ def fit_start(
     if not np.isfinite(search.gain).any():
         raise ValueError("the poses cover less than half of them")
     near_s = None if near_ns is None else (near_ns - int(t_ns[0])) / 1e9
-    possible = np.isfinite(search.gain) & (near_s is None or np.abs(search.starts_s - near_s) <= within_s)
+    possible = np.isfinite(search.gain) & (near_s is None or np.abs(search.starts_s - near_s) <= _WITHIN_S)
     if not possible.any():
-        raise ValueError(f"the poses cover less than half of them within {within_s:g} s of the stated start")
+        raise ValueError(f"the poses cover less than half of them within {_WITHIN_S:g} s of the stated start")
 
     start_s, sigma_s = search.likeliest(possible)
     explained = search.explained(start_s)
     if near_s is not None:
         likeliest_s, _ = search.likeliest(np.ones(len(possible), np.bool_))
         apart_s = likeliest_s - near_s
-        if abs(apart_s) > within_s and _is_clear(search.explained(likeliest_s) - explained):
+        if abs(apart_s) > _WITHIN_S and _is_clear(search.explained(likeliest_s) - explained):
             raise ValueError(
                 f"they move as the poses do {apart_s:+.2f} s from the stated start, which must be right to"
-                f" {within_s:g} s"
+                f" {_WITHIN_S:g} s"
             )
     if not _is_clear(explained):
         raise ValueError("they do not move as the poses do")

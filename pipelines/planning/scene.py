@@ -202,18 +202,15 @@ def _doubts(scene: Scene) -> list[str]:
 
 
 def hidden_shares(
-    flight: LoggedFlight,
-    description: Description,
-    maps: Sequence[Occupancy],
-    *,
-    start_m: float = PlannerConfig().sight_start_m,
+    flight: LoggedFlight, description: Description, maps: Sequence[Occupancy]
 ) -> dict[str, float]:
     """Compute for each camera the share of moments in which an occupied voxel hid the actor from it.
 
     Ten moments a second, while the camera's pose is known; true poses and hips where they are known. Each
-    map counts from its own time on; unknown voxels are free. `start_m` of the sight line next to the actor
-    is left out: maps contain the actor. Cameras without a pose at any of the moments are left out.
+    map counts from its own time on; unknown voxels are free. The end of the sight line next to the actor is
+    left out (the default `sight_start_m`): maps contain the actor. So are cameras that never have a pose.
     """
+    start_m = PlannerConfig().sight_start_m
     first_ns, last_ns = int(flight.actor_t_ns[0]), int(flight.actor_t_ns[-1])
     count = max(2, round((last_ns - first_ns) / 1e9 * _HIDDEN_HZ) + 1)
     t_ns = np.linspace(first_ns, last_ns, count).round().astype(np.int64)

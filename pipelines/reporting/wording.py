@@ -17,6 +17,7 @@ ABSENT = "–"
 # A stamp after this one counts from the epoch: no log counts 30 years since its own start.
 _EPOCH_SINCE_NS = 946_684_800_000_000_000  # 2000-01-01
 
+_LABEL = 24  # most characters of a label
 _FORMULA = re.compile(r"(?:^|(?<=[;\t\r\n]))(?=[-=+@\t\r\n＝＋－＠])")
 
 STATUS_LABELS = {
@@ -84,9 +85,9 @@ def percent(share: float | None) -> str:
     return quantity(100 * share, "%", 0 if share in {0, 1} else 1)
 
 
-def plural(count: float, noun: str, nouns: str = "") -> str:
+def plural(count: float, noun: str) -> str:
     """Format a count with its noun: `1 frame`, `2 frames`."""
-    return f"{whole(count)} {noun if count == 1 else nouns or noun + 's'}"
+    return f"{whole(count)} {noun if count == 1 else noun + 's'}"
 
 
 def listing(words: Iterable[str]) -> str:
@@ -95,11 +96,11 @@ def listing(words: Iterable[str]) -> str:
     return f"{', '.join(most)} and {last}" if most else last
 
 
-def shortened(label: str, length: int = 24) -> str:
+def shortened(label: str) -> str:
     """Shorten a name for a figure's label: printable, on one line, cut in the middle if it is long."""
     clean = "".join(c if c.isprintable() else " " for c in label).strip()
-    half = (length - 1) // 2
-    return clean if len(clean) <= length else f"{clean[:half]}…{clean[-half:]}"
+    half = (_LABEL - 1) // 2
+    return clean if len(clean) <= _LABEL else f"{clean[:half]}…{clean[-half:]}"
 
 
 def cell_text(value: object) -> object:

@@ -335,14 +335,13 @@ def hashes_of_models(detector: Detector) -> dict[str, str]:
     return {name: sha256_of(path) for name, path in detector.models().items() if path is not None}
 
 
-def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format] | None = None) -> F:
+def recognise(path: Path, protocol: type[F], noun: str) -> F:
     """Find the one registered format of a kind that recognises a file.
 
     Args:
         path: an existing file or folder.
         protocol: the kind, one of the runtime-checkable protocols above.
         noun: the kind's name in messages ("keypoint file", "camera trajectory").
-        formats: the candidates; every registered format by default.
 
     Raises:
         DataError: the path is missing, no format of the kind knows it, or several do.
@@ -352,7 +351,7 @@ def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format
             path, "does not exist", "check the path; paths are relative to the file that names them"
         )
     refuse_special(path)
-    candidates = [f for f in (FORMATS.all() if formats is None else formats) if isinstance(f, protocol)]
+    candidates = [f for f in FORMATS.all() if isinstance(f, protocol)]
     matches = [f for f in candidates if f.recognises(path)]
     if len(matches) == 1:
         return matches[0]

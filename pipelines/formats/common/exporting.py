@@ -133,8 +133,8 @@ def shown_surface(recording: Recording, occupancy: Occupancy, export: str) -> Ma
     return surface
 
 
-def surface_of(occupancy: Occupancy, most: int = MOST_CUBES) -> MapSurface:
-    """Find the surface of a map, in cubes of as few whole voxels as give at most `most` cubes.
+def surface_of(occupancy: Occupancy) -> MapSurface:
+    """Find the surface of a map, in cubes of as few whole voxels as give at most `MOST_CUBES`.
 
     Voxels beyond the map's box and unknown voxels count as not occupied.
     """
@@ -155,7 +155,7 @@ def surface_of(occupancy: Occupancy, most: int = MOST_CUBES) -> MapSurface:
         found.append(here.astype(np.int64) + np.array([first, 0, 0]))
     voxels = np.concatenate(found)
     gathered, cubes = 1, voxels
-    while len(cubes) > most:
+    while len(cubes) > MOST_CUBES:
         gathered += 1
         cubes = np.unique(voxels // gathered, axis=0)
     cube_m = occupancy.resolution_m * gathered

@@ -18,6 +18,7 @@ TICK_S = Fraction(1, 90_000)
 """Unit of the stamps, as in MPEG; a stamp is off by up to 5.6 microseconds."""
 
 # The edit list that shifts a part to its start counts in the movie's own unit, by default 1 ms.
+_KEY_EVERY = 60  # frames from one key frame to the next; a seek goes to a key frame
 _OPTIONS = {"movflags": "faststart", "movie_timescale": str(TICK_S.denominator)}
 
 
@@ -29,7 +30,6 @@ def write_h264(
     width: int,
     height: int,
     quality: int = 23,
-    key_every: int = 60,
     bits_per_s: int | None = None,
 ) -> None:
     """Encode pictures [height, width, 3] BGR as an H.264 MP4, 4:2:0, in one thread.
@@ -40,7 +40,6 @@ def write_h264(
         width: of the pictures, even.
         height: of the pictures, even.
         quality: x264's constant rate factor; 18 looks lossless, 28 poor.
-        key_every: frames from one key frame to the next; a seek goes to a key frame.
         bits_per_s: a mean rate over a second, kept in place of the quality.
     """
     import av
@@ -54,7 +53,7 @@ def write_h264(
         rate = {"crf": str(quality)}
         if bits_per_s is not None:
             rate = {name: str(bits_per_s) for name in ("b", "maxrate", "bufsize")}
-        stream.codec_context.options = {**rate, "preset": "fast", "g": str(key_every), "bf": "0"}
+        stream.codec_context.options = {**rate, "preset": "fast", "g": str(_KEY_EVERY), "bf": "0"}
         for pts, picture in zip(ticks, pictures, strict=True):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
             frame.pts, frame.time_base = pts, TICK_S

@@ -10,6 +10,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.simulation.motion import gait
 
 _SPACING_M = 0.02
+_WALK_MPS2, _RUN_MPS2 = 0.9, 1.9  # mean accelerations
 _ROUNDED_M = 0.4  # a corner is cut over this far on either side
 
 
@@ -96,15 +97,15 @@ class Pace:
     knots: tuple[tuple[float, float, float], ...]
 
 
-def pace(parts: Sequence[Part], *, walk_mps2: float = 0.9, run_mps2: float = 1.9) -> Pace:
+def pace(parts: Sequence[Part]) -> Pace:
     """Compute speeds over time from a stand to a stand.
 
     Each part has its own speed where it is long enough for that.
 
-    Speed goes from one knot to the next as a smooth step, at `walk_mps2` or `run_mps2` on average; where a
+    Speed goes from one knot to the next as a smooth step, at `_WALK_MPS2` or `_RUN_MPS2` on average; where a
     part is slower than the next, it is slower to its end.
     """
-    gains = [run_mps2 if part.run else walk_mps2 for part in parts]
+    gains = [_RUN_MPS2 if part.run else _WALK_MPS2 for part in parts]
     between = [0.0, *(min(a.speed_mps, b.speed_mps) for a, b in pairwise(parts)), 0.0]
     for i, (part, gain) in enumerate(zip(parts, gains, strict=True)):
         between[i + 1] = min(between[i + 1], (between[i] ** 2 + 2 * gain * part.length_m) ** 0.5)
