@@ -55,7 +55,7 @@ _MOST_STILLS = 40  # of a camera
 _MOST_PIXELS = 2_500_000  # of a still: larger ones are halved
 _LEVELS = 3  # of the stills' pyramids
 _SIGMAS = 3.0  # of where a patch should be, that are searched
-_MOST_REACH_CELLS = 12  # beyond that, cells get larger
+_MOST_REACH_CELLS = 20  # beyond that, cells get larger
 _MOST_SIGHTINGS = 500_000  # of a cloud
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
 _AGREEING = 9.2  # 99 % of it
@@ -367,12 +367,16 @@ def _compare(
                 row[:, turns + 3 * a : turns + 3 * a + 3] = -first.by_turn[i]
                 expected = row @ known.errors
                 spread = row @ known.covariance @ row.T + first.covariance[i]
-                reach = _SIGMAS * float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
+                axes = _axes(first.normal[i], ray_b[t, i])
+                # A height is seen beside its place on the plane, along the second camera's ray.
+                onto = np.outer(ray_b[t, i], first.normal[i]) / (ray_b[t, i] @ first.normal[i])
+                fallen = axes @ (np.eye(3) - onto)
+                reach = _SIGMAS * np.sqrt(np.diagonal(fallen @ spread @ fallen.T))
                 moved = _displacement(
                     _Cut(first.stills[s], position_a[s, i], rotation_a[s, i], first.camera),
                     _Cut(second.stills[t], position_b[t, i], rotation_b[t, i], second.camera),
                     first.points[i],
-                    first.normal[i],
+                    axes,
                     expected,
                     reach,
                 )
@@ -419,8 +423,8 @@ class _Cut:
     rotation: Float  # [3, 3]
     camera: Camera
 
-    def orthophoto(self, centre: Float, axes: Float, half: int, cell_m: float) -> Picture | None:
-        """Cut out [2 half + 1]^2 cells about a point, along two axes [2, 3]; None if they are not inside."""
+    def orthophoto(self, centre: Float, axes: Float, half: Int64, cell_m: float) -> Picture | None:
+        """Cut out 2 half + 1 cells [2] along each of two axes [2, 3] about a point; None if not inside."""
         import cv2
 
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
@@ -429,42 +433,57 @@ class _Cut:
         inside = (xy > 0).all() and (xy < [width - 1, height - 1]).all() and (depth > 0).all()
         if not inside:
             return None
-        span_px = float(np.abs(xy - np.roll(xy, 1, axis=0)).max()) / (2 * half)
+        sides_px = np.abs(xy - np.roll(xy, 1, axis=0)).max(axis=1)
+        span_px = float((sides_px / (2 * half[[1, 0, 1, 0]])).max())
         level = int(np.clip(np.log2(max(span_px, 1.0)), min(self.pyramid), _LEVELS))
         to_still = cv2.getPerspectiveTransform(
             (corners + half).astype(np.float32), (xy / 2**level).astype(np.float32)
         )
-        size = (2 * half + 1, 2 * half + 1)
+        size = (2 * half + 1).tolist()
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         cut = cv2.warpPerspective(self.pyramid[level], to_still, size, flags=flags)
         return np.asarray(cv2.GaussianBlur(cut.astype(np.float32), (0, 0), _BLUR_CELLS))
 
 
+def _axes(normal: Float, ray: Float) -> Float:
+    """Build two axes [2, 3] of a plane: away along a ray, and across it."""
+    along = ray - (ray @ normal) * normal
+    along /= np.linalg.norm(along)
+    return np.stack([along, np.cross(normal, along)])
+
+
 def _displacement(
-    a: _Cut, b: _Cut, point: Float, normal: Float, expected: Float, reach_m: float
+    a: _Cut, b: _Cut, point: Float, axes: Float, expected: Float, reach_m: Float
 ) -> Float | None:
-    """Find a patch of one still in another: its shift [3] in the plane beyond `point`; None if not clear."""
+    """Find a patch of one still in another: its shift [3] in the plane beyond `point`; None if not clear.
+
+    Args:
+        a: the still that the patch is cut out of.
+        b: the still that is searched.
+        point: [3] centre of the patch.
+        axes: [2, 3] of its plane.
+        expected: [3] shift at which the search begins.
+        reach_m: [2] how far it goes along each axis.
+    """
     import cv2
 
-    first = np.cross([0.0, 1.0, 0.0], normal)
-    first /= np.linalg.norm(first)
-    axes = np.stack([first, np.cross(normal, first)])
-    cell_m = max(_CELL_M, reach_m / _MOST_REACH_CELLS)
-    reach = max(int(np.ceil(reach_m / cell_m)), _PEAK_CELLS + 2)
-    searched = b.orthophoto(point + expected, axes, _HALF_CELLS + reach, cell_m)
-    wanted = a.orthophoto(point, axes, _HALF_CELLS, cell_m)
+    cell_m = max(_CELL_M, float(reach_m.max()) / _MOST_REACH_CELLS)
+    half = np.full(2, _HALF_CELLS)
+    reach = np.maximum(np.ceil(reach_m / cell_m).astype(np.int64), _PEAK_CELLS + 2)
+    searched = b.orthophoto(point + expected, axes, half + reach, cell_m)
+    wanted = a.orthophoto(point, axes, half, cell_m)
     if wanted is None or searched is None or wanted.std() < _FLAT:
         return None
     alike = cv2.matchTemplate(searched, wanted, cv2.TM_CCOEFF_NORMED)
     y, x = np.unravel_index(int(alike.argmax()), alike.shape)
-    if not (0 < x < 2 * reach and 0 < y < 2 * reach) or alike[y, x] < _ALIKE:
+    if not (0 < x < 2 * reach[0] and 0 < y < 2 * reach[1]) or alike[y, x] < _ALIKE:
         return None
     other = alike.copy()
     other[max(0, y - _PEAK_CELLS) : y + _PEAK_CELLS + 1, max(0, x - _PEAK_CELLS) : x + _PEAK_CELLS + 1] = -1
     if alike[y, x] - other.max() < _CLEARER:
         return None
-    right = _vertex(*alike[y, x - 1 : x + 2]) + x - reach
-    down = _vertex(*alike[y - 1 : y + 2, x]) + y - reach
+    right = _vertex(*alike[y, x - 1 : x + 2]) + x - reach[0]
+    down = _vertex(*alike[y - 1 : y + 2, x]) + y - reach[1]
     moved: Float = expected + cell_m * (right * axes[0] + down * axes[1])
     return moved
 
