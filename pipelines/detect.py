@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.follow import BLOCK, Following
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.hints import Hint, actor_hints
 from pipelines.keypoints.tracking import PeopleTracker
@@ -63,8 +64,6 @@ if TYPE_CHECKING:
 
 DETECT = Stage("detect", revision=3)
 
-_BLOCK = 300  # pictures: ten seconds of work are a small loss, and a search at each start costs little
-
 
 @dataclass(frozen=True)
 class Block:
@@ -99,6 +98,7 @@ def detect(
     end_s: float | None = None,
     workers: int = 1,
     force: bool = False,
+    following: Following | None = None,
     progress: Progress | None = None,
 ) -> StageRecord | None:
     """Detect keypoints for cameras without imported ones.
@@ -113,6 +113,7 @@ def detect(
         end_s: use only pictures before this time; by default to the last.
         workers: the number of blocks in parallel; the result does not depend on it.
         force: run it again even if nothing changed.
+        following: is shown the pictures too.
         progress: receives the progress.
 
     Returns:
@@ -167,7 +168,7 @@ def detect(
         )
     progress.start("Detecting keypoints", pictures)
     hints_at = _Hints(session.folder, description, media)
-    produce = partial(_produce, work, hints_at, chosen, people == 1, progress)
+    produce = partial(_produce, work, hints_at, chosen, people == 1, following, progress)
     folders = side_by_side(
         lambda block: run.chunk(block.name, partial(produce, block)), blocks, workers=workers, halt=work.halt
     )
@@ -322,8 +323,8 @@ class _Work:
     def blocks(self, camera: str) -> list[Block]:
         """List the blocks of a camera; a single empty one if no picture is in the span."""
         rows = self._spans[camera]
-        firsts = rows[::_BLOCK] or [rows.start]
-        return [Block(camera, first, min(first + _BLOCK, rows.stop)) for first in firsts]
+        firsts = rows[::BLOCK] or [rows.start]
+        return [Block(camera, first, min(first + BLOCK, rows.stop)) for first in firsts]
 
     def span(self, camera: str) -> tuple[int, int]:
         """Return the first row of a camera's frame table that is used, and the row after the last."""
@@ -373,6 +374,7 @@ def _produce(
     hints: _Hints,
     detector: Detector,
     only_one: bool,
+    following: Following | None,
     progress: Progress,
     block: Block,
     folder: Path,
@@ -383,15 +385,21 @@ def _produce(
     tracker = PeopleTracker(networks, only_one=only_one)
     found: list[tuple[int, int, Float, Float]] = []
     undecoded = 0
+    part = None if following is None else following.part(block.camera, block.first)
+    before = [] if part is None or part.block.before is None else [part.block.before]
     numbers = frame.tolist()
     # Left early, the pictures must not be closed while the next one is being decoded.
     with (
         open_pictures(work.folder, work.description, block.camera) as pictures,
-        closing(_decoded_ahead(pictures, numbers)) as decoded,
+        closing(_decoded_ahead(pictures, before + numbers)) as decoded,
     ):
+        if part is not None and before:
+            part.see(before[0], next(decoded))
         for number, picture, hint in zip(numbers, decoded, hints.at(block.camera, t_ns), strict=True):
             work.halt.check()
             progress.advance()
+            if part is not None:
+                part.see(number, picture)
             if picture is None:
                 undecoded += 1
                 continue
@@ -399,6 +407,8 @@ def _produce(
                 (number, seen.track, seen.person.xy, seen.person.confidence)
                 for seen in tracker.step(picture, hint=hint)
             ]
+    if following is not None and part is not None:
+        following.keep(part)
     write_table(folder / "keypoints.parquet", _table(found, networks, frame, t_ns), KEYPOINTS)
     counts = {**tracker.counts, "detections": len(found), "undecoded": undecoded}
     write_json(folder / "counts.json", {"joints": list(networks.joints), "counts": counts})

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipelines.detect import detect, hints_from, hints_of
-from pipelines.geometry.arrays import Bool, Float, Int64, Picture
+from pipelines.follow import Following
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -27,8 +28,8 @@ from pipelines.keypoints.association import Association, associate
 from pipelines.keypoints.calibration import measured_for, read_calibration
 from pipelines.keypoints.no_people import Ground, Scene, level_of
 from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
-from pipelines.reconstruction.background import Followed, refine_cameras, rows_to_follow
-from pipelines.reconstruction.background_tracks import follow, people_boxes
+from pipelines.reconstruction.background import refine_cameras
+from pipelines.reconstruction.background_tracks import Followed, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import Doubt, doubts_of, said_doubts
 from pipelines.reconstruction.doubts.scene import Ground as GroundOfMap
 from pipelines.reconstruction.finishing import finish
@@ -68,7 +69,6 @@ from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
-from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -147,14 +147,17 @@ def reconstruct(
         if ingested is None:
             raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
         description = read_description(folder)
+        following = None
         if settings.refine_cameras == "background":
-            refuse_changed_pictures(folder, description, _with_background(description))
-        detected = _detected(session, settings, workers, force, progress)
+            span_s = (settings.start_s, settings.end_s)
+            following = Following(session, every=settings.every, span_s=span_s, force=force)
+        detected = _detected(session, settings, workers, force, following, progress)
+        background = following.finish(workers=workers, progress=progress) if following else None
         measured = measured_for(detected.settings["detector"]) if detected else None
         run = session.begin(
             RECONSTRUCT,
             settings=_stated(settings, detected),
-            inputs=_inputs(ingested, detected, measured),
+            inputs=_inputs(ingested, detected, background, measured),
             force=force,
         )
         if run.finished:
@@ -173,9 +176,7 @@ def reconstruct(
         )
         cameras, swaps = _without_swaps(cameras)
         progress.advance()
-        followed = {}
-        if settings.refine_cameras == "background":
-            followed = _follow_backgrounds(folder, description, cameras, progress)
+        followed = _followed(folder, cameras) if background else {}
         actor = logged_actor(folder, description)
         flight = _Flight(
             description,
@@ -235,7 +236,12 @@ def ground_of(folder: Path, description: Description, actor: LoggedActor | None)
 
 
 def _detected(
-    session: WritableSession, settings: Settings, workers: int, force: bool, progress: Progress
+    session: WritableSession,
+    settings: Settings,
+    workers: int,
+    force: bool,
+    following: Following | None,
+    progress: Progress,
 ) -> StageRecord | None:
     """Run the stage `detect`; return None if every camera has imported keypoints."""
     detected = detect(
@@ -247,6 +253,7 @@ def _detected(
         end_s=settings.end_s,
         workers=workers,
         force=force,
+        following=following,
         progress=progress,
     )
     if detected is None and (settings.start_s, settings.end_s) != (None, None):
@@ -265,9 +272,12 @@ def _stated(settings: Settings, detected: StageRecord | None) -> dict[str, objec
     return asdict(settings) | {"detector": detected.settings["detector"] if detected else None}
 
 
-def _inputs(ingested: StageRecord, detected: StageRecord | None, measured: Path | None) -> dict[str, str]:
+def _inputs(
+    ingested: StageRecord, detected: StageRecord | None, background: StageRecord | None, measured: Path | None
+) -> dict[str, str]:
     """The hashes of what is read: tables, hints of the detector, and how its confidences were measured."""
     inputs = dict(ingested.outputs) | (detected.outputs | hints_from(detected) if detected else {})
+    inputs |= background.outputs if background else {}
     return inputs if measured is None else inputs | {"calibration of confidences": sha256_of(measured)}
 
 
@@ -499,15 +509,6 @@ def chosen_detections(cameras: Sequence[Camera], found: Candidates, association:
     return chosen
 
 
-def _with_background(description: Description) -> list[str]:
-    """List the moving cameras with pictures."""
-    return [
-        name
-        for name, entry in description.cameras.items()
-        if entry.media is not None and not entry.poses.static
-    ]
-
-
 def _people_seen(cameras: Sequence[Camera], association: Association) -> dict[str, Any]:
     """Count people seen at once, times with more people than requested, and unused detections."""
     asked = association.choice.shape[2]
@@ -582,38 +583,15 @@ def _readout_warnings(readout: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _follow_backgrounds(
-    folder: Path, description: Description, cameras: list[Camera], progress: Progress
-) -> dict[str, Followed | str]:
-    """Track the background of every moving camera with pictures; for the others, return the reason."""
+def _followed(folder: Path, cameras: Sequence[Camera]) -> dict[str, Followed | str]:
+    """Load the background of every moving camera with pictures; for the others, return the reason."""
     followed: dict[str, Followed | str] = {}
     for camera in cameras:
         if camera.static:
             followed[camera.name] = "it stands still"
-        elif description.cameras[camera.name].media is None:
-            followed[camera.name] = "it came without pictures"
         else:
-            rows = rows_to_follow(camera)
-            numbers = camera.frame_number[rows].tolist()
-            progress.start(f"Following the background of {camera.name}", len(rows))
-            with open_pictures(folder, description, camera.name) as pictures:
-                grey = (_grey(pictures.read(number), progress) for number in numbers)
-                tracks = follow(grey, people_boxes(camera)[rows])
-            followed[camera.name] = Followed(rows, tracks)
-    if not any(isinstance(each, Followed) for each in followed.values()):
-        raise DataError(
-            "--refine-cameras",
-            "no moving camera has pictures to look at",
-            "state their `video`, or leave it out",
-        )
+            followed[camera.name] = load_tracks(folder, camera) or "it came without pictures"
     return followed
-
-
-def _grey(picture: Picture | None, progress: Progress) -> Picture | None:
-    import cv2
-
-    progress.advance()
-    return None if picture is None else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 def _refine_cameras(

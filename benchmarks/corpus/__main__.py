@@ -29,7 +29,7 @@ from benchmarks.corpus.stored import (
 )
 from pipelines.detect import detect
 from pipelines.ingest import ingest
-from pipelines.reconstruction.background_tracks import Tracks, follow, people_boxes
+from pipelines.reconstruction.background_tracks import Tracks, follow, off_people, people_boxes
 from pipelines.reconstruction.loading import load_cameras
 from pipelines.session.description import read_description
 from pipelines.session.stage_records import StageRecord
@@ -118,7 +118,7 @@ def _follow(session: Path, record: StageRecord) -> dict[str, Tracks]:
                 None if each is None else np.asarray(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), np.uint8)
                 for each in read
             )
-            tracks[camera.name] = follow(grey, people_boxes(camera))
+            tracks[camera.name] = off_people(follow(grey), people_boxes(camera))
     return tracks
 
 

@@ -26,10 +26,10 @@ from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.noise import GaussMarkov
 from pipelines.ingest import ingest
-from pipelines.reconstruction.background import Followed, rows_to_follow
-from pipelines.reconstruction.background_tracks import Tracks
+from pipelines.reconstruction.background_tracks import Followed, Tracks, rows_to_follow
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.registries import noise_models
+from pipelines.session.stage_records import StageRecord
 from pipelines.session.storage import write_json
 from pipelines.session.tables import KEYPOINTS, write_table
 from pipelines.simulate import _planner
@@ -175,22 +175,36 @@ def kept_in_place_of_pictures(flight: Flight, detector: str) -> Iterator[None]:
         counts = kept.counts[block.camera] if not block.first else dict.fromkeys(kept.counts[block.camera], 0)
         write_json(folder / "counts.json", {"joints": list(kept.joints), "counts": counts})
 
-    def follow(*given: Any) -> dict[str, Any]:
-        cameras: Sequence[Camera] = given[2]
+    def follow(_: Path, cameras: Sequence[Camera]) -> dict[str, Any]:
         return {camera.name: _followed(camera, tracks.get(camera.name)) for camera in cameras}
 
     with (
         patch("pipelines.detect._produce", produce),
         patch("pipelines.detect.hashes_of_models", lambda _: {}),
-        patch("pipelines.reconstruct._follow_backgrounds", follow),
+        patch("pipelines.reconstruct.Following", _Followed),
+        patch("pipelines.reconstruct._followed", follow),
     ):
         yield
+
+
+class _Followed:
+    """Backgrounds that were followed before, in the place of `pipelines.follow.Following`."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        pass
+
+    def part(self, *_: object) -> None:
+        """Look at no pictures."""
+
+    def finish(self, **_: object) -> StageRecord:
+        """Return the record of a stage without files."""
+        return StageRecord("background", 1, "kept", {}, {}, {}, {}, [])
 
 
 def _followed(camera: Camera, tracks: Tracks | None) -> Followed | str:
     if tracks is None:
         return "it came without pictures"
-    rows = rows_to_follow(camera)
+    rows = rows_to_follow(camera.frame_t_ns)
     used = np.isin(tracks.picture, rows)
     picture = np.searchsorted(rows, tracks.picture[used])
     return Followed(rows, Tracks(picture, tracks.point[used], tracks.xy[used]))

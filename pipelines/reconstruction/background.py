@@ -8,7 +8,7 @@ nothing, or contradicts the log, the logged poses stay, with the reason in one l
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,29 +18,10 @@ from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.noise import EXACT, ROTATION, PoseErrors, Process
 from pipelines.geometry.poses import quaternion_from_matrix, velocities
 from pipelines.reconstruction.background_adjustment import Adjusted, PosePrior, SeenPoints, adjust
-from pipelines.reconstruction.background_tracks import Tracks
+from pipelines.reconstruction.background_tracks import Followed, Tracks
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Trajectory
-
-_MOST_HZ = 60.0  # of the pictures that are followed
-
-
-@dataclass(frozen=True)
-class Followed:
-    """Background of one camera."""
-
-    rows: Int64  # [T] of its frames
-    tracks: Tracks  # their `picture` counts these rows
-
-
-def rows_to_follow(camera: Camera) -> Int64:
-    """Choose the frames [T] in which a camera's background is followed."""
-    frames = len(camera.frame_t_ns)
-    if frames < 2:
-        return np.arange(frames)
-    period_s = float(np.median(np.diff(camera.frame_t_ns))) / 1e9
-    return np.arange(0, frames, max(1, round(1 / (_MOST_HZ * period_s))))
 
 
 def refine_cameras(

@@ -1,39 +1,164 @@
-"""Points of the background followed through the pictures of one camera, people left out.
+"""Points of the background followed through the pictures of one camera, and pictures of it.
 
 Corners (Shi & Tomasi 1994) are followed by pyramidal Lucas-Kanade, forwards and back again. Points that do
-not return to their start are dropped. Everything inside the boxes of detected people is left out.
+not return to their start are dropped. Everything is followed, people too, so that tracks depend on the
+pictures alone; sightings on people are dropped when tracks are loaded.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bytes, Float, Int64
 from pipelines.reconstruction.observations import Camera
+from pipelines.session.errors import DataError
+from pipelines.session.tables import TRACKS, table_parts
 
-UInt8 = NDArray[np.uint8]
-
-_MOST, _FEWEST = 400, 250  # points in a picture; new ones are looked for when fewer are left
+_MOST, _FEWEST = 300, 200  # points in a picture; new ones are looked for when fewer are left
 _APART_PX, _EDGE_PX = 20, 8
 _QUALITY = 0.005  # of the best corner
 _RETURN_PX = 0.3
 _WINDOW_PX, _LEVELS = 21, 3
-_AROUND = 0.25  # of a person's box on each side: arms beyond joints, and 20 px of shadow
-_AROUND_PX = 20.0
+_AROUND, _AROUND_PX = 0.03, 10.0  # of a person's box on each side, and px: arms beyond joints
+_MOST_HZ = 60.0  # of the pictures that are followed
+_MOST_SIGHTINGS = 8_000_000  # that are loaded: a fifth of the points after an hour
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Sightings of background points: K of them."""
+    """Sightings of background points: K of them, sorted by picture."""
 
     picture: Int64  # [K] row of the pictures
     point: Int64  # [K] number of the point
     xy: Float  # [K, 2] px
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Background of one camera."""
+
+    rows: Int64  # [T] of its frames
+    tracks: Tracks  # their `picture` counts these rows
+
+
+class _LazyPictures(Sequence[Bytes]):
+    """Grey pictures [H, W] in files, decoded one at a time."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths = paths
+
+    def __len__(self) -> int:
+        """Count the pictures."""
+        return len(self._paths)
+
+    @overload
+    def __getitem__(self, index: int) -> Bytes: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Bytes]: ...
+
+    def __getitem__(self, index: int | slice) -> Bytes | Sequence[Bytes]:
+        """Decode a picture.
+
+        Raises:
+            DataError: it cannot be decoded.
+        """
+        import cv2
+
+        if isinstance(index, slice):
+            return _LazyPictures(self._paths[index])
+        picture = cv2.imdecode(np.frombuffer(self._paths[index].read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+        if picture is None:
+            raise DataError(self._paths[index], "cannot be decoded", "run `mocap reconstruct --force`")
+        return np.asarray(picture, dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class Stills:
+    """Some grey pictures of one camera."""
+
+    rows: Int64  # [S] of its frames
+    pictures: Sequence[Bytes]  # each is decoded when it is looked at
+
+
+def tracks_path(folder: Path) -> Path:
+    """Return the file of a camera's tracks in its folder of the stage `background`."""
+    return folder / "tracks.parquet"
+
+
+def still_name(number: int) -> str:
+    """Return the name of the file of a still by its frame's number."""
+    return f"{number:09d}.jpg"
+
+
+def rows_to_follow(t_ns: Int64) -> Int64:
+    """Choose the frames, of times [F], in which a camera's background is followed."""
+    if len(t_ns) < 2:
+        return np.arange(len(t_ns))
+    period_s = float(np.median(np.diff(t_ns))) / 1e9
+    return np.arange(0, len(t_ns), max(1, round(1 / (_MOST_HZ * max(period_s, 1e-9)))))
+
+
+def load_tracks(session: Path, camera: Camera) -> Followed | None:
+    """Load the background of a camera, without sightings on people; None if it was not followed.
+
+    A track ends where it meets the box of a person. Of a long flight, a share of the points is used.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    path = tracks_path(session / "background" / camera.name)
+    if not path.is_file():
+        return None
+    rows = rows_to_follow(camera.frame_t_ns)
+    boxes = people_boxes(camera)[rows]
+    total, parts = table_parts(path, TRACKS)
+    share = min(_MOST_SIGHTINGS / max(total, 1), 1.0)
+    loaded = []
+    for part in parts:
+        frame, point = (part[name].to_numpy(np.int64) for name in ("frame", "point"))
+        xy = part[["x", "y"]].to_numpy(np.float64)
+        picture = np.searchsorted(camera.frame_number[rows], frame)
+        known = picture < len(rows)
+        known[known] = camera.frame_number[rows][picture[known]] == frame[known]
+        known &= (0.6180339887498949 * point) % 1.0 < share
+        tracks = Tracks(picture[known], point[known], xy[known])
+        loaded.append(off_people(tracks, boxes))
+    return Followed(
+        rows,
+        Tracks(
+            np.concatenate([tracks.picture for tracks in loaded] or [np.empty(0, np.int64)]),
+            np.concatenate([tracks.point for tracks in loaded] or [np.empty(0, np.int64)]),
+            np.concatenate([tracks.xy for tracks in loaded] or [np.empty((0, 2))]),
+        ),
+    )
+
+
+def load_stills(session: Path, camera: Camera) -> Stills | None:
+    """Load the stills of a camera; None if there are none."""
+    paths = sorted((session / "background" / camera.name / "stills").glob("*.jpg"))
+    numbers = np.array([int(path.stem) for path in paths], dtype=np.int64)
+    row = np.searchsorted(camera.frame_number, numbers)
+    known = row < len(camera.frame_number)
+    known[known] = camera.frame_number[row[known]] == numbers[known]
+    if not known.any():
+        return None
+    return Stills(row[known], _LazyPictures([paths[k] for k in np.flatnonzero(known)]))
+
+
+def off_people(tracks: Tracks, boxes: Float) -> Tracks:
+    """Drop sightings in people's boxes [T, D, 4] of the pictures, and the rest of their tracks."""
+    at, xy = boxes[tracks.picture], tracks.xy[:, None]
+    inside = np.asarray(((xy > at[..., :2]) & (xy < at[..., 2:])).all(axis=2)).any(axis=1)
+    names, number = np.unique(tracks.point, return_inverse=True)
+    ended = np.full(len(names), np.iinfo(np.int64).max)
+    np.minimum.at(ended, number[inside], tracks.picture[inside])
+    kept = tracks.picture < ended[number]
+    return Tracks(tracks.picture[kept], tracks.point[kept], tracks.xy[kept])
 
 
 def people_boxes(camera: Camera) -> Float:
@@ -58,49 +183,73 @@ def people_boxes(camera: Camera) -> Float:
     return filled
 
 
-def follow(pictures: Iterable[UInt8 | None], boxes: Float) -> Tracks:
-    """Follow points through pictures.
+class Follower:
+    """Tracker of points through the pictures of one camera."""
 
-    Args:
-        pictures: in the order of time, each grey [H, W]; None for one that cannot be decoded. No point is
-            followed across it.
-        boxes: [F, D, 4] px of each picture, areas to leave out; NaN for none.
-    """
-    import cv2
+    def __init__(self) -> None:
+        self._before: Bytes | None = None
+        self._points = np.empty((0, 2), np.float32)
+        self._number = np.empty(0, np.int64)
+        self._count = 0
+        self._found: list[tuple[int, Int64, NDArray[np.float32]]] = []
 
-    rows, numbers, places = [], [], []
-    before: UInt8 | None = None
-    points, number, count = np.empty((0, 2), np.float32), np.empty(0, np.int64), 0
-    for row, picture in enumerate(pictures):
-        if picture is None or before is None:
-            points, number = points[:0], number[:0]
-        elif len(points):
-            ahead, found = _flow(before, picture, points[:, None])
-            back, again = _flow(picture, before, ahead)
+    def step(self, row: int, picture: Bytes | None) -> None:
+        """Follow the points into the next picture.
+
+        Args:
+            row: number of the picture in the tracks.
+            picture: grey [H, W]; None if it cannot be decoded. No point is followed across it.
+        """
+        import cv2
+
+        if picture is None or self._before is None:
+            self._points, self._number = self._points[:0], self._number[:0]
+        elif len(self._points):
+            ahead, found = _flow(self._before, picture, self._points[:, None])
+            back, again = _flow(picture, self._before, ahead)
             good = (found[:, 0] > 0) & (again[:, 0] > 0)
-            good &= np.linalg.norm(back[:, 0] - points, axis=1) < _RETURN_PX
-            good &= _free(ahead[:, 0], boxes[row], picture.shape)
-            points, number = ahead[good, 0], number[good]
-        if picture is not None and len(points) < _FEWEST:
+            good &= np.linalg.norm(back[:, 0] - self._points, axis=1) < _RETURN_PX
+            size = np.array([picture.shape[1], picture.shape[0]])
+            good &= ((ahead[:, 0] > _EDGE_PX) & (ahead[:, 0] < size - _EDGE_PX)).all(axis=1)
+            self._points, self._number = ahead[good, 0], self._number[good]
+        if picture is not None and len(self._points) < _FEWEST:
+            mask = np.zeros(picture.shape, np.uint8)
+            mask[_EDGE_PX:-_EDGE_PX, _EDGE_PX:-_EDGE_PX] = 255
+            for x, y in np.round(self._points).astype(int).tolist():
+                cv2.circle(mask, (x, y), _APART_PX, 0, -1)
             corners = cv2.goodFeaturesToTrack(
-                picture, _MOST - len(points), _QUALITY, _APART_PX, mask=_mask(picture, points, boxes[row])
+                picture, _MOST - len(self._points), _QUALITY, _APART_PX, mask=mask
             )
             if corners is not None:
-                fresh = corners[:, 0][_free(corners[:, 0], boxes[row], picture.shape)]
-                points = np.concatenate([points, fresh])
-                number = np.concatenate([number, count + np.arange(len(fresh))])
-                count += len(fresh)
+                fresh = np.asarray(corners[:, 0], np.float32)
+                self._points = np.concatenate([self._points, fresh])
+                self._number = np.concatenate([self._number, self._count + np.arange(len(fresh))])
+                self._count += len(fresh)
         if picture is not None:
-            rows.append(np.full(len(points), row))
-            numbers.append(number)
-            places.append(points.astype(np.float64))
-        before = picture
-    if not rows:
-        return Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))
-    return Tracks(np.concatenate(rows), np.concatenate(numbers), np.concatenate(places))
+            self._found.append((row, self._number, self._points))
+        self._before = picture
+
+    def tracks(self) -> Tracks:
+        """Return all sightings so far; their pictures are the rows."""
+        if not self._found:
+            return Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))
+        rows, numbers, places = zip(*self._found, strict=True)
+        return Tracks(
+            np.repeat(np.array(rows, np.int64), [len(own) for own in numbers]),
+            np.concatenate(numbers),
+            np.concatenate(places).astype(np.float64),
+        )
 
 
-def _flow(before: UInt8, after: UInt8, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+def follow(pictures: Iterable[Bytes | None]) -> Tracks:
+    """Follow points through all pictures of one camera; see `Follower.step`."""
+    follower = Follower()
+    for row, picture in enumerate(pictures):
+        follower.step(row, picture)
+    return follower.tracks()
+
+
+def _flow(before: Bytes, after: Bytes, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Find points [N, 1, 2] of one picture in the other; also return found [N, 1], 0 or 1."""
     import cv2
 
@@ -109,26 +258,3 @@ def _flow(before: UInt8, after: UInt8, points: NDArray[Any]) -> tuple[NDArray[An
         before, after, points, np.empty_like(points), winSize=window, maxLevel=_LEVELS
     )
     return np.asarray(there), np.asarray(found)
-
-
-def _free(xy: NDArray[np.float32], boxes: Float, shape: tuple[int, ...]) -> Bool:
-    """Mark the points [N] that are inside the picture and on no person."""
-    size = np.array([shape[1], shape[0]])
-    free = ((xy > _EDGE_PX) & (xy < size - _EDGE_PX)).all(axis=1)
-    for box in boxes[np.isfinite(boxes[:, 0])]:
-        free &= ~((xy > box[:2]) & (xy < box[2:])).all(axis=1)
-    return np.asarray(free, dtype=np.bool_)
-
-
-def _mask(picture: UInt8, points: NDArray[np.float32], boxes: Float) -> UInt8:
-    """Build the mask for new corners: away from old points and from people."""
-    import cv2
-
-    mask = np.full(picture.shape, 255, np.uint8)
-    for x, y in np.round(points).astype(int).tolist():
-        cv2.circle(mask, (x, y), _APART_PX, 0, -1)
-    height, width = picture.shape
-    for box in boxes[np.isfinite(boxes[:, 0])]:
-        left, top, right, bottom = np.clip(np.round(box), 0, [width, height, width, height]).astype(int)
-        mask[top:bottom, left:right] = 0
-    return mask

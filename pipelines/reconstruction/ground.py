@@ -22,8 +22,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.cameras import project, row_delay_s, undistort
 from pipelines.geometry.noise import EXACT, ROTATION, SHIFT_IN_WORLD, Process
 from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector
-from pipelines.reconstruction.background import Followed
-from pipelines.reconstruction.background_tracks import people_boxes
+from pipelines.reconstruction.background_tracks import Followed, Stills, people_boxes
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 
@@ -69,14 +68,6 @@ _ROUNDS = 8
 _FEWEST_PATCHES = 10  # of a pair of cameras, distinct and in agreement
 _AGREE = 0.5  # share of a pair's patches that must agree
 _GAIN = 0.7  # of the prior sigma: a camera with more left is not bound
-
-
-@dataclass(frozen=True)
-class Stills:
-    """Some pictures of one camera."""
-
-    rows: Int64  # [S] of its frames
-    pictures: Sequence[Picture]  # grey
 
 
 @dataclass(frozen=True)

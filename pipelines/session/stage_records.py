@@ -21,12 +21,13 @@ from pipelines.session.storage import hash_of, read_json, write_json
 SCHEMA = 1
 """Version of session.json and stage.json. Older ones are read, newer ones refused."""
 
-STAGES = ("ingest", "detect", "reconstruct", "overlay", "replan", "film", "report")
+STAGES = ("ingest", "detect", "background", "reconstruct", "overlay", "replan", "film", "report")
 """The stages in the order in which they may run."""
 
 COMMANDS = {
     "ingest": "mocap ingest",
     "detect": "mocap reconstruct",
+    "background": "mocap reconstruct",
     "reconstruct": "mocap reconstruct",
     "overlay": "mocap reconstruct --overlay",
     "replan": "mocap replan-compare",

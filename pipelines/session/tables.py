@@ -7,7 +7,7 @@ found has no row, and is read back as NaN.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,6 +33,9 @@ FRAMES = pa.schema([_FRAME, _T_NS, ("pts_ns", pa.int64())])
 POSES = pa.schema([_T_NS, *_POSE])
 POSES_WITH_COVARIANCE = pa.schema([*POSES, *[(name, pa.float64()) for name in COVARIANCE_COLUMNS]])
 KEYPOINTS = pa.schema([_FRAME, _T_NS, _PERSON, _JOINT, *_XY, ("confidence", pa.float64())])
+TRACKS = pa.schema([_FRAME, ("point", pa.int32()), ("x", pa.float32()), ("y", pa.float32())])
+"""background/<camera>/tracks.parquet: points of the background in the pictures, px, sorted by frame."""
+
 ACTOR = pa.schema([_T_NS, _PERSON, *_XYZ])
 TRUTH = pa.schema([_T_NS, _PERSON, _JOINT, *_XYZ])
 CAMERA_POSES = pa.schema([_T_NS, _CAMERA, *_POSE])
@@ -78,6 +81,35 @@ def write_table(path: Path, frame: pd.DataFrame, schema: pa.Schema) -> None:
     # An open file, because pyarrow takes no path that is not UTF-8.
     with path.open("wb") as file:
         pq.write_table(pa.Table.from_arrays(columns, schema=schema), file, compression="zstd", version="2.6")
+
+
+def join_tables(path: Path, parts: Iterable[pd.DataFrame], schema: pa.Schema) -> None:
+    """Write one table from several, one at a time in memory."""
+    import pyarrow.parquet as pq
+
+    with path.open("wb") as file, pq.ParquetWriter(file, schema, compression="zstd", version="2.6") as writer:
+        for part in parts:
+            columns = [pa.array(part[field.name].to_numpy(), type=field.type) for field in schema]
+            writer.write_table(pa.Table.from_arrays(columns, schema=schema))
+
+
+def table_parts(path: Path, schema: pa.Schema) -> tuple[int, Iterator[pd.DataFrame]]:
+    """Read a table of `join_tables` part by part; also return the number of its rows.
+
+    Raises:
+        DataError: not a Parquet file, truncated, or columns are missing.
+    """
+    import pyarrow.parquet as pq
+
+    try:
+        file = pq.ParquetFile(path)
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(
+            path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
+        ) from error
+    names = schema.names
+    parts = (file.read_row_group(k, columns=names).to_pandas() for k in range(file.num_row_groups))
+    return file.metadata.num_rows, parts
 
 
 def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:

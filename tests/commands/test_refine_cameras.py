@@ -22,7 +22,7 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
 )
 from pipelines.reconstruction.background_adjustment import PosePrior, SeenPoints, adjust
-from pipelines.reconstruction.background_tracks import follow
+from pipelines.reconstruction.background_tracks import follow, off_people
 from pipelines.session.description import read_description
 from pipelines.session.registries import noise_models
 from tests.commands.runner import refused, succeeds
@@ -52,9 +52,8 @@ def test_the_background_of_the_sample_flight_halves_the_errors_of_attitudes(tmp_
     chosen = frames[(since_s >= SPAN_S[0]) & (since_s < SPAN_S[1])].iloc[::2]
     with VideoReader(SAMPLE / "drone2.mp4") as video:
         pictures = [cv2.cvtColor(video.read(int(k)), cv2.COLOR_BGR2GRAY) for k in chosen["frame"]]
-    tracks = follow(
-        [np.asarray(picture, dtype=np.uint8) for picture in pictures], np.tile(PERSON, (len(chosen), 1, 1))
-    )
+    followed = follow([np.asarray(picture, dtype=np.uint8) for picture in pictures])
+    tracks = off_people(followed, np.tile(PERSON, (len(chosen), 1, 1)))
     t_ns = chosen["t_ns"].to_numpy(np.int64)
     truth = pd.read_parquet(session / "truth_poses.parquet")
     poses = {

@@ -11,9 +11,8 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, PoseErrors, Process
 from pipelines.geometry.poses import quaternion_from_matrix
-from pipelines.reconstruction.background import Followed
-from pipelines.reconstruction.background_tracks import Tracks
-from pipelines.reconstruction.ground import Stills, bind_positions
+from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks
+from pipelines.reconstruction.ground import bind_positions
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Detections, Trajectory
