@@ -365,10 +365,10 @@ def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, 
     """
     changing, constant = [], []
     own = session / "reconstruct" / "cameras.parquet"
+    estimated = pd.read_parquet(own) if own.exists() else pd.DataFrame({"camera": []})
     for name, attitude in true.items():
-        if own.exists():
-            poses = pd.read_parquet(own).query("camera == @name")
-        else:
+        poses = estimated[estimated["camera"] == name]
+        if not len(poses):  # this camera stayed with its log
             poses = pd.read_parquet(session / "cameras" / name / "poses.parquet")
         quaternion = poses.sort_values("t_ns")[["qx", "qy", "qz", "qw"]].to_numpy()
         error = (Rotation.from_matrix(attitude).inv() * Rotation.from_quat(quaternion)).as_rotvec(
