@@ -15,7 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.reconstruction.doubts.hypotheses import Hypothesis, Trial, of_descriptions, of_paths, of_times
+from pipelines.reconstruction.doubts.faults import fit
+from pipelines.reconstruction.doubts.hypotheses import (
+    Hypothesis,
+    Trial,
+    of_descriptions,
+    of_faults,
+    of_noise,
+    of_paths,
+    of_times,
+)
 from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
 from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, solve
 from pipelines.session.description import Description
@@ -60,10 +69,17 @@ SCATTERED = 0.65
 MISSED = 1.8
 """Misfit of rays from which more than times is tried, whatever the score; 0.4 to 1.6 on right flights."""
 
+STRAINED = 4.0
+"""Chi^2 of constant errors of poses from which faults of one camera's poses are tried."""
+
+GAIN = 14.0
+"""By how much a fault must lower the chi^2 of the rays, to be named."""
+
 DOUBTFUL = 6.0
 """Score of a description above which it is doubted although no mistake explains it."""
 
 _ALIKE = 1.0  # hypotheses whose scores are this close are stated together
+_ALIKE_COST = 4.0  # of faults that are stated together
 _DISCRETE = 0.8  # the largest penalty of a hypothesis without a free number
 _TIMES = ("clock", "frame_rate")
 
@@ -154,12 +170,19 @@ def diagnose(flight: Sampled | None) -> Diagnosis:
     base, found = base_of(flight, described)
     trial = Trial(flight, described, base)
     hypotheses = [*of_paths(trial), *of_times(trial)]
+    stated = fit(flight, described, "none", 0)
     explained = min((each.total for each in hypotheses), default=np.inf)
     odd = base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
     if odd or explained <= base.total - MARGIN_OF_TIMES:
         hypotheses += list(of_descriptions(trial))
+    if odd or stated.strain >= STRAINED:
+        hypotheses += list(of_faults(trial))
+        noisy = of_noise(trial, stated.cost)
+        hypotheses += [trial.scored(noisy)] if noisy else []
     hypotheses.sort(key=lambda each: each.total)
     causes = _causes(hypotheses, base.total)
+    if not causes or np.isfinite(causes[0].cost):
+        causes = _faults(hypotheses, stated.cost, described) or causes
     doubts = [_doubt(each, found, described) for each in causes]
     if doubts or base.total >= DOUBTFUL:
         doubts += _oddities(found, described, flight)
@@ -182,6 +205,26 @@ def _causes(hypotheses: list[Hypothesis], described: float) -> list[Hypothesis]:
     for each in sorted(alike, key=lambda each: (each.penalty > _DISCRETE, each.total)):
         causes.setdefault(each.code, each)
     return list(causes.values())
+
+
+def _faults(hypotheses: list[Hypothesis], stated: float, scene: Scene) -> list[Hypothesis]:
+    """Return the faults of one camera's poses that fit best, one of each code; none if they gain too little.
+
+    Args:
+        hypotheses: all that were tried.
+        stated: the cost of a fit without a fault.
+        scene: as described.
+    """
+    best = min((each.cost for each in hypotheses), default=np.inf)
+    # Where even the best fits badly, errors are larger than their model: chi^2 counts for less.
+    pictures = int(np.isfinite(scene.rays[..., 0]).any(axis=-1).sum())
+    if not best <= stated - GAIN * max(1.0, best / pictures):
+        return []
+    alike: dict[str, Hypothesis] = {}
+    for each in sorted(hypotheses, key=lambda each: each.cost):
+        if each.cost <= best + _ALIKE_COST:
+            alike.setdefault(each.code, each)
+    return list(alike.values())
 
 
 def _doubt(cause: Hypothesis, described: Score, scene: Scene) -> Doubt:

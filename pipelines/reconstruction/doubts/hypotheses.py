@@ -15,6 +15,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
+from pipelines.reconstruction.doubts.faults import FREE, Fault, fit, undone
 from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene, scene_of
 from pipelines.reconstruction.doubts.score import Base, Score, score, solve
 
@@ -25,6 +26,7 @@ _FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
 _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _FLU_FROM_FRD = np.diag([1.0, -1, -1])
 _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
+_COST_OF_NUMBER = 2.0  # of chi^2, as in Akaike's criterion
 _SPARE = 2.0  # hypotheses whose scores are farther from the best need no exact score
 _LONGEST_CLOCK_S = 3.0
 _LEAST_CLOCK_S = 0.05
@@ -48,6 +50,7 @@ class Hypothesis:
     scene: Scene | None
     score: Score | None = None
     same_scatter: bool = False
+    cost: float = np.inf  # chi^2 of a fitted fault, with 2 for each of its numbers
 
     @property
     def total(self) -> float:
@@ -551,7 +554,7 @@ def _continuous(trial: Trial) -> Iterator[Hypothesis]:
                 trial.names,
                 "every log counts positions from a place of its own",
                 remedies.own_origins(trial.flight.cameras, scene.position - trial.described.position),
-                2.2,
+                1.1 * (len(trial.moving) - 1),
                 scene,
             )
         )
@@ -614,64 +617,113 @@ def _each_number(trial: Trial) -> Iterator[Hypothesis | None]:
             31,
             _LEAST_CLOCK_S,
         )
-    for index in every:
-        yield trial.best(focal([index], 1.3), -1.5, 1.5, 19, _LEAST_OCTAVES)
-        if index not in trial.moving:
-            continue
-        yield trial.best(pitch([index], 1.3), -90, 90, 37, least_deg)
-        yield trial.best(heading([index], 1.3), -180, 170, 36, least_deg)
-        yield trial.best(_rolled(trial, index), -30, 30, 13, least_deg)
-        yield from _moved(trial, index, least_deg)
 
 
-def _rolled(trial: Trial, index: int) -> Callable[[float], Hypothesis]:
-    return lambda degrees: Hypothesis(
-        "mount",
-        (trial.names[index],),
-        f"{trial.names[index]} is rolled by {degrees:+.0f} deg about the optical axis",
-        remedies.mount(trial.flight.cameras, [index], lambda mount: mount @ _turn("z", degrees)),
-        1.5,
-        trial.turned_in_camera(_turn("z", degrees), [index]),
-    )
+# --- faults of one camera's poses ----------------------------------------------------------------------
 
 
-def _moved(trial: Trial, index: int, least_deg: float) -> Iterator[Hypothesis | None]:
-    """Try another origin of one camera's log, and another north."""
-    cameras, name = trial.flight.cameras, trial.names[index]
-    scene, shift = trial.shifted(trial.described, index)
-    least_m = max(_LEAST_ORIGIN_M, 4 * float(trial.described.sigma[:, 0].max()))
-    if np.linalg.norm(shift) >= least_m:
-        yield trial.scored(
-            Hypothesis(
-                "origin",
-                _pair(trial, [index]),
-                f"the log of {name} has its zero {np.linalg.norm(shift):.1f} m from the world's"
-                + _relative(trial, [index]),
-                remedies.origin(cameras, index, shift, 0.0),
-                1.8,
-                scene,
-            )
-        )
+def of_faults(trial: Trial) -> Iterator[Hypothesis]:
+    """Fit a fault of each moving camera's poses: where its log has zero and north, and how it is turned."""
     located = trial.flight.hips is not None or trial.flight.ground is not None
-    if index == trial.moving[0] and len(trial.names) == 2 and not located:
-        return  # of two, one alone can be turned against the other
+    for index in trial.every:
+        for name, penalty in _PENALTIES.items():
+            if index not in trial.moving and name != "focal":
+                continue
+            if name in ("north", "zero") and len(trial.names) == 2 and index == 0 and not located:
+                continue  # of two, one alone can be turned against the other
+            fault = fit(trial.flight, trial.described, name, index, _first_turn(trial, name, index))
+            yield trial.scored(_of_fault(trial, fault, penalty))
 
-    def turned(degrees: float) -> Hypothesis:
-        turn = _turn("z", degrees)
-        rotation, position = trial.described.rotation.copy(), trial.described.position.copy()
-        rotation[index], position[index] = turn @ rotation[index], position[index] @ turn.T
-        scene, shift = trial.shifted(replace(trial.described, rotation=rotation, position=position), index)
-        return Hypothesis(
-            "origin",
-            _pair(trial, [index]),
-            f"the log of {name} has its north {degrees:+.0f} deg from the world's"
-            + _relative(trial, [index]),
-            remedies.origin(cameras, index, shift, degrees),
-            2.2,
-            scene,
-        )
 
-    yield trial.best(turned, -180, 170, 36, least_deg)
+def of_noise(trial: Trial, stated: float) -> Hypothesis | None:
+    """Try if constant errors of all poses, some times larger than stated, fit as a fault of one would.
+
+    Args:
+        trial: the flight.
+        stated: the cost of a fit with the errors as stated.
+    """
+    scene, best = trial.described, None
+    for factor in _NOISE_FACTORS:
+        constant2 = np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0)
+        sigma = scene.sigma.copy()
+        sigma[:, :2] = np.sqrt(factor**2 * constant2 + scene.sigma[:, 4:] ** 2)
+        wider = replace(scene, sigma=sigma)
+        # Each of the 6 errors of a camera is `factor` times less likely to be what it is.
+        cost = fit(trial.flight, wider, "none", 0).cost + 12 * len(trial.names) * np.log(factor)
+        if cost < stated and (best is None or cost < best.cost):
+            best = Hypothesis(
+                "noise",
+                trial.names,
+                f"constant errors of the poses are about {factor:g} times as large as stated",
+                remedies.pose_noise(trial.flight.cameras, factor),
+                np.inf,  # its score says nothing: larger errors excuse everything
+                wider,
+                cost=cost,
+            )
+    return best
+
+
+_NOISE_FACTORS = (2.0, 4.0, 8.0)
+_PENALTIES = {
+    "shift": 1.8,
+    "heading": 1.3,
+    "north": 1.8,
+    "zero": 2.2,
+    "pitch": 1.3,
+    "roll": 1.5,
+    "focal": 1.3,
+}
+_TURNS = np.radians([0, 45, 90, 135, 180, -135, -90, -45])
+
+
+def _first_turn(trial: Trial, name: str, index: int) -> float:
+    """Return from which turn to search: a fit from there finds the best within some 30 deg."""
+    if name in ("shift", "focal"):
+        return 0.0
+    turns = (_TURNS[0], _TURNS[1], _TURNS[-1]) if name == "pitch" else _TURNS
+
+    def misfit(turn: float) -> float:
+        solved = solve(undone(trial.described, name, index, np.zeros(3), turn))
+        chi2 = solved.chi2[solved.views >= 2]
+        return float(np.median(chi2)) if chi2.size else np.inf
+
+    return float(min(turns, key=misfit))
+
+
+def _of_fault(trial: Trial, fault: Fault, penalty: float) -> Hypothesis:
+    cameras, index, degrees = trial.flight.cameras, fault.index, fault.turn_deg
+    name = trial.names[index]
+    far = f"{np.linalg.norm(fault.shift):.1f} m"
+    mounted = fault.name in ("pitch", "roll", "focal")  # of one camera, whatever the others
+    said = {
+        "shift": f"the log of {name} has its zero {far} from the world's",
+        "north": f"the log of {name} has its north {degrees:+.0f} deg from the world's",
+        "zero": f"the log of {name} has its zero {far} and its north {degrees:+.0f} deg from the world's",
+        "heading": f"the heading of {name} is {degrees:+.0f} deg from what is logged",
+        "pitch": f"{name} looks {abs(degrees):.0f} deg {_higher(degrees)} than stated",
+        "roll": f"{name} is rolled by {degrees:+.0f} deg about the optical axis",
+        "focal": f"the focal length of {name} is {np.exp(fault.turn_rad):.3g} times what is stated",
+    }[fault.name]
+    codes = {"heading": "pose", "pitch": "mount", "roll": "mount", "focal": "intrinsics"}
+    code = codes.get(fault.name, "origin")
+    if code == "intrinsics":
+        remedy = remedies.intrinsics(cameras, [index], float(np.exp(fault.turn_rad)))
+    elif code == "origin":
+        remedy = remedies.origin(cameras, index, fault.shift, degrees)
+    elif mounted:
+        own = _turn("x" if fault.name == "pitch" else "z", degrees)
+        remedy = remedies.mount(cameras, [index], lambda mount: mount @ own)
+    else:
+        remedy = remedies.mount(cameras, [index], lambda mount: _turn("z", degrees) @ mount)
+    return Hypothesis(
+        code,
+        (name,) if mounted else _pair(trial, [index]),
+        said if mounted else said + _relative(trial, [index]),
+        remedy,
+        penalty,
+        fault.scene,
+        cost=fault.cost + _COST_OF_NUMBER * FREE[fault.name],
+    )
 
 
 def _higher(degrees: float) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.camera_poses import stated_models
 from pipelines.session.description import CameraEntry, Description, Interpolation
@@ -37,13 +38,9 @@ MOMENTS = 60
 STEP_NS = 100_000_000
 """Between the two moments of a pair, for speeds."""
 
-_UNKNOWN = (
-    0.3,
-    np.radians(1.0),
-    0.1,
-    np.radians(0.3),
-)  # of poses whose noise nobody states, in a usual flight
-_CALIBRATED = (0.003, 0.001, 0.0, 0.0)  # of a still camera
+# Of poses whose noise nobody states, in a usual flight.
+_UNKNOWN = (0.3, np.radians(1.0), 0.1, np.radians(0.3), 0.1, np.radians(0.3))
+_CALIBRATED = (0.003, 0.001, 0.0, 0.0, 0.0, 0.0)  # of a still camera
 _LONGEST_GAP_NS = 250_000_000  # between two pictures across which a keypoint is interpolated
 _CHOSEN_SHARE = 0.5  # of the pictures with people
 _NEW_SHARE = 0.5  # of a logged covariance: the part that is drawn anew in every pose
@@ -93,12 +90,14 @@ class Camera(Protocol):
 
 
 class PoseSigma(NamedTuple):
-    """Standard deviations per axis of a camera's poses, and of the part that is new in every pose."""
+    """Standard deviations per axis of a camera's poses, and of parts of them."""
 
     position_m: float
     rotation_rad: float
-    white_position_m: float
+    white_position_m: float  # new in every pose
     white_rotation_rad: float
+    varying_position_m: float  # not constant in this flight; with the white part
+    varying_rotation_rad: float
 
 
 @dataclass(frozen=True)
@@ -133,7 +132,7 @@ class Scene:
     position: Float  # [C, T, 3] m
     rotation: Float  # [C, T, 3, 3] world_from_camera
     focal_px: Float  # [C]
-    sigma: Float  # [C, 4] as `PoseSigma`
+    sigma: Float  # [C, 6] as `PoseSigma`
     person_px: Float  # [C] height of the person in the pictures, median
 
     def with_rotation(self, rotation: Float) -> Scene:
@@ -276,19 +275,37 @@ def _pixels(camera: Camera, detection: Int64) -> Float:
 def _sigma(camera: Camera, entry: CameraEntry, pose_noise: str | None) -> PoseSigma:
     models = stated_models(camera.name, entry, pose_noise)
     if models is not None:
-        white = [model for model in models if type(model).__name__ == "White"]
-        return PoseSigma(*_level(models), *_level(white))
+        length_s = float(np.ptp(camera.frame_t_ns)) / 1e9
+        parts = np.array([_variances(model, length_s) for model in models]).reshape(-1, 6)
+        return PoseSigma(*np.sqrt(parts.sum(axis=0)).tolist())
     if camera.sigma is not None:
-        position, rotation = np.median(camera.sigma, axis=0)
-        share = np.sqrt(_NEW_SHARE)
-        return PoseSigma(float(position), float(rotation), share * position, share * rotation)
+        position, rotation = np.median(camera.sigma, axis=0).tolist()
+        share = float(np.sqrt(_NEW_SHARE))
+        new = (share * position, share * rotation)
+        return PoseSigma(position, rotation, *new, *new)
     return PoseSigma(*(_CALIBRATED if camera.static else _UNKNOWN))
 
 
-def _level(models: Sequence[object]) -> tuple[float, float]:
-    position = sum(getattr(model, "position_m", 0.0) ** 2 for model in models)
-    rotation = sum(getattr(model, "rotation_deg", 0.0) ** 2 for model in models)
-    return float(np.sqrt(position)), float(np.radians(np.sqrt(rotation)))
+def _variances(model: NoiseModel, length_s: float) -> list[float]:
+    """Return the variances [6] of a noise model in a flight, as in `PoseSigma`."""
+    match model:
+        case White():
+            white, varying = 1.0, 1.0
+        case GaussMarkov():
+            # Of the mean over a stretch: the integral of the autocorrelation.
+            steps = max(length_s / model.correlation_s, 1e-6)
+            white, varying = 0.0, 1 - 2 / steps * (1 + np.expm1(-steps) / steps)
+        case Bias():
+            white, varying = 0.0, 0.0
+        case Drift():
+            # A random walk has a mean variance of half its last one; a third of that is about its own mean.
+            level = length_s / 2
+            rates = np.array([model.position_m_per_sqrt_s, np.radians(model.rotation_deg_per_sqrt_s)])
+            return [*(level * rates**2), 0.0, 0.0, *(level / 3 * rates**2)]
+        case _:
+            return [0.0] * 6
+    squares = np.array([model.position_m, np.radians(model.rotation_deg)]) ** 2
+    return [*squares, *(white * squares), *(varying * squares)]
 
 
 # --- the scene as described, and with other pixels and times -------------------------------------------

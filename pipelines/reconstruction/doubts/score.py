@@ -94,7 +94,7 @@ def solve(scene: Scene) -> Solved:
     position = np.where(posed[..., None], np.nan_to_num(scene.position)[:, :, None, :], 0.0)
     across = np.eye(3) - direction[..., :, None] * direction[..., None, :]
     across_position = np.einsum("cthij,cthj->cthi", across, np.broadcast_to(position, direction.shape))
-    angle2 = (_pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2)[:, None, None]
+    angle2 = (pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2)[:, None, None]
     place2 = (scene.sigma[:, 0] ** 2)[:, None, None]
     depth = np.full(seen.shape, 10.0)
     for _ in range(2):
@@ -112,7 +112,8 @@ def solve(scene: Scene) -> Solved:
     return Solved(joints, (weight * miss2).sum(axis=0), views, in_front, direction, seen, depth)
 
 
-def _pixel_variance(scene: Scene) -> Float:
+def pixel_variance(scene: Scene) -> Float:
+    """Return the variance [C] px^2 of keypoints: it grows with the person in the picture."""
     variance: Float = _KEYPOINT_PX**2 + (_KEYPOINT_SHARE * scene.person_px) ** 2
     return variance
 
@@ -220,7 +221,7 @@ def _parallax(solved: Solved) -> float:
 
 def _scatter(scene: Scene, solved: Solved) -> float:
     """Return the scatter of two cameras' rays within pictures over the pixel noise, mean over the pairs."""
-    variance = _pixel_variance(scene) / scene.focal_px**2
+    variance = pixel_variance(scene) / scene.focal_px**2
     distance = np.clip(np.abs(solved.depth), 1e-4, 1e5)
     found = [
         _scatter_of_pair(scene, solved, distance, variance, pair)
@@ -290,8 +291,7 @@ def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
     """Say how odd the person is; None if too few limbs are seen."""
     body = _Body(solved.joints)
     lengths = body.lengths()
-    medians = np.array([_median(length) for length, _ in lengths])
-    statures = medians / np.array([share for _, share in lengths])
+    statures = _statures(lengths)
     if np.isfinite(statures).sum() < 5:
         return None
     stature = float(np.nanmedian(statures))
@@ -303,9 +303,20 @@ def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
     odd["unposed"] = _unposed(scene) / 0.05
     odd |= body.posture()
     far_m = _distances(solved)
-    odd |= body.motion(flight, stature, _moved_by(scene.sigma[:, 2:], far_m))
+    odd |= body.motion(flight, stature, _moved_by(scene.sigma[:, 2:4], far_m))
     odd |= _place(flight, scene, body, far_m)
     return _Person(odd, stature)
+
+
+def _statures(lengths: list[tuple[Float, float]]) -> Float:
+    """Return the stature that each limb is usual for."""
+    statures: Float = np.array([_median(length) / share for length, share in lengths])
+    return statures
+
+
+def stature_m(joints: Float) -> float:
+    """Return a person's stature from their joints [T, J, 3]; NaN if too few limbs are seen."""
+    return _median(_statures(_Body(joints).lengths()))
 
 
 def _unposed(scene: Scene) -> float:
@@ -402,7 +413,7 @@ def _moved_by(sigma: Float, far_m: Float) -> float:
 def _place(flight: Sampled, scene: Scene, body: _Body, far_m: Float) -> dict[str, float]:
     """Say how far the person is from where people are: below drones, on the ground, at the logged actor."""
     odd: dict[str, float] = {}
-    stated_m, white_m = _moved_by(scene.sigma[:, :2], far_m), _moved_by(scene.sigma[:, 2:], far_m)
+    stated_m, white_m = _moved_by(scene.sigma[:, :2], far_m), _moved_by(scene.sigma[:, 2:4], far_m)
     if not all(camera.static for camera in flight.cameras):
         odd["above"] = max(0.0, _median(body.hips[:, 2]) - _median(scene.position[..., 2])) / 2.0
     if flight.ground is not None:

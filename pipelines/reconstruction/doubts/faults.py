@@ -1,0 +1,247 @@
+"""Faults of one camera's poses, fitted with the constant errors that are stated of all poses.
+
+Every camera may be off by a constant shift and a constant turn, with what is stated of them as prior. A fault
+is a shift or a turn of one camera without a prior. The joints are eliminated, so that a fit of one fault
+solves for 6 numbers of each camera and those of the fault. What the fit costs is a chi^2: the residuals of
+all pictures, each as one observation, and the constant errors over their standard deviations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.poses import cross_matrix, matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene
+from pipelines.reconstruction.doubts.score import STATURE_M, Solved, pixel_variance, solve, stature_m
+
+FREE = {"none": 0, "shift": 3, "heading": 1, "north": 1, "zero": 4, "pitch": 1, "roll": 1, "focal": 1}
+"""Faults by name, and how many numbers they have.
+
+`shift`: the log has its zero elsewhere; `north`: it has its north elsewhere; `zero`: both. `heading`,
+`pitch`, `roll`: the camera is turned where it is, about the vertical or its own x and z axes. `focal`: its
+focal length is another; the turn is then the logarithm of the factor.
+"""
+
+_STEPS = 20
+_CONVERGED = 0.05  # of the cost
+_LEAST_SIGMA = (0.02, np.radians(0.1))  # of constant errors, m and rad
+_LOOSE_M = 30.0  # sigma of a shift that is a fault: any is as likely
+_SIZE_SIGMA = 0.09  # of the logarithm of statures
+_PROBE_M = 0.05
+_PLACED_M = 0.3  # sigma of the logged actor's hips, and of the feet on the ground
+_HUBER = 1.5
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fitted fault."""
+
+    name: str  # of `FREE`
+    index: int  # of the camera
+    cost: float  # chi^2
+    strain: float  # the part of it that is of constant errors, the logged actor and the person's stature
+    shift: Float  # [3] m
+    turn_rad: float
+    scene: Scene  # without the fault; constant errors stay
+
+    @property
+    def turn_deg(self) -> float:
+        """The turn in degrees."""
+        return float(np.degrees(self.turn_rad))
+
+
+def fit(flight: Sampled, scene: Scene, name: str, index: int, start_rad: float = 0.0) -> Fault:
+    """Fit a fault of one camera, and the constant errors of all.
+
+    Args:
+        flight: the flight.
+        scene: the scene as described.
+        name: of `FREE`.
+        index: of the camera.
+        start_rad: where the search for the turn begins.
+    """
+    nothing = np.zeros(3)
+    first = undone(scene, name, index, nothing, start_rad)
+    fault = Fault(name, index, np.inf, np.inf, nothing, start_rad, first)
+    errors = np.zeros((len(scene.focal_px), 6))
+    best, last = fault, np.inf
+    for _ in range(_STEPS):
+        cost, strain, change, values = _step(flight, _with_errors(fault.scene, errors), fault, errors)
+        settled = abs(cost - last) < _CONVERGED
+        last = cost
+        if cost < best.cost:
+            best = replace(fault, cost=cost, strain=strain)
+        if settled or not np.isfinite(cost) or cost > 4 * best.cost + 100:
+            break
+        errors = errors + change
+        shift, turn_rad = fault.shift, fault.turn_rad
+        if FREE[name] >= 3:
+            shift = shift + values[:3]
+        if FREE[name] in (1, 4):
+            turn_rad = turn_rad + float(values[-1])
+        changed = undone(scene, name, index, shift, turn_rad)
+        fault = replace(fault, shift=shift, turn_rad=turn_rad, scene=changed)
+    return best
+
+
+def undone(scene: Scene, name: str, index: int, shift: Float, turn_rad: float) -> Scene:
+    """Return the scene without a fault of one camera."""
+    if name == "focal":
+        factor = np.ones(len(scene.focal_px))
+        factor[index] = np.exp(turn_rad)
+        return replace(scene, rays=scene.rays / factor[:, None, None, None], focal_px=scene.focal_px * factor)
+    rotation, position = scene.rotation.copy(), scene.position.copy()
+    turn = _rotation(_axis(name) * turn_rad)
+    if name in ("pitch", "roll"):
+        rotation[index] = rotation[index] @ turn
+    else:
+        rotation[index] = turn @ rotation[index]
+    if name in ("north", "zero"):
+        position[index] = position[index] @ turn.T
+    position[index] = position[index] + shift
+    return replace(scene, rotation=rotation, position=position)
+
+
+def _axis(name: str) -> Float:
+    axis: Float = np.eye(3)[{"pitch": 0}.get(name, 2)]
+    return axis
+
+
+def _rotation(vector: Float) -> Float:
+    matrix: Float = matrix_from_quaternion(quaternion_from_rotation_vector(vector))
+    return matrix
+
+
+def _with_errors(scene: Scene, errors: Float) -> Scene:
+    turn = _rotation(errors[:, 3:])[:, None]
+    return replace(scene, rotation=turn @ scene.rotation, position=scene.position + errors[:, None, :3])
+
+
+def _constant_sigma(scene: Scene) -> Float:
+    """Return the standard deviations [C, 6] of the constant errors."""
+    level = np.sqrt(np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0))
+    sigma: Float = np.repeat(np.maximum(level, _LEAST_SIGMA), 3, axis=1)
+    return sigma
+
+
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
+def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[float, float, Float, Float]:
+    """Return cost and strain of a scene, and the changes of constant errors [C, 6] and a fault's numbers."""
+    solved = solve(scene)
+    cameras, times, joints = solved.seen.shape
+    used = solved.seen & (solved.views >= 2)
+    depth = np.where(used, np.maximum(np.abs(solved.depth), 0.5), 1.0)
+    toward = np.where(used[..., None], solved.joints[None] - scene.position[:, :, None, :], 0.0)
+    direction = solved.direction
+    across = np.eye(3) - direction[..., :, None] * direction[..., None, :]
+    residual = np.einsum("ctjik,ctjk->ctji", across, toward) / depth[..., None]
+    varying2 = (scene.sigma[:, 5] ** 2)[:, None, None] + (scene.sigma[:, 4][:, None, None] / depth) ** 2
+    variance = (pixel_variance(scene) / scene.focal_px**2)[:, None, None] + varying2
+    size = np.linalg.norm(residual, axis=-1) / np.sqrt(variance)
+    if used.sum() < 60:
+        return np.inf, np.inf, np.zeros_like(errors), np.zeros(FREE[fault.name])
+    # One picture is one observation: its keypoints err alike.
+    seen = np.maximum(used.sum(axis=-1, keepdims=True), 1)
+    scale = np.maximum(1.0, np.median(size[used]))
+    robust = np.where(size > _HUBER * scale, _HUBER * scale / np.maximum(size, 1e-12), 1.0)
+    weight = np.where(used, robust / (variance * seen), 0.0)
+    huber = np.where(size > _HUBER, _HUBER * (2 * size - _HUBER), size**2)
+    sigma = _constant_sigma(scene)
+    cost = float((np.where(used, huber, 0.0) / seen).sum())
+
+    # Derivatives of (X - p) / depth - direction by the joint and by the camera's turn. The terms with the
+    # residual keep the scale: without them a smaller flight seems to fit better.
+    point = (across - residual[..., :, None] * direction[..., None, :]) / depth[..., None, None]
+    leaning = np.eye(3) + (direction + residual)[..., :, None] * residual[..., None, :]
+    turned = leaning @ cross_matrix(direction)
+    columns = 6 * cameras + FREE[fault.name]
+    design = np.zeros((cameras, times, joints, 3, columns))
+    for camera in range(cameras):
+        design[camera, ..., 6 * camera : 6 * camera + 3] = -point[camera]
+        design[camera, ..., 6 * camera + 3 : 6 * camera + 6] = turned[camera]
+    if fault.name == "focal":
+        axis = scene.rotation[fault.index][:, None, :, 2]
+        cosine = (direction[fault.index] * axis).sum(axis=-1, keepdims=True)
+        inwards = cosine * (axis - cosine * direction[fault.index])
+        design[fault.index, ..., -1] = -np.einsum("tjkl,tjl->tjk", leaning[fault.index], inwards)
+    elif FREE[fault.name]:
+        basis = _basis(scene, fault)  # [T, 6, free]
+        own = np.concatenate([-point[fault.index], turned[fault.index]], axis=-1)
+        design[fault.index, ..., 6 * cameras :] = own @ basis[:, None]
+    weighted = weight[..., None, None] * design
+    of_points = np.einsum("ctjki,ctjkl->tjil", point, weight[..., None, None] * point)
+    of_both = np.einsum("ctjki,ctjkl->tjil", point, weighted)
+    of_all = np.einsum("ctjki,ctjkl->il", design, weighted)
+    at_points = np.einsum("ctjki,ctjk->tji", point, weight[..., None] * residual)
+    at_all = np.einsum("ctjki,ctjk->i", weighted, residual)
+    placed, pull, extra = _placed(flight, solved)
+    sized = _size(solved)
+    strain = float(((errors / sigma) ** 2).sum()) + extra + sized**2
+    cost += strain
+    of_points = of_points + placed[..., None, None] * np.eye(3) + 1e-9 * np.eye(3)
+    at_points = at_points - pull
+    inverse = np.linalg.inv(of_points)
+    eliminated = np.einsum("tjik,tjkl->tjil", inverse, of_both)
+    normal = of_all - np.einsum("tjki,tjkl->il", of_both, eliminated)
+    right = at_all - np.einsum("tjki,tjk->i", eliminated, at_points)
+    normal[range(errors.size), range(errors.size)] += 1 / sigma.ravel() ** 2
+    right[: errors.size] += errors.ravel() / sigma.ravel() ** 2
+    if fault.name in ("shift", "zero"):
+        shift = slice(errors.size, errors.size + 3)
+        slope = _size_by_shift(scene, fault.index, sized)
+        normal[shift, shift] += np.outer(slope, slope) + np.eye(3) / _LOOSE_M**2
+        right[shift] += slope * sized + fault.shift / _LOOSE_M**2
+    normal += 1e-9 * np.eye(len(normal))
+    change = -np.linalg.solve(normal, right)
+    return cost, strain, change[: errors.size].reshape(errors.shape), change[errors.size :]
+
+
+def _size(solved: Solved) -> float:
+    """Return how far the person's stature is from a grown-up's, in standard deviations."""
+    stature = stature_m(solved.joints)
+    return float(np.log(stature / STATURE_M)) / _SIZE_SIGMA if np.isfinite(stature) else 0.0
+
+
+def _size_by_shift(scene: Scene, index: int, size: float) -> Float:
+    """Return the derivative [3] of `_size` by a camera's position."""
+    slope = np.zeros(3)
+    for axis in range(3):
+        position = scene.position.copy()
+        position[index, :, axis] += _PROBE_M
+        slope[axis] = (_size(solve(replace(scene, position=position))) - size) / _PROBE_M
+    return slope
+
+
+def _basis(scene: Scene, fault: Fault) -> Float:
+    """Return how a camera's shift and turn [T, 6] change with each number of the fault."""
+    times = scene.position.shape[1]
+    basis = np.zeros((times, 6, FREE[fault.name]))
+    if fault.name in ("shift", "zero"):
+        basis[:, :3, :3] = np.eye(3)
+    if fault.name in ("heading", "north", "zero"):
+        basis[:, 5, -1] = 1.0
+    if fault.name in ("north", "zero"):
+        unshifted = np.nan_to_num(scene.position[fault.index] - fault.shift)
+        basis[:, 0, -1], basis[:, 1, -1] = -unshifted[:, 1], unshifted[:, 0]
+    if fault.name in ("pitch", "roll"):
+        basis[:, 3:, -1] = scene.rotation[fault.index] @ _axis(fault.name)
+    return np.nan_to_num(basis)
+
+
+def _placed(flight: Sampled, solved: Solved) -> tuple[Float, Float, float]:
+    """Pull hips to the logged actor; return weights [T, J], pulls [T, J, 3] and the cost."""
+    weight, pull = np.zeros(solved.views.shape), np.zeros(solved.joints.shape)
+    if flight.hips is None:
+        return weight, pull, 0.0
+    hips = [JOINTS.index("left_hip"), JOINTS.index("right_hip")]
+    apart = flight.hips[:, None] - solved.joints[:, hips]
+    known = np.asarray(np.isfinite(apart).all(axis=-1))
+    apart = np.where(known[..., None], apart, 0.0)
+    each = 1 / (_PLACED_M**2 * max(int(known.sum()), 1))
+    weight[:, hips] = each * known
+    pull[:, hips] = each * apart
+    middle = apart[known].mean(axis=0) if known.any() else np.zeros(3)
+    return weight, pull, float((middle**2).sum() / _PLACED_M**2)
