@@ -8,22 +8,25 @@ description does. If none does, the doubt is stated without a cause.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.reconstruction.doubts.faults import fit
+from pipelines.reconstruction.doubts import remedies
+from pipelines.reconstruction.doubts.faults import FREE, Fault, fit, undone
 from pipelines.reconstruction.doubts.hypotheses import (
     Hypothesis,
     Trial,
+    higher_or_lower,
     of_descriptions,
-    of_faults,
-    of_noise,
     of_paths,
     of_times,
+    pair_of,
+    relative_to,
+    turn_about,
 )
 from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
 from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, solve
@@ -79,6 +82,7 @@ DOUBTFUL = 6.0
 """Score of a description above which it is doubted although no mistake explains it."""
 
 _ALIKE = 1.0  # hypotheses whose scores are this close are stated together
+_COST_OF_NUMBER = 2.0  # of chi^2, as in Akaike's criterion
 _ALIKE_COST = 4.0  # of faults that are stated together
 _DISCRETE = 0.8  # the largest penalty of a hypothesis without a free number
 _TIMES = ("clock", "frame_rate")
@@ -176,8 +180,8 @@ def diagnose(flight: Sampled | None) -> Diagnosis:
     if odd or explained <= base.total - MARGIN_OF_TIMES:
         hypotheses += list(of_descriptions(trial))
     if odd or stated.strain >= STRAINED:
-        hypotheses += list(of_faults(trial))
-        noisy = of_noise(trial, stated.cost)
+        hypotheses += list(_of_faults(trial))
+        noisy = _of_noise(trial, stated.cost)
         hypotheses += [trial.scored(noisy)] if noisy else []
     hypotheses.sort(key=lambda each: each.total)
     causes = _causes(hypotheses, base.total)
@@ -225,6 +229,113 @@ def _faults(hypotheses: list[Hypothesis], stated: float, scene: Scene) -> list[H
         if each.cost <= best + _ALIKE_COST:
             alike.setdefault(each.code, each)
     return list(alike.values())
+
+
+# --- faults of one camera's poses ----------------------------------------------------------------------
+
+
+def _of_faults(trial: Trial) -> Iterator[Hypothesis]:
+    """Fit a fault of each moving camera's poses: where its log has zero and north, and how it is turned."""
+    located = trial.flight.hips is not None or trial.flight.ground is not None
+    for index in trial.every:
+        for name, penalty in _PENALTIES.items():
+            if index not in trial.moving and name != "focal":
+                continue
+            if name in ("north", "zero") and len(trial.names) == 2 and index == 0 and not located:
+                continue  # of two, one alone can be turned against the other
+            fault = fit(trial.flight, trial.described, name, index, _first_turn(trial, name, index))
+            yield trial.scored(_of_fault(trial, fault, penalty))
+
+
+def _of_noise(trial: Trial, stated: float) -> Hypothesis | None:
+    """Try if constant errors of all poses, some times larger than stated, fit as a fault of one would.
+
+    Args:
+        trial: the flight.
+        stated: the cost of a fit with the errors as stated.
+    """
+    scene, best = trial.described, None
+    for factor in _NOISE_FACTORS:
+        constant2 = np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0)
+        sigma = scene.sigma.copy()
+        sigma[:, :2] = np.sqrt(factor**2 * constant2 + scene.sigma[:, 4:] ** 2)
+        wider = replace(scene, sigma=sigma)
+        # Each of the 6 errors of a camera is `factor` times less likely to be what it is.
+        cost = fit(trial.flight, wider, "none", 0).cost + 12 * len(trial.names) * np.log(factor)
+        if cost < stated and (best is None or cost < best.cost):
+            best = Hypothesis(
+                "noise",
+                trial.names,
+                f"constant errors of the poses are about {factor:g} times as large as stated",
+                remedies.pose_noise(trial.flight.cameras, factor),
+                np.inf,  # its score says nothing: larger errors excuse everything
+                wider,
+                cost=cost,
+            )
+    return best
+
+
+_NOISE_FACTORS = (2.0, 4.0, 8.0)
+_PENALTIES = {
+    "shift": 1.8,
+    "heading": 1.3,
+    "north": 1.8,
+    "zero": 2.2,
+    "pitch": 1.3,
+    "roll": 1.5,
+    "focal": 1.3,
+}
+_TURNS = np.radians([0, 45, 90, 135, 180, -135, -90, -45])
+
+
+def _first_turn(trial: Trial, name: str, index: int) -> float:
+    """Return from which turn to search: a fit from there finds the best within some 30 deg."""
+    if name in ("shift", "focal"):
+        return 0.0
+    turns = (_TURNS[0], _TURNS[1], _TURNS[-1]) if name == "pitch" else _TURNS
+
+    def misfit(turn: float) -> float:
+        solved = solve(undone(trial.described, name, index, np.zeros(3), turn))
+        chi2 = solved.chi2[solved.views >= 2]
+        return float(np.median(chi2)) if chi2.size else np.inf
+
+    return float(min(turns, key=misfit))
+
+
+def _of_fault(trial: Trial, fault: Fault, penalty: float) -> Hypothesis:
+    cameras, index, degrees = trial.flight.cameras, fault.index, fault.turn_deg
+    name = trial.names[index]
+    far = f"{np.linalg.norm(fault.shift):.1f} m"
+    mounted = fault.name in ("pitch", "roll", "focal")  # of one camera, whatever the others
+    said = {
+        "shift": f"the log of {name} has its zero {far} from the world's",
+        "north": f"the log of {name} has its north {degrees:+.0f} deg from the world's",
+        "zero": f"the log of {name} has its zero {far} and its north {degrees:+.0f} deg from the world's",
+        "heading": f"the heading of {name} is {degrees:+.0f} deg from what is logged",
+        "pitch": f"{name} looks {abs(degrees):.0f} deg {higher_or_lower(degrees)} than stated",
+        "roll": f"{name} is rolled by {degrees:+.0f} deg about the optical axis",
+        "focal": f"the focal length of {name} is {np.exp(fault.turn_rad):.3g} times what is stated",
+    }[fault.name]
+    codes = {"heading": "pose", "pitch": "mount", "roll": "mount", "focal": "intrinsics"}
+    code = codes.get(fault.name, "origin")
+    if code == "intrinsics":
+        remedy = remedies.intrinsics(cameras, [index], float(np.exp(fault.turn_rad)))
+    elif code == "origin":
+        remedy = remedies.origin(cameras, index, fault.shift, degrees)
+    elif mounted:
+        own = turn_about("x" if fault.name == "pitch" else "z", degrees)
+        remedy = remedies.mount(cameras, [index], lambda mount: mount @ own)
+    else:
+        remedy = remedies.mount(cameras, [index], lambda mount: turn_about("z", degrees) @ mount)
+    return Hypothesis(
+        code,
+        (name,) if mounted else pair_of(trial, [index]),
+        said if mounted else said + relative_to(trial, [index]),
+        remedy,
+        penalty,
+        fault.scene,
+        cost=fault.cost + _COST_OF_NUMBER * FREE[fault.name],
+    )
 
 
 def _doubt(cause: Hypothesis, described: Score, scene: Scene) -> Doubt:

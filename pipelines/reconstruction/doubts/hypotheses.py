@@ -15,7 +15,6 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
-from pipelines.reconstruction.doubts.faults import FREE, Fault, fit, undone
 from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene, scene_of
 from pipelines.reconstruction.doubts.score import Base, Score, score, solve
 
@@ -26,7 +25,6 @@ _FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
 _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _FLU_FROM_FRD = np.diag([1.0, -1, -1])
 _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
-_COST_OF_NUMBER = 2.0  # of chi^2, as in Akaike's criterion
 _SPARE = 2.0  # hypotheses whose scores are farther from the best need no exact score
 _LONGEST_CLOCK_S = 3.0
 _LEAST_CLOCK_S = 0.05
@@ -203,7 +201,7 @@ class Trial:
         return scene
 
 
-def _turn(axis: str, degrees: float) -> Float:
+def turn_about(axis: str, degrees: float) -> Float:
     """Return the rotation [3, 3] about an axis."""
     sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
     if axis == "x":
@@ -222,7 +220,7 @@ def of_times(trial: Trial) -> Iterator[Hypothesis]:
             found = trial.best(
                 lambda seconds, index=index: Hypothesis(  # type: ignore[misc]
                     "clock",
-                    _pair(trial, [index]),
+                    pair_of(trial, [index]),
                     f"the pictures of {names[index]} were taken {seconds:+.3f} s from where their clock says",
                     remedies.clock(described, [index], seconds),
                     1.0 + abs(seconds) / 2,
@@ -246,7 +244,7 @@ def of_times(trial: Trial) -> Iterator[Hypothesis]:
             yield trial.scored(
                 Hypothesis(
                     "frame_rate",
-                    _pair(trial, group),
+                    pair_of(trial, group),
                     f"the pictures of {said} follow each other {factor:.3g} times as slowly as stated",
                     remedies.frame_rate(described, group, factor),
                     penalty,
@@ -341,21 +339,22 @@ def _mounted(trial: Trial) -> Iterator[Hypothesis]:
             continue
         whose = _whose(trial, group)
         for degrees in (90, 180, 270):
+            turn = turn_about("z", degrees)
             yield Hypothesis(
                 "mount",
                 tuple(trial.names[index] for index in group),
                 f"{whose} rolled by {degrees} deg about the optical axis",
-                remedies.mount(trial.flight.cameras, group, lambda mount, d=degrees: mount @ _turn("z", d)),  # type: ignore[misc]
+                remedies.mount(trial.flight.cameras, group, _after(turn)),
                 penalty,
-                trial.turned_in_camera(_turn("z", degrees), group),
+                trial.turned_in_camera(turn, group),
             )
             yield Hypothesis(
                 "mount",
                 tuple(trial.names[index] for index in group),
                 f"{whose} mounted {degrees} deg to the left of where it is said to look",
-                remedies.mount(trial.flight.cameras, group, lambda mount, d=degrees: _turn("z", d) @ mount),  # type: ignore[misc]
+                remedies.mount(trial.flight.cameras, group, _before(turn)),
                 penalty,
-                trial.turned_in_body(_turn("z", degrees), group),
+                trial.turned_in_body(turn, group),
             )
 
 
@@ -366,13 +365,15 @@ def _tilts_negated(trial: Trial) -> Iterator[Hypothesis]:
         cameras = trial.flight.cameras
         rotation = trial.described.rotation.copy()
         for index in tilted:
-            rotation[index] = rotation[index] @ _turn("x", 2 * remedies.down_deg(cameras[index]))
+            rotation[index] = rotation[index] @ turn_about("x", 2 * remedies.down_deg(cameras[index]))
         yield Hypothesis(
             "mount",
             tuple(trial.names[index] for index in tilted),
             "the tilt of every camera has the wrong sign",
             "; ".join(
-                remedies.mount(cameras, [index], _tilted_by(2 * remedies.down_deg(cameras[index])))
+                remedies.mount(
+                    cameras, [index], _after(turn_about("x", 2 * remedies.down_deg(cameras[index])))
+                )
                 for index in tilted
             ),
             0.5,
@@ -380,9 +381,14 @@ def _tilts_negated(trial: Trial) -> Iterator[Hypothesis]:
         )
 
 
-def _tilted_by(degrees: float) -> Callable[[Float], Float]:
-    """Return what tilts a mount upwards."""
-    return lambda mount: mount @ _turn("x", degrees)
+def _after(turn: Float) -> Callable[[Float], Float]:
+    """Return what turns a mount about the camera's axes."""
+    return lambda mount: mount @ turn
+
+
+def _before(turn: Float) -> Callable[[Float], Float]:
+    """Return what turns a mount about the body's axes."""
+    return lambda mount: turn @ mount
 
 
 def _whose(trial: Trial, group: Sequence[int]) -> str:
@@ -579,21 +585,21 @@ def _each_number(trial: Trial) -> Iterator[Hypothesis | None]:
         return lambda degrees: Hypothesis(
             "mount",
             tuple(names[index] for index in group),
-            f"{_said(names, group)} looks {abs(degrees):.0f} deg {_higher(degrees)} than stated",
-            remedies.mount(cameras, group, lambda mount: mount @ _turn("x", degrees)),
+            f"{_said(names, group)} looks {abs(degrees):.0f} deg {higher_or_lower(degrees)} than stated",
+            remedies.mount(cameras, group, lambda mount: mount @ turn_about("x", degrees)),
             penalty,
-            trial.turned_in_camera(_turn("x", degrees), group),
+            trial.turned_in_camera(turn_about("x", degrees), group),
         )
 
     def heading(group: list[int], penalty: float) -> Callable[[float], Hypothesis]:
         return lambda degrees: Hypothesis(
             "pose",
-            _pair(trial, group),
+            pair_of(trial, group),
             f"the heading of {_said(names, group)} is {degrees:+.0f} deg from what is logged"
-            + _relative(trial, group),
-            remedies.mount(cameras, group, lambda mount: _turn("z", degrees) @ mount),
+            + relative_to(trial, group),
+            remedies.mount(cameras, group, lambda mount: turn_about("z", degrees) @ mount),
             penalty,
-            trial.turned_in_world(_turn("z", degrees), group),
+            trial.turned_in_world(turn_about("z", degrees), group),
         )
 
     for factor in _FOCAL_FACTORS:
@@ -619,114 +625,7 @@ def _each_number(trial: Trial) -> Iterator[Hypothesis | None]:
         )
 
 
-# --- faults of one camera's poses ----------------------------------------------------------------------
-
-
-def of_faults(trial: Trial) -> Iterator[Hypothesis]:
-    """Fit a fault of each moving camera's poses: where its log has zero and north, and how it is turned."""
-    located = trial.flight.hips is not None or trial.flight.ground is not None
-    for index in trial.every:
-        for name, penalty in _PENALTIES.items():
-            if index not in trial.moving and name != "focal":
-                continue
-            if name in ("north", "zero") and len(trial.names) == 2 and index == 0 and not located:
-                continue  # of two, one alone can be turned against the other
-            fault = fit(trial.flight, trial.described, name, index, _first_turn(trial, name, index))
-            yield trial.scored(_of_fault(trial, fault, penalty))
-
-
-def of_noise(trial: Trial, stated: float) -> Hypothesis | None:
-    """Try if constant errors of all poses, some times larger than stated, fit as a fault of one would.
-
-    Args:
-        trial: the flight.
-        stated: the cost of a fit with the errors as stated.
-    """
-    scene, best = trial.described, None
-    for factor in _NOISE_FACTORS:
-        constant2 = np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0)
-        sigma = scene.sigma.copy()
-        sigma[:, :2] = np.sqrt(factor**2 * constant2 + scene.sigma[:, 4:] ** 2)
-        wider = replace(scene, sigma=sigma)
-        # Each of the 6 errors of a camera is `factor` times less likely to be what it is.
-        cost = fit(trial.flight, wider, "none", 0).cost + 12 * len(trial.names) * np.log(factor)
-        if cost < stated and (best is None or cost < best.cost):
-            best = Hypothesis(
-                "noise",
-                trial.names,
-                f"constant errors of the poses are about {factor:g} times as large as stated",
-                remedies.pose_noise(trial.flight.cameras, factor),
-                np.inf,  # its score says nothing: larger errors excuse everything
-                wider,
-                cost=cost,
-            )
-    return best
-
-
-_NOISE_FACTORS = (2.0, 4.0, 8.0)
-_PENALTIES = {
-    "shift": 1.8,
-    "heading": 1.3,
-    "north": 1.8,
-    "zero": 2.2,
-    "pitch": 1.3,
-    "roll": 1.5,
-    "focal": 1.3,
-}
-_TURNS = np.radians([0, 45, 90, 135, 180, -135, -90, -45])
-
-
-def _first_turn(trial: Trial, name: str, index: int) -> float:
-    """Return from which turn to search: a fit from there finds the best within some 30 deg."""
-    if name in ("shift", "focal"):
-        return 0.0
-    turns = (_TURNS[0], _TURNS[1], _TURNS[-1]) if name == "pitch" else _TURNS
-
-    def misfit(turn: float) -> float:
-        solved = solve(undone(trial.described, name, index, np.zeros(3), turn))
-        chi2 = solved.chi2[solved.views >= 2]
-        return float(np.median(chi2)) if chi2.size else np.inf
-
-    return float(min(turns, key=misfit))
-
-
-def _of_fault(trial: Trial, fault: Fault, penalty: float) -> Hypothesis:
-    cameras, index, degrees = trial.flight.cameras, fault.index, fault.turn_deg
-    name = trial.names[index]
-    far = f"{np.linalg.norm(fault.shift):.1f} m"
-    mounted = fault.name in ("pitch", "roll", "focal")  # of one camera, whatever the others
-    said = {
-        "shift": f"the log of {name} has its zero {far} from the world's",
-        "north": f"the log of {name} has its north {degrees:+.0f} deg from the world's",
-        "zero": f"the log of {name} has its zero {far} and its north {degrees:+.0f} deg from the world's",
-        "heading": f"the heading of {name} is {degrees:+.0f} deg from what is logged",
-        "pitch": f"{name} looks {abs(degrees):.0f} deg {_higher(degrees)} than stated",
-        "roll": f"{name} is rolled by {degrees:+.0f} deg about the optical axis",
-        "focal": f"the focal length of {name} is {np.exp(fault.turn_rad):.3g} times what is stated",
-    }[fault.name]
-    codes = {"heading": "pose", "pitch": "mount", "roll": "mount", "focal": "intrinsics"}
-    code = codes.get(fault.name, "origin")
-    if code == "intrinsics":
-        remedy = remedies.intrinsics(cameras, [index], float(np.exp(fault.turn_rad)))
-    elif code == "origin":
-        remedy = remedies.origin(cameras, index, fault.shift, degrees)
-    elif mounted:
-        own = _turn("x" if fault.name == "pitch" else "z", degrees)
-        remedy = remedies.mount(cameras, [index], lambda mount: mount @ own)
-    else:
-        remedy = remedies.mount(cameras, [index], lambda mount: _turn("z", degrees) @ mount)
-    return Hypothesis(
-        code,
-        (name,) if mounted else _pair(trial, [index]),
-        said if mounted else said + _relative(trial, [index]),
-        remedy,
-        penalty,
-        fault.scene,
-        cost=fault.cost + _COST_OF_NUMBER * FREE[fault.name],
-    )
-
-
-def _higher(degrees: float) -> str:
+def higher_or_lower(degrees: float) -> str:
     """Say which way a turn about a camera's x axis tilts it."""
     return "higher" if degrees > 0 else "lower"
 
@@ -735,12 +634,13 @@ def _said(names: Sequence[str], group: Sequence[int]) -> str:
     return "every camera" if len(group) == len(names) else names[group[0]]
 
 
-def _pair(trial: Trial, group: Sequence[int]) -> tuple[str, ...]:
+def pair_of(trial: Trial, group: Sequence[int]) -> tuple[str, ...]:
     """Name the cameras of a group; of two cameras both, since neither can be told to be the wrong one."""
     return trial.names if len(trial.names) == 2 else tuple(trial.names[index] for index in group)
 
 
-def _relative(trial: Trial, group: Sequence[int]) -> str:
+def relative_to(trial: Trial, group: Sequence[int]) -> str:
+    """Say of one of two cameras that the other may be the wrong one."""
     if len(trial.names) == 2 and len(group) == 1:
         return f" (relative to {trial.names[1 - group[0]]}: either may be wrong)"
     return ""
