@@ -30,6 +30,7 @@ _FEWEST_SIGHTINGS = 5  # of a point of the cloud
 _PIXEL_SIGMA = 0.5  # of a followed point
 _POINT_SIGMA_M = 0.15  # the largest: of a point's place, all axes together
 _WORST_PX = 1.5  # mean residual of a point
+_ANYWHERE_M = 300.0  # prior of a point's place, about the origin: it keeps equations regular
 _NEAREST_M, _FARTHEST_M = 1.5, 40.0
 
 _GRID_M = 0.8  # of patches: at most one point of a cloud in a cube of this size
@@ -67,7 +68,6 @@ _LOSS = 2.0  # standard deviations at which a patch counts half
 _ROUNDS = 8
 _FEWEST_PATCHES = 10  # of a pair of cameras, distinct and in agreement
 _AGREE = 0.5  # share of a pair's patches that must agree
-_GAIN = 0.7  # of the prior sigma: a camera with more left is not bound
 
 
 @dataclass(frozen=True)
@@ -261,19 +261,22 @@ def _cloud(
     points = len(names)
     count = np.bincount(number, minlength=points)
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    new_m, new_turn = (0.0, 0.0) if camera.errors is None else camera.errors.white
+    turn = np.hypot(new_turn, _PIXEL_SIGMA / camera.focal_px)
     weight = np.ones(len(ray))
     for _ in range(_ROUNDS // 2):
-        normal = _sums(across * weight[:, None, None], number, points) + 1e-12 * np.eye(3)
+        normal = _sums(across * weight[:, None, None], number, points) + _ANYWHERE_M**-2.0 * np.eye(3)
         right = _sums(np.einsum("kij,kj->ki", across, position) * weight[:, None], number, points)
         place3 = np.linalg.solve(normal, right[..., None])[..., 0]
         arm = place3[number] - position
         distance = np.linalg.norm(arm, axis=1)
         missed = np.linalg.norm(np.einsum("kij,kj->ki", across, arm), axis=1) / distance * camera.focal_px
-        weight = 1 / np.maximum(distance, 0.5) ** 2 / (1 + missed**2)
-    inverse = np.linalg.inv(_sums(across * weight[:, None, None], number, points) + 1e-12 * np.eye(3))
+        weight = 1 / ((turn * np.maximum(distance, 0.5)) ** 2 + new_m**2) / (1 + missed**2)
+    covariance = np.linalg.inv(
+        _sums(across * weight[:, None, None], number, points) + _ANYWHERE_M**-2.0 * np.eye(3)
+    )
     turned = -_cross(arm) @ rotation
-    by_turn = inverse @ _sums(across @ turned * weight[:, None, None], number, points)
-    covariance = inverse * (_PIXEL_SIGMA / camera.focal_px) ** 2
+    by_turn = covariance @ _sums(across @ turned * weight[:, None, None], number, points)
     far, off = (np.bincount(number, each, points) / np.maximum(count, 1) for each in (distance, missed))
     kept = (count >= _FEWEST_SIGHTINGS) & (np.trace(covariance, axis1=1, axis2=2) < _POINT_SIGMA_M**2)
     kept &= (off < _WORST_PX) & (far > _NEAREST_M) & (far < _FARTHEST_M)
@@ -630,7 +633,7 @@ def _reason(c: int, cameras: Sequence[Camera], pairs: Sequence[tuple[int, int]],
     """Say in one line why a camera is not bound."""
     mine = [n for n, pair in enumerate(pairs) if c in pair]
     if not mine:
-        return "no pictures, or no camera with a known background, to compare its ground with"
+        return "no camera's ground compares with its own: both need pictures, and one some metres of flight"
     best = max(mine, key=lambda n: (counts[n, 1], counts[n, 0]))
     a, b = pairs[best]
     other = cameras[b if a == c else a].name

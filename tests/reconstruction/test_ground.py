@@ -99,11 +99,13 @@ def camera(
 ERRORS_M = {"north": np.array([0.06, -0.04, 0.05]), "east": np.array([-0.05, 0.03, -0.06])}
 
 
-def scene(contrast: float = 25.0) -> tuple[list[Camera], dict[str, Followed | str], dict[str, Stills]]:
+def scene(
+    contrast: float = 25.0, way_m: float = 4.0
+) -> tuple[list[Camera], dict[str, Followed | str], dict[str, Stills]]:
     """Film the same ground by two cameras 60 degrees apart."""
     ground = texture(contrast)
     made = [
-        camera(name, turn, error, ground)
+        camera(name, turn, error, ground, way_m)
         for (name, error), turn in zip(ERRORS_M.items(), (90, 30), strict=True)
     ]
     return (
@@ -151,8 +153,9 @@ def test_exact_camera_leaves_no_common_offset() -> None:
     assert binding.cameras[1].trajectory.position == pytest.approx(exact.trajectory.position, abs=1e-6)
 
 
-def test_ground_without_texture_binds_nothing() -> None:
-    cameras, followed, stills = scene(contrast=0.0)
+@pytest.mark.parametrize(("contrast", "way_m"), [(0.0, 4.0), (25.0, 0.0)])
+def test_flat_ground_and_hovering_cameras_bind_nothing(contrast: float, way_m: float) -> None:
+    cameras, followed, stills = scene(contrast, way_m)
     binding = bind_positions(cameras, followed, stills, between=BETWEEN)
     assert binding.bound == ()
     assert set(binding.reasons) == {"north", "east"}
