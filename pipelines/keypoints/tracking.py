@@ -27,6 +27,7 @@ from pipelines.keypoints.tiles import (
 from pipelines.session.registries import KeypointNetworks, Person, Region
 
 _PRESENT = 0.5
+_STILL_PRESENT = 0.2  # of who was seen in the last picture, if the score is that of a person
 _CENTRED = 0.3  # a margin (3 sigma) of this many heights, 0.1 per sigma, leaves the region good enough
 _SMALLEST_PX = 8.0
 _WIDER = (1.3, 1.0)  # factors on the last region of a person just lost
@@ -154,8 +155,8 @@ class PeopleTracker:
         followed, missed = self._seen(), self._missed()
         for track in self._tracks:
             track.missing += 1
-        once = self._locate(picture, [track.person.region for track in followed])
-        for track, person in zip(followed, once, strict=True):
+        regions = [track.person.region for track in followed]
+        for track, person in zip(followed, self._locate(picture, regions, followed=True), strict=True):
             if person is not None:
                 track.see(person)
         for share in _WIDER:
@@ -351,12 +352,27 @@ class PeopleTracker:
             track for track in self._seen() if not _agrees(region, hint) or _agrees(track.person.region, hint)
         ]
 
-    def _locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person | None]:
-        """Locate the person in each region, None if there is none."""
+    def _locate(
+        self, picture: Picture, regions: Sequence[Region], *, followed: bool = False
+    ) -> list[Person | None]:
+        """Locate the person in each region, None if there is none.
+
+        Who is followed may have a low presence in a single picture: the joints' confidences are surer.
+        """
         if not regions:
             return []
-        people = self._networks.locate(picture, regions)
-        return [person if _is_present(person, picture) else None for person in people]
+        return [
+            person
+            if _is_within(person, picture)
+            and (
+                person.presence >= _PRESENT
+                or (
+                    followed and person.presence >= _STILL_PRESENT and _score(person) >= self._least_score > 0
+                )
+            )
+            else None
+            for person in self._networks.locate(picture, regions)
+        ]
 
     def _locate_twice(self, picture: Picture, regions: Sequence[Region]) -> list[Person | None]:
         """Locate people twice, for regions not from their own joints: one pass alone flips left and right."""
@@ -384,13 +400,13 @@ class PeopleTracker:
         return person
 
 
-def _is_present(person: Person, picture: Picture) -> bool:
-    """Test if a person is present, with a region that the next picture can be searched in."""
+def _is_within(person: Person, picture: Picture) -> bool:
+    """Test if a person has a region that the next picture can be searched in."""
     region, (height, width) = person.region, picture.shape[:2]
     x, y = region.centre
     reach = region.side / 2
     within = -reach <= x <= width + reach and -reach <= y <= height + reach
-    return person.presence >= _PRESENT and _SMALLEST_PX <= region.side < math.inf and within
+    return _SMALLEST_PX <= region.side < math.inf and within
 
 
 def _one_body(a: Person, b: Person) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -247,6 +247,50 @@ def test_a_tree_is_dropped_after_a_few_pictures_beside_a_person() -> None:
     assert tracker.counts["no people"] > 1
     # Each search finds the tree again; a single pass is enough to see what it is.
     assert len([region for region in networks.located[-20:] if region.side < 100]) <= 10
+
+
+@dataclass
+class _Doubting(BarNetworks):
+    """Networks whose presence is low in some pictures, and which tell people by confidences or do not."""
+
+    presence: float = 1.0
+    confidence: float = 0.9
+
+    def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
+        return [
+            replace(
+                person, presence=min(person.presence, self.presence), confidence=np.full(5, self.confidence)
+            )
+            for person in super().locate(picture, regions)
+        ]
+
+
+@dataclass
+class _TellingAndDoubting(_Doubting):
+    person_confidence: float = 0.55
+
+
+@pytest.mark.parametrize(
+    ("networks", "presence", "confidence", "followed"),
+    [
+        (_TellingAndDoubting, 0.3, 0.9, True),
+        (_TellingAndDoubting, 0.3, 0.4, False),  # joints that are no person's
+        (_TellingAndDoubting, 0.1, 0.9, False),  # hardly anybody there
+        (_Doubting, 0.3, 0.9, False),  # its confidences tell nothing
+    ],
+)
+def test_who_is_followed_outlasts_a_low_presence(
+    networks: type[_Doubting], presence: float, confidence: float, followed: bool
+) -> None:
+    """Nobody who is not followed yet is taken with such a presence."""
+    picture = draw(WIDTH, HEIGHT, Bar(500, 270, 121))
+    tracker = PeopleTracker(fake := networks())
+    fake.presence, fake.confidence = presence, confidence
+    assert tracker.step(picture, hint=None) == []
+    fake.presence, fake.confidence = 1.0, 0.9
+    assert _tracks([tracker.step(picture, hint=None) for _ in range(6)]) == [[0]] * 6
+    fake.presence, fake.confidence = presence, confidence
+    assert bool(tracker.step(picture, hint=None)) is followed
 
 
 def test_a_lone_thing_is_followed_and_so_is_one_that_can_be_the_actor() -> None:
