@@ -536,7 +536,7 @@ def _no_people_warnings(no_people: Mapping[str, Mapping[str, int]]) -> list[str]
     """Write which detections were taken for no people, by cause, and which were kept all the same."""
     words = {
         "ground": "no people: nobody who stands on the ground is there or so large: {}",
-        "alone": "no people: another camera looks there and sees nobody: {}",
+        "alone": "no people: no other camera sees them, though one looks wherever they could stand: {}",
         "kept": "nobody on the ground is there or so large, but the surest person of the camera is not"
         " either: detections are kept, the poses or the ground may be wrong: {}",
     }

@@ -246,3 +246,29 @@ def test_nonsense_is_refused_in_a_line(
     assert done.exit_code == 1, (done.output, done.exception)
     (line,) = done.stderr.strip().splitlines()
     assert said in line
+
+
+def test_a_thing_in_the_sky_is_left_out_counted_and_said(tmp_path: Path) -> None:
+    """Expect a skeleton as without it: a body thrice as large as the actor at the upper edge of a picture.
+
+    No other camera sees it, and at the distance of somebody of usual size, 3 m, it is higher than people are.
+    """
+    flight = write_flight(tmp_path, cameras=2, clean=True)
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest, "-o", session)
+    before = run(session)
+    path = tmp_path / "drone1.json"
+    keypoints = json.loads(path.read_text(encoding="utf-8"))
+    for entry in list(keypoints):
+        points = np.array(entry["keypoints"]).reshape(-1, 3)
+        points[:, :2] = 3 * (points[:, :2] - points[:, :2].mean(axis=0)) + (640.0, 0.0)
+        keypoints.append(entry | {"keypoints": points.ravel().tolist()})
+    path.write_text(json.dumps(keypoints), encoding="utf-8")
+    succeeds("ingest", flight.manifest, "-o", session)
+    after = run(session)
+    told = {cause: cameras for cause, cameras in after["people"]["no_people"].items() if cameras}
+    assert told == {"alone": {"drone1": len(flight.t_ns)}}
+    assert after["people"]["detections_not_used"] == before["people"]["detections_not_used"]
+    assert after["mpjpe_mm"] == pytest.approx(before["mpjpe_mm"], rel=1e-9)  # rounding of longer rows
+    assert stage(session)["counts"]["no_people"] == after["people"]["no_people"]
+    assert any(f"drone1 {len(flight.t_ns)}" in line for line in stage(session)["warnings"])
