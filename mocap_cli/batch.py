@@ -44,8 +44,8 @@ _settings_options = grouped(
     ),
     click.option(
         "--method",
-        type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
-        default="robust",
+        type=click.Choice(["auto", "refined", "robust", "midpoint", "dlt"]),
+        default="auto",
         show_default=True,
         help="Of `mocap reconstruct`, as the next three are.",
     ),

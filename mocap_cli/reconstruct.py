@@ -42,12 +42,13 @@ _settings_options = grouped(
     _settings,
     click.option(
         "--method",
-        type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
-        default="robust",
+        type=click.Choice(["auto", "refined", "robust", "midpoint", "dlt"]),
+        default="auto",
         show_default=True,
-        help="dlt: linear triangulation; midpoint: the point closest to the rays; robust: outlier views"
-        " rejected, then least squares on the reprojection; refined: robust, then skeleton, camera poses and"
-        " clocks estimated together.",
+        help="auto: the best estimate that the flight allows, from backgrounds, keypoints, motion, bones,"
+        " poses and clocks together. The others are parts of it, for comparison. refined: without"
+        " backgrounds; robust: outlier views rejected, then least squares on the reprojection; midpoint: the"
+        " point closest to the rays; dlt: linear triangulation.",
     ),
     click.option(
         "--rate",
@@ -197,10 +198,14 @@ def reconstruct_command(
 
 
 def _print(result: Reconstructed, *, every_joint: bool) -> None:
+    from pipelines.reconstruction.results import line_of_parts
+
     metrics: dict[str, Any] = result.metrics
     counts = metrics["status_counts"]
     filled = f", {counts['filled']} filled" if counts.get("filled") else ""
     say(f"{metrics['method']}: {counts['ok']} of {counts['all']} joint-frames reconstructed{filled}")
+    if metrics["method"] == "auto":
+        say(line_of_parts(metrics["method_used"]))
     if metrics.get("smoothing"):
         done = metrics["smoothing"]
         cutoff = done["cutoff_hz"]

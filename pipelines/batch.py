@@ -48,7 +48,7 @@ class Settings:
     """Settings for every flight."""
 
     stages: tuple[str, ...] = STAGES
-    method: Method | Literal["refined"] = "robust"
+    method: Method | Literal["refined", "auto"] = "auto"
     detector: str = "blazepose"
     every: int = 1
 

@@ -8,7 +8,7 @@ could not be measured is NaN with a status that gives the reason.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipelines.detect import detect, hints_from, hints_of
-from pipelines.follow import Following
+from pipelines.follow import Following, cameras_to_follow
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.triangulation import (
     STATUS,
@@ -38,6 +38,7 @@ from pipelines.reconstruction.loading import (
     load_clock_sigma,
     load_pose_errors,
     load_truth,
+    source_of_pose_noise,
 )
 from pipelines.reconstruction.observations import (
     Camera,
@@ -49,7 +50,15 @@ from pipelines.reconstruction.observations import (
     readout_of,
     time_base,
 )
-from pipelines.reconstruction.results import assess, camera_poses_table, skeleton_table
+from pipelines.reconstruction.refining import (
+    FoundClocks,
+    RefinedFlight,
+    RobustFlight,
+    find_clocks,
+    refine_flight,
+    shifted,
+)
+from pipelines.reconstruction.results import assess, camera_poses_table, method_used, skeleton_table
 from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import (
     noise_text,
@@ -73,9 +82,8 @@ from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pipelines.reconstruction.refining import RefinedFlight
 
-RECONSTRUCT = Stage("reconstruct", revision=16)
+RECONSTRUCT = Stage("reconstruct", revision=17)
 
 _LONGEST_FILL_S = 10.0
 
@@ -84,7 +92,7 @@ _LONGEST_FILL_S = 10.0
 class Settings:
     """Settings that determine the result, in addition to the session itself."""
 
-    method: Method | Literal["refined"] = "robust"
+    method: Method | Literal["refined", "auto"] = "auto"
     rate_hz: float | None = None
     people: int = 1
     min_confidence: float = 0.3
@@ -96,10 +104,15 @@ class Settings:
     end_s: float | None = None
     fill_s: float | None = None  # the longest gap that is filled
     smooth: str | None = None  # as `smoothing.smoother` reads it
-    refine_cameras: Literal["background"] | None = None  # method to refine poses before triangulation
+    refine_cameras: Literal["background"] | None = None  # before the triangulation; `auto` does it unasked
     disturb_poses: str | None = None  # errors added to the logged poses, in the form of `--pose-noise`
     trials: int = 1  # draws of these errors
     seed: int = 0  # of these draws
+
+    @property
+    def asks_background(self) -> bool:
+        """True if moving cameras with pictures have their poses corrected by their backgrounds."""
+        return self.method == "auto" or self.refine_cameras == "background"
 
 
 @dataclass(frozen=True)
@@ -147,12 +160,11 @@ def reconstruct(
         if ingested is None:
             raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
         description = read_description(folder)
-        following = None
-        if settings.refine_cameras == "background":
-            span_s = (settings.start_s, settings.end_s)
-            following = Following(session, every=settings.every, span_s=span_s, force=force)
+        following, left_out = _following(session, description, settings, force)
         detected = _detected(session, settings, workers, force, following, progress)
-        background = following.finish(workers=workers, progress=progress) if following else None
+        background = None
+        if following is not None:
+            background, left_out = _finished(following, settings, workers, progress)
         measured = measured_for(detected.settings["detector"]) if detected else None
         run = session.begin(
             RECONSTRUCT,
@@ -176,7 +188,7 @@ def reconstruct(
         )
         cameras, swaps = _without_swaps(cameras)
         progress.advance()
-        followed = _followed(folder, cameras) if background else {}
+        followed = _followed(folder, cameras, left_out) if background or left_out else {}
         actor = logged_actor(folder, description)
         flight = _Flight(
             description,
@@ -199,8 +211,8 @@ def reconstruct(
         doubts = doubts_of(
             folder,
             description,
-            cameras,
-            chosen=chosen_detections(cameras, stored.found, stored.association),
+            stored.cameras,
+            chosen=chosen_detections(stored.cameras, stored.found, stored.association),
             pose_noise=settings.pose_noise,
         )
         _refuse_nothing(folder, stored, doubts)
@@ -359,6 +371,7 @@ class _Flight:
 class _Attempt:
     """Result of one reconstruction of the flight (one trial)."""
 
+    cameras: list[Camera]  # with the clocks that were found, and the logged poses
     observations: Observations
     views: Views
     result: Triangulation
@@ -373,25 +386,27 @@ class _Attempt:
 def _attempt(
     flight: _Flight, cameras: list[Camera], settings: Settings, workers: int, progress: Progress
 ) -> _Attempt:
-    description = flight.description
+    description, refines = flight.description, settings.method in ("refined", "auto")
+    clocks: FoundClocks | None = None
+    if settings.method != "refined" and load_clock_sigma(description, cameras).any():
+        seen, views, result, _ = _triangulated(flight, cameras, settings, workers)
+        clocks = find_clocks(_robust_flight(cameras, seen, views, result, description, settings, workers))
+        cameras = shifted(cameras, clocks.offset_s)
+    timed = cameras
     background: dict[str, Any] = {"background": None}
     warnings: list[str] = []
     if flight.followed:
         cameras, background["background"], warnings = _refine_cameras(
             cameras, flight.followed, description, settings
         )
-    seen = _observe(flight, cameras, settings)
-    progress.advance()
+    seen, views, result, solve = _triangulated(flight, cameras, settings, workers)
     observations = seen.observations
-    views = views_with_noise(cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers)
-    solve = solver_for(
-        settings.method, cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers
-    )
-    result = refused_people(solve(views), observations, seen.anybody)
+    progress.advance()
+    result = refused_people(result, observations, seen.anybody)
     progress.advance()
     refined = None
-    if settings.method == "refined":
-        refined = _refine(cameras, seen, views, result, description, settings, workers)
+    if refines:
+        refined = refine_flight(_robust_flight(cameras, seen, views, result, description, settings, workers))
         observations, views = refined.observations, refined.views
         result = refused_people(refined.result, observations, seen.anybody)
         if refined.cameras is None:  # refinement rejected: fall back to `robust`, with its own loss
@@ -413,15 +428,18 @@ def _attempt(
     )
     people = {"people": _people_seen(cameras, seen.association)}
     readout = _readout(cameras, seen)
+    parts = background | (refined.metrics if refined else {}) | _clock_metrics(cameras, clocks, refined)
+    known = source_of_pose_noise(description, timed, settings.pose_noise)
     progress.advance()
     return _Attempt(
+        timed,
         observations,
         views,
         result,
         seen.found,
         seen.association,
         seen.between_views,
-        metrics | finished | background | people | readout | (refined.metrics if refined else {}),
+        metrics | finished | people | readout | parts | {"method_used": method_used(parts, cameras, known)},
         _poses_stored(cameras, refined, background["background"], description.pose_interpolation),
         [
             *warnings,
@@ -431,6 +449,60 @@ def _attempt(
             *_readout_warnings(readout),
         ],
     )
+
+
+def _triangulated(
+    flight: _Flight, cameras: list[Camera], settings: Settings, workers: int
+) -> tuple[_Seen, Views, Triangulation, Callable[[Views], Triangulation]]:
+    """Observe and triangulate by the method, or by what it starts from; the last result is its solver."""
+    seen = _observe(flight, cameras, settings)
+    views = views_with_noise(cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers)
+    solve = solver_for(
+        settings.method, cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers
+    )
+    return seen, views, solve(views), solve
+
+
+def _robust_flight(
+    cameras: list[Camera],
+    seen: _Seen,
+    views: Views,
+    result: Triangulation,
+    description: Description,
+    settings: Settings,
+    workers: int,
+) -> RobustFlight:
+    """Collect what the refinement starts from."""
+    return RobustFlight(
+        cameras,
+        seen.found,
+        seen.association.choice,
+        seen.observations,
+        seen.sides,
+        views,
+        result,
+        prior=load_pose_errors(description, cameras, settings.pose_noise),
+        clock_sigma_s=load_clock_sigma(description, cameras),
+        pixel_sigma=settings.pixel_sigma,
+        between=description.pose_interpolation,
+        threads=workers,
+    )
+
+
+def _clock_metrics(
+    cameras: Sequence[Camera], clocks: FoundClocks | None, refined: RefinedFlight | None
+) -> dict[str, dict[str, float]]:
+    """Collect the clock offsets of all steps and their standard deviations; empty without unknown clocks."""
+    if clocks is None:
+        return {}
+    names = [camera.name for camera in cameras]
+    offset_s = dict(zip(names, clocks.offset_s.tolist(), strict=True))
+    sigma_s = dict(zip(names, clocks.sigma_s.tolist(), strict=True))
+    if refined is not None and refined.cameras is not None:
+        later = refined.metrics["clock_offsets_s"]
+        offset_s = {name: offset + later[name] for name, offset in offset_s.items()}
+        sigma_s = refined.metrics["clock_offset_sigmas_s"]
+    return {"clock_offsets_s": offset_s, "clock_offset_sigmas_s": sigma_s}
 
 
 @dataclass(frozen=True)
@@ -583,14 +655,42 @@ def _readout_warnings(readout: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _followed(folder: Path, cameras: Sequence[Camera]) -> dict[str, Followed | str]:
+def _following(
+    session: WritableSession, description: Description, settings: Settings, force: bool
+) -> tuple[Following | None, str | None]:
+    """Prepare to follow the backgrounds of moving cameras; None with the reason why `auto` goes without them."""
+    if not settings.asks_background or (settings.method == "auto" and not cameras_to_follow(description)):
+        return None, None
+    try:
+        span_s = (settings.start_s, settings.end_s)
+        return Following(session, every=settings.every, span_s=span_s, force=force), None
+    except DataError as error:
+        if settings.refine_cameras is not None:
+            raise
+        return None, error.problem
+
+
+def _finished(
+    following: Following, settings: Settings, workers: int, progress: Progress
+) -> tuple[StageRecord | None, str | None]:
+    """Follow what the detector did not show; None with the reason why `auto` goes without backgrounds."""
+    try:
+        return following.finish(workers=workers, progress=progress), None
+    except DataError as error:
+        if settings.refine_cameras is not None:
+            raise
+        return None, error.problem
+
+
+def _followed(folder: Path, cameras: Sequence[Camera], left_out: str | None) -> dict[str, Followed | str]:
     """Load the background of every moving camera with pictures; for the others, return the reason."""
     followed: dict[str, Followed | str] = {}
     for camera in cameras:
         if camera.static:
             followed[camera.name] = "it stands still"
         else:
-            followed[camera.name] = load_tracks(folder, camera) or "it came without pictures"
+            tracks = None if left_out else load_tracks(folder, camera)
+            followed[camera.name] = tracks or left_out or "it came without pictures"
     return followed
 
 
@@ -641,35 +741,6 @@ def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, di
         )
         total.update(counts)
     return sides, dict(sorted(total.items()))
-
-
-def _refine(
-    cameras: list[Camera],
-    seen: _Seen,
-    views: Views,
-    result: Triangulation,
-    description: Description,
-    settings: Settings,
-    workers: int,
-) -> RefinedFlight:
-    from pipelines.reconstruction.refining import RobustFlight, refine_flight
-
-    return refine_flight(
-        RobustFlight(
-            cameras,
-            seen.found,
-            seen.association.choice,
-            seen.observations,
-            seen.sides,
-            views,
-            result,
-            prior=load_pose_errors(description, cameras, settings.pose_noise),
-            clock_sigma_s=load_clock_sigma(description, cameras),
-            pixel_sigma=settings.pixel_sigma,
-            between=description.pose_interpolation,
-            threads=workers,
-        )
-    )
 
 
 def _refuse_nothing(folder: Path, attempt: _Attempt, doubts: Sequence[Doubt]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,14 +176,30 @@ def load_pose_errors(
     return known if len(known) == len(stated) else None
 
 
+def source_of_pose_noise(
+    description: Description, cameras: Sequence[Camera], pose_noise: str | None
+) -> Literal["stated", "logged"] | None:
+    """Say where the noise of the moving cameras' poses is known from; None if not known of all of them."""
+    moving = [camera for camera in cameras if not camera.static]
+    stated = [stated_models(camera.name, description.cameras[camera.name], pose_noise) for camera in moving]
+    if moving and all(models is not None for models in stated):
+        return "stated"
+    logged = [camera.sigma is not None for camera in moving]
+    return "logged" if moving and all(logged) else None
+
+
 def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Float:
-    """Load the prior standard deviation [C] s of each camera's clock offset; 0 for the reference camera."""
+    """Load the prior standard deviation [C] s of each camera's clock offset; 0 for the reference camera.
+
+    The manifest's reference is replaced by a camera with a known clock if its own is not known.
+    """
+    sigma_s = np.array([description.cameras[camera.name].clock.sigma_s for camera in cameras])
+    names = [camera.name for camera in cameras]
+    if (sigma_s == 0).any():
+        return sigma_s
     held = description.clock_reference
-    if held not in {camera.name for camera in cameras}:
-        held = cameras[0].name
-    return np.array(
-        [0.0 if camera.name == held else description.cameras[camera.name].clock.sigma_s for camera in cameras]
-    )
+    sigma_s[names.index(held) if held in names else 0] = 0.0
+    return sigma_s
 
 
 def load_truth(folder: Path, description: Description, joints: tuple[str, ...]) -> JointMotion | None:

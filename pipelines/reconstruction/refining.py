@@ -106,6 +106,24 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
 # --- clocks --------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class FoundClocks:
+    """Clock offsets that the keypoints determine."""
+
+    offset_s: Float  # [C] to add to the pictures' times
+    sigma_s: Float  # [C] posterior standard deviation; 0 for known clocks, the prior's where none was found
+    reason: str | None  # why offsets are only those of the search in steps, or zero
+
+
+def find_clocks(flight: RobustFlight) -> FoundClocks:
+    """Find the clock offsets of a flight: by the refinement, or by its search alone where that is refused."""
+    searched_s = _initial_clock_offsets_s(flight)
+    refined, offset_s = _settle_clocks(flight, searched_s)
+    if refined.fallback is not None:
+        return FoundClocks(searched_s, flight.clock_sigma_s, refined.fallback)
+    return FoundClocks(offset_s, refined.clock_sigma_s, None)
+
+
 def _initial_clock_offsets_s(flight: RobustFlight) -> Float:
     """Find the initial offset [C] s of every clock from some times of the flight, see `initial_offsets_s`."""
     times = len(flight.observations.t_ns)
@@ -137,7 +155,7 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
 def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangulation) -> Refined:
     """Run the refinement with these clock offsets, starting from these points."""
     _, people, joints, _ = flight.observations.confidence.shape
-    cameras = _shifted(flight.cameras, offset_s)
+    cameras = shifted(flight.cameras, offset_s)
     return refine(
         flight.t_s,
         [_sighting(flight, c, camera) for c, camera in enumerate(cameras)],
@@ -188,7 +206,7 @@ def _observe_with_offsets(
     flight: RobustFlight, offset_s: Float, every: int = 1
 ) -> tuple[Observations, Views]:
     """Observe with these clock offsets, at every k-th time of the skeleton."""
-    cameras = _shifted(flight.cameras, offset_s)
+    cameras = shifted(flight.cameras, offset_s)
     t_ns, sides = flight.observations.t_ns[::every], flight.sides[::every]
     observed = observe(cameras, flight.found, flight.choice, t_ns, flight.between)
     rays, confidence = on_sides(observed.rays, observed.confidence, sides)
@@ -239,7 +257,7 @@ def _keep_reconstructed_joints(refined: Refined, views: Views, threads: int) -> 
     )
 
 
-def _shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
+def shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
     """Return the cameras with their clocks moved forward by offsets [C] s."""
     return [
         replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
@@ -315,7 +333,7 @@ def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> di
 
 def _camera_table(flight: RobustFlight, refined: Refined, offset_s: Float) -> pd.DataFrame:
     """Build the table of corrected poses of every picture that has one."""
-    cameras = _shifted(flight.cameras, offset_s)
+    cameras = shifted(flight.cameras, offset_s)
     poses = []
     for c, camera in enumerate(cameras):
         t_s = (camera.frame_t_ns - flight.observations.t_ns[0]) / 1e9 - refined.clock_offset_s[c]

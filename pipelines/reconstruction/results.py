@@ -7,7 +7,7 @@ figures that could not be measured.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -205,6 +205,62 @@ def _leave_one_out(
         points = solve(replace(views, weight=weight)).points
         figures[name] = _spread(reprojection_px(views, points)[:, c])
     return figures
+
+
+# --- parts of the method -------------------------------------------------------------------------------
+
+
+def method_used(metrics: Mapping[str, Any], cameras: Sequence[Camera], known: str | None) -> dict[str, Any]:
+    """Say which parts of a method took part in a reconstruction, which not, and why.
+
+    Args:
+        metrics: the figures of `background`, `refinement` and `clock_offset_sigmas_s`, where there are any.
+        cameras: all of them, as loaded.
+        known: "stated" or "logged", the source of the pose noise; None without any.
+
+    Returns:
+        `background` and `ground`: the cameras whose poses they corrected, and the `reason` of each other;
+        `clocks`: the cameras whose clocks were estimated; `body`: whether motion and bones took part, and
+        the `reason` if not; `pose_noise`: stated, logged, estimated, or none.
+    """
+    used: dict[str, Any] = {}
+    for part in ("background", "ground"):
+        entries = metrics.get(part) or {}
+        used[part] = {
+            "cameras": [name for name, entry in entries.items() if entry["used"]],
+            "reasons": {name: entry["reason"] for name, entry in entries.items() if not entry["used"]},
+        }
+    sigmas_s = metrics.get("clock_offset_sigmas_s") or {}
+    refinement = metrics.get("refinement")
+    reason = "the method has no such part" if refinement is None else refinement["fallback"]
+    learned = refinement is not None and reason is None and refinement["pose_noise"] == "estimated"
+    guessed = learned or bool(used["background"]["cameras"])
+    exact = all(camera.static for camera in cameras)
+    return used | {
+        "clocks": [name for name, sigma_s in sigmas_s.items() if sigma_s > 0],
+        "body": {"used": reason is None, "reason": reason},
+        "pose_noise": known or ("estimated" if guessed and not exact else "none"),
+    }
+
+
+def line_of_parts(used: Mapping[str, Any]) -> str:
+    """Write the parts of the method `auto` in one line."""
+    parts = ["keypoints"]
+    if used["body"]["used"]:
+        parts.append("motion and bones")
+    for name, text in (("background", "backgrounds of"), ("ground", "ground seen by")):
+        if used[name]["cameras"]:
+            parts.append(f"{text} {', '.join(used[name]['cameras'])}")
+    if used["clocks"]:
+        parts.append(f"estimated clocks of {', '.join(used['clocks'])}")
+    noise = {"none": "the poses as exact", "estimated": "pose noise estimated from the pictures"}
+    parts.append(noise.get(used["pose_noise"], f"{used['pose_noise']} pose noise"))
+    left_out = [] if used["body"]["used"] else [f"motion and bones ({used['body']['reason']})"]
+    for name in ("background", "ground"):
+        for reason in dict.fromkeys(used[name]["reasons"].values()):
+            cameras = [camera for camera, own in used[name]["reasons"].items() if own == reason]
+            left_out.append(f"{name} of {', '.join(cameras)} ({reason})")
+    return "used " + "; ".join(parts) + (f". Not used: {'; '.join(left_out)}" if left_out else "")
 
 
 # --- tables --------------------------------------------------------------------------------------------

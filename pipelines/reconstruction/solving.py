@@ -94,20 +94,20 @@ def views_with_noise(
 
 
 def solver_for(
-    method: Method | Literal["refined"],
+    method: Method | Literal["refined", "auto"],
     cameras: Sequence[Camera],
     observations: Observations,
     *,
     pixel_sigma: float,
     threads: int,
 ) -> Callable[[Views], Triangulation]:
-    """Choose the solver from views to points; for `refined`, the solver of its start.
+    """Choose the solver from views to points; for `refined` and `auto`, the solver of their start.
 
     For calibrated cameras, `robust` has its own loss. For poses with errors, it has a gate that knows the
     common error of a picture's joints, and weights from logged covariances.
     """
     calibrated = observations.pose_sigma is None and all(camera.static for camera in cameras)
-    if method == "robust" and calibrated:
+    if method in ("robust", "auto") and calibrated:
         return partial(triangulate_heavy_tailed, threads=threads)
     if method in ("dlt", "midpoint"):
         return partial(triangulate, method=method, threads=threads)
