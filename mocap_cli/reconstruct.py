@@ -198,14 +198,12 @@ def reconstruct_command(
 
 
 def _print(result: Reconstructed, *, every_joint: bool) -> None:
-    from pipelines.reconstruction.results import line_of_parts
-
     metrics: dict[str, Any] = result.metrics
     counts = metrics["status_counts"]
     filled = f", {counts['filled']} filled" if counts.get("filled") else ""
     say(f"{metrics['method']}: {counts['ok']} of {counts['all']} joint-frames reconstructed{filled}")
     if metrics["method"] == "auto":
-        say(line_of_parts(metrics["method_used"]))
+        say(metrics["method_used"]["summary"])
     if metrics.get("smoothing"):
         done = metrics["smoothing"]
         cutoff = done["cutoff_hz"]

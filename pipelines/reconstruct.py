@@ -482,6 +482,7 @@ def _robust_flight(
         views,
         result,
         prior=load_pose_errors(description, cameras, settings.pose_noise),
+        measured=any(camera.errors is not None for camera in cameras),
         clock_sigma_s=load_clock_sigma(description, cameras),
         pixel_sigma=settings.pixel_sigma,
         between=description.pose_interpolation,

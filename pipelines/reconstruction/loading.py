@@ -17,6 +17,7 @@ from pipelines.geometry.noise import (
     pose_errors,
 )
 from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.solving import UNKNOWN_SIGMA
 from pipelines.session.camera_poses import stated_models, stated_noise
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
@@ -154,7 +155,10 @@ def _load_camera(
 def load_pose_errors(
     description: Description, cameras: Sequence[Camera], pose_noise: str | None
 ) -> list[PoseErrors] | None:
-    """Load the prior of each camera's pose errors over time; None unless known for all moving cameras.
+    """Load the prior of each camera's pose errors over time; None if not known for all moving cameras.
+
+    Errors that remain after a correction by the background are known. Beside such cameras, those without any
+    statement have errors of the size that poses of drones usually have (`UNKNOWN_SIGMA`).
 
     A logged covariance gives the size of errors, not their correlation over time (`errors_of_level`): the
     white part uses the covariance of each pose, the constant part the median. A static camera without stated
@@ -172,6 +176,9 @@ def load_pose_errors(
             stated.append(replace(level, logged=True))
         else:
             stated.append(PoseErrors((0.0, 0.0), ()) if camera.static else None)
+    if any(camera.errors is not None for camera in cameras):
+        usual = errors_of_level(np.array(UNKNOWN_SIGMA))
+        stated = [usual if errors is None else errors for errors in stated]
     known = [errors for errors in stated if errors is not None]
     return known if len(known) == len(stated) else None
 

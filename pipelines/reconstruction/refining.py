@@ -60,6 +60,7 @@ class RobustFlight:
     views: Views  # the same, one row for each joint-frame
     result: Triangulation  # `robust` of the views
     prior: Sequence[PoseErrors] | None  # of each camera's pose; None without stated noise
+    measured: bool  # the prior was measured, and not only stated
     clock_sigma_s: Float  # [C] prior standard deviation of each clock offset, 0 for a known clock
     pixel_sigma: float  # px, of a good keypoint
     between: Interpolation  # rules for interpolating between logged poses
@@ -163,6 +164,7 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
         rigid_pairs(flight.observations.joints, people),
         flight.prior,
         flight.clock_sigma_s,
+        contested=not flight.measured,
         threads=flight.threads,
     )
 

@@ -221,7 +221,7 @@ def method_used(metrics: Mapping[str, Any], cameras: Sequence[Camera], known: st
     Returns:
         `background` and `ground`: the cameras whose poses they corrected, and the `reason` of each other;
         `clocks`: the cameras whose clocks were estimated; `body`: whether motion and bones took part, and
-        the `reason` if not; `pose_noise`: stated, logged, estimated, or none.
+        the `reason` if not; `pose_noise`: stated, logged, estimated, or none; `summary`: all that in a line.
     """
     used: dict[str, Any] = {}
     for part in ("background", "ground"):
@@ -236,15 +236,16 @@ def method_used(metrics: Mapping[str, Any], cameras: Sequence[Camera], known: st
     learned = refinement is not None and reason is None and refinement["pose_noise"] == "estimated"
     guessed = learned or bool(used["background"]["cameras"])
     exact = all(camera.static for camera in cameras)
-    return used | {
+    used |= {
         "clocks": [name for name, sigma_s in sigmas_s.items() if sigma_s > 0],
         "body": {"used": reason is None, "reason": reason},
         "pose_noise": known or ("estimated" if guessed and not exact else "none"),
     }
+    return used | {"summary": _summary(used)}
 
 
-def line_of_parts(used: Mapping[str, Any]) -> str:
-    """Write the parts of the method `auto` in one line."""
+def _summary(used: Mapping[str, Any]) -> str:
+    """Write the parts in one line."""
     parts = ["keypoints"]
     if used["body"]["used"]:
         parts.append("motion and bones")

@@ -96,7 +96,8 @@ def _quality(summary: Summary) -> list[str]:
         number(summary.metrics, k) for k in ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
     )
     reprojection = number(section(summary.metrics, "reprojection_px"), "median")
-    sentences = []
+    used = text(section(summary.metrics, "method_used"), "summary")
+    sentences = [f"The method {text(summary.metrics, 'method')} {used}."] if used else []
     if absolute is not None:
         finer = [f"{quantity(root, 'mm')} relative to the hips"] if root is not None else []
         finer += (

@@ -98,7 +98,7 @@ def cost(system: System, state: State) -> float:
 
 
 def learn(
-    problem: Problem, known: Knowledge, state: State, *, poses: bool, rounds: int
+    problem: Problem, known: Knowledge, state: State, *, poses: bool, memory: bool, rounds: int
 ) -> tuple[Knowledge, State]:
     """Learn the prior: alternate Gauss-Newton steps and estimates of its parameters.
 
@@ -116,6 +116,7 @@ def learn(
         known: initial parameters of the prior.
         state: initial estimate.
         poses: True to estimate the levels of pose errors too.
+        memory: True to estimate the memory of keypoint errors.
         rounds: number of rounds.
     """
     for index in range(rounds):
@@ -126,11 +127,11 @@ def learn(
                 problem, known, state, rounds=1, bounds=(BOUND,), most_growth=_MOST_GROWTH
             )
         known = reestimated(system, state, at, poses=poses, motion=known.memory < REMEMBERED)
-        if poses and index == rounds // 2:
-            memory = memory_of(system, state)
-            if memory > REMEMBERED:
-                memory = memory_of_whole_error(memory, known.pixel_scale)
-            known = replace(known, memory=memory)
+        if memory and index == rounds // 2:
+            tau = memory_of(system, state)
+            if tau > REMEMBERED:
+                tau = memory_of_whole_error(tau, known.pixel_scale)
+            known = replace(known, memory=tau)
     return known, state
 
 

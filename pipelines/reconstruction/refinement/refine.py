@@ -102,6 +102,7 @@ def refine(
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
     *,
+    contested: bool = True,
     threads: int = 1,
 ) -> Refined:
     """Estimate a skeleton, its cameras' pose errors and clocks together (maximum a posteriori).
@@ -113,6 +114,7 @@ def refine(
         bones: [B, 2] pairs of joints with a nearly constant distance; without any, the first two joints.
         prior: prior of each camera's pose errors; None without stated noise.
         clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
+        contested: False if the prior was measured, and no other level of pose errors competes with it.
         threads: at most two are used, one for each half of the flight; the result does not depend on it.
     """
     part = _participating(start)
@@ -124,7 +126,11 @@ def refine(
     problem = build(t_s, sightings, bones, threads=threads)
     refused = None
     try:
-        for found in _priors(problem, sightings, filled, prior, clock_sigma_s):
+        if prior is not None and not contested:
+            priors = _measured_prior(problem, sightings, filled, prior, clock_sigma_s)
+        else:
+            priors = _priors(problem, sightings, filled, prior, clock_sigma_s)
+        for found in priors:
             refined = _refined(problem, start, part, filled, found)
             if refined.fallback is None:
                 return refined
@@ -332,7 +338,7 @@ def _priors(
     spread = _spread_of(len(sightings))
     unlearned = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
     state = initial_state(problem, unlearned, start[chosen])
-    free, state = learn(problem, unlearned, state, poses=True, rounds=_LEARNING_ROUNDS)
+    free, state = learn(problem, unlearned, state, poses=True, memory=True, rounds=_LEARNING_ROUNDS)
     # The alternatives use the same motion, bones and image noise: from round to round, learning these changes
     # the evidence by more than the differences between right levels.
     found = {}
@@ -364,7 +370,7 @@ def _priors(
     for name in tried:
         _, known, state = found[name]
         if name != "estimated":
-            known, state = learn(problem, known, state, poses=False, rounds=_FEWER_ROUNDS)
+            known, state = learn(problem, known, state, poses=False, memory=False, rounds=_FEWER_ROUNDS)
         known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
         most = min(_UNEXPLAINED * image, _LEFT_BY_GIVEN * free.pixel_scale)
         if known.memory < REMEMBERED and known.pixel_scale > most:
@@ -376,6 +382,26 @@ def _priors(
             warnings=(_UNLIKE_STATED + _INSTEAD[name],) if "stated" in others and name != "stated" else (),
             expected_m=spread * max(_FARTHEST * disagreement_m, of_stated),
         )
+
+
+def _measured_prior(
+    flight: Problem,
+    sightings: Sequence[Sighting],
+    start: Float,
+    prior: Sequence[PoseErrors],
+    clock_sigma_s: Float,
+) -> Iterator[_Prior]:
+    """Yield the prior with measured pose errors; motion, bones and keypoint noise are learned beside them."""
+    chosen = _stretches(len(flight.t_s))
+    problem = build(flight.t_s[chosen], sightings, flight.bones, threads=flight.threads)
+    _, _, disagreement_m, range_m = _first_guess(problem, start[chosen])
+    unlearned = _unlearned(problem, start[chosen], tuple(prior), clock_sigma_s)
+    state = initial_state(problem, unlearned, start[chosen])
+    known, state = learn(problem, unlearned, state, poses=False, memory=True, rounds=_LEARNING_ROUNDS)
+    known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
+    measured_m = float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
+    expected_m = _spread_of(len(sightings)) * max(_FARTHEST * disagreement_m, _FARTHEST_STATED * measured_m)
+    yield _Prior(known, learned=False, warnings=(), expected_m=expected_m)
 
 
 def _evidence_margin(problem: Problem, stated: Sequence[PoseErrors] | None, *, correlated: bool) -> float:
