@@ -268,6 +268,9 @@ def disturb(
 SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA = 0, 3, 6
 """First index of each part of the corrections of a picture's pose (see `refinement.kernels`)."""
 
+UNKNOWN_SIGMA = (0.3, math.radians(1.0))
+"""Pose noise (m, rad) that is possible where none is stated: the studies' medium level."""
+
 EXACT = 1e-5
 """Constant error (m and rad) that stands for none, so that the equations stay well posed."""
 
@@ -319,6 +322,8 @@ class PoseErrors:
     processes: tuple[Process, ...]
     logged: bool = False
     """True if white errors have the logged covariance of each pose; `white` is then its level."""
+    assumed: bool = False
+    """True if nobody knows the level of the constant errors, and `processes` have a wide one."""
 
     def white_with_stray(self, knot_s: float) -> Float:
         """Compute the standard deviation [2] (m, rad) of white errors, with slow errors between knots."""

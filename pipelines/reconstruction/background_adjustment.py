@@ -28,6 +28,7 @@ from pipelines.geometry.noise import (
     ROTATION,
     SHIFT_IN_CAMERA,
     SHIFT_IN_WORLD,
+    UNKNOWN_SIGMA,
     PoseErrors,
     Process,
 )
@@ -45,7 +46,6 @@ from pipelines.reconstruction.background_kernels import (
     solve_lower,
     solve_upper,
 )
-from pipelines.reconstruction.solving import UNKNOWN_SIGMA
 
 STRETCH = 1500
 """Most pictures adjusted together: memory stays bounded, and so many poses average their white errors."""
@@ -204,8 +204,11 @@ def adjust(seen: SeenPoints, position: Float, rotation: Float, prior: PosePrior)
         new_position,
         new_rotation,
         covariance,
-        _remaining(
-            [found.draws for found in results], float(np.median(np.diff(seen.t_s))), prior.constant[0]
+        replace(
+            _remaining(
+                [found.draws for found in results], float(np.median(np.diff(seen.t_s))), prior.constant[0]
+            ),
+            assumed=prior.estimated,
         ),
         replace(prior, white=_rms([p.white for p in priors]), slow=_rms_slow(priors)),
         sum(len(stretch.points.inverse_depth) for stretch in stretches),

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import (
+    UNKNOWN_SIGMA,
     PoseErrors,
     errors_of_level,
     pose_errors,
 )
 from pipelines.reconstruction.observations import Camera
-from pipelines.reconstruction.solving import UNKNOWN_SIGMA
 from pipelines.session.camera_poses import stated_models, stated_noise
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
@@ -177,7 +177,7 @@ def load_pose_errors(
         else:
             stated.append(PoseErrors((0.0, 0.0), ()) if camera.static else None)
     if any(camera.errors is not None for camera in cameras):
-        usual = errors_of_level(np.array(UNKNOWN_SIGMA))
+        usual = replace(errors_of_level(np.array(UNKNOWN_SIGMA)), assumed=True)
         stated = [usual if errors is None else errors for errors in stated]
     known = [errors for errors in stated if errors is not None]
     return known if len(known) == len(stated) else None

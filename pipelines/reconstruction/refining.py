@@ -93,7 +93,7 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
         *_undetermined_clocks(refined, flight.cameras, flight.clock_sigma_s),
         *_unsettled_clocks(refined, flight.cameras),
     ]
-    metrics = _metrics(refined, flight.cameras, offset_s)
+    metrics = _metrics(refined, flight, offset_s)
     if refined.fallback is not None:
         warnings.append(f"refined: fell back to robust, because {refined.fallback}")
         return RefinedFlight(flight.observations, flight.views, flight.result, None, metrics, warnings)
@@ -315,8 +315,9 @@ def _numbers_at(correction: tuple[Float, Float], t_s: Float) -> Float:
 # --- reporting ------------------------------------------------------------------------------------------
 
 
-def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> dict[str, Any]:
-    used = refined.fallback is None
+def _metrics(refined: Refined, flight: RobustFlight, offset_s: Float) -> dict[str, Any]:
+    used, cameras = refined.fallback is None, flight.cameras
+    learned = refined.learned or flight.prior is None
     offsets, sigmas = (
         {camera.name: float(value) if used else 0.0 for camera, value in zip(cameras, values, strict=True)}
         for values in (offset_s, refined.clock_sigma_s)
@@ -326,7 +327,7 @@ def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> di
         "clock_offset_sigmas_s": sigmas,
         "refinement": {
             "fallback": refined.fallback,
-            "pose_noise": "estimated" if refined.learned else "stated",
+            "pose_noise": "estimated" if learned else "stated",
             "levels": refined.levels,
             "bone_lengths_m": refined.bone_lengths_m.tolist() if used else [],
         },

@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.noise import UNKNOWN_SIGMA
 from pipelines.geometry.poses import cross_matrix
 from pipelines.geometry.triangulation import (
     STATUS,
@@ -34,9 +35,6 @@ from pipelines.geometry.triangulation import (
 )
 from pipelines.reconstruction.observations import Camera, Observations
 from pipelines.session.errors import DataError
-
-UNKNOWN_SIGMA = (0.3, np.radians(1.0))
-"""Camera pose noise (m, rad) for associating people if none is stated: the studies' medium level."""
 
 
 def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_sigma: float) -> Float:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.noise import ROTATION, SHIFT_IN_CAMERA, SHIFT_IN_WORLD, PoseErrors, Process
+from pipelines.geometry.noise import (
+    ROTATION,
+    SHIFT_IN_CAMERA,
+    SHIFT_IN_WORLD,
+    UNKNOWN_SIGMA,
+    PoseErrors,
+    Process,
+)
 from pipelines.reconstruction.refinement.elimination import (
     Eliminated,
     covariances,
@@ -44,6 +51,10 @@ _SIGMAS = 4.0
 _SETTLING = 4  # rounds to test how well given levels explain the pictures
 _STATED = 10.0  # bonus on the log evidence of stated levels
 _STATED_DRIFT = 0.5  # bonus per picture if errors change over time: between knots they count as white
+_USUAL_CONSTANT, _USUAL_COUNT = (0.1, float(np.radians(0.3))), 3.0
+"""Usual level of constant errors (m, rad), and how many numbers its estimate is worth."""
+_LEVEL_ROUNDS = 3
+_UNDETERMINED = 0.3  # of the usual level: a constant error with a smaller one is known from the background
 _UNINFORMATIVE_MEMORY = 30.0
 """Memory of image points from which levels of slow pose errors cannot be estimated."""
 _SMALL_SCALE = 0.01  # standard deviation of the formation's scale that does not matter
@@ -73,7 +84,7 @@ UNOBSERVED = (
 )
 RESTS_ON_STATED = (
     "refined: the formation hardly changes, so the videos determine neither its scale nor constant pose "
-    "errors in the cameras' own frames: both rest on the stated pose noise alone"
+    "errors in the cameras' own frames: both rest on the logged poses and what is known of their noise"
 )
 
 
@@ -339,6 +350,13 @@ def _priors(
     unlearned = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
     state = initial_state(problem, unlearned, start[chosen])
     free, state = learn(problem, unlearned, state, poses=True, memory=True, rounds=_LEARNING_ROUNDS)
+    if prior is None and free.memory >= _UNINFORMATIVE_MEMORY:
+        # Keypoints determine no levels of lasting errors, which are possible all the same.
+        position, rotation = UNKNOWN_SIGMA
+        lasting = (Process(SHIFT_IN_WORLD, position), Process(ROTATION, rotation))
+        usual = PoseErrors(guess.white, lasting, assumed=True)
+        yield from _measured_prior(flight, sightings, start, [usual] * len(sightings), clock_sigma_s)
+        return
     # The alternatives use the same motion, bones and image noise: from round to round, learning these changes
     # the evidence by more than the differences between right levels.
     found = {}
@@ -398,10 +416,56 @@ def _measured_prior(
     unlearned = _unlearned(problem, start[chosen], tuple(prior), clock_sigma_s)
     state = initial_state(problem, unlearned, start[chosen])
     known, state = learn(problem, unlearned, state, poses=False, memory=True, rounds=_LEARNING_ROUNDS)
+    if any(errors.assumed for errors in prior):
+        known = _with_constant_levels(problem, known, state)
     known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
     measured_m = float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     expected_m = _spread_of(len(sightings)) * max(_FARTHEST * disagreement_m, _FARTHEST_STATED * measured_m)
     yield _Prior(known, learned=False, warnings=(), expected_m=expected_m)
+
+
+def _with_constant_levels(problem: Problem, known: Knowledge, state: State) -> Knowledge:
+    """Estimate the level of assumed constant errors by MacKay's rule, pooled over the cameras.
+
+    Differences between cameras show in the pictures, their common error does not. A few numbers say little of
+    a level, so a level of usual size counts as `_USUAL_COUNT` more of them.
+    """
+    for _ in range(_LEVEL_ROUNDS):
+        system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
+        variance = np.diagonal(shared_covariance(system, at))
+        found: dict[int, list[tuple[float, float]]] = {}
+        for (camera, process), (at_knots, column) in zip(
+            system.layout.processes, system.layout.place, strict=True
+        ):
+            if _is_assumed(known.poses[camera], process) and not at_knots:
+                kind = 1 if process.number == ROTATION else 0
+                own = slice(column, column + 3)
+                determined = float(np.sum(1 - variance[own] / process.sigma0**2))
+                found.setdefault(kind, []).append((float(np.sum(state.shared[own] ** 2)), determined))
+        level = {}
+        for kind, parts in found.items():
+            squares, determined = np.sum(parts, axis=0)
+            usual2 = _USUAL_CONSTANT[kind] ** 2
+            level[kind] = np.sqrt((squares + _USUAL_COUNT * usual2) / (max(determined, 0.0) + _USUAL_COUNT))
+        known = replace(known, poses=tuple(_of_level(errors, level) for errors in known.poses))
+    return known
+
+
+def _is_assumed(errors: PoseErrors, process: Process) -> bool:
+    """Test if the level of a constant error is unknown; a smaller one was determined by the background."""
+    usual = _USUAL_CONSTANT[1 if process.number == ROTATION else 0]
+    return errors.assumed and process.constant and process.sigma0 > _UNDETERMINED * usual
+
+
+def _of_level(errors: PoseErrors, level: Mapping[int, float]) -> PoseErrors:
+    """Give assumed constant errors the levels found, by kind: 0 for positions (m), 1 for rotations (rad)."""
+    processes = (
+        replace(process, sigma0=float(level[1 if process.number == ROTATION else 0]))
+        if _is_assumed(errors, process)
+        else process
+        for process in errors.processes
+    )
+    return replace(errors, processes=tuple(processes))
 
 
 def _evidence_margin(problem: Problem, stated: Sequence[PoseErrors] | None, *, correlated: bool) -> float:
