@@ -208,11 +208,12 @@ def reconstruct(
             for trial in range(settings.trials)
         )
         stored = next(attempts)
+        timed = shifted(cameras, stored.offset_s)
         doubts = doubts_of(
             folder,
             description,
-            stored.cameras,
-            chosen=chosen_detections(stored.cameras, stored.found, stored.association),
+            timed,
+            chosen=chosen_detections(timed, stored.found, stored.association),
             pose_noise=settings.pose_noise,
         )
         _refuse_nothing(folder, stored, doubts)
@@ -371,7 +372,7 @@ class _Flight:
 class _Attempt:
     """Result of one reconstruction of the flight (one trial)."""
 
-    cameras: list[Camera]  # with the clocks that were found, and the logged poses
+    offset_s: Float  # [C] of the clocks that were found, added to the pictures' times
     observations: Observations
     views: Views
     result: Triangulation
@@ -392,7 +393,7 @@ def _attempt(
         seen, views, result, _ = _triangulated(flight, cameras, settings, workers)
         clocks = find_clocks(_robust_flight(cameras, seen, views, result, description, settings, workers))
         cameras = shifted(cameras, clocks.offset_s)
-    timed = cameras
+    logged = cameras
     background: dict[str, Any] = {"background": None}
     warnings: list[str] = []
     if flight.followed:
@@ -429,10 +430,10 @@ def _attempt(
     people = {"people": _people_seen(cameras, seen.association)}
     readout = _readout(cameras, seen)
     parts = background | (refined.metrics if refined else {}) | _clock_metrics(cameras, clocks, refined)
-    known = source_of_pose_noise(description, timed, settings.pose_noise)
+    known = source_of_pose_noise(description, logged, settings.pose_noise)
     progress.advance()
     return _Attempt(
-        timed,
+        np.zeros(len(cameras)) if clocks is None else clocks.offset_s,
         observations,
         views,
         result,
