@@ -29,10 +29,11 @@ from pipelines.keypoints.calibration import measured_for, read_calibration
 from pipelines.keypoints.no_people import Ground, Scene, level_of
 from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
 from pipelines.reconstruction.background import refine_cameras
-from pipelines.reconstruction.background_tracks import Followed, load_tracks
+from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import Doubt, doubts_of, said_doubts
 from pipelines.reconstruction.doubts.scene import Ground as GroundOfMap
 from pipelines.reconstruction.finishing import finish
+from pipelines.reconstruction.ground import bind_positions
 from pipelines.reconstruction.loading import (
     load_cameras,
     load_clock_sigma,
@@ -193,6 +194,7 @@ def reconstruct(
         flight = _Flight(
             description,
             followed,
+            _stills(folder, cameras) if settings.method == "auto" else {},
             actor,
             ground_of(folder, description, actor),
             load_truth(folder, description, cameras[0].detections.joints),
@@ -363,6 +365,7 @@ class _Flight:
 
     description: Description
     followed: Mapping[str, Followed | str]  # the backgrounds of the cameras that are refined by them
+    stills: Mapping[str, Stills]  # some pictures of cameras that are bound to each other by the ground
     actor: LoggedActor | None
     ground: Ground | None
     truth: JointMotion | None
@@ -400,6 +403,12 @@ def _attempt(
         cameras, background["background"], warnings = _refine_cameras(
             cameras, flight.followed, description, settings
         )
+    binding = None
+    if len(flight.stills) > 1:
+        binding = bind_positions(
+            cameras, flight.followed, flight.stills, between=description.pose_interpolation
+        )
+        cameras, background["ground"] = binding.cameras, binding.entry
     seen, views, result, solve = _triangulated(flight, cameras, settings, workers)
     observations = seen.observations
     progress.advance()
@@ -415,6 +424,8 @@ def _attempt(
                 "robust", cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers
             )
             result = refused_people(solve(views), observations, seen.anybody)
+    if binding is not None:
+        result = replace(result, covariance=result.covariance + binding.common)
     result, finished = finish(
         observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)
     )
@@ -660,7 +671,7 @@ def _readout_warnings(readout: Mapping[str, Any]) -> list[str]:
 def _following(
     session: WritableSession, description: Description, settings: Settings, force: bool
 ) -> tuple[Following | None, str | None]:
-    """Prepare to follow the backgrounds of moving cameras; None with the reason why `auto` goes without them."""
+    """Prepare to follow the backgrounds of moving cameras; None, with the reason where `auto` cannot."""
     if not settings.asks_background or (settings.method == "auto" and not cameras_to_follow(description)):
         return None, None
     try:
@@ -669,7 +680,7 @@ def _following(
     except DataError as error:
         if settings.refine_cameras is not None:
             raise
-        return None, error.problem
+        return None, f"{Path(error.source).name} {error.problem}"
 
 
 def _finished(
@@ -681,7 +692,7 @@ def _finished(
     except DataError as error:
         if settings.refine_cameras is not None:
             raise
-        return None, error.problem
+        return None, f"{Path(error.source).name} {error.problem}"
 
 
 def _followed(folder: Path, cameras: Sequence[Camera], left_out: str | None) -> dict[str, Followed | str]:
@@ -694,6 +705,12 @@ def _followed(folder: Path, cameras: Sequence[Camera], left_out: str | None) -> 
             tracks = None if left_out else load_tracks(folder, camera)
             followed[camera.name] = tracks or left_out or "it came without pictures"
     return followed
+
+
+def _stills(folder: Path, cameras: Sequence[Camera]) -> dict[str, Stills]:
+    """Load the stills of the cameras that have any."""
+    stills = {camera.name: load_stills(folder, camera) for camera in cameras}
+    return {name: own for name, own in stills.items() if own is not None}
 
 
 def _refine_cameras(

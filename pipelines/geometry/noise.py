@@ -271,6 +271,9 @@ SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA = 0, 3, 6
 UNKNOWN_SIGMA = (0.3, math.radians(1.0))
 """Pose noise (m, rad) that is possible where none is stated: the studies' medium level."""
 
+USUAL_CONSTANT, USUAL_COUNT = (0.1, math.radians(0.3)), 3.0
+"""Usual level (m, rad) of constant errors that nobody stated, and how many numbers that is worth."""
+
 EXACT = 1e-5
 """Constant error (m and rad) that stands for none, so that the equations stay well posed."""
 

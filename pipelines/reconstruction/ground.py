@@ -20,7 +20,14 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.cameras import project, row_delay_s, undistort
-from pipelines.geometry.noise import EXACT, ROTATION, SHIFT_IN_WORLD, Process
+from pipelines.geometry.noise import (
+    EXACT,
+    ROTATION,
+    SHIFT_IN_WORLD,
+    USUAL_CONSTANT,
+    USUAL_COUNT,
+    Process,
+)
 from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector
 from pipelines.reconstruction.background_tracks import Followed, Stills, people_boxes
 from pipelines.reconstruction.observations import Camera
@@ -573,6 +580,8 @@ def _bound(
     common = np.zeros((3, 3))
     if group:
         common = np.asarray(np.linalg.inv(every.T @ np.linalg.inv(joint) @ every), dtype=np.float64)
+        if any((errors := cameras[c].errors) is not None and errors.assumed for c in group):
+            common *= _share_of_assumed(position[group], prior[3 * np.array(group)])
     moved, left_m, reasons = list(cameras), {}, {}
     for c, camera in enumerate(cameras):
         if c not in group:
@@ -619,6 +628,19 @@ def _bound(
         "reasons": reasons,
     }
     return GroundBinding(moved, tuple(cameras[c].name for c in group), reasons, common, entry)
+
+
+def _share_of_assumed(position: Float, prior_m: Float) -> float:
+    """Compute the share of an assumed variance that the differences [N, 3] m of N cameras let expect.
+
+    Args:
+        position: [N, 3] m, the errors found.
+        prior_m: [N] standard deviations assumed.
+    """
+    differences = position - position.mean(axis=0)
+    numbers = 3 * (len(position) - 1)
+    level2 = (np.sum(differences**2) + USUAL_COUNT * USUAL_CONSTANT[0] ** 2) / (numbers + USUAL_COUNT)
+    return float(min(level2 / np.mean(prior_m**2), 1.0))
 
 
 def _largest_group(total: int, edges: Sequence[tuple[int, int]]) -> list[int]:

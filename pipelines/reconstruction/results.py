@@ -224,12 +224,13 @@ def method_used(metrics: Mapping[str, Any], cameras: Sequence[Camera], known: st
         the `reason` if not; `pose_noise`: stated, logged, estimated, or none; `summary`: all that in a line.
     """
     used: dict[str, Any] = {}
-    for part in ("background", "ground"):
-        entries = metrics.get(part) or {}
-        used[part] = {
-            "cameras": [name for name, entry in entries.items() if entry["used"]],
-            "reasons": {name: entry["reason"] for name, entry in entries.items() if not entry["used"]},
-        }
+    entries = metrics.get("background") or {}
+    used["background"] = {
+        "cameras": [name for name, entry in entries.items() if entry["used"]],
+        "reasons": {name: entry["reason"] for name, entry in entries.items() if not entry["used"]},
+    }
+    ground = metrics.get("ground") or {"moved_m": {}, "reasons": {}}
+    used["ground"] = {"cameras": list(ground["moved_m"]), "reasons": ground["reasons"]}
     sigmas_s = metrics.get("clock_offset_sigmas_s") or {}
     refinement = metrics.get("refinement")
     reason = "the method has no such part" if refinement is None else refinement["fallback"]

@@ -13,6 +13,8 @@ from pipelines.geometry.noise import (
     SHIFT_IN_CAMERA,
     SHIFT_IN_WORLD,
     UNKNOWN_SIGMA,
+    USUAL_CONSTANT,
+    USUAL_COUNT,
     PoseErrors,
     Process,
 )
@@ -51,8 +53,6 @@ _SIGMAS = 4.0
 _SETTLING = 4  # rounds to test how well given levels explain the pictures
 _STATED = 10.0  # bonus on the log evidence of stated levels
 _STATED_DRIFT = 0.5  # bonus per picture if errors change over time: between knots they count as white
-_USUAL_CONSTANT, _USUAL_COUNT = (0.1, float(np.radians(0.3))), 3.0
-"""Usual level of constant errors (m, rad), and how many numbers its estimate is worth."""
 _LEVEL_ROUNDS = 3
 _UNDETERMINED = 0.3  # of the usual level: a constant error with a smaller one is known from the background
 _UNINFORMATIVE_MEMORY = 30.0
@@ -428,7 +428,7 @@ def _with_constant_levels(problem: Problem, known: Knowledge, state: State) -> K
     """Estimate the level of assumed constant errors by MacKay's rule, pooled over the cameras.
 
     Differences between cameras show in the pictures, their common error does not. A few numbers say little of
-    a level, so a level of usual size counts as `_USUAL_COUNT` more of them.
+    a level, so a level of usual size counts as `USUAL_COUNT` more of them.
     """
     for _ in range(_LEVEL_ROUNDS):
         system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
@@ -445,15 +445,15 @@ def _with_constant_levels(problem: Problem, known: Knowledge, state: State) -> K
         level = {}
         for kind, parts in found.items():
             squares, determined = np.sum(parts, axis=0)
-            usual2 = _USUAL_CONSTANT[kind] ** 2
-            level[kind] = np.sqrt((squares + _USUAL_COUNT * usual2) / (max(determined, 0.0) + _USUAL_COUNT))
+            usual2 = USUAL_CONSTANT[kind] ** 2
+            level[kind] = np.sqrt((squares + USUAL_COUNT * usual2) / (max(determined, 0.0) + USUAL_COUNT))
         known = replace(known, poses=tuple(_of_level(errors, level) for errors in known.poses))
     return known
 
 
 def _is_assumed(errors: PoseErrors, process: Process) -> bool:
     """Test if the level of a constant error is unknown; a smaller one was determined by the background."""
-    usual = _USUAL_CONSTANT[1 if process.number == ROTATION else 0]
+    usual = USUAL_CONSTANT[1 if process.number == ROTATION else 0]
     return errors.assumed and process.constant and process.sigma0 > _UNDETERMINED * usual
 
 
