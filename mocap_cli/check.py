@@ -1,7 +1,5 @@
 """`mocap check`: whether a flight's description, logs and pictures fit together."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

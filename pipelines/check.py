@@ -4,8 +4,6 @@ A flight that was not ingested yet is read into a temporary session. Where no ke
 detector looks at a few seconds in the middle of the flight, in a temporary copy: a check changes no session.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from dataclasses import dataclass
@@ -54,7 +52,6 @@ def check(
         pose_noise: what is known of the poses' errors, instead of what flight.yaml says.
         detector: looks at pictures without keypoints.
         workers: the number of threads; the result does not depend on it.
-        progress: receives the progress.
 
     Raises:
         DataError: the flight cannot be read, or nobody is seen.

@@ -5,8 +5,6 @@ detector; reconstruct, and measure errors against the truth; draw the skeleton o
 are simulated, the detector is real. `replan` is only read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -95,10 +93,7 @@ def film(
 
     Args:
         folder: the session; `replan` has run.
-        settings: the settings that determine the result.
         scenario: of the simulated flight; by default it is searched beside its pictures and the session.
-        force: run it again even if nothing changed.
-        progress: receives the progress.
 
     Raises:
         DataError: nothing was compared yet, a table of the session was changed, the flight was not simulated,

@@ -4,8 +4,6 @@ The packages are downloaded and opened, never installed: mediapipe 0.10.21 would
 everything, and of @mediapipe/pose only one file is wanted.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

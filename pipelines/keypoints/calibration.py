@@ -6,8 +6,6 @@ Classifier Scores into Accurate Multiclass Probability Estimates", 2002). It is 
 knots with the command that measured it.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 Everywhere here the centre of the top left pixel is (0, 0), in pictures and in crops.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

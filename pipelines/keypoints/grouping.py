@@ -18,8 +18,6 @@ part as the only detection of one more camera.
 `follow` is the one function called from outside. `grouping_rays` compares detections and places groups.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Detections of one frame as rays: distance between two of them, and place of a group."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Place of the actor in a picture by the log, with its uncertainty."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -49,7 +47,6 @@ def project_actor(
     Args:
         position_world: [3] m, the point of the actor that the log follows (hip or near it).
         world_from_camera: position [3] m and quaternion [4] xyzw of the camera at that time.
-        intrinsics: the camera.
         sigma_m: one sigma per axis of the actor's position relative to the camera's, both errors together.
         sigma_rad: one sigma per axis of the camera's rotation.
         height_m: height of the actor.
@@ -98,10 +95,6 @@ def actor_hints(
     """Predict the logged actor's hips in a camera's pictures; None where the log or the pose is missing.
 
     Args:
-        actor: the logged actor.
-        name: name of the camera.
-        entry: the camera's entry in session.json.
-        trajectory: its logged poses.
         between: rules for interpolating between the logged poses.
         t_ns: [T] times of the pictures.
     """
@@ -122,9 +115,7 @@ def hint_sigma(name: str, entry: CameraEntry, trajectory: Trajectory, t_ns: Int6
     """Compute the uncertainty of the logged actor as seen from a camera's logged pose.
 
     Args:
-        name: name of the camera.
         entry: the camera's entry in session.json; its pose noise is used, else the log's covariances.
-        trajectory: its logged poses.
         t_ns: [T] times of the pictures.
 
     Returns:

@@ -15,8 +15,6 @@ centre of the top left one at (0, 0).
   Representation", 2020): exact for a Gaussian.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,8 +62,6 @@ class OnnxNetwork:
     """Loaded model. Not thread-safe: each thread needs its own.
 
     Args:
-        path: the model.
-        colours: how it wants its pixels.
         provider: the short name of the execution provider that runs it.
         size: width and height of its input, where the graph leaves them open.
         layout: of its input, where the graph leaves it open.
@@ -257,7 +253,6 @@ def decoder_for(
     """Choose the decoder of a network's outputs from their shapes.
 
     Args:
-        path: path of the model, for the message.
         shapes: shapes of the outputs for one picture, by name.
         size: width and height of the network's input.
         cells: convention for the place of heatmap cells.

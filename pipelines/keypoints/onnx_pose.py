@@ -8,8 +8,6 @@ The argument of `onnx:` is a model's path, with options for information that its
 `MODEL.onnx[,option=value...]`, for example `pose.onnx,skeleton=halpe26,people=yolox.onnx`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -286,7 +284,6 @@ class OnnxPose:
     """Loaded networks. Not thread-safe.
 
     Args:
-        network: the pose model.
         decoder: reads its outputs.
         joints: names of its first joints; further joints are left out.
         people: finder of people; None if only the log gives their place.

@@ -16,8 +16,6 @@ in one or two cameras can make them meet. All sets of one or two cameras are tri
 for each pair of joints.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

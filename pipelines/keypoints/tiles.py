@@ -5,8 +5,6 @@ size, and almost none of a tenth (measured with BlazePose: all in a square of 3 
 frames).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -99,9 +97,7 @@ def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile])
     """Find people in parts of a picture, each person once.
 
     Args:
-        networks: the detector.
         picture: [H, W, 3] BGR.
-        parts: tiles to search.
 
     Returns:
         Whole bodies before those that a tile's border cuts, then by score; of several at one place (in

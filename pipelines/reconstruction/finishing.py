@@ -7,8 +7,6 @@ stretches of the same joint: the same number of samples is left out, interpolate
 covariance grows by that error.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,7 +31,6 @@ def finish(
     Args:
         observations: the triangulated observations.
         views: the same, one row for each joint-frame.
-        result: their triangulation.
         fill_s: the longest gap to fill, None to fill none.
         smoother: the smoother, None for no smoothing.
 

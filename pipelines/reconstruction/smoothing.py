@@ -9,8 +9,6 @@ Both work on contiguous runs of a joint's samples and never across a gap. `fille
   (driven by white jerk) or constant jerk (driven by white snap), weighing each sample by its covariance.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields

@@ -4,8 +4,6 @@ The random draws of trial k and camera i do not depend on other options, so that
 methods, are compared on the same draws.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -70,7 +68,6 @@ def summary_of_trials(metrics: Sequence[Mapping[str, Any]], text: str, seed: int
     """Summarise all trials for metrics.json.
 
     Args:
-        metrics: figures of every trial.
         text: the errors, as users write them.
         seed: seed of the draws, and of the resampling of trials.
 

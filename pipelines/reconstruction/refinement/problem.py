@@ -1,7 +1,5 @@
 """Refinement problem: pictures, the skeleton's times, the priors of errors, and their construction."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -178,7 +176,6 @@ def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64, *, threads: i
         t_s: [T] strictly increasing times of the skeleton, at least three.
         sightings: keypoints and poses of each camera.
         bones: [B, 2] joints with a nearly constant distance.
-        threads: see `Problem`.
     """
     parts, covariances, logged = [], [np.empty((0, 6, 6))], 0
     for camera, sighting in enumerate(sightings):

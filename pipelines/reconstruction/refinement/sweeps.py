@@ -5,8 +5,6 @@ knots before and after (2 c), unknowns shared by all times. Eliminated unknowns 
 front as x = R' (y - W' z), with R the inverse of the Cholesky factor of their own block and W = B R'.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -6,8 +6,6 @@ the second half is a flight like the first and uses the same kernels. The same u
 of both halves: the joints at two times, the knots around them, and the unknowns shared by all times.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
