@@ -53,20 +53,20 @@ def refine_cameras(
             entries[camera.name] = {"used": False, "reason": seen}
         else:
             t_ns = camera.frame_t_ns[seen.rows]
-            points = SeenPoints(
-                seen.tracks.picture,
-                seen.tracks.point,
-                _rays(seen.tracks, camera, t_ns),
-                camera.focal_px,
-                (t_ns - t_ns[0]) / 1e9,
-            )
-            found = adjust(points, *camera.poses_at(t_ns, between), PosePrior.of(stated))
+            found = adjust(points_of(camera, seen), *camera.poses_at(t_ns, between), PosePrior.of(stated))
             refined.append(_with_poses(camera, t_ns, found))
             entries[camera.name] = _entry(found)
         if entries[camera.name]["reason"] is not None:
             reason = entries[camera.name]["reason"]
             refusals.append(f"{camera.name}: its logged poses stay, because {reason}")
     return refined, entries, refusals
+
+
+def points_of(camera: Camera, followed: Followed) -> SeenPoints:
+    """Return the points of a camera's background as they are adjusted."""
+    t_ns, tracks = camera.frame_t_ns[followed.rows], followed.tracks
+    rays = _rays(tracks, camera, t_ns)
+    return SeenPoints(tracks.picture, tracks.point, rays, camera.focal_px, (t_ns - t_ns[0]) / 1e9)
 
 
 def _rays(tracks: Tracks, camera: Camera, t_ns: Int64) -> Float:
