@@ -120,7 +120,7 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path, help="for films and sessions, outside the repository")
     parser.add_argument("--kept", action="store_true", help="measure on the paths that are kept aside")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=[*METHODS][:-1])
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=[*METHODS])
     parser.add_argument("--detectors", nargs="+", default=["blazepose"])
     parser.add_argument("--paths", nargs="+", help="some of the paths only")
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"of the log's errors (default {DRAWS})")
