@@ -14,29 +14,25 @@ import shutil
 import time
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from benchmarks.corpus.stored import (
     DETECTORS,
     RECORDED,
     SAMPLE,
+    Background,
     Flight,
     Keypoints,
     flights,
+    write_backgrounds,
     write_keypoints,
-    write_tracks,
 )
 from pipelines.detect import detect
+from pipelines.follow import Following
 from pipelines.ingest import ingest
-from pipelines.reconstruction.background_tracks import Tracks, follow, off_people, people_boxes
-from pipelines.reconstruction.loading import load_cameras
-from pipelines.session.description import read_description
+from pipelines.reconstruction.background_tracks import tracks_path
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import locked
-from pipelines.session.tables import KEYPOINTS, read_table
+from pipelines.session.tables import KEYPOINTS, TRACKS, read_table
 from pipelines.simulate import simulate
-from pipelines.sources.pictures import open_pictures
 
 
 def main() -> None:
@@ -82,8 +78,7 @@ def _make(flight: Flight, films: Path, workers: int, *, again: bool) -> bool:
         found = Keypoints(tuple(record.counts["joints"]), counts, tables)
         write_keypoints(flight.keypoints_path(detector), found)
     if follows:
-        record = _detected(session, DETECTORS[0], workers)
-        write_tracks(flight.tracks_path, _follow(session, record))
+        write_backgrounds(flight, _followed(session))
     return True
 
 
@@ -106,20 +101,16 @@ def _detected(session: Path, detector: str, workers: int) -> StageRecord:
     return record
 
 
-def _follow(session: Path, record: StageRecord) -> dict[str, Tracks]:
-    """Follow the background through all pictures of every camera, with the people's boxes left out."""
-    description = read_description(session)
-    cameras, _ = load_cameras(session, description, record, min_confidence=0.3, pose_noise=None)
-    tracks = {}
-    for camera in cameras:
-        with open_pictures(session, description, camera.name) as pictures:
-            read = (pictures.read(number) for number in camera.frame_number.tolist())
-            grey = (
-                None if each is None else np.asarray(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), np.uint8)
-                for each in read
-            )
-            tracks[camera.name] = off_people(follow(grey), people_boxes(camera))
-    return tracks
+def _followed(session: Path) -> dict[str, Background]:
+    """Follow the background through all pictures of every camera."""
+    with locked(session) as writable:
+        record = Following(writable).finish()
+    backgrounds = {}
+    for camera in record.counts["cameras"]:
+        folder = session / "background" / camera
+        stills = {int(path.stem): path.read_bytes() for path in sorted(folder.glob("stills/*.jpg"))}
+        backgrounds[camera] = Background(read_table(tracks_path(folder), TRACKS), stills)
+    return backgrounds
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ videos are grey.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,8 +17,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks.corpus.stored import RECORDED, Flight, read_keypoints, read_tracks
-from pipelines.detect import Block
+from benchmarks.corpus.stored import RECORDED, Flight, read_backgrounds, read_keypoints
+from pipelines.detect import Block as DetectorBlock
+from pipelines.follow import Block
 from pipelines.formats.calibrations.ros_camera_info import write_camera_info
 from pipelines.formats.logs.ros2_writing import Ros2Recording
 from pipelines.formats.maps.octomap import write_octomap
@@ -26,12 +27,10 @@ from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.noise import GaussMarkov
 from pipelines.ingest import ingest
-from pipelines.reconstruction.background_tracks import Followed, Tracks, rows_to_follow
-from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.background_tracks import still_name
 from pipelines.session.registries import noise_models
-from pipelines.session.stage_records import StageRecord
 from pipelines.session.storage import write_json
-from pipelines.session.tables import KEYPOINTS, write_table
+from pipelines.session.tables import KEYPOINTS, TRACKS, write_table
 from pipelines.simulate import _planner
 from pipelines.simulation.flight import SimulatedFlight, fly_scenario
 from pipelines.simulation.flight_files import (
@@ -160,12 +159,12 @@ class DrawnFlight:
 
 @contextmanager
 def kept_in_place_of_pictures(flight: Flight, detector: str) -> Iterator[None]:
-    """Let `reconstruct` find the keypoints and tracks that are kept, in the place of its pictures."""
+    """Let `reconstruct` find the keypoints and the background that are kept, in the place of its pictures."""
     kept = read_keypoints(flight.keypoints_path(detector))
-    tracks = read_tracks(flight.tracks_path) if flight.tracks_path.is_file() else {}
+    backgrounds = read_backgrounds(flight) if flight.with_pictures else {}
 
-    def produce(work: Any, *others: Any) -> None:
-        block: Block = others[-2]
+    def detect(work: Any, *others: Any) -> None:
+        block: DetectorBlock = others[-2]
         folder: Path = others[-1]
         frame, t_ns = work.frames(block)
         table = kept.tables[block.camera]
@@ -175,36 +174,20 @@ def kept_in_place_of_pictures(flight: Flight, detector: str) -> Iterator[None]:
         counts = kept.counts[block.camera] if not block.first else dict.fromkeys(kept.counts[block.camera], 0)
         write_json(folder / "counts.json", {"joints": list(kept.joints), "counts": counts})
 
-    def follow(_: Path, cameras: Sequence[Camera]) -> dict[str, Any]:
-        return {camera.name: _followed(camera, tracks.get(camera.name)) for camera in cameras}
+    def follow(self: Any, block: Block, halt: Any, progress: Any, folder: Path) -> None:
+        del self, halt, progress
+        background = backgrounds[block.camera]
+        table = background.tracks[background.tracks["frame"].isin(block.numbers)]
+        write_table(folder / "tracks.parquet", table, TRACKS)
+        stills = [number for number in background.stills if number in block.numbers]
+        for number in stills:
+            (folder / still_name(number)).write_bytes(background.stills[number])
+        counts = {"pictures": len(block.numbers), "undecoded": 0, "stills": len(stills)}
+        write_json(folder / "counts.json", counts | {"points": 0})  # their numbers are the flight's already
 
     with (
-        patch("pipelines.detect._produce", produce),
+        patch("pipelines.detect._produce", detect),
         patch("pipelines.detect.hashes_of_models", lambda _: {}),
-        patch("pipelines.reconstruct.Following", _Followed),
-        patch("pipelines.reconstruct._followed", follow),
+        patch("pipelines.follow.Following._produce", follow),
     ):
         yield
-
-
-class _Followed:
-    """Backgrounds that were followed before, in the place of `pipelines.follow.Following`."""
-
-    def __init__(self, *_: object, **__: object) -> None:
-        pass
-
-    def part(self, *_: object) -> None:
-        """Look at no pictures."""
-
-    def finish(self, **_: object) -> StageRecord:
-        """Return the record of a stage without files."""
-        return StageRecord("background", 1, "kept", {}, {}, {}, {}, [])
-
-
-def _followed(camera: Camera, tracks: Tracks | None) -> Followed | str:
-    if tracks is None:
-        return "it came without pictures"
-    rows = rows_to_follow(camera.frame_t_ns)
-    used = np.isin(tracks.picture, rows)
-    picture = np.searchsorted(rows, tracks.picture[used])
-    return Followed(rows, Tracks(picture, tracks.point[used], tracks.xy[used]))

@@ -1,7 +1,8 @@
 """Files of the corpus: one folder for each flight, with what took hours to make.
 
 `tuning/` and `kept/` hold a folder for each flight: its scenario, the keypoints of both detectors in its
-pictures, and the tracks of the background. Pixels are rounded (0.1 px for keypoints, 0.05 px for tracks).
+pictures, and the background: its tracks, and some
+stills. Pixels are rounded (0.1 px for keypoints, 0.05 px for tracks).
 Everything else is made again from the scenario in seconds (`benchmarks.corpus.drawn`).
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +20,6 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipelines.reconstruction.background_tracks import Tracks
 from pipelines.simulation.scenario import Scenario, read_scenario
 
 Half = Literal["tuning", "kept"]
@@ -35,7 +35,8 @@ WITHOUT_PICTURES = ("09-crouch", "11-turn", "12-kick", "22-jog")
 """Flights that come with keypoint files in place of pictures: 17 joints and no background."""
 
 _KEYPOINT_STEP_PX, _TRACK_STEP_PX, _CONFIDENCE_STEP = 0.1, 0.05, 1e-3
-_TRACKS = "background.parquet"
+_CAMERA = pa.dictionary(pa.int8(), pa.string())
+_INT16, _INT32 = pa.int16(), pa.int32()
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,12 @@ class Flight:
     @property
     def tracks_path(self) -> Path:
         """The file of the background's tracks."""
-        return self.folder / _TRACKS
+        return self.folder / "background.parquet"
+
+    @property
+    def stills_path(self) -> Path:
+        """The file of the stills."""
+        return self.folder / "stills.parquet"
 
 
 def flights(halves: Sequence[Half] = HALVES) -> list[Flight]:
@@ -93,13 +99,10 @@ def flights(halves: Sequence[Half] = HALVES) -> list[Flight]:
 
 _KEYPOINTS = pa.schema(
     [
-        ("camera", pa.dictionary(pa.int8(), pa.string())),
-        ("person", pa.int16()),
+        ("camera", _CAMERA),
+        ("person", _INT16),
         ("joint", pa.int8()),
-        ("frame", pa.int16()),
-        ("x", pa.int16()),
-        ("y", pa.int16()),
-        ("confidence", pa.int16()),
+        *((name, _INT16) for name in ("frame", "x", "y", "confidence")),
     ]
 )
 
@@ -156,41 +159,49 @@ def read_keypoints(path: Path) -> Keypoints:
 # --- background ----------------------------------------------------------------------------------------
 
 _SIGHTINGS = pa.schema(
-    [
-        ("camera", pa.dictionary(pa.int8(), pa.string())),
-        ("point", pa.int32()),
-        ("picture", pa.int32()),
-        ("x", pa.int16()),
-        ("y", pa.int16()),
-    ]
+    [("camera", _CAMERA), ("point", _INT32), ("frame", _INT32), ("x", _INT16), ("y", _INT16)]
 )
+_STILLS = pa.schema([("camera", _CAMERA), ("frame", _INT32), ("jpeg", pa.binary())])
 
 
-def write_tracks(path: Path, tracks: dict[str, Tracks]) -> None:
-    """Write the tracks of all cameras, rounded; `picture` is the row of the camera's pictures."""
-    parts = [
-        pd.DataFrame(
-            {
-                "camera": camera,
-                "point": seen.point,
-                "picture": seen.picture,
-                "x": _steps(seen.xy[:, 0], _TRACK_STEP_PX),
-                "y": _steps(seen.xy[:, 1], _TRACK_STEP_PX),
-            }
-        ).sort_values(["point", "picture"])
-        for camera, seen in tracks.items()
-    ]
-    _write(path, pd.concat(parts), _SIGHTINGS, {})
+@dataclass(frozen=True)
+class Background:
+    """Background of one camera."""
+
+    tracks: pd.DataFrame  # rows of `tables.TRACKS`
+    stills: dict[int, bytes]  # JPEG files by the number of the frame
 
 
-def read_tracks(path: Path) -> dict[str, Tracks]:
-    """Read the tracks of all cameras in the order in which the follower gives them."""
-    tracks = {}
-    ordered = pq.read_table(path).to_pandas().sort_values(["picture", "point"])
-    for camera, rows in ordered.groupby("camera", observed=True):
-        xy = rows[["x", "y"]].to_numpy(np.float64) * _TRACK_STEP_PX
-        tracks[str(camera)] = Tracks(rows["picture"].to_numpy(np.int64), rows["point"].to_numpy(np.int64), xy)
-    return tracks
+def write_backgrounds(flight: Flight, backgrounds: Mapping[str, Background]) -> None:
+    """Write the tracks of all cameras, rounded, and their stills."""
+    tracks, stills = [], []
+    for camera, background in backgrounds.items():
+        seen = background.tracks
+        rounded = {
+            "camera": camera,
+            "point": seen["point"],
+            "frame": seen["frame"],
+            "x": _steps(seen["x"], _TRACK_STEP_PX),
+            "y": _steps(seen["y"], _TRACK_STEP_PX),
+        }
+        tracks.append(pd.DataFrame(rounded).sort_values(["point", "frame"]))
+        kept = background.stills
+        stills.append(pd.DataFrame({"camera": camera, "frame": list(kept), "jpeg": list(kept.values())}))
+    _write(flight.stills_path, pd.concat(stills), _STILLS, {})
+    _write(flight.tracks_path, pd.concat(tracks), _SIGHTINGS, {})
+
+
+def read_backgrounds(flight: Flight) -> dict[str, Background]:
+    """Read the tracks in the order in which the follower writes them, and the stills."""
+    tracks = pq.read_table(flight.tracks_path).to_pandas().sort_values(["frame", "point"])
+    stills = pq.read_table(flight.stills_path).to_pandas()
+    backgrounds = {}
+    for camera, rows in tracks.groupby("camera", observed=True):
+        table = pd.DataFrame({name: rows[name].to_numpy(np.int64) for name in ("frame", "point")})
+        table[["x", "y"]] = rows[["x", "y"]].to_numpy(np.float64) * _TRACK_STEP_PX
+        own = stills[stills["camera"] == camera]
+        backgrounds[str(camera)] = Background(table, dict(zip(own["frame"], own["jpeg"], strict=True)))
+    return backgrounds
 
 
 def _steps(values: Any, step: float) -> Any:
@@ -200,7 +211,7 @@ def _steps(values: Any, step: float) -> Any:
 def _write(path: Path, rows: pd.DataFrame, schema: pa.Schema, said: dict[str, str]) -> None:
     table = pa.Table.from_pandas(rows, schema=schema.with_metadata(said), preserve_index=False)
     table = table.replace_schema_metadata(said)  # without the note of pandas
-    numbers = [field.name for field in schema if field.name != "camera"]
+    numbers = [field.name for field in schema if pa.types.is_integer(field.type)]
     partial = path.with_suffix(".part")
     pq.write_table(
         table,

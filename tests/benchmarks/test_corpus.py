@@ -13,16 +13,16 @@ from benchmarks.corpus.stored import (
     CORPUS,
     HALVES,
     SAMPLE,
+    Background,
     Flight,
     Half,
     Keypoints,
     flights,
+    read_backgrounds,
     read_keypoints,
-    read_tracks,
+    write_backgrounds,
     write_keypoints,
-    write_tracks,
 )
-from pipelines.reconstruction.background_tracks import Tracks
 from pipelines.session.registries import noise_models
 from pipelines.simulation.scenario import Scenario
 
@@ -106,12 +106,13 @@ def test_keypoints_and_tracks_come_back_rounded(tmp_path: Path) -> None:
     assert back.joints == joints
     assert back.counts == {"drone1": {"frames": 50}}
     pd.testing.assert_frame_equal(back.tables["drone1"], table, check_exact=False, atol=0.05001, rtol=0)
-    tracks = Tracks(np.repeat(np.arange(20), 3), np.tile(np.arange(3), 20), rng.uniform(0, 1500, (60, 2)))
-    write_tracks(tmp_path / "t.parquet", {"drone1": tracks})
-    (followed,) = read_tracks(tmp_path / "t.parquet").values()
-    np.testing.assert_array_equal(followed.picture, tracks.picture)
-    np.testing.assert_array_equal(followed.point, tracks.point)
-    np.testing.assert_allclose(followed.xy, tracks.xy, atol=0.02501, rtol=0)
+    seen = pd.DataFrame({"frame": np.repeat(np.arange(20), 3), "point": np.tile(np.arange(3), 20)})
+    seen[["x", "y"]] = rng.uniform(0, 1500, (60, 2))
+    flight = Flight("tuning", tmp_path)
+    write_backgrounds(flight, {"drone1": Background(seen, {7: b"still"})})
+    (background,) = read_backgrounds(flight).values()
+    pd.testing.assert_frame_equal(background.tracks, seen, check_exact=False, atol=0.02501, rtol=0)
+    assert background.stills == {7: b"still"}
 
 
 def test_robust_is_measured_on_a_flight() -> None:
