@@ -46,7 +46,7 @@ def test_the_logged_actor_decides_who_it_is(tmp_path: Path) -> None:
     succeeds("ingest", flight.manifest)
     actor = pd.read_parquet(tmp_path / "flight.session" / "actor.parquet")
     assert list(actor["t_ns"]) == list(flight.t_ns)
-    result = json.loads(succeeds("reconstruct", tmp_path / "flight.session", "--json"))
+    result = json.loads(succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust", "--json"))
     assert result["mpjpe_mm"] < 0.5
 
 

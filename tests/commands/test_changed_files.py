@@ -45,7 +45,7 @@ def detected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     manifest = write_spotted_flight(folder, FRAMES)
     detector = spot_detector(folder)
     succeeds("ingest", manifest)
-    succeeds("reconstruct", folder / "flight.session", "--detector", detector)
+    succeeds("reconstruct", folder / "flight.session", "--method", "robust", "--detector", detector)
     return folder
 
 
@@ -218,7 +218,7 @@ def test_every_command_that_reads_pictures_refuses_others(
     assert not (tmp_path / "figures").exists()
     assert not (tmp_path / "exported").exists()
     # What reads no pictures goes on.
-    assert "unchanged" in succeeds("reconstruct", session)
+    assert "unchanged" in succeeds("reconstruct", session, "--method", "robust")
     assert "written" in succeeds("export", session, "--to", "csv", "-o", tmp_path / "csv")
 
 
@@ -250,7 +250,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("filmed")
     flight = filmed_flight(folder)
     succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", folder / "flight.session")
+    succeeds("reconstruct", folder / "flight.session", "--method", "robust")
     return folder
 
 
@@ -295,7 +295,7 @@ def test_a_changed_table_of_ingest_is_refused_by_all_until_ingest_makes_it_anew(
     assert content(session) == changed
     assert "written" in succeeds("ingest", manifest)
     assert content(session) == before
-    assert "unchanged" in succeeds("reconstruct", session)
+    assert "unchanged" in succeeds("reconstruct", session, "--method", "robust")
 
 
 def test_a_changed_skeleton_is_refused_until_reconstruct_makes_it_anew(filmed: Path, tmp_path: Path) -> None:
@@ -311,7 +311,7 @@ def test_a_changed_skeleton_is_refused_until_reconstruct_makes_it_anew(filmed: P
     skeleton.write_bytes(kept)
     succeeds("export", session, "--to", "csv", "-o", tmp_path / "exported")
     shift(skeleton)
-    assert "written" in succeeds("reconstruct", session)
+    assert "written" in succeeds("reconstruct", session, "--method", "robust")
     assert content(session) == before
 
 
@@ -331,7 +331,7 @@ def test_a_changed_replay_is_neither_shown_nor_filmed(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=1.5, clean=True)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", session)
+    succeeds("reconstruct", session, "--method", "robust")
     compare = ("replan-compare", session, "--arms", "fixed", "--trials", "1")
     succeeds(*compare)
     before = content(session)

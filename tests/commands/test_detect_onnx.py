@@ -23,7 +23,7 @@ def test_keypoints_of_the_users_model_become_a_skeleton(tmp_path: Path) -> None:
     session = write_spotted_flight(tmp_path, frames).with_suffix(".session")
     succeeds("ingest", tmp_path / "flight.yaml")
     detector = spot_detector(tmp_path)
-    succeeds("reconstruct", session, "--detector", detector)
+    succeeds("reconstruct", session, "--method", "robust", "--detector", detector)
 
     table = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
     assert (table["status"] == "ok").all()
@@ -41,19 +41,34 @@ def test_keypoints_of_the_users_model_become_a_skeleton(tmp_path: Path) -> None:
     for model in ("pose.onnx", "people.onnx"):
         shutil.move(tmp_path / model, moved / model)
     before = (session / "detect" / "stage.json").stat().st_ino
-    succeeds("reconstruct", session, "--detector", detector.replace(f"{tmp_path}/", f"{moved}/"))
+    succeeds(
+        "reconstruct",
+        session,
+        "--method",
+        "robust",
+        "--detector",
+        detector.replace(f"{tmp_path}/", f"{moved}/"),
+    )
     assert (session / "detect" / "stage.json").stat().st_ino == before
-    assert "pose.onnx: does not exist" in refused("reconstruct", session, "--detector", detector)
+    assert "pose.onnx: does not exist" in refused(
+        "reconstruct", session, "--method", "robust", "--detector", detector
+    )
 
 
 def test_what_cannot_be_run_is_refused_in_one_line(tmp_path: Path) -> None:
     session = write_spotted_flight(tmp_path, 5).with_suffix(".session")
     succeeds("ingest", tmp_path / "flight.yaml")
-    assert "write onnx:MODEL.onnx" in refused("reconstruct", session, "--detector", "onnx")
-    assert "takes nothing behind" in refused("reconstruct", session, "--detector", "blazepose:x")
+    assert "write onnx:MODEL.onnx" in refused(
+        "reconstruct", session, "--method", "robust", "--detector", "onnx"
+    )
+    assert "takes nothing behind" in refused(
+        "reconstruct", session, "--method", "robust", "--detector", "blazepose:x"
+    )
     text = tmp_path / "text.onnx"
     text.write_text("no model")
-    assert "is no model" in refused("reconstruct", session, "--detector", f"onnx:{text}")
+    assert "is no model" in refused(
+        "reconstruct", session, "--method", "robust", "--detector", f"onnx:{text}"
+    )
 
 
 def test_another_provider_detects_anew_and_one_that_is_not_there_is_refused(tmp_path: Path) -> None:
@@ -73,7 +88,7 @@ def test_another_provider_detects_anew_and_one_that_is_not_there_is_refused(tmp_
     assert "unchanged" in succeeds(*reconstruct, "--provider", "CPUExecutionProvider")
     assert provider(session) == "cpu"
     assert "states provider twice" in refused(*reconstruct[:-1], spot_detector(tmp_path), "--provider", "cpu")
-    refusal = mocap("reconstruct", session, "--provider", "cpu")
+    refusal = mocap("reconstruct", session, "--method", "robust", "--provider", "cpu")
     assert refusal.returncode == 2, "BlazePose is not run by ONNX Runtime"
     onnxruntime = need("onnxruntime", "onnx")
     others = [name for name in onnxruntime.get_available_providers() if name != "CPUExecutionProvider"]
@@ -105,7 +120,7 @@ def test_stopped_in_the_middle_it_goes_on_with_what_is_finished(tmp_path: Path) 
     undisturbed, session = tmp_path / "undisturbed.session", tmp_path / "stopped.session"
     for folder in (undisturbed, session):
         succeeds("ingest", manifest, "-o", folder)
-    succeeds("reconstruct", undisturbed, "--detector", detector, "--workers", "1")
+    succeeds("reconstruct", undisturbed, "--method", "robust", "--detector", detector, "--workers", "1")
 
     kept: dict[str, int] = {}
     for blocks, how, status in (
@@ -117,7 +132,7 @@ def test_stopped_in_the_middle_it_goes_on_with_what_is_finished(tmp_path: Path) 
         assert blocks <= len(now) < 2 * len(CAMERAS)
         assert kept.items() <= now.items()  # the very same files: not made again
         kept = now
-    succeeds("reconstruct", session, "--detector", detector, "--workers", "1")
+    succeeds("reconstruct", session, "--method", "robust", "--detector", detector, "--workers", "1")
     assert content(session) == content(undisturbed)
 
 

@@ -52,7 +52,9 @@ def flight(tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_detector_and_triangulation_agree_with_the_peers_skeleton(flight: Path) -> None:
     session = flight.with_suffix(".session")
-    result: dict[str, Any] = json.loads(succeeds("reconstruct", session, "--every", str(EVERY), "--json"))
+    result: dict[str, Any] = json.loads(
+        succeeds("reconstruct", session, "--method", "robust", "--every", str(EVERY), "--json")
+    )
     assert result["reconstructed_share"] > 0.95
     peer = TRC.read_joints(real_data("pose2sim_single/pose-3d/single_0-99.trc"), unit=None, axes=None)
     ours = motion_from(pd.read_parquet(session / "reconstruct" / "skeleton.parquet"), peer.joints)
@@ -64,7 +66,7 @@ def test_detector_and_triangulation_agree_with_the_peers_skeleton(flight: Path) 
     # Not the detector's again: its keypoints are kept while pictures and settings are the same.
     (flight.parent / "videos" / "cam01.mp4").unlink()
     succeeds("reconstruct", session, "--every", str(EVERY), "--method", "dlt")
-    assert "cam01.mp4" in refused("reconstruct", session, "--every", str(2 * EVERY))
+    assert "cam01.mp4" in refused("reconstruct", session, "--method", "robust", "--every", str(2 * EVERY))
 
 
 @pytest.mark.slow
@@ -73,13 +75,17 @@ def test_keypoints_do_not_depend_on_workers(flight: Path) -> None:
     results = []
     for workers in ("1", "2"):
         shutil.rmtree(session / "detect", ignore_errors=True)
-        succeeds("reconstruct", session, "--every", "50", "--workers", workers, "--force")
+        succeeds(
+            "reconstruct", session, "--method", "robust", "--every", "50", "--workers", workers, "--force"
+        )
         results.append(content(session))
     assert results[0] == results[1]
 
 
 def test_unknown_detector_lists_those_there_are(flight: Path) -> None:
-    assert "blazepose" in refused("reconstruct", flight.with_suffix(".session"), "--detector", "magic")
+    assert "blazepose" in refused(
+        "reconstruct", flight.with_suffix, "--method", "robust"(".session"), "--detector", "magic"
+    )
 
 
 @pytest.mark.slow

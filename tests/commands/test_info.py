@@ -111,7 +111,7 @@ def test_a_stage_whose_data_changed_is_out_of_date(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=0.4)
     session = flight.manifest.with_suffix(".session")
     succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", session)
+    succeeds("reconstruct", session, "--method", "robust")
     assert STALE not in reading(session)["reconstruct"]
     flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 0.01}
     flight.save()
@@ -121,7 +121,7 @@ def test_a_stage_whose_data_changed_is_out_of_date(tmp_path: Path) -> None:
     succeeds("report", session)
     page = session / "report" / "index.html"
     assert changed in page.read_text(encoding="utf-8")
-    succeeds("reconstruct", session)
+    succeeds("reconstruct", session, "--method", "robust")
     assert STALE not in reading(session)["reconstruct"]
     succeeds("report", session)
     assert changed not in page.read_text(encoding="utf-8")
@@ -136,7 +136,7 @@ def test_detections_of_a_session_are_the_imported_or_the_found_ones(tmp_path: Pa
 
     succeeds("ingest", manifest)
     assert detections() == dict.fromkeys(CAMERAS)  # no detection has run yet: None, not 0
-    succeeds("reconstruct", session, "--detector", spot_detector(tmp_path))
+    succeeds("reconstruct", session, "--method", "robust", "--detector", spot_detector(tmp_path))
     assert detections() == dict.fromkeys(CAMERAS, 6)  # one person in each of the pictures
     flight = write_flight(tmp_path / "imported", seconds=0.2, clean=True)
     succeeds("ingest", flight.manifest)

@@ -132,7 +132,7 @@ def test_maps_change_during_the_replay(tmp_path: Path) -> None:
     flight.settings["map"] = {"log": "ground"}
     flight.save()
     succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", tmp_path / "flight.session")
+    succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust")
     done = mocap("replan-compare", tmp_path / "flight.session", "--arms", "adaptive,fixed")
     assert done.returncode == 0, done.stderr
     assert re.search(r"\bmap\b.* 0\.5 s ", done.stderr)

@@ -24,4 +24,4 @@ def test_second_writer_says_so(tmp_path: Path) -> None:
             ("report", session),
         ):
             assert f"process {holder};" in refusal(mocap_process(*arguments))
-    succeeds("reconstruct", session)
+    succeeds("reconstruct", session, "--method", "robust")

@@ -311,15 +311,23 @@ def test_the_command_refuses_before_it_reconstructs(session: Path, tmp_path: Pat
     flight = write_flight(tmp_path / "keypoints", seconds=0.3)
     succeeds("ingest", flight.manifest)
     unseen = flight.manifest.with_suffix(".session")
-    assert re.search(rf"{unseen.name}: .*pictures.*flight\.yaml", refused("reconstruct", unseen, "--overlay"))
+    assert re.search(
+        rf"{unseen.name}: .*pictures.*flight\.yaml",
+        refused("reconstruct", unseen, "--method", "robust", "--overlay"),
+    )
     assert not (unseen / "reconstruct").exists()
     shutil.rmtree(session / "reconstruct")
     (session / "overlay").mkdir()
-    assert re.search(r"\boverlay: .*--force", refused("reconstruct", session, "--overlay"))
+    assert re.search(
+        r"\boverlay: .*--force", refused("reconstruct", session, "--method", "robust", "--overlay")
+    )
     (session / "overlay").rmdir()
     for name in ("drone1", "drone2"):
         (session.parent / f"{name}.mp4").unlink()
-    assert re.search(r"drone1\.mp4: .*pictures.*\bdrone1\b", refused("reconstruct", session, "--overlay"))
+    assert re.search(
+        r"drone1\.mp4: .*pictures.*\bdrone1\b",
+        refused("reconstruct", session, "--method", "robust", "--overlay"),
+    )
     assert not (session / "reconstruct").exists()
 
 

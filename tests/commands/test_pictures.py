@@ -82,7 +82,7 @@ def test_overlays_lie_on_frames_until_the_video_is_gone(tmp_path: Path) -> None:
     flight = with_videos(tmp_path)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest)
-    assert json.loads(succeeds("reconstruct", session, "--json"))["mpjpe_mm"] < 2
+    assert json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))["mpjpe_mm"] < 2
     succeeds("report", session)
     page = session / "report" / "index.html"
     pictures = page.read_text(encoding="utf-8").count("data:image/jpeg")
@@ -99,7 +99,7 @@ def test_overlays_on_pictures_of_a_log(tmp_path: Path) -> None:
     write_logged_flight(tmp_path, "ros2-mcap")
     session = tmp_path / "flight.session"
     succeeds("ingest", tmp_path / "flight.yaml")
-    succeeds("reconstruct", session)
+    succeeds("reconstruct", session, "--method", "robust")
     succeeds("report", session)
     page = session / "report" / "index.html"
     assert "data:image/jpeg" in page.read_text(encoding="utf-8")
@@ -148,5 +148,5 @@ def test_video_without_keypoints_is_ingested_and_reconstruct_says_what_is_missin
     succeeds("ingest", flight.manifest)
     assert session_json(tmp_path)["cameras"]["drone1"]["keypoints"] is None
     session = tmp_path / "flight.session"
-    assert "keypoints" in refused("reconstruct", session)
+    assert "keypoints" in refused("reconstruct", session, "--method", "robust")
     succeeds("report", tmp_path / "flight.session")

@@ -58,7 +58,7 @@ def test_same_bytes_twice_and_with_one_or_two_workers(tmp_path: Path) -> None:
         flight = write_flight(tmp_path / place, cameras=3, bystander=True)
         session = tmp_path / place / "flight.session"
         succeeds("ingest", flight.manifest)
-        succeeds("reconstruct", session, "--workers", workers)
+        succeeds("reconstruct", session, "--method", "robust", "--workers", workers)
         succeeds("report", session)
         sessions.append(content(session))
     assert sessions[0] == sessions[1]
@@ -83,10 +83,10 @@ def test_unchanged_stages_are_skipped_and_changed_settings_replace(tmp_path: Pat
     flight = write_flight(tmp_path)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", session)
+    succeeds("reconstruct", session, "--method", "robust")
     assert "unchanged" in succeeds("ingest", flight.manifest)
-    assert "unchanged" in succeeds("reconstruct", session)
-    assert "written" in succeeds("reconstruct", session, "--force")
+    assert "unchanged" in succeeds("reconstruct", session, "--method", "robust")
+    assert "written" in succeeds("reconstruct", session, "--method", "robust", "--force")
     replaced = mocap("reconstruct", session, "--method", "dlt")
     assert re.search(r"\bmethod\b.*\brobust\b.*\bdlt\b", replaced.stderr)
     assert "written" in replaced.stdout
@@ -96,7 +96,7 @@ def test_tables_are_read_by_pandas_alone(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=3)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", session)
+    succeeds("reconstruct", session, "--method", "robust")
     skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
     assert len(skeleton) == len(flight.t_ns) * len(flight.joints)
     assert list(skeleton["t_ns"].unique()) == list(flight.t_ns)
@@ -112,7 +112,7 @@ def test_exports_lie_beside_the_session_and_are_not_overwritten(tmp_path: Path) 
     flight = write_flight(tmp_path)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", session)
+    succeeds("reconstruct", session, "--method", "robust")
     result = json.loads(succeeds("export", session, "--to", "trc,csv,tum", "--json"))
     names = {Path(path).suffix for path in result["written"]}
     assert names == {".trc", ".csv", ".tum"}

@@ -24,7 +24,7 @@ def test_refined_halves_the_error_of_noisy_poses_and_writes_them(tmp_path: Path)
     flight = write_flight(tmp_path, cameras=3, seconds=1.5, pose_noise=NOISE)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
-    trusting = json.loads(succeeds("reconstruct", session, "--json"))
+    trusting = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
     metrics = json.loads(succeeds("reconstruct", session, "--method", "refined", "--json"))
     assert metrics["refinement"]["fallback"] is None
     # White errors are independent from picture to picture; a smooth walk averages a dozen and more.
@@ -63,7 +63,7 @@ def test_refined_takes_the_sides_on_which_the_views_agreed(tmp_path: Path) -> No
     exchange_sides(tmp_path / "drone1.json", flight.joints)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
-    robust = json.loads(succeeds("reconstruct", session, "--json"))
+    robust = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
     refined = json.loads(succeeds("reconstruct", session, "--method", "refined", "--json"))
     counts = json.loads((session / "reconstruct" / "stage.json").read_text(encoding="utf-8"))["counts"]
     assert counts["left_right_swaps"]["between_views"]["undone"] > 0
@@ -79,7 +79,7 @@ def test_refined_finds_how_far_a_clock_is_off(tmp_path: Path) -> None:
     flight.save()
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
-    robust = json.loads(succeeds("reconstruct", session, "--json"))
+    robust = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
     refined = json.loads(succeeds("reconstruct", session, "--method", "refined", "--json"))
     assert refined["clock_offsets_s"]["drone1"] == 0.0
     # 17 joints in 90 frames tell it to about 2 ms: two and a half of those.
@@ -142,7 +142,7 @@ def test_refined_falls_back_to_what_robust_gives_and_says_why(
     flight.save()
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
-    robust = json.loads(succeeds("reconstruct", session, "--json"))
+    robust = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
     skeleton = (session / "reconstruct" / "skeleton.parquet").read_bytes()
 
     done = mocap("reconstruct", session, "--method", "refined", "--json")

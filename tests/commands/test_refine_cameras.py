@@ -37,7 +37,7 @@ def test_without_pictures_it_is_refused_in_a_line(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=0.5)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
-    line = refused("reconstruct", session, "--refine-cameras", "background")
+    line = refused("reconstruct", session, "--method", "robust", "--refine-cameras", "background")
     assert re.search(r"--refine-cameras\b.*`video`", line)
 
 

@@ -109,7 +109,7 @@ def test_absurd_keypoints_are_counted_and_the_rest_is_used(
     assert len(lines) == 2
     assert any(re.search(r": .*\b2 joint .*\b1000000 px", line) for line in lines)
     assert any(re.search(r": 17 confidence ", line) for line in lines)
-    succeeds("reconstruct", tmp_path / "flight.session")
+    succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust")
     metrics = read_json(tmp_path / "flight.session" / "reconstruct" / "metrics.json")
     assert metrics["mpjpe_mm"] < 500  # one view at 1e9 px would put the joint kilometres away
 
@@ -135,7 +135,7 @@ def test_absurd_truth_is_counted_and_measures_nothing(
     stored = pd.read_parquet(tmp_path / "flight.session" / "truth.parquet")
     assert len(stored) == flight.position.shape[0] * 17 - 5
     assert stored[["x", "y", "z"]].abs().to_numpy().max() < 100
-    succeeds("reconstruct", tmp_path / "flight.session")
+    succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust")
     assert read_json(tmp_path / "flight.session" / "reconstruct" / "metrics.json")["mpjpe_mm"] < 500
     if dropped:
         assert f"truth: {dropped} position" in refused("ingest", flight.manifest, "--strict")
@@ -261,7 +261,7 @@ def test_joints_that_nobody_sees_have_a_status(flight: SyntheticFlight, tmp_path
             person["keypoints"][3 * nose : 3 * nose + 3] = [0, 0, 0]
         path.write_text(json.dumps(people), encoding="utf-8")
     succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", tmp_path / "flight.session")
+    succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust")
     skeleton = pd.read_parquet(tmp_path / "flight.session" / "reconstruct" / "skeleton.parquet")
     assert set(skeleton.loc[skeleton["joint"] == "nose", "status"]) == {"not_detected"}
 
@@ -272,7 +272,7 @@ def test_when_nothing_is_reconstructed_the_gate_is_named(tmp_path: Path) -> None
     (tmp_path / "drone2.tum").write_bytes((tmp_path / "drone1.tum").read_bytes())
     flight.save()
     succeeds("ingest", flight.manifest)
-    line = refused("reconstruct", tmp_path / "flight.session")
+    line = refused("reconstruct", tmp_path / "flight.session", "--method", "robust")
     assert line.startswith(f"mocap: {tmp_path}/flight.session: ")
     assert "(rejected 255;" in line
     assert not (tmp_path / "flight.session" / "reconstruct").exists()
@@ -398,5 +398,7 @@ def test_unknown_export_lists_those_there_are(flight: SyntheticFlight, tmp_path:
 
 def test_unknown_noise_model_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:
     succeeds("ingest", flight.manifest)
-    line = refused("reconstruct", tmp_path / "flight.session", "--pose-noise", "pink:position_m=1")
+    line = refused(
+        "reconstruct", tmp_path / "flight.session", "--method", "robust", "--pose-noise", "pink:position_m=1"
+    )
     assert ", ".join(NOISE_MODELS.names()) in line

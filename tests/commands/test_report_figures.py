@@ -26,7 +26,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "scenario.yaml").write_text(SCENARIO, encoding="utf-8")
     succeeds("simulate", folder / "scenario.yaml", "-o", folder / "flight", "--no-video")
     succeeds("ingest", folder / "flight" / "flight.yaml", "-o", folder / "robust.session")
-    succeeds("reconstruct", folder / "robust.session")
+    succeeds("reconstruct", folder / "robust.session", "--method", "robust")
     return folder / "robust.session"
 
 

@@ -86,10 +86,10 @@ def test_the_remedy_leaves_no_doubt(flight: Described, case: str) -> None:
 def test_reconstruct_states_doubts_and_strict_refuses(flight: Described, tmp_path: Path) -> None:
     manifest, session = mistaken(flight, CASES["rolled"][1]), tmp_path / "rolled.session"
     succeeds("ingest", manifest, "-o", session)
-    metrics = json.loads(succeeds("reconstruct", session, "--json"))
+    metrics = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
     assert metrics["doubts"][0]["code"] == "mount"
     assert metrics["doubts"][0]["remedy"].startswith("cameras.drone1.mount: {looks: forward, down_deg: 15")
-    assert "(mount)" in refused("reconstruct", session, "--strict")
+    assert "(mount)" in refused("reconstruct", session, "--method", "robust", "--strict")
     assert (session / "reconstruct" / "metrics.json").exists()
 
 
@@ -97,7 +97,8 @@ def test_what_cannot_be_reconstructed_names_the_mistake(flight: Described, tmp_p
     manifest, session = mistaken(flight, looks_left), tmp_path / "left.session"
     succeeds("ingest", manifest, "-o", session)
     assert re.search(
-        r"cameras\.drone1\.mount: \{(looks: forward|body_from_camera)", refused("reconstruct", session)
+        r"cameras\.drone1\.mount: \{(looks: forward|body_from_camera)",
+        refused("reconstruct", session, "--method", "robust"),
     )
 
 
