@@ -84,7 +84,7 @@ def test_keypoints_do_not_depend_on_workers(flight: Path) -> None:
 
 def test_unknown_detector_lists_those_there_are(flight: Path) -> None:
     assert "blazepose" in refused(
-        "reconstruct", flight.with_suffix, "--method", "robust"(".session"), "--detector", "magic"
+        "reconstruct", flight.with_suffix(".session"), "--method", "robust", "--detector", "magic"
     )
 
 

@@ -48,7 +48,7 @@ def test_detections_count_at_the_time_of_their_rows(tmp_path: Path) -> None:
         manifest.write_text(text)
         succeeds("ingest", manifest)
         metrics: dict[str, Any] = json.loads(
-            succeeds("reconstruct", manifest.with_suffix, "--method", "robust"(".session"), "--json")
+            succeeds("reconstruct", manifest.with_suffix(".session"), "--method", "robust", "--json")
         )
         assert metrics["reconstructed_share"] > 0.8  # shutters are free: the first or last picture is alone
         errors[name] = metrics["mpjpe_mm"]

@@ -55,7 +55,7 @@ def test_clock_offset_that_is_stated_is_applied(tmp_path: Path) -> None:
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0
     wrong = mocap(
-        "reconstruct", flight.manifest.with_suffix, "--method", "robust"(".session"), "--json", "-q"
+        "reconstruct", flight.manifest.with_suffix(".session"), "--method", "robust", "--json", "-q"
     )
     assert wrong.returncode == 1 or json.loads(wrong.stdout)["mpjpe_mm"] > 100 * right_mm
 
