@@ -65,8 +65,8 @@ _ROUNDS, _CONVERGED = 8, 1e-5  # m and rad
 _SIGMAS = 4.0
 _KNOT_S = 1.0  # between the knots of slow errors
 _SLOW_S = 10.0  # over which slow errors are counted in the level of all errors
-_UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.005, UNKNOWN_SIGMA[1] / 10)
-"""Start of estimated levels. With positions free by more, far and near points can be confused at first."""
+_UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1] / 10)
+"""Start of estimated levels. White positions that are free by more confuse far and near points at first."""
 
 _DRAWS = 32  # of the posterior
 _LEVEL_ROUNDS = 6
