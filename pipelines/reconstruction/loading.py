@@ -200,7 +200,7 @@ def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Flo
 
     The manifest's reference is replaced by a camera with a known clock if its own is not known.
     """
-    sigma_s = np.array([description.cameras[camera.name].clock.sigma_s for camera in cameras])
+    sigma_s = np.array([description.cameras[camera.name].clock.prior_sigma_s for camera in cameras])
     names = [camera.name for camera in cameras]
     if (sigma_s == 0).any():
         return sigma_s
