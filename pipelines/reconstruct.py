@@ -392,10 +392,17 @@ def _attempt(
 ) -> _Attempt:
     description, refines = flight.description, settings.method in ("refined", "auto")
     clocks: FoundClocks | None = None
-    if settings.method != "refined" and load_clock_sigma(description, cameras).any():
+    clock_sigma_s, stated = load_clock_sigma(description, cameras)
+    if (
+        settings.method == "refined"
+    ):  # finds clocks itself, those of which the manifest says that they are off
+        clock_sigma_s = np.where(stated, clock_sigma_s, 0.0)
+    elif clock_sigma_s.any():
         seen, views, result, _ = _triangulated(flight, cameras, settings, workers)
-        clocks = find_clocks(_robust_flight(cameras, seen, views, result, description, settings, workers))
-        cameras = shifted(cameras, clocks.offset_s)
+        clocks = find_clocks(
+            _robust_flight(flight, cameras, seen, views, result, clock_sigma_s, settings, workers), stated
+        )
+        cameras, clock_sigma_s = shifted(cameras, clocks.offset_s), clocks.prior_s
     logged = cameras
     background: dict[str, Any] = {"background": None}
     warnings: list[str] = []
@@ -416,7 +423,9 @@ def _attempt(
     progress.advance()
     refined = None
     if refines:
-        refined = refine_flight(_robust_flight(cameras, seen, views, result, description, settings, workers))
+        refined = refine_flight(
+            _robust_flight(flight, cameras, seen, views, result, clock_sigma_s, settings, workers)
+        )
         observations, views = refined.observations, refined.views
         result = refused_people(refined.result, observations, seen.anybody)
         if refined.cameras is None:  # refinement rejected: fall back to `robust`, with its own loss
@@ -476,11 +485,12 @@ def _triangulated(
 
 
 def _robust_flight(
+    flight: _Flight,
     cameras: list[Camera],
     seen: _Seen,
     views: Views,
     result: Triangulation,
-    description: Description,
+    clock_sigma_s: Float,
     settings: Settings,
     workers: int,
 ) -> RobustFlight:
@@ -493,11 +503,11 @@ def _robust_flight(
         seen.sides,
         views,
         result,
-        prior=load_pose_errors(description, cameras, settings.pose_noise),
+        prior=load_pose_errors(flight.description, cameras, settings.pose_noise),
         measured=any(camera.errors is not None for camera in cameras),
-        clock_sigma_s=load_clock_sigma(description, cameras),
+        clock_sigma_s=clock_sigma_s,
         pixel_sigma=settings.pixel_sigma,
-        between=description.pose_interpolation,
+        between=flight.description.pose_interpolation,
         threads=workers,
     )
 

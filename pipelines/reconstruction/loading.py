@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.noise import (
     UNKNOWN_SIGMA,
     PoseErrors,
@@ -195,18 +195,17 @@ def source_of_pose_noise(
     return "logged" if moving and all(logged) else None
 
 
-def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Float:
-    """Load the prior standard deviation [C] s of each camera's clock offset; 0 for the reference camera.
+def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> tuple[Float, Bool]:
+    """Load the prior standard deviation [C] s of each clock offset, and whether somebody stated the offset.
 
-    The manifest's reference is replaced by a camera with a known clock if its own is not known.
+    The deviation is 0 for known clocks. Where none is known, it is 0 for the manifest's reference camera.
     """
-    sigma_s = np.array([description.cameras[camera.name].clock.prior_sigma_s for camera in cameras])
-    names = [camera.name for camera in cameras]
-    if (sigma_s == 0).any():
-        return sigma_s
-    held = description.clock_reference
-    sigma_s[names.index(held) if held in names else 0] = 0.0
-    return sigma_s
+    clocks = [description.cameras[camera.name].clock for camera in cameras]
+    sigma_s = np.array([clock.prior_sigma_s for clock in clocks])
+    if (sigma_s > 0).all():
+        names, held = [camera.name for camera in cameras], description.clock_reference
+        sigma_s[names.index(held) if held in names else 0] = 0.0
+    return sigma_s, np.array([clock.sigma_s > 0 or clock.start == "stated" for clock in clocks])
 
 
 def load_truth(folder: Path, description: Description, joints: tuple[str, ...]) -> JointMotion | None:

@@ -112,17 +112,26 @@ class FoundClocks:
     """Clock offsets that the keypoints determine."""
 
     offset_s: Float  # [C] to add to the pictures' times
-    sigma_s: Float  # [C] posterior standard deviation; 0 for known clocks, the prior's where none was found
-    reason: str | None  # why offsets are only those of the search in steps, or zero
+    sigma_s: Float  # [C] posterior standard deviation; the prior's where only the search found it, 0 if held
+    prior_s: Float  # [C] prior standard deviation for later estimates; 0 for clocks that are held
 
 
-def find_clocks(flight: RobustFlight) -> FoundClocks:
-    """Find the clock offsets of a flight: by the refinement, or by its search alone where that is refused."""
+def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
+    """Find the clock offsets of a flight: by the refinement, or by its search alone where that is refused.
+
+    A clock whose offset nobody stated (False in `stated` [C]) is held unless the search finds views that agree
+    clearly better elsewhere. Lasting keypoint errors can pull a right clock by many standard deviations: by
+    40 ms in a real recording with synchronised cameras.
+    """
     searched_s = _initial_clock_offsets_s(flight)
-    refined, offset_s = _settle_clocks(flight, searched_s)
+    prior_s = np.where(stated | (searched_s != 0), flight.clock_sigma_s, 0.0)
+    held = FoundClocks(searched_s, prior_s, prior_s)
+    if not prior_s.any():
+        return held
+    refined, offset_s = _settle_clocks(replace(flight, clock_sigma_s=prior_s), searched_s)
     if refined.fallback is not None:
-        return FoundClocks(searched_s, flight.clock_sigma_s, refined.fallback)
-    return FoundClocks(offset_s, refined.clock_sigma_s, None)
+        return held
+    return FoundClocks(offset_s, refined.clock_sigma_s, prior_s)
 
 
 def _initial_clock_offsets_s(flight: RobustFlight) -> Float:
