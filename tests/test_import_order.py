@@ -37,13 +37,6 @@ heavy = {"numpy", "pandas", "scipy", "cv2", "numba", "matplotlib", "pycolmap", "
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 """
 
-NO_REFINEMENT_BY_DEFAULT = """
-import sys
-import pipelines.reconstruct
-refinement = [name for name in sys.modules if name.startswith("pipelines.reconstruction.refin")]
-assert not refinement, refinement
-"""
-
 
 def run(code: str) -> None:
     done = subprocess.run(
@@ -58,10 +51,6 @@ def test_png_encoding_survives_pycolmap() -> None:
 
 def test_pipelines_run_without_the_terminal_libraries() -> None:
     run(NO_TERMINAL_IN_PIPELINES)
-
-
-def test_reconstruct_loads_the_refinement_only_when_asked() -> None:
-    run(NO_REFINEMENT_BY_DEFAULT)
 
 
 def test_help_loads_nothing_heavy() -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.noise import (
     UNKNOWN_SIGMA,
+    NoiseModel,
     PoseErrors,
     errors_of_level,
     pose_errors,
@@ -170,7 +171,7 @@ def load_pose_errors(
         if camera.errors is not None:
             stated.append(camera.errors)
         elif models is not None:
-            stated.append(pose_errors(models))
+            stated.append(_prior_of(models, camera))
         elif camera.covariance is not None and camera.sigma is not None:
             level = errors_of_level(np.median(camera.sigma, axis=0))
             stated.append(replace(level, logged=True))
@@ -181,6 +182,15 @@ def load_pose_errors(
         stated = [usual if errors is None else errors for errors in stated]
     known = [errors for errors in stated if errors is not None]
     return known if len(known) == len(stated) else None
+
+
+def _prior_of(models: Sequence[NoiseModel], camera: Camera) -> PoseErrors:
+    """Build the prior from stated models; for models of plug-ins, from the size of their errors alone."""
+    try:
+        return pose_errors(models)
+    except ValueError:
+        level = np.array(UNKNOWN_SIGMA) if camera.sigma is None else np.median(camera.sigma, axis=0)
+        return errors_of_level(level)
 
 
 def source_of_pose_noise(

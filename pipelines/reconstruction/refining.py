@@ -119,9 +119,9 @@ class FoundClocks:
 def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
     """Find the clock offsets of a flight: by the refinement, or by its search alone where that is refused.
 
-    A clock whose offset nobody stated (False in `stated` [C]) is held unless the search finds views that agree
-    clearly better elsewhere. Lasting keypoint errors can pull a right clock by many standard deviations: by
-    40 ms in a real recording with synchronised cameras.
+    A clock whose offset nobody stated (False in `stated` [C]) is held unless the search finds that views
+    agree clearly better elsewhere. Lasting keypoint errors can pull a right clock by many standard
+    deviations: by 40 ms in a real recording with synchronised cameras.
     """
     searched_s = _initial_clock_offsets_s(flight)
     prior_s = np.where(stated | (searched_s != 0), flight.clock_sigma_s, 0.0)

@@ -43,6 +43,11 @@ class CameraRow:
     last_s: float
     gaps_s: tuple[tuple[float, float], ...]
 
+    @property
+    def gap_total_s(self) -> float:
+        """Total duration of the gaps in the poses."""
+        return sum(end - start for start, end in self.gaps_s)
+
 
 @dataclass(frozen=True)
 class JointRow:

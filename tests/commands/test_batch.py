@@ -85,7 +85,7 @@ def flights_and_single_runs(folder: Path, count: int) -> tuple[list[Path], list[
             flight = write_flight(folder / place / f"day{k}", seconds=0.4, seed=k)
         session = folder / "alone" / f"day{k}" / "flight.session"
         succeeds("ingest", folder / "alone" / f"day{k}" / "flight.yaml")
-        succeeds("reconstruct", session, "--method", "robust")
+        succeeds("reconstruct", session)
         single.append(content(session))
         manifests.append(flight.manifest)
     return manifests, single

@@ -57,7 +57,9 @@ def flight(detected: Path, tmp_path: Path) -> Path:
 
 def again(flight: Path, *options: str) -> list[str | Path]:
     """Return the command that reconstructed the flight; models are identified by their content, not path."""
-    return ["reconstruct", flight / "flight.session", "--detector", spot_detector(flight), *options]
+    method = [] if "--method" in options else ["--method", "robust"]
+    command = ["reconstruct", flight / "flight.session", "--detector", spot_detector(flight)]
+    return [*command, *method, *options]
 
 
 def stages_run(session: Path) -> list[str]:
@@ -181,7 +183,7 @@ def test_nothing_is_kept_of_a_video_that_is_exchanged_while_it_is_looked_at(flig
     session, video = flight / "flight.session", flight / "right.mp4"
     expected = content(session)
     shutil.copy2(video, flight / "kept.mp4")
-    settings = Settings(detector=spot_detector(flight))
+    settings = Settings(method="robust", detector=spot_detector(flight))
     shutil.rmtree(session / "detect")
     with pytest.raises(DataError, match=r"right\.mp4"):
         reconstruct(session, settings, progress=Meddler(FRAMES + 3, lambda: mirror(video)))

@@ -138,7 +138,8 @@ def test_stopped_in_the_middle_it_goes_on_with_what_is_finished(tmp_path: Path) 
 
 def stopped_with(how: signal.Signals, blocks: int, session: Path, detector: str) -> int:
     """Send a signal to `mocap reconstruct` after some finished blocks; return its exit status."""
-    arguments = [MOCAP, "reconstruct", str(session), "--detector", detector, "--workers", "1"]
+    arguments = [MOCAP, "reconstruct", str(session), "--method", "robust"]
+    arguments += ["--detector", detector, "--workers", "1"]
     process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
     while len(finished(session)) < blocks:

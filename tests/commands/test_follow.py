@@ -65,7 +65,7 @@ def test_tracks_and_stills_are_kept_for_other_methods_and_poses(session: Path) -
 
 
 def test_robust_alone_follows_nothing(session: Path) -> None:
-    succeeds("reconstruct", session)
+    succeeds("reconstruct", session, "--method", "robust")
     assert not (session / "background").exists()
 
 

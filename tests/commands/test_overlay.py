@@ -74,7 +74,7 @@ def filmed_flight(folder: Path) -> SyntheticFlight:
 def session_of(flight: SyntheticFlight) -> Path:
     session = flight.manifest.parent / "flight.session"
     ingest(flight.manifest, session)
-    reconstruct(session)
+    reconstruct(session, Settings(method="robust"))
     return session
 
 
@@ -348,10 +348,10 @@ def test_the_stages_of_a_session_do_not_mind_its_videos(session: Path) -> None:
     before = [hashlib.sha256(video.read_bytes()).hexdigest() for video in videos]
     manifest = session.parent / "flight.yaml"
     assert ingest(manifest, session).skipped
-    assert reconstruct(session).skipped
+    assert reconstruct(session, Settings(method="robust")).skipped
     report(session)
     ingest(manifest, session, force=True)
-    reconstruct(session, force=True)
+    reconstruct(session, Settings(method="robust"), force=True)
     assert not report(session, force=True).skipped
     assert [hashlib.sha256(video.read_bytes()).hexdigest() for video in videos] == before
     # The same skeleton from the same files: the videos are still its own.

@@ -181,7 +181,7 @@ def test_what_is_left_open_is_drafted_as_comments(tmp_path: Path) -> None:
         shutil.copyfile(real_data(f"logs/{name}"), tmp_path / Path(name).name)
     result = draft([tmp_path])
     stated = YAML(typ="safe", pure=True).load(result.text)["cameras"]
-    assert stated["air2"]["pose"] == {"dji": "air2s.srt"}
+    assert stated["air2"]["pose"] == {"dji": "air2s.srt", "assumed": True}
     assert stated["air2"]["frame_times"] == {"srt": "air2s.srt"}
     assert stated["sample"]["pose"] == {"ulog": "sample_px4_events.ulg"}
     assert stated["sample"]["mount"]["looks"] == "forward"

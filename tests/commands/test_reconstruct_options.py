@@ -37,7 +37,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> tuple[SyntheticFlight, Pa
 
 def command(session: Path, *options: str) -> Result:
     """Run the command in this process, because starting one takes longer than the work."""
-    arguments = ["reconstruct", str(session), "--workers", "1", *options]
+    arguments = ["reconstruct", str(session), "--workers", "1", "--method", "robust", *options]
     return CliRunner().invoke(Mocap(commands=[reconstruct_command]), arguments)
 
 

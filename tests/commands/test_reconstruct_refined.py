@@ -153,7 +153,7 @@ def test_refined_falls_back_to_what_robust_gives_and_says_why(
     assert any("robust" in line and line.endswith(reason) for line in done.stderr.splitlines())
     assert (session / "reconstruct" / "skeleton.parquet").read_bytes() == skeleton
     assert not (session / "reconstruct" / "cameras.parquet").exists()
-    of_refined_alone = {"method", "clock_offsets_s"}
+    of_refined_alone = {"method", "method_used", "clock_offsets_s"}
     assert {name: refined[name] for name in robust.keys() - of_refined_alone} == {
         name: robust[name] for name in robust.keys() - of_refined_alone
     }

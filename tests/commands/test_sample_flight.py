@@ -66,7 +66,9 @@ def reconstructed(folder: Path, detector: str, *options: str) -> tuple[Path, str
     fetch_networks(detector)
     session = folder / "true_poses.session"
     succeeds("ingest", SAMPLE / "true_poses.yaml", "-o", session)
-    done = mocap("reconstruct", session, "--detector", detector, *options, "--workers", "2")
+    done = mocap(
+        "reconstruct", session, "--method", "robust", "--detector", detector, *options, "--workers", "2"
+    )
     assert done.returncode == 0, done.stderr
     return session, done.stderr
 

@@ -110,7 +110,7 @@ def test_keypoints_say_which_detector_they_imitate(small: Path, tmp_path: Path) 
 def reconstructed(flight: Path, *options: str) -> dict[str, Any]:
     succeeds("ingest", flight)
     metrics: dict[str, Any] = json.loads(
-        succeeds("reconstruct", flight.with_suffix(".session"), "--json", *options)
+        succeeds("reconstruct", flight.with_suffix(".session"), "--method", "robust", "--json", *options)
     )
     return metrics
 

@@ -23,7 +23,9 @@ INTERPOLATED_MM = 1.5
 def measured(flight: SyntheticFlight, *options: str) -> dict[str, Any]:
     succeeds("ingest", flight.manifest)
     session = flight.manifest.with_suffix(".session")
-    result: dict[str, Any] = json.loads(succeeds("reconstruct", session, "--json", *options))
+    result: dict[str, Any] = json.loads(
+        succeeds("reconstruct", session, "--method", "robust", "--json", *options)
+    )
     return result
 
 
