@@ -62,6 +62,7 @@ from pipelines.reconstruction.refining import (
 from pipelines.reconstruction.results import assess, camera_poses_table, method_used, skeleton_table
 from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import (
+    are_calibrated,
     noise_text,
     ray_sigma,
     refused_people,
@@ -418,6 +419,8 @@ def _attempt(
         cameras, background["ground"] = binding.cameras, binding.entry
     seen, views, result, solve = _triangulated(flight, cameras, settings, workers)
     observations = seen.observations
+    if settings.method == "auto" and are_calibrated(cameras, observations):
+        refines = False
     progress.advance()
     result = refused_people(result, observations, seen.anybody)
     progress.advance()
@@ -460,7 +463,12 @@ def _attempt(
         seen.found,
         seen.association,
         seen.between_views,
-        metrics | finished | people | readout | parts | {"method_used": method_used(parts, cameras, known)},
+        metrics
+        | finished
+        | people
+        | readout
+        | parts
+        | {"method_used": method_used(parts, cameras, known, settings.method)},
         _poses_stored(cameras, refined, background["background"], description.pose_interpolation),
         [
             *warnings,

@@ -210,13 +210,16 @@ def _leave_one_out(
 # --- parts of the method -------------------------------------------------------------------------------
 
 
-def method_used(metrics: Mapping[str, Any], cameras: Sequence[Camera], known: str | None) -> dict[str, Any]:
+def method_used(
+    metrics: Mapping[str, Any], cameras: Sequence[Camera], known: str | None, method: str
+) -> dict[str, Any]:
     """Say which parts of a method took part in a reconstruction, which not, and why.
 
     Args:
         metrics: the figures of `background`, `refinement` and `clock_offset_sigmas_s`, where there are any.
         cameras: all of them, as loaded.
         known: "stated" or "logged", the source of the pose noise; None without any.
+        method: as asked for.
 
     Returns:
         `background` and `ground`: the cameras whose poses they corrected, and the `reason` of each other;
@@ -233,7 +236,8 @@ def method_used(metrics: Mapping[str, Any], cameras: Sequence[Camera], known: st
     used["ground"] = {"cameras": list(ground["moved_m"]), "reasons": ground["reasons"]}
     sigmas_s = metrics.get("clock_offset_sigmas_s") or {}
     refinement = metrics.get("refinement")
-    reason = "the method has no such part" if refinement is None else refinement["fallback"]
+    absent = "robust fits calibrated still cameras better" if method == "auto" else "the method has none"
+    reason = absent if refinement is None else refinement["fallback"]
     learned = refinement is not None and reason is None and refinement["pose_noise"] == "estimated"
     guessed = learned or bool(used["background"]["cameras"])
     exact = all(camera.static for camera in cameras)

@@ -104,8 +104,7 @@ def solver_for(
     For calibrated cameras, `robust` has its own loss. For poses with errors, it has a gate that knows the
     common error of a picture's joints, and weights from logged covariances.
     """
-    calibrated = observations.pose_sigma is None and all(camera.static for camera in cameras)
-    if method in ("robust", "auto") and calibrated:
+    if method in ("robust", "auto") and are_calibrated(cameras, observations):
         return partial(triangulate_heavy_tailed, threads=threads)
     if method in ("dlt", "midpoint"):
         return partial(triangulate, method=method, threads=threads)
@@ -118,6 +117,11 @@ def solver_for(
     if observations.pose_covariance is None:
         return in_pictures
     return partial(triangulate_weighted, solve=in_pictures, pose_covariance=observations.pose_covariance)
+
+
+def are_calibrated(cameras: Sequence[Camera], observations: Observations) -> bool:
+    """Test if all cameras stand still and nobody stated errors of their poses."""
+    return observations.pose_sigma is None and all(camera.static for camera in cameras)
 
 
 def pictures_of(observations: Observations) -> Int64:

@@ -40,7 +40,7 @@ def test_without_pictures_it_is_the_refinement(tmp_path: Path) -> None:
 
 
 def test_a_flight_too_short_for_motion_and_bones_keeps_the_rest(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, seconds=0.5, static=True)
+    flight = write_flight(tmp_path, seconds=0.5)
     for camera in flight.settings["cameras"].values():
         del camera["pose_noise"]
     flight.save()
@@ -70,6 +70,17 @@ def test_every_method_is_served_by_the_clocks_that_were_found(tmp_path: Path, me
     assert metrics["clock_offsets_s"]["drone1"] == 0.0
     assert metrics["method_used"]["clocks"] == ["drone2"]
     assert metrics["mpjpe_mm"] < 0.3 * 240
+
+
+def test_calibrated_still_cameras_are_left_to_robust(tmp_path: Path) -> None:
+    """Check the choice that the real recording supports (docs/decisions/0012-auto.md)."""
+    flight = write_flight(tmp_path, seconds=1.5, static=True, pose_noise={})
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest, "-o", session)
+    unasked, skeleton = reconstructed(session)
+    _, of_robust = reconstructed(session, "--method", "robust")
+    assert skeleton == of_robust
+    assert not unasked["method_used"]["body"]["used"]
 
 
 @pytest.mark.slow

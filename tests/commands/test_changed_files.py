@@ -57,9 +57,8 @@ def flight(detected: Path, tmp_path: Path) -> Path:
 
 def again(flight: Path, *options: str) -> list[str | Path]:
     """Return the command that reconstructed the flight; models are identified by their content, not path."""
-    method = [] if "--method" in options else ["--method", "robust"]
-    command = ["reconstruct", flight / "flight.session", "--detector", spot_detector(flight)]
-    return [*command, *method, *options]
+    method = () if "--method" in options else ("--method", "robust")
+    return ["reconstruct", flight / "flight.session", "--detector", spot_detector(flight), *method, *options]
 
 
 def stages_run(session: Path) -> list[str]:

@@ -47,11 +47,11 @@ def test_clock_offset_that_is_stated_is_applied(tmp_path: Path) -> None:
     table = pd.read_csv(times)
     table["t_ns"] -= 200_000_000
     table.to_csv(times, index=False)
-    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 0.2}
+    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 0.2, "sigma_s": 0}
     flight.save()
     right_mm = measured(flight)["mpjpe_mm"]
     assert right_mm < 0.5
-    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -0.2}
+    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -0.2, "sigma_s": 0}
     flight.save()
     # The other sign is 0.4 s off: the walk goes on by half a metre meanwhile, and the drone with it.
     done = mocap("ingest", flight.manifest)

@@ -26,6 +26,7 @@ focal length is another; the turn is then the logarithm of the factor.
 """
 
 _STEPS = 20
+_MOST_ZOOM = 3.0  # logarithm of the factor on a focal length
 _CONVERGED = 0.05  # of the cost
 _LEAST_SIGMA = (0.02, np.radians(0.1))  # of constant errors, m and rad
 _LOOSE_M = 30.0  # sigma of a shift that is a fault: any is as likely
@@ -91,7 +92,7 @@ def undone(scene: Scene, name: str, index: int, shift: Float, turn_rad: float) -
     """Return the scene without a fault of one camera."""
     if name == "focal":
         factor = np.ones(len(scene.focal_px))
-        factor[index] = np.exp(turn_rad)
+        factor[index] = np.exp(np.clip(turn_rad, -_MOST_ZOOM, _MOST_ZOOM))
         return replace(scene, rays=scene.rays / factor[:, None, None, None], focal_px=scene.focal_px * factor)
     rotation, position = scene.rotation.copy(), scene.position.copy()
     turn = _rotation(_axis(name) * turn_rad)
