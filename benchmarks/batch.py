@@ -36,7 +36,7 @@ def main() -> None:
             write_flight(Path(folder) / f"flight{k}", seconds=options.seconds, cameras=3, seed=k).manifest
             for k in range(options.flights)
         ]
-        batch(manifests[:1], Path(folder) / "first", Settings(stages=STAGES), workers=1)
+        batch(manifests[:1], Path(folder) / "first", Settings(stages=STAGES, method="robust"), workers=1)
         runs: dict[int, list[tuple[float, float, float]]] = {1: [], 2: []}
         for turn in range(TURNS):
             for workers, of_workers in runs.items():
@@ -56,7 +56,7 @@ def main() -> None:
 def run(manifests: list[Path], output: Path, workers: int) -> tuple[float, float, float]:
     """Run a batch; return wall seconds, and processor seconds of the busiest worker and of all."""
     started = time.perf_counter()
-    done = batch(manifests, output, Settings(stages=STAGES), workers=workers)
+    done = batch(manifests, output, Settings(stages=STAGES, method="robust"), workers=workers)
     seconds = time.perf_counter() - started
     assert not done.failed
     of_worker: Counter[int] = Counter()

@@ -145,7 +145,7 @@ def print_joints(detector: str, offsets: dict[str, Float]) -> None:
 
 def found_by(session: Path, detector: str, every: int) -> dict[str, Any]:
     """Reconstruct from a detector's keypoints and return the figures."""
-    return reconstruct(session, Settings(detector=detector, every=every), workers=2).metrics
+    return reconstruct(session, Settings(method="robust", detector=detector, every=every), workers=2).metrics
 
 
 def person_ms(detector: str) -> float:

@@ -48,7 +48,7 @@ def main() -> None:
 
 def row_of(folder: Path, noise: str, draw: int) -> str:
     """Measure one draw of a flight; return its row of the table."""
-    reconstruct(folder, Settings(refine_cameras="background", pose_noise=noise))
+    reconstruct(folder, Settings(method="robust", refine_cameras="background", pose_noise=noise))
     description = read_description(folder)
     with locked(folder) as session:
         detected = session.intact_record("detect")

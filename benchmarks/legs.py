@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.ingest import ingest
-from pipelines.reconstruct import reconstruct
+from pipelines.reconstruct import Settings, reconstruct
 from pipelines.session.people import true_joints_at
 from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
 from pipelines.simulate import simulate
@@ -95,7 +95,7 @@ def measure(name: str, folder: Path) -> None:
         simulate(scenario, flight)
     for manifest, poses in (("true_poses", "true"), ("flight", "logged")):
         session = ingest(flight / f"{manifest}.yaml", folder / f"{name}_{poses}.session").folder
-        reconstruct(session)
+        reconstruct(session, Settings(method="robust"))
         print(f"| {name} | {poses} | {row(session)} |", flush=True)
 
 

@@ -59,7 +59,7 @@ def row_of(name: str, offset_s: float, sigma_s: float, seed: int, seconds: float
         flight.save()
         session = Path(folder) / "flight.session"
         succeeds("ingest", flight.manifest, "-o", session)
-        robust = json.loads(succeeds("reconstruct", session, "--json"))
+        robust = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
         began = time.process_time()
         refined = json.loads(succeeds("reconstruct", session, "--method", "refined", "--json"))
         took = time.process_time() - began

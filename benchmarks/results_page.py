@@ -32,15 +32,15 @@ POSES = PosesSection(
     commands={
         "true": (
             f"mocap ingest {_SAMPLE}/true_poses.yaml -o {PLACE}/true.session",
-            f"mocap reconstruct {PLACE}/true.session",
+            f"mocap reconstruct {PLACE}/true.session --method robust",
         ),
         "sample": (
             f"mocap ingest {_SAMPLE}/flight.yaml -o {PLACE}/sample.session",
-            f"mocap reconstruct {PLACE}/sample.session",
+            f"mocap reconstruct {PLACE}/sample.session --method robust",
         ),
         "background": (
             f"mocap ingest {_SAMPLE}/flight.yaml -o {PLACE}/background.session",
-            f"mocap reconstruct {PLACE}/background.session --refine-cameras background",
+            f"mocap reconstruct {PLACE}/background.session --method robust --refine-cameras background",
         ),
     },
     names={
