@@ -384,16 +384,7 @@ def report(
         judged = "auto" if "auto" in methods else methods[-1]
         lines += ["", f"`{judged}`, {_SAID[said]}:", ""]
         lines += markdown_table(
-            [
-                "flight",
-                "acceleration m/s^2",
-                "peak speed",
-                "NEES",
-                "in 95 % %",
-                "measured %",
-                "CPU s",
-                "fell back",
-            ],
+            _QUALITY,
             [_quality_row(flight, judged, detector, said, found) for flight in chosen],
         )
         lines += ["", *criteria(chosen, judged, detector, said, found)]

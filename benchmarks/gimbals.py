@@ -79,7 +79,7 @@ _SHAKE_HZ_DEG = ((6.3, 0.06), (8.9, 0.05), (11.2, 0.04))
 
 @dataclass(frozen=True)
 class Shot:
-    """What a real camera was when the recording was made: intrinsics and pose."""
+    """Real camera of the recording: its intrinsics and its pose."""
 
     intrinsics: IntrinsicsEntry
     position: Float  # [3] m
