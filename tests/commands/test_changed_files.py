@@ -178,14 +178,18 @@ class Meddler(Silent):
             self._what()
 
 
-def test_nothing_is_kept_of_a_video_that_is_exchanged_while_it_is_looked_at(flight: Path) -> None:
-    session, video = flight / "flight.session", flight / "right.mp4"
+@pytest.mark.parametrize("steps", [3, FRAMES + 3])
+def test_nothing_is_kept_of_a_video_that_is_exchanged_while_it_is_looked_at(flight: Path, steps: int) -> None:
+    session, video = flight / "flight.session", flight / ("left.mp4" if steps < FRAMES else "right.mp4")
+    settings = Settings(detector=spot_detector(flight))
+    reconstruct(session, settings)
     expected = content(session)
+    assert any(name.startswith("background/left/") for name in expected), "the camera that moves is followed"
     shutil.copy2(video, flight / "kept.mp4")
-    settings = Settings(method="robust", detector=spot_detector(flight))
-    shutil.rmtree(session / "detect")
-    with pytest.raises(DataError, match=r"right\.mp4"):
-        reconstruct(session, settings, progress=Meddler(FRAMES + 3, lambda: mirror(video)))
+    for stage in ("detect", "background"):
+        shutil.rmtree(session / stage)
+    with pytest.raises(DataError, match=video.name):
+        reconstruct(session, settings, progress=Meddler(steps, lambda: mirror(video)))
     shutil.copy2(flight / "kept.mp4", video)
     reconstruct(session, settings)
     assert content(session) == expected

@@ -1,5 +1,6 @@
 """Stage `background`: what it keeps, what it depends on, and the binding of its blocks."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -10,11 +11,13 @@ import pytest
 from pipelines import follow
 from pipelines.follow import Following
 from pipelines.geometry.arrays import Picture
+from pipelines.reconstruct import reconstruct
 from pipelines.reconstruction.background_tracks import load_stills, load_tracks
 from pipelines.reconstruction.loading import load_cameras
 from pipelines.session.description import read_description
 from pipelines.session.stages import locked
-from tests.commands.runner import succeeds
+from tests.commands.runner import content, succeeds
+from tests.commands.test_changed_files import Meddler, mirror
 from tests.synthetic.flights import LENS, write_flight
 from tests.synthetic.videos import even_ticks, write_video
 
@@ -62,6 +65,21 @@ def test_tracks_and_stills_are_kept_for_other_methods_and_poses(session: Path) -
     found = load_tracks(session, camera)
     assert found is not None
     assert set(found.tracks.picture.tolist()) == set(range(FRAMES))
+
+
+def test_auto_goes_on_without_a_video_that_is_exchanged_while_it_is_followed(session: Path) -> None:
+    """Nothing of it is kept: with the right video, the result is that of a flight where nothing happened."""
+    reconstruct(session)
+    expected = content(session)
+    video = session.parent / "drone1.mp4"
+    shutil.copy2(video, session.parent / "kept.mp4")
+    shutil.rmtree(session / "background")
+    metrics = reconstruct(session, progress=Meddler(FRAMES // 2, lambda: mirror(video))).metrics
+    assert not metrics["background"]["drone1"]["used"]
+    assert "drone1.mp4" in metrics["background"]["drone1"]["reason"]
+    shutil.copy2(session.parent / "kept.mp4", video)
+    reconstruct(session)
+    assert content(session) == expected
 
 
 def test_robust_alone_follows_nothing(session: Path) -> None:
