@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pipelines.simulation.study.settings import Study
 
 
-@click.group("ablate", short_help="What the error depends on: tilt, drones, noise.")
+@click.group("ablate", short_help="Study the error against tilt, number of drones, noise.")
 def ablate_command() -> None:
     """Measure how the reconstruction error depends on tilt, the number of drones, or the noise of poses.
 
@@ -55,17 +55,17 @@ _study_options = grouped(
         metavar="NAME,...",
         default="dlt,midpoint,robust,refined",
         show_default=True,
-        help="Compared side by side. refined takes most of the time.",
+        help="Methods to compare. refined takes most of the time.",
     ),
     click.option(
         "--keypoints",
         type=click.Choice(["model", "exact"]),
-        help="With the measured errors of a detector, or without any [default: model].",
+        help="Keypoints with the measured errors of a detector, or exact ones [default: model].",
     ),
     click.option(
         "--detector",
         metavar="NAME",
-        help="Render pictures and let this detector look at them (`mocap models`).",
+        help="Render pictures and run this detector on them (`mocap models`).",
     ),
     click.option(
         "--seconds",
@@ -78,7 +78,7 @@ _study_options = grouped(
         "--rate",
         type=FiniteRange(0.1, 240),
         metavar="HZ",
-        help="Of the pictures [default: 30; 1 with --detector].",
+        help="Rate of the pictures [default: 30; 1 with --detector].",
     ),
     click.option(
         "--trials",
@@ -87,7 +87,7 @@ _study_options = grouped(
         show_default=True,
         help="Draws of all noise.",
     ),
-    seed_option("Of all noise."),
+    seed_option("Seed of all noise."),
     workers_option("Conditions worked on at once; the results do not depend on them."),
     overwrite_option,
     force_option,
@@ -95,15 +95,22 @@ _study_options = grouped(
 
 
 _drones_option = click.option(
-    "--drones", type=click.IntRange(2, 8), default=2, show_default=True, help="How many film."
+    "--drones", type=click.IntRange(2, 8), default=2, show_default=True, help="Number of drones."
 )
 _tilt_option = click.option(
-    "--tilt", type=FiniteRange(-10, 85), default=15.0, show_default=True, metavar="DEG", help="Of the slots."
+    "--tilt",
+    type=FiniteRange(-10, 85),
+    default=15.0,
+    show_default=True,
+    metavar="DEG",
+    help="Tilt of the slots.",
 )
 
 
 @ablate_command.command("tilt", short_help="Error against the tilt of the formation.")
-@click.option("--tilts", metavar="DEG,...", default="0,15,30,45,60", show_default=True, help="Of the slots.")
+@click.option(
+    "--tilts", metavar="DEG,...", default="0,15,30,45,60", show_default=True, help="Tilts of the slots."
+)
 @_drones_option
 @_study_options
 @output_options
@@ -113,7 +120,7 @@ def tilt_command(tilts: str, drones: int, study: dict[str, Any], shown: Shown) -
 
 
 @ablate_command.command("robots", short_help="Error against the number of drones.")
-@click.option("--robots", metavar="N,...", default="2,3,4,5", show_default=True, help="How many film.")
+@click.option("--robots", metavar="N,...", default="2,3,4,5", show_default=True, help="Numbers of drones.")
 @_tilt_option
 @_study_options
 @output_options

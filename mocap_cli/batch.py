@@ -40,22 +40,24 @@ _settings_options = grouped(
         default="ingest,reconstruct,replan-compare,report",
         show_default=True,
         metavar="NAME,...",
-        help="Which of them.",
+        help="Stages to run.",
     ),
     click.option(
         "--method",
         type=click.Choice(["auto", "refined", "robust", "midpoint", "dlt"]),
         default="auto",
         show_default=True,
-        help="Of `mocap reconstruct`, as the next three are.",
+        help="Method of `mocap reconstruct`; the next three options are that command's, too.",
     ),
-    click.option("--detector", default="blazepose", show_default=True, help="For flights without keypoints."),
+    click.option(
+        "--detector", default="blazepose", show_default=True, help="Detector for cameras without keypoints."
+    ),
     provider_option,
     every_option,
 )
 
 
-@click.command("batch", short_help="All of it over many flights, on Dask.")
+@click.command("batch", short_help="Run all stages over many flights, on Dask.")
 @click.argument("flights", nargs=-1, required=True, metavar="FLIGHT.yaml...")
 @click.option(
     "-o",
@@ -68,8 +70,8 @@ _settings_options = grouped(
     "--workers",
     type=click.IntRange(1, 1024),
     metavar="N",
-    help="How many work here: on a flight each, and on long videos where flights are fewer [default: all"
-    " cores].",
+    help="Number of workers on this machine: one for each flight; several for a long video where flights are"
+    " fewer [default: all cores].",
 )
 @click.option(
     "--scheduler",

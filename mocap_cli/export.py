@@ -43,7 +43,7 @@ class _ListsFormats(click.Command):
     "formats",
     required=True,
     metavar="FORMAT[,FORMAT...]",
-    help="What to write, as listed below; several at once.",
+    help="Formats to write, as listed below.",
 )
 @click.option(
     "-o",
@@ -52,7 +52,7 @@ class _ListsFormats(click.Command):
     help="Folder, or of several sessions the folder around them [default: the session's name with .export].",
 )
 @click.option("--unit", metavar="m|cm|mm|inch", help="Unit of lengths, for formats that have a choice.")
-@click.option("--axes", metavar="z-up|y-up", help="Which way is up, for formats that have a choice.")
+@click.option("--axes", metavar="z-up|y-up", help="Direction that is up, for formats that have a choice.")
 @click.option(
     "--pictures-hz",
     type=FiniteRange(0, 1000),
@@ -72,8 +72,8 @@ def export_command(
 ) -> dict[str, Any] | None:
     """Write the skeleton and the cameras in the formats of other programs.
 
-    Beside the files, export.json says what each is, in which unit and axes, and what was left out or held.
-    Files of an earlier export are replaced; what else lies there only with --overwrite.
+    export.json states for each file its format, unit and axes, and what was left out or held. Files of an
+    earlier export are replaced; other files only with --overwrite.
     """
     from pipelines.export import PICTURES_HZ, export
 

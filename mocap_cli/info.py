@@ -13,11 +13,11 @@ from mocap_cli.terminal import one_line, say
 _LONGEST_LIST = 12
 
 
-@click.command("info", short_help="Say what a file or session holds.")
+@click.command("info", short_help="Print the content of a file or session.")
 @each("path", "PATH", titled=False)
 @json_option
 def info_command(path: Path, as_json: bool) -> dict[str, Any] | None:
-    """Say what a path holds: anything that mocap reads, and what it writes.
+    """Print the content of a path: anything that mocap reads, and what it writes.
 
     Logs, videos, maps, calibrations, keypoint files and trajectories; manifests, scenarios and planner
     settings; sessions, simulated flights and studies.

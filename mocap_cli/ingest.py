@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     default=0.5,
     show_default=True,
     metavar="SECONDS",
-    help="Frames between logged poses further apart than this have no pose.",
+    help="Longest time between two logged poses across which a frame gets a pose.",
 )
 @click.option(
     "--max-extrapolation",
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     default=0.1,
     show_default=True,
     metavar="SECONDS",
-    help="Frames further than this before or after all logged poses have none.",
+    help="Longest time before the first or after the last logged pose at which a frame gets a pose.",
 )
 @click.option("--strict", is_flag=True, help="Refuse a flight of which anything is lost or damaged.")
 @overwrite_option

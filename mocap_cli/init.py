@@ -17,7 +17,7 @@ from mocap_cli.terminal import one_line, print_json, say, watching
 _MANY = 5  # most files of one kind in one folder that are listed one by one
 
 
-@click.command("init", short_help="Draft a flight.yaml from what was brought home.")
+@click.command("init", short_help="Draft a flight.yaml from the files of a flight.")
 @click.argument("paths", type=any_path, nargs=-1, required=True, metavar="PATHS...")
 @click.option(
     "-o",
@@ -30,10 +30,10 @@ _MANY = 5  # most files of one kind in one folder that are listed one by one
 def init_command(paths: tuple[Path, ...], output: Path | None, overwrite: bool, shown: Shown) -> None:
     """Look into logs, videos, keypoints, calibrations and maps, and draft the flight.yaml that names them.
 
-    PATHS are files and folders; folders are looked through. What belongs to which camera is told by names
-    (drone1.mp4, drone1_poses.tum, /drone1/odometry, a camera of a calibration) and by times. What no file
-    says - a frame rate, a clock, how a camera is mounted - is assumed and marked in a comment, or named as
-    missing: read the manifest before you ingest it.
+    PATHS are files and folders; folders are searched. Names (drone1.mp4, drone1_poses.tum, /drone1/odometry,
+    a camera of a calibration) and times decide what belongs to which camera. What no file states, such as a
+    frame rate, a clock or a mount, is assumed and marked with `assumed: true`, or named as missing. Read the
+    manifest before you ingest it.
     """
     from pipelines.draft import draft
     from pipelines.session.storage import jsonable

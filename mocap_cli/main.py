@@ -60,9 +60,9 @@ class _Lazy(Mocap):
 def mocap() -> None:
     """From the flight logs and keypoints of a drone team to the 3D motion of the person it filmed.
 
-    A flight is described by a flight.yaml, which `init` drafts from what was brought home. `ingest` turns
-    it into a session, a folder of plain tables; `reconstruct` measures the skeleton; `report` shows how far
-    it can be trusted; `export` carries on.
+    A flight.yaml describes a flight; `init` drafts it from the flight's files. `ingest` turns it into a
+    session, a folder of plain tables. `reconstruct` measures the skeleton, `report` shows how far it can be
+    trusted, and `export` writes it for other programs.
     """
 
 

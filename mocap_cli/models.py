@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 def models_command(context: click.Context, as_json: bool) -> None:
     """List the keypoint detectors and whether their files are here; `fetch` gets those that are missing.
 
-    MPJPE is that of the sample flight with true poses. ms is the processor's time for one person in one
-    picture, on one thread of a machine of two cores that had other work; idle, the same machine takes about
-    half of it (docs/detector.md).
+    MPJPE is that of the sample flight with true poses. ms is processor time for one person in one picture,
+    on one thread of a machine with other work. The same machine takes about half of it when idle
+    (docs/detector.md).
     """
     if context.invoked_subcommand is None:
         _list(as_json)

@@ -43,7 +43,7 @@ any_path = click.Path(path_type=Path)
 """A path that click does not check: the function that reads it reports a missing path or a wrong kind."""
 
 overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Write where something else lies. Never done without this."
+    "--overwrite", is_flag=True, help="Replace what lies at the output. Never done without this."
 )
 force_option = click.option(
     "--force",
@@ -61,7 +61,7 @@ every_option = click.option(
     default=1,
     show_default=True,
     metavar="N",
-    help="Let the detector look at every N-th picture only.",
+    help="Run the detector on every N-th picture only.",
 )
 
 
@@ -128,7 +128,7 @@ output_options = grouped(
     "shown",
     Shown,
     json_option,
-    click.option("-q", "--quiet", is_flag=True, help="Say only where the result is, and errors."),
-    click.option("-v", "--verbose", count=True, help="Say more."),
+    click.option("-q", "--quiet", is_flag=True, help="Print only the place of the result, and errors."),
+    click.option("-v", "--verbose", count=True, help="Print more."),
 )
 """--json, -q and -v; the command takes `shown: Shown`."""

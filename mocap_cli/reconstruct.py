@@ -63,7 +63,7 @@ _settings_options = grouped(
         type=click.IntRange(1, 20),
         default=1,
         show_default=True,
-        help="How many people.",
+        help="Number of people to reconstruct.",
     ),
     click.option(
         "--min-confidence",
@@ -79,7 +79,7 @@ _settings_options = grouped(
         default=3.0,
         show_default=True,
         metavar="PX",
-        help="Standard deviation of a good keypoint; more is found from the data.",
+        help="Standard deviation of a good keypoint; raised where views disagree by more.",
     ),
     click.option(
         "--pose-noise",
@@ -90,14 +90,14 @@ _settings_options = grouped(
     click.option(
         "--refine-cameras",
         type=click.Choice(["background"]),
-        help="Correct the attitudes of moving cameras first, by how the still background passes through their"
-        " pictures.",
+        help="Correct the poses of moving cameras by the background of their pictures before triangulation."
+        " auto does it unasked.",
     ),
     click.option(
         "--disturb-poses",
         metavar="MODEL",
-        help="Add such errors to every logged pose first, to see what they do. Methods are not told of them:"
-        " --pose-noise does that.",
+        help="Add such errors to every logged pose, to measure their effect. The methods do not know them;"
+        " --pose-noise states them.",
     ),
     click.option(
         "--trials",
@@ -108,14 +108,14 @@ _settings_options = grouped(
         help="Draws of --disturb-poses. metrics.json has the figures of each, their mean, spread and"
         " interval; the skeleton is that of the first.",
     ),
-    seed_option("Of --disturb-poses."),
+    seed_option("Seed of --disturb-poses."),
     click.option(
         "--fill",
         "fill_s",
         type=FiniteRange(0, min_open=True),
         metavar="SECONDS",
-        help="Interpolate a joint across gaps of at most this length; their status is `filled`. Without it"
-        " gaps stay open.",
+        help="Interpolate a joint across gaps of at most this length; its status there is `filled`. Without"
+        " this, gaps stay open.",
     ),
     click.option(
         "--smooth",
@@ -127,7 +127,7 @@ _settings_options = grouped(
         "--detector",
         default="blazepose",
         show_default=True,
-        help="Runs on the pictures of cameras that came without keypoints (see `mocap models`).",
+        help="Detector for cameras with pictures and without keypoints (see `mocap models`).",
     ),
     provider_option,
     every_option,
@@ -136,14 +136,14 @@ _settings_options = grouped(
         "start_s",
         type=FiniteRange(0, 1e9),
         metavar="SECONDS",
-        help="Let the detector look at pictures from then on, since the flight's first.",
+        help="First time at which the detector looks at pictures, since the flight's first picture.",
     ),
     click.option(
         "--end",
         "end_s",
         type=FiniteRange(0, 1e9),
         metavar="SECONDS",
-        help="And at pictures before then only.",
+        help="Time from which it looks at no pictures, counted alike.",
     ),
 )
 

@@ -43,46 +43,50 @@ _settings_options = grouped(
     click.option(
         "--arms",
         metavar="NAME,...",
-        help="What is compared: adaptive, fixed, covariance, greedy; flown and planned, what the log says was"
-        " flown and commanded [default: adaptive, fixed, flown where cameras moved, planned where logged].",
+        help="Arms to compare: adaptive, fixed, covariance, greedy; flown and planned are the logged flight"
+        " and its commands [default: adaptive, fixed, flown where cameras moved, planned where logged].",
     ),
     click.option(
-        "--drones", type=click.IntRange(2, 8), help="How many [default: the session's cameras, at least 2]."
+        "--drones",
+        type=click.IntRange(2, 8),
+        help="Number of drones [default: the session's cameras, at least 2].",
     ),
     click.option(
         "--radius",
         "radius_m",
         type=FiniteRange(0.5, 500),
         metavar="M",
-        help="From the actor to the slots (`covariance` and `greedy` only start there).",
+        help="Distance of the slots from the actor (`covariance` and `greedy` only start there).",
     ),
     click.option(
         "--tilt",
         "tilt_deg",
         type=FiniteRange(-10, 85),
         metavar="DEG",
-        help="Of the slots above the actor (likewise).",
+        help="Tilt of the slots above the actor (likewise).",
     ),
-    click.option("--yaws", type=click.IntRange(1, 360), help="Cells of a full turn that are searched."),
+    click.option(
+        "--yaws", type=click.IntRange(1, 360), help="Number of yaws of a full turn that the search considers."
+    ),
     click.option(
         "--horizon",
         "horizon_s",
         type=FiniteRange(0.1, 600),
         metavar="S",
-        help="How far the search looks ahead, at most 60 knots.",
+        help="Time that the search looks ahead, at most 60 knots.",
     ),
     click.option(
         "--yaw",
         "yaw_deg",
         type=FiniteRange(-360, 360),
         metavar="DEG",
-        help="Of the first camera at the start, counterclockwise from east, or from --yaw-frame"
+        help="Yaw of the first camera at the start, counterclockwise from the zero of --yaw-frame"
         " [default: where it was].",
     ),
     click.option(
         "--yaw-frame",
         type=click.Choice(["world", "heading"]),
-        help="What yaws count from: east, or where the actor heads, so that formations turn with them"
+        help="Zero of yaws: east, or the actor's heading, so that formations turn with the actor"
         " [default: world].",
     ),
     click.option(
@@ -96,7 +100,7 @@ _settings_options = grouped(
         type=click.Choice(["closed-loop", "plan-only"]),
         default="closed-loop",
         show_default=True,
-        help="Fly the plans as point masses, or be exactly where they are.",
+        help="Fly the plans as point masses, or put the drones exactly on them.",
     ),
     click.option(
         "--trials",
@@ -105,11 +109,11 @@ _settings_options = grouped(
         show_default=True,
         help="Draws of detector and pose noise for the reconstruction error.",
     ),
-    seed_option("Of all noise."),
+    seed_option("Seed of all noise."),
     click.option(
         "--pose-noise",
         metavar="MODEL",
-        help="Errors of the cameras' poses, instead of what the session says; for example"
+        help="Errors of the cameras' poses, instead of those of the session; for example"
         ' "white:position_m=0.3,rotation_deg=1".',
     ),
 )
@@ -140,16 +144,27 @@ _film_options = grouped(
         " SESSION/film/ARM/CAMERA.mp4.",
     ),
     click.option(
-        "--render-hz", type=FiniteRange(0.1, 30), default=5.0, show_default=True, help="Pictures a second."
+        "--render-hz",
+        type=FiniteRange(0.1, 30),
+        default=5.0,
+        show_default=True,
+        help="Pictures filmed a second.",
     ),
-    click.option("--render-start", type=FiniteRange(0, 1e6), metavar="S", help="Film from then on only."),
-    click.option("--render-end", type=FiniteRange(0, 1e6), metavar="S", help="And before then only."),
-    click.option("--detector", default="blazepose", show_default=True, help="See `mocap models`."),
+    click.option("--render-start", type=FiniteRange(0, 1e6), metavar="S", help="First time to film."),
+    click.option(
+        "--render-end", type=FiniteRange(0, 1e6), metavar="S", help="Time from which nothing is filmed."
+    ),
+    click.option(
+        "--detector",
+        default="blazepose",
+        show_default=True,
+        help="Detector of --render (see `mocap models`).",
+    ),
     click.option(
         "--scenario",
         type=any_path,
         metavar="SCENARIO.yaml",
-        help="Of the simulated flight [default: scenario.yaml beside the flight].",
+        help="Scenario of the simulated flight [default: scenario.yaml beside the flight].",
     ),
 )
 

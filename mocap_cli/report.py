@@ -51,10 +51,10 @@ def report_command(
     overwrite: bool,
     shown: Shown,
 ) -> None:
-    """Write one self-contained HTML page for each session: how good, how sure, what is doubtful.
+    """Write one self-contained HTML page for each session: its quality, its certainty, its doubts.
 
     Two or more sessions are compared side by side as well, every one against the first: which skeleton is
-    better, by how much, and whether that is more than noise.
+    better, by how much, and if that is more than noise.
     """
     from pipelines.report import compare_sessions, report, write_figures_of
 

@@ -21,7 +21,7 @@ from mocap_cli.terminal import print_json, print_table, say, watching
 @click.option(
     "--no-video",
     is_flag=True,
-    help="Write keypoints with the errors of a detector in the place of videos: a thousand times faster.",
+    help="Write keypoints with the modelled errors of a detector instead of videos; a thousand times faster.",
 )
 @workers_option("Pictures rendered at once; the flight does not depend on them.")
 @overwrite_option
@@ -36,7 +36,7 @@ def simulate_command(
     force: bool,
     shown: Shown,
 ) -> None:
-    """Make the files that a flight would bring home: logs, videos, calibration, map - and the truth."""
+    """Make the files of a flight (logs, videos, calibration, map) and the truth."""
     from pipelines.simulate import simulate
 
     with watching(shown.level) as progress:
