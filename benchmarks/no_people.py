@@ -1,8 +1,8 @@
 """Things among the detections that are dropped, and people that are lost: `python -m benchmarks.no_people`.
 
-Detections are made twice: as the stage makes them, and as a model makes them whose confidences tell nothing
-of people, which searches everywhere (`any`): all tiles of a picture in every second picture, and nothing is
-dropped by score. Then the ground and the other cameras tell what is nobody (`keypoints/no_people.py`).
+Detections are made twice: as the stage makes them, and as with a model whose confidences do not separate
+people from things (`any`): all tiles of a picture are searched in every second picture, and nothing is
+dropped by score. Then things are dropped by the ground and the other cameras (`keypoints/no_people.py`).
 
 - the sample flight (`sample_data/mound_walk`), rendered, two drones, one person, trees on a mound and a map;
 - a wood, rendered, three drones, two people who are 4 m from trees or more, and a map;

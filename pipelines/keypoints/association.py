@@ -85,7 +85,7 @@ def associate(
         actor: [T, 3] m, the logged actor, NaN where unknown.
         actor_sigma_m: standard deviation of the log on each axis.
         people: number of people to choose.
-        scene: the surroundings, by which things are told from people; by default nothing is.
+        scene: the surroundings, by which things that are no people are dropped; by default nothing is.
 
     Returns:
         The choice and its counts. A lone view is kept where its picture continues the person's last one.
@@ -95,10 +95,10 @@ def associate(
         confidence = np.zeros(xy.shape[:-1])
     logged = None if actor is None else np.c_[actor, np.full(len(actor), actor_sigma_m)]
     seen = follow(time_s, xy, confidence, position, rotation, sigma, logged)
-    told: dict[str, Int64] = {}
+    dropped: dict[str, Int64] = {}
     if scene is not None:
         things = tell_no_people(seen, xy, confidence, position, rotation, sigma, scene)
-        told = {cause: which.sum((0, 2)) for cause, which in things._asdict().items()}
+        dropped = {cause: which.sum((0, 2)) for cause, which in things._asdict().items()}
         if (out := things.ground | things.alone).any():
             confidence = np.where(out[..., None], 0.0, confidence)
             seen = follow(time_s, xy, confidence, position, rotation, sigma, logged)
@@ -117,7 +117,7 @@ def associate(
         tracks = [one for one in tracks if one.identity not in taken]
     if not np.any(chosen >= 0):
         reasons.append(_nobody(seen.nearest))
-    return _counted(chosen, seen, resumed, told, tuple(reasons))
+    return _counted(chosen, seen, resumed, dropped, tuple(reasons))
 
 
 def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
@@ -237,7 +237,7 @@ def _nobody(nearest: Float) -> str:
 
 
 def _counted(
-    chosen: Int64, seen: Followed, resumed: Int64, told: dict[str, Int64], reasons: tuple[str, ...]
+    chosen: Int64, seen: Followed, resumed: Int64, dropped: dict[str, Int64], reasons: tuple[str, ...]
 ) -> Association:
     """Build the result: the choice with its counts."""
     at = np.maximum(chosen.transpose(2, 0, 1), 0)[..., None]  # [P, T, C, 1]
@@ -261,6 +261,6 @@ def _counted(
         resumed=resumed,
         people=np.rint(standing.sum((1, 2))).astype(np.int64),
         unused=(seen.track >= 0).sum((0, 2)) - present.sum((0, 1)),
-        no_people=told,
+        no_people=dropped,
         reasons=reasons,
     )
