@@ -76,7 +76,7 @@ def project_actor(
 
 
 ACTOR_SIGMA_M = 1.0
-"""Standard deviation of the actor's logged position, used to tell people apart."""
+"""Standard deviation of the actor's logged position, used to distinguish people."""
 UNKNOWN_SIGMA_RAD = float(np.radians(1.0))
 """Standard deviation of a camera's rotation if the user states none.
 

@@ -48,7 +48,7 @@ _SEARCH_LOST = 5  # pictures from one such search to the next
 
 @runtime_checkable
 class TellsPeople(Protocol):
-    """Networks whose confidences tell people from other things."""
+    """Networks whose confidences separate people from other things."""
 
     @property
     def person_confidence(self) -> float:

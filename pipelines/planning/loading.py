@@ -245,7 +245,7 @@ def _measured(folder: Path, t_ns: Int64, position: Float, what: str) -> tuple[In
     rows = np.isfinite(position).all(axis=1)
     if rows.sum() < 2:
         raise DataError(
-            folder, f"{what} say where the actor is {int(rows.sum())} times", "a replay needs a way"
+            folder, f"{what} hold {int(rows.sum())} positions", "a replay needs two or more"
         )
     return t_ns[rows], position[rows]
 
@@ -255,12 +255,12 @@ def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.in
     first_ns = max([int(t_ns[0]), *(int(span[0]) for span in spans.values())])
     last_ns = min([int(t_ns[-1]), *(int(span[1]) for span in spans.values())])
     kept = (t_ns >= first_ns) & (t_ns <= last_ns)
-    lasting_s = float(np.ptp(t_ns[kept]) / 1e9) if kept.any() else 0.0
-    if lasting_s < _SHORTEST_S:
+    shared_s = float(np.ptp(t_ns[kept]) / 1e9) if kept.any() else 0.0
+    if shared_s < _SHORTEST_S:
         raise DataError(
             folder,
-            f"the actor is known for {lasting_s:.2f} s while {' and '.join(spans) or 'nothing else'} are,"
-            f" less than {_SHORTEST_S:g} s",
+            f"{', '.join(['the actor', *spans])} are known together for {shared_s:.2f} s, less than"
+            f" {_SHORTEST_S:g} s",
             "check the clocks of the logs",
         )
     return t_ns[kept], actor[kept]

@@ -42,7 +42,7 @@ SWAP_FRAMES = (2, 6)
 """Number of frames for which left and right stay swapped: least and most."""
 
 # Ordinary errors raise or lower the confidence by up to half the range, outliers lower it by half of it
-# and some more. Chosen so that it tells errors above 5 % of the height as well as the measured detector's
+# and some more. Chosen so that it separates errors above 5 % of the height as well as the measured detector's
 # does: the area under the ROC curve is 0.84 to 0.90 over tilts of 60 to 15 degrees, measured was 0.88.
 _CONFIDENCE_RANGE, _CONFIDENCE_NOISE, _OUTLIER_DOUBT = 0.14, 0.05, 0.3
 

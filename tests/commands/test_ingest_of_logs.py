@@ -98,7 +98,7 @@ def test_losses_count_for_the_topic_that_lost_them(tmp_path: Path) -> None:
             assert trajectory.dropped == {}
 
 
-def test_a_frozen_estimator_is_told_from_a_camera_at_rest() -> None:
+def test_a_frozen_estimator_is_distinguished_from_a_camera_at_rest() -> None:
     """Use 100 Hz for ten seconds; x stands still from 2 to 4.5 s and, too short to count, from 6 to 6.9 s."""
     k = np.arange(1000)
     x = np.where(k < 200, k, np.where(k < 451, 200, np.where(k < 600, k, np.where(k < 691, 600, k)))) / 100.0

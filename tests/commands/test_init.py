@@ -170,7 +170,7 @@ def test_the_truth_stands_in_for_poses_only_with_a_word(tmp_path: Path) -> None:
     assert any(remark.startswith("drone2: pose: ") and "truth" in remark for remark in result.assumed)
 
 
-def test_files_that_cannot_be_read_are_told_and_left_out(tmp_path: Path) -> None:
+def test_files_that_cannot_be_read_are_listed_and_left_out(tmp_path: Path) -> None:
     write_flight(tmp_path, static=True).manifest.unlink()
     (tmp_path / "drone2.json").write_text('[{"image_id": "0.jpg", "keypoints"', encoding="utf-8")
     (tmp_path / "drone3.json").write_text(

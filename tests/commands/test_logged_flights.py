@@ -218,7 +218,9 @@ def test_moved_flight_is_the_same_flight(tmp_path: Path) -> None:
     assert content(moved.with_suffix(".session")) == content(session)
 
 
-def test_logged_pictures_of_another_size_are_told_from_those_of_the_calibration(tmp_path: Path) -> None:
+def test_logged_pictures_of_another_size_are_distinguished_from_those_of_the_calibration(
+    tmp_path: Path,
+) -> None:
     flight = write_logged_flight(tmp_path / "shape", "ros2-mcap", picture_size=(640, 400))
     line = refused("ingest", flight.manifest)
     assert "cameras.drone1.intrinsics" in line

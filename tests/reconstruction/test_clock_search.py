@@ -60,7 +60,7 @@ def test_a_camera_that_sees_nothing_for_a_while_is_left_out_then() -> None:
     np.testing.assert_allclose(found, [0.0, 0.0, LATE_S], atol=STEP_S)
 
 
-def test_nothing_is_begun_where_all_clocks_are_known_or_none() -> None:
+def test_no_offset_is_searched_where_all_clocks_are_known_or_none() -> None:
     flight = formation(TIMES, 2, [], 0, late_s=(0.0, LATE_S))
     assert not initial_offsets(flight, np.zeros(2)).any()
     assert not initial_offsets(flight, np.full(2, SIGMA_S)).any()

@@ -127,23 +127,23 @@ def _extent(before: Footstep, after: Footstep, leg_m: float) -> float:
 
 def _stance(keys: Keys, strike_s: float, lift_s: float | None, rolled: Roll) -> None:
     """Write the keys from the strike until the foot is flat, and, if it lifts, from heel rise to lift."""
-    lasting = _LONGEST_ROLL_S if lift_s is None else min(lift_s - strike_s, _LONGEST_ROLL_S)
+    duration_s = _LONGEST_ROLL_S if lift_s is None else min(lift_s - strike_s, _LONGEST_ROLL_S)
     for name, value in (("pitch_deg", rolled.strike_deg), ("clear", 0.0), ("soft", _SOFTNESS_M[0])):
         keys.add(name, (strike_s, value))
     keys.add("bent", (strike_s, 1.0))
     keys.add("carries", (strike_s, 1.0))
     for name, curve in (("pitch_deg", rolled.stance_deg), ("knee_deg", rolled.knee_deg)):
         down = [(share, value) for share, value in curve if share <= _SET_DOWN]
-        keys.add(name, *((strike_s + share * lasting, value) for share, value in down))
+        keys.add(name, *((strike_s + share * duration_s, value) for share, value in down))
         if lift_s is not None:
             up = [down[-1], *curve[len(down) :]]
-            keys.add(name, *((lift_s - (1 - share) * lasting, value) for share, value in up))
+            keys.add(name, *((lift_s - (1 - share) * duration_s, value) for share, value in up))
     if lift_s is None:
         return
     keys.add("pitch_deg", (lift_s, rolled.lift_deg))
     for name, value in (("clear", 0.0), ("soft", _SOFTNESS_M[0]), ("bent", 1.0), ("carries", 1.0)):
         keys.add(name, (lift_s, value))
-    keys.add("leaves", (lift_s - 0.5 * lasting, 0.0), (lift_s - 0.18 * lasting, 0.9), (lift_s, 1.0))
+    keys.add("leaves", (lift_s - 0.5 * duration_s, 0.0), (lift_s - 0.18 * duration_s, 0.9), (lift_s, 1.0))
 
 
 def _onward(keys: Keys, lift_s: float, before: Footstep, after: Footstep, rolled: Roll) -> None:

@@ -116,13 +116,13 @@ def pace(parts: Sequence[Part]) -> Pace:
         enter, leave = between[i], between[i + 1]
         peak = min(part.speed_mps, ((enter**2 + leave**2) / 2 + gain * part.length_m) ** 0.5)
         ramps_m = (2 * peak**2 - enter**2 - leave**2) / (2 * gain)
-        for lasting, speed in (
+        for duration_s, speed in (
             ((peak - enter) / gain, peak),
             ((part.length_m - ramps_m) / peak, peak),
             ((peak - leave) / gain, leave),
         ):
-            if lasting > 1e-6:
-                knots.append((knots[-1][0] + lasting, speed, part.run))
+            if duration_s > 1e-6:
+                knots.append((knots[-1][0] + duration_s, speed, part.run))
     return Pace(tuple(knots))
 
 
@@ -302,9 +302,9 @@ class Plan:
         """Turn on the spot by an angle in rad, to the left if positive."""
         if abs(angle) < _STILL_RAD / 20:
             return
-        lasting = abs(angle) / _TURN_RATE * 1.4 + 0.3
+        duration_s = abs(angle) / _TURN_RATE * 1.4 + 0.3
         turn = (self.heading, self.heading + angle)
-        stretch = Stretch(self.t_s, self.t_s + lasting, None, None, self.place, turn)
+        stretch = Stretch(self.t_s, self.t_s + duration_s, None, None, self.place, turn)
         self._step_through(
             stretch, [(0.0, 0.0, 0.0)], first=LEFT if angle > 0 else RIGHT, least=_TURN_CADENCE
         )
@@ -406,8 +406,8 @@ class Plan:
         With `count`, so many steps are taken up to the last knot.
         """
         phase = self._phase(knots, least)
-        lasting = stretch.end_s - stretch.start_s
-        since_s = np.linspace(-3.0, lasting + 5.0, int((lasting + 8.0) / 0.005))
+        duration_s = stretch.end_s - stretch.start_s
+        since_s = np.linspace(-3.0, duration_s + 5.0, int((duration_s + 8.0) / 0.005))
         moments_s = stretch.start_s + since_s
         places, _ = stretch.at(moments_s)
         climbed = np.abs(np.diff(self.ground(places))) / np.maximum(
