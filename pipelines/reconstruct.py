@@ -638,10 +638,11 @@ def _people_warnings(people: Mapping[str, Any]) -> list[str]:
 def _no_people_warnings(no_people: Mapping[str, Mapping[str, int]]) -> list[str]:
     """Write which detections were taken for no people, by cause, and which were kept all the same."""
     words = {
-        "ground": "no people: nobody who stands on the ground is there or so large: {}",
-        "alone": "no people: no other camera sees them, though one looks wherever they could stand: {}",
-        "kept": "nobody on the ground is there or so large, but the surest person of the camera is not"
-        " either: detections are kept, the poses or the ground may be wrong: {}",
+        "ground": "detections left out, because nobody of their size could stand on the ground there: {}",
+        "alone": "detections left out, because no other camera sees them although one shows every place"
+        " where they could stand: {}",
+        "kept": "nobody of their size could stand on the ground there, but this holds for the camera's most"
+        " confident person, too: the detections are kept, and the poses or the ground may be wrong: {}",
     }
     return [
         words[cause].format(", ".join(f"{name} {count}" for name, count in cameras.items()))
@@ -655,7 +656,7 @@ def _unused_warnings(people: Mapping[str, Any]) -> list[str]:
     unused = [f"{name} {count}" for name, count in people["detections_not_used"].items() if count]
     if not unused:
         return []
-    line = f"detections of nobody who was reconstructed: {', '.join(unused)}"
+    line = f"detections that belong to nobody reconstructed: {', '.join(unused)}"
     if people["times_with_more"]:
         line += (
             f"; two cameras or more detect up to {people['seen_at_once']} at once, and more than"
