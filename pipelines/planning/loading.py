@@ -244,9 +244,7 @@ def _actor(
 def _measured(folder: Path, t_ns: Int64, position: Float, what: str) -> tuple[Int64, Float]:
     rows = np.isfinite(position).all(axis=1)
     if rows.sum() < 2:
-        raise DataError(
-            folder, f"{what} hold {int(rows.sum())} positions", "a replay needs two or more"
-        )
+        raise DataError(folder, f"{what} hold {int(rows.sum())} positions", "a replay needs two or more")
     return t_ns[rows], position[rows]
 
 
