@@ -6,6 +6,8 @@
 Pictures are rendered, the detector is real (`benchmarks/corpus/README.md`). For each draw the errors of the
 logs are drawn anew. flight.yaml gives their true model, or neither it nor the logs give anything. Every
 method gets the same sessions by the same call as `mocap reconstruct`. `floor` is `robust` with true poses.
+Without `--methods`, `robust` and `auto` are measured on all draws, and the parts of `auto` by themselves on
+the first one, with the model given: they would take as long as everything else.
 
 Per flight and method, means over the draws (times: medians):
 
@@ -14,11 +16,14 @@ Per flight and method, means over the draws (times: medians):
 - peak speed of wrists and ankles over the true one: mean speed over mean true speed, over the 5 % of moments
   at which the truth is fastest; joints that reach 1 m/s only;
 - NEES (3 is right), and the share of joint-frames within their 95 % ellipsoids;
-- processor seconds of the call, detection and following excluded; fallbacks.
+- processor seconds of the call on the first draw, detection and following excluded; fallbacks.
 
-Two processes. Results are kept in build/accuracy by the hash of the code and of the flight's files, so an
-interrupted run goes on, and a changed program measures anew. `--reference` stores the results of `robust`, to
-which later versions are compared, in benchmarks/corpus/robust.json. `--write` writes docs/results.md.
+To save time, methods share the clocks that the first of them found, and mistakes are searched for in the call
+alone whose time is taken: errors do not depend on either. Two processes, each flight in one.
+
+Results are kept in build/accuracy by the hash of the code and of the flight's files, so an interrupted run
+goes on, and a changed program measures anew. `--reference` stores the results of `robust`, to which later
+versions are compared, in benchmarks/corpus/robust.json. `--write` writes docs/results.md.
 """
 
 from __future__ import annotations
@@ -26,17 +31,18 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from hashlib import sha256
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -50,6 +56,8 @@ from pipelines.follow import Following
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import measure
 from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruction.doubts.diagnosis import Doubt
+from pipelines.reconstruction.refining import FoundClocks, find_clocks
 from pipelines.session.errors import DataError
 from pipelines.session.people import true_joints_at
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
@@ -68,6 +76,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "both": {"method": "refined", "refine_cameras": "background"},
     "auto": {"method": "auto"},
 }
+ALWAYS = ("auto", "robust")
+"""Methods that are measured on all draws; the first finds the clocks, and its time is taken."""
 GIVEN: tuple[Given, ...] = ("model", "nothing")
 DRAWS = 8
 
@@ -99,7 +109,7 @@ class Outcome:
     nees: float | None = None
     inside: float | None = None
     measured_share: float | None = None
-    cpu_s: float | None = None
+    cpu_s: float | None = None  # of the first method of the first draw
     fallback: str | None = None  # reason why a part of the method was not used
     error: str | None = None
 
@@ -110,7 +120,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--flights", nargs="+", default=["all"], help="tuning, kept, all, or names")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=_methods_that_exist())
+    parser.add_argument("--methods", nargs="+", choices=METHODS, help="on all draws (default: see above)")
     parser.add_argument("--detector", choices=DETECTORS, default=DETECTORS[0])
     parser.add_argument("--given", nargs="+", choices=GIVEN, default=list(GIVEN))
     parser.add_argument("--draws", type=int, default=DRAWS)
@@ -119,22 +129,19 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write the section of docs/results.md")
     arguments = parser.parse_args()
     chosen = _chosen(arguments.flights, arguments.detector)
-    methods = ["robust"] if arguments.reference else arguments.methods
+    methods = ["robust"] if arguments.reference else arguments.methods or list(ALWAYS)
+    parts = [name for name in METHODS if not arguments.reference and not arguments.methods]
     found = measured(
-        chosen, methods, arguments.detector, arguments.given, arguments.draws, arguments.processes
+        chosen, methods, parts, arguments.detector, arguments.given, arguments.draws, arguments.processes
     )
     if arguments.reference:
         _store_reference(found)
     lines = report(chosen, methods, arguments.detector, found)
+    if parts:
+        lines += parts_table(chosen, parts, arguments.detector, found)
     print("\n".join(lines))
     if arguments.write:
         keep_numbers("accuracy", {arguments.detector: lines})
-
-
-def _methods_that_exist() -> list[str]:
-    """List the methods; `auto` only where the program has it."""
-    default = str(Settings().method)
-    return [name for name in METHODS if name != "auto" or default == "auto"]
 
 
 def _chosen(names: Sequence[str], detector: str) -> list[Flight]:
@@ -160,29 +167,46 @@ def _chosen(names: Sequence[str], detector: str) -> list[Flight]:
 def measured(
     chosen: Sequence[Flight],
     methods: Sequence[str],
+    parts: Sequence[str],
     detector: str,
     given: Sequence[Given],
     draws: int,
     processes: int,
 ) -> dict[Case, Outcome]:
-    """Measure every flight, draw and method; take what is kept of earlier runs of the same code."""
-    groups = [[Case(flight.name, FLOOR, detector)] for flight in chosen]
-    groups += [
-        [Case(flight.name, method, detector, said, draw) for method in methods]
-        for draw in range(draws)
-        for flight in chosen
-        for said in given
+    """Measure every flight, draw and method, and the parts on the first draw with the model given.
+
+    What is kept of earlier runs of the same code is taken.
+    """
+    work = [
+        [
+            [Case(flight.name, FLOOR, detector)],
+            *(
+                [Case(flight.name, method, detector, said, draw) for method in dict.fromkeys(names)]
+                for draw in range(draws)
+                for said in given
+                for names in [[*methods, *(parts if (said, draw) == ("model", 0) else ())]]
+            ),
+        ]
+        for flight in sorted(chosen, key=_effort, reverse=True)
     ]
     found: dict[Case, Outcome] = {}
     began_s = time.perf_counter()
-    with get_context("spawn").Pool(processes) as pool:
-        done = pool.imap(partial(_outcomes_of, revision()), groups, chunksize=1)
-        for number, (group, outcomes) in enumerate(zip(groups, done, strict=True), 1):
-            found |= dict(zip(group, outcomes, strict=True))
-            if sys.stderr.isatty() or number % 20 == 0:
-                took_s = time.perf_counter() - began_s
-                print(f"{number} of {len(groups)} after {took_s:.0f} s", file=sys.stderr, flush=True)
+    with (
+        tempfile.TemporaryDirectory(prefix="accuracy-") as place,
+        get_context("spawn").Pool(processes) as pool,
+    ):
+        done = pool.imap_unordered(partial(_outcomes_of, revision(), Path(place)), work, chunksize=1)
+        for number, outcomes in enumerate(done, 1):
+            found |= outcomes
+            took_s = time.perf_counter() - began_s
+            print(f"{number} of {len(work)} flights after {took_s:.0f} s", file=sys.stderr, flush=True)
     return found
+
+
+def _effort(flight: Flight) -> tuple[bool, int]:
+    """Order flights by how long they take: unknown clocks most of all, then cameras."""
+    drones = flight.scenario.drones
+    return any(drones.clock_offsets_s), drones.count
 
 
 @cache
@@ -196,22 +220,22 @@ def revision() -> str:
     return digest.hexdigest()[:16]
 
 
-def _outcomes_of(code: str, group: Sequence[Case]) -> list[Outcome]:
-    """Measure the methods of one draw, or read their results of the same code and flight."""
+def _outcomes_of(code: str, shared: Path, groups: Sequence[Sequence[Case]]) -> dict[Case, Outcome]:
+    """Measure a flight's draws, or read their results of the same code and flight."""
     cv2.setNumThreads(1)
-    first = group[0]
+    first = groups[0][0]
     flight = next(each for each in flights() if each.name == first.flight)
     place = WORK / f"{code}-{_files_hash(flight, first.detector)}"
-    paths = [place / f"{_name_of(case)}.json" for case in group]
-    missing = [case for case, path in zip(group, paths, strict=True) if not path.is_file()]
-    if missing:
-        place.mkdir(parents=True, exist_ok=True)
-        for case, outcome in _measure(flight, missing):
-            path = place / f"{_name_of(case)}.json"
-            partial_path = path.with_suffix(f".{os.getpid()}")
+    place.mkdir(parents=True, exist_ok=True)
+    drawn = DrawnFlight(flight, shared / flight.name)
+    paths = {case: place / f"{_name_of(case)}.json" for group in groups for case in group}
+    for group in groups:
+        missing = [case for case in group if not paths[case].is_file()]
+        for case, outcome in measure_draw(drawn, missing) if missing else ():
+            partial_path = paths[case].with_suffix(f".{os.getpid()}")
             partial_path.write_text(json.dumps(asdict(outcome)), encoding="utf-8")
-            partial_path.replace(path)
-    return [Outcome(**json.loads(path.read_text(encoding="utf-8"))) for path in paths]
+            partial_path.replace(paths[case])
+    return {case: Outcome(**json.loads(path.read_text(encoding="utf-8"))) for case, path in paths.items()}
 
 
 def _name_of(case: Case) -> str:
@@ -226,42 +250,49 @@ def _files_hash(flight: Flight, detector: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def _measure(flight: Flight, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+def measure_draw(drawn: DrawnFlight, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
     """Make the session of one draw, reconstruct it by each method, and compare with the truth."""
-    drawn, first = _drawn(flight), cases[0]
+    drawn.write_shared()
+    flight, first = drawn.flight, cases[0]
+    clocks: list[FoundClocks] = []
+
+    def find_once(*args: Any) -> FoundClocks:
+        clocks[:] = clocks or [find_clocks(*args)]
+        return clocks[0]
+
     with tempfile.TemporaryDirectory(prefix="accuracy-") as folder:
         place = Path(folder) / "flight"
         session = drawn.session(
             place, first.draw, first.given, first.detector, true_poses=first.method == FLOOR
         )
-        with kept_in_place_of_pictures(flight, first.detector):
+        with (
+            kept_in_place_of_pictures(flight, first.detector),
+            patch("pipelines.reconstruct.find_clocks", find_once),
+        ):
             with locked(session) as writable:
                 detect(writable, detector=first.detector)
                 if flight.with_pictures:
                     Following(writable).finish()
             for case in cases:
+                timed = case is first and not case.draw
                 method = METHODS["robust" if case.method == FLOOR else case.method]
                 settings = Settings(**method, detector=first.detector)
                 began_s = time.process_time()
                 try:
-                    metrics = reconstruct(session, settings).metrics
+                    with nullcontext() if timed else patch("pipelines.reconstruct.doubts_of", _no_doubts):
+                        metrics = reconstruct(session, settings).metrics
                 except DataError as error:
                     yield case, Outcome(error=str(error))
                 else:
-                    took_s = time.process_time() - began_s
+                    took_s = time.process_time() - began_s if timed else None
                     yield case, _outcome(session, metrics, took_s)
 
 
-@cache
-def _drawn(flight: Flight) -> DrawnFlight:
-    """Return the flight with its shared files written; once for each process."""
-    drawn = DrawnFlight(flight, WORK / f"flights-{os.getpid()}" / flight.name)
-    shutil.rmtree(drawn.folder, ignore_errors=True)
-    drawn.write_shared()
-    return drawn
+def _no_doubts(*_: object, **__: object) -> list[Doubt]:
+    return []
 
 
-def _outcome(session: Path, metrics: Mapping[str, Any], took_s: float) -> Outcome:
+def _outcome(session: Path, metrics: Mapping[str, Any], took_s: float | None) -> Outcome:
     skeleton = read_table(session / "reconstruct" / "skeleton.parquet", SKELETON)
     skeleton = skeleton[skeleton["person"] == 0]
     joints = tuple(skeleton["joint"].iloc[: skeleton["joint"].nunique()])
@@ -373,7 +404,7 @@ def report(
 ) -> list[str]:
     """Write the tables and the criteria as lines of Markdown."""
     given = [said for said in GIVEN if any(case.given == said for case in found if case.method != FLOOR)]
-    draws = len({case.draw for case in found})
+    draws = 1 + max(case.draw for case in found)
     lines = [f"Means over {draws} draws of the logs' errors."]
     for said in given:
         lines += ["", f"Pose noise: {_SAID[said]}. MPJPE / root-relative mm.", ""]
@@ -389,6 +420,16 @@ def report(
         )
         lines += ["", *criteria(chosen, judged, detector, said, found)]
     return lines
+
+
+def parts_table(
+    chosen: Sequence[Flight], parts: Sequence[str], detector: str, found: Mapping[Case, Outcome]
+) -> list[str]:
+    """Write the table of the first draw, with `auto` beside what it is made of."""
+    first = {case: outcome for case, outcome in found.items() if not case.draw}
+    rows = [_errors_row(flight, parts, detector, "model", first) for flight in chosen]
+    said = "The parts of `auto`, on the first draw, its true model given. MPJPE / root-relative mm."
+    return ["", said, "", *markdown_table(["flight", "drones", *parts, "true poses"], rows)]
 
 
 _QUALITY = (
@@ -424,12 +465,6 @@ def _cell(value: float, digits: int = 0) -> str:
     return "" if np.isnan(value) else f"{value:.{digits}f}"
 
 
-def _median_cpu_s(outcomes: Sequence[tuple[Case, Outcome]]) -> float:
-    """Compute the median time: the first call in a process loads what was compiled."""
-    known = [outcome.cpu_s for _, outcome in outcomes if outcome.cpu_s is not None]
-    return float(np.median(known)) if known else float("nan")
-
-
 def _errors_row(
     flight: Flight, methods: Sequence[str], detector: str, given: Given, found: Mapping[Case, Outcome]
 ) -> list[str]:
@@ -453,7 +488,7 @@ def _quality_row(
         _cell(_mean(outcomes, "nees"), 1),
         _cell(100 * _mean(outcomes, "inside")),
         _cell(100 * _mean(outcomes, "measured_share")),
-        _cell(_median_cpu_s(outcomes), 1),
+        _cell(_mean(outcomes, "cpu_s"), 1),
         str(sum(outcome.fallback is not None for _, outcome in outcomes)),
     ]
 
@@ -483,7 +518,7 @@ def criteria(
         passed = all(error <= most for error, most in zip(errors, wanted, strict=True))
         lines.append(
             f"- {_VERDICT[passed]} sample: {errors[0]:.1f} / {errors[1]:.1f} mm"
-            f" (at most {wanted[0]} / {wanted[1]}), {_median_cpu_s(outcomes):.1f} s of the processor"
+            f" (at most {wanted[0]} / {wanted[1]}), {_mean(outcomes, 'cpu_s'):.1f} s of the processor"
         )
     return lines
 

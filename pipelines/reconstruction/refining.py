@@ -150,13 +150,14 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
 
     A picture is joined to the three times nearest to its stamp, which is not accurate for large offsets.
     Also, estimated levels of pose noise absorb part of a large offset. So the stamps are shifted by the
-    estimated offsets, and the refinement is repeated until the remaining correction is small.
+    estimated offsets, and the refinement is repeated until the remaining correction is small, or smaller than
+    its standard deviation.
     """
     started = _triangulate_with_offsets(flight, offset_s) if offset_s.any() else flight.result
     for _ in range(1 + _MOST_SHIFTS):
         refined = _refine_with_offsets(flight, offset_s, started)
         offset_s = offset_s + refined.clock_offset_s
-        if np.abs(refined.clock_offset_s).max() <= SETTLED_S:
+        if not _unsettled(refined).any():
             break
         started = _triangulate_with_offsets(flight, offset_s)
     return refined, offset_s
@@ -200,13 +201,19 @@ def _undetermined_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: F
     ]
 
 
+def _unsettled(refined: Refined) -> Bool:
+    """Test which clocks [C] the estimate moved by more than counts."""
+    unsettled: Bool = np.abs(refined.clock_offset_s) > np.maximum(SETTLED_S, refined.clock_sigma_s)
+    return unsettled
+
+
 def _unsettled_clocks(refined: Refined, cameras: Sequence[Camera]) -> list[str]:
     """List clocks that the last estimate still moved."""
     return [
         f"refined: the clock of {camera.name} did not settle: the last of {1 + _MOST_SHIFTS} estimates still "
         f"moved it by {1e3 * abs(left):.1f} ms"
-        for camera, left in zip(cameras, refined.clock_offset_s, strict=True)
-        if refined.fallback is None and abs(left) > SETTLED_S
+        for camera, left, moves in zip(cameras, refined.clock_offset_s, _unsettled(refined), strict=True)
+        if refined.fallback is None and moves
     ]
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.accuracy import FLOOR, Case, _measure, nees, peak_ratio
+from benchmarks.accuracy import FLOOR, Case, measure_draw, nees, peak_ratio
+from benchmarks.corpus.drawn import DrawnFlight
 from benchmarks.corpus.stored import (
     CORPUS,
     HALVES,
@@ -115,12 +116,13 @@ def test_keypoints_and_tracks_come_back_rounded(tmp_path: Path) -> None:
     assert background.stills == {7: b"still"}
 
 
-def test_robust_is_measured_on_a_flight() -> None:
+def test_robust_is_measured_on_a_flight(tmp_path: Path) -> None:
     """Errors of a few centimetres in the poses: more than with true poses, less than half a metre."""
     flight = next(each for each in flights(["tuning"]) if each.name == "01-walk")
     found = {}
     for method in ("robust", FLOOR):
-        ((case, outcome),) = _measure(flight, [Case(flight.name, method, "blazepose")])
+        drawn = DrawnFlight(flight, tmp_path / "shared")
+        ((case, outcome),) = measure_draw(drawn, [Case(flight.name, method, "blazepose")])
         found[case.method] = outcome
     robust, floor = found["robust"], found[FLOOR]
     assert robust.error is None
