@@ -14,12 +14,11 @@ import time
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.keypoints.association import associate
-from pipelines.session.records import Int64
 from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flying import orbit
 from tests.synthetic.keypoints import KeypointNoise, detect

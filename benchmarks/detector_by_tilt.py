@@ -28,7 +28,7 @@ import pandas as pd
 from scipy.stats import rankdata
 
 from pipelines.detect import detect
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.ingest import ingest
 from pipelines.keypoints import calibration
 from pipelines.keypoints.calibration import (
@@ -40,7 +40,6 @@ from pipelines.keypoints.calibration import (
 )
 from pipelines.keypoints.swaps import undo_swaps_of_tracks
 from pipelines.reconstruct import reconstruct
-from pipelines.session.records import Int64
 from pipelines.session.registries import find_detector
 from pipelines.session.skeletons import get_skeleton
 from pipelines.session.stages import locked

@@ -27,7 +27,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from pipelines.check import check
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import (
     compose,
@@ -40,7 +40,6 @@ from pipelines.geometry.poses import (
 from pipelines.ingest import ingest
 from pipelines.reconstruct import reconstruct
 from pipelines.session.errors import MocapError
-from pipelines.session.records import Int64
 from pipelines.session.tables import POSES, read_table, trajectory_from
 from pipelines.simulate import simulate
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.follow import BLOCK, Following
-from pipelines.geometry.arrays import Float, Picture
+from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.keypoints.hints import Hint, actor_hints
 from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.session.description import (
@@ -36,7 +36,7 @@ from pipelines.session.description import (
 from pipelines.session.errors import DataError
 from pipelines.session.people import logged_actor
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
-from pipelines.session.records import Detections, Int64
+from pipelines.session.records import Detections
 from pipelines.session.registries import (
     Detector,
     KeypointNetworks,

@@ -35,10 +35,11 @@ from pipelines.formats.drone_logs.subtitles import read_subtitles
 from pipelines.formats.logs.messages import kind_of, samples
 from pipelines.formats.logs.presets import namespaces, parts_of
 from pipelines.formats.videos.frame_times import read_frame_times
+from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Int64, PoseSample
+from pipelines.session.records import PoseSample
 from pipelines.session.registries import (
     FORMATS,
     CalibrationFormat,

@@ -14,14 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
-from pipelines.geometry.arrays import Picture
+from pipelines.geometry.arrays import Int64, Picture
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton
 from pipelines.reporting.overlays import FilmedCamera, read_filmed, status_at, views_of
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
-from pipelines.session.records import Int64
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, locked, open_session
 from pipelines.session.storage import read_json, write_json

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import invert, transform
 from pipelines.session.camera_poses import poses_at, stated_noise
 from pipelines.session.description import CameraEntry, Interpolation
 from pipelines.session.people import LoggedActor
-from pipelines.session.records import Int64, Trajectory
+from pipelines.session.records import Trajectory
 
 _SIGMAS = 3.0
 _STEP = 1e-4  # of the range: small against a body, large against rounding

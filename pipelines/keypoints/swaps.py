@@ -23,9 +23,9 @@ from itertools import combinations
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.compilation import cached
-from pipelines.session.records import Detections, Int64
+from pipelines.session.records import Detections
 from pipelines.session.skeletons import mirrored
 
 Pair = tuple[int, int]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.reporting.plates import (
     CAMERAS,
     GRID,
@@ -24,7 +24,6 @@ from pipelines.reporting.plates import (
 )
 from pipelines.reporting.replanned import Arm, Replan, Seen
 from pipelines.reporting.wording import listing, plural, quantity, shortened
-from pipelines.session.records import Int64
 from pipelines.session.skeletons import bones_of
 
 if TYPE_CHECKING:

@@ -15,14 +15,13 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.bootstrap import Series, interval_of, intervals, resampled
 from pipelines.geometry.metrics import aligned_distances, bone_lengths, root_relative_distances
 from pipelines.reporting.content import SessionContent, text
 from pipelines.reporting.motion import Motion, middles
 from pipelines.reporting.summary import Summary, summarise
 from pipelines.session.camera_poses import poses_at
-from pipelines.session.records import Int64
 from pipelines.session.skeletons import bones_of
 from pipelines.session.tables import trajectory_from
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import rotate
 from pipelines.reporting.motion import Motion, middles
 from pipelines.reporting.plates import (
@@ -36,7 +36,7 @@ from pipelines.reporting.replanned import Arm, Replan, bounds_of
 from pipelines.reporting.summary import CameraRow
 from pipelines.reporting.terrain import LOWEST_M, Heights, heights
 from pipelines.reporting.wording import fixed, listing, plural, quantity, shortened
-from pipelines.session.records import Int64, Trajectory
+from pipelines.session.records import Trajectory
 from pipelines.session.tables import trajectory_from
 
 if TYPE_CHECKING:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.metrics import bone_lengths
 from pipelines.geometry.triangulation import STATUS
-from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 
 if TYPE_CHECKING:
     import pandas as pd

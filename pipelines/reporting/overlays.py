@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Picture
+from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
 from pipelines.geometry.triangulation import STATUS
@@ -25,7 +25,7 @@ from pipelines.reporting.motion import Motion, full_covariance
 from pipelines.reporting.summary import Summary
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Description, Interpolation
-from pipelines.session.records import Int64, Trajectory
+from pipelines.session.records import Trajectory
 from pipelines.session.skeletons import with_derived
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.storage import read_json

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.reporting.content import ReplanContent, items, number, section, text
 from pipelines.reporting.plates import bounds
 from pipelines.reporting.terrain import Terrain, terrain_around
 from pipelines.reporting.wording import ABSENT, THIN, fixed, listing, percent, plural
-from pipelines.session.records import Int64
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-from pipelines.session.records import Int64, Occupancy
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.session.records import Occupancy
 
 LOWEST_M = 0.5
 """Least height above the ground of an obstacle; everything lower is ground."""

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.reporting.motion import Motion, full_covariance, middles, side_of
 from pipelines.reporting.replanned import Arm, Replan
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.terrain import Surface, surface
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at
-from pipelines.session.records import Int64, Trajectory
+from pipelines.session.records import Trajectory
 from pipelines.session.skeletons import DERIVED, bones_of
 from pipelines.session.tables import trajectory_from
 

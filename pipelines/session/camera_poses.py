@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.noise import NoiseModel, sum_sigma
 from pipelines.geometry.poses import interpolate_poses, rates
 from pipelines.session.description import CameraEntry, Interpolation
-from pipelines.session.records import Int64, Trajectory
+from pipelines.session.records import Trajectory
 from pipelines.session.registries import noise_models, parsed_noise_models
 
 

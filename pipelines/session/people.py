@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.description import Description
-from pipelines.session.records import Int64, JointMotion
+from pipelines.session.records import JointMotion
 from pipelines.session.tables import ACTOR, read_table
 
 _GAP_NS = 2_000_000_000  # no interpolation between two stamps that are further apart

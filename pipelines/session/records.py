@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.progress import Progress, Silent
 
 POINT_COVARIANCE_COLUMNS = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 """Upper triangle of a joint's covariance, m^2, as tables name it."""
-
-Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

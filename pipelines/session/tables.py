@@ -16,8 +16,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Detections, Int64, JointMotion, Trajectory
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Detections, JointMotion, Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -5,11 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import RelativeTo
-from pipelines.session.records import Int64
 from pipelines.session.registries import Format
 
 Height = Literal["sea level", "ellipsoid", "take-off", "stated", "unknown"]

@@ -13,12 +13,13 @@ import numpy as np
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
 from pipelines.formats.videos.picture_motion import followed_points
 from pipelines.formats.videos.video import black_bars, created_ns
+from pipelines.geometry.arrays import Int64
 from pipelines.geometry.cameras import Intrinsics, fit_to_size, is_resized
 from pipelines.geometry.clocks import fit_start
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, FrameTimes, IntrinsicsSource
-from pipelines.session.records import Detections, Int64, Trajectory, VideoIndex
+from pipelines.session.records import Detections, Trajectory, VideoIndex
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs, Frames
 from pipelines.sources.parts import CameraFrames

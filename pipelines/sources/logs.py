@@ -29,10 +29,11 @@ from pipelines.formats.logs.trajectories import (
     poses_of,
     transforms_in,
 )
+from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
 from pipelines.session.manifest import Log as LogSource
-from pipelines.session.records import Int64, IntrinsicsSample, PictureSample, Trajectory
+from pipelines.session.records import IntrinsicsSample, PictureSample, Trajectory
 from pipelines.session.registries import Log, LogFormat, recognise
 from pipelines.sources.world import world_times
 

@@ -14,10 +14,11 @@ from pipelines.formats.logs.maps import (
     read_maps,
 )
 from pipelines.formats.logs.trajectories import frames_of_poses, place_of_frame
+from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
 from pipelines.session.manifest import Map as MapSource
-from pipelines.session.records import Int64, Message, Occupancy
+from pipelines.session.records import Message, Occupancy
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.world import in_enu, in_world, world_times
 

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from pipelines.geometry.arrays import Int64
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.poses import gaps
@@ -26,7 +27,7 @@ from pipelines.session.description import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, PoseSource
-from pipelines.session.records import Detections, Int64, Trajectory
+from pipelines.session.records import Detections, Trajectory
 from pipelines.session.tables import (
     FRAMES,
     KEYPOINTS,

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
 from pipelines.formats.logs.presets import NAV_SAT_FIX, read_pair, read_positions, read_preset
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
 from pipelines.geometry.mounting import (
@@ -34,7 +34,7 @@ from pipelines.geometry.poses import (
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan, PoseSource
 from pipelines.session.manifest import Log as LogSource
-from pipelines.session.records import Int64, Trajectory
+from pipelines.session.records import Trajectory
 from pipelines.session.registries import FORMATS, TrajectoryFormat, recognise
 from pipelines.session.telemetry import (
     AttitudeTrack,

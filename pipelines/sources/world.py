@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import body_from_camera, flu_body_from_frd
 from pipelines.geometry.poses import (
@@ -18,7 +18,7 @@ from pipelines.geometry.poses import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, LogClock, Mount, PoseSource, WorldFromLog
-from pipelines.session.records import Int64, Trajectory
+from pipelines.session.records import Trajectory
 
 _FASTEST_MPS = 100.0  # no camera that films a person flies faster
 _FROZEN_S, _FROZEN_POSES = 1.0, 10  # a frozen pose stays the same for longer, and for as many messages

@@ -32,7 +32,7 @@ from pipelines.formats.logs.recordings import (
     UnlikeError,
     require_content,
 )
-from pipelines.session.records import Int64
+from pipelines.geometry.arrays import Int64
 
 CHUNK_LIMIT = 1 << 30  # bytes of a chunk, compressed or not: a larger one is taken for damage
 _CACHE = 64 << 20  # bytes of chunks kept in memory, for files whose chunks overlap in time

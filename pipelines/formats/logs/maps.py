@@ -21,11 +21,11 @@ from pipelines.formats.logs.message_decoders import OCTOMAP
 from pipelines.formats.logs.messages import Stamps, bytes_of, nanoseconds
 from pipelines.formats.maps.octomap import leaves_of, occupancy_from
 from pipelines.formats.maps.voxel_grids import Pose, VoxelSet, extruded, placed
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import compose, interpolate_poses, transform
 from pipelines.session.errors import DataError
 from pipelines.session.maps import MOST_VOXELS, check_resolution
-from pipelines.session.records import Int64, Message, Occupancy, Trajectory
+from pipelines.session.records import Message, Occupancy, Trajectory
 
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"

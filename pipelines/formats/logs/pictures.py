@@ -14,9 +14,9 @@ import numpy as np
 from pipelines.formats.logs.message_decoders import Layout, find_layout
 from pipelines.formats.logs.messages import FAULTS, LATEST_NS, all_samples, nanoseconds, unreadable
 from pipelines.formats.logs.recordings import messages_alike
-from pipelines.geometry.arrays import Picture
+from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, PictureSample
+from pipelines.session.records import PictureSample
 from pipelines.session.registries import Log
 
 _LAID_OUT = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")

@@ -31,12 +31,12 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     world_from_heading,
 )
 from pipelines.formats.logs.messages import FAULTS, Stamps, nanoseconds, unreadable
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes
-from pipelines.session.records import Int64, Message
+from pipelines.session.records import Message
 from pipelines.session.registries import Log
 from pipelines.session.telemetry import (
     AttitudeTrack,

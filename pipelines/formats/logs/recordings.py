@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.logs.message_decoders import Schema, decoder
+from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, Message, Topic
+from pipelines.session.records import Message, Topic
 from pipelines.session.registries import Log
 
 # Causes of losses, as sessions and `mocap info` state them.

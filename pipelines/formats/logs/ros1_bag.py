@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pipelines.formats.logs.chunked_logs import Chunk, ChunkedPart, Content, RecordShape
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
+from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 from pipelines.session.storage import is_special
 
 _MAGIC = re.compile(rb"#ROSBAG V(\d+)\.(\d+)\n")

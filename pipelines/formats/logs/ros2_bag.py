@@ -40,8 +40,8 @@ from pipelines.formats.logs.recordings import (
     open_parts,
     require_content,
 )
+from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 from pipelines.session.storage import is_special
 from pipelines.session.yaml_files import plain_yaml
 

@@ -16,13 +16,13 @@ from pipelines.formats.logs.message_decoders import Layout, find_layout
 from pipelines.formats.logs.messages import LATEST_NS, Stamps, all_samples, kind_of
 from pipelines.formats.logs.recordings import UnlikeError, messages_alike
 from pipelines.formats.poses.pose_rows import clean_poses
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.geometry.poses import pose_covariance_in_body
 from pipelines.geometry.transform_tree import Link, chain, find_route
 from pipelines.session.errors import DataError
-from pipelines.session.records import AngleSample, Int64, PoseSample, Sample, Trajectory
+from pipelines.session.records import AngleSample, PoseSample, Sample, Trajectory
 from pipelines.session.registries import Log
 
 Source = Path | str

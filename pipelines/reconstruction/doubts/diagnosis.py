@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.geometry.arrays import Int64
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.faults import FREE, Fault, fit, undone
 from pipelines.reconstruction.doubts.hypotheses import (
@@ -33,7 +34,6 @@ from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, res
 from pipelines.session.description import Description
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
-from pipelines.session.records import Int64
 
 CODES = (
     "videos_swapped",

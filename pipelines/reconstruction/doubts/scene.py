@@ -11,14 +11,14 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.camera_poses import stated_models
 from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.people import LoggedActor
-from pipelines.session.records import Detections, Int64, Occupancy, Trajectory
+from pipelines.session.records import Detections, Occupancy, Trajectory
 
 JOINTS = (
     "nose",

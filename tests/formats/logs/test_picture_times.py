@@ -21,8 +21,9 @@ from pipelines.formats.logs.pictures import (
     stamps_at_once,
 )
 from pipelines.formats.logs.ros2_writing import build
+from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, PictureSample
+from pipelines.session.records import PictureSample
 from pipelines.session.registries import LogFormat, recognise
 from tests.synthetic.logs import CONTAINERS, ROS1, ROS2, Container, Entry, write_log
 
