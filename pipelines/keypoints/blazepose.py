@@ -180,7 +180,7 @@ DETECTOR = BlazePoseDetector(
     "BlazePose GHUM full (MediaPipe 0.10.21, Apache-2.0): 33 joints, on the CPU",
     PERSON_MODELS,
     BLAZEPOSE_MODELS,
-    Measured(sample_mpjpe_mm=34.4, person_ms=20.0),
+    Measured(sample_mpjpe_mm=34.4, person_ms=17.0),
     advice="`--detector blazepose-heavy` errs an eighth less and takes three times as long "
     "(`mocap models fetch blazepose-heavy`, which needs npm)",
 )
@@ -189,7 +189,7 @@ HEAVY = BlazePoseDetector(
     "BlazePose GHUM heavy (@mediapipe/pose 0.5.1675469404, Apache-2.0): 33 joints, on the CPU",
     PERSON_MODELS,
     HEAVY_MODELS,
-    Measured(sample_mpjpe_mm=29.9, person_ms=55.0),
+    Measured(sample_mpjpe_mm=29.9, person_ms=54.0),
 )
 
 
