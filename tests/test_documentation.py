@@ -148,6 +148,23 @@ def _modules() -> list[Path]:
     return [path for folder in ("pipelines", "mocap_cli") for path in (_ROOT / folder).rglob("*.py")]
 
 
+@pytest.mark.parametrize(
+    ("walk", "beside"),
+    [
+        ("A comparison", set()),
+        ("A ROS pose", {"ros2_bag.py", "mcap_log.py"}),  # in the place of ros1_bag.py
+        ("A keypoint", {"pipelines/ingest.py", "sources/files.py"}),  # of a keypoint file, without a video
+    ],
+)
+def test_a_walk_names_as_many_files_as_its_heading_says(walk: str, beside: set[str]) -> None:
+    text = _text("architecture.md")
+    text = text[text.index(f"### {walk}") :]
+    text = text[: text.index("\n##")]
+    named = {file for span in _spans(text) for file in re.findall(r"[\w/]+\.py", span)}
+    assert beside < named or not beside
+    assert f": {len(named - beside)} files" in text.splitlines()[0]
+
+
 def test_every_page_that_code_names_exists() -> None:
     for folder in (*_FOLDERS, "."):
         pattern = "*" if folder == "." else "**/*"
