@@ -242,7 +242,7 @@ def _filming(numbers: Numbers) -> list[str]:
         "",
         *_words(
             "The paper's experiments with real drones, in simulation: flights are rendered as each arm's "
-            "cameras would have seen them, BlazePose looks at the pictures, and `robust` reconstructs from "
+            "cameras would have seen them, BlazePose looks at the pictures, and `auto` reconstructs from "
             "poses with one draw of 0.02 m and 0.2 deg. In E2 somebody walks towards a mound that the fixed "
             "formation climbs; in E3 they jog a slalom with a dead stop, and play soccer. Clips of 5 s; "
             "[measurements](measurements-planner.md#filmed-with-the-real-detector) explains the columns."

@@ -53,9 +53,9 @@ _study_options = grouped(
     click.option(
         "--methods",
         metavar="NAME,...",
-        default="dlt,midpoint,robust,refined",
+        default="dlt,midpoint,robust,auto",
         show_default=True,
-        help="Methods to compare. refined takes most of the time.",
+        help="Methods to compare. auto takes most of the time.",
     ),
     click.option(
         "--keypoints",

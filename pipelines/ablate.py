@@ -44,7 +44,7 @@ from pipelines.simulation.study.sightings import (
 )
 from pipelines.simulation.world.scene import build_world
 
-_REVISION = 3
+_REVISION = 4
 _PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
 _HINT_SIGMA_M = 0.1  # of the detector's hint of the person's position: the camera looks exactly there
 
@@ -212,12 +212,12 @@ def reconstructed(
 ) -> tuple[Float, str | None]:
     """Triangulate views by a method: points [N, 3] m, NaN where there is none, and the reason for a fallback.
 
-    All methods know the standard deviations of the poses. `robust` and `refined` also estimate the noise of
-    keypoints. `refined` also knows the noise models, and so the correlation of pose errors in time.
+    All methods know the standard deviations of the poses. `robust` and `auto` also estimate the noise of
+    keypoints. `auto` also knows the noise models, and so the correlation of pose errors in time.
     """
-    if method == "refined":
+    if method == "auto":
         elapsed_s = (filmed.t_ns - filmed.t_ns[0]) / 1e9
-        return refined_points(views, elapsed_s, tuple(filmed.person.joints), models)
+        return refined_points(views, elapsed_s, tuple(filmed.person.joints), models)[1:]
     if method == "robust":
         return triangulate_robustly(views)[1], None
     return locate(views, method=method).points, None

@@ -24,6 +24,7 @@ from pipelines.keypoints.tracking import FollowedAlone
 from pipelines.planning.arm_flights import poses_from
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.loading import LoggedFlight, load_flight
+from pipelines.reconstruction.refining import refined_points
 from pipelines.reporting.frame_drawing import draw_frame, with_inlet
 from pipelines.reporting.overlays import View
 from pipelines.session.description import Description, read_description
@@ -49,11 +50,10 @@ from pipelines.simulation.study.sightings import (
     Walk,
     errors_in_common,
     measure_arm,
-    triangulate_robustly,
     views_of,
 )
 
-FILM = Stage("film", revision=2)
+FILM = Stage("film", revision=3)
 
 _SAME_M = 0.05  # tolerance between the scenario's hips and the session's truth, which is interpolated
 _HIPS = ("left_hip", "right_hip")
@@ -154,7 +154,8 @@ def film(
             sightings = _read_sightings(parts)
             seed = compared.settings["seed"]  # one draw of the comparison's pose noise
             views = views_of(arm.of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
-            views, found = triangulate_robustly(views)
+            elapsed_s = (arm.of.t_ns - arm.of.t_ns[0]) / 1e9
+            views, found, doubt = refined_points(views, elapsed_s, arm.of.person.joints, arm.noise)
             points = reconstructed[name] = found.reshape(arm.of.joints.shape)
             slots = slot_of(arm.seen_by.position - arm.of.motion.root)
             metrics[name] = measure_arm(
@@ -166,7 +167,7 @@ def film(
                 tilt_deg=np.degrees(slots[..., TILT]),
                 range_m=slots[..., 2],
                 desired_tilt_deg=desired_deg,
-            )
+            ) | {"fallback": doubt}
             _write_arm(run.folder / name, arm, sightings, points, parts)
         true_joints = {name: arm.of.joints for name, arm in arms.items()}
         for name, error_mm in errors_in_common(reconstructed, true_joints).items():

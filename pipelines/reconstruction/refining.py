@@ -435,8 +435,10 @@ def _disagreement(views: Views, instants: int, known: Bool, camera: int) -> floa
 
 def refined_points(
     views: Views, t_s: Float, joints: tuple[str, ...], models: Sequence[NoiseModel]
-) -> tuple[Float, str | None]:
-    """Compute the points of one person by `refined`, and the reason of a fallback to `robust`, if any.
+) -> tuple[Views, Float, str | None]:
+    """Estimate the points of one person in moving cameras without pictures and with right clocks.
+
+    There `auto` is `refined`, and `robust` where that is refused.
 
     Args:
         views: N = T * J joint-frames, joints fastest; one row of poses for each of the T times. The pose
@@ -446,7 +448,8 @@ def refined_points(
         models: pose noise, the same for every camera; an empty list for exact poses.
 
     Returns:
-        Points [N, 3] m, NaN for none, and the reason of the fallback, None without one.
+        The views with the estimated noise of keypoints, and with corrected poses where the method corrects
+        them; points [N, 3] m, NaN for none; and the reason of the fallback to `robust`, None without one.
     """
     times, cameras = views.position.shape[:2]
     noisy = replace(views, pixel_sigma=estimate_noise(views))
@@ -467,13 +470,14 @@ def refined_points(
     shape = (times, len(joints), 3)
     found = refine(t_s, sightings, start.reshape(shape), rigid_pairs(joints, 1), prior, np.zeros(cameras))
     if found.fallback is not None:
-        return start, found.fallback
+        return noisy, start, found.fallback
     position, rotation = views.position.copy(), views.rotation.copy()
     for c, correction in enumerate(found.corrections):
         numbers = _numbers_at(correction, t_s)
         position[:, c], rotation[:, c] = corrected(position[:, c], rotation[:, c], numbers)
     moved = replace(views, position=position, rotation=rotation, pose_sigma=np.zeros_like(views.pose_sigma))
-    gated = triangulate(replace(moved, pixel_sigma=estimate_noise(moved)), method="robust")
+    moved = replace(moved, pixel_sigma=estimate_noise(moved))
+    gated = triangulate(moved, method="robust")
     refined = found.position.reshape(-1, 3)
     ok = (gated.status == STATUS.index("ok")) & np.isfinite(refined[:, 0])
-    return np.where(ok[:, None], refined, gated.points), None
+    return moved, np.where(ok[:, None], refined, gated.points), None

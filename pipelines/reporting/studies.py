@@ -45,7 +45,7 @@ METRICS = {
     "own_mpjpe_mm": "MPJPE of everything that the method itself reconstructed, mm",
     "pck150": "PCK@150 mm, missing joints counted as wrong, %",
     "reconstructed_share": "Reconstructed, %",
-    "fell_back": "Trials in which refined fell back to robust, %",
+    "fell_back": "Trials in which auto fell back to robust, %",
 }
 """Titles of the metrics in the tables; the first three are on the joint-frames that every method has."""
 
@@ -68,7 +68,7 @@ _TITLES = {
     "noise": "Error against the kind of pose noise",
 }
 _SHOWN = (METRICS["mpjpe_mm"], METRICS["reconstructed_share"])  # tables on a session's page
-_BEST = ("refined", "robust", "midpoint", "dlt")  # the sentence is about the first one available
+_BEST = ("auto", "robust", "midpoint", "dlt")  # the sentence is about the first one available
 
 
 def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, Any]]:
@@ -189,7 +189,7 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
         rows = [
             [*label, *(_text(cell, name) for cell in cells)]
             for label, cells in _lines(summary)
-            if name != "fell_back" or label[-1] == "refined"  # no other method can fall back
+            if name != "fell_back" or label[-1] == "auto"  # no other method can fall back
         ]
         if rows:
             made.append(Table(title, [*head, *columns], len(head), rows))

@@ -22,7 +22,7 @@ from pipelines.simulation.study import settings
 from pipelines.simulation.study.sightings import RANGE_M, exact_keypoints, formation, views_of, walk
 from tests.commands.runner import content
 
-TRUSTING = ("--methods", "dlt,midpoint,robust")  # refined takes longer than all of them
+TRUSTING = ("--methods", "dlt,midpoint,robust")  # auto takes longer than all of them
 SMALL = ("--seconds", "8", "--rate", "5", "--trials", "2", "--workers", "1", *TRUSTING)
 
 
@@ -242,25 +242,25 @@ def test_methods_are_compared_where_all_of_them_have_a_point(tmp_path: Path) -> 
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_refined_is_one_of_the_methods_and_says_where_it_fell_back(tmp_path: Path) -> None:
+def test_auto_is_one_of_the_methods_and_says_where_it_fell_back(tmp_path: Path) -> None:
     """Expect half the error: white errors are new in every picture, so n pictures reduce them by sqrt(n).
 
     A step of the walk takes half a second, 8 pictures at 15 Hz. So a third of the error would remain, and a
     half is allowed.
     """
     noise = "white:position_m=0.3,rotation_deg=1"
-    options = ("--seconds", "4", "--rate", "15", "--trials", "1", "--methods", "midpoint,robust,refined")
+    options = ("--seconds", "4", "--rate", "15", "--trials", "1", "--methods", "midpoint,robust,auto")
     output = tmp_path / "out"
     cells = study("robots", *options, "--robots", "3", "--noise", noise, "-o", output)
-    robust, refined = (cells[15, 3, noise, method]["metrics"] for method in ("robust", "refined"))
-    assert refined["fell_back"]["mean"] == 0
-    assert refined["mpjpe_mm"]["mean"] < 0.5 * robust["mpjpe_mm"]["mean"]
-    assert refined["reconstructed_share"]["mean"] > 0.95
+    robust, auto = (cells[15, 3, noise, method]["metrics"] for method in ("robust", "auto"))
+    assert auto["fell_back"]["mean"] == 0
+    assert auto["mpjpe_mm"]["mean"] < 0.5 * robust["mpjpe_mm"]["mean"]
+    assert auto["reconstructed_share"]["mean"] > 0.95
     with (output / "results.csv").open(newline="") as file:
         assert [row["fell_back"] for row in csv.DictReader(file)] == ["0.0"] * 3
     text = succeeds("robots", *options, "--robots", "3", "--noise", noise, "-o", output)
-    table = text[text.index("Trials in which refined fell back") :].split("\n\n")[0]
-    assert table.splitlines()[2].split() == [noise, "refined", "0.0"]
+    table = text[text.index("Trials in which auto fell back") :].split("\n\n")[0]
+    assert table.splitlines()[2].split() == [noise, "auto", "0.0"]
 
 
 def test_workers_do_not_matter_and_a_study_that_is_there_is_not_made_again(tmp_path: Path) -> None:
@@ -317,7 +317,7 @@ HOSTILE = {
     "noise that there is not": (("noise", "--noise", "pink:position_m=1"), "pink"),
     "noise and levels": (("noise", "--noise", "white:position_m=1", "--levels", "low"), "--levels"),
     "a single picture": (("tilt", "--seconds", "0.1", "--rate", "1"), "two pictures"),
-    "too short for refined": (("tilt", "--seconds", "1", "--rate", "15"), "too few pictures for refined"),
+    "too short for auto": (("tilt", "--seconds", "1", "--rate", "15"), "too few pictures for auto"),
     "no such detector": (("tilt", "--detector", "oracle"), "oracle"),
     "detector and exact": (("tilt", "--detector", "blazepose", "--keypoints", "exact"), "--keypoints"),
 }

@@ -17,12 +17,12 @@ Keypoints = Literal["model", "exact"]
 LEVELS = {"none": (0.0, 0.0), "low": (0.1, 0.5), "medium": (0.3, 1.0), "high": (0.5, 2.0)}
 """Pose noise per axis, m and degrees."""
 
-StudyMethod = Method | Literal["refined"]
-METHODS: tuple[StudyMethod, ...] = (*get_args(Method), "refined")
+StudyMethod = Method | Literal["auto"]
+METHODS: tuple[StudyMethod, ...] = (*get_args(Method), "auto")
 
 _LONGEST_S = 600.0  # of a walk
 _CORRELATION_S = 10.0  # of gauss-markov
-_FEWEST_REFINED = 20  # pictures: below, it would always be robust
+_FEWEST_TIMES = 20  # pictures: below, auto would always be robust
 _DRONES, _TILT_DEG, _STEEPEST_DEG = (2, 8), 15.0, 85.0
 
 
@@ -114,10 +114,10 @@ def settings_for(
         _check_once(name, values)
     if seconds * rate_hz < 2:
         raise DataError("--seconds", f"{seconds:g} s at {rate_hz:g} Hz are not two pictures", "film longer")
-    if "refined" in methods and seconds * rate_hz < _FEWEST_REFINED:
+    if "auto" in methods and seconds * rate_hz < _FEWEST_TIMES:
         raise DataError(
             "--seconds",
-            f"{seconds:g} s at {rate_hz:g} Hz are too few pictures for refined ({_FEWEST_REFINED})",
+            f"{seconds:g} s at {rate_hz:g} Hz are too few pictures for auto ({_FEWEST_TIMES})",
             "film longer, or leave it out of --methods",
         )
     asked = [Noise(text, text) for text in noise] or _levels(study, levels, seconds)
