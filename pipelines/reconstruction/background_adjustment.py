@@ -63,14 +63,14 @@ _INVERSE_DEPTH = np.array([0.0, 0.01])  # mean (1/m) and precision (m^2) of the 
 _WORST_PX = 2.0
 _ROUNDS, _CONVERGED = 8, 1e-5  # m and rad
 _SIGMAS = 4.0
-_KNOT_S = 1.0  # between the knots of slow errors
+_KNOT_S = 0.5  # between the knots of slow errors; what they do in between counts as white
 _SLOW_S = 10.0  # over which slow errors are counted in the level of all errors
 _UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1] / 10)
 """Start of estimated levels. White positions that are free by more confuse far and near points at first."""
 
 _DRAWS = 32  # of the posterior
 _LEVEL_ROUNDS = 6
-_LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; below it stays
+_LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; below it MacKay's rule leaps
 _LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
 _SMALL = 0.1  # share of the constant variance below which a slow error counts as a part of it
 
@@ -88,8 +88,7 @@ class PosePrior:
     def of(cls, errors: PoseErrors | None) -> PosePrior:
         """Build the prior from stated pose errors; None for unknown ones."""
         if errors is None:
-            position, rotation = _UNKNOWN_RATE
-            slow = Process(SHIFT_IN_WORLD, EXACT, position), Process(ROTATION, EXACT, rotation)
+            slow = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]), _unknown(ROTATION, _UNKNOWN_RATE[1])
             return cls(_UNKNOWN_WHITE, (*UNKNOWN_SIGMA, 0.0), slow, estimated=True)
         constant = dict.fromkeys((SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA), 0.0)
         changing: dict[int, list[Process]] = {SHIFT_IN_WORLD: [], ROTATION: []}
@@ -115,12 +114,25 @@ class PosePrior:
         return np.tile(np.diag(np.repeat(self.level**2, 3)), (times, 1, 1))
 
 
+def _unknown(number: int, rate: float) -> Process:
+    """Build the process of slow errors that nobody stated, from their rate (m or rad per sqrt(s)).
+
+    It is stationary: a random walk from zero would take the first pose of the log as exact.
+    """
+    return Process(number, rate * float(np.sqrt(_SLOW_S / 2)), correlation_s=_SLOW_S)
+
+
+def _rate(process: Process) -> float:
+    """Compute the rate of a process over short times."""
+    return float(np.sqrt(process.rate**2 + 2 * process.sigma0**2 / process.correlation_s))
+
+
 def _sum(number: int, processes: Sequence[Process]) -> Process:
     """Build one process for the sum of several; that of different kinds is a random walk."""
     if len(processes) == 1:
         return replace(processes[0], number=number)
     sigma2 = sum(process.sigma0**2 for process in processes)
-    rate2 = sum(process.rate**2 + 2 * process.sigma0**2 / process.correlation_s for process in processes)
+    rate2 = sum(_rate(process) ** 2 for process in processes)
     return Process(number, max(float(np.sqrt(sigma2)), EXACT), float(np.sqrt(rate2)))
 
 
@@ -200,6 +212,7 @@ def adjust(seen: SeenPoints, position: Float, rotation: Float, prior: PosePrior)
         covariance[stretch.rows] = found.covariance
         covariance[stretch.rows[:, None], range(3), range(3)] += prior.constant[0] ** 2
     priors = [found.prior for found in results]
+    slow = _rms_slow(priors) if prior.estimated else prior.slow
     return Adjusted(
         new_position,
         new_rotation,
@@ -210,7 +223,7 @@ def adjust(seen: SeenPoints, position: Float, rotation: Float, prior: PosePrior)
             ),
             assumed=prior.estimated,
         ),
-        replace(prior, white=_rms([p.white for p in priors]), slow=_rms_slow(priors)),
+        replace(prior, white=_rms([p.white for p in priors]), slow=slow),
         sum(len(stretch.points.inverse_depth) for stretch in stretches),
         pixels,
         None,
@@ -223,8 +236,8 @@ def _rms(levels: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def _rms_slow(priors: Sequence[PosePrior]) -> tuple[Process, Process]:
-    rate = _rms([(prior.slow[0].rate, prior.slow[1].rate) for prior in priors])
-    return replace(priors[0].slow[0], rate=rate[0]), replace(priors[0].slow[1], rate=rate[1])
+    position, rotation = _rms([(_rate(prior.slow[0]), _rate(prior.slow[1])) for prior in priors])
+    return _unknown(SHIFT_IN_WORLD, position), _unknown(ROTATION, rotation)
 
 
 def _remaining(draws: Sequence[Float], period_s: float, shift: float) -> PoseErrors:
@@ -410,8 +423,11 @@ class _Stretch:
 
     def _ties(self, prior: PosePrior) -> Ties:
         """Build the prior of errors about slow and constant ones, and of slow ones over time."""
-        white = 1 / np.maximum(np.repeat(prior.white, 3), EXACT) ** 2
         steps = np.diff(self.knot_t_s)
+        variance = np.square(prior.white)
+        if not prior.estimated:  # an estimated level already holds what slow errors do between knots
+            variance += [process.stray(float(steps.max(initial=0.0))) for process in prior.slow]
+        white = 1 / np.repeat(np.maximum(variance, EXACT**2), 3)
         left, added = np.empty((len(steps), 6)), np.empty((len(steps), 6))
         for k, step in enumerate(steps):
             both = [process.step(float(step)) for process in prior.slow]
@@ -464,10 +480,10 @@ class _Stretch:
         scale = 1 / np.sqrt(np.diff(self.knot_t_s))[:, None]
         steps, spread = np.diff(state.knots, axis=0) * scale, np.diff(draws[1], axis=1) * scale
         rate = [
-            _level(steps[:, of], spread[..., of], process.rate, least)
+            _level(steps[:, of], spread[..., of], _rate(process), least)
             for of, process, least in zip(_KINDS, prior.slow, _LEAST_RATE, strict=True)
         ]
-        slow = replace(prior.slow[0], rate=rate[0]), replace(prior.slow[1], rate=rate[1])
+        slow = _unknown(SHIFT_IN_WORLD, rate[0]), _unknown(ROTATION, rate[1])
         return replace(prior, white=(white[0], white[1]), slow=slow)
 
     def _fresh(self, state: _State) -> Float:
@@ -487,11 +503,16 @@ def _parts(state: _State) -> tuple[Float, Float, Float]:
 
 
 def _level(estimates: Float, draws: Float, sigma: float, least: float) -> float:
-    """Estimate a standard deviation: squares of estimates over the number that the data determine."""
+    """Estimate a standard deviation: squares of estimates over the number that the data determine.
+
+    Where the data determine little, the step is that of expectation maximisation (Dempster et al. 1977):
+    it has the same fixed point, and is smaller.
+    """
     determined = 1 - np.mean(draws**2) / sigma**2
     if determined < _LEAST_DETERMINED:
-        return sigma
-    variance = np.mean(estimates**2) / determined
+        variance = np.mean(estimates**2) + np.mean(draws**2)
+    else:
+        variance = np.mean(estimates**2) / determined
     return max(float(np.sqrt(np.clip(variance, 0.04 * sigma**2, 6.0 * sigma**2))), least)
 
 
