@@ -29,6 +29,7 @@ from pipelines.geometry.noise import (
     SHIFT_IN_CAMERA,
     SHIFT_IN_WORLD,
     UNKNOWN_SIGMA,
+    USUAL_CONSTANT,
     PoseErrors,
     Process,
 )
@@ -72,7 +73,7 @@ _DRAWS = 32  # of the posterior
 _LEVEL_ROUNDS = 6
 _LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; below it MacKay's rule leaps
 _LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
-_SMALL = 0.1  # share of the constant variance below which a slow error counts as a part of it
+_SMALL = 0.1  # share of the constant variance, at most a usual one, below which slow errors are part of it
 
 
 @dataclass(frozen=True)
@@ -258,7 +259,7 @@ def _remaining(draws: Sequence[Float], period_s: float, shift: float) -> PoseErr
         slow = max(whole - constant - fresh, 0.0)
         constant += 0.0 if kind else shift**2
         white[kind] = max(float(np.sqrt(fresh)), EXACT)
-        if slow > _SMALL * constant:
+        if slow > _SMALL * min(constant, USUAL_CONSTANT[kind] ** 2):
             most = max(part.shape[1] for part in parts)
             lags = np.unique(np.geomspace(1, max(most // 2, 1), 24).astype(np.int64))
             grown = np.array([_structure(parts, int(lag)) for lag in lags]) - fresh

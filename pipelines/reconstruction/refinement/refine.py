@@ -177,7 +177,8 @@ def _refined(problem: Problem, start: Float, part: Bool, filled: Float, prior: _
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
     as_stated = not prior.learned and _scale_unseen(system, state, at)
-    as_logged = prior.learned and _position_undetermined(system, state, at, covariance)
+    assumed = any(errors.assumed for errors in known.poses)
+    as_logged = prior.learned and not assumed and _position_undetermined(system, state, at, covariance)
     del at  # the next solutions have their own factors
     slow = system, state  # determines the poses
     if known.memory > REMEMBERED:
@@ -355,7 +356,9 @@ def _priors(
         position, rotation = UNKNOWN_SIGMA
         lasting = (Process(SHIFT_IN_WORLD, position), Process(ROTATION, rotation))
         usual = PoseErrors(guess.white, lasting, assumed=True)
-        yield from _measured_prior(flight, sightings, start, [usual] * len(sightings), clock_sigma_s)
+        for possible in _measured_prior(flight, sightings, start, [usual] * len(sightings), clock_sigma_s):
+            # Two views disagree across one line only, which says too little without a background.
+            yield replace(possible, learned=possible.learned or len(sightings) == 2)
         return
     # The alternatives use the same motion, bones and image noise: from round to round, learning these changes
     # the evidence by more than the differences between right levels.
@@ -416,19 +419,27 @@ def _measured_prior(
     unlearned = _unlearned(problem, start[chosen], tuple(prior), clock_sigma_s)
     state = initial_state(problem, unlearned, start[chosen])
     known, state = learn(problem, unlearned, state, poses=False, memory=True, rounds=_LEARNING_ROUNDS)
+    levels = [known]
     if any(errors.assumed for errors in prior):
-        known = _with_constant_levels(problem, known, state)
-    known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
+        usual = _of_levels(known, dict(enumerate(USUAL_CONSTANT)))
+        found = _with_constant_levels(problem, known, state)
+        levels = [usual] if found is None else [found, usual]
     measured_m = float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     expected_m = _spread_of(len(sightings)) * max(_FARTHEST * disagreement_m, _FARTHEST_STATED * measured_m)
-    yield _Prior(known, learned=False, warnings=(), expected_m=expected_m)
+    acceleration = shrunk(known.acceleration, problem.t_s, state.position)
+    for number, level in enumerate(levels, 1):
+        settled = replace(level, acceleration=acceleration)
+        yield _Prior(settled, learned=number < len(levels), warnings=(), expected_m=expected_m)
 
 
-def _with_constant_levels(problem: Problem, known: Knowledge, state: State) -> Knowledge:
+def _with_constant_levels(problem: Problem, known: Knowledge, state: State) -> Knowledge | None:
     """Estimate the level of assumed constant errors by MacKay's rule, pooled over the cameras.
 
     Differences between cameras show in the pictures, their common error does not. A few numbers say little of
     a level, so a level of usual size counts as `USUAL_COUNT` more of them.
+
+    Returns None where the pictures do not determine the formation's scale, or the level exceeds what is
+    possible: the scene would grow to fit the detector's errors.
     """
     for _ in range(_LEVEL_ROUNDS):
         system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
@@ -447,14 +458,22 @@ def _with_constant_levels(problem: Problem, known: Knowledge, state: State) -> K
             squares, determined = np.sum(parts, axis=0)
             usual2 = USUAL_CONSTANT[kind] ** 2
             level[kind] = np.sqrt((squares + USUAL_COUNT * usual2) / (max(determined, 0.0) + USUAL_COUNT))
-        known = replace(known, poses=tuple(_of_level(errors, level) for errors in known.poses))
-    return known
+        if any(sigma > UNKNOWN_SIGMA[kind] for kind, sigma in level.items()):
+            return None
+        known = _of_levels(known, level)
+    system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
+    return None if _scale_unseen(system, state, at) else known
 
 
 def _is_assumed(errors: PoseErrors, process: Process) -> bool:
     """Test if the level of a constant error is unknown; a smaller one was determined by the background."""
     usual = USUAL_CONSTANT[1 if process.number == ROTATION else 0]
     return errors.assumed and process.constant and process.sigma0 > _UNDETERMINED * usual
+
+
+def _of_levels(known: Knowledge, level: Mapping[int, float]) -> Knowledge:
+    """Give assumed constant errors of all cameras these levels, see `_of_level`."""
+    return replace(known, poses=tuple(_of_level(errors, level) for errors in known.poses))
 
 
 def _of_level(errors: PoseErrors, level: Mapping[int, float]) -> PoseErrors:
