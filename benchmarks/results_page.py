@@ -42,15 +42,20 @@ POSES = PosesSection(
             f"mocap ingest {_SAMPLE}/flight.yaml -o {PLACE}/background.session",
             f"mocap reconstruct {PLACE}/background.session --method robust --refine-cameras background",
         ),
+        "auto": (
+            f"mocap ingest {_SAMPLE}/flight.yaml -o {PLACE}/auto.session",
+            f"mocap reconstruct {PLACE}/auto.session",
+        ),
     },
     names={
         "true": "true poses: the detector alone",
         "sample": "logged poses",
         "background": "logged poses, corrected by the background of the pictures",
+        "auto": "logged poses, as `mocap reconstruct` does unasked",
     },
     compare=(
-        f"mocap report {PLACE}/sample.session {PLACE}/background.session {PLACE}/true.session "
-        f"-o {PLACE}/compared.html --figures {PLACE}/compared"
+        f"mocap report {PLACE}/sample.session {PLACE}/background.session {PLACE}/auto.session "
+        f"{PLACE}/true.session -o {PLACE}/compared.html --figures {PLACE}/compared"
     ),
     figures=("compare-time", "compare-joints"),
     measures=("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150", "reconstructed_share_of_truth"),
@@ -129,7 +134,8 @@ def _head(numbers: Numbers) -> list[str]:
     return [
         "# Results",
         "",
-        "Every table and figure of this page is written by one command, from a clean clone:",
+        "Tables and figures of this page are written by one command, from a clean clone; the sections on real "
+        "pictures and on the corpus have their own:",
         "",
         "    mocap models fetch blazepose",
         "    python -m benchmarks.results      # or: make results",
@@ -142,8 +148,8 @@ def _head(numbers: Numbers) -> list[str]:
             "filmed ones by up to 8 %."
         ),
         *_words(
-            "**Everything here is simulated**, except for the last section: body, flights, logs and "
-            "pictures are made by `mocap simulate`. The detector that looks at the pictures of the sample "
+            "**Everything here is simulated**, except for the section on real pictures: body, flights, logs "
+            "and pictures are made by `mocap simulate`. The detector that looks at the pictures of the sample "
             "flight and of filmed planners is the real one."
         ),
     ]
@@ -162,7 +168,7 @@ def _poses(numbers: Numbers) -> list[str]:
         "",
         *_words(
             "`sample_data/mound_walk`: two drones, 12 s, BlazePose on the rendered pictures, method "
-            "`robust`. The poses' errors are one draw of those that `sample_data/README.md` states."
+            "`robust` but for the row that says `mocap reconstruct`. The poses' errors are one draw of those that `sample_data/README.md` states."
         ),
         *_code([*commands, POSES.compare]),
         *markdown_table(header, rows),
