@@ -38,7 +38,7 @@ from pipelines.geometry.poses import (
     quaternion_from_matrix,
 )
 from pipelines.ingest import ingest
-from pipelines.reconstruct import reconstruct
+from pipelines.reconstruct import Settings, reconstruct
 from pipelines.session.errors import MocapError
 from pipelines.session.tables import POSES, read_table, trajectory_from
 from pipelines.simulate import simulate
@@ -426,7 +426,8 @@ def cycled(mistaken: Mistaken) -> None:
 
 
 def same_topic(mistaken: Mistaken) -> None:
-    mistaken.poses[mistaken.names[0]] = mistaken.poses[mistaken.names[1]]
+    first, second = mistaken.names[:2]
+    mistaken.manifest["cameras"][first]["pose"]["tum"] = f"{second}.tum"
 
 
 def own_origins(mistaken: Mistaken) -> None:
@@ -565,7 +566,7 @@ def measured(manifest: Path) -> tuple[float | None, list[dict[str, Any]], str]:
     shutil.rmtree(session, ignore_errors=True)
     try:
         ingest(manifest, session)
-        metrics = reconstruct(session).metrics
+        metrics = reconstruct(session, Settings(method="robust")).metrics
     except MocapError as error:
         doubts = check(session).doubts if (session / "session.json").exists() else []
         return None, [doubt.as_json() for doubt in doubts], str(error)

@@ -12,9 +12,9 @@ from pathlib import Path
 from pipelines.detect import DETECT, cameras_to_detect, detect
 from pipelines.ingest import ingest
 from pipelines.reconstruct import chosen_detections, find_people
-from pipelines.reconstruction.doubts.diagnosis import Doubt, doubts_of
+from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.loading import load_cameras
-from pipelines.session.description import Description, read_description
+from pipelines.session.description import Description, Doubt, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import logged_actor
 from pipelines.session.progress import Progress, Silent

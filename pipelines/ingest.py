@@ -27,12 +27,14 @@ from pipelines.session.description import (
     TruthEntry,
     read_description,
     said_assumptions,
+    said_doubts,
 )
 from pipelines.session.errors import DataError, MocapError, NotYetReadError
+from pipelines.session.log_doubts import doubts_of_logs
 from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import JointMotion, Occupancy
+from pipelines.session.records import JointMotion, Occupancy, Trajectory
 from pipelines.session.registries import MapFormat, noise_models, recognise
 from pipelines.session.stage_records import Stage, StageRecord, note_sources
 from pipelines.session.stages import Run, locked
@@ -41,10 +43,13 @@ from pipelines.session.tables import (
     ACTOR,
     CAMERA_POSES,
     PLAN,
+    POSES,
     TRUTH,
     actor_table,
     motion_table,
     pose_table,
+    read_table,
+    trajectory_from,
     write_table,
 )
 from pipelines.sources.cameras import FlightCameras
@@ -66,7 +71,7 @@ from pipelines.sources.parts import (
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=7)
+INGEST = Stage("ingest", revision=8)
 
 _AHEAD_ROWS = 200_000  # of cameras that are read during hashing: some 70 MB
 
@@ -148,6 +153,9 @@ def ingest(
             warnings += said_assumptions(flight.assumptions)
             warnings += [f"{path}: {losses(causes)}: copy it again" for path, causes in damage.items()]
 
+            doubts = doubts_of_logs({name: (entry, _track(run, name)) for name, entry in entries.items()})
+            warnings += said_doubts(doubts)
+
             description = Description(
                 schema_version=1,
                 flight=flight.name,
@@ -163,6 +171,7 @@ def ingest(
                 sources=sources,
                 damage=damage,
                 assumptions=flight.assumptions,
+                doubts=doubts,
                 warnings=warnings,
             )
             if strict:
@@ -448,6 +457,10 @@ def _store_cameras(
         warnings += stored["warnings"]
         progress.advance()
     return entries, warnings
+
+
+def _track(run: Run, name: str) -> Trajectory:
+    return trajectory_from(read_table(run.folder / "cameras" / name / "poses.parquet", POSES))
 
 
 def _store_camera(reader: _FlightReader, name: str, check_sources: Callable[[], None], folder: Path) -> None:

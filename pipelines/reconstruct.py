@@ -30,7 +30,7 @@ from pipelines.keypoints.no_people import Ground, Scene, level_of
 from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
 from pipelines.reconstruction.background import refine_cameras
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
-from pipelines.reconstruction.doubts.diagnosis import Doubt, doubts_of, said_doubts
+from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.doubts.scene import Ground as GroundOfMap
 from pipelines.reconstruction.finishing import finish
 from pipelines.reconstruction.ground import bind_positions
@@ -70,7 +70,14 @@ from pipelines.reconstruction.solving import (
     views_with_noise,
 )
 from pipelines.reconstruction.trials import disturbances, disturbed, summary_of_trials
-from pipelines.session.description import Description, Interpolation, read_description, said_assumptions
+from pipelines.session.description import (
+    Description,
+    Doubt,
+    Interpolation,
+    read_description,
+    said_assumptions,
+    said_doubts,
+)
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.people import LoggedActor, logged_actor, true_joints_at

@@ -18,6 +18,7 @@ from pipelines.reporting.wording import (
     quantity,
     whole,
 )
+from pipelines.session.description import said_doubts
 
 # Below this share of measured times a joint is named among the doubts.
 DOUBTFUL_COVERAGE = 0.8
@@ -190,7 +191,9 @@ def _large_errors(summary: Summary) -> list[str]:
 
 
 def _of_the_flight(summary: Summary) -> list[dict[str, object]]:
-    """Return what metrics.json doubts of the flight, what explains the most first."""
+    """Return what metrics.json doubts of the flight, what explains the most first; else session.json."""
+    if "doubts" not in summary.metrics:
+        return [doubt.as_json() for doubt in summary.description.doubts]
     return [doubt for doubt in items(summary.metrics, "doubts") if isinstance(doubt, dict)]
 
 
@@ -224,7 +227,8 @@ def _doubts(content: SessionContent, summary: Summary) -> list[str]:
     doubts += _large_errors(summary)
     doubts += _odd_cameras(summary)
     doubts += [f"The inputs of {stage} have changed since: run it again." for stage in content.outdated]
-    doubts += summary.description.warnings
+    told = said_doubts(summary.description.doubts)  # reconstruct says them again
+    doubts += [warning for warning in summary.description.warnings if warning not in told]
     for record in content.stages.values():
         doubts += [str(warning) for warning in items(record, "warnings")]
     return list(dict.fromkeys(doubts))  # a stage repeats the warnings of ingest

@@ -78,6 +78,8 @@ class PosesEntry(Entry):
     frames_without_pose: int
     dropped: dict[str, int]
     stamps: str | None = None  # of a log's messages: header or receive
+    key: str = "log"  # of `pose` in the manifest that names it: log, topic, tum, csv, ...
+    topic: str | None = None  # of the log
     mount: MountEntry | None = None  # None where poses are the camera's own, or a gimbal turns it
 
 
@@ -248,6 +250,20 @@ class Interpolation(Entry):
         return round(self.max_extrapolation_s * 1e9)
 
 
+class Doubt(Entry):
+    """A contradiction in a flight, as session.json and metrics.json hold it."""
+
+    code: str
+    cameras: list[str]
+    what: str  # one sentence
+    evidence: dict[str, float]
+    remedy: str  # the lines of flight.yaml to change; empty where no cause was found
+
+    def as_json(self) -> dict[str, object]:
+        """Return the mapping that is stored."""
+        return self.model_dump(mode="json")
+
+
 class Description(Entry):
     """The whole of session.json."""
 
@@ -265,6 +281,7 @@ class Description(Entry):
     sources: dict[str, str]  # path as the manifest states it -> sha256
     damage: dict[str, dict[str, int]] = {}  # of sources as wholes: path -> how often, by cause
     assumptions: list[str] = []  # keys of the manifest that `mocap init` guessed and nobody confirmed
+    doubts: list[Doubt] = []  # that the logs raise by themselves; those of the pictures are in metrics.json
     warnings: list[str]
 
     @model_validator(mode="after")
@@ -314,6 +331,14 @@ def said_assumptions(assumptions: Sequence[str]) -> list[str]:
     """State what `mocap init` guessed and nobody has confirmed, as one warning if there is anything."""
     remedy = "confirm it in flight.yaml and take `assumed: true` away"
     return [f"assumed by `mocap init`: {', '.join(assumptions)}; {remedy}"] if assumptions else []
+
+
+def said_doubts(doubts: list[Doubt]) -> list[str]:
+    """State doubts as warnings of a stage, with the lines that mend them."""
+    return [
+        f"doubt ({doubt.code}): {doubt.what}" + (f"; set {doubt.remedy}" if doubt.remedy else "")
+        for doubt in doubts
+    ]
 
 
 def read_description(session: Path) -> Description:

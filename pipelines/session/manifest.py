@@ -202,6 +202,7 @@ class PoseSource(Guess):
     inverse: bool = False  # the file has camera_from_world, or body_from_world
     quaternion: Literal["xyzw", "wxyz"] | None = None  # the order in which the file has it [its format's]
     unit: Literal["m", "cm", "mm", "ft"] = "m"  # of its positions
+    z: Literal["up", "down"] = "up"  # where its positions count to, where its axes are east, north, up else
     world_from_source: WorldFromLog = WorldFromLog()  # where the file's zero and north lie in the world
 
     @model_validator(mode="after")
@@ -217,7 +218,7 @@ class PoseSource(Guess):
                 not self.is_telemetry or self.attitude is not None,
                 "that is no drone's own log (those state theirs)",
             ),
-            ("inverse", "quaternion", "unit"): (
+            ("inverse", "quaternion", "unit", "z"): (
                 not self.is_telemetry and self.static is None,
                 "from a log, tum or csv",
             ),

@@ -185,6 +185,8 @@ def _poses_entry(
         frames_without_pose=without_pose,
         dropped=trajectory.dropped,
         stamps=stamps,
+        key=_pose_key(pose),
+        topic=pose.topic,
         mount=_mount_entry(camera),
     )
 
@@ -294,6 +296,12 @@ def _clock_start(camera: Camera) -> Literal["stated", "assumed", "none"]:
 def _pose_source(pose: PoseSource) -> str:
     drones_own = pose.dji or pose.ulog or pose.ardupilot
     return pose.tum or pose.csv or drones_own or (pose.static.path if pose.static else pose.log) or ""
+
+
+def _pose_key(pose: PoseSource) -> str:
+    if pose.topic is not None:
+        return "topic"
+    return next(key for key in PoseSource.one_of if getattr(pose, key) is not None)
 
 
 def _mount_entry(camera: Camera) -> MountEntry | None:

@@ -41,6 +41,11 @@ def as_stated(trajectory: Trajectory, pose: PoseSource) -> Trajectory:
         position = position * metres
         scale = np.diag([metres] * 3 + [1.0] * 3)
         covariance = None if covariance is None else carried_covariance(scale, covariance)
+    if pose.z == "down":
+        flip = np.array([1.0, 1.0, -1.0])
+        position = position * flip
+        turned = np.diag([*flip, 1.0, 1.0, 1.0])
+        covariance = None if covariance is None else carried_covariance(turned, covariance)
     return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
 
 

@@ -26,6 +26,7 @@ from benchmarks.mistakes import (
     of_cameras,
     of_mounts,
     of_poses,
+    own_origins,
     same_topic,
     swapped,
     turned,
@@ -34,6 +35,7 @@ from benchmarks.mistakes import (
 )
 from pipelines.geometry.poses import compose, invert
 from pipelines.reconstruction.doubts.diagnosis import CODES
+from pipelines.session.description import read_description
 from tests.commands.runner import refused, succeeds
 
 THREE = next(flight for flight in FLIGHTS if flight.name == "kick3")
@@ -83,6 +85,37 @@ def test_the_remedy_leaves_no_doubt(flight: Described, case: str) -> None:
     assert doubts_of(manifest) == []
 
 
+@pytest.mark.parametrize(("change", "code"), [(same_topic, "pose"), (own_origins, "origin")])
+def test_ingest_doubts_what_the_logs_alone_show(
+    flight: Described, tmp_path: Path, change: Change, code: str
+) -> None:
+    session = tmp_path / "logs.session"
+    succeeds("ingest", mistaken(flight, change), "-o", session)
+    found = json.loads((session / "session.json").read_text())["doubts"]
+    assert {doubt["code"] for doubt in found} == {code}
+    assert all(set(doubt) == {"code", "cameras", "what", "evidence", "remedy"} for doubt in found)
+
+
+def test_a_log_that_two_cameras_have_is_exchanged_by_its_name(flight: Described, tmp_path: Path) -> None:
+    manifest = mistaken(flight, same_topic)
+    assert doubts_of(manifest)[0]["remedy"] == "cameras.drone1.pose.tum: drone1.tum"
+    assert with_remedy(manifest, "cameras.drone1.pose.tum: drone1.tum")
+    succeeds("ingest", manifest, "-o", tmp_path / "mended.session")
+    described = json.loads((tmp_path / "mended.session" / "session.json").read_text())
+    assert described["doubts"] == []
+
+
+def test_a_session_of_before_has_no_doubts(flight: Described, tmp_path: Path) -> None:
+    session = tmp_path / "old.session"
+    succeeds("ingest", mistaken(flight, None), "-o", session)
+    stored = json.loads((session / "session.json").read_text())
+    for part in (stored, *(camera["poses"] for camera in stored["cameras"].values())):
+        for key in ("doubts", "key", "topic"):
+            part.pop(key, None)
+    (session / "session.json").write_text(json.dumps(stored))
+    assert read_description(session).doubts == []
+
+
 def test_reconstruct_states_doubts_and_strict_refuses(flight: Described, tmp_path: Path) -> None:
     manifest, session = mistaken(flight, CASES["rolled"][1]), tmp_path / "rolled.session"
     succeeds("ingest", manifest, "-o", session)
@@ -122,6 +155,7 @@ KEYS: dict[str, tuple[Change, str]] = {
     "quaternion": (of_poses(lambda pose: (pose[0], np.roll(pose[1], 1, axis=-1))), "pose.quaternion: wxyz"),
     "ft": (of_poses(lambda pose: (pose[0] / 0.3048, pose[1])), "pose.unit: ft"),
     "cm": (of_poses(lambda pose: (pose[0] * 100, pose[1])), "pose.unit: cm"),
+    "z": (of_poses(lambda pose: (pose[0] * [1, 1, -1], pose[1])), "pose.z: down"),
     "world": (
         of_poses(moved_away),
         f"pose.world_from_source: {{translation: {SHIFT.tolist()}, yaw_deg: {YAW_DEG}}}",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from pipelines.reconstruction.doubts.hypotheses import (
     Trial,
     higher_or_lower,
     of_descriptions,
-    of_paths,
+    of_logs,
     of_times,
     pair_of,
     relative_to,
@@ -31,7 +31,7 @@ from pipelines.reconstruction.doubts.hypotheses import (
 )
 from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
 from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, solve
-from pipelines.session.description import Description
+from pipelines.session.description import Description, Doubt
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
 
@@ -89,21 +89,6 @@ _TIMES = ("clock", "frame_rate")
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """One doubt, as metrics.json holds it."""
-
-    code: str  # one of CODES
-    cameras: list[str]
-    what: str  # one sentence
-    evidence: dict[str, float]
-    remedy: str  # the lines of flight.yaml to change; empty where no cause was found
-
-    def as_json(self) -> dict[str, object]:
-        """Return the mapping that is stored."""
-        return asdict(self)
-
-
-@dataclass(frozen=True)
 class Diagnosis:
     """The doubts of a flight, those first that explain the most."""
 
@@ -158,14 +143,6 @@ def _distinct(chosen: Sampled | None, prominent: Sampled | None) -> list[Sampled
     return [chosen] if same else [chosen, prominent]
 
 
-def said_doubts(doubts: list[Doubt]) -> list[str]:
-    """State doubts as warnings of a stage, with the lines that mend them."""
-    return [
-        f"doubt ({doubt.code}): {doubt.what}" + (f"; set {doubt.remedy}" if doubt.remedy else "")
-        for doubt in doubts
-    ]
-
-
 def diagnose(flight: Sampled | None) -> Diagnosis:
     """Find what is odd about a flight, and why; a flight whose cameras share no time is not doubted here."""
     if flight is None:
@@ -173,7 +150,7 @@ def diagnose(flight: Sampled | None) -> Diagnosis:
     described = scene_of(flight)
     base, found = base_of(flight, described)
     trial = Trial(flight, described, base)
-    hypotheses = [*of_paths(trial), *of_times(trial)]
+    hypotheses = [*of_logs(trial), *of_times(trial)]
     stated = fit(flight, described, "none", 0)
     explained = min((each.total for each in hypotheses), default=np.inf)
     odd = base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
@@ -348,11 +325,11 @@ def _doubt(cause: Hypothesis, described: Score, scene: Scene) -> Doubt:
             "stature_m_if": _rounded(cause.score.stature_m),
         }
     return Doubt(
-        cause.code,
-        list(cause.cameras),
-        cause.what,
-        {name: value for name, value in evidence.items() if np.isfinite(value)},
-        cause.remedy,
+        code=cause.code,
+        cameras=list(cause.cameras),
+        what=cause.what,
+        evidence={name: value for name, value in evidence.items() if np.isfinite(value)},
+        remedy=cause.remedy,
     )
 
 
@@ -393,7 +370,8 @@ def _oddities(described: Score, scene: Scene, flight: Sampled) -> list[Doubt]:
         if value >= _LEAST_ODD and name in _ODD:
             code, said = _ODD[name]
             what = said.format(stature=described.stature_m, usual=STATURE_M)
-            found.setdefault(code, Doubt(code, names, what, {name: round(value, 2)}, ""))
+            evidence = {name: round(float(value), 2)}
+            found.setdefault(code, Doubt(code=code, cameras=names, what=what, evidence=evidence, remedy=""))
     if described.misfit > _LEAST_ODD or "residual" in found or not found:
         times = f"{described.misfit:.1f} times"
         what = f"the rays miss each other by {times} what keypoints and poses are stated to err by"
@@ -402,7 +380,6 @@ def _oddities(described: Score, scene: Scene, flight: Sampled) -> list[Doubt]:
             "residual_px": residual,
             "scatter": round(described.scatter, 2),
         }
-        found["residual"] = Doubt(
-            "residual", names, what, {k: v for k, v in evidence.items() if np.isfinite(v)}, ""
-        )
+        evidence = {name: value for name, value in evidence.items() if np.isfinite(value)}
+        found["residual"] = Doubt(code="residual", cameras=names, what=what, evidence=evidence, remedy="")
     return list(found.values())

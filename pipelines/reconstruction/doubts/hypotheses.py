@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, permutations
+from itertools import permutations
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_mat
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene, scene_of
 from pipelines.reconstruction.doubts.score import Base, Score, score, solve
+from pipelines.session.log_doubts import doubts_of_logs
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 """Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
@@ -29,8 +30,6 @@ _SPARE = 2.0  # hypotheses whose scores are farther from the best need no exact 
 _LONGEST_CLOCK_S = 3.0
 _LEAST_CLOCK_S = 0.05
 _LEAST_OCTAVES = 0.15
-_LEAST_ORIGIN_M = 0.5
-_SAME_PATH_M = 0.1
 _LEFT_RIGHT = [
     JOINTS.index(name.replace("left", "@").replace("right", "left").replace("@", "right")) for name in JOINTS
 ]
@@ -151,7 +150,7 @@ class Trial:
         """Add seconds to the times of cameras' pictures."""
         late_s = np.zeros(len(self.names))
         late_s[list(cameras)] = seconds
-        return scene_of(self.flight, late_s=late_s)
+        return scene_of(self.flight, self.described, late_s=late_s)
 
     def focal(self, factor: float, cameras: Sequence[int]) -> Scene:
         """Multiply the focal lengths of cameras."""
@@ -164,6 +163,7 @@ class Trial:
         """Change the pixels [F, J, 2] of every camera."""
         return scene_of(
             self.flight,
+            self.described,
             pixels=[change(camera.pixels, camera.intrinsics.width) for camera in self.flight.cameras],
         )
 
@@ -228,7 +228,7 @@ def of_times(trial: Trial) -> Iterator[Hypothesis]:
                 ),
                 -_LONGEST_CLOCK_S,
                 _LONGEST_CLOCK_S,
-                31,
+                61,
                 _LEAST_CLOCK_S,
             )
             if found is not None:
@@ -248,7 +248,7 @@ def of_times(trial: Trial) -> Iterator[Hypothesis]:
                     f"the pictures of {said} follow each other {factor:.3g} times as slowly as stated",
                     remedies.frame_rate(described, group, factor),
                     penalty,
-                    scene_of(trial.flight, slower=slower),
+                    scene_of(trial.flight, trial.described, slower=slower),
                 )
             )
 
@@ -263,46 +263,15 @@ def of_descriptions(trial: Trial) -> Iterator[Hypothesis]:
     yield from _continuous(trial)
 
 
-def of_paths(trial: Trial) -> Iterator[Hypothesis]:
+def of_logs(trial: Trial) -> Iterator[Hypothesis]:
     """Find cameras that fly the same path, or start at the same place: no picture is needed for that."""
-    position = trial.described.position
-    for one, other in combinations(trial.moving, 2):
-        apart = np.linalg.norm(position[one] - position[other], axis=-1)
-        apart = apart[np.isfinite(apart)]
-        if not len(apart):
-            continue
-        pair = (trial.names[one], trial.names[other])
-        if np.median(apart) < _SAME_PATH_M:
-            yield Hypothesis(
-                "pose",
-                pair,
-                f"{pair[0]} and {pair[1]} fly the same path: one of them has the other's topic or log",
-                remedies.topic(trial.flight.cameras, one, other),
-                0.0,
-                None,
-            )
-            continue
-        starts = [_start(trial, index) for index in (one, other)]
-        if (
-            starts[0] is not None
-            and starts[1] is not None
-            and np.linalg.norm(starts[0] - starts[1]) < _LEAST_ORIGIN_M
-        ):
-            yield Hypothesis(
-                "origin",
-                pair,
-                f"{pair[0]} and {pair[1]} start at the same place: each log counts from its own start",
-                remedies.own_origins(trial.flight.cameras, trial.apart().position - position),
-                0.0,
-                None,
-            )
-
-
-def _start(trial: Trial, index: int) -> Float | None:
-    """Return the first logged position [3] of a camera."""
-    position: Float = trial.flight.cameras[index].camera.trajectory.position
-    known = position[np.isfinite(position).all(axis=1)]
-    return known[0] if len(known) else None
+    cameras = trial.flight.cameras
+    logs = {camera.name: (camera.entry, camera.camera.trajectory) for camera in cameras}
+    for doubt in doubts_of_logs(logs):
+        remedy = doubt.remedy
+        if doubt.code == "origin":
+            remedy = remedies.own_origins(cameras, trial.apart().position - trial.described.position)
+        yield Hypothesis(doubt.code, tuple(doubt.cameras), doubt.what, remedy, 0.0, None)
 
 
 def _discrete(trial: Trial) -> Iterator[Hypothesis]:
@@ -326,8 +295,8 @@ def _permuted(trial: Trial) -> Iterator[Hypothesis]:
                 tuple(names[index] for index in moved),
                 f"pictures are exchanged: {said}",
                 remedies.videos(trial.flight.cameras, order),
-                0.5 + 0.25 * (len(moved) - 2),
-                scene_of(trial.flight, order=order),
+                0.5 if len(names) == 2 else 0.8,  # of more cameras there are more ways
+                scene_of(trial.flight, trial.described, order=order),
             )
 
 
@@ -441,7 +410,13 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
             body @ _FLU_FROM_FRD @ mounts,
             place,
         ),
-        hypothesis("axes", "the positions count z downwards", "", camera, place * [1.0, 1.0, -1.0]),
+        hypothesis(
+            "axes",
+            "the positions count z downwards, the attitudes do not",
+            remedies.pose(cameras, "z: down"),
+            camera,
+            place * [1.0, 1.0, -1.0],
+        ),
         hypothesis("axes", "the positions have x and y exchanged", "", camera, place[..., [1, 0, 2]]),
         hypothesis(
             "convention",

@@ -173,13 +173,6 @@ def pose_noise(cameras: Sequence[Filmed], factor: float) -> str:
     return _lines(cameras, _moving(cameras), said)
 
 
-def topic(cameras: Sequence[Filmed], one: int, other: int) -> str:
-    """Ask for the topic or log of each of two cameras that have the same."""
-    return _lines(
-        cameras, (one, other), lambda camera: f"pose: {{log: ..., topic: ...}}  # that of {camera.name}"
-    )
-
-
 def origin(cameras: Sequence[Filmed], index: int, shift: Float | None, yaw_deg: float | None) -> str:
     """Place the world of a camera's log in the flight's."""
     translation = "[east, north, up]" if shift is None else _vector(np.round(shift, 2).tolist())

@@ -313,6 +313,7 @@ def _variances(model: NoiseModel, length_s: float) -> list[float]:
 
 def scene_of(
     flight: Sampled,
+    posed: Scene | None = None,
     *,
     late_s: Float | None = None,
     slower: Float | None = None,
@@ -323,6 +324,7 @@ def scene_of(
 
     Args:
         flight: the flight.
+        posed: a scene of it, whose poses are taken.
         late_s: [C] added to the times of each camera's pictures.
         slower: [C] factor of the times between each camera's pictures.
         order: whose pictures each camera has; its own by default.
@@ -341,7 +343,7 @@ def scene_of(
         at = _interpolated(since, seen, (flight.t_ns - flight.t_ns[0]).astype(np.float64))
         rays.append(undistort(at, camera.intrinsics))
         person_px.append(_median(_extent(at)))
-    position, rotation = _poses(flight)
+    position, rotation = (posed.position, posed.rotation) if posed else _poses(flight)
     return Scene(
         np.array(rays),
         position,

@@ -48,6 +48,9 @@ STATURE_M = 1.73
 """Of a grown-up; 95 % are within 17 % of it (NCD-RisC 2016, men and women together)."""
 
 _ANKLE_ABOVE_GROUND_M = 0.08
+_WALK_NS = 1_000_000_000  # how far apart two moments may be that tell where somebody walks
+_LEAST_PACE_MPS = 0.3  # over the flight, of somebody who walks
+_FASTEST_MPS = 6.0
 SCATTER_WEIGHT = 12.0
 SCATTER_RANGE = (0.4, 30.0)  # what is less is no better: keypoints scatter by themselves
 
@@ -249,7 +252,7 @@ def _scatter_of_pair(
     normal = normal / np.where(used, length, 1.0)[..., None]
     apart = (normal * baseline).sum(axis=-1)[used]
     noise = np.sqrt(
-        np.median((distance[one] ** 2 * variance[one] + distance[other] ** 2 * variance[other])[used])
+        _median((distance[one] ** 2 * variance[one] + distance[other] ** 2 * variance[other])[used])
     )
     columns = []
     for camera, sign in ((one, -1.0), (other, 1.0)):
@@ -268,7 +271,7 @@ def _scatter_of_pair(
     residual = np.full(used.shape, np.nan)
     residual[used] = left
     middle = _median_of_rows(residual)
-    return float(1.48 * np.median(np.abs(residual - middle[:, None])[used]) / noise)
+    return float(1.48 * _median(np.abs(residual - middle[:, None])[used]) / noise)
 
 
 def _median_of_rows(values: Float) -> Float:
@@ -384,18 +387,35 @@ class _Body:
             np.linalg.norm(self[name][flight.second] - self[name][flight.first], axis=-1) / step_s
             for name in ("left_ankle", "right_ankle")
         ]
-        forwards = self._forwards()[flight.first, :2]
-        walks = pace > 0.7 + 2 * noise
-        course = (moved[:, :2] * forwards).sum(axis=-1)[walks]
-        course /= pace[walks] * np.linalg.norm(forwards[walks], axis=-1)
-        ahead = _median(course) if np.isfinite(course).sum() >= 8 else 1.0
         climbed = _median(np.abs(moved[:, 2]))
         return {
-            "course": max(0.0, 0.5 - ahead) / 0.3,
+            "course": max(0.0, 0.5 - self._ahead(flight, white_m)) / 0.15,
             "speed": max(0.0, _quantile(pace, 0.75) - 4.0 - 1.5 * noise) / (2 + noise),
             "climb": max(0.0, climbed - 0.5 - noise) / (0.5 + noise / 2),
             "slide": max(0.0, _median(np.minimum(*feet)) - 0.4 * stature / 1.7 - noise) / (0.5 + noise / 2),
         }
+
+    def _ahead(self, flight: Sampled, white_m: float) -> float:
+        """Return the cosine of where the person walks, over the flight, against where they face.
+
+        It is 1 of somebody who hardly walks.
+        """
+        first = np.arange(len(flight.t_ns))
+        second = np.searchsorted(flight.t_ns, flight.t_ns + _WALK_NS, side="right") - 1
+        step_s = (flight.t_ns[second] - flight.t_ns[first]) / 1e9
+        forwards = (self._forwards()[first] + self._forwards()[second])[:, :2]
+        forwards /= np.linalg.norm(forwards, axis=1, keepdims=True)
+        moved = (self.hips[second] - self.hips[first])[:, :2]
+        along = (moved * forwards).sum(axis=1)
+        across = forwards[:, 0] * moved[:, 1] - forwards[:, 1] * moved[:, 0]
+        # Steps weigh by their squared length in time, as those of equal noise do; none faster than people.
+        known = np.isfinite(along) & (np.hypot(along, across) < _FASTEST_MPS * step_s + 3 * white_m)
+        weight = float((step_s[known] ** 2).sum())
+        if not weight:
+            return 1.0
+        ahead, aside = (float((part * step_s)[known].sum()) / weight for part in (along, across))
+        pace = float(np.hypot(ahead, aside))
+        return ahead / pace if pace > _LEAST_PACE_MPS + 3 * white_m * np.sqrt(2 / weight) else 1.0
 
 
 def _distances(solved: Solved) -> Float:
@@ -440,8 +460,11 @@ def _finite(values: Float) -> Float:
 
 
 def _median(values: Float) -> float:
-    finite = _finite(values)
-    return float(np.median(finite)) if finite.size else float("nan")
+    """Return the median of what is finite; `np.median` is slow on small arrays."""
+    ordered = np.sort(_finite(values))
+    if not ordered.size:
+        return float("nan")
+    return float(ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2]) / 2
 
 
 def _quantile(values: Float, share: float) -> float:
