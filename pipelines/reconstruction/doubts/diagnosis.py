@@ -30,7 +30,7 @@ from pipelines.reconstruction.doubts.hypotheses import (
     turn_about,
 )
 from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
-from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, solve
+from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, score, solve
 from pipelines.session.description import Description, Doubt
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
@@ -72,7 +72,7 @@ SCATTERED = 0.65
 MISSED = 1.8
 """Misfit of rays from which more than times is tried, whatever the score; 0.4 to 1.6 on right flights."""
 
-STRAINED = 4.0
+STRAINED = 10.0
 """Chi^2 of constant errors of poses from which faults of one camera's poses are tried."""
 
 GAIN = 14.0
@@ -84,6 +84,7 @@ DOUBTFUL = 6.0
 _ALIKE = 1.0  # hypotheses whose scores are this close are stated together
 _COST_OF_NUMBER = 2.0  # of chi^2, as in Akaike's criterion
 _ALIKE_COST = 4.0  # of faults that are stated together
+_SAME_RESIDUAL = 1.1
 _DISCRETE = 0.8  # the largest penalty of a hypothesis without a free number
 _TIMES = ("clock", "frame_rate")
 
@@ -161,7 +162,7 @@ def diagnose(flight: Sampled | None) -> Diagnosis:
         noisy = _of_noise(trial, stated.cost)
         hypotheses += [trial.scored(noisy)] if noisy else []
     hypotheses.sort(key=lambda each: each.total)
-    causes = _causes(hypotheses, base.total)
+    causes = _causes(trial, hypotheses)
     if not causes or np.isfinite(causes[0].cost):
         causes = _faults(hypotheses, stated.cost, described) or causes
     doubts = [_doubt(each, found, described) for each in causes]
@@ -170,22 +171,41 @@ def diagnose(flight: Sampled | None) -> Diagnosis:
     return Diagnosis(doubts, base.total, len(hypotheses))
 
 
-def _causes(hypotheses: list[Hypothesis], described: float) -> list[Hypothesis]:
+def _causes(trial: Trial, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     """Return the hypotheses that score next to the best, one of each code; none if it explains too little.
 
     Those without a free number are first.
     """
-    if not hypotheses:
-        return []
-    best = hypotheses[0]
-    margin = MARGIN_OF_TIMES if best.code in _TIMES else MARGIN
-    if best.total > described - margin:
-        return []
-    alike = [each for each in hypotheses if each.total <= best.total + _ALIKE]
+    explaining: list[Hypothesis] = []
+    for each in hypotheses:
+        if explaining and each.total > explaining[0].total + _ALIKE:
+            break
+        if each.total > trial.base.total - MARGIN_OF_TIMES:
+            break
+        if _explains(trial, each):
+            explaining.append(each)
     causes: dict[str, Hypothesis] = {}
-    for each in sorted(alike, key=lambda each: (each.penalty > _DISCRETE, each.total)):
+    for each in sorted(explaining, key=lambda each: (each.penalty > _DISCRETE, each.total)):
         causes.setdefault(each.code, each)
     return list(causes.values())
+
+
+def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
+    """Return True if a hypothesis explains markedly more than the description of the same moments.
+
+    Another clock leaves moments out; errors that wander are smaller in fewer. Nor may the rays of a
+    person in whom nothing is odd miss each other by more than before.
+    """
+    if hypothesis.scene is None:
+        return True
+    seen = np.isfinite(hypothesis.scene.rays[..., :1]).any(axis=(0, 2), keepdims=True)
+    described = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
+    same = score(trial.flight, described, trial.base)
+    margin = MARGIN_OF_TIMES if hypothesis.code in _TIMES else MARGIN
+    if hypothesis.total > min(same.total, trial.base.total) - margin:
+        return False
+    missed = [residual_px(scene, solve(scene)) for scene in (described, hypothesis.scene)]
+    return trial.base.total >= ODD or missed[1] <= _SAME_RESIDUAL * missed[0]
 
 
 def _faults(hypotheses: list[Hypothesis], stated: float, scene: Scene) -> list[Hypothesis]:

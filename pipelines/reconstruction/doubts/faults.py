@@ -34,6 +34,7 @@ _SIZE_SIGMA = 0.09  # of the logarithm of statures
 _PROBE_M = 0.05
 _PLACED_M = 0.3  # sigma of the logged actor's hips, and of the feet on the ground
 _HUBER = 1.5
+_FEW = 3
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,8 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     direction = solved.direction
     across = np.eye(3) - direction[..., :, None] * direction[..., None, :]
     residual = np.einsum("ctjik,ctjk->ctji", across, toward) / depth[..., None]
-    varying2 = (scene.sigma[:, 5] ** 2)[:, None, None] + (scene.sigma[:, 4][:, None, None] / depth) ** 2
+    varying2 = _varying2(scene.sigma[:, 5], scene.sigma[:, 3], times)[:, None, None]
+    varying2 = varying2 + _varying2(scene.sigma[:, 4], scene.sigma[:, 2], times)[:, None, None] / depth**2
     variance = (pixel_variance(scene) / scene.focal_px**2)[:, None, None] + varying2
     size = np.linalg.norm(residual, axis=-1) / np.sqrt(variance)
     if used.sum() < 60:
@@ -198,6 +200,16 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     normal += 1e-9 * np.eye(len(normal))
     change = -np.linalg.solve(normal, right)
     return cost, strain, change[: errors.size].reshape(errors.shape), change[errors.size :]
+
+
+def _varying2(varying: Float, white: Float, times: int) -> Float:
+    """Return the variance [C] of errors that vary, as of one of so many pictures with independent errors.
+
+    What is not new in every pose is worth `_FEW` independent pictures, however many there are.
+    """
+    lasting2 = np.maximum(varying**2 - white**2, 0.0)
+    variance: Float = white**2 + lasting2 * times / _FEW
+    return variance
 
 
 def _size(solved: Solved) -> float:

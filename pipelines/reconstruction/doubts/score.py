@@ -51,6 +51,7 @@ _ANKLE_ABOVE_GROUND_M = 0.08
 _WALK_NS = 1_000_000_000  # how far apart two moments may be that tell where somebody walks
 _LEAST_PACE_MPS = 0.3  # over the flight, of somebody who walks
 _FASTEST_MPS = 6.0
+_HALF_BODY_M = 0.5
 SCATTER_WEIGHT = 12.0
 SCATTER_RANGE = (0.4, 30.0)  # what is less is no better: keypoints scatter by themselves
 
@@ -223,7 +224,7 @@ def _parallax(solved: Solved) -> float:
 
 
 def _scatter(scene: Scene, solved: Solved) -> float:
-    """Return the scatter of two cameras' rays within pictures over the pixel noise, mean over the pairs."""
+    """Return the scatter of two cameras' rays within pictures over their noise, mean over the pairs."""
     variance = pixel_variance(scene) / scene.focal_px**2
     distance = np.clip(np.abs(solved.depth), 1e-4, 1e5)
     found = [
@@ -251,9 +252,15 @@ def _scatter_of_pair(
     baseline = (scene.position[other] - scene.position[one])[:, None, :]
     normal = normal / np.where(used, length, 1.0)[..., None]
     apart = (normal * baseline).sum(axis=-1)[used]
-    noise = np.sqrt(
-        _median((distance[one] ** 2 * variance[one] + distance[other] ** 2 * variance[other])[used])
-    )
+    # What is new in every pose turns the person in the picture, besides moving them.
+    white2 = _HALF_BODY_M**2 * scene.sigma[:, 3] ** 2
+    noise2 = [
+        distance[camera] ** 2 * variance[camera]
+        + white2[camera]
+        + (_HALF_BODY_M * scene.sigma[camera, 2] / np.maximum(distance[camera], 1.0)) ** 2
+        for camera in pair
+    ]
+    noise = np.sqrt(_median((noise2[0] + noise2[1])[used]))
     columns = []
     for camera, sign in ((one, -1.0), (other, 1.0)):
         lever = distance[camera][..., None] * np.cross(solved.direction[camera], normal)
@@ -306,7 +313,8 @@ def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
     odd["unposed"] = _unposed(scene) / 0.05
     odd |= body.posture()
     far_m = _distances(solved)
-    odd |= body.motion(flight, stature, _moved_by(scene.sigma[:, 2:4], far_m))
+    keypoint_m = float(np.sqrt(np.mean(pixel_variance(scene)) * np.mean((far_m / scene.focal_px) ** 2)))
+    odd |= body.motion(flight, stature, _moved_by(scene.sigma[:, 2:4], far_m), keypoint_m)
     odd |= _place(flight, scene, body, far_m)
     return _Person(odd, stature)
 
@@ -371,13 +379,14 @@ class _Body:
         forwards: Float = np.cross(up, self["right_hip"] - self["left_hip"])
         return forwards
 
-    def motion(self, flight: Sampled, stature: float, white_m: float) -> dict[str, float]:
+    def motion(self, flight: Sampled, stature: float, white_m: float, keypoint_m: float) -> dict[str, float]:
         """Say how oddly the person moves: not forwards, faster than people, or with a foot that slides.
 
         Args:
             flight: the flight.
             stature: m.
             white_m: by how much pose errors that are new in every pose move the person.
+            keypoint_m: by how much keypoints' errors move a joint.
         """
         step_s = STEP_NS / 1e9
         noise = np.sqrt(2) * white_m / step_s  # m/s
@@ -387,12 +396,14 @@ class _Body:
             np.linalg.norm(self[name][flight.second] - self[name][flight.first], axis=-1) / step_s
             for name in ("left_ankle", "right_ankle")
         ]
+        of_foot = float(np.hypot(noise, np.sqrt(2) * keypoint_m / step_s))
         climbed = _median(np.abs(moved[:, 2]))
         return {
             "course": max(0.0, 0.5 - self._ahead(flight, white_m)) / 0.15,
             "speed": max(0.0, _quantile(pace, 0.75) - 4.0 - 1.5 * noise) / (2 + noise),
             "climb": max(0.0, climbed - 0.5 - noise) / (0.5 + noise / 2),
-            "slide": max(0.0, _median(np.minimum(*feet)) - 0.4 * stature / 1.7 - noise) / (0.5 + noise / 2),
+            "slide": max(0.0, _median(np.minimum(*feet)) - 0.4 * stature / 1.7 - of_foot)
+            / (0.5 + of_foot / 2),
         }
 
     def _ahead(self, flight: Sampled, white_m: float) -> float:
