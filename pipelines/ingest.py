@@ -31,7 +31,7 @@ from pipelines.session.description import (
 )
 from pipelines.session.errors import DataError, MocapError, NotYetReadError
 from pipelines.session.log_doubts import doubts_of_logs
-from pipelines.session.manifest import Flight, read_flight
+from pipelines.session.manifest import Axes, Camera, Flight, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
@@ -250,10 +250,17 @@ class _FlightReader:
             self._interpolation,
             base=self._flight_path.parent,
             stamps=self._logs.settings(camera.pose.log).stamps if camera.pose.log else None,
+            axes=self._gimbal_axes(camera),
             note=self._take_note,
         )
         warnings = list(dict.fromkeys(data.notes + self.take_notes()))
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
+
+    def _gimbal_axes(self, camera: Camera) -> Axes:
+        """Return the axes that the angles of a camera's gimbal are in."""
+        gimbal = camera.gimbal
+        stated = gimbal and (gimbal.axes or (gimbal.log and self._logs.settings(gimbal.log).axes))
+        return stated or self._flight.world.frame
 
     def _read_camera(self, name: str) -> CameraData:
         """Read everything about one camera, and check the parts against each other."""

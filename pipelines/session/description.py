@@ -80,6 +80,8 @@ class PosesEntry(Entry):
     stamps: str | None = None  # of a log's messages: header or receive
     key: str = "log"  # of `pose` in the manifest that names it: log, topic, tum, csv, ...
     topic: str | None = None  # of the log
+    gimbal: str | None = None  # what the angles of a gimbal with a topic are relative to
+    gimbal_axes: Literal["enu", "ned"] = "enu"  # that they are in
     mount: MountEntry | None = None  # None where poses are the camera's own, or a gimbal turns it
 
 

@@ -26,7 +26,7 @@ from pipelines.session.description import (
     PosesEntry,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Camera, PoseSource
+from pipelines.session.manifest import Axes, Camera, PoseSource
 from pipelines.session.records import Detections, Trajectory
 from pipelines.session.tables import (
     FRAMES,
@@ -101,6 +101,7 @@ def camera_entry(
     *,
     base: Path,
     stamps: str | None,
+    axes: Axes,
     note: Callable[[str], None],
 ) -> CameraEntry:
     """Describe a camera for session.json; note doubts about its poses, and losses, one line each.
@@ -118,7 +119,7 @@ def camera_entry(
             rate_hz=_rate(frames.t_ns),
             dropped=frames.dropped,
         ),
-        poses=_poses_entry(name, camera, data, interpolation, base=base, stamps=stamps, note=note),
+        poses=_poses_entry(name, camera, data, interpolation, base=base, stamps=stamps, axes=axes, note=note),
         keypoints=_keypoints_entry(camera, data),
         clock=ClockEntry(
             offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
@@ -149,6 +150,7 @@ def _poses_entry(
     *,
     base: Path,
     stamps: str | None,
+    axes: Axes,
     note: Callable[[str], None],
 ) -> PosesEntry:
     pose, trajectory, frames_t_ns = camera.pose, data.trajectory, data.frames.t_ns
@@ -187,6 +189,8 @@ def _poses_entry(
         stamps=stamps,
         key=_pose_key(pose),
         topic=pose.topic,
+        gimbal=camera.gimbal.relative_to if camera.gimbal and camera.gimbal.topic else None,
+        gimbal_axes=axes,
         mount=_mount_entry(camera),
     )
 

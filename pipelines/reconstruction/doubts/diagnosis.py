@@ -17,7 +17,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Int64
 from pipelines.reconstruction.doubts import remedies
-from pipelines.reconstruction.doubts.faults import FREE, Fault, fit, undone
+from pipelines.reconstruction.doubts.faults import FREE, Fault, fit, picture_variance, undone
 from pipelines.reconstruction.doubts.hypotheses import (
     Hypothesis,
     Trial,
@@ -163,6 +163,8 @@ def diagnose(flight: Sampled | None) -> Diagnosis:
         hypotheses += [trial.scored(noisy)] if noisy else []
     hypotheses.sort(key=lambda each: each.total)
     causes = _causes(trial, hypotheses)
+    if causes and causes[0].scene is not None and _is_noise(flight, causes[0].scene, hypotheses):
+        causes = []
     if not causes or np.isfinite(causes[0].cost):
         causes = _faults(hypotheses, stated.cost, described) or causes
     doubts = [_doubt(each, found, described) for each in causes]
@@ -193,19 +195,26 @@ def _causes(trial: Trial, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
 def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
     """Return True if a hypothesis explains markedly more than the description of the same moments.
 
-    Another clock leaves moments out; errors that wander are smaller in fewer. Nor may the rays of a
-    person in whom nothing is odd miss each other by more than before.
+    Another clock leaves moments out: in fewer, errors that wander are smaller, and they say less. Nor may the
+    rays of a person in whom nothing is odd miss each other by more than before.
     """
     if hypothesis.scene is None:
         return True
-    seen = np.isfinite(hypothesis.scene.rays[..., :1]).any(axis=(0, 2), keepdims=True)
+    seen = np.isfinite(hypothesis.scene.rays[..., :1]).any(axis=2, keepdims=True)
     described = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
     same = score(trial.flight, described, trial.base)
-    margin = MARGIN_OF_TIMES if hypothesis.code in _TIMES else MARGIN
+    share = np.isfinite(described.rays[..., 0]).sum() / np.isfinite(trial.described.rays[..., 0]).sum()
+    margin = (MARGIN_OF_TIMES if hypothesis.code in _TIMES else MARGIN) / share
     if hypothesis.total > min(same.total, trial.base.total) - margin:
         return False
     missed = [residual_px(scene, solve(scene)) for scene in (described, hypothesis.scene)]
     return trial.base.total >= ODD or missed[1] <= _SAME_RESIDUAL * missed[0]
+
+
+def _is_noise(flight: Sampled, cause: Scene, hypotheses: list[Hypothesis]) -> bool:
+    """Return True if larger errors of the poses fit markedly better than the scene without a mistake."""
+    noise = min((each.cost for each in hypotheses if each.code == "noise"), default=np.inf)
+    return bool(noise < np.inf) and noise < fit(flight, cause, "none", 0).cost - GAIN
 
 
 def _faults(hypotheses: list[Hypothesis], stated: float, scene: Scene) -> list[Hypothesis]:
@@ -245,31 +254,46 @@ def _of_faults(trial: Trial) -> Iterator[Hypothesis]:
 
 
 def _of_noise(trial: Trial, stated: float) -> Hypothesis | None:
-    """Try if constant errors of all poses, some times larger than stated, fit as a fault of one would.
+    """Try if errors of all poses, some times larger than stated, fit as a fault of one would.
 
     Args:
         trial: the flight.
         stated: the cost of a fit with the errors as stated.
     """
-    scene, best = trial.described, None
-    for factor in _NOISE_FACTORS:
-        constant2 = np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0)
-        sigma = scene.sigma.copy()
-        sigma[:, :2] = np.sqrt(factor**2 * constant2 + scene.sigma[:, 4:] ** 2)
-        wider = replace(scene, sigma=sigma)
-        # Each of the 6 errors of a camera is `factor` times less likely to be what it is.
-        cost = fit(trial.flight, wider, "none", 0).cost + 12 * len(trial.names) * np.log(factor)
-        if cost < stated and (best is None or cost < best.cost):
-            best = Hypothesis(
-                "noise",
-                trial.names,
-                f"constant errors of the poses are about {factor:g} times as large as stated",
-                remedies.pose_noise(trial.flight.cameras, factor),
-                np.inf,  # its score says nothing: larger errors excuse everything
-                wider,
-                cost=cost,
-            )
-    return best
+    factors = [(factor, 1.0) for factor in _NOISE_FACTORS] + [(1.0, factor) for factor in _NOISE_FACTORS]
+    found = [_noisier(trial, lasting, changing) for lasting, changing in factors]
+    half = len(_NOISE_FACTORS)
+    both = [min(part, key=lambda each: each.cost) for part in (found[:half], found[half:])]
+    if all(each.cost < stated for each in both):
+        chosen = [factors[found.index(each)] for each in both]
+        found.append(_noisier(trial, chosen[0][0], chosen[1][1]))
+    best = min(found, key=lambda each: each.cost)
+    return best if best.cost < stated else None
+
+
+def _noisier(trial: Trial, lasting: float, changing: float) -> Hypothesis:
+    """Fit errors of all poses that are larger by given factors: those that last, and those that change."""
+    scene = trial.described
+    constant2 = np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0)
+    sigma = scene.sigma.copy()
+    sigma[:, 2:] *= changing
+    sigma[:, :2] = np.sqrt(lasting**2 * constant2 + sigma[:, 4:] ** 2)
+    wider = replace(scene, sigma=sigma)
+    # Larger errors are less likely to be what they are: 6 of each camera, and 2 of each picture.
+    pictures = np.isfinite(scene.rays[..., 0]).any(axis=-1).sum(axis=1)
+    before, after = (picture_variance(each) for each in (scene, wider))
+    unlikely = 12 * len(trial.names) * np.log(lasting) + 2 * float(pictures @ np.log(after / before))
+    parts = (("constant", lasting), ("changing", changing))
+    said = ", ".join(f"{part} ones {factor:g} times" for part, factor in parts if factor > 1)
+    return Hypothesis(
+        "noise",
+        trial.names,
+        f"errors of the poses are larger than stated: {said}",
+        remedies.pose_noise(trial.flight.cameras, lasting, changing),
+        np.inf,  # its score says nothing: larger errors excuse everything
+        wider,
+        cost=fit(trial.flight, wider, "none", 0).cost + unlikely,
+    )
 
 
 _NOISE_FACTORS = (2.0, 4.0, 8.0)
@@ -332,6 +356,7 @@ def _of_fault(trial: Trial, fault: Fault, penalty: float) -> Hypothesis:
         penalty,
         fault.scene,
         cost=fault.cost + _COST_OF_NUMBER * FREE[fault.name],
+        sigmas=fault.sigmas,
     )
 
 
@@ -343,6 +368,7 @@ def _doubt(cause: Hypothesis, described: Score, scene: Scene) -> Doubt:
             "score_if": round(cause.score.total, 2),
             "stature_m": _rounded(described.stature_m),
             "stature_m_if": _rounded(cause.score.stature_m),
+            **cause.sigmas,
         }
     return Doubt(
         code=cause.code,

@@ -35,6 +35,7 @@ _PROBE_M = 0.05
 _PLACED_M = 0.3  # sigma of the logged actor's hips, and of the feet on the ground
 _HUBER = 1.5
 _FEW = 3
+_USUAL_M = 10.0  # distance of a person
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,17 @@ class Fault:
     shift: Float  # [3] m
     turn_rad: float
     scene: Scene  # without the fault; constant errors stay
+    covariance: Float  # [n, n] of its numbers: what the constant errors leave of it, m and rad
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """The standard deviations of its shift (of all axes together) and its turn."""
+        variance = np.diag(self.covariance)
+        moved, turned = variance[: 3 * (FREE[self.name] >= 3)], variance[3 * (FREE[self.name] >= 3) :]
+        sigmas = {"shift_sigma_m": float(np.sqrt(moved.sum()))} if moved.size else {}
+        if turned.size and self.name != "focal":
+            sigmas["turn_sigma_deg"] = float(np.degrees(np.sqrt(turned[0])))
+        return {name: round(value, 2) for name, value in sigmas.items()}
 
     @property
     def turn_deg(self) -> float:
@@ -67,18 +79,19 @@ def fit(flight: Sampled, scene: Scene, name: str, index: int, start_rad: float =
     """
     nothing = np.zeros(3)
     first = undone(scene, name, index, nothing, start_rad)
-    fault = Fault(name, index, np.inf, np.inf, nothing, start_rad, first)
+    fault = Fault(name, index, np.inf, np.inf, nothing, start_rad, first, np.zeros((0, 0)))
     errors = np.zeros((len(scene.focal_px), 6))
     best, last = fault, np.inf
     for _ in range(_STEPS):
-        cost, strain, change, values = _step(flight, _with_errors(fault.scene, errors), fault, errors)
+        cost, strain, change, covariance = _step(flight, _with_errors(fault.scene, errors), fault, errors)
+        values = change[errors.size :]
         settled = abs(cost - last) < _CONVERGED
         last = cost
         if cost < best.cost:
-            best = replace(fault, cost=cost, strain=strain)
+            best = replace(fault, cost=cost, strain=strain, covariance=covariance)
         if settled or not np.isfinite(cost) or cost > 4 * best.cost + 100:
             break
-        errors = errors + change
+        errors = errors + change[: errors.size].reshape(errors.shape)
         shift, turn_rad = fault.shift, fault.turn_rad
         if FREE[name] >= 3:
             shift = shift + values[:3]
@@ -131,7 +144,10 @@ def _constant_sigma(scene: Scene) -> Float:
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[float, float, Float, Float]:
-    """Return cost and strain of a scene, and the changes of constant errors [C, 6] and a fault's numbers."""
+    """Return cost and strain of a scene, the changes of constant errors [C, 6] and a fault's numbers [n].
+
+    Also the covariance [n, n] of these numbers.
+    """
     solved = solve(scene)
     cameras, times, joints = solved.seen.shape
     used = solved.seen & (solved.views >= 2)
@@ -145,7 +161,8 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     variance = (pixel_variance(scene) / scene.focal_px**2)[:, None, None] + varying2
     size = np.linalg.norm(residual, axis=-1) / np.sqrt(variance)
     if used.sum() < 60:
-        return np.inf, np.inf, np.zeros_like(errors), np.zeros(FREE[fault.name])
+        free = FREE[fault.name]
+        return np.inf, np.inf, np.zeros(errors.size + free), np.zeros((free, free))
     # One picture is one observation: its keypoints err alike.
     seen = np.maximum(used.sum(axis=-1, keepdims=True), 1)
     scale = np.maximum(1.0, np.median(size[used]))
@@ -160,26 +177,24 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     point = (across - residual[..., :, None] * direction[..., None, :]) / depth[..., None, None]
     leaning = np.eye(3) + (direction + residual)[..., :, None] * residual[..., None, :]
     turned = leaning @ cross_matrix(direction)
+    own = np.concatenate([-point, turned], axis=-1)  # [C, T, J, 3, 6]
+    numbers = _derivatives(scene, fault, own[fault.index], leaning[fault.index], direction[fault.index])
     columns = 6 * cameras + FREE[fault.name]
-    design = np.zeros((cameras, times, joints, 3, columns))
-    for camera in range(cameras):
-        design[camera, ..., 6 * camera : 6 * camera + 3] = -point[camera]
-        design[camera, ..., 6 * camera + 3 : 6 * camera + 6] = turned[camera]
-    if fault.name == "focal":
-        axis = scene.rotation[fault.index][:, None, :, 2]
-        cosine = (direction[fault.index] * axis).sum(axis=-1, keepdims=True)
-        inwards = cosine * (axis - cosine * direction[fault.index])
-        design[fault.index, ..., -1] = -np.einsum("tjkl,tjl->tjk", leaning[fault.index], inwards)
-    elif FREE[fault.name]:
-        basis = _basis(scene, fault)  # [T, 6, free]
-        own = np.concatenate([-point[fault.index], turned[fault.index]], axis=-1)
-        design[fault.index, ..., 6 * cameras :] = own @ basis[:, None]
-    weighted = weight[..., None, None] * design
     of_points = np.einsum("ctjki,ctjkl->tjil", point, weight[..., None, None] * point)
-    of_both = np.einsum("ctjki,ctjkl->tjil", point, weighted)
-    of_all = np.einsum("ctjki,ctjkl->il", design, weighted)
     at_points = np.einsum("ctjki,ctjk->tji", point, weight[..., None] * residual)
-    at_all = np.einsum("ctjki,ctjk->i", weighted, residual)
+    of_both = np.zeros((times, joints, 3, columns))
+    of_all, at_all = np.zeros((columns, columns)), np.zeros(columns)
+    for camera in range(cameras):
+        mine = np.arange(6 * camera, 6 * camera + 6)
+        design = own[camera]
+        if camera == fault.index and FREE[fault.name]:
+            mine = np.append(mine, np.arange(6 * cameras, columns))
+            design = np.concatenate([design, numbers], axis=-1)
+        weighted = weight[camera][..., None, None] * design
+        of_both[..., mine] = np.swapaxes(point[camera], -1, -2) @ weighted
+        rows = weighted.reshape(-1, len(mine))
+        of_all[mine[:, None], mine] = design.reshape(rows.shape).T @ rows
+        at_all[mine] = rows.T @ residual[camera].ravel()
     placed, pull, extra = _placed(flight, solved)
     sized = _size(solved)
     strain = float(((errors / sigma) ** 2).sum()) + extra + sized**2
@@ -187,9 +202,9 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     of_points = of_points + placed[..., None, None] * np.eye(3) + 1e-9 * np.eye(3)
     at_points = at_points - pull
     inverse = np.linalg.inv(of_points)
-    eliminated = np.einsum("tjik,tjkl->tjil", inverse, of_both)
-    normal = of_all - np.einsum("tjki,tjkl->il", of_both, eliminated)
-    right = at_all - np.einsum("tjki,tjk->i", eliminated, at_points)
+    eliminated = (inverse @ of_both).reshape(-1, columns)
+    normal = of_all - of_both.reshape(-1, columns).T @ eliminated
+    right = at_all - eliminated.T @ at_points.ravel()
     normal[range(errors.size), range(errors.size)] += 1 / sigma.ravel() ** 2
     right[: errors.size] += errors.ravel() / sigma.ravel() ** 2
     if fault.name in ("shift", "zero"):
@@ -198,8 +213,37 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
         normal[shift, shift] += np.outer(slope, slope) + np.eye(3) / _LOOSE_M**2
         right[shift] += slope * sized + fault.shift / _LOOSE_M**2
     normal += 1e-9 * np.eye(len(normal))
-    change = -np.linalg.solve(normal, right)
-    return cost, strain, change[: errors.size].reshape(errors.shape), change[errors.size :]
+    covariance = np.linalg.inv(normal)
+    return cost, strain, -covariance @ right, covariance[errors.size :, errors.size :]
+
+
+def _derivatives(scene: Scene, fault: Fault, own: Float, leaning: Float, direction: Float) -> Float:
+    """Return the derivatives [T, J, 3, n] of a camera's residuals by the numbers of its fault.
+
+    Args:
+        scene: the scene.
+        fault: of which camera.
+        own: the derivatives [T, J, 3, 6] by its shift and turn.
+        leaning: those [T, J, 3, 3] by its rays.
+        direction: its rays [T, J, 3].
+    """
+    if fault.name != "focal":
+        derivatives: Float = own @ _basis(scene, fault)[:, None]
+        return derivatives
+    axis = scene.rotation[fault.index][:, None, :, 2]
+    cosine = (direction * axis).sum(axis=-1, keepdims=True)
+    inwards = cosine * (axis - cosine * direction)
+    zoomed: Float = -np.einsum("tjkl,tjl->tjk", leaning, inwards)[..., None]
+    return zoomed
+
+
+def picture_variance(scene: Scene) -> Float:
+    """Return the variance [C] rad^2 of what a picture shows: keypoints, and errors of poses that change."""
+    times = scene.rays.shape[1]
+    turned2 = _varying2(scene.sigma[:, 5], scene.sigma[:, 3], times)
+    moved2 = _varying2(scene.sigma[:, 4], scene.sigma[:, 2], times)
+    variance: Float = pixel_variance(scene) / scene.focal_px**2 + turned2 + moved2 / _USUAL_M**2
+    return variance
 
 
 def _varying2(varying: Float, white: Float, times: int) -> Float:

@@ -6,8 +6,8 @@ and more, so that what explains equally well with less freedom is named first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import permutations
 
 import numpy as np
@@ -48,6 +48,7 @@ class Hypothesis:
     score: Score | None = None
     same_scatter: bool = False
     cost: float = np.inf  # chi^2 of a fitted fault, with 2 for each of its numbers
+    sigmas: Mapping[str, float] = field(default_factory=dict)  # of its numbers, as evidence has them
 
     @property
     def total(self) -> float:
@@ -278,6 +279,7 @@ def _discrete(trial: Trial) -> Iterator[Hypothesis]:
     yield from _permuted(trial)
     yield from _mounted(trial)
     yield from _tilts_negated(trial)
+    yield from _gimbals(trial)
     yield from _conventions(trial)
     yield from _pixels(trial)
 
@@ -345,6 +347,27 @@ def _tilts_negated(trial: Trial) -> Iterator[Hypothesis]:
                 )
                 for index in tilted
             ),
+            0.5,
+            trial.described.with_rotation(rotation),
+        )
+
+
+def _gimbals(trial: Trial) -> Iterator[Hypothesis]:
+    """Try the other axes of gimbals' angles: tilts have the other sign, headings count the other way."""
+    cameras = trial.flight.cameras
+    turned = [index for index in trial.moving if cameras[index].entry.poses.gimbal == "world"]
+    if turned:
+        rotation = trial.described.rotation.copy()
+        for index in turned:
+            mount = trial.mount(index)
+            rotation[index] = _ENU_FROM_NED @ rotation[index] @ mount.T @ _FLU_FROM_FRD @ mount
+        axes = [cameras[index].entry.poses.gimbal_axes for index in turned]
+        right = "enu" if axes[0] == "ned" else "ned"
+        yield Hypothesis(
+            "gimbal",
+            tuple(trial.names[index] for index in turned),
+            f"the gimbals' angles are in {right.upper()}: tilts have the wrong sign",
+            "; ".join(f"cameras.{trial.names[index]}.gimbal.axes: {right}" for index in turned),
             0.5,
             trial.described.with_rotation(rotation),
         )

@@ -157,17 +157,17 @@ def intrinsics(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -
     return _lines(cameras, group, said)
 
 
-def pose_noise(cameras: Sequence[Filmed], factor: float) -> str:
-    """State larger constant errors of poses, beside those that vary."""
+def pose_noise(cameras: Sequence[Filmed], lasting: float, changing: float) -> str:
+    """State larger errors of poses: factors on constant ones, and on those that change."""
 
     def said(camera: Filmed) -> str:
         sigma = camera.sigma
-        position = factor * np.sqrt(max(sigma.position_m**2 - sigma.varying_position_m**2, 0.0))
-        rotation = factor * np.sqrt(max(sigma.rotation_rad**2 - sigma.varying_rotation_rad**2, 0.0))
+        position = lasting * np.sqrt(max(sigma.position_m**2 - sigma.varying_position_m**2, 0.0))
+        rotation = lasting * np.sqrt(max(sigma.rotation_rad**2 - sigma.varying_rotation_rad**2, 0.0))
         return (
             f"pose_noise: {{bias: {{position_m: {position:.3g}, rotation_deg: {np.degrees(rotation):.3g}}},"
-            f" white: {{position_m: {sigma.varying_position_m:.3g},"
-            f" rotation_deg: {np.degrees(sigma.varying_rotation_rad):.3g}}}}}"
+            f" white: {{position_m: {changing * sigma.varying_position_m:.3g},"
+            f" rotation_deg: {changing * np.degrees(sigma.varying_rotation_rad):.3g}}}}}"
         )
 
     return _lines(cameras, _moving(cameras), said)

@@ -308,11 +308,13 @@ def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
     odd = {
         "size": max(0.0, abs(np.log(stature / STATURE_M)) - 0.08) / 0.09,
         "shape": float(np.nanmedian(np.abs(np.log(statures / stature)))) / 0.10,
-        "limp": float(np.nanmedian([_spread(length) for length, _ in lengths])) / 0.10,
     }
     odd["unposed"] = _unposed(scene) / 0.05
     odd |= body.posture()
     far_m = _distances(solved)
+    # The cameras that see a joint change, and with them the errors that they have in common.
+    limp = float(np.nanmedian([_spread(length) for length, _ in lengths]))
+    odd["limp"] = limp / (0.10 + 0.5 * _moved_by(scene.sigma[:, :2], far_m))
     keypoint_m = float(np.sqrt(np.mean(pixel_variance(scene)) * np.mean((far_m / scene.focal_px) ** 2)))
     odd |= body.motion(flight, stature, _moved_by(scene.sigma[:, 2:4], far_m), keypoint_m)
     odd |= _place(flight, scene, body, far_m)
