@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from ruamel.yaml import YAML
 
 from benchmarks.mistakes import (
     COCO_SWAPPED,
     FLIGHTS,
     Change,
     Described,
+    Flight,
+    Mistaken,
     Pose,
     clock,
     focal,
@@ -32,6 +37,7 @@ from benchmarks.mistakes import (
     turned,
     with_keypoints,
     with_remedy,
+    written,
 )
 from pipelines.geometry.poses import compose, invert
 from pipelines.reconstruction.doubts.diagnosis import CODES
@@ -201,3 +207,54 @@ def test_a_check_changes_no_session(tmp_path: Path) -> None:
     before = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*"))
     assert json.loads(succeeds("check", session, "--json"))["doubts"] == []
     assert sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*")) == before
+
+
+def as_made(flight: Described, folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """Write the flight with its own gimbals and logs, changed."""
+    made = flight.folder / "made"
+    manifest = YAML(typ="safe").load((made / "flight.yaml").read_text())
+    change(manifest)
+    shutil.copytree(made, folder, dirs_exist_ok=True)
+    return written(manifest, folder / "flight.yaml")
+
+
+def test_a_gimbal_in_other_axes_is_named_and_mended(flight: Described, tmp_path: Path) -> None:
+    def in_ned(manifest: dict[str, Any]) -> None:
+        for camera in manifest["cameras"].values():
+            camera["gimbal"]["axes"] = "ned"
+
+    manifest = as_made(flight, tmp_path / "gimbals", in_ned)
+    first = doubts_of(manifest)[0]
+    assert first["code"] == "gimbal"
+    assert first["remedy"].startswith("cameras.drone1.gimbal.axes: enu; ")
+    assert with_remedy(manifest, first["remedy"])
+    assert doubts_of(manifest) == []
+
+
+NOISY = Flight(
+    "noisy3",
+    3,
+    "[walk: {distance_m: 6, turn_deg: 30}]",
+    "{radius_m: 9, tilt_deg: 20, yaw_deg: 60}",
+    7,
+    carried=False,
+    actor=False,
+    map=False,
+    noise="{white: {position_m: 0.5, rotation_deg: 2}}",
+)
+
+
+def test_errors_far_larger_than_stated_are_noise(tmp_path: Path) -> None:
+    def stated_small(mistaken: Mistaken) -> None:
+        for camera in mistaken.manifest["cameras"].values():
+            camera["pose_noise"] = {"white": {"position_m": 0.05, "rotation_deg": 0.2}}
+
+    flight = Described(NOISY, tmp_path / NOISY.name)
+    assert doubts_of(mistaken(flight, None)) == []
+    manifest = mistaken(flight, stated_small)
+    first = doubts_of(manifest)[0]
+    assert first["code"] == "noise"
+    assert with_remedy(manifest, first["remedy"])
+    # Errors were stated a tenth of what they are; one of the factors 2, 4 and 8 is nearest.
+    stated = YAML(typ="safe").load(manifest.read_text())["cameras"]["drone1"]["pose_noise"]["white"]
+    assert 0.5 / 4 <= stated["position_m"] <= 0.5 * 1.6
