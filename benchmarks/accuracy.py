@@ -56,8 +56,8 @@ from pipelines.follow import Following
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import measure
 from pipelines.reconstruct import Settings, reconstruct
-from pipelines.reconstruction.doubts.diagnosis import Doubt
 from pipelines.reconstruction.refining import FoundClocks, find_clocks
+from pipelines.session.description import Doubt
 from pipelines.session.errors import DataError
 from pipelines.session.people import true_joints_at
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS

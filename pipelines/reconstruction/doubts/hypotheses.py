@@ -16,7 +16,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene, scene_of
-from pipelines.reconstruction.doubts.score import Base, Score, score, solve
+from pipelines.reconstruction.doubts.score import STATURE_M, Base, Score, score, solve, stature_m
 from pipelines.session.log_doubts import doubts_of_logs
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
@@ -27,6 +27,7 @@ _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _FLU_FROM_FRD = np.diag([1.0, -1, -1])
 _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
 _SPARE = 2.0  # hypotheses whose scores are farther from the best need no exact score
+_USUAL_STATURE = 0.17  # 95 % of grown-ups differ by less, logarithm
 _LONGEST_CLOCK_S = 3.0
 _LEAST_CLOCK_S = 0.05
 _LEAST_OCTAVES = 0.15
@@ -269,9 +270,10 @@ def of_logs(trial: Trial) -> Iterator[Hypothesis]:
     cameras = trial.flight.cameras
     logs = {camera.name: (camera.entry, camera.camera.trajectory) for camera in cameras}
     for doubt in doubts_of_logs(logs):
-        remedy = doubt.remedy
-        if doubt.code == "origin":
-            remedy = remedies.own_origins(cameras, trial.apart().position - trial.described.position)
+        remedy, scene = doubt.remedy, trial.apart() if doubt.code == "origin" else None
+        # Where the rays place the cameras, but not on top of each other with a dwarf between them.
+        if scene is not None and abs(np.log(stature_m(solve(scene).joints) / STATURE_M)) < _USUAL_STATURE:
+            remedy = remedies.own_origins(cameras, scene.position - trial.described.position)
         yield Hypothesis(doubt.code, tuple(doubt.cameras), doubt.what, remedy, 0.0, None)
 
 
