@@ -430,13 +430,6 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
         ),
         hypothesis(
             "axes",
-            "the body's axes are FRD (forward, right, down)",
-            remedies.mount(cameras, trial.moving, lambda mount: _FLU_FROM_FRD @ mount),
-            body @ _FLU_FROM_FRD @ mounts,
-            place,
-        ),
-        hypothesis(
-            "axes",
             "the positions count z downwards, the attitudes do not",
             remedies.pose(cameras, "z: down"),
             camera,
@@ -486,6 +479,15 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
             place,
         ),
     )
+    if any(cameras[index].mount is not None for index in trial.moving):
+        # Of poses of the camera itself, it would be a roll by 180 deg.
+        yield hypothesis(
+            "axes",
+            "the body's axes are FRD (forward, right, down)",
+            remedies.mount(cameras, trial.moving, lambda mount: _FLU_FROM_FRD @ mount),
+            body @ _FLU_FROM_FRD @ mounts,
+            place,
+        )
     for attitudes, carried in ((camera, np.eye(3)), (body, mounts)):
         quaternion = quaternion_from_matrix(np.where(np.isfinite(attitudes), attitudes, np.eye(3)))
         for roll, order in ((-1, "wxyz"), (1, "xyzw")):
