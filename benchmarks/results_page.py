@@ -134,8 +134,8 @@ def _head(numbers: Numbers) -> list[str]:
     return [
         "# Results",
         "",
-        "Tables and figures of this page are written by one command, from a clean clone; the sections on real "
-        "pictures and on the corpus have their own:",
+        "One command writes tables and figures, from a clean clone; the sections on real pictures and on the",
+        "corpus have their own:",
         "",
         "    mocap models fetch blazepose",
         "    python -m benchmarks.results      # or: make results",
@@ -149,8 +149,8 @@ def _head(numbers: Numbers) -> list[str]:
         ),
         *_words(
             "**Everything here is simulated**, except for the section on real pictures: body, flights, logs "
-            "and pictures are made by `mocap simulate`. The detector that looks at the pictures of the sample "
-            "flight and of filmed planners is the real one."
+            "and pictures are made by `mocap simulate`. The detector that looks at the pictures of the "
+            "sample flight and of filmed planners is the real one."
         ),
     ]
 
@@ -168,7 +168,8 @@ def _poses(numbers: Numbers) -> list[str]:
         "",
         *_words(
             "`sample_data/mound_walk`: two drones, 12 s, BlazePose on the rendered pictures, method "
-            "`robust` but for the row that says `mocap reconstruct`. The poses' errors are one draw of those that `sample_data/README.md` states."
+            "`robust` but for the row that says `mocap reconstruct`. The poses' errors are one draw of those "
+            "that `sample_data/README.md` states."
         ),
         *_code([*commands, POSES.compare]),
         *markdown_table(header, rows),
