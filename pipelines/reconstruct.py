@@ -92,7 +92,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-RECONSTRUCT = Stage("reconstruct", revision=17)
+RECONSTRUCT = Stage("reconstruct", revision=18)
 
 _LONGEST_FILL_S = 10.0
 
