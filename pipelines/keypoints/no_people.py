@@ -39,7 +39,7 @@ _BETWEEN = 8  # points on the way from another camera to a place
 _SLOPE = 0.3  # by which the ground may rise from where somebody went
 _HIP_M = 0.95  # above the ground, of a standing actor
 _BESIDE_M = 1.0  # error of the ground under a person: posture and log
-_AT_ONCE = 20_000  # detections whose places are in memory
+_AT_ONCE = 1_000  # detections whose places are in memory: 100 MB
 
 
 class Scene(NamedTuple):

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 _SEARCHED = 300  # times of the skeleton that the search for clock offsets uses, at most
 _MOST_SHIFTS = 6  # of the clocks; offsets of 0.2 s took one to five
 _UNDETERMINED = 0.5  # a clock is determined if its posterior sigma is below this share of its prior sigma
+_FEWEST_GUIDES = 6
+_OF_LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # ends of the names of limbs' joints
 _HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid as a bone
 
 
@@ -65,6 +67,16 @@ class RobustFlight:
     pixel_sigma: float  # px, of a good keypoint
     between: Interpolation  # rules for interpolating between logged poses
     threads: int  # see `triangulate`
+    only_guides: bool = False  # other joints are not refined
+
+    @property
+    def guides(self) -> Bool:
+        """Joints [J] that determine cameras and clocks: those of limbs, if enough of them have names.
+
+        A detector places faces, hands and feet by the side that it sees: wrongly, and always in the same way.
+        """
+        limbs = np.array([name.endswith(_OF_LIMBS) for name in self.observations.joints])
+        return limbs if limbs.sum() >= _FEWEST_GUIDES else np.ones_like(limbs)
 
     @property
     def t_s(self) -> Float:
@@ -119,6 +131,8 @@ class FoundClocks:
 def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
     """Find the clock offsets of a flight: by the refinement, or by its search alone where that is refused.
 
+    Limbs are enough for that: fingers and faces move with them, and would take most of the time.
+
     A clock whose offset nobody stated (False in `stated` [C]) is held unless the search finds that views
     agree clearly better elsewhere. Lasting keypoint errors can pull a right clock by many standard
     deviations: by 40 ms in a real recording with synchronised cameras.
@@ -128,7 +142,8 @@ def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
     held = FoundClocks(searched_s, prior_s, prior_s)
     if not prior_s.any():
         return held
-    refined, offset_s = _settle_clocks(replace(flight, clock_sigma_s=prior_s), searched_s)
+    limbs = replace(flight, clock_sigma_s=prior_s, only_guides=True)
+    refined, offset_s = _settle_clocks(limbs, searched_s)
     if refined.fallback is not None:
         return held
     return FoundClocks(offset_s, refined.clock_sigma_s, prior_s)
@@ -167,13 +182,17 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
     """Run the refinement with these clock offsets, starting from these points."""
     _, people, joints, _ = flight.observations.confidence.shape
     cameras = shifted(flight.cameras, offset_s)
+    start = started.points.reshape(-1, people, joints, 3)
+    if flight.only_guides:
+        start = np.where(flight.guides[:, None], start, np.nan)
     return refine(
         flight.t_s,
         [_sighting(flight, c, camera) for c, camera in enumerate(cameras)],
-        started.points.reshape(-1, people * joints, 3),
+        start.reshape(-1, people * joints, 3),
         rigid_pairs(flight.observations.joints, people),
         flight.prior,
         flight.clock_sigma_s,
+        guides=np.tile(flight.guides, people),
         contested=not flight.measured,
         threads=flight.threads,
     )

@@ -26,15 +26,13 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import ROTATION, PoseErrors, Process
 from pipelines.reconstruction.refinement.elimination import Eliminated, eliminate, moments, step
 from pipelines.reconstruction.refinement.kernels import State
-from pipelines.reconstruction.refinement.problem import Knowledge, Problem, lay_out
+from pipelines.reconstruction.refinement.problem import REMEMBERED, Knowledge, Problem, lay_out
 from pipelines.reconstruction.refinement.sweeps import Moments
 from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
 
 BOUND = 3.5
 """Residual, in standard deviations, beyond which an image point's weight falls: one good view in 450."""
 
-REMEMBERED = 1.5
-"""Memory (correlation length) of keypoint errors above which it is taken into account."""
 
 _CONVERGED_M = 2e-4
 _BOUNDS = (20.0, 8.0, BOUND)

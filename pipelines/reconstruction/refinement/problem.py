@@ -14,6 +14,10 @@ CLOCK = 9
 """Index of the clock offset among a picture's ten numbers (see `kernels`)."""
 
 
+REMEMBERED = 1.5
+"""Memory (correlation length) of keypoint errors above which it is taken into account."""
+
+
 @dataclass(frozen=True)
 class Pictures:
     """G pictures of C cameras, sorted by `first`, then camera.
@@ -122,6 +126,8 @@ class Problem:
     """Covariances [L, 6, 6] of logged white pose errors: world shift (m), camera rotation vector (rad)."""
     threads: int = 1
     """Largest number of threads; the results do not depend on it."""
+    guides: Bool | None = None
+    """Joints [J] whose keypoints determine the cameras where keypoint errors last; None for all of them."""
 
     @property
     def joints(self) -> int:
@@ -169,13 +175,22 @@ class Sighting:
         return ~np.isnan(self.position[:, 0]) & ~np.isnan(self.rays[..., 0]).all(axis=1)
 
 
-def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64, *, threads: int = 1) -> Problem:
+def build(
+    t_s: Float,
+    sightings: Sequence[Sighting],
+    bones: Int64,
+    *,
+    threads: int = 1,
+    guides: Bool | None = None,
+) -> Problem:
     """Build the problem: sort pictures by the skeleton's times around them; leave out those near none.
 
     Args:
         t_s: [T] strictly increasing times of the skeleton, at least three.
         sightings: keypoints and poses of each camera.
         bones: [B, 2] joints with a nearly constant distance.
+        threads: see `Problem`.
+        guides: see `Problem`.
     """
     parts, covariances, logged = [], [np.empty((0, 6, 6))], 0
     for camera, sighting in enumerate(sightings):
@@ -188,7 +203,7 @@ def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64, *, threads: i
     pictures = Pictures(*(np.ascontiguousarray(column[order]) for column in columns))
     knots = max(int(np.ceil((t_s[-1] - t_s[0]) / KNOT_S)) + 1, 2)
     knot_t_s = np.linspace(t_s[0], t_s[-1], knots)
-    return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances), threads)
+    return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances), threads, guides)
 
 
 def _pictures(t_s: Float, sighting: Sighting, camera: int, logged: int) -> tuple[NDArray[np.generic], ...]:

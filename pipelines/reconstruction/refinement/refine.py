@@ -25,7 +25,6 @@ from pipelines.reconstruction.refinement.elimination import (
 )
 from pipelines.reconstruction.refinement.estimate import (
     BOUND,
-    REMEMBERED,
     evidence,
     initial_state,
     learn,
@@ -34,7 +33,14 @@ from pipelines.reconstruction.refinement.estimate import (
     solve,
 )
 from pipelines.reconstruction.refinement.kernels import State, turned
-from pipelines.reconstruction.refinement.problem import Knowledge, Pictures, Problem, Sighting, build
+from pipelines.reconstruction.refinement.problem import (
+    REMEMBERED,
+    Knowledge,
+    Pictures,
+    Problem,
+    Sighting,
+    build,
+)
 from pipelines.reconstruction.refinement.system import System, misfit
 
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
@@ -113,6 +119,7 @@ def refine(
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
     *,
+    guides: Bool | None = None,
     contested: bool = True,
     threads: int = 1,
 ) -> Refined:
@@ -125,6 +132,7 @@ def refine(
         bones: [B, 2] pairs of joints with a nearly constant distance; without any, the first two joints.
         prior: prior of each camera's pose errors; None without stated noise.
         clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
+        guides: [J] joints whose keypoints determine the cameras where keypoint errors last; None for all.
         contested: False if the prior was measured, and no other level of pose errors competes with it.
         threads: at most two are used, one for each half of the flight; the result does not depend on it.
     """
@@ -134,7 +142,8 @@ def refine(
     sightings = [_take(sighting, part) for sighting in sightings]
     bones = _renumbered(bones, part)
     filled = _without_gaps(t_s, start[:, part])
-    problem = build(t_s, sightings, bones, threads=threads)
+    guides = None if guides is None else guides[part]
+    problem = build(t_s, sightings, bones, threads=threads, guides=guides)
     refused = None
     try:
         if prior is not None and not contested:
@@ -344,7 +353,7 @@ def _priors(
         LinAlgError: none of them explains the pictures.
     """
     chosen = _stretches(len(flight.t_s))
-    problem = build(flight.t_s[chosen], sightings, flight.bones, threads=flight.threads)
+    problem = build(flight.t_s[chosen], sightings, flight.bones, threads=flight.threads, guides=flight.guides)
     guess, image, disagreement_m, range_m = _first_guess(problem, start[chosen])
     stated_m = 0.0 if prior is None else float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     spread = _spread_of(len(sightings))
@@ -414,7 +423,7 @@ def _measured_prior(
 ) -> Iterator[_Prior]:
     """Yield the prior with measured pose errors; motion, bones and keypoint noise are learned beside them."""
     chosen = _stretches(len(flight.t_s))
-    problem = build(flight.t_s[chosen], sightings, flight.bones, threads=flight.threads)
+    problem = build(flight.t_s[chosen], sightings, flight.bones, threads=flight.threads, guides=flight.guides)
     _, _, disagreement_m, range_m = _first_guess(problem, start[chosen])
     unlearned = _unlearned(problem, start[chosen], tuple(prior), clock_sigma_s)
     state = initial_state(problem, unlearned, start[chosen])
