@@ -22,8 +22,7 @@ To save time, methods share the clocks that the first of them found, and mistake
 alone whose time is taken: errors do not depend on either. Two processes, each flight in one.
 
 Results are kept in build/accuracy by the hash of the code and of the flight's files, so an interrupted run
-goes on, and a changed program measures anew. `--reference` stores the results of `robust`, to which later
-versions are compared, in benchmarks/corpus/robust.json. `--write` writes docs/results.md.
+goes on, and a changed program measures anew. `--write` writes docs/results.md.
 """
 
 from __future__ import annotations
@@ -31,6 +30,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import sys
 import tempfile
 import time
@@ -66,7 +66,6 @@ from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
 
 ROOT = Path(__file__).parents[1]
 WORK = ROOT / "build" / "accuracy"
-REFERENCE = CORPUS / "robust.json"
 
 FLOOR = "floor"
 METHODS: dict[str, dict[str, Any]] = {
@@ -125,23 +124,21 @@ def main() -> None:
     parser.add_argument("--given", nargs="+", choices=GIVEN, default=list(GIVEN))
     parser.add_argument("--draws", type=int, default=DRAWS)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--reference", action="store_true", help="store the results of robust to compare to")
     parser.add_argument("--write", action="store_true", help="write the section of docs/results.md")
     arguments = parser.parse_args()
     chosen = _chosen(arguments.flights, arguments.detector)
-    methods = ["robust"] if arguments.reference else arguments.methods or list(ALWAYS)
-    parts = [name for name in METHODS if not arguments.reference and not arguments.methods]
+    methods = arguments.methods or list(ALWAYS)
+    parts = [name for name in METHODS if not arguments.methods]
     found = measured(
         chosen, methods, parts, arguments.detector, arguments.given, arguments.draws, arguments.processes
     )
-    if arguments.reference:
-        _store_reference(found)
     lines = report(chosen, methods, arguments.detector, found)
     if parts:
         lines += parts_table(chosen, parts, arguments.detector, found)
     print("\n".join(lines))
     if arguments.write:
-        keep_numbers("accuracy", {arguments.detector: lines})
+        command = shlex.join(["python", "-m", "benchmarks.accuracy", *sys.argv[1:]])
+        keep_numbers("accuracy", {arguments.detector: [f"    {command}", "", *lines]})
 
 
 def _chosen(names: Sequence[str], detector: str) -> list[Flight]:
@@ -370,32 +367,6 @@ def _fallback(metrics: Mapping[str, Any]) -> str | None:
     return "; ".join(reason for reason in reasons if reason) or None
 
 
-# --- the reference -------------------------------------------------------------------------------------
-
-
-def _store_reference(found: Mapping[Case, Outcome]) -> None:
-    stored = _reference()
-    for case, outcome in found.items():
-        stored[_reference_key(case)] = [
-            None if value is None else round(value, 3) for value in (outcome.mpjpe_mm, outcome.root_mpjpe_mm)
-        ]
-    lines = ",\n".join(f"{json.dumps(key)}: {json.dumps(stored[key])}" for key in sorted(stored))
-    REFERENCE.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
-
-
-def _reference_key(case: Case) -> str:
-    return f"{case.detector} {_name_of(case)}"
-
-
-@cache
-def _reference() -> dict[str, list[float | None]]:
-    """Read the errors (mm, absolute and root-relative) of `robust` as it was, by case."""
-    stored: dict[str, list[float | None]] = {}
-    if REFERENCE.is_file():
-        stored = json.loads(REFERENCE.read_text(encoding="utf-8"))
-    return stored
-
-
 # --- the tables ----------------------------------------------------------------------------------------
 
 
@@ -508,7 +479,7 @@ def criteria(
         of = {flight: _of(flight, method, detector, given, found) for flight in own}
         lines += [
             f"- {_VERDICT[passed]} {half}: {said}"
-            for said, passed in [*_against_robust(of), *_motion(of), *_covariances(of)]
+            for said, passed in [*_against_robust(of, found), *_motion(of), *_covariances(of)]
         ]
     sample = [flight for flight in chosen if flight.name == SAMPLE.name]
     if sample:
@@ -529,18 +500,17 @@ _Outcomes = Mapping[Flight, Sequence[tuple[Case, Outcome]]]
 _Verdict = tuple[str, bool]
 
 
-def _against_robust(of: _Outcomes) -> Iterator[_Verdict]:
-    """Compare with the stored results of `robust`, on the same draws."""
-    names = (("mpjpe_mm", "MPJPE", 0.55), ("root_mpjpe_mm", "root-relative", 0.85))
-    for place, (name, title, wanted) in enumerate(names):
+def _against_robust(of: _Outcomes, found: Mapping[Case, Outcome]) -> Iterator[_Verdict]:
+    """Compare with `robust` on the same draws."""
+    for name, title, wanted in (("mpjpe_mm", "MPJPE", 0.55), ("root_mpjpe_mm", "root-relative", 0.85)):
         ratios: dict[str, float] = {}
         for flight, outcomes in of.items():
             pairs = []
             for case, outcome in outcomes:
-                robust = _reference().get(_reference_key(replace(case, method="robust")))
+                robust = getattr(found.get(replace(case, method="robust")), name, None)
                 mine = getattr(outcome, name)
-                if robust is not None and robust[place] is not None and mine is not None:
-                    pairs.append((mine, robust[place]))
+                if robust is not None and mine is not None:
+                    pairs.append((mine, robust))
             if pairs:
                 ratios[flight.name] = float(np.mean([p[0] for p in pairs]) / np.mean([p[1] for p in pairs]))
         if not ratios:

@@ -309,7 +309,7 @@ def _accuracy(numbers: Numbers) -> list[str]:
         ),
     ]
     for detector, own in numbers["accuracy"].items():
-        lines += [*_code([f"python -m benchmarks.accuracy --detector {detector} --write"]), *own, ""]
+        lines += [f"Detector `{detector}`:", "", *own, ""]
     return lines
 
 
