@@ -279,8 +279,8 @@ def _gimbals(numbers: Numbers) -> list[str]:
         ),
         *_code(
             [
-                "python -m benchmarks.gimbals FOLDER --write           # tuned on",
-                "python -m benchmarks.gimbals FOLDER --write --kept    # kept aside",
+                "python -m benchmarks.gimbals FOLDER --methods robust auto --write           # tuned on",
+                "python -m benchmarks.gimbals FOLDER --methods robust auto --write --kept    # kept aside",
             ]
         ),
         *_words(
