@@ -401,9 +401,7 @@ def _attempt(
     description, refines = flight.description, settings.method in ("refined", "auto")
     clocks: FoundClocks | None = None
     clock_sigma_s, stated = load_clock_sigma(description, cameras)
-    if (
-        settings.method == "refined"
-    ):  # finds clocks itself, those of which the manifest says that they are off
+    if settings.method == "refined":  # it finds the clocks of which the manifest says that they are off
         clock_sigma_s = np.where(stated, clock_sigma_s, 0.0)
     elif clock_sigma_s.any():
         seen, views, result, _ = _triangulated(flight, cameras, settings, workers)
