@@ -31,6 +31,7 @@ from pipelines.drafting.found import (
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import match
 from pipelines.formats.common.rows import median_step_ns
+from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.subtitles import read_subtitles
 from pipelines.formats.logs.messages import kind_of, samples
 from pipelines.formats.logs.presets import namespaces, parts_of
@@ -56,6 +57,14 @@ from pipelines.session.storage import as_data_error
 from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat
 
 _FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
+_KEYS: dict[str, Literal["dji", "ulog", "ardupilot"]] = {
+    "dji": "dji",
+    "dji_record": "dji",
+    "ulog": "ulog",
+    "ardupilot": "ardupilot",
+}
+"""The key in a manifest for each format of a drone's own log."""
+
 _TRANSFORMS_ASKED = 2000  # messages of a topic that are read for the names of its frames
 
 
@@ -238,11 +247,11 @@ def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
     except DataError:  # if only heights are missing, reading with a stated height works
         telemetry = format_.read_telemetry(head.path, TelemetryChoice(altitude=0.0))
     track = telemetry.position
-    keys: tuple[Literal["dji"], Literal["ulog"], Literal["ardupilot"]] = ("dji", "ulog", "ardupilot")
-    key = next((key for key in keys if key == head.format), None)
+    key = _KEYS.get(head.format)
     if key is None:
         return None
     start_ns = None
+    films = recordings_of(head.path) if head.format == "dji_record" else []
     if head.path.suffix.lower() == ".srt":
         subtitles = read_subtitles(head.path)
         start_ns = subtitles.start_ns() if subtitles.are_slow else None
@@ -260,6 +269,7 @@ def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
         gimbal=telemetry.gimbal is not None,
         height=track.height,
         video_start_ns=start_ns,
+        films=tuple(Span(*film) for film in films),
     )
 
 

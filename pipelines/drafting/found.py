@@ -144,6 +144,7 @@ class DroneLog(Found):
     gimbal: bool
     height: Height = "unknown"  # zero level of its heights; "stated" if it has no heights
     video_start_ns: int | None = None  # of the video beside it, if its own times are too coarse for frames
+    films: tuple[Span, ...] = ()  # when it says that the camera recorded videos
 
 
 @dataclass(frozen=True)

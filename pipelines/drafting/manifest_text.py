@@ -81,6 +81,7 @@ def one_line(text: str) -> str:
 
 ASSUMED_FPS = 30
 _BRIDGED_NS = 500_000_000  # ingest's default for the longest gap between two poses
+_LENGTHS_DIFFER_NS = 2_000_000_000  # of a video and of its recording by a flight record
 _MOST_OTHERS = 8  # candidates that are listed after the chosen one
 
 
@@ -173,9 +174,9 @@ class CameraText:
         if self._camera.videos and self._film is None:
             return []  # the log's own stamps
         if self._coarse_start is not None:
-            self._assume("frame_times", "start by the subtitles' clock, to a second")
-            remark = "assumed: by the subtitles' clock, whole seconds of local time taken as UTC"
-            return [self._entry("frame_times", {"start": self._coarse_start}, remark)]
+            coarse, source = self._coarse_start
+            self._assume("frame_times", f"start {source}, to a second")
+            return [self._entry("frame_times", {"start": coarse}, f"assumed: {source}")]
         start, reason = self._start()
         if self._film:
             if start is None:
@@ -194,12 +195,22 @@ class CameraText:
         return [self._entry("frame_times", {"start": start, **fps}, remark)]
 
     @property
-    def _coarse_start(self) -> Decimal | None:
-        """The video's start in seconds, by subtitles that show whole seconds."""
+    def _coarse_start(self) -> tuple[Decimal, str] | None:
+        """The video's start in seconds with its source, by a drone's log that knows it to a second.
+
+        That are subtitles with whole seconds, or a flight record with one video of about this length.
+        """
         found = self._camera.poses.taken.found if self._camera.poses else None
-        if not isinstance(found, DroneLog) or found.video_start_ns is None or not self._film:
+        if not isinstance(found, DroneLog) or not self._film:
             return None
-        return (Decimal(found.video_start_ns) / 10**9).normalize()
+        start_ns, source = found.video_start_ns, "by the subtitles' clock, local time taken as UTC"
+        if start_ns is None:
+            length_ns = self._film.length_ns
+            alike = [f for f in found.films if abs(f.last_ns - f.first_ns - length_ns) < _LENGTHS_DIFFER_NS]
+            if len(alike) != 1:
+                return None
+            start_ns, source = alike[0].first_ns, "when the flight record says that a video began"
+        return (Decimal(start_ns) / 10**9).normalize(), source
 
     def _start(self) -> tuple[Decimal | None, str]:
         """Assume the first frame's time in seconds: the start of poses and truth; None for 0."""
@@ -226,7 +237,7 @@ class CameraText:
             return []
         if self._coarse_start is not None:
             settings = {"offset_s": 0, "sigma_s": 1}
-            return [entry("clock", settings, "the subtitles' clock shows whole seconds")]
+            return [entry("clock", settings, "the start is known to a second")]
         return ["# clock: {offset_s: 0, sigma_s: 0.2}  # if its clock is off against the poses', or unsure"]
 
     # --- poses -----------------------------------------------------------------------------------------

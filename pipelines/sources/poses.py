@@ -35,7 +35,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan, PoseSource
 from pipelines.session.manifest import Log as LogSource
 from pipelines.session.records import Trajectory
-from pipelines.session.registries import FORMATS, TrajectoryFormat, recognise
+from pipelines.session.registries import FORMATS, Format, TrajectoryFormat, recognise
 from pipelines.session.telemetry import (
     AttitudeTrack,
     PositionTrack,
@@ -316,8 +316,8 @@ class FlightPoses:
             if pose.log:
                 self._telemetry[key] = self._logged_telemetry(pose, choice)
             else:
-                reader = FORMATS.get(_kind(pose))
                 path = self._one_file(stated)
+                reader = _reader(_kind(pose), path)
                 if not isinstance(reader, TelemetryFormat):
                     raise DataError(path, f"the format {_kind(pose)} reads no telemetry")
                 self._telemetry[key] = reader.read_telemetry(path, choice)
@@ -586,6 +586,14 @@ class FlightPoses:
 
 def _kind(pose: PoseSource) -> str:
     return next(kind for kind in ("dji", "ulog", "ardupilot") if getattr(pose, kind) is not None)
+
+
+def _reader(kind: str, path: Path) -> Format:
+    """Return the format of a drone's own log; DJI's comes as subtitles or as a flight record."""
+    several = ("dji_record", "dji_binary") if kind == "dji" else ()
+    return next(
+        (found for name in several if (found := FORMATS.get(name)).recognises(path)), FORMATS.get(kind)
+    )
 
 
 def _stated(pose: PoseSource) -> str:

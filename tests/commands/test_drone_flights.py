@@ -27,6 +27,7 @@ from tests.synthetic.drone_logs import (
     drone_of,
     ulog_rows,
     write_dataflash,
+    write_record,
     write_srt,
     write_ulog,
 )
@@ -99,6 +100,11 @@ def _srt(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"dji": f"{name}.SRT", "altitude": "absolute"}
 
 
+def _record(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_record(folder / f"{name}.csv", truth)
+    return {"dji": f"{name}.csv", "altitude": "absolute"}
+
+
 def _ulog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_ulog(folder / f"{name}.ulg", ulog_rows(truth))
     return {"ulog": f"{name}.ulg"}
@@ -153,6 +159,7 @@ def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
         # ms (at 1 m/s), and the origin to 1e-7 deg (11 mm).
         (_dataflash, 0.013, 0.1),
         (_osdk, 1e-4, 1e-4),
+        (_record, 1e-3, 1e-4),  # 1e-9 deg are 0.1 mm
     ],
 )
 def test_drones_that_log_body_and_gimbal(tmp_path: Path, write: Any, metres: float, degrees: float) -> None:

@@ -137,6 +137,26 @@ def _timecode(milliseconds: int) -> str:
     return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d},{rest:03d}"
 
 
+def write_record(path: Path, truth: DroneTruth) -> Path:
+    """Write a flight record as Flight Reader exports it, with more decimals."""
+    names = [
+        *("CUSTOM.date [utc]", "CUSTOM.updateTime [utc]", "OSD.flyTime [s]", "OSD.latitude", "OSD.longitude"),
+        *("OSD.height [ft]", "OSD.altitude [ft]", "OSD.pitch", "OSD.roll", "OSD.yaw"),
+        *("GIMBAL.pitch", "GIMBAL.roll", "GIMBAL.yaw"),
+    ]
+    lines = ["sep=,", ",".join(names)]
+    for row, stamp_ns in enumerate(truth.t_ns.tolist()):
+        shown = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=stamp_ns // 1000)
+        heights = truth.enu[row, 2] / 0.3048, truth.altitude_m[row] / 0.3048
+        angles = [part[row, [1, 2, 0]].tolist() for part in (truth.body_ypr_deg, truth.gimbal_ypr_deg)]
+        numbers = [truth.latitude_deg[row], truth.longitude_deg[row], *heights, *angles[0], *angles[1]]
+        since_s = (stamp_ns - int(truth.t_ns[0])) / 1e9
+        cells = [f"{shown:%Y-%m-%d}", f"{shown:%H:%M:%S.%f}", f"{since_s:.1f}"]
+        lines.append(",".join([*cells, *(f"{number:.9f}" for number in numbers)]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8-sig")
+    return path
+
+
 # --- DataFlash -----------------------------------------------------------------------------------------
 
 DATAFLASH = {

@@ -14,27 +14,19 @@ Angles are those of an FRD body and gimbal in NED (docs/drones.md).
 """
 
 import re
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.formats.common.files import read_head
-from pipelines.formats.common.rows import describe_times, longest_rising
+from pipelines.formats.common.rows import describe_times
+from pipelines.formats.drone_logs.dji_rows import angles_track, any_finite, choose_height, range_of
 from pipelines.formats.drone_logs.subtitles import Subtitles, parse_subtitles, read_subtitles
-from pipelines.formats.drone_logs.telemetry_rows import (
-    attitude_track,
-    between_refreshed_angles,
-    between_repeats,
-    of_angles,
-    position_track,
-    turned_as_stated,
-    whatever_from,
-)
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.session.errors import DataError
-from pipelines.session.telemetry import AttitudeTrack, Height, Telemetry, TelemetryChoice
+from pipelines.formats.drone_logs.telemetry_rows import between_repeats, position_track
+from pipelines.geometry.arrays import Float
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _BRACKETS = re.compile(r"\[([^\[\]\n]{1,300})\]")
@@ -56,7 +48,6 @@ _COLUMNS = (
     *("gb_yaw", "gb_pitch", "gb_roll", "drone_yaw", "drone_pitch", "drone_roll"),
 )
 _HEIGHTS = {"rel_alt": "relative", "abs_alt": "absolute"}
-_HIGHEST_M = 500  # above the take-off: the largest height that DJI's drones reach
 
 
 class DjiSrtFormat:
@@ -85,18 +76,19 @@ class DjiSrtFormat:
             "clock": _clock_name(subtitles),
         }
         for name in ("latitude", "longitude"):
-            facts[f"{name}_deg"] = _range(columns[name], 7)
+            facts[f"{name}_deg"] = range_of(columns[name], 7)
         heights = {
             "height_above_take_off_m": "relative",
             "height_absolute_m": "absolute",
             "height_m": "altitude",
         }
-        facts |= {label: _range(columns[name], 3) for label, name in heights.items() if _any(columns[name])}
+        named = {label: name for label, name in heights.items() if any_finite(columns[name])}
+        facts |= {label: range_of(columns[name], 3) for label, name in named.items()}
         for label, part in (("gimbal", "gb"), ("body", "drone")):
             angles = _angles(columns, part)
-            if _any(angles):
+            if any_finite(angles):
                 facts[f"{label}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
-                facts[f"{label}_pitch_deg"] = _range(angles[:, 1], 2)
+                facts[f"{label}_pitch_deg"] = range_of(angles[:, 1], 2)
         if not any(name.endswith("_angles") for name in facts):
             facts["orientation"] = "none: state a gimbal in the manifest"
         return facts
@@ -112,7 +104,7 @@ class DjiSrtFormat:
         subtitles = read_subtitles(path)
         columns = _columns(subtitles.texts)
         t_ns, timed = subtitles.times()
-        height, which, note_on_height = _height(path, columns, choice)
+        height, which, note_on_height = choose_height(path, columns, choice)
         dropped: dict[str, int] = {}
         track = position_track(
             path,
@@ -127,8 +119,8 @@ class DjiSrtFormat:
         values, moved = between_repeats(track.t_ns, track.values)
         return Telemetry(
             position=replace(track, values=values),
-            body=_attitude("F.PRY", t_ns[timed], _angles(columns, "drone")[timed], dropped),
-            gimbal=_attitude("its gimbal angles", t_ns[timed], _angles(columns, "gb")[timed], dropped),
+            body=angles_track("F.PRY", t_ns[timed], _angles(columns, "drone")[timed], dropped),
+            gimbal=angles_track("its gimbal angles", t_ns[timed], _angles(columns, "gb")[timed], dropped),
             clock=_clock_name(subtitles),
             notes=tuple(f"{path}: {note}" for note in _notes(subtitles, note_on_height, moved, len(values))),
             dropped=dropped,
@@ -167,75 +159,12 @@ def _fields(text: str) -> dict[str, float]:
     return fields
 
 
-def _height(path: Path, columns: Mapping[str, Float], choice: TelemetryChoice) -> tuple[Float, Height, str]:
-    """Choose the height of each position; return it with its reference and a note about the choice.
-
-    An `altitude` without a reference is used for each of the two heights that has no field of its own.
-    """
-    stated, unnamed = choice.altitude, columns["altitude"]
-    if isinstance(stated, int | float):
-        throughout = np.full(len(columns["latitude"]), float(stated))
-        return throughout, "stated", "its height is the one stated, throughout"
-    both = ("relative", "absolute")
-    named = {name: columns[name] for name in both if _any(columns[name])}
-    there = (dict.fromkeys(both, unnamed) if _any(unnamed) else {}) | named
-    if not there:
-        raise DataError(
-            path,
-            "holds no height",
-            "state it, in metres above the take-off: pose: {dji: ..., altitude: 30}",
-        )
-    if stated is not None and stated not in there:
-        raise DataError(
-            path, f"holds no {stated} height", f"write altitude: {next(iter(there))}, or the metres"
-        )
-    if stated is None and not named:
-        highest_m = float(np.nanmax(unnamed))
-        if highest_m > _HIGHEST_M:
-            problem = f"its altitude of up to {highest_m:.0f} m is no height above the take-off"
-            return unnamed, "unknown", f"{problem}: taken as absolute, from a barometer"
-        problem = "its altitude does not say what it counts from"
-        return unnamed, "take-off", f"{problem}: taken from the take-off (else write altitude: absolute)"
-    name = stated or ("relative" if "relative" in named else "absolute")
-    if name == "relative":
-        return there[name], "take-off", "heights count from the take-off"
-    return there[name], "unknown", "heights are absolute, from a barometer: drones differ by many metres"
-
-
 def _angles(columns: Mapping[str, Float], part: str) -> Float:
     """Return yaw, pitch, roll [B, 3] in degrees; a missing roll is 0."""
     yaw, pitch, roll = (columns[f"{part}_{angle}"] for angle in ("yaw", "pitch", "roll"))
     return np.stack(
         [yaw, pitch, np.where(np.isnan(roll), np.where(np.isnan(yaw), np.nan, 0.0), roll)], axis=1
     )
-
-
-def _any(values: Float) -> bool:
-    return bool(np.isfinite(values).any())
-
-
-def _range(values: Float, decimals: int) -> list[float]:
-    finite = values[np.isfinite(values)]
-    return [round(float(v), decimals) for v in (finite.min(), finite.max())] if len(finite) else []
-
-
-def _attitude(
-    name: str, t_ns: Int64, yaw_pitch_roll_deg: Float, dropped: MutableMapping[str, int]
-) -> AttitudeTrack | None:
-    """Build the attitude from angles [B, 3]; None if there are none."""
-    stated = np.isfinite(yaw_pitch_roll_deg).all(axis=1)
-    if not stated.any():
-        return None
-    if missing := int(np.count_nonzero(~stated)):
-        dropped[f"subtitles without {name}"] = missing
-    rows = np.flatnonzero(stated)
-    rows = rows[longest_rising(t_ns[rows])]
-    if late := int(np.count_nonzero(stated)) - len(rows):
-        dropped[f"{name} out of order"] = late
-    continuous = np.degrees(np.unwrap(np.radians(yaw_pitch_roll_deg[rows]), axis=0))
-    between = between_refreshed_angles(t_ns[rows], continuous)
-    as_logged = whatever_from(of_angles(between))
-    return attitude_track(name, t_ns[rows], turned_as_stated(between), dropped, stated=as_logged)
 
 
 def _clock_name(subtitles: Subtitles) -> str:

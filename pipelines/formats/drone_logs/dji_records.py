@@ -1,0 +1,447 @@
+"""DJI's flight records: as the CSV that log services export, and as the binary that a phone keeps.
+
+The record is the only place where most consumer drones log their gimbal's angles. The CSV has the columns
+that the exporting service chose, in feet or metres, often in both. Known are those of Airdata
+(`time(millisecond),datetime(utc),latitude,...,height_above_takeoff(feet),...,gimbal_pitch(degrees)`), of
+Flight Reader and CsvView (`CUSTOM.updateTime [local],OSD.flyTime [s],OSD.latitude,...,GIMBAL.pitch`) and of
+PhantomHelp's log viewer (`Time(seconds),...,Altitude(feet),Altitude(meters),...,Pitch,Roll,Yaw`).
+
+Angles are those of an FRD body and gimbal in NED (docs/drones.md).
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.common.files import first_bytes, read_head
+from pipelines.formats.common.rows import describe_times
+from pipelines.formats.drone_logs.dji_rows import angles_track, any_finite, choose_height, range_of
+from pipelines.formats.drone_logs.telemetry_rows import between_repeats, position_track
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.session.errors import DataError
+from pipelines.session.storage import as_data_error, refuse_special
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
+
+_METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "metres": 1.0, "ft": 0.3048, "feet": 0.3048}
+_SECONDS = {"millisecond": 1e-3, "ms": 1e-3, "seconds": 1.0, "s": 1.0}
+_LENGTHS = {  # the preferred name first
+    "relative": ("height_above_takeoff", "osd.height", "altitude"),
+    "absolute": ("altitude_above_sealevel", "osd.altitude"),
+}
+_ELAPSED = ("time", "osd.flytime")
+_NUMBERS = {
+    "latitude": ("latitude", "osd.latitude"),
+    "longitude": ("longitude", "osd.longitude"),
+    "drone_yaw": ("compass_heading", "osd.yaw", "yaw"),
+    "drone_pitch": ("pitch", "osd.pitch"),
+    "drone_roll": ("roll", "osd.roll"),
+    "gb_yaw": ("gimbal_heading", "gimbal.yaw"),
+    "gb_pitch": ("gimbal_pitch", "gimbal.pitch"),
+    "gb_roll": ("gimbal_roll", "gimbal.roll"),
+}
+_FILMS = ("isvideo", "camera.isvideo")
+_HEADING = re.compile(r"([^\[(]+?)\s*(?:[\[(]([^\])]*)[\])])?")
+_CLOCK = re.compile(
+    r"(\d{1,4})[-/.](\d{1,2})[-/.](\d{1,4})[ T]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?"
+    r"\s*([aApP])?\.?[mM]?\.?Z?"
+)
+_DAY_OF_NAME = re.compile(r"(\d{4})[-_](\d{2})[-_](\d{2})")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_PREFIX = struct.Struct("<QHB")  # of a binary record: where its details lie, their length, and the version
+_NEWEST_BINARY = 30  # 14 in 2025
+
+
+class DjiRecordFormat:
+    """Reader of a flight record as CSV; every column but times and positions may be absent."""
+
+    name = "dji_record"
+    title = "DJI flight record (CSV)"
+    suffixes: tuple[str, ...] = (".csv",)
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if the heading names times, positions on Earth, and heights or angles."""
+        return _find_heading(read_head(path, self.suffixes)) is not None
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe rows, times, ranges of the positions, heights and angles, recordings, and losses."""
+        record = _read(path)
+        t_ns, timed = record.times
+        placed = record.placed
+        facts: dict[str, object] = {
+            "rows": len(t_ns),
+            "positions": int(np.count_nonzero(placed)),
+            **describe_times(np.unique(t_ns[timed])),
+            "clock": record.clock,
+        }
+        for name in ("latitude", "longitude"):
+            facts[f"{name}_deg"] = range_of(record.columns[name][placed], 7)
+        for label, name in (("height_above_take_off_m", "relative"), ("height_absolute_m", "absolute")):
+            if any_finite(record.columns[name]):
+                facts[label] = range_of(record.columns[name], 3)
+        for label, part in (("gimbal", "gb"), ("body", "drone")):
+            angles = record.angles(part)
+            if any_finite(angles):
+                facts[f"{label}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
+                facts[f"{label}_pitch_deg"] = range_of(angles[:, 1], 2)
+        if record.films:
+            facts["videos_started_s"] = [round(int(t_ns[first]) / 1e9, 3) for first, _ in record.films]
+        return facts | {f"dropped: {cause}": count for cause, count in record.dropped.items()}
+
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Read positions, and the angles of body and gimbal if the record has them.
+
+        A position that is repeated until the next measurement is replaced by linear interpolation.
+
+        Raises:
+            DataError: no flight record, no position, or no height while the user states none.
+        """
+        record = _read(path)
+        columns, (t_ns, timed) = record.columns, record.times
+        height, which, note_on_height = choose_height(path, columns, choice)
+        dropped = dict(record.dropped)
+        track = position_track(
+            path,
+            "its GPS",
+            t_ns,
+            np.stack([columns["latitude"], columns["longitude"], height], axis=1),
+            dropped,
+            on_earth=True,
+            height=which,
+            unusable={"no time": ~timed, "no position": ~record.placed},
+        )
+        values, moved = between_repeats(track.t_ns, track.values)
+        body, gimbal = (
+            angles_track(name, t_ns[timed], record.angles(part)[timed], dropped, rows="rows")
+            for name, part in (("its body's angles", "drone"), ("its gimbal angles", "gb"))
+        )
+        notes = [*record.notes, note_on_height]
+        if moved:
+            notes.append(f"{moved} of {len(values)} positions repeat the one before: taken between them")
+        return Telemetry(
+            position=replace(track, values=values),
+            body=body,
+            gimbal=gimbal,
+            clock=record.clock,
+            notes=tuple(f"{path}: {note}" for note in notes),
+            dropped=dropped,
+        )
+
+
+class DjiBinaryFormat:
+    """Recogniser of DJI's binary records (.txt of the app, .DAT of the drone), which only DJI's keys open."""
+
+    name = "dji_binary"
+    title = "DJI flight record (binary)"
+    suffixes: tuple[str, ...] = (".txt", ".dat")
+
+    def recognises(self, path: Path) -> bool:
+        """Return True for the app's record by its prefix, and for the drone's by its signatures.
+
+        The prefix is described in lvauvillier/dji-log-parser, the signatures in DatCon.
+        """
+        head = first_bytes(path, 256, suffixes=self.suffixes)
+        if path.suffix.lower() == ".dat":
+            return head[16:21] == b"BUILD" or head[242:252] == b"DJI_LOG_V3" or head.startswith(b"LOGH")
+        if len(head) < 100:
+            return False
+        details, length, version = _PREFIX.unpack_from(head)
+        size = path.stat().st_size
+        return 0 < version <= _NEWEST_BINARY and length > 0 and 12 <= details <= size and b"\0\0" in head[:8]
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Refuse it, with the way to a CSV."""
+        raise _binary(path)
+
+    def read_telemetry(self, path: Path, _choice: TelemetryChoice) -> Telemetry:
+        """Refuse it, with the way to a CSV."""
+        raise _binary(path)
+
+
+def _binary(path: Path) -> DataError:
+    return DataError(
+        path,
+        "is DJI's binary flight record, which mocap does not decode",
+        "convert it to CSV (Airdata, PhantomHelp or Flight Reader; dji-log-parser) and give that: pose:"
+        " {dji: RECORD.csv}",
+    )
+
+
+# --- reading -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Heading:
+    """The line that names the columns."""
+
+    line: int
+    delimiter: str
+    cells: int
+    numbers: Mapping[str, tuple[int, float]]  # by name: the column, and what one of its units is
+    clock: tuple[int, ...]  # columns of date and time, or of both in one
+    utc: bool  # the clock's zone, else local
+    films: int | None
+
+
+@dataclass(frozen=True)
+class _Record:
+    """Columns of a record, [N] each, NaN where there is no number."""
+
+    path: Path
+    columns: Mapping[str, Float]
+    clock_ns: Int64  # [N] since the epoch, 0 without
+    fine: bool  # the clock shows parts of seconds
+    utc: bool
+    filming: Bool
+    notes: list[str] = field(default_factory=list)
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def placed(self) -> Bool:
+        """[N] True for a position on Earth."""
+        known: Bool = np.isfinite(self.columns["latitude"]) & np.isfinite(self.columns["longitude"])
+        return known
+
+    @property
+    def clock(self) -> str:
+        """The zero of the times."""
+        if not self.clock_ns.any():
+            return "the record's start"
+        return "UTC" if self.utc else "local time"
+
+    @cached_property
+    def times(self) -> tuple[Int64, Bool]:
+        """Times [N] in ns, and True where they are known [N].
+
+        A clock of whole seconds places the record's own seconds: the middle of its ticks does.
+        """
+        shown = self.clock_ns != 0
+        if self.fine or not any_finite(self.columns["elapsed"]):
+            return self.clock_ns, shown
+        known: Bool = np.isfinite(self.columns["elapsed"])
+        since_ns = np.round(np.where(known, self.columns["elapsed"], 0) * 1e9).astype(np.int64)
+        both = np.flatnonzero(shown & known)
+        if not len(both):
+            return since_ns, known
+        ahead_ns = self.clock_ns[both] - since_ns[both]
+        ticks = np.flatnonzero(np.diff(self.clock_ns[both]) > 0) + 1
+        if len(ticks):  # the clock ticked between a row and the one before
+            ahead_ns = ahead_ns[ticks] + np.diff(since_ns[both])[ticks - 1] // 2
+        else:
+            ahead_ns = ahead_ns + 500_000_000
+        return since_ns + int(np.median(ahead_ns)), known
+
+    def angles(self, part: str) -> Float:
+        """Return yaw, pitch, roll [N, 3] in degrees; NaN for a gimbal that is 0 throughout."""
+        angles = np.stack([self.columns[f"{part}_{name}"] for name in ("yaw", "pitch", "roll")], axis=1)
+        if part == "gb" and not np.nan_to_num(angles).any():
+            return np.full_like(angles, np.nan)
+        angles[np.isnan(angles[:, 2]) & np.isfinite(angles[:, 0]), 2] = 0
+        return angles
+
+    @property
+    def films(self) -> list[tuple[int, int]]:
+        """First and last row of every video that was recorded."""
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], self.filming, [False]]).astype(np.int8)))
+        return [(int(first), int(end) - 1) for first, end in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def recordings_of(path: Path) -> list[tuple[int, int]]:
+    """Read first and last time (ns) of every video that a flight record says was recorded."""
+    record = _read(path)
+    t_ns, timed = record.times
+    return [(int(t_ns[a]), int(t_ns[b])) for a, b in record.films if timed[a] and timed[b]]
+
+
+def _find_heading(text: str) -> _Heading | None:
+    """Parse the heading, also below a line `sep=,`; None if it is no flight record's."""
+    lines = text.split("\n", 2)
+    line = 1 if lines[0].strip().strip('"').lower().startswith("sep=") else 0
+    if len(lines) <= line:
+        return None
+    delimiter = max(",;\t", key=lines[line].count)
+    try:
+        cells = next(csv.reader([lines[line]], delimiter=delimiter), [])
+    except csv.Error:
+        return None
+    matches = [_HEADING.fullmatch(cell.strip().lower()) for cell in cells]
+    names = [(match[1], match[2] or "") if match else ("", "") for match in matches]
+    numbers: dict[str, tuple[int, float]] = {}
+    for name, known in _NUMBERS.items():
+        if (column := _column(names, known)) is not None:
+            numbers[name] = (column, 1.0)
+    for name, known in _LENGTHS.items():
+        if found := _measured(names, known, _METRES):
+            numbers[name] = found
+    if found := _measured(names, _ELAPSED, _SECONDS):
+        numbers["elapsed"] = found
+    zone, clock = next(
+        ((zone, c) for zone in ("utc", "local") if (c := _clock_columns(names, zone))), ("", ())
+    )
+    told = numbers.keys() & {"relative", "absolute", "drone_pitch", "gb_pitch"}
+    if not numbers.keys() >= {"latitude", "longitude"} or not told or not ("elapsed" in numbers or clock):
+        return None
+    return _Heading(line, delimiter, len(cells), numbers, clock, zone == "utc", _column(names, _FILMS))
+
+
+def _column(names: Sequence[tuple[str, str]], known: Sequence[str]) -> int | None:
+    """Return the column of the first known name."""
+    plain = [name for name, _ in names]
+    return next((plain.index(name) for name in known if name in plain), None)
+
+
+def _measured(
+    names: Sequence[tuple[str, str]], known: Sequence[str], units: Mapping[str, float]
+) -> tuple[int, float] | None:
+    """Return the column of the first known name in a known unit, and that unit; 1.0 is preferred."""
+    for wanted in known:
+        found = [(units[u], k) for k, (name, u) in enumerate(names) if name == wanted and u in units]
+        if found:
+            unit, column = min(found, key=lambda each: each[0] != 1.0)
+            return column, unit
+    return None
+
+
+def _clock_columns(names: Sequence[tuple[str, str]], zone: str) -> tuple[int, ...]:
+    """Return the columns of the date and the time of day in a zone; empty without."""
+    for date, time in (("datetime", ""), ("custom.date", "custom.updatetime")):
+        wanted = [(name, zone) for name in (date, time) if name]
+        if all(name in names for name in wanted):
+            return tuple(names.index(name) for name in wanted)
+    return ()
+
+
+def _read(path: Path) -> _Record:
+    """Read the columns of a record.
+
+    Rows with too few cells, or with something else where a number should be, are dropped and counted.
+
+    Raises:
+        DataError: it cannot be read, is no flight record, or has no rows.
+    """
+    refuse_special(path)
+    heading = _find_heading(read_head(path))
+    if heading is None:
+        raise DataError(
+            path,
+            "has no heading that names times, latitude, longitude, and heights or angles",
+            "export the flight record with these columns",
+        )
+    values: dict[str, list[float]] = {name: [] for name in heading.numbers}
+    clocks: list[str] = []
+    filming: list[bool] = []
+    damaged = 0
+    try:
+        for row in _rows(path, heading):
+            try:
+                numbers = {n: _number(row[column]) for n, (column, _) in heading.numbers.items()}
+                clock = " ".join(row[column].strip() for column in heading.clock)
+                films = heading.films is not None and row[heading.films].strip().lower() in {"1", "true"}
+            except (ValueError, IndexError):
+                damaged += 1
+                continue
+            for name, number in numbers.items():
+                values[name].append(number)
+            clocks.append(clock)
+            filming.append(films)
+    except OSError as error:
+        raise as_data_error(error, path) from error
+    if not clocks:
+        raise DataError(path, f"holds no rows ({damaged} damaged)", "export the flight record again")
+    blank = np.full(len(clocks), np.nan)
+    names = (*_NUMBERS, *_LENGTHS, "elapsed", "altitude")
+    columns = {
+        name: np.array(values[name]) * heading.numbers[name][1] if name in values else blank for name in names
+    }
+    notes: list[str] = []
+    clock_ns, fine = _parse_clocks(path, clocks, notes)
+    if not clock_ns.any():
+        notes.append("shows no date: its times count from the record's start")
+    elif not heading.utc:
+        notes.append("its clock is local time, taken as UTC")
+    dropped = {"damaged row": damaged} if damaged else {}
+    return _Record(path, columns, clock_ns, fine, heading.utc, np.array(filming), notes, dropped)
+
+
+def _rows(path: Path, heading: _Heading) -> Iterator[list[str]]:
+    """Yield the rows below the heading that are not blank; one that is no CSV comes as an empty row."""
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        below = (line.replace("\0", "") for line in islice(file, heading.line + 1, None))
+        rows = csv.reader(below, delimiter=heading.delimiter)
+        while True:
+            try:
+                row = next(rows, None)
+            except csv.Error:
+                yield []
+                continue
+            if row is None:
+                return
+            if any(row):
+                yield row
+
+
+def _number(cell: str) -> float:
+    """Parse a number with a decimal dot or comma; a blank cell is NaN."""
+    text = cell.strip()
+    return float(text.replace(",", ".") if text.count(",") == 1 and "." not in text else text or "nan")
+
+
+def _parse_clocks(path: Path, texts: Sequence[str], notes: list[str]) -> tuple[Int64, bool]:
+    """Parse dates with times as ns since the epoch [N], 0 without, and say if any has parts of seconds."""
+    clock_ns = np.zeros(len(texts), dtype=np.int64)
+    matches = [_CLOCK.fullmatch(text) for text in texts]
+    shown = [match for match in matches if match]
+    if not shown:
+        return clock_ns, False
+    day_first = _day_comes_first(path, shown, notes)
+    for row, match in enumerate(matches):
+        if match:
+            clock_ns[row] = _since_epoch_ns(match, day_first)
+    return clock_ns, any(match[7] for match in shown)
+
+
+def _day_comes_first(path: Path, shown: Sequence[re.Match[str]], notes: list[str]) -> bool:
+    """Decide the order of dates without the year in front: by their numbers, else by the file's name."""
+    dates = {(int(match[1]), int(match[2]), int(match[3])) for match in shown if len(match[1]) < 3}
+    if any(first > 12 for first, _, _ in dates):
+        return True
+    if not dates or any(second > 12 for _, second, _ in dates):
+        return False
+    if named := _DAY_OF_NAME.search(path.name):
+        year, month, day = (int(part) for part in named.groups())
+        if (day, month, year) in dates:
+            return True
+        if (month, day, year) in dates:
+            return False
+    first, second, year = min(dates)
+    if first != second:
+        notes.append(f"its date {first}/{second}/{year} is taken as month/day/year")
+    return False
+
+
+def _since_epoch_ns(match: re.Match[str], day_first: bool) -> int:
+    first, second, third, hour, minute = (int(part) for part in match.groups()[:5])
+    if len(match[1]) > 2:
+        year, month, day = first, second, third
+    else:
+        year, (month, day) = third, ((second, first) if day_first else (first, second))
+    if match[8]:
+        hour = hour % 12 + 12 * (match[8].lower() == "p")
+    try:
+        moment = datetime(year, month, day, hour, minute, int(match[6] or 0), tzinfo=UTC)
+    except ValueError:
+        return 0
+    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000 + int((match[7] or "").ljust(9, "0"))
+
+
+FORMAT = DjiRecordFormat()
+BINARY = DjiBinaryFormat()
