@@ -42,7 +42,6 @@ from pipelines.session.manifest import read_flight
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import PoseSample
 from pipelines.session.registries import (
-    FORMATS,
     CalibrationFormat,
     Format,
     JointFormat,
@@ -55,6 +54,7 @@ from pipelines.session.registries import (
 )
 from pipelines.session.storage import as_data_error
 from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat
+from pipelines.session.unknown_files import EXPECTED
 
 _FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
 _KEYS: dict[str, Literal["dji", "ulog", "ardupilot"]] = {
@@ -111,7 +111,7 @@ def draft(
         path, reason = home, f"holds nothing that can be used ({len(left_out)} files)"
         if len(left_out) == 1:
             [(path, reason)] = left_out.items()
-        raise DataError(path, reason, f"known formats: {', '.join(FORMATS.names())}")
+        raise DataError(path, reason, EXPECTED)
 
     flight = match(findings)
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))

@@ -11,10 +11,11 @@ from pipelines.planning.config import PlannerConfig, planner_config
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight, read_flight
-from pipelines.session.registries import FORMATS, why_not
+from pipelines.session.registries import FORMATS
 from pipelines.session.stage_records import SCHEMA, STAGES, outdated
 from pipelines.session.stages import open_session
 from pipelines.session.storage import read_json, refuse_special
+from pipelines.session.unknown_files import EXPECTED, describe_unknown
 from pipelines.session.whole_folders import SIMULATION_MARK, STUDY_MARK
 from pipelines.session.yaml_files import keys_of
 from pipelines.simulation.scenario import Scenario, read_scenario
@@ -53,9 +54,8 @@ def survey(path: Path) -> list[Survey]:
         return readings
     if path.suffix in {".yaml", ".yml"} and path.is_file():
         return [_of_yaml(path)]
-    raise DataError(
-        path, f"is of no known kind{why_not(path)}", f"known formats: {', '.join(FORMATS.names())}"
-    )
+    like = describe_unknown(path)
+    raise DataError(path, like.problem, like.remedy or EXPECTED)
 
 
 # --- what mocap writes ---------------------------------------------------------------------------------
@@ -159,10 +159,12 @@ def _of_yaml(path: Path) -> Survey:
     known = {title: len(keys & stated.keys()) for title, (keys, _) in kinds.items()}
     title, most = max(known.items(), key=lambda each: each[1])
     if list(known.values()).count(most) > 1:  # `schema` and `name` are keys of several kinds
+        like = describe_unknown(path)
         raise DataError(
             path,
-            "is YAML, but of no known kind",
-            "a flight manifest has `cameras:`, a scenario `drones:`, planner settings `w_obs:` and the like",
+            like.problem,
+            like.remedy
+            or "flight manifests have `cameras:`, scenarios `drones:`, planner settings keys like `w_obs:`",
         )
     return Survey(path, title, kinds[title][1](path))
 

@@ -26,9 +26,9 @@ from pipelines.session.registries import (
     MapFormat,
     TrajectoryFormat,
     VideoFormat,
-    why_not,
 )
 from pipelines.session.telemetry import Height, TelemetryFormat
+from pipelines.session.unknown_files import describe_unknown
 
 F = TypeVar("F", bound="Found")
 
@@ -330,7 +330,7 @@ def _why_left_out(path: Path) -> str:
             pass
         else:
             return "is a flight manifest already (run `mocap ingest` on it), left out"
-    return f"not recognised{why_not(path)}, left out"
+    return f"{describe_unknown(path).problem}, left out"
 
 
 def joined(recordings: Sequence[Recording]) -> list[Recording]:

@@ -7,7 +7,6 @@ Where an extension needs an optional library that is missing, the error gives th
 
 from __future__ import annotations
 
-import json
 import re
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -35,7 +34,8 @@ from pipelines.session.records import (
     Trajectory,
     VideoIndex,
 )
-from pipelines.session.storage import is_special, refuse_special, sha256_of
+from pipelines.session.storage import refuse_special, sha256_of
+from pipelines.session.unknown_files import describe_unknown
 
 T = TypeVar("T")
 
@@ -355,9 +355,8 @@ def recognise(path: Path, protocol: type[F], noun: str) -> F:
     matches = [f for f in candidates if f.recognises(path)]
     if len(matches) == 1:
         return matches[0]
-    known = ", ".join(sorted(f.name for f in candidates))
     if not matches:
-        raise DataError(path, f"not recognised as a {noun}{why_not(path)}", f"known formats: {known}")
+        raise _unrecognised(path, noun, sorted(f.name for f in candidates))
     raise DataError(
         path,
         f"could be {' or '.join(sorted(f.name for f in matches))}",
@@ -365,20 +364,14 @@ def recognise(path: Path, protocol: type[F], noun: str) -> F:
     )
 
 
-def why_not(path: Path) -> str:
-    """Explain why a file may not be recognised, as the end of a message; empty if no reason is found."""
-    if not path.is_file():
-        return ": it is a pipe, a socket or a device" if is_special(path) else ""
-    try:
-        if path.stat().st_size == 0:
-            return ": it is empty"
-        if path.suffix.lower() == ".json":
-            json.loads(path.read_bytes())
-    except OSError as error:
-        return f": it cannot be read ({error.strerror})"
-    except (ValueError, RecursionError) as error:
-        return f": it is no valid JSON ({str(error)[:100]}), perhaps cut off"
-    return ""
+def _unrecognised(path: Path, noun: str, known: list[str]) -> DataError:
+    """Report a file that is of another kind than expected, or of none."""
+    others = [f.title for f in FORMATS.all() if f.recognises(path)]
+    remedy = f"a {noun} is expected here: {', '.join(known)}"
+    if others:
+        return DataError(path, f"is no {noun} but {' or '.join(others)}", remedy)
+    like = describe_unknown(path)
+    return DataError(path, f"{like.problem} and no {noun}", "; ".join(filter(None, [like.remedy, remedy])))
 
 
 def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[NoiseModel]:

@@ -103,6 +103,11 @@ _JOINTS: dict[str, tuple[str, ...]] = {
         *_one_side("left", "big_toe", "small_toe", "heel"),
         *_one_side("right", "big_toe", "small_toe", "heel"),
     ),
+    "coco23": (
+        *_COCO17,
+        *_one_side("left", "big_toe", "small_toe", "heel"),
+        *_one_side("right", "big_toe", "small_toe", "heel"),
+    ),
     "body25b": (
         *(*_COCO17, "neck", "head"),
         *_one_side("left", "big_toe", "small_toe", "heel"),

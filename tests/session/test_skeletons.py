@@ -23,7 +23,8 @@ NAMES = st.sampled_from(sorted(SKELETONS))
 
 
 @pytest.mark.parametrize(
-    ("name", "count"), [("coco17", 17), ("halpe26", 26), ("body25", 25), ("body25b", 25), ("blazepose33", 33)]
+    ("name", "count"),
+    [("coco17", 17), ("halpe26", 26), ("body25", 25), ("body25b", 25), ("blazepose33", 33), ("coco23", 23)],
 )
 def test_every_skeleton_has_its_detectors_number_of_distinct_joints(name: str, count: int) -> None:
     joints = get_skeleton(name).joints
@@ -32,6 +33,7 @@ def test_every_skeleton_has_its_detectors_number_of_distinct_joints(name: str, c
 
 # Joints by number as the detectors' own documentation gives them, a few of each group.
 NUMBERED = {
+    "coco23": "16 right_ankle 17 left_big_toe 18 left_small_toe 19 left_heel 20 right_big_toe 22 right_heel",
     "coco17": "0 nose 1 left_eye 4 right_ear 5 left_shoulder 10 right_wrist 16 right_ankle",
     "halpe26": "16 right_ankle 17 head 18 neck 19 hip 20 left_big_toe 21 right_big_toe 22 left_small_toe "
     "24 left_heel 25 right_heel",

@@ -22,6 +22,10 @@ _FRAME_LIMIT = 2**62  # keeps frame numbers and their differences inside int64
 _SUFFIX = re.compile(r"\.[A-Za-z]\w*$")
 _FARTHEST_PX = 1_000_000  # far larger than any picture: beyond it the file is faulty
 
+# Whole-body skeletons by their number of keypoints: those of this body come first, then face and hands.
+_BODIES = {136: "halpe26", 133: "coco23"}  # Halpe-136, COCO-WholeBody
+_LEAST_SHARE = 0.25  # of a folder's files that are JSON; one JSON among logs is no folder of keypoints
+
 
 def load_json(path: Path) -> object:
     """Read a JSON file; NaN and Infinity are accepted, as Python writes them.
@@ -55,6 +59,8 @@ def samples(path: Path) -> list[object]:
     """
     if path.is_dir():
         files = json_files(path)
+        if len(files) < _LEAST_SHARE * sum(not each.name.startswith(".") for each in path.iterdir()):
+            return []
         files = files[:: max(1, len(files) // _SAMPLED_FILES)][:_SAMPLED_FILES]
     else:
         files = [path] if path.suffix.lower() == ".json" and path.is_file() else []
@@ -167,6 +173,7 @@ class KeypointFile:
         """
         people = Gathering(path)
         self.gather(people)
+        people.leave_out_face_and_hands()
         return people.detections(_choose_skeleton(people, skeleton), first_frame)
 
 
@@ -275,6 +282,16 @@ class Gathering:
                 self.path, f"holds no keypoints{detail}", "check that the detector saw the person"
             )
         return len(self._rows[0])
+
+    def leave_out_face_and_hands(self) -> None:
+        """Keep only the body of people with the keypoints of a whole-body skeleton; count the rest."""
+        body = _BODIES.get(self.count())
+        if body is None:
+            return
+        joints = len(SKELETONS[body].joints)
+        self.dropped["face and hand keypoint"] += sum(len(rows) - joints for rows in self._rows)
+        self._rows = [rows[:joints] for rows in self._rows]
+        self.joint_names = self.joint_names[:joints] if self.joint_names else None
 
     def detections(self, skeleton: Skeleton, first_frame: int) -> Detections:
         """Return everything collected, cleaned and sorted.

@@ -59,6 +59,8 @@ def _read_file(file: Path, content: object, people: Gathering) -> tuple[str, ...
         for where, entry in objects(content, file, "frames"):
             frame = people.frame_of(entry.get("frame_id"), where, file)
             _add_people(frame, entry.get("instances"), where, people)
+    elif frame_number(file.stem) is None and file == people.path:  # the predictions of one picture
+        _add_people(people.frame_of(0, str(file)), content, str(file), people)
     elif frame_number(file.stem) is None:
         people.dropped["file without a frame number"] += 1
     else:

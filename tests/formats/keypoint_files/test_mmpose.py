@@ -114,7 +114,6 @@ def test_two_videos_in_a_folder_are_refused(tmp_path: Path) -> None:
     [
         ([], "holds no keypoints"),
         (video([], []), "holds no keypoints .2 x frame without people."),
-        ([instance()], "file without a frame number"),
         (video([{"keypoints": [[1, 2, 3]], "keypoint_scores": [1]}]), r"of shape \[1, 3\] and \[1\]"),
         (video([{"keypoints": [[1, 2]], "keypoint_scores": [1, 1]}]), r"of shape \[1, 2\] and \[2\]"),
         (video([{"keypoints": [[1, 2], [1]], "keypoint_scores": [1, 1]}]), "not plain numbers"),
@@ -122,13 +121,43 @@ def test_two_videos_in_a_folder_are_refused(tmp_path: Path) -> None:
         ([{"frame_id": 0, "instances": None}], "the instances are not a list"),
         ([{"frame_id": "x", "instances": []}], "'x' has no frame number"),
         ({"instance_info": 3}, "file without predictions"),
-        (video([instance(count=133)]), "has 133 keypoints per person, as no known skeleton"),
+        (video([instance(count=134)]), "has 134 keypoints per person, as no known skeleton"),
     ],
 )
 def test_bad_content_is_one_clear_line(tmp_path: Path, content: object, message: str) -> None:
     with pytest.raises(DataError, match=message) as caught:
         FORMAT.read_keypoints(written(tmp_path / "walk.json", content), skeleton=None, first_frame=0)
     assert "\n" not in str(caught.value)
+
+
+def test_a_real_picture_is_frame_0() -> None:
+    """The inferencer's file of one picture is a list of people, and its name holds no number."""
+    path = real_data("second/mmpose_demo_image.json")
+    stated = json.loads(path.read_text())
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert found.frame.tolist() == [0] * len(stated)
+    assert found.joints == get_skeleton("coco17").joints
+    np.testing.assert_array_equal(found.xy, [person["keypoints"] for person in stated])
+
+
+@pytest.mark.parametrize(("count", "body"), [(136, "halpe26"), (133, "coco23")])
+def test_of_whole_body_keypoints_the_body_is_kept_and_the_rest_counted(
+    tmp_path: Path, count: int, body: str
+) -> None:
+    path = written(tmp_path / "walk.json", video([instance(count=count), instance(9.0, count)]))
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    joints = get_skeleton(body).joints
+    assert found.joints == joints
+    assert found.xy[1, :, 0].tolist() == [9.0 + k for k in range(len(joints))]
+    assert found.dropped == {"face and hand keypoint": 2 * (count - len(joints))}
+
+
+def test_a_folder_with_one_json_among_logs_is_no_folder_of_keypoints(tmp_path: Path) -> None:
+    written(tmp_path / "walk.json", video([instance()]))
+    assert FORMAT.recognises(tmp_path)
+    for index in range(4):
+        (tmp_path / f"{index}.bag").touch()
+    assert not FORMAT.recognises(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,209 @@
+"""Description of files that no format recognises: their likely kind, and the step that makes them usable."""
+
+import json
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipelines.session.errors import DataError
+from pipelines.session.storage import is_special
+from pipelines.session.yaml_files import plain_yaml
+
+_HEAD_BYTES = 64 * 1024
+_LARGEST_PARSED = 8 << 20  # bytes; larger text is described by its first line
+_SHOWN = 8  # names of keys, columns or endings in a message
+_WIDEST = 60  # characters of a quoted line
+
+
+EXPECTED = (
+    "expected is a log, a video, keypoints, a calibration, a trajectory, joints or a map; "
+    "docs/formats.md lists the formats"
+)
+"""Remedy for a file of which nothing better is known."""
+
+
+class Likeness(NamedTuple):
+    """Description of an unrecognised file: `problem` completes "FILE: ..."; `remedy` is empty if unknown."""
+
+    problem: str
+    remedy: str = ""
+
+
+_COPY = "it is damaged or of another kind: copy it again from where it was recorded"
+
+# Kind, the bytes at its beginning, the endings of its name. A file of this name with another beginning is
+# damaged. One with this beginning was not recognised for another reason.
+_BEGINNINGS = (
+    ("an MCAP log", b"\x89MCAP0\r\n", (".mcap",)),
+    ("a ROS 1 bag", b"#ROSBAG V", (".bag",)),
+    ("a PX4 log", b"ULog\x01\x12\x35", (".ulg",)),
+    ("an ArduPilot log", b"\xa3\x95", (".bin",)),
+    ("a bag's SQLite database", b"SQLite format 3\0", (".db3",)),
+    ("a Matroska or WebM video", b"\x1aE\xdf\xa3", (".mkv", ".webm")),
+    ("an OctoMap", b"# Octomap OcTree", (".bt", ".ot")),
+    ("a PLY point cloud", b"ply", (".ply",)),
+    ("a NumPy archive", b"PK\x03\x04", (".npz",)),
+)
+
+# Kinds that are known by their first bytes but not read, and the step that makes them usable.
+_UNREAD = (
+    (re.compile(rb"\xff\xd8\xff"), "a JPEG picture", "name the folder of a sequence of pictures"),
+    (re.compile(rb"\x89PNG\r\n"), "a PNG picture", "name the folder of a sequence of pictures"),
+    (re.compile(rb"P[1-6]\s"), "a PGM picture", "of a floor plan, name the .yaml beside it"),
+    (re.compile(rb"(?s).{4}ftyp|\x1aE\xdf\xa3|RIFF....AVI "), "a video without pictures", _COPY),
+    (re.compile(rb"%PDF"), "a PDF document", ""),
+    (re.compile(rb"PK\x03\x04"), "a ZIP archive", "unpack it"),
+    (re.compile(rb"\x1f\x8b"), "a gzip archive", "unpack it"),
+    (re.compile(rb"7z\xbc\xaf|Rar!"), "an archive", "unpack it"),
+    (re.compile(rb"\x89HDF|MATLAB 5"), "an HDF5 or MATLAB file", "export its tables as CSV"),
+    (re.compile(rb"PAR1"), "a Parquet table", "export it as CSV"),
+    (re.compile(rb"SQLite format 3"), "an SQLite database without the tables of a bag", ""),
+    (re.compile(rb"Kaydara FBX"), "an FBX scene", "export its motion as BVH"),
+    (re.compile(rb"(?s)\s*(?:<\?xml.*?\?>\s*)?<calibration\b.*<camera "), "a Qualisys calibration (XML)",
+     "convert it to TOML with Pose2Sim's calibration step"),
+    (re.compile(rb"# Camera list|# Image list|# 3D point list"), "one file of a COLMAP model",
+     "name the folder that holds it"),
+    (re.compile(rb"(?s).{,200}rosbag2_bagfile_information:"), "the metadata of a ROS 2 bag",
+     "name the bag's folder"),
+)  # fmt: skip
+
+
+def describe_unknown(path: Path) -> Likeness:
+    """Describe an existing file or folder that is not recognised. Never raise."""
+    if path.is_dir():
+        return _of_folder(path)
+    if is_special(path):
+        return Likeness("is a pipe, a socket or a device", "write what comes out of it to a file")
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        return Likeness(f"cannot be read ({reason})", "check its permissions")
+    if not size:
+        return Likeness("is empty", "copy it again")
+    return _of_bytes(path, head) or _of_text(path, head, size)
+
+
+def _of_folder(path: Path) -> Likeness:
+    try:
+        endings = Counter(each.suffix.lower() or "no ending" for each in path.iterdir())
+    except OSError as error:
+        return Likeness(f"cannot be read ({error.strerror})", "check its permissions")
+    if not endings:
+        return Likeness("is an empty folder", "")
+    held = _listed(f"{count} x {ending}" for ending, count in endings.most_common())
+    return Likeness(f"is a folder of no known kind ({held})", "name a file in it, or draft a flight of it")
+
+
+def _of_bytes(path: Path, head: bytes) -> Likeness | None:
+    """Describe a file by its first bytes and its name; None if it may be text."""
+    if head[:2] in {b"\xff\xfe", b"\xfe\xff"}:
+        return Likeness("is text in UTF-16", "save it as UTF-8")
+    if (
+        len(head) >= 16
+        and not any(head[1:64:2])
+        and all(32 <= c < 127 or c in b"\r\n\t" for c in head[:64:2])
+    ):
+        return Likeness("is text in UTF-16 without a byte order mark", "save it as UTF-8")
+    for kind, magic, endings in _BEGINNINGS:
+        if path.suffix.lower() in endings and not head.startswith(magic):
+            return Likeness(
+                f"is called {path.suffix} but begins with {_quoted(head[: len(magic)])} instead of the "
+                f"{_quoted(magic)} of {kind}",
+                _COPY,
+            )
+    for pattern, kind, remedy in _UNREAD:
+        if pattern.match(head):
+            return Likeness(f"is {kind}", remedy)
+    for kind, magic, _ in _BEGINNINGS:
+        if head.startswith(magic):
+            return Likeness(f"begins as {kind} but is none that can be read", _COPY)
+    if b"\0" in head or _undecodable(head):
+        return Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
+    return None
+
+
+def _undecodable(head: bytes) -> bool:
+    try:
+        head.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        return error.start < len(head) - 4  # a character that the end of the head cuts is no damage
+    return False
+
+
+def _of_text(path: Path, head: bytes, size: int) -> Likeness:
+    text = head.decode("utf-8-sig", "replace")
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if not lines:
+        return Likeness("holds blank lines only", "")
+    ending = path.suffix.lower()
+    if size <= _LARGEST_PARSED:
+        if ending == ".json":
+            return _of_json(path)
+        if ending == ".toml":
+            return _of_toml(path)
+        if ending in {".yaml", ".yml"}:
+            return _of_yaml(path)
+    if ending == ".srt":
+        return Likeness("holds subtitles without the positions and times of a drone", "")
+    for mark in ",;\t":
+        cells = [cell.strip(' "#') for cell in lines[0].split(mark)]
+        if len(cells) > 2 and len(lines) > 1 and lines[1].count(mark) > len(cells) // 2:
+            named = sum(bool(re.match(r"[A-Za-z_]", cell)) for cell in cells) > len(cells) / 2
+            columns = f"the columns {_listed(cells)}" if named else f"{len(cells)} columns without names"
+            remedy = "poses need a time, x, y, z, qx, qy, qz, qw; joints person, joint, x, y, z"
+            return Likeness(f"is a table with {columns}", f"{remedy}, by name in the first line")
+    return Likeness(f"is text that begins with {lines[0][:_WIDEST]!r}")
+
+
+def _of_json(path: Path) -> Likeness:
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        return Likeness(f"is no valid JSON ({str(error)[:100]})", "it may be cut off: copy it again")
+    if isinstance(content, list):
+        first: Any = content[0] if content else None
+        keys = f" of objects with {_keys(first)}" if isinstance(first, dict) else ""
+        return Likeness(f"is JSON, a list of {len(content)}{keys}")
+    return Likeness(f"is JSON with {_keys(content)}" if isinstance(content, dict) else "is JSON, one value")
+
+
+def _of_toml(path: Path) -> Likeness:
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        return Likeness(f"is no valid TOML ({str(error)[:100]})", "write it again")
+    return Likeness(
+        f"is TOML with {_keys(content)}", "a calibration has a table for each camera, with `matrix`"
+    )
+
+
+def _of_yaml(path: Path) -> Likeness:
+    content: object = None
+    with suppress(DataError, OSError, ValueError):
+        text = path.read_text(encoding="utf-8-sig")
+        content = plain_yaml(path, re.sub(r"\A%YAML:", "#", text))
+    if not isinstance(content, dict):
+        return Likeness("is YAML without names at its top")
+    return Likeness(f"is YAML with {_keys(content)}")
+
+
+def _keys(content: dict[Any, Any]) -> str:
+    return f"the keys {_listed(str(key)[:40] for key in content)}" if content else "no keys"
+
+
+def _listed(names: Iterable[str]) -> str:
+    named = [" ".join(name.split()) for name in names]
+    return ", ".join(named[:_SHOWN]) + (f", ... ({len(named)})" if len(named) > _SHOWN else "")
+
+
+def _quoted(first: bytes) -> str:
+    """Write bytes as text if they are printable, else in hexadecimal."""
+    plain = first.isascii() and all(32 <= byte < 127 for byte in first.rstrip(b"\0\r\n"))
+    return repr(first.rstrip(b"\0\r\n").decode("ascii")) if plain else first.hex(" ")
