@@ -92,7 +92,7 @@ def test_a_real_record_has_the_numbers_of_its_metric_columns() -> None:
         changed = np.append(True, np.diff(stated) != 0)  # a repeated height is interpolated
         np.testing.assert_allclose(values[changed], stated[changed], atol=1e-9)
     # The record's own distance from home (0.1 m) is that of the positions, at every row.
-    home = Place(*(float(rows[-1][f"Home{name}"]) for name in ("Latitude", "Longitude")), 0.0)
+    home = Place(float(rows[-1]["HomeLatitude"]), float(rows[-1]["HomeLongitude"]), 0.0)
     enu = enu_from_geodetic(track.values[:, 0], track.values[:, 1], np.zeros(len(rows)), home)
     after = [k for k, row in enumerate(rows) if row["HomeLatitude"] == rows[-1]["HomeLatitude"]]
     stated = np.array([float(row["HomeDistance(meters)"]) for row in rows])
