@@ -33,8 +33,8 @@ from pipelines.drafting.matching import match
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.subtitles import read_subtitles
-from pipelines.formats.logs.messages import kind_of, samples
-from pipelines.formats.logs.presets import namespaces, parts_of
+from pipelines.formats.logs.messages import header_ns, kind_of, samples
+from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
 from pipelines.formats.videos.frame_times import read_frame_times
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
@@ -284,7 +284,10 @@ def _recording(head: Found, format_: LogFormat) -> Recording:
             kind = kind_of(topic)
             if kind and topic.name not in topics:
                 span = Span(topic.first_ns or 0, topic.last_ns or 0)
-                topics[topic.name] = TopicFound(topic.name, topic.type, kind, topic.count, span)
+                lead_ns = _lead_ns(log, topic.name) if topic.count else None
+                topics[topic.name] = TopicFound(
+                    topic.name, topic.type, kind, topic.count, span, lead_ns=lead_ns
+                )
         drivers = tuple(_drivers(log))
         edges: dict[Edge, None] = {}
         for name, known in topics.items():
@@ -295,7 +298,9 @@ def _recording(head: Found, format_: LogFormat) -> Recording:
             elif known.kind == "transforms":
                 still = name.rstrip("/").endswith("tf_static")
                 for sample in _pose_samples(log, name, _TRANSFORMS_ASKED, head.path):
-                    edges[Edge(name, sample.target, sample.source, still)] = None
+                    lead_ns = sample.stamp_ns - sample.receive_ns if sample.stamp_ns else None
+                    link = (name, sample.target, sample.source, still)
+                    edges.setdefault(Edge(*link, sample.receive_ns, lead_ns))
     about = (head.path, head.place, head.format, head.title)
     return Recording(*about, (head.path,), tuple(topics.values()), tuple(edges), drivers)
 
@@ -307,17 +312,34 @@ def _drivers(log: Log) -> Iterator[Driver]:
     for preset, namespace in every:
         parts = parts_of(preset, namespace, list(topics))
         spans = [topics[name] for name in parts.position]
+        alone = len([known for known, _ in every if known == preset]) == 1
         yield Driver(
-            preset=preset,
-            namespace=None
-            if len([known for known, _ in every if known == preset]) == 1
-            else namespace or "/",
+            settings={"preset": preset, "namespace": None if alone else namespace or "/"},
             span=Span(min(t.first_ns or 0 for t in spans), max(t.last_ns or 0 for t in spans)),
             count=max(topic.count for topic in spans),
             body=bool(parts.attitude),
             gimbal=bool(parts.gimbal),
-            by_gps=any("NavSatFix" in topics[name].type for name in parts.position),
+            by_gps=preset == "px4" or any(topics[name].type in FIXES for name in parts.position),
+            lead_ns=0 if preset == "px4" else _lead_ns(log, parts.position[0]),
         )
+    for place, turned in pairs_of(list(topics.values())):
+        topic = topics[place]
+        yield Driver(
+            settings={"topic": place, "attitude": turned},
+            span=Span(topic.first_ns or 0, topic.last_ns or 0),
+            count=topic.count,
+            body=True,
+            gimbal=False,
+            by_gps=True,
+            lead_ns=_lead_ns(log, place),
+        )
+
+
+def _lead_ns(log: Log, topic: str) -> int | None:
+    """Return by how much the first header stamp of a topic is ahead of its receipt; None without one."""
+    first = next(iter(log.messages([topic])), None)
+    stamp_ns = 0 if first is None else header_ns(first)
+    return stamp_ns - first.receive_ns if first is not None and stamp_ns else None
 
 
 def _pose_samples(log: Log, topic: str, messages: int, source: Path) -> Iterator[PoseSample]:

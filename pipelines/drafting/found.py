@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -129,6 +129,7 @@ class TopicFound:
     span: Span
     target: str = ""
     source: str = ""
+    lead_ns: int | None = None  # by which header stamps are ahead of those of receipt; None without
 
 
 @dataclass(frozen=True)
@@ -149,15 +150,17 @@ class DroneLog(Found):
 
 @dataclass(frozen=True)
 class Driver:
-    """The topics of a drone's driver in a log, as a manifest's preset reads them."""
+    """Topics of a drone in a log that make poses together: those of a preset, or two that are named."""
 
-    preset: str
-    namespace: str | None  # None if it is the only one
+    settings: dict[
+        str, str | None
+    ]  # preset and namespace (None if it is the only one), or topic and attitude
     span: Span
     count: int
     body: bool
     gimbal: bool
     by_gps: bool
+    lead_ns: int | None = None  # as for topics
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,8 @@ class Edge:
     parent: str
     child: str
     still: bool
+    first_ns: int = field(default=0, compare=False)  # time of the first one
+    lead_ns: int | None = field(default=None, compare=False)  # as for topics
 
 
 @dataclass(frozen=True)
@@ -178,6 +183,15 @@ class Recording(Found):
     topics: tuple[TopicFound, ...]
     edges: tuple[Edge, ...] = ()
     drivers: tuple[Driver, ...] = ()
+    stamps: Literal["header", "receive"] = "header"
+    ahead_ns: int = 0  # of its header stamps, if that is more than the log is long
+
+    @property
+    def span(self) -> Span:
+        """The time from its first message to its last."""
+        parts: tuple[TopicFound | Driver, ...] = (*self.topics, *self.drivers)
+        spans = [part.span for part in parts if part.count]
+        return Span(min(s.first_ns for s in spans), max(s.last_ns for s in spans))
 
 
 _KINDS = (Video, Keypoints, Recording, DroneLog, Poses, Calibration, FrameTimes, Joints, Map)
@@ -200,6 +214,7 @@ class Findings:
 
 _PART = re.compile(r"(.*)_(\d{1,9})", re.DOTALL)
 _BODIES = frozenset({"base", "body", "imu", "fcu"})
+_LEAST_APART_NS = 10_000_000_000  # of header stamps and receipt; less is transport and start-up
 _FILES_ASKED = 16  # of a folder of keypoints, for their format
 
 
@@ -348,6 +363,52 @@ def joined(recordings: Sequence[Recording]) -> list[Recording]:
     return sorted(result, key=lambda recording: recording.place)
 
 
+def with_stamps(recordings: Sequence[Recording]) -> list[Recording]:
+    """Choose one kind of stamps for all logs; with it, the spans are those of these stamps.
+
+    Header stamps are taken, unless they differ from those of receipt by more than a log is long (simulation
+    time, time since boot) and are not alike in all topics of all logs: then only the receipt is one clock.
+    """
+    leads: list[int | None] = []
+    apart = False
+    longest_ns = _LEAST_APART_NS
+    for recording in recordings:
+        moving = [t for t in recording.topics if t.kind != "intrinsics" and not t.name.endswith("static")]
+        every: list[TopicFound | Driver] = [*moving, *recording.drivers]
+        parts = [part for part in every if part.count]
+        if not parts:
+            continue
+        length_ns = recording.span.last_ns - recording.span.first_ns
+        longest_ns = max(longest_ns, length_ns)
+        leads += [part.lead_ns for part in parts]
+        apart |= any(abs(part.lead_ns or 0) > max(length_ns, _LEAST_APART_NS) for part in parts)
+    if not apart:
+        return list(recordings)
+    known = [lead for lead in leads if lead is not None]
+    alike = len(known) == len(leads) and max(known) - min(known) <= longest_ns
+    ahead_ns = int(max(known, key=abs))
+    if not alike:
+        return [replace(recording, stamps="receive", ahead_ns=ahead_ns) for recording in recordings]
+    return [
+        replace(
+            recording,
+            ahead_ns=ahead_ns,
+            topics=tuple(replace(t, span=_later(t.span, t.lead_ns, ahead_ns)) for t in recording.topics),
+            drivers=tuple(replace(d, span=_later(d.span, d.lead_ns, ahead_ns)) for d in recording.drivers),
+            edges=tuple(
+                replace(e, first_ns=e.first_ns + (ahead_ns if e.lead_ns is None else e.lead_ns))
+                for e in recording.edges
+            ),
+        )
+        for recording in recordings
+    ]
+
+
+def _later(span: Span, lead_ns: int | None, otherwise_ns: int) -> Span:
+    later_ns = otherwise_ns if lead_ns is None else lead_ns
+    return Span(span.first_ns + later_ns, span.last_ns + later_ns)
+
+
 def _part(recording: Recording) -> tuple[Place, str, int]:
     match = _PART.fullmatch(recording.place[-1])
     name, number = (match[1], int(match[2])) if match else (recording.place[-1], -1)
@@ -395,8 +456,10 @@ def label_of_topic(recording: Recording, name: str) -> Label:
     return label_of(name) or label_of_recording(recording)
 
 
-def chains(recording: Recording) -> list[tuple[str, str]]:
+def chains(recording: Recording) -> list[tuple[str, str, int]]:
     """List (parent, child) of every moving camera or body frame of a log's transforms; cameras first.
+
+    The third is the time (ns) from which all transforms between them are known.
 
     The parent is the root of the child's tree. Frames that are fixed to the root are left out.
     """
@@ -407,7 +470,8 @@ def chains(recording: Recording) -> list[tuple[str, str]]:
     for child in sorted(above):
         way = _way_up(child, above)
         if way and not all(edge.still for edge in way):
-            found.append((way[-1].parent, child))
+            first_ns = max(edge.first_ns for edge in way if not edge.still)
+            found.append((way[-1].parent, child, first_ns))
     cameras = [pair for pair in found if is_called(pair[1], OPTICAL)]
     # A picture's frame is the optical one; its mounting frame has the axes of a body.
     optical = [pair for pair in cameras if is_called(pair[1], frozenset({"optical"}))]

@@ -250,7 +250,7 @@ class CameraText:
             return [
                 f"# pose: {{tum: {self._camera.name}.tum}}  # missing: nothing of that name has poses{loose}",
                 "#   or {csv: FILE}, {static: CALIBRATION}, {log: LOG, topic: TOPIC}, {log, parent, child},",
-                "#   {dji: SRT}, {ulog: FILE}, {ardupilot: FILE}, {log: LOG, preset: dji_osdk or mavros}",
+                "#   {dji: SRT}, {ulog: FILE}, {ardupilot: FILE}, {log, preset: dji_osdk, mavros, px4}",
             ]
         taken = choice.taken
         remarks = [describe(taken)]
@@ -439,6 +439,8 @@ def describe(candidate: Candidate) -> str:
         case DroneLog():
             has = "with gimbal angles" if found.gimbal else "no gimbal angles"
             return f"{found.title}, {found.positions} positions, {has}, {spanned(found.span)}"
+        case Recording() if "attitude" in candidate.settings:
+            return "positions and attitudes" + (f", {spanned(candidate.span)}" if candidate.span else "")
         case Recording() if "preset" in candidate.settings:
             turned = "" if candidate.of_body or candidate.unturned else " with gimbal angles"
             return f"usual topics{turned}" + (f", {spanned(candidate.span)}" if candidate.span else "")
@@ -543,12 +545,19 @@ def _logs(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> li
     several = len({str(settings["log"]) for settings in taken if "log" in settings}) > 1
     for name, log in draft.logs.items():
         paths = [relative(path) for path in log.parts]
-        settings: dict[str, object] = {"path": paths[0] if len(paths) == 1 else paths, "stamps": "header"}
-        if several:
+        settings: dict[str, object] = {"path": paths[0] if len(paths) == 1 else paths, "stamps": log.stamps}
+        remark = f"{log.title}, {spanned(log.span)}"
+        if log.ahead_ns:
+            remark += (
+                f"; header stamps are {log.ahead_ns / 1e9:.3f} s ahead of receipt, assumed: {log.stamps}"
+            )
+            what = (
+                f"logs: {log.stamps} stamps, for header stamps and those of receipt are of different clocks"
+            )
+            remarks.assumed[what] = []
+        if several or log.ahead_ns:
             settings["assumed"] = True
-        spans = [topic.span for topic in log.topics if topic.count]
-        whole = Span(min(s.first_ns for s in spans), max(s.last_ns for s in spans))
-        lines.append("  " + entry(name, settings, f"{log.title}, {spanned(whole)}"))
+        lines.append("  " + entry(name, settings, remark))
     if several:
         remarks.assumed["logs: one clock and one origin for all; else say clock and world_from_log"] = []
     return [*lines, _ABOUT_LOGS]

@@ -30,6 +30,7 @@ from pipelines.drafting.found import (
     joined,
     label_of_recording,
     label_of_topic,
+    with_stamps,
 )
 from pipelines.drafting.labels import (
     ACTOR,
@@ -140,13 +141,13 @@ def _of_drivers(logs: Mapping[str, Recording]) -> Iterator[Candidate]:
     """Yield candidates of drivers: the usual topics of a driver together hold more than each topic alone."""
     for log, recording in logs.items():
         for driver in recording.drivers:
-            namespace = driver.namespace or ""
-            settings = {"log": log, "preset": driver.preset, "namespace": driver.namespace}
+            named = driver.settings.get("namespace") or driver.settings.get("topic") or ""
+            likelihood = -1 if "preset" in driver.settings else len(_POSE_TYPES)
             yield Candidate(
-                dict(settings),
-                (label_of_topic(recording, namespace),),
+                {"log": log, **driver.settings},
+                (label_of_topic(recording, named),),
                 recording,
-                (1, 1 - int(driver.gimbal) + int(not driver.body), -1, -driver.count, namespace),
+                (1, 1 - int(driver.gimbal) + int(not driver.body), likelihood, -driver.count, named),
                 driver.span,
                 of_body=driver.body and not driver.gimbal,
                 by_gps=driver.by_gps,
@@ -211,14 +212,14 @@ def _topic_of(candidate: Candidate) -> str:
 def _of_transforms(logs: Mapping[str, Recording]) -> Iterator[Candidate]:
     for log, recording in logs.items():
         spans = [topic.span for topic in recording.topics if topic.kind == "transforms" and topic.count]
-        for parent, child in chains(recording):
+        for parent, child, first_ns in chains(recording):
             of_body = not is_called(child, OPTICAL)
             yield Candidate(
                 {"log": log, "parent": parent, "child": child},
                 (label_of_topic(recording, child),),
                 recording,
                 (1, int(of_body), len(_POSE_TYPES) + 1, 0, child),
-                Span(min(s.first_ns for s in spans), max(s.last_ns for s in spans)) if spans else None,
+                Span(first_ns, max(s.last_ns for s in spans)) if spans else None,
                 of_body=of_body,
                 ned_hint=hints_at_ned(parent, child),
             )
@@ -278,7 +279,7 @@ class Draft:
 
 def match(findings: Findings) -> Draft:
     """Find the cameras, and what belongs to each."""
-    logs = _log_names(joined(findings.of(Recording)))
+    logs = _log_names(with_stamps(joined(findings.of(Recording))))
     cameras = _cameras(findings, logs)
     moving, still = _moving_poses(findings, logs), _calibrated(findings, "pose")
     truth = [replace(_of_trajectory(f), is_true=True) for f in _trajectories(findings) if _is_true(f)]

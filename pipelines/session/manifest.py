@@ -184,7 +184,7 @@ class PoseSource(Guess):
     topic: str | None = None
     parent: str | None = None
     child: str | None = None
-    preset: Literal["dji_osdk", "mavros"] | None = None  # the usual topics of a driver, in a log
+    preset: Literal["dji_osdk", "mavros", "px4"] | None = None  # the usual topics of a driver, in a log
     namespace: str | None = None  # of the preset's topics, where a log holds several drones: /uav1
     attitude: str | None = None  # topic of attitudes, if `topic` has only positions (NavSatFix, PointStamped)
     tum: str | None = None

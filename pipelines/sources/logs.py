@@ -94,7 +94,9 @@ class FlightLog:
                 return topic
             type_ = self.type_of(topic)
             problem = f"topic {topic} holds {type_}, no {noun}" if type_ else f"has no topic {topic}"
-            raise DataError(self.source, problem, f"topics with {noun}: {listed}")
+            of_px4 = (type_ or "").startswith("px4_msgs/") and noun == _NOUNS["poses"]
+            remedy = "write preset: px4 instead of the topic" if of_px4 else f"topics with {noun}: {listed}"
+            raise DataError(self.source, problem, remedy)
         if len(there) != 1:
             problem = f"has {len(there)} topics with {noun} ({listed})"
             raise DataError(self.source, problem, "say which with `topic:`" if there else "name another log")

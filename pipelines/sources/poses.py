@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
-from pipelines.formats.logs.presets import NAV_SAT_FIX, read_pair, read_positions, read_preset
+from pipelines.formats.logs.presets import FIXES, read_pair, read_positions, read_preset
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
@@ -268,7 +268,7 @@ class FlightPoses:
     def actor(self, log: str, topic: str | None) -> Trajectory:
         """Read the actor's logged positions; the rotation has no meaning."""
         with self._logs.open(log) as opened:
-            if opened.type_of(topic) == NAV_SAT_FIX and topic is not None:
+            if topic is not None and opened.type_of(topic) in FIXES:
                 dropped: dict[str, int] = {}
                 track = read_positions(
                     opened.recording, opened.source, topic, opened.settings.stamps, dropped

@@ -25,6 +25,7 @@ from tests.synthetic.drone_logs import (
     LEVER_ARM,
     DroneTruth,
     drone_of,
+    px4_entries,
     ulog_rows,
     write_dataflash,
     write_record,
@@ -33,7 +34,7 @@ from tests.synthetic.drone_logs import (
 )
 from tests.synthetic.flights import SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import header
-from tests.synthetic.logs import Entry, write_log
+from tests.synthetic.logs import Entry, write_log, write_mcap, write_ros2
 
 WORLD = {
     "origin": {
@@ -141,6 +142,16 @@ def _osdk(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"log": f"{name}.bag", "preset": "dji_osdk"}
 
 
+def _px4(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_mcap(folder / f"{name}.mcap", px4_entries(truth, "/px4_1"))
+    return {"log": f"{name}.mcap", "preset": "px4", "namespace": "/px4_1"}
+
+
+def _px4_since_boot(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_ros2(folder / name, px4_entries(truth, synchronised=False), storage="mcap")
+    return {"log": name, "preset": "px4"}
+
+
 def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
     return {
         "header": header(int(truth.t_ns[row]), "/gps"),
@@ -159,6 +170,8 @@ def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
         # ms (at 1 m/s), and the origin to 1e-7 deg (11 mm).
         (_dataflash, 0.013, 0.1),
         (_osdk, 1e-4, 1e-4),
+        (_px4, 1e-4, 1e-4),
+        (_px4_since_boot, 0.002, 0.1),  # receipt is 1 ms late, at 1 m/s and 60 deg/s
         (_record, 1e-3, 1e-4),  # 1e-9 deg are 0.1 mm
     ],
 )

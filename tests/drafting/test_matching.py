@@ -244,7 +244,7 @@ def test_poses_of_a_camera_come_before_those_of_a_body() -> None:
             Edge("/tf_static", "map", "camera_optical_on_a_tripod", True),
         ),
     )
-    assert chains(log) == [("map", "drone1/camera_optical_frame"), ("map", "drone1/base_link")]
+    assert chains(log) == [("map", "drone1/camera_optical_frame", 0), ("map", "drone1/base_link", 0)]
     choice = match(Findings([log])).cameras[0].poses
     assert choice
     assert choice.taken.settings == {"log": "flight", "parent": "map", "child": "drone1/camera_optical_frame"}

@@ -34,6 +34,15 @@ _MESSAGES = {
         "D": "double*",
         "K": "double*",
     },
+    "LocationFix": {
+        "timestamp": "Timestamp",
+        "frame_id": "string",
+        "latitude": "double",
+        "longitude": "double",
+        "altitude": "double",
+        "position_covariance": "double*",
+        "position_covariance_type": "fixed32",
+    },
     "CompressedImage": {"timestamp": "Timestamp", "data": "bytes", "format": "string"},
     "RawImage": {
         "timestamp": "Timestamp",

@@ -119,7 +119,7 @@ def whatever_from(attitude: Float) -> Mapping[RelativeTo, Float]:
 
 
 def fixes_track(
-    source: Path, name: str, t_ns: Int64, values: Float, fixed: Bool, dropped: MutableMapping[str, int]
+    source: Path | str, name: str, t_ns: Int64, values: Float, fixed: Bool, dropped: MutableMapping[str, int]
 ) -> PositionTrack:
     """Apply `position_track` to latitude, longitude and height above the sea [N, 3] with 3D fixes [N]."""
     unusable = {"no 3D fix": ~fixed}
@@ -173,7 +173,7 @@ def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Fl
 
 
 def on_one_clock(
-    path: Path,
+    path: Path | str,
     position: PositionTrack,
     body: AttitudeTrack | None,
     gimbal: AttitudeTrack | None,

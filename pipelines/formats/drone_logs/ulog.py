@@ -120,13 +120,9 @@ class UlogFormat:
             DataError: no ULog, pyulog is missing, or no position in it.
         """
         topics = topics_of(open_ulog(path, _WANTED))
-        dropped: dict[str, int] = {}
         notes: list[str] = []
         fit = on_gps_time(path, _gps_time(topics), choice.time, notes)
-        body = _body(topics, choice.instance, dropped, notes)
-        position = _position(path, topics, choice, dropped, notes)
-        gimbal = _gimbal(topics, body, dropped, notes)
-        return on_one_clock(path, position, body, gimbal, fit=fit, notes=notes, dropped=dropped)
+        return telemetry_of(path, topics, choice, fit, notes)
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
         """Read the times of pictures: by the camera's feedback, else by the trigger.
@@ -146,8 +142,23 @@ class UlogFormat:
 # --- content of a log ----------------------------------------------------------------------------------
 
 
+def telemetry_of(
+    path: Path | str, topics: Sequence[Topic], choice: TelemetryChoice, fit: ClockFit | None, notes: list[str]
+) -> Telemetry:
+    """Make the telemetry of PX4's topics, of a .ulg or of px4_msgs; stamps are converted by `fit`.
+
+    Raises:
+        DataError: no position among them, or not the one that the user asks for.
+    """
+    dropped: dict[str, int] = {}
+    body = _body(topics, choice.instance, dropped, notes)
+    position = _position(path, topics, choice, dropped, notes)
+    gimbal = _gimbal(topics, body, dropped, notes)
+    return on_one_clock(path, position, body, gimbal, fit=fit, notes=notes, dropped=dropped)
+
+
 def _position(
-    path: Path,
+    path: Path | str,
     topics: Sequence[Topic],
     choice: TelemetryChoice,
     dropped: MutableMapping[str, int],
@@ -197,7 +208,9 @@ def _likeliest(found: Mapping[str, Topic]) -> str:
     return next(iter(found))
 
 
-def _local(path: Path, topic: Topic, dropped: MutableMapping[str, int], notes: list[str]) -> PositionTrack:
+def _local(
+    path: Path | str, topic: Topic, dropped: MutableMapping[str, int], notes: list[str]
+) -> PositionTrack:
     """Read the estimator's metres and their origin on Earth, which the estimator may move in flight."""
     enu = topic.numbers("y", "x", "z") * [1, 1, -1]
     valid = _local_is_valid(topic)
@@ -336,7 +349,7 @@ def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:
 
 
 def _instance(
-    path: Path, topics: Sequence[Topic], names: Sequence[str], choice: TelemetryChoice, *, wanted: bool
+    path: Path | str, topics: Sequence[Topic], names: Sequence[str], choice: TelemetryChoice, *, wanted: bool
 ) -> Topic | None:
     """Return the topic of the chosen instance, the first by default; None if there is none.
 
@@ -359,7 +372,7 @@ def _there(topics: Sequence[Topic], names: Sequence[str]) -> list[Topic]:
     return [topic for name in names for topic in topics if topic.name == name and len(topic)]
 
 
-def _no_instance(path: Path, instance: int, what: str, there: Sequence[Topic]) -> DataError:
+def _no_instance(path: Path | str, instance: int, what: str, there: Sequence[Topic]) -> DataError:
     listed = ", ".join(f"{topic.name} {topic.instance}" for topic in there)
     return DataError(path, f"has no instance {instance} of {what}", f"there are {listed}")
 

@@ -121,6 +121,22 @@ def _pose_stamped(message: Message, _: Source) -> Iterator[Sample]:
     yield _pose(message, message.value.header, message.value.pose)
 
 
+def _bare_pose(message: Message, _: Source) -> Iterator[Sample]:
+    """Yield a pose without a header: it has only the time of its receipt."""
+    value = message.value
+    covariance = getattr(value, "covariance", None)
+    pose = value.pose if hasattr(value, "pose") else value
+    yield PoseSample(
+        0,
+        message.receive_ns,
+        "",
+        "",
+        _vector(pose.position),
+        _quaternion(pose.orientation),
+        None if covariance is None else np.asarray(covariance, dtype=np.float64).reshape(6, 6),
+    )
+
+
 def _pose_with_covariance(message: Message, _: Source) -> Iterator[Sample]:
     stated = message.value.pose
     yield _pose(message, message.value.header, stated.pose, covariance=stated.covariance)
@@ -297,6 +313,20 @@ def _stamp_ns(message: Message) -> int:
     return nanoseconds(value.timestamp if _is_foxglove(message) else value.header.stamp)
 
 
+def header_ns(message: Message) -> int:
+    """Return the stamp that a message of any type has of its own; 0 without one, or if it is no time.
+
+    Of transforms it is that of the first. The stamps of px4_msgs are no header stamps: see `px4_topics`.
+    """
+    value = message.value
+    stated = next(iter(getattr(value, "transforms", ())), value)
+    stamp = getattr(getattr(stated, "header", None), "stamp", None) or getattr(stated, "timestamp", None)
+    try:
+        return 0 if stamp is None else nanoseconds(stamp)
+    except FAULTS:
+        return 0
+
+
 def nanoseconds(stamp: Any) -> int:
     """Convert a stamp to ns: ROS (sec, nanosec), protobuf (seconds, nanos), Foxglove's JSON (sec, nsec)."""
     if hasattr(stamp, "seconds"):
@@ -339,7 +369,9 @@ _Reader = Callable[[Message, Source], Iterator[Sample]]
 _PATH = "nav_msgs/msg/Path"
 
 _ROS_READERS: dict[str, tuple[Kind, _Reader]] = {
+    "geometry_msgs/msg/Pose": ("poses", _bare_pose),
     "geometry_msgs/msg/PoseStamped": ("poses", _pose_stamped),
+    "geometry_msgs/msg/PoseWithCovariance": ("poses", _bare_pose),
     "geometry_msgs/msg/PoseWithCovarianceStamped": ("poses", _pose_with_covariance),
     "geometry_msgs/msg/QuaternionStamped": ("angles", _quaternion_stamped),
     "geometry_msgs/msg/TransformStamped": ("poses", _transform),

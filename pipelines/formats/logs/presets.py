@@ -10,13 +10,17 @@ frame_id is ground_ENU, as roll, pitch, yaw (M100, M600 and others: broadcast).
 `mavros`: local_position and imu/data are ENU and FLU; global_position/global is NavSatFix above the
 ellipsoid; mount_control/orientation is a quaternion without a stamp, of FRD angles that count yaw from
 the nose.
+
+`px4` (px4_msgs of ROS 2, by way of uXRCE-DDS): the autopilot's own messages, as in its .ulg (px4_topics.py).
 """
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -31,12 +35,13 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     world_from_heading,
 )
 from pipelines.formats.logs.messages import FAULTS, Stamps, nanoseconds, unreadable
+from pipelines.formats.logs.px4_topics import read_px4
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes
-from pipelines.session.records import Message
+from pipelines.session.records import Message, Topic
 from pipelines.session.registries import Log
 from pipelines.session.telemetry import (
     AttitudeTrack,
@@ -46,11 +51,21 @@ from pipelines.session.telemetry import (
     TelemetryChoice,
 )
 
-Preset = Literal["dji_osdk", "mavros"]
+Preset = Literal["dji_osdk", "mavros", "px4"]
 Position = Literal["local", "global", "gps"]
 
-NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
-_NO_FIX = -1  # NavSatFix.status.status
+FIXES = (
+    "sensor_msgs/msg/NavSatFix",
+    "gps_common/msg/GPSFix",
+    "gps_msgs/msg/GPSFix",
+    "foxglove.LocationFix",
+    "foxglove_msgs/msg/LocationFix",
+)
+"""Types of positions on Earth."""
+
+_NO_FIX = -1  # status.status of NavSatFix and GPSFix
+_TURNED = ("sensor_msgs/msg/Imu", "geometry_msgs/msg/QuaternionStamped")
+_VERSION = re.compile(r"_v\d+")  # PX4 appends it to the names of topics whose messages changed
 _TIME_REFERENCE = "sensor_msgs/msg/TimeReference"
 
 _POSES = (
@@ -58,8 +73,8 @@ _POSES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "nav_msgs/msg/Odometry",
 )
-_POSITIONS = (NAV_SAT_FIX, "geometry_msgs/msg/PointStamped", *_POSES)
-_ATTITUDES = ("sensor_msgs/msg/Imu", "geometry_msgs/msg/QuaternionStamped", *_POSES)
+_POSITIONS = (*FIXES, "geometry_msgs/msg/PointStamped", *_POSES)
+_ATTITUDES = (*_TURNED, *_POSES)
 _VECTORS = ("geometry_msgs/msg/Vector3Stamped",)
 
 
@@ -93,6 +108,17 @@ DRIVERS: dict[Preset, _Driver] = {
         gimbal=("mount_control/orientation",),
         height="ellipsoid",
     ),
+    "px4": _Driver(
+        names=("fmu/out",),
+        positions={
+            "local": ("vehicle_local_position", "vehicle_odometry"),
+            "global": ("vehicle_global_position",),
+            "gps": ("vehicle_gps_position", "sensor_gps"),
+        },
+        attitude=("vehicle_attitude", "vehicle_odometry"),
+        gimbal=("gimbal_device_attitude_status",),
+        height="sea level",
+    ),
 }
 
 
@@ -124,7 +150,7 @@ def namespaces(names: Sequence[str]) -> list[tuple[Preset, str]]:
     for preset, driver in DRIVERS.items():
         for base in driver.names:
             for name in names:
-                before, mark, rest = name.rpartition(f"/{base}/")
+                before, mark, rest = _plain(name).rpartition(f"/{base}/")
                 if mark and any(rest in topics for topics in driver.positions.values()):
                     found.append((preset, before))
     return sorted(set(found))
@@ -146,8 +172,43 @@ def parts_of(preset: Preset, namespace: str, names: Collection[str]) -> Parts:
 
 
 def _among(names: Collection[str], prefix: str, driver: _Driver, parts: Iterable[str]) -> list[str]:
+    named = {_plain(name): name for name in names}
     topics = [f"{prefix}/{base}/{part}" for part in parts for base in driver.names]
-    return [topic for topic in topics if topic in names]
+    return [named[topic] for topic in topics if topic in named]
+
+
+def _plain(name: str) -> str:
+    """Return the name of a topic without the version of its message."""
+    return _VERSION.sub("", name) if "/fmu/" in name else name
+
+
+def pairs_of(topics: Sequence[Topic]) -> list[tuple[str, str]]:
+    """Find topics of positions on Earth, each with the topic of attitudes that shares most of its name.
+
+    Topics of a driver that has a preset are left out, and so are raw attitudes.
+    """
+    of_drivers = [
+        f"{prefix}/{base}/"
+        for preset, prefix in namespaces([t.name for t in topics])
+        for base in DRIVERS[preset].names
+    ]
+    free = [t for t in topics if t.count and not t.name.startswith(tuple(of_drivers))]
+    turned = [t.name for t in free if t.type in _TURNED and "raw" not in t.name]
+    return [
+        (t.name, max(sorted(turned), key=lambda name: _shared(name, t.name)))
+        for t in free
+        if t.type in FIXES and turned
+    ]
+
+
+def _shared(one: str, other: str) -> int:
+    """Count the leading parts that the names of two topics share."""
+    return sum(
+        1
+        for _ in takewhile(
+            lambda parts: parts[0] == parts[1], zip(one.split("/"), other.split("/"), strict=False)
+        )
+    )
 
 
 def read_preset(
@@ -175,12 +236,16 @@ def read_preset(
     wanted = [choice.position] if choice.position else list(driver.positions)
     places = {kind: topic for kind in wanted if (topic := first(driver.positions[kind]))}
     if not places:
-        there = [kind for kind, parts in driver.positions.items() if first(parts)]
+        others = [kind for kind, parts in driver.positions.items() if first(parts)]
         raise DataError(
             source,
             f"has no {' or '.join(wanted)} position of {prefix}/{driver.names[0]}",
-            f"there is {', '.join(there)}" if there else "record its topics",
+            f"there is {', '.join(others)}" if others else "record its topics",
         )
+    if preset == "px4":
+        there = {name for parts in parts_of(preset, prefix, with_messages) for name in parts}
+        asked = {_plain(name).rpartition("/")[2]: name for name in there}
+        return read_px4(recording, source, asked, choice, stamps)
     kind, place = next(iter(places.items()))
     dropped: dict[str, int] = {}
     notes = [f"{source}: took the {kind} position from {place}"]
@@ -213,7 +278,7 @@ def read_preset(
 def read_pair(
     recording: Log, source: str, position: str, attitude: str, axes: Axes, stamps: Stamps
 ) -> Telemetry:
-    """Read a topic of positions (NavSatFix, PointStamped) and one of attitudes (Imu, QuaternionStamped).
+    """Read a topic of positions (`FIXES`, PointStamped) and one of attitudes (Imu, QuaternionStamped).
 
     Axes are those of attitudes, and of positions in metres.
 
@@ -254,7 +319,7 @@ def read_positions(
     Raises:
         DataError: nothing usable in it.
     """
-    if _type_of(recording, topic) != NAV_SAT_FIX:
+    if _type_of(recording, topic) not in FIXES:
         rows = _read(recording, source, topic, _point_of)
         return position_track(source, topic, rows.times(stamps), rows.values(), dropped, on_earth=False)
     rows = _read(recording, source, topic, _fix_of)
@@ -288,10 +353,18 @@ def _prefix(source: str, preset: Preset, namespace: str | None, names: Sequence[
             )
         return wanted
     if not there:
+        driver = DRIVERS[preset]
+        others = [name for name in names if any(f"/{base}/" in name for base in driver.names)]
+        bases = "/".join(driver.names)
+        if not others:
+            problem = f"has no topics of {preset} ({bases}/...)"
+            raise DataError(source, problem, "name the topic of the poses instead")
+        positions = ", ".join(part for parts in driver.positions.values() for part in parts)
         raise DataError(
             source,
-            f"has no topics of {preset} ({'/'.join(DRIVERS[preset].names)}/...)",
-            "name the topic of the poses instead",
+            f"has topics of {preset} ({', '.join(others[:3])}{', ...' if len(others) > 3 else ''}), but none"
+            f" with positions ({positions})",
+            "record one of these below it, or name the topic of the poses instead",
         )
     if len(there) > 1:
         raise DataError(
@@ -364,8 +437,9 @@ def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequ
         value = message.value
         try:
             header = getattr(value, "header", None)
+            stamp = getattr(value, "timestamp", None) if header is None else header.stamp
             row = [float(number) for number in numbers(value)]
-            rows.header_ns.append(0 if header is None else nanoseconds(header.stamp))
+            rows.header_ns.append(0 if stamp is None else nanoseconds(stamp))
             rows.receive_ns.append(message.receive_ns)
             rows.numbers.extend(row)
             if header is not None:
@@ -404,12 +478,17 @@ def _point_of(value: Any) -> Sequence[float]:
 
 
 def _fix_of(value: Any) -> Sequence[float]:
-    """Return latitude, longitude, altitude, status, and horizontal and vertical variance (0 if unknown)."""
-    covariance = np.asarray(value.position_covariance, dtype=np.float64).reshape(3, 3)
-    known = bool(value.position_covariance_type)
+    """Return latitude, longitude, altitude, status, and horizontal and vertical variance (0 if unknown).
+
+    Foxglove's LocationFix has no status.
+    """
+    status = value.status.status if hasattr(value, "status") else 0
+    stated = np.asarray(getattr(value, "position_covariance", ()), dtype=np.float64)
+    covariance = stated.reshape(3, 3) if stated.size else np.zeros((3, 3))
+    known = bool(getattr(value, "position_covariance_type", 0))
     across = (covariance[0, 0] + covariance[1, 1]) / 2
     variances = (float(across), float(covariance[2, 2])) if known else (0.0, 0.0)
-    return value.latitude, value.longitude, value.altitude, value.status.status, *variances
+    return value.latitude, value.longitude, value.altitude, status, *variances
 
 
 def _quaternion_of(value: Any) -> Sequence[float]:

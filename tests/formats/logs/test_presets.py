@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.logs.presets import Preset, namespaces, parts_of, read_pair, read_preset
+from pipelines.formats.logs.presets import (
+    Preset,
+    namespaces,
+    pairs_of,
+    parts_of,
+    read_pair,
+    read_positions,
+    read_preset,
+)
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import rotate
 from pipelines.session.errors import DataError
@@ -16,7 +24,7 @@ from pipelines.session.registries import LogFormat, recognise
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 from tests.real_data import real_data
 from tests.synthetic.logged_flights import header
-from tests.synthetic.logs import Entry, write_log, write_mcap
+from tests.synthetic.logs import Entry, write_log, write_mcap, write_ros2
 
 START_NS = 1_700_000_000_000_000_000
 ROWS = 8
@@ -200,6 +208,8 @@ def test_several_drones(tmp_path: Path) -> None:
         read(tmp_path / "z", "mavros", *both, namespace="/c")
     with pytest.raises(DataError, match=r"dji_osdk .*dji_sdk/dji_osdk_ros"):
         read(tmp_path / "w", "dji_osdk", *both)
+    with pytest.raises(DataError, match=r"/mavros/imu/data.*local_position/pose"):  # topics, but no position
+        read(tmp_path / "u", "mavros", imu("/mavros/imu/data", (0, 0, 0, 1)))
     with pytest.raises(DataError, match=r"gps .*/a/mavros.* local"):
         read(tmp_path / "v", "mavros", both[0], position="gps")
 
@@ -212,7 +222,6 @@ def _pair(path: Path, position: str, attitude: str) -> Telemetry:
 @pytest.mark.parametrize(
     ("position", "attitude", "fault", "type_"),
     [
-        ("/gps/gps", "/novatel/oem7/odom", "/gps/gps", "gps_common/msg/GPSFix"),
         (
             "/novatel/oem7/inspva",
             "/novatel/oem7/odom",
@@ -237,16 +246,56 @@ def test_topics_of_other_types_are_refused_by_name(
     assert ("/gps/fix" in refused.value.remedy) == (fault == position)
 
 
-def test_vectors_and_fixes_of_foxglove_are_no_poses(tmp_path: Path) -> None:
-    place = {"latitude": 47.5, "longitude": 8.5, "altitude": 400.0, "frame_id": "gps"}
-    fixes = [Entry("/place", "foxglove.LocationFix", t, {"timestamp": t, **place}) for t in stamps()]
-    as_json = write_mcap(tmp_path / "a.mcap", fixes, "json")
+def test_a_real_gps_fix_is_where_the_nav_sat_fix_beside_it_is() -> None:
+    path = real_data("second/novatel_bestpos.bag")
+    own, other = (_pair(path, topic, "/novatel/oem7/odom").position for topic in ("/gps/gps", "/gps/fix"))
+    assert (own.on_earth, own.height, len(own.t_ns)) == (True, "ellipsoid", len(other.t_ns))
+    np.testing.assert_array_equal(own.values, other.values)
+    assert np.abs(own.t_ns - other.t_ns).max() < 1_000_000  # the driver stamps one after the other
+
+
+@pytest.mark.parametrize("package", ["gps_common", "gps_msgs"])
+def test_a_gps_fix_without_a_fix_is_dropped(tmp_path: Path, package: str) -> None:
+    place = {"latitude": 47.5, "longitude": 8.5, "altitude": 400.0}
+    entries = [
+        Entry(
+            "/gps",
+            f"{package}/msg/GPSFix",
+            t,
+            {"header": header(t, ""), "status": {"status": -(k < 2)}, **place},
+        )
+        for k, t in enumerate(stamps())
+    ]
+    turned = imu("/imu", (0, 0, 0, 1))
+    path = write_log(tmp_path, "a", "mcap-cdr", sorted([*entries, *turned], key=lambda e: e.stamp_ns))
+    telemetry = _pair(path, "/gps", "/imu")
+    assert (len(telemetry.position.t_ns), list(telemetry.dropped.values())) == (ROWS - 2, [2])
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        assert pairs_of(log.topics) == [("/gps", "/imu")]
+
+
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+def test_fixes_of_foxglove(tmp_path: Path, encoding: Any) -> None:
+    entries = []
+    for k, t in enumerate(stamps()):
+        sec, nsec = divmod(t, 10**9)
+        stamp = {"sec": sec, "nsec": nsec} if encoding == "json" else {"seconds": sec, "nanos": nsec}
+        place = {"latitude": 47.5 + k, "longitude": 8.5, "altitude": 400.0, "frame_id": "gps"}
+        # The receipt is later: the message's own time counts.
+        entries.append(Entry("/place", "foxglove.LocationFix", t + 10**8, {"timestamp": stamp, **place}))
+    path = write_mcap(tmp_path / "a.mcap", entries, encoding)
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        track = read_positions(log, "a", "/place", "header", {})
+    assert (track.on_earth, track.t_ns.tolist()) == (True, stamps())
+    np.testing.assert_array_equal(track.values, [[47.5 + k, 8.5, 400.0] for k in range(ROWS)])
+
+
+def test_vectors_are_no_positions(tmp_path: Path) -> None:
     ros = sorted([*vectors("/v", "", 1, 2, 3), *imu("/imu", (0, 0, 0, 1))], key=lambda entry: entry.stamp_ns)
     as_ros = write_log(tmp_path, "b", "ros1", ros)
-    for path, topic, turned in ((as_json, "/place", "/place"), (as_ros, "/v", "/imu")):
-        with pytest.raises(DataError, match=f" {topic} .*NavSatFix") as refused:
-            _pair(path, topic, turned)
-        assert "attribute" not in str(refused.value)
+    with pytest.raises(DataError, match=r" /v .*NavSatFix") as refused:
+        _pair(as_ros, "/v", "/imu")
+    assert "attribute" not in str(refused.value)
     with pytest.raises(DataError, match=r" /v .*NavSatFix"):
         _pair(as_ros, "/v", "/v")
 
@@ -259,3 +308,49 @@ def test_a_time_reference_of_another_type_is_left_aside(tmp_path: Path) -> None:
         vectors("/mavros/time_reference", "", 1, 2, 3),
     )
     assert telemetry.position.values[0].tolist() == [1, 2, 3]
+
+
+def odometry(frame: int, **more: Any) -> list[Entry]:
+    half = 0.5**0.5
+    return [
+        Entry(
+            "/fmu/out/vehicle_odometry",
+            "px4_msgs/msg/VehicleOdometry",
+            t,
+            # 1 m north, 2 m east, 3 m up, heading east
+            {
+                "timestamp": t // 1000,
+                "pose_frame": frame,
+                "position": [1, 2, -3],
+                "q": [half, 0, 0, half],
+                **more,
+            },
+        )
+        for t in stamps()
+    ]
+
+
+def test_the_odometry_of_px4_is_turned_to_enu(tmp_path: Path) -> None:
+    path = write_log(tmp_path, "a", "ros2-mcap", odometry(1))
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        telemetry = read_preset(log, str(path), "px4", None, TelemetryChoice(), "header")
+        other = read_preset(log, str(path), "px4", None, TelemetryChoice(position="local"), "receive")
+    np.testing.assert_allclose(telemetry.position.values, [[2, 1, 3]] * ROWS)
+    np.testing.assert_array_equal(telemetry.position.t_ns, stamps())
+    np.testing.assert_array_equal(other.position.t_ns, stamps())
+    assert telemetry.body is not None
+    nose = rotate(telemetry.body.quaternion_xyzw[0], np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(nose, [1, 0, 0], atol=1e-6)
+    assert not any("FRD" in note for note in telemetry.notes)
+    path = write_log(tmp_path, "b", "ros2-mcap", odometry(2))
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        telemetry = read_preset(log, str(path), "px4", None, TelemetryChoice(), "header")
+        assert any("FRD" in note for note in telemetry.notes)
+        with pytest.raises(DataError, match=r"gps .*local"):
+            read_preset(log, str(path), "px4", None, TelemetryChoice(position="gps"), "header")
+
+
+def test_px4_without_definitions_asks_for_mcap(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "old", odometry(1), definitions=False)
+    with recognise(path, LogFormat, "log").open_log([path]) as log, pytest.raises(DataError, match="MCAP"):
+        read_preset(log, str(path), "px4", None, TelemetryChoice(), "header")

@@ -1,0 +1,161 @@
+"""`mocap init` beside logs of drivers and of drones: what it drafts, `mocap ingest` takes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from ruamel.yaml import YAML
+
+from pipelines.draft import Drafted, draft
+from pipelines.ingest import ingest
+from tests.real_data import real_data
+from tests.synthetic.drone_logs import drone_of, px4_entries
+from tests.synthetic.flights import LENS, START_NS, write_flight
+from tests.synthetic.logged_flights import header
+from tests.synthetic.logs import Entry, write_log, write_mcap
+from tests.synthetic.videos import even_ticks, write_video
+
+FRAMES = 30
+UPTIME_NS = 900_000_000_000  # a stamp of simulation time
+
+
+def drafted(folder: Path) -> tuple[Drafted, dict[str, Any]]:
+    result = draft([folder])
+    return result, YAML(typ="safe", pure=True).load(result.text)
+
+
+def write_pictures(folder: Path, name: str = "keypoints") -> None:
+    """Write keypoints without times, and a calibration."""
+    joints = [value for j in range(17) for value in (100 + j, 200, 0.9)]
+    people = [{"image_id": k, "category_id": 1, "keypoints": joints, "score": 1.0} for k in range(FRAMES)]
+    (folder / f"{name}.json").write_text(json.dumps(people), encoding="utf-8")
+    matrix = [[LENS.fx, 0.0, LENS.cx], [0.0, LENS.fy, LENS.cy], [0.0, 0.0, 1.0]]
+    text = (
+        f"[cam_0]\nsize = [{LENS.width}, {LENS.height}]\nmatrix = {matrix}\ndistortions = [0, 0, 0, 0, 0]\n"
+    )
+    (folder / "lenses.toml").write_text(text, encoding="utf-8")
+
+
+def frames_with_poses(manifest: Path) -> int:
+    camera = next(iter(ingest(manifest).description.cameras.values()))
+    return camera.frames.count - camera.poses.frames_without_pose
+
+
+def poses(topic: str, ahead_ns: int | None, *, bare: bool = False) -> list[Entry]:
+    """List poses at 30 Hz over 20 s, whose header stamps are ahead of their receipt."""
+    entries = []
+    for k in range(600):
+        t = START_NS + k * 33_333_333
+        at = {"position": {"x": 0.01 * k, "y": 0.1 * (k % 7)}, "orientation": {"w": 1.0}}
+        if bare:
+            entries.append(Entry(topic, "geometry_msgs/msg/Pose", t, at))
+        else:
+            stamped = header(t + (ahead_ns or 0), "map")
+            entries.append(Entry(topic, "geometry_msgs/msg/PoseStamped", t, {"header": stamped, "pose": at}))
+    return entries
+
+
+def test_a_real_log_of_simulation_time_is_drafted_as_it_is_ingested(tmp_path: Path) -> None:
+    shutil.copyfile(real_data("second/ros2_nav2_turtlebot.mcap"), tmp_path / "turtle.mcap")
+    write_pictures(tmp_path)
+    result, stated = drafted(tmp_path)
+    assert not result.missing
+    assert stated["logs"]["turtle"] == {"path": "turtle.mcap", "stamps": "header", "assumed": True}
+    (camera,) = stated["cameras"].values()
+    assert 900 < camera["frame_times"]["start"] < 1100  # the receipt is in the year 2026
+    ingest(result.path)  # which refused a start of which no pose has the time
+
+
+@pytest.mark.parametrize(
+    ("others", "stamps"),
+    [
+        ([], "header"),
+        ([("/other/pose", UPTIME_NS - START_NS, False)], "header"),
+        ([("/other/pose", 0, False)], "receive"),  # two clocks in one log
+        ([("/other/pose", None, True)], "receive"),  # no header at all: only the receipt is there
+    ],
+)
+def test_one_kind_of_stamps_is_chosen_for_all(tmp_path: Path, others: list[Any], stamps: str) -> None:
+    entries = poses("/drone1/pose", UPTIME_NS - START_NS)
+    entries += [entry for topic, ahead_ns, bare in others for entry in poses(topic, ahead_ns, bare=bare)]
+    write_mcap(tmp_path / "drone1.mcap", sorted(entries, key=lambda entry: entry.stamp_ns))
+    write_pictures(tmp_path, "drone1")
+    result, stated = drafted(tmp_path)
+    assert stated["logs"]["drone1"]["stamps"] == stamps
+    start_s = (UPTIME_NS if stamps == "header" else START_NS) / 1e9
+    assert float(stated["cameras"]["drone1"]["frame_times"]["start"]) == pytest.approx(start_s, abs=1e-3)
+    assert frames_with_poses(result.path) == FRAMES
+
+
+def test_logs_with_equal_clocks_keep_header_stamps_without_a_guess(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "drone1.mcap", poses("/drone1/pose", -40_000_000))
+    write_pictures(tmp_path, "drone1")
+    assert drafted(tmp_path)[1]["logs"]["drone1"] == {"path": "drone1.mcap", "stamps": "header"}
+
+
+def test_poses_without_a_header_have_the_time_of_receipt(tmp_path: Path) -> None:
+    entries = poses("/vrpn/pose", None, bare=True)
+    write_log(tmp_path, "drone1", "ros1", entries)
+    write_pictures(tmp_path, "drone1")
+    result, stated = drafted(tmp_path)
+    assert stated["cameras"]["drone1"]["pose"]["topic"] == "/vrpn/pose"
+    assert frames_with_poses(result.path) == FRAMES
+    table = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "drone1" / "poses.parquet")
+    assert table["t_ns"].tolist() == [entry.stamp_ns for entry in entries]
+
+
+def test_px4_messages_and_fixes_with_attitudes_are_drafted(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path / "x", cameras=1, seconds=1.0, clean=True)
+    write_mcap(tmp_path / "drone1.mcap", px4_entries(drone_of(flight, 0), "/px4_1"))
+    shutil.rmtree(tmp_path / "x")
+    entries = []
+    for k in range(30):
+        t = START_NS + k * 33_333_333
+        place = {"header": header(t, "gps"), "latitude": 47.5 + 1e-6 * k, "longitude": 8.5, "altitude": 400.0}
+        turned = {"header": header(t, "base_link"), "orientation": {"w": 1.0}}
+        entries += [
+            Entry("/drone2/gps", "gps_common/msg/GPSFix", t, place),
+            Entry("/drone2/imu/data_raw", "sensor_msgs/msg/Imu", t, turned),
+            Entry("/drone2/imu/data", "sensor_msgs/msg/Imu", t, turned),
+        ]
+    write_log(tmp_path, "drone2", "ros1", entries)
+    for name in ("drone1", "drone2"):
+        write_pictures(tmp_path, name)
+    result, stated = drafted(tmp_path)
+    assert not result.missing
+    of_px4, of_gps = (stated["cameras"][name]["pose"] for name in ("drone1", "drone2"))
+    assert of_px4 == {"log": "drone1", "preset": "px4"}
+    assert of_gps == {
+        "log": "drone2",
+        "topic": "/drone2/gps",
+        "attitude": "/drone2/imu/data",
+        "of": "body",
+    }
+    assert all(
+        camera.frames.count - camera.poses.frames_without_pose == FRAMES
+        for camera in ingest(result.path).description.cameras.values()
+    )
+
+
+def test_a_flight_record_says_when_the_video_of_its_length_began(tmp_path: Path) -> None:
+    heading = "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),isVideo"
+    heading += ",gimbal_heading(degrees),gimbal_pitch(degrees),gimbal_roll(degrees)"
+    films = {*range(100, 130), *range(200, 280)}  # of 3 s and of 8 s
+    rows = [
+        f"{100 * k},2024-05-01 10:00:{k // 10:02d},47.5,{8.25 + 1e-6 * k},{k},{int(k in films)},90,-30,0"
+        for k in range(400)
+    ]
+    (tmp_path / "drone1.csv").write_text("\n".join([heading, *rows]), encoding="utf-8")
+    write_video(tmp_path / "drone1.mp4", even_ticks(90))
+    write_pictures(tmp_path, "drone1")
+    _, stated = drafted(tmp_path)
+    camera = stated["cameras"]["drone1"]
+    assert camera["pose"] == {"dji": "drone1.csv", "assumed": True}
+    assert camera["frame_times"]["start"] == pytest.approx(1_714_557_610, abs=0.1)
+    assert camera["frame_times"]["assumed"] is True
+    assert camera["clock"]["sigma_s"] == 1
