@@ -25,7 +25,7 @@ from pipelines.geometry.poses import (
     quaternion_from_matrix,
     rotation_vector_from_quaternion,
 )
-from pipelines.reconstruction.background import points_of
+from pipelines.reconstruction.background import background_of
 from pipelines.reconstruction.background_adjustment import Adjusted, PosePrior, adjust
 from pipelines.reconstruction.background_tracks import Follower, load_tracks
 from pipelines.reconstruction.loading import load_cameras
@@ -96,7 +96,7 @@ def main() -> None:
         for draw in range(given.draws):
             moved, other = disturb(models, t_ns, at, turned, np.random.default_rng(draw))
             logs[f"draw {draw}"] = moved, matrix_from_quaternion(other)
-        points = points_of(camera, followed)
+        points = background_of(camera, followed)
         for name, logged in logs.items():
             for noise, errors in (("given", pose_errors(models)), ("unknown", None)):
                 started_s = time.process_time()

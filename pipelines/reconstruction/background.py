@@ -17,7 +17,7 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.noise import EXACT, ROTATION, PoseErrors, Process
 from pipelines.geometry.poses import quaternion_from_matrix, velocities
-from pipelines.reconstruction.background_adjustment import Adjusted, PosePrior, SeenPoints, adjust
+from pipelines.reconstruction.background_adjustment import Adjusted, Background, PosePrior, SeenPoints, adjust
 from pipelines.reconstruction.background_tracks import Followed, Tracks
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
@@ -53,7 +53,7 @@ def refine_cameras(
             entries[camera.name] = {"used": False, "reason": seen}
         else:
             t_ns = camera.frame_t_ns[seen.rows]
-            found = adjust(points_of(camera, seen), *camera.poses_at(t_ns, between), PosePrior.of(stated))
+            found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), PosePrior.of(stated))
             refined.append(_with_poses(camera, t_ns, found))
             entries[camera.name] = _entry(found)
         if entries[camera.name]["reason"] is not None:
@@ -62,11 +62,22 @@ def refine_cameras(
     return refined, entries, refusals
 
 
-def points_of(camera: Camera, followed: Followed) -> SeenPoints:
-    """Return the points of a camera's background as they are adjusted."""
-    t_ns, tracks = camera.frame_t_ns[followed.rows], followed.tracks
-    rays = _rays(tracks, camera, t_ns)
-    return SeenPoints(tracks.picture, tracks.point, rays, camera.focal_px, (t_ns - t_ns[0]) / 1e9)
+def background_of(camera: Camera, followed: Followed) -> Background:
+    """Return a camera's background as it is adjusted."""
+    t_ns = camera.frame_t_ns[followed.rows]
+
+    def between(first: int, stop: int) -> SeenPoints:
+        parts = [SeenPoints(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))]
+        for tracks in followed.between(first, stop):
+            rays = _rays(tracks, camera, t_ns)  # of whole parts: velocities need the neighbours
+            parts.append(SeenPoints(tracks.picture, tracks.point, rays).between(first, stop))
+        return SeenPoints(
+            np.concatenate([part.picture for part in parts]),
+            np.concatenate([part.point for part in parts]),
+            np.concatenate([part.rays for part in parts]),
+        )
+
+    return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9)
 
 
 def _rays(tracks: Tracks, camera: Camera, t_ns: Int64) -> Float:

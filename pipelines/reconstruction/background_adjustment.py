@@ -17,7 +17,7 @@ error is always possible, and one draw of it says little of its level, which the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,16 +153,28 @@ class Adjusted:
 
 @dataclass(frozen=True)
 class SeenPoints:
-    """K sightings of points of the background in the T pictures of a camera."""
+    """K sightings of points of the background in the pictures of a camera."""
 
     picture: Int64  # [K] row of the pictures
     point: Int64  # [K]
     rays: Float  # [K, 2] undistorted normalised image coordinates
+
+    def between(self, first: int, stop: int) -> SeenPoints:
+        """Return those in pictures from `first` to before `stop`."""
+        mine = (self.picture >= first) & (self.picture < stop)
+        return SeenPoints(self.picture[mine], self.point[mine], self.rays[mine])
+
+
+@dataclass(frozen=True)
+class Background:
+    """Background of one camera with T pictures."""
+
+    between: Callable[[int, int], SeenPoints]  # in pictures from the first number to before the second
     focal_px: float
     t_s: Float  # [T]
 
 
-def adjust(seen: SeenPoints, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
+def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
     """Refine the poses of one camera by its background.
 
     Args:
@@ -185,21 +197,24 @@ def adjust(seen: SeenPoints, position: Float, rotation: Float, prior: PosePrior)
 
     if not len(posed):
         return refused("none of its pictures has a pose")
-    stretches = [
-        _Stretch.of(seen, rows, position, rotation)
-        for rows in np.array_split(posed, -(-len(posed) // STRETCH))
-    ]
-    unbound = sum(stretch.unbound for stretch in stretches)
+    # Each stretch is built twice, so that a long flight's points need not be in memory together.
+    parts = np.array_split(posed, -(-len(posed) // STRETCH))
+    unbound = sum(_Stretch.of(seen, rows, position, rotation).unbound for rows in parts)
     if unbound > _MOST_UNBOUND * (len(posed) - 1) or len(posed) < 2:
         return refused(
             f"{unbound} of {len(posed)} pictures share fewer than {_FEWEST_SHARED} points of the background"
             " with the one before"
         )
-    results = []
-    for stretch in stretches:
+    results, points = [], 0
+    for rows in parts:
+        stretch = _Stretch.of(seen, rows, position, rotation)
         found = stretch.solve_with_levels(prior)
         if found is None:
             return refused("the adjustment did not converge")
+        new_position[rows], new_rotation[rows] = stretch.poses(found.errors)
+        covariance[rows] = found.covariance
+        covariance[rows[:, None], range(3), range(3)] += prior.constant[0] ** 2
+        points += len(stretch.points.inverse_depth)
         results.append(found)
     pixels = float(np.median(np.concatenate([found.missed for found in results])))
     if pixels > _WORST_PX:
@@ -208,10 +223,6 @@ def adjust(seen: SeenPoints, position: Float, rotation: Float, prior: PosePrior)
     surprise = max(float((np.sqrt(np.mean(found.errors**2, axis=0)) / level).max()) for found in results)
     if surprise > _SIGMAS:
         return refused(f"its poses would be {surprise:.0f} standard deviations from the log")
-    for stretch, found in zip(stretches, results, strict=True):
-        new_position[stretch.rows], new_rotation[stretch.rows] = stretch.poses(found.errors)
-        covariance[stretch.rows] = found.covariance
-        covariance[stretch.rows[:, None], range(3), range(3)] += prior.constant[0] ** 2
     priors = [found.prior for found in results]
     slow = _rms_slow(priors) if prior.estimated else prior.slow
     return Adjusted(
@@ -225,7 +236,7 @@ def adjust(seen: SeenPoints, position: Float, rotation: Float, prior: PosePrior)
             assumed=prior.estimated,
         ),
         replace(prior, white=_rms([p.white for p in priors]), slow=slow),
-        sum(len(stretch.points.inverse_depth) for stretch in stretches),
+        points,
         pixels,
         None,
     )
@@ -329,9 +340,10 @@ class _Stretch:
     unbound: int  # pictures that share too few points with the one before
 
     @classmethod
-    def of(cls, seen: SeenPoints, rows: Int64, position: Float, rotation: Float) -> _Stretch:
+    def of(cls, whole: Background, rows: Int64, position: Float, rotation: Float) -> _Stretch:
         """Build a stretch of some pictures."""
-        t_s = seen.t_s[rows]
+        seen = whole.between(int(rows[0]), int(rows[-1]) + 1)
+        t_s = whole.t_s[rows]
         period_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 1.0
         longest = int(np.clip(round(_LONGEST_S / max(period_s, 1e-3)), *_LONGEST))
         row_of = np.full(len(position), -1)
@@ -352,14 +364,14 @@ class _Stretch:
             rows,
             position[rows],
             rotation[rows],
-            Sightings(first, picture, rays, _PIXEL_SIGMA / seen.focal_px),
+            Sightings(first, picture, rays, _PIXEL_SIGMA / whole.focal_px),
             _far_points(first, picture, rays, position[rows][middle], rotation[rows]),
             place,
             knot_place,
             knot_t_s,
             knot,
             share,
-            seen.focal_px,
+            whole.focal_px,
             int((_shared(first, picture, len(rows)) < _FEWEST_SHARED).sum()),
         )
 

@@ -5,10 +5,13 @@ not return to their start are dropped. Everything is followed, people too, so th
 pictures alone; sightings on people are dropped when tracks are loaded.
 """
 
-from collections.abc import Iterable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,9 @@ from pipelines.reconstruction.observations import Camera
 from pipelines.session.errors import DataError
 from pipelines.session.tables import TRACKS, table_parts
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 _MOST, _FEWEST = 300, 200  # points in a picture; new ones are looked for when fewer are left
 _APART_PX, _EDGE_PX = 20, 8
 _QUALITY = 0.005  # of the best corner
@@ -25,7 +31,6 @@ _RETURN_PX = 0.3
 _WINDOW_PX, _LEVELS = 21, 3
 _AROUND, _AROUND_PX = 0.03, 10.0  # of a person's box on each side, and px: arms beyond joints
 _MOST_HZ = 60.0  # of the pictures that are followed
-_MOST_SIGHTINGS = 8_000_000  # that are loaded: a fifth of the points after an hour
 
 
 @dataclass(frozen=True)
@@ -39,10 +44,20 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Followed:
-    """Background of one camera."""
+    """Background of one camera, in parts with points of their own, which are loaded when they are needed.
+
+    A part begins with the last picture of the part before.
+    """
 
     rows: Int64  # [T] of its frames
-    tracks: Tracks  # their `picture` counts these rows
+    begins: Int64  # [N] first picture of each part; pictures count these rows
+    parts: Sequence[Callable[[], Tracks]]  # N of them
+
+    def between(self, first: int, stop: int) -> Iterator[Tracks]:
+        """Load the parts with pictures from `first` to before `stop`, one at a time."""
+        begin, end = np.searchsorted(self.begins, (first, stop)).tolist()
+        for part in self.parts[max(begin - 1, 0) : end]:
+            yield part()
 
 
 class _LazyPictures(Sequence[Bytes]):
@@ -104,9 +119,9 @@ def rows_to_follow(t_ns: Int64) -> Int64:
 
 
 def load_tracks(session: Path, camera: Camera) -> Followed | None:
-    """Load the background of a camera, without sightings on people; None if it was not followed.
+    """Open the background of a camera, without sightings on people; None if it was not followed.
 
-    A track ends where it meets the box of a person. Of a long flight, a share of the points is used.
+    A track ends where it meets the box of a person.
 
     Raises:
         DataError: the file cannot be read.
@@ -115,27 +130,20 @@ def load_tracks(session: Path, camera: Camera) -> Followed | None:
     if not path.is_file():
         return None
     rows = rows_to_follow(camera.frame_t_ns)
-    boxes = people_boxes(camera)[rows]
-    total, parts = table_parts(path, TRACKS)
-    share = min(_MOST_SIGHTINGS / max(total, 1), 1.0)
-    loaded = []
-    for part in parts:
+    numbers, boxes = camera.frame_number[rows], people_boxes(camera)[rows]
+
+    def load(read: Callable[[], pd.DataFrame]) -> Tracks:
+        part = read()
         frame, point = (part[name].to_numpy(np.int64) for name in ("frame", "point"))
         xy = part[["x", "y"]].to_numpy(np.float64)
-        picture = np.searchsorted(camera.frame_number[rows], frame)
+        picture = np.searchsorted(numbers, frame)
         known = picture < len(rows)
-        known[known] = camera.frame_number[rows][picture[known]] == frame[known]
-        known &= (0.6180339887498949 * point) % 1.0 < share
-        tracks = Tracks(picture[known], point[known], xy[known])
-        loaded.append(off_people(tracks, boxes))
-    return Followed(
-        rows,
-        Tracks(
-            np.concatenate([tracks.picture for tracks in loaded] or [np.empty(0, np.int64)]),
-            np.concatenate([tracks.point for tracks in loaded] or [np.empty(0, np.int64)]),
-            np.concatenate([tracks.xy for tracks in loaded] or [np.empty((0, 2))]),
-        ),
-    )
+        known[known] = numbers[picture[known]] == frame[known]
+        return off_people(Tracks(picture[known], point[known], xy[known]), boxes)
+
+    parts = table_parts(path, TRACKS)
+    begins = np.searchsorted(numbers, np.array([first for first, _ in parts], dtype=np.int64))
+    return Followed(rows, begins, [partial(load, read) for _, read in parts])
 
 
 def load_stills(session: Path, camera: Camera) -> Stills | None:

@@ -29,7 +29,7 @@ from pipelines.geometry.noise import (
     Process,
 )
 from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector
-from pipelines.reconstruction.background_tracks import Followed, Stills, people_boxes
+from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks, people_boxes
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 
@@ -250,12 +250,8 @@ def _cloud(
     Returns:
         Place [N, 3], covariance [N, 3, 3], and derivative by a constant attitude error [N, 3, 3].
     """
-    tracks = followed.tracks
-    pictures = np.clip(np.searchsorted(followed.rows, rows), 0, len(followed.rows) - 1)
-    shown = np.isin(tracks.picture, pictures)
-    mine = np.flatnonzero(np.isin(tracks.point, np.unique(tracks.point[shown])))
-    mine = mine[:: max(1, -(-len(mine) // _MOST_SIGHTINGS))]
-    xy, t_ns = tracks.xy[mine], camera.frame_t_ns[followed.rows[tracks.picture[mine]]]
+    tracks = _shown(followed, np.clip(np.searchsorted(followed.rows, rows), 0, len(followed.rows) - 1))
+    xy, t_ns = tracks.xy, camera.frame_t_ns[followed.rows[tracks.picture]]
     delay_s = np.clip(row_delay_s(xy[:, 1], camera.intrinsics), *_readout(camera))
     when, place = np.unique(t_ns + np.round(1e9 * delay_s).astype(np.int64), return_inverse=True)
     position, rotation = (each[place] for each in camera.poses_at(when, between))
@@ -263,7 +259,7 @@ def _cloud(
     ray = np.einsum("kij,kj->ki", rotation, ray / np.linalg.norm(ray, axis=1, keepdims=True))
     known = np.isfinite(ray).all(axis=1)
     ray, position, rotation = ray[known], position[known], rotation[known]
-    names, number = np.unique(tracks.point[mine][known], return_inverse=True)
+    names, number = np.unique(tracks.point[known], return_inverse=True)
     if not len(names):
         return np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
     points = len(names)
@@ -290,6 +286,20 @@ def _cloud(
     kept &= (off < _WORST_PX) & (far > _NEAREST_M) & (far < _FARTHEST_M)
     kept &= np.bincount(number, (ray * arm).sum(axis=1) > 0, points) == count
     return place3[kept], covariance[kept], by_turn[kept]
+
+
+def _shown(followed: Followed, pictures: Int64) -> Tracks:
+    """Collect the tracks of the points that some pictures show; of many sightings, every k-th."""
+    found = [Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))]
+    for part in followed.between(0, len(followed.rows)):
+        shown = np.isin(part.picture, pictures)
+        mine = np.isin(part.point, np.unique(part.point[shown]))
+        found.append(Tracks(part.picture[mine], part.point[mine], part.xy[mine]))
+    picture, point, xy = (
+        np.concatenate([getattr(part, name) for part in found]) for name in ("picture", "point", "xy")
+    )
+    every = max(1, -(-len(point) // _MOST_SIGHTINGS))
+    return Tracks(picture[::every], point[::every], xy[::every])
 
 
 def _ground(points: Float, covariance: Float) -> tuple[Int64, Float]:

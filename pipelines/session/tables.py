@@ -7,10 +7,11 @@ found has no row, and is read back as NaN.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -94,23 +95,31 @@ def join_tables(path: Path, parts: Iterable[pd.DataFrame], schema: pa.Schema) ->
             writer.write_table(pa.Table.from_arrays(columns, schema=schema))
 
 
-def table_parts(path: Path, schema: pa.Schema) -> tuple[int, Iterator[pd.DataFrame]]:
-    """Read a table of `join_tables` part by part; also return the number of its rows.
+def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], pd.DataFrame]]]:
+    """List the parts of a table of `join_tables`: the least value of the first column, and a reader of each.
 
     Raises:
         DataError: not a Parquet file, truncated, or columns are missing.
     """
     import pyarrow.parquet as pq
 
-    try:
-        file = pq.ParquetFile(path)
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(
-            path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
-        ) from error
-    names = schema.names
-    parts = (file.read_row_group(k, columns=names).to_pandas() for k in range(file.num_row_groups))
-    return file.metadata.num_rows, parts
+    def group(number: int | None) -> Any:
+        try:
+            with path.open("rb") as opened:
+                file = pq.ParquetFile(opened)
+                return file.metadata if number is None else file.read_row_group(number, columns=schema.names)
+        except (OSError, pa.ArrowException) as error:
+            raise DataError(
+                path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
+            ) from error
+
+    def read(number: int) -> pd.DataFrame:
+        frame: pd.DataFrame = group(number).to_pandas()
+        return frame
+
+    metadata = group(None)
+    filled = [k for k in range(metadata.num_row_groups) if metadata.row_group(k).num_rows]
+    return [(metadata.row_group(k).column(0).statistics.min, partial(read, k)) for k in filled]
 
 
 def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:

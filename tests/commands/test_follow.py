@@ -64,7 +64,8 @@ def test_tracks_and_stills_are_kept_for_other_methods_and_poses(session: Path) -
     assert np.abs(stills.pictures[1].astype(float) - textured(int(stills.rows[1]))[..., 0]).mean() < 5
     found = load_tracks(session, camera)
     assert found is not None
-    assert set(found.tracks.picture.tolist()) == set(range(FRAMES))
+    pictures = np.concatenate([part.picture for part in found.between(0, FRAMES)])
+    assert set(pictures.tolist()) == set(range(FRAMES))
 
 
 def test_auto_goes_on_without_a_video_that_is_exchanged_while_it_is_followed(session: Path) -> None:

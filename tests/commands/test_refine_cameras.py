@@ -21,7 +21,7 @@ from pipelines.geometry.poses import (
     quaternion_from_matrix,
     rotation_vector_from_quaternion,
 )
-from pipelines.reconstruction.background_adjustment import PosePrior, SeenPoints, adjust
+from pipelines.reconstruction.background_adjustment import Background, PosePrior, SeenPoints, adjust
 from pipelines.reconstruction.background_tracks import follow, off_people
 from pipelines.session.description import read_description
 from pipelines.session.registries import noise_models
@@ -74,7 +74,8 @@ def test_the_background_of_the_sample_flight_halves_the_errors_of_attitudes(tmp_
     lens: Intrinsics = entry.intrinsics.intrinsics()
     prior = PosePrior.of(pose_errors(noise_models("the flight", entry.pose_noise or {})))
     rays = undistort(tracks.xy, lens)
-    seen = SeenPoints(tracks.picture, tracks.point, rays, lens.fx, (t_ns - t_ns[0]) / 1e9)
+    points = SeenPoints(tracks.picture, tracks.point, rays)
+    seen = Background(points.between, lens.fx, (t_ns - t_ns[0]) / 1e9)
     found = adjust(seen, at, matrix_from_quaternion(turned), prior)
     assert found.refused is None
     logged_rad, left_rad = (

@@ -20,7 +20,7 @@ from pipelines.geometry.poses import (
 )
 from pipelines.reconstruction import background_adjustment
 from pipelines.reconstruction.background import refine_cameras
-from pipelines.reconstruction.background_adjustment import Adjusted, PosePrior, SeenPoints, adjust
+from pipelines.reconstruction.background_adjustment import Adjusted, Background, PosePrior, SeenPoints, adjust
 from pipelines.reconstruction.background_tracks import Followed, Tracks, follow, off_people
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
@@ -84,7 +84,7 @@ def adjusted(
 ) -> Adjusted:
     """Adjust poses of pictures 30 times a second."""
     t_s = np.arange(len(logged_poses[0])) / 30
-    return adjust(SeenPoints(picture, point, xy, FOCAL, t_s), *logged_poses, prior)
+    return adjust(Background(SeenPoints(picture, point, xy).between, FOCAL, t_s), *logged_poses, prior)
 
 
 def refined(way_m: float, seed: int, lost: float = 0.0) -> tuple[Adjusted, Float, Float, Float, Float]:
@@ -441,7 +441,7 @@ def test_a_rolling_shutter_does_not_bend_the_background(shutter: str) -> None:
         detections=nobody,
     )
     between = Interpolation(max_gap_s=1.0, max_extrapolation_s=0.0)
-    followed = {"drone1": Followed(np.arange(len(t_ns)), tracks)}
+    followed = {"drone1": Followed(np.arange(len(t_ns)), np.zeros(1, np.int64), [lambda: tracks])}
     (found,), entries, _ = refine_cameras([camera], followed, [ERRORS], between=between)
     left = errors_deg(matrix_from_quaternion(found.trajectory.quaternion_xyzw), turned[stamps])
     assert entries["drone1"]["used"]
