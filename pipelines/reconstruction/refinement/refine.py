@@ -21,6 +21,7 @@ from pipelines.geometry.noise import (
 from pipelines.reconstruction.refinement.elimination import (
     Eliminated,
     covariances,
+    eliminate,
     shared_covariance,
 )
 from pipelines.reconstruction.refinement.estimate import (
@@ -191,10 +192,11 @@ def _refined(problem: Problem, start: Float, part: Bool, filled: Float, prior: _
     del at  # the next solutions have their own factors
     slow = system, state  # determines the poses
     if known.memory > REMEMBERED:
-        joints = _joints_without_slow_errors(*slow, freely)
+        joints, own = _joints_without_slow_errors(*slow, freely)
+        covariance = _with_own(covariance, own, problem.guides, joints)
     elif _mainly_slow(problem, known, state):
         slow = _solve_with_loose_motion(problem, known, state)[:2]
-        joints = _joints_without_slow_errors(*slow, freely)
+        joints, _ = _joints_without_slow_errors(*slow, freely)
     else:
         joints = state.position
     fallback = doubts or _too_far(joints, filled, prior.expected_m)
@@ -263,11 +265,14 @@ def _solve_with_loose_motion(
     return solve(problem, loose, state, rounds=_ROUNDS)
 
 
-def _joints_without_slow_errors(system: System, state: State, known: Knowledge) -> Float:
+def _joints_without_slow_errors(system: System, state: State, known: Knowledge) -> tuple[Float, Float]:
     """Estimate the joints [T, J, 3] after removing slow pose errors, with the full weight of keypoints.
 
     Slow errors were estimated with correlated keypoints weighted less, or with a looser motion prior. That is
     right for slow errors and wrong for limbs: their motion would be smoothed away, or become jittery.
+
+    Returns the positions, and their covariance [T, J, 3, 3] if slow errors were known exactly. In that one,
+    correlated keypoints count less again.
     """
     pictures = system.problem.pictures
     slow = state._replace(white=np.zeros_like(state.white))
@@ -280,10 +285,38 @@ def _joints_without_slow_errors(system: System, state: State, known: Knowledge) 
     for errors in known.poses:
         white = errors.white_with_stray(knot_s)
         poses.append(PoseErrors((float(white[0]), float(white[1])), (), errors.logged))
-    known = replace(known, poses=tuple(poses), memory=1.0)
-    initial = initial_state(problem, known, state.position)
-    _, found, _ = solve(problem, known, initial, rounds=4, bounds=(BOUND,))
-    return found.position
+    known = replace(known, poses=tuple(poses))
+    weighted = replace(known, memory=1.0)
+    initial = initial_state(problem, weighted, state.position)
+    solved, found, at = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
+    del at
+    remembering = System(replace(problem, guides=None), known, solved.layout, BOUND**2)
+    return found.position, covariances(remembering, eliminate(remembering, found))
+
+
+def _with_own(covariance: Float, own: Float, guides: Bool | None, position: Float) -> Float:
+    """Compute the covariance [T, J, 3, 3] of joints that did not determine the cameras.
+
+    They have their own error, and the error by slow pose errors of the guide that is mostly the nearest.
+
+    Args:
+        covariance: [T, J, 3, 3] of the estimate in which only guides determined the cameras.
+        own: [T, J, 3, 3] with slow pose errors known.
+        guides: [J]; None if every joint is one.
+        position: [T, J, 3] m.
+    """
+    if guides is None or guides.all():
+        return covariance
+    (of,) = np.nonzero(guides)
+    found = covariance.copy()
+    for joint in np.nonzero(~guides)[0]:
+        away = np.linalg.norm(position[:, of] - position[:, joint, None], axis=-1)
+        near = of[np.argmin(np.median(away, axis=0))]
+        by_poses = covariance[:, near] - own[:, near]
+        variance, axes = np.linalg.eigh(0.5 * (by_poses + by_poses.swapaxes(-1, -2)))
+        by_poses = np.einsum("tij,tj,tkj->tik", axes, np.maximum(variance, 0.0), axes)
+        found[:, joint] = own[:, joint] + by_poses
+    return found
 
 
 def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, Float]:
