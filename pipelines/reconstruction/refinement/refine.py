@@ -51,6 +51,7 @@ _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a wa
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
 _LOOSE_MOTION = 3.0  # times the accelerations of the prior, for the estimate of clocks and slow pose errors
+_FAST_MOTION = 2.0  # times the accelerations of the prior, for joints beside correlated keypoint errors
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
@@ -286,7 +287,9 @@ def _joints_without_slow_errors(system: System, state: State, known: Knowledge) 
         white = errors.white_with_stray(knot_s)
         poses.append(PoseErrors((float(white[0]), float(white[1])), (), errors.logged))
     known = replace(known, poses=tuple(poses))
-    weighted = replace(known, memory=1.0)
+    # Beside correlated keypoints the motion is learned only at first, and kicks would be smoothed.
+    freely = _FAST_MOTION**2 if known.memory > REMEMBERED else 1.0
+    weighted = replace(known, memory=1.0, acceleration=freely * known.acceleration)
     initial = initial_state(problem, weighted, state.position)
     solved, found, at = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
     del at
