@@ -49,9 +49,11 @@ _ROUGH_M = 0.05  # rms of the neighbours about the plane, at most
 _STEEPEST = 0.6  # cosine of the slope
 _GRAZING = 0.12  # sine of the angle between ray and ground, at least
 
+_PASSES = 3  # of the comparison, each in the place that the one before found
 _PAIRS_OF_STILLS = 4  # in which a patch is compared
 _HALF_CELLS = 20  # of a patch, on each side of its centre
 _CELL_M = 0.03
+_FARTHEST_REACH_CELLS = 100  # of a search: patches that may lie farther off are found by chance
 _BLUR_CELLS = 3.0
 _FLAT = 2.5  # grey levels: a patch whose standard deviation is smaller shows nothing
 _ALIKE, _CLEARER = 0.75, 0.08  # correlation, and by how much it must exceed that of any other place
@@ -62,7 +64,6 @@ _MOST_STILLS = 40  # of a camera
 _MOST_PIXELS = 2_500_000  # of a still: larger ones are halved
 _LEVELS = 3  # of the stills' pyramids
 _SIGMAS = 3.0  # of where a patch should be, that are searched
-_MOST_REACH_CELLS = 20  # beyond that, cells get larger
 _MOST_SIGHTINGS = 500_000  # of a cloud
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
 _AGREEING = 9.2  # 99 % of it
@@ -184,17 +185,20 @@ def bind_positions(
     ]
     solution = _Solution(np.zeros(6 * len(cameras)), np.diag(prior**2))
     counts, used = np.zeros((len(pairs), 2), dtype=np.int64), np.zeros(len(pairs), dtype=np.bool_)
-    if pairs:
-        most = min(_MOST_OF_PAIR, _MOST_PATCHES // len(pairs))
-        first = _compare(views, pairs, solution, most)
-        rough, agree = _solve(first, prior) if len(first.pair) else (solution, np.empty(0, np.bool_))
+    most = min(_MOST_OF_PAIR, _MOST_PATCHES // max(len(pairs), 1))
+    for _ in range(_PASSES if pairs else 0):
+        # Where nothing is known the search goes far, and few patches are found; they narrow the next search.
+        matches = _compare(views, pairs, solution, most)
+        if not len(matches.pair):
+            break
+        _, agree = _solve(matches, prior)
         counts = np.stack(
-            [np.bincount(pair, minlength=len(pairs)) for pair in (first.pair, first.pair[agree])], 1
+            [np.bincount(pair, minlength=len(pairs)) for pair in (matches.pair, matches.pair[agree])], 1
         )
         used = (counts[:, 1] >= _FEWEST_PATCHES) & (counts[:, 1] > _AGREE * counts[:, 0])
-        if used.any():
-            chosen = [pair for pair, use in zip(pairs, used, strict=True) if use]
-            solution, _ = _solve(_compare(views, chosen, rough, most), prior)
+        if not used.any():
+            break
+        solution, _ = _solve(_of_pairs(matches, used), prior)
     return _bound(cameras, pairs, counts, used, prior, solution)
 
 
@@ -412,6 +416,21 @@ def _compare(
     )
 
 
+def _of_pairs(matches: _Matches, used: Bool) -> _Matches:
+    """Return the comparisons of the pairs that are used."""
+    kept = used[matches.pair]
+    number = np.cumsum(kept) - 1
+    mine = kept[matches.patch]
+    return _Matches(
+        number[matches.patch[mine]],
+        matches.pair[kept],
+        matches.covariance[kept],
+        matches.across[mine],
+        matches.shift[mine],
+        matches.design[mine],
+    )
+
+
 def _alike(seen_a: Bool, seen_b: Bool, ray_a: Float, ray_b: Float) -> list[tuple[int, int]]:
     """Choose pairs of stills that see a patch from similar directions, each still at most once."""
     cosine = ray_a @ ray_b.T
@@ -435,26 +454,53 @@ class _Cut:
     rotation: Float  # [3, 3]
     camera: Camera
 
-    def orthophoto(self, centre: Float, axes: Float, half: Int64, cell_m: float) -> Picture | None:
-        """Cut out 2 half + 1 cells [2] along each of two axes [2, 3] about a point; None if not inside."""
+    def shown(self, centre: Float, axes: Float, half: Int64) -> tuple[Int64, Int64]:
+        """Find how much of a rectangle of cells about a point the still shows: first and last cell [2].
+
+        The rectangle has `half` cells [2] on each side along two axes [2, 3]. It keeps its width across the
+        second axis, unless the still is too narrow for it even at the point itself.
+        """
+        across = np.arange(-half[1], half[1] + 1)
+        wide = self._inside(centre + _CELL_M * across[:, None] * axes[1])
+        first, last = _run(wide, int(half[1]))
+        along = np.arange(-half[0], half[0] + 1)[:, None, None] * axes[0]
+        sides = np.array([across[first], across[last]])[:, None] * axes[1]
+        low, high = _run(self._inside(centre + _CELL_M * (along + sides)).all(axis=1), int(half[0]))
+        return np.array([low - half[0], first - half[1]]), np.array([high - half[0], last - half[1]])
+
+    def _inside(self, points: Float) -> Bool:
+        xy, depth = _pixels(points, self.position, self.rotation, self.camera)
+        size = np.array([self.camera.intrinsics.width, self.camera.intrinsics.height])
+        with np.errstate(invalid="ignore"):
+            inside: Bool = ((xy > 0) & (xy < size - 1)).all(axis=-1) & (depth > 0)
+        return inside
+
+    def orthophoto(self, centre: Float, axes: Float, begins: Int64, ends: Int64) -> Picture | None:
+        """Cut out the cells from `begins` to `ends` [2] along axes [2, 3] about a point; None if not inside."""
         import cv2
 
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
-        xy, depth = _pixels(centre + corners * cell_m @ axes, self.position, self.rotation, self.camera)
-        width, height = self.camera.intrinsics.width, self.camera.intrinsics.height
-        inside = (xy > 0).all() and (xy < [width - 1, height - 1]).all() and (depth > 0).all()
-        if not inside:
+        corners = np.array([begins, [ends[0], begins[1]], ends, [begins[0], ends[1]]])
+        places = centre + corners * _CELL_M @ axes
+        if not self._inside(places).all():
             return None
+        xy, _ = _pixels(places, self.position, self.rotation, self.camera)
         sides_px = np.abs(xy - np.roll(xy, 1, axis=0)).max(axis=1)
-        span_px = float((sides_px / (2 * half[[1, 0, 1, 0]])).max())
+        span_px = float((sides_px / (ends - begins)[[1, 0, 1, 0]]).max())
         level = int(np.clip(np.log2(max(span_px, 1.0)), min(self.pyramid), _LEVELS))
         to_still = cv2.getPerspectiveTransform(
-            (corners + half).astype(np.float32), (xy / 2**level).astype(np.float32)
+            (corners - begins).astype(np.float32), (xy / 2**level).astype(np.float32)
         )
-        size = (2 * half + 1).tolist()
+        size = (ends - begins + 1).tolist()
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         cut = cv2.warpPerspective(self.pyramid[level], to_still, size, flags=flags)
         return np.asarray(cv2.GaussianBlur(cut.astype(np.float32), (0, 0), _BLUR_CELLS))
+
+
+def _run(inside: Bool, middle: int) -> tuple[int, int]:
+    """Find the first and the last of the true values about the middle one."""
+    outside = np.flatnonzero(~inside)
+    before, after = outside[outside <= middle], outside[outside >= middle]
+    return int(before.max(initial=-1)) + 1, int(after.min(initial=len(inside))) - 1
 
 
 def _axes(normal: Float, ray: Float) -> Float:
@@ -479,24 +525,29 @@ def _displacement(
     """
     import cv2
 
-    cell_m = max(_CELL_M, float(reach_m.max()) / _MOST_REACH_CELLS)
     half = np.full(2, _HALF_CELLS)
-    reach = np.maximum(np.ceil(reach_m / cell_m).astype(np.int64), _PEAK_CELLS + 2)
-    searched = b.orthophoto(point + expected, axes, half + reach, cell_m)
-    wanted = a.orthophoto(point, axes, half, cell_m)
-    if wanted is None or searched is None or wanted.std() < _FLAT:
+    wanted = a.orthophoto(point, axes, -half, half)
+    if wanted is None or wanted.std() < _FLAT:
+        return None
+    reach = np.clip(np.ceil(reach_m / _CELL_M).astype(np.int64), _PEAK_CELLS + 2, _FARTHEST_REACH_CELLS)
+    begins, ends = b.shown(point + expected, axes, half + reach)
+    least = half + _PEAK_CELLS + 2
+    if (-begins < least).any() or (ends < least).any():
+        return None
+    searched = b.orthophoto(point + expected, axes, begins, ends)
+    if searched is None:
         return None
     alike = cv2.matchTemplate(searched, wanted, cv2.TM_CCOEFF_NORMED)
     y, x = np.unravel_index(int(alike.argmax()), alike.shape)
-    if not (0 < x < 2 * reach[0] and 0 < y < 2 * reach[1]) or alike[y, x] < _ALIKE:
+    if not (0 < x < alike.shape[1] - 1 and 0 < y < alike.shape[0] - 1) or alike[y, x] < _ALIKE:
         return None
     other = alike.copy()
     other[max(0, y - _PEAK_CELLS) : y + _PEAK_CELLS + 1, max(0, x - _PEAK_CELLS) : x + _PEAK_CELLS + 1] = -1
     if alike[y, x] - other.max() < _CLEARER:
         return None
-    right = _vertex(*alike[y, x - 1 : x + 2]) + x - reach[0]
-    down = _vertex(*alike[y - 1 : y + 2, x]) + y - reach[1]
-    moved: Float = expected + cell_m * (right * axes[0] + down * axes[1])
+    right = _vertex(*alike[y, x - 1 : x + 2]) + x + begins[0] + half[0]
+    down = _vertex(*alike[y - 1 : y + 2, x]) + y + begins[1] + half[1]
+    moved: Float = expected + _CELL_M * (right * axes[0] + down * axes[1])
     return moved
 
 
@@ -587,9 +638,10 @@ def _bound(
     columns = np.array([3 * c + k for c in group for k in range(3)], dtype=np.int64)
     joint = solution.covariance[np.ix_(columns, columns)]
     every = np.tile(np.eye(3), (len(group), 1))
-    common = np.zeros((3, 3))
+    common = of_group = np.zeros((3, 3))
     if group:
-        common = np.asarray(np.linalg.inv(every.T @ np.linalg.inv(joint) @ every), dtype=np.float64)
+        of_group = np.asarray(np.linalg.inv(every.T @ np.linalg.inv(joint) @ every), dtype=np.float64)
+        common = of_group.copy()
         if any((errors := cameras[c].errors) is not None and errors.assumed for c in group):
             common *= _share_of_assumed(position[group], prior[3 * np.array(group)])
     moved, left_m, reasons = list(cameras), {}, {}
@@ -602,7 +654,7 @@ def _bound(
                 moved[c] = _narrowed(camera, wider, None, float(prior[3 * c]))
             continue
         place = slice(3 * c, 3 * c + 3)
-        own = float(np.trace(solution.covariance[place, place] - common)) / 3
+        own = float(np.trace(solution.covariance[place, place] - of_group)) / 3
         relative = own * len(group) / (len(group) - 1)
         sigma = float(
             np.sqrt(max(relative, 0.0) + (0.0 if camera.static else _CAMERA_SIGMA_M) ** 2 + EXACT**2)
