@@ -279,10 +279,13 @@ def _radtan_holds(
 
 def _radtan_gain(square: Float, coefficients: tuple[float, ...]) -> tuple[Float, Float]:
     """Compute the radial factor at a squared radius, and its derivative by the squared radius."""
-    numerator, denominator = _radtan_polynomials(coefficients)
-    above, below = numerator(square), denominator(square)
-    gain = above / below
-    slope = (numerator.deriv()(square) - gain * denominator.deriv()(square)) / below
+    k1, k2, _, _, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    gain = 1 + square * (k1 + square * (k2 + square * k3))
+    slope = k1 + square * (2 * k2 + square * (3 * k3))
+    if k4 or k5 or k6:
+        below = 1 + square * (k4 + square * (k5 + square * k6))
+        gain = gain / below
+        slope = (slope - gain * (k4 + square * (2 * k5 + square * (3 * k6)))) / below
     return gain, slope
 
 

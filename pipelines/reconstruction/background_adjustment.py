@@ -64,7 +64,7 @@ _INVERSE_DEPTH = np.array([0.0, 0.01])  # mean (1/m) and precision (m^2) of the 
 _WORST_PX = 2.0
 _ROUNDS, _CONVERGED = 8, 1e-5  # m and rad
 _SIGMAS = 4.0
-_KNOT_S = 0.5  # between the knots of slow errors; what they do in between counts as white
+_KNOT_S = 0.2  # between the knots of slow errors; what they do in between counts as white
 _SLOW_S = 10.0  # over which slow errors are counted in the level of all errors
 _UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1] / 10)
 """Start of estimated levels. White positions that are free by more confuse far and near points at first."""

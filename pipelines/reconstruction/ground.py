@@ -42,14 +42,14 @@ _NEAREST_M, _FARTHEST_M = 1.5, 40.0
 
 _GRID_M = 0.8  # of patches: at most one point of a cloud in a cube of this size
 _MOST_PATCHES = 3000  # of all pairs together
-_MOST_OF_PAIR = 250
+_MOST_OF_PAIR = 160
 _AROUND_M = 1.5  # of a point, where its ground plane is fitted
 _NEIGHBOURS = 6  # needed there
 _ROUGH_M = 0.05  # rms of the neighbours about the plane, at most
 _STEEPEST = 0.6  # cosine of the slope
 _GRAZING = 0.12  # sine of the angle between ray and ground, at least
 
-_PASSES = 3  # of the comparison, each in the place that the one before found
+_PASSES = (2, 2, 1)  # of the comparison, each about what the one before found: one in so many patches
 _PAIRS_OF_STILLS = 4  # in which a patch is compared
 _HALF_CELLS = 20  # of a patch, on each side of its centre
 _CELL_M = 0.03
@@ -71,6 +71,7 @@ _PAIR_SIGMA_M = 0.012  # of an error that all patches of a pair share: clouds an
 
 _MATCH_SIGMA_M = 0.03  # of one comparison
 _TURN_SIGMA = np.radians(0.1)  # of attitudes from the background, at least: followed points drift alike
+_USUAL_RANGE_M = 10.0  # at which a slow error of an attitude moves a patch
 _CAMERA_SIGMA_M = 0.007  # of each camera's error that no pair shows: its path is bent a little
 _REPEATED = 0.5  # correlation of the errors of comparisons of the same patch
 _LOSS = 2.0  # standard deviations at which a patch counts half
@@ -177,7 +178,7 @@ def bind_positions(
         between: rules for interpolating between logged poses.
     """
     views = [_view(camera, followed.get(camera.name), stills.get(camera.name), between) for camera in cameras]
-    prior = _prior_sigma(cameras)
+    prior, bent = _prior_sigma(cameras), np.array([_bent(camera) for camera in cameras])
     pairs = [
         (a, b)
         for a, b in permutations(range(len(cameras)), 2)
@@ -186,19 +187,19 @@ def bind_positions(
     solution = _Solution(np.zeros(6 * len(cameras)), np.diag(prior**2))
     counts, used = np.zeros((len(pairs), 2), dtype=np.int64), np.zeros(len(pairs), dtype=np.bool_)
     most = min(_MOST_OF_PAIR, _MOST_PATCHES // max(len(pairs), 1))
-    for _ in range(_PASSES if pairs else 0):
+    of_pair = np.array([np.sqrt(_PAIR_SIGMA_M**2 + bent[a] ** 2 + bent[b] ** 2) for a, b in pairs])
+    for share in _PASSES if pairs else ():
         # Where nothing is known the search goes far, and few patches are found; they narrow the next search.
-        matches = _compare(views, pairs, solution, most)
+        matches = _compare(views, pairs, solution, most // share)
         if not len(matches.pair):
             break
-        _, agree = _solve(matches, prior)
-        counts = np.stack(
-            [np.bincount(pair, minlength=len(pairs)) for pair in (matches.pair, matches.pair[agree])], 1
-        )
+        _, agree = _solve(matches, prior, of_pair)
+        both = (matches.pair, matches.pair[agree])
+        counts = np.stack([np.bincount(pair, minlength=len(pairs)) for pair in both], axis=1)
         used = (counts[:, 1] >= _FEWEST_PATCHES) & (counts[:, 1] > _AGREE * counts[:, 0])
         if not used.any():
             break
-        solution, _ = _solve(_of_pairs(matches, used), prior)
+        solution, _ = _solve(_of_pairs(matches, used), prior, of_pair)
     return _bound(cameras, pairs, counts, used, prior, solution)
 
 
@@ -469,21 +470,23 @@ class _Cut:
         return np.array([low - half[0], first - half[1]]), np.array([high - half[0], last - half[1]])
 
     def _inside(self, points: Float) -> Bool:
-        xy, depth = _pixels(points, self.position, self.rotation, self.camera)
+        return self._holds(_pixels(points, self.position, self.rotation, self.camera)[0])
+
+    def _holds(self, xy: Float) -> Bool:
         size = np.array([self.camera.intrinsics.width, self.camera.intrinsics.height])
         with np.errstate(invalid="ignore"):
-            inside: Bool = ((xy > 0) & (xy < size - 1)).all(axis=-1) & (depth > 0)
+            inside: Bool = ((xy > 0) & (xy < size - 1)).all(axis=-1)
         return inside
 
     def orthophoto(self, centre: Float, axes: Float, begins: Int64, ends: Int64) -> Picture | None:
-        """Cut out the cells from `begins` to `ends` [2] along axes [2, 3] about a point; None if not inside."""
+        """Cut out cells, from `begins` to `ends` [2], along axes [2, 3] about a point; None if not inside."""
         import cv2
 
         corners = np.array([begins, [ends[0], begins[1]], ends, [begins[0], ends[1]]])
         places = centre + corners * _CELL_M @ axes
-        if not self._inside(places).all():
-            return None
         xy, _ = _pixels(places, self.position, self.rotation, self.camera)
+        if not self._holds(xy).all():
+            return None
         sides_px = np.abs(xy - np.roll(xy, 1, axis=0)).max(axis=1)
         span_px = float((sides_px / (ends - begins)[[1, 0, 1, 0]]).max())
         level = int(np.clip(np.log2(max(span_px, 1.0)), min(self.pyramid), _LEVELS))
@@ -574,8 +577,31 @@ def _prior_sigma(cameras: Sequence[Camera]) -> Float:
     return np.maximum(np.repeat(sigma.ravel(), 3), EXACT)
 
 
-def _solve(matches: _Matches, prior: Float) -> tuple[_Solution, Bool]:
-    """Solve for constant errors; return also which patches [P] agree."""
+def _bent(camera: Camera) -> float:
+    """Compute the standard deviation (m) of what slow errors leave in a camera's constant position error.
+
+    The stills show it at some times; over a flight that is longer than an error lasts, it averages out.
+    """
+    if camera.static or camera.errors is None:
+        return 0.0
+    span_s = float(camera.frame_t_ns[-1] - camera.frame_t_ns[0]) / 1e9
+    variance = 0.0
+    for process in camera.errors.processes:
+        if not process.constant:
+            arm_m = _USUAL_RANGE_M if process.number == ROTATION else 1.0
+            lasts = min(2 * process.correlation_s / max(span_s, EXACT), 1.0)
+            variance += lasts * (arm_m * process.sigma0) ** 2
+    return float(np.sqrt(variance))
+
+
+def _solve(matches: _Matches, prior: Float, of_pairs_m: Float) -> tuple[_Solution, Bool]:
+    """Solve for constant errors; return also which patches [P] agree.
+
+    Args:
+        matches: the comparisons.
+        prior: standard deviations [6 C] of constant errors.
+        of_pairs_m: that of the error which all patches of a pair share.
+    """
     cut = matches.across
     spread = (
         cut @ (matches.covariance[matches.patch] + _MATCH_SIGMA_M**2 * np.eye(3)) @ np.swapaxes(cut, 1, 2)
@@ -586,7 +612,7 @@ def _solve(matches: _Matches, prior: Float) -> tuple[_Solution, Bool]:
     shared = pairs[matches.pair[matches.patch]]
     of_pair = (shared[:, None, :, None] * np.eye(3)[:, None]).reshape(len(cut), 3, -1)
     design = cut @ np.concatenate([matches.design, of_pair], axis=2)
-    every = np.concatenate([prior, np.full(of_pair.shape[2], _PAIR_SIGMA_M)])
+    every = np.concatenate([prior, np.repeat(of_pairs_m[: len(pairs)], 3)])
     errors = np.zeros(len(every))
     seen, back_cut = np.einsum("kij,kj->ki", cut, matches.shift), np.swapaxes(cut, 1, 2)
     for k in range(_ROUNDS):
@@ -657,7 +683,11 @@ def _bound(
         own = float(np.trace(solution.covariance[place, place] - of_group)) / 3
         relative = own * len(group) / (len(group) - 1)
         sigma = float(
-            np.sqrt(max(relative, 0.0) + (0.0 if camera.static else _CAMERA_SIGMA_M) ** 2 + EXACT**2)
+            np.sqrt(
+                max(relative, 0.0)
+                + (0.0 if camera.static else _CAMERA_SIGMA_M**2 + _bent(camera) ** 2)
+                + EXACT**2
+            )
         )
         left_m[camera.name] = sigma
         turned = slice(3 * (total + c), 3 * (total + c) + 3)
