@@ -51,6 +51,7 @@ _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a wa
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
 _LOOSE_MOTION = 3.0  # times the accelerations of the prior, for the estimate of clocks and slow pose errors
+_ANY_MOTION = 100.0  # times the accelerations of the prior, for the error of single pictures
 _FAST_MOTION = 2.0  # times the accelerations of the prior, for joints beside correlated keypoint errors
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
@@ -193,11 +194,11 @@ def _refined(problem: Problem, start: Float, part: Bool, filled: Float, prior: _
     del at  # the next solutions have their own factors
     slow = system, state  # determines the poses
     if known.memory > REMEMBERED:
-        joints, own = _joints_without_slow_errors(*slow, freely)
-        covariance = _with_own(covariance, own, problem.guides, joints)
+        joints, own, least = _joints_without_slow_errors(*slow, freely)
+        covariance = _with_own(covariance, own, least, problem.guides, joints)
     elif _mainly_slow(problem, known, state):
         slow = _solve_with_loose_motion(problem, known, state)[:2]
-        joints, _ = _joints_without_slow_errors(*slow, freely)
+        joints = _joints_without_slow_errors(*slow, freely)[0]
     else:
         joints = state.position
     fallback = doubts or _too_far(joints, filled, prior.expected_m)
@@ -266,7 +267,7 @@ def _solve_with_loose_motion(
     return solve(problem, loose, state, rounds=_ROUNDS)
 
 
-def _joints_without_slow_errors(system: System, state: State, known: Knowledge) -> tuple[Float, Float]:
+def _joints_without_slow_errors(system: System, state: State, known: Knowledge) -> tuple[Float, Float, Float]:
     """Estimate the joints [T, J, 3] after removing slow pose errors, with the full weight of keypoints.
 
     Slow errors were estimated with correlated keypoints weighted less, or with a looser motion prior. That is
@@ -293,32 +294,36 @@ def _joints_without_slow_errors(system: System, state: State, known: Knowledge) 
     initial = initial_state(problem, weighted, state.position)
     solved, found, at = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
     del at
-    remembering = System(replace(problem, guides=None), known, solved.layout, BOUND**2)
-    return found.position, covariances(remembering, eliminate(remembering, found))
+    problem = replace(problem, guides=None)
+    remembering = System(problem, known, solved.layout, BOUND**2)
+    own = covariances(remembering, eliminate(remembering, found))
+    alone = replace(weighted, acceleration=_ANY_MOTION**2 * known.acceleration)
+    single = System(problem, alone, solved.layout, BOUND**2)
+    return found.position, own, covariances(single, eliminate(single, found))
 
 
-def _with_own(covariance: Float, own: Float, guides: Bool | None, position: Float) -> Float:
-    """Compute the covariance [T, J, 3, 3] of joints that did not determine the cameras.
+def _with_own(covariance: Float, own: Float, least: Float, guides: Bool | None, position: Float) -> Float:
+    """Compute covariances [T, J, 3, 3] of joints: each has its own error, and one by slow pose errors.
 
-    They have their own error, and the error by slow pose errors of the guide that is mostly the nearest.
+    Where keypoint errors last longer than motion is smooth, a joint's own error is that of a single picture.
+    A joint that did not determine the cameras has the error by poses of the guide that is mostly the nearest.
 
     Args:
         covariance: [T, J, 3, 3] of the estimate in which only guides determined the cameras.
-        own: [T, J, 3, 3] with slow pose errors known.
+        own: [T, J, 3, 3] with slow pose errors known, correlated keypoints counting less.
+        least: [T, J, 3, 3] with slow pose errors known, of single pictures.
         guides: [J]; None if every joint is one.
         position: [T, J, 3] m.
     """
-    if guides is None or guides.all():
-        return covariance
-    (of,) = np.nonzero(guides)
-    found = covariance.copy()
-    for joint in np.nonzero(~guides)[0]:
+    of = np.arange(position.shape[1]) if guides is None else np.flatnonzero(guides)
+    single = np.trace(least, axis1=2, axis2=3) < np.trace(own, axis1=2, axis2=3)
+    found = np.where(single[..., None, None], least, own)
+    for joint in range(position.shape[1]):
         away = np.linalg.norm(position[:, of] - position[:, joint, None], axis=-1)
         near = of[np.argmin(np.median(away, axis=0))]
         by_poses = covariance[:, near] - own[:, near]
         variance, axes = np.linalg.eigh(0.5 * (by_poses + by_poses.swapaxes(-1, -2)))
-        by_poses = np.einsum("tij,tj,tkj->tik", axes, np.maximum(variance, 0.0), axes)
-        found[:, joint] = own[:, joint] + by_poses
+        found[:, joint] += np.einsum("tij,tj,tkj->tik", axes, np.maximum(variance, 0.0), axes)
     return found
 
 
