@@ -466,7 +466,9 @@ class _Cut:
         first, last = _run(wide, int(half[1]))
         along = np.arange(-half[0], half[0] + 1)[:, None, None] * axes[0]
         sides = np.array([across[first], across[last]])[:, None] * axes[1]
-        low, high = _run(self._inside(centre + _CELL_M * (along + sides)).all(axis=1), int(half[0]))
+        low, high = _run(
+            np.asarray(self._inside(centre + _CELL_M * (along + sides)).all(axis=1)), int(half[0])
+        )
         return np.array([low - half[0], first - half[1]]), np.array([high - half[0], last - half[1]])
 
     def _inside(self, points: Float) -> Bool:
@@ -475,8 +477,7 @@ class _Cut:
     def _holds(self, xy: Float) -> Bool:
         size = np.array([self.camera.intrinsics.width, self.camera.intrinsics.height])
         with np.errstate(invalid="ignore"):
-            inside: Bool = ((xy > 0) & (xy < size - 1)).all(axis=-1)
-        return inside
+            return np.asarray(((xy > 0) & (xy < size - 1)).all(axis=-1))
 
     def orthophoto(self, centre: Float, axes: Float, begins: Int64, ends: Int64) -> Picture | None:
         """Cut out cells, from `begins` to `ends` [2], along axes [2, 3] about a point; None if not inside."""

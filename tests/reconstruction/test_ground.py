@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
-from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, PoseErrors, Process
+from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, UNKNOWN_SIGMA, PoseErrors, Process
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks
 from pipelines.reconstruction.ground import bind_positions
@@ -142,6 +142,41 @@ def test_offset_between_two_cameras_is_found() -> None:
     # With equal priors the mean of both stays as logged, and as uncertain as a mean of two.
     assert sum(left) == pytest.approx(sum(ERRORS_M.values()), abs=2e-3)
     assert binding.common == pytest.approx(CONSTANT_M**2 / 2 * np.eye(3), rel=1e-6, abs=1e-9)
+
+
+def test_offsets_are_found_where_nobody_stated_the_noise() -> None:
+    cameras, followed, stills = scene()
+    unknown = PoseErrors(
+        (1e-3, 1e-4), (Process(SHIFT_IN_WORLD, UNKNOWN_SIGMA[0]), Process(ROTATION, 1e-3)), assumed=True
+    )
+    errors = {name: 3 * error for name, error in ERRORS_M.items()}
+    logged = [
+        replace(camera.trajectory, position=flown(turn, 4.0)[0] + errors[camera.name])
+        for camera, turn in zip(cameras, (90, 30), strict=True)
+    ]
+    far = [replace(c, errors=unknown, trajectory=log) for c, log in zip(cameras, logged, strict=True)]
+    binding = bind_positions(far, followed, stills, between=BETWEEN)
+    assert binding.bound == ("north", "east")
+    left = [
+        (moved.trajectory.position - flown(turn, 4.0)[0]).mean(axis=0)
+        for moved, turn in zip(binding.cameras, (90, 30), strict=True)
+    ]
+    sigma = [shift_sigma(moved) for moved in binding.cameras]
+    assert max(sigma) < UNKNOWN_SIGMA[0] / 10
+    assert np.linalg.norm(left[0] - left[1]) < 4 * np.linalg.norm(sigma)
+
+
+def test_slow_errors_widen_what_is_left_of_an_offset() -> None:
+    cameras, followed, stills = scene()
+    slow = Process(SHIFT_IN_WORLD, 0.04, correlation_s=100.0)  # all but constant over the flight
+    assert cameras[0].errors is not None
+    bent = replace(
+        cameras[0], errors=replace(cameras[0].errors, processes=(*cameras[0].errors.processes, slow))
+    )
+    steady, with_slow = (
+        bind_positions([first, cameras[1]], followed, stills, between=BETWEEN) for first in (cameras[0], bent)
+    )
+    assert shift_sigma(steady.cameras[0]) < slow.sigma0 < shift_sigma(with_slow.cameras[0])
 
 
 def test_exact_camera_leaves_no_common_offset() -> None:
