@@ -5,7 +5,9 @@
 
 Pictures are rendered, the detector is real (`benchmarks/corpus/README.md`). For each draw the errors of the
 logs are drawn anew. flight.yaml gives their true model, or neither it nor the logs give anything. Every
-method gets the same sessions by the same call as `mocap reconstruct`. `floor` is `robust` with true poses.
+method gets the same sessions by the same call as `mocap reconstruct`. "True poses" is `robust` with them.
+"Shared error only" is `robust` with the true poses, moved and turned together by the error that all cameras
+of a draw share. No picture tells of that one: whoever knew all poses relative to each other would keep it.
 Without `--methods`, `robust` and `auto` are measured on all draws, and the parts of `auto` by themselves on
 the first one, with the model given: they would take as long as everything else.
 
@@ -41,13 +43,13 @@ from functools import cache, partial
 from hashlib import sha256
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 from unittest.mock import patch
 
 import cv2
 import numpy as np
 
-from benchmarks.corpus.drawn import DrawnFlight, Given, kept_in_place_of_pictures
+from benchmarks.corpus.drawn import DrawnFlight, Given, Poses, kept_in_place_of_pictures
 from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, Half, flights
 from benchmarks.results import keep_numbers
 from benchmarks.results_page import markdown_table
@@ -67,7 +69,9 @@ from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
 ROOT = Path(__file__).parents[1]
 WORK = ROOT / "build" / "accuracy"
 
-FLOOR = "floor"
+FLOOR: Final = "floor"
+SHARED: Final = "shared"
+_POSES: dict[str, Poses] = {FLOOR: "true", SHARED: "shared"}
 METHODS: dict[str, dict[str, Any]] = {
     "robust": {"method": "robust"},
     "refined": {"method": "refined"},
@@ -91,7 +95,7 @@ class Case:
     """One reconstruction, to be measured."""
 
     flight: str
-    method: str  # of METHODS, or FLOOR
+    method: str  # of METHODS, FLOOR or SHARED
     detector: str
     given: Given = "model"
     draw: int = 0
@@ -177,6 +181,7 @@ def measured(
     work = [
         [
             [Case(flight.name, FLOOR, detector)],
+            *([Case(flight.name, SHARED, detector, "model", draw)] for draw in range(draws)),
             *(
                 [Case(flight.name, method, detector, said, draw) for method in dict.fromkeys(names)]
                 for draw in range(draws)
@@ -260,7 +265,7 @@ def measure_draw(drawn: DrawnFlight, cases: Sequence[Case]) -> Iterator[tuple[Ca
     with tempfile.TemporaryDirectory(prefix="accuracy-") as folder:
         place = Path(folder) / "flight"
         session = drawn.session(
-            place, first.draw, first.given, first.detector, true_poses=first.method == FLOOR
+            place, first.draw, first.given, first.detector, poses=_POSES.get(first.method, "logged")
         )
         with (
             kept_in_place_of_pictures(flight, first.detector),
@@ -272,7 +277,7 @@ def measure_draw(drawn: DrawnFlight, cases: Sequence[Case]) -> Iterator[tuple[Ca
                     Following(writable).finish()
             for case in cases:
                 timed = case is first and not case.draw
-                method = METHODS["robust" if case.method == FLOOR else case.method]
+                method = METHODS["robust" if case.method in _POSES else case.method]
                 settings = Settings(**method, detector=first.detector)
                 began_s = time.process_time()
                 try:
@@ -374,13 +379,13 @@ def report(
     chosen: Sequence[Flight], methods: Sequence[str], detector: str, found: Mapping[Case, Outcome]
 ) -> list[str]:
     """Write the tables and the criteria as lines of Markdown."""
-    given = [said for said in GIVEN if any(case.given == said for case in found if case.method != FLOOR)]
+    given = [said for said in GIVEN if any(case.given == said for case in found if case.method not in _POSES)]
     draws = 1 + max(case.draw for case in found)
     lines = [f"Means over {draws} draws of the logs' errors."]
     for said in given:
         lines += ["", f"Pose noise: {_SAID[said]}. MPJPE / root-relative mm.", ""]
         lines += markdown_table(
-            ["flight", "drones", *methods, "true poses"],
+            ["flight", "drones", *methods, "true poses", "shared error only"],
             [_errors_row(flight, methods, detector, said, found) for flight in chosen],
         )
         judged = "auto" if "auto" in methods else methods[-1]
@@ -400,7 +405,12 @@ def parts_table(
     first = {case: outcome for case, outcome in found.items() if not case.draw}
     rows = [_errors_row(flight, parts, detector, "model", first) for flight in chosen]
     said = "The parts of `auto`, on the first draw, its true model given. MPJPE / root-relative mm."
-    return ["", said, "", *markdown_table(["flight", "drones", *parts, "true poses"], rows)]
+    return [
+        "",
+        said,
+        "",
+        *markdown_table(["flight", "drones", *parts, "true poses", "shared error only"], rows),
+    ]
 
 
 _QUALITY = (
@@ -440,8 +450,8 @@ def _errors_row(
     flight: Flight, methods: Sequence[str], detector: str, given: Given, found: Mapping[Case, Outcome]
 ) -> list[str]:
     cells = [flight.name, str(flight.scenario.drones.count)]
-    for method in [*methods, FLOOR]:
-        outcomes = _of(flight, method, detector, "model" if method == FLOOR else given, found)
+    for method in [*methods, *_POSES]:
+        outcomes = _of(flight, method, detector, "model" if method in _POSES else given, found)
         mean = [_mean(outcomes, name) for name in ("mpjpe_mm", "root_mpjpe_mm")]
         failed = sum(outcome.error is not None for _, outcome in outcomes)
         cells.append(" / ".join(map(_cell, mean)) if failed < len(outcomes) else "")
@@ -481,6 +491,13 @@ def criteria(
             f"- {_VERDICT[passed]} {half}: {said}"
             for said, passed in [*_against_robust(of, found), *_motion(of), *_covariances(of)]
         ]
+        shared = {flight: _of(flight, SHARED, detector, "model", found) for flight in own}
+        ratios = list(_ratios(shared, found, "mpjpe_mm").values())
+        if ratios and given == "model":
+            lines.append(
+                f"- {half}: if all poses were exact but for the error that the cameras share, MPJPE would be"
+                f" {np.median(ratios):.2f} of robust in the median, {max(ratios):.2f} at most"
+            )
     sample = [flight for flight in chosen if flight.name == SAMPLE.name]
     if sample:
         outcomes = _of(sample[0], method, detector, given, found)
@@ -503,16 +520,7 @@ _Verdict = tuple[str, bool]
 def _against_robust(of: _Outcomes, found: Mapping[Case, Outcome]) -> Iterator[_Verdict]:
     """Compare with `robust` on the same draws."""
     for name, title, wanted in (("mpjpe_mm", "MPJPE", 0.55), ("root_mpjpe_mm", "root-relative", 0.85)):
-        ratios: dict[str, float] = {}
-        for flight, outcomes in of.items():
-            pairs = []
-            for case, outcome in outcomes:
-                robust = getattr(found.get(replace(case, method="robust")), name, None)
-                mine = getattr(outcome, name)
-                if robust is not None and mine is not None:
-                    pairs.append((mine, robust))
-            if pairs:
-                ratios[flight.name] = float(np.mean([p[0] for p in pairs]) / np.mean([p[1] for p in pairs]))
+        ratios = _ratios(of, found, name)
         if not ratios:
             yield f"{title}: no results of robust to compare to", False
             continue
@@ -520,6 +528,21 @@ def _against_robust(of: _Outcomes, found: Mapping[Case, Outcome]) -> Iterator[_V
         yield f"{title} at most 1.02 of robust: {ratios[worst]:.2f} on {worst}", ratios[worst] <= 1.02
         median = float(np.median(list(ratios.values())))
         yield f"{title} at most {wanted} of robust in the median: {median:.2f}", median <= wanted
+
+
+def _ratios(of: _Outcomes, found: Mapping[Case, Outcome], name: str) -> dict[str, float]:
+    """Compute each flight's mean error over that of `robust` on the same draws."""
+    ratios: dict[str, float] = {}
+    for flight, outcomes in of.items():
+        pairs = []
+        for case, outcome in outcomes:
+            robust = getattr(found.get(replace(case, method="robust")), name, None)
+            mine = getattr(outcome, name)
+            if robust is not None and mine is not None:
+                pairs.append((mine, robust))
+        if pairs:
+            ratios[flight.name] = float(np.mean([p[0] for p in pairs]) / np.mean([p[1] for p in pairs]))
+    return ratios
 
 
 def _motion(of: _Outcomes) -> Iterator[_Verdict]:

@@ -25,7 +25,16 @@ from pipelines.formats.logs.ros2_writing import Ros2Recording
 from pipelines.formats.maps.octomap import write_octomap
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import write_h264
-from pipelines.geometry.noise import GaussMarkov
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.noise import EXACT, GaussMarkov
+from pipelines.geometry.poses import (
+    conjugate,
+    cross_matrix,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotate,
+    rotation_vector_from_quaternion,
+)
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import still_name
 from pipelines.session.registries import noise_models
@@ -40,14 +49,53 @@ from pipelines.simulation.flight_files import (
     write_alphapose,
     write_keypoints,
     write_truth,
+    write_tum,
 )
-from pipelines.simulation.recording import ACTOR_CORRELATION_S, estimate
+from pipelines.simulation.recording import ACTOR_CORRELATION_S, DronePoses, estimate
 
+Poses = Literal["logged", "true", "shared"]
 Given = Literal["model", "nothing"]
 """Knowledge of the poses' errors: their model in flight.yaml, or nothing there and no covariances in logs."""
 
 _DRAWS = 100  # first of the numbers that name a draw's random numbers; the flight has those below
 _GREY = 128
+
+
+@dataclass(frozen=True)
+class SharedError:
+    """Rigid motion of all cameras together, about a point."""
+
+    about: Float  # [3] m
+    shift: Float  # [3] m
+    turn: Float  # [3] rad, rotation vector in the world
+
+    def moved(self, poses: DronePoses) -> tuple[Float, Float]:
+        """Move true camera poses [M] by the error: position [M, 3] and world_from_camera [M, 4]."""
+        turned = quaternion_from_rotation_vector(self.turn)
+        position = rotate(turned, poses.camera_position - self.about) + self.about + self.shift
+        return position, multiply(turned, poses.camera_quaternion_xyzw)
+
+
+def shared_error(flight: SimulatedFlight) -> SharedError:
+    """Find the rigid motion that brings the true cameras nearest to the logged ones, weighted by their noise.
+
+    No picture tells of it: it moves cameras, people and ground alike.
+    """
+    about = flight.people[0].joints.mean(axis=(0, 1))
+    normal, right = np.zeros((6, 6)), np.zeros(6)
+    for drone in flight.drones:
+        logged, true = drone.log.camera, drone.at_log
+        away = true.camera_position - about
+        back = multiply(logged.quaternion_xyzw, conjugate(true.camera_quaternion_xyzw))
+        error = np.hstack([logged.position - true.camera_position, rotation_vector_from_quaternion(back)])
+        design = np.tile(np.eye(6), (len(away), 1, 1))
+        design[:, :3, 3:] = -cross_matrix(away)
+        assert logged.covariance is not None, "every flight of the corpus has noise"
+        weight = 1 / np.maximum(np.diagonal(logged.covariance, axis1=1, axis2=2), EXACT**2)
+        normal += np.einsum("tki,tk,tkj->ij", design, weight, design)
+        right += np.einsum("tki,tk,tk->i", design, weight, error)
+    found = np.linalg.solve(normal, right)
+    return SharedError(about, np.asarray(found[:3]), np.asarray(found[3:]))
 
 
 @dataclass(frozen=True)
@@ -90,7 +138,7 @@ class DrawnFlight:
         write_truth(self.folder, flight)
 
     def session(
-        self, place: Path, draw: int, given: Given, detector: str, *, true_poses: bool = False
+        self, place: Path, draw: int, given: Given, detector: str, *, poses: Poses = "logged"
     ) -> Path:
         """Write the files of one draw, ingest them, and return the session.
 
@@ -99,7 +147,8 @@ class DrawnFlight:
             draw: the number of the draw.
             given: what flight.yaml and the logs give of the poses' errors.
             detector: the keypoints of a flight without pictures.
-            true_poses: take the true poses in place of logged ones.
+            poses: those that the manifest names; `shared` ones are the true ones, moved and turned together
+                by the error that all cameras of this draw share.
         """
         place.mkdir(parents=True)
         for path in self.folder.iterdir():
@@ -111,7 +160,17 @@ class DrawnFlight:
                     log.write(message.topic, message.type, message.received_ns, message.fields)
         if not self.flight.with_pictures:
             self._write_keypoint_files(place, detector)
-        text = manifest_text(flight, video=self.flight.with_pictures, true_poses=true_poses)
+        text = manifest_text(flight, video=self.flight.with_pictures, true_poses=poses != "logged")
+        if poses == "shared":
+            error = shared_error(flight)
+            for drone in flight.drones:
+                moved = error.moved(drone.at_log)
+                write_tum(
+                    place / f"{drone.name}_shared.tum", drone.at_log.t_ns + flight.scenario.start_ns, *moved
+                )
+                text = text.replace(
+                    f"pose: {{tum: truth/{drone.name}.tum}}", f"pose: {{tum: {drone.name}_shared.tum}}"
+                )
         (place / "flight.yaml").write_text(text, encoding="utf-8")
         return ingest(place / "flight.yaml", place / "session").folder
 

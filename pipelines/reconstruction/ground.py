@@ -28,7 +28,7 @@ from pipelines.geometry.noise import (
     USUAL_COUNT,
     Process,
 )
-from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector
+from pipelines.geometry.poses import cross_matrix, multiply, quaternion_from_rotation_vector
 from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks, people_boxes
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
@@ -284,7 +284,7 @@ def _cloud(
     covariance = np.linalg.inv(
         _sums(across * weight[:, None, None], number, points) + _ANYWHERE_M**-2.0 * np.eye(3)
     )
-    turned = -_cross(arm) @ rotation
+    turned = -cross_matrix(arm) @ rotation
     by_turn = covariance @ _sums(across @ turned * weight[:, None, None], number, points)
     far, off = (np.bincount(number, each, points) / np.maximum(count, 1) for each in (distance, missed))
     kept = (count >= _FEWEST_SIGHTINGS) & (np.trace(covariance, axis1=1, axis2=2) < _POINT_SIGMA_M**2)
@@ -339,13 +339,6 @@ def _sums(values: Float, number: Int64, count: int) -> Float:
     return np.asarray(sums, dtype=np.float64).reshape(count, *values.shape[1:])
 
 
-def _cross(vectors: Float) -> Float:
-    """Build matrices [..., 3, 3] that multiply from the left as the cross product does."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    o = np.zeros_like(x)
-    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*vectors.shape[:-1], 3, 3)
-
-
 # --- patches -----------------------------------------------------------------------------------------------
 
 
@@ -380,7 +373,7 @@ def _compare(
                 row[:, 3 * b : 3 * b + 3], row[:, 3 * a : 3 * a + 3] = np.eye(3), -np.eye(3)
                 turns = 3 * len(views)
                 arm = first.points[i] - position_b[t, i]
-                row[:, turns + 3 * b : turns + 3 * b + 3] = -_cross(arm) @ rotation_b[t, i]
+                row[:, turns + 3 * b : turns + 3 * b + 3] = -cross_matrix(arm) @ rotation_b[t, i]
                 row[:, turns + 3 * a : turns + 3 * a + 3] = -first.by_turn[i]
                 expected = row @ known.errors
                 spread = row @ known.covariance @ row.T + first.covariance[i]

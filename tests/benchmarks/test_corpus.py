@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pandas as pd
 import pytest
 
 from benchmarks.accuracy import FLOOR, Case, measure_draw, nees, peak_ratio
-from benchmarks.corpus.drawn import DrawnFlight
+from benchmarks.corpus.drawn import DrawnFlight, SharedError, shared_error
 from benchmarks.corpus.stored import (
     CORPUS,
     HALVES,
@@ -132,6 +133,23 @@ def test_robust_is_measured_on_a_flight(tmp_path: Path) -> None:
     assert robust.measured_share is not None
     assert robust.measured_share > 0.9
     assert robust.nees is not None
+
+
+def test_the_error_that_all_cameras_share_is_found(tmp_path: Path) -> None:
+    """A rigid motion of all logs is found as it is, and moves the true poses onto them."""
+    flight = next(each for each in flights(["tuning"]) if each.name == "01-walk")
+    simulated = DrawnFlight(flight, tmp_path / "shared").simulated
+    about = simulated.people[0].joints.mean(axis=(0, 1))
+    error = SharedError(about, np.array([0.1, -0.2, 0.05]), np.array([0.01, 0.0, -0.02]))
+    drones = []
+    for drone in simulated.drones:
+        position, quaternion = error.moved(drone.at_log)
+        moved = replace(drone.log.camera, position=position, quaternion_xyzw=quaternion)
+        drones.append(replace(drone, log=replace(drone.log, camera=moved)))
+    found = shared_error(replace(simulated, drones=drones))
+    # Turns of 0.02 rad are linear to half their square, over 10 m.
+    assert found.shift == pytest.approx(error.shift, abs=10 * 0.02**2)
+    assert found.turn == pytest.approx(error.turn, abs=0.02**2)
 
 
 def test_the_squared_error_has_three_degrees_of_freedom() -> None:
