@@ -27,6 +27,9 @@ from pipelines.sources.parts import CameraFrames
 _MOST_FRAMES = 20_000_000  # a week at 30 Hz; a larger number was misread from a date
 _WATCHED_NS = 120 * 10**9  # of a video, to estimate when it began
 
+# Of half the picture's size: cameras' principal points lie nearer to the middle (a few per cent), while
+# pictures of another usual size (3/4, 2/3, 1/2 of it) have their middle further off.
+_FARTHEST_CENTRE = 0.2
 
 # Shares of keypoints. Detectors extrapolate people whom the border cuts, to all sides alike. But if the
 # pictures have another size, keypoints lie beyond the right and the lower border only: all begin at 0.
@@ -274,6 +277,10 @@ class FlightCameras:
                     self._base / source.path, "holds poses but no intrinsics", "name one with both"
                 )
             intrinsics = calibrated.intrinsics
+            if not calibrated.size_stated:
+                size = self._picture_size(camera, video, detections)
+                intrinsics = _with_size(intrinsics, size, self._base / source.path)
+                self._note(f"{name}: its calibration states no picture size; that of its pictures is taken")
         elif source.log:
             intrinsics = self._logs.intrinsics(source.log, source.topic).intrinsics
         else:
@@ -322,6 +329,27 @@ def _ticks_ns(count: int, fps: Fraction) -> Int64:
     """Return the times of `count` frames from 0, each rounded to a ns; Python's integers never overflow."""
     period = Fraction(1_000_000_000) / fps
     return np.array([round(k * period) for k in range(count)], dtype=np.int64)
+
+
+def _with_size(intrinsics: Intrinsics, size: tuple[int, int] | None, source: Path) -> Intrinsics:
+    """Give intrinsics of a calibration without a size that of the pictures, if they can belong together.
+
+    Raises:
+        DataError: the size of the pictures is not known, or their middle is far from the principal point.
+    """
+    if size is None:
+        raise DataError(
+            source, "states no picture size, and no video does", "add the size to the calibration"
+        )
+    offset = np.abs(np.divide((2 * intrinsics.cx + 1, 2 * intrinsics.cy + 1), size) - 1)
+    if offset.max() > _FARTHEST_CENTRE:
+        raise DataError(
+            source,
+            f"has its principal point at {intrinsics.cx:.0f}, {intrinsics.cy:.0f} px, which is not the middle"
+            f" of pictures of {size[0]} x {size[1]} px",
+            "give the calibration of these pictures, or the size of its own",
+        )
+    return replace(intrinsics, width=size[0], height=size[1])
 
 
 def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:

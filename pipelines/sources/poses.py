@@ -140,7 +140,8 @@ class FlightPoses:
 
     def _filed_trajectory(self, stated: str, kind: str) -> Trajectory:
         path = self._base / stated
-        reader = FORMATS.get(kind)
+        kitti = FORMATS.get("kitti")
+        reader = kitti if kitti.recognises(path) else FORMATS.get(kind)
         if not isinstance(reader, TrajectoryFormat):
             raise DataError(path, f"the format {kind} reads no trajectories")
         trajectory = reader.read_trajectory(path)

@@ -1,8 +1,8 @@
 """Calibrations as TOML: anipose, Pose2Sim and caliscope write the same tables, one for each camera.
 
 `matrix`, `distortions` (OpenCV's order) and `size` (floats in Pose2Sim's files) are the intrinsics.
-`rotation` (Rodrigues) and `translation` map world to camera. Lengths are in the file's unit: metres for
-Pose2Sim and caliscope, the unit of the board for anipose.
+`rotation` (Rodrigues, or 3 x 3 in today's caliscope) and `translation` map world to camera. Lengths are in
+the file's unit: metres for Pose2Sim and caliscope, the unit of the board for anipose.
 """
 
 import re
@@ -11,7 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.calibrations.camera_matrices import describe_cameras, intrinsics, invert_rodrigues
+from pipelines.formats.calibrations.camera_matrices import (
+    describe_cameras,
+    intrinsics,
+    invert_matrix,
+    invert_rodrigues,
+)
 from pipelines.formats.common.files import read_head, read_text
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
@@ -20,6 +25,8 @@ from pipelines.session.records import CalibratedCamera
 
 class AniposeToml:
     """Reader of anipose's tables; a camera has the name in `name`, or else the name of its table.
+
+    Tables may lie in `cameras`, as in today's caliscope: `[cameras.0]` is the camera cam_0, as in older ones.
 
     Tables without a matrix (`[metadata]`, uncalibrated cameras) and those with `ignore = true` are
     left out. A camera without rotation and translation has intrinsics alone.
@@ -57,7 +64,11 @@ class AniposeToml:
                 raise DataError(path, f"two cameras are called {name}", "rename one")
             cameras[name] = _camera(path, name, table)
         if not cameras:
-            raise DataError(path, "holds no calibrated camera (a table with a matrix)", "calibrate first")
+            ignored = sum("matrix" in table for table in _tables(path).values())
+            if ignored:
+                problem = f"says `ignore = true` of all {ignored} cameras that have a matrix"
+                raise DataError(path, problem, "take `ignore` away from those that count")
+            raise DataError(path, "holds no table with a matrix", "calibrate first")
         return cameras
 
 
@@ -66,7 +77,12 @@ def _tables(path: Path) -> dict[str, dict[str, object]]:
         content = tomllib.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise DataError(path, f"is not TOML ({error})", "it may be truncated; write it again") from error
-    return {key: value for key, value in content.items() if isinstance(value, dict)}
+    tables = {key: value for key, value in content.items() if isinstance(value, dict)}
+    nested = tables.get("cameras", {})
+    if "matrix" in nested:  # one camera of that name
+        return tables
+    named = {f"cam_{key}" if key.isdecimal() else key: value for key, value in nested.items()}
+    return tables | {key: value for key, value in named.items() if isinstance(value, dict)}
 
 
 def _is_calibrated(table: dict[str, object]) -> bool:
@@ -85,8 +101,10 @@ def _camera(path: Path, name: str, table: dict[str, object]) -> CalibratedCamera
     given = [key for key in ("rotation", "translation") if key in table]
     if not given:
         return CalibratedCamera(lens)
-    rotation, translation = (_numbers(path, name, table, key).ravel() for key in ("rotation", "translation"))
-    return CalibratedCamera(lens, *invert_rodrigues(path, name, rotation, translation))
+    rotation, translation = (_numbers(path, name, table, key) for key in ("rotation", "translation"))
+    if rotation.shape == (3, 3):
+        return CalibratedCamera(lens, *invert_matrix(path, name, rotation, translation.ravel()))
+    return CalibratedCamera(lens, *invert_rodrigues(path, name, rotation.ravel(), translation.ravel()))
 
 
 def _numbers(path: Path, camera: str, table: dict[str, object], key: str) -> Float:

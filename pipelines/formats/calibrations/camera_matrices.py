@@ -63,6 +63,12 @@ def intrinsics(
     return build_intrinsics(source, camera, size, matrix, "radtan", coefficients)
 
 
+def unstated_size(matrix: Float) -> tuple[float, float]:
+    """Return the width and height of which the principal point of a camera matrix is the middle."""
+    centre = matrix[:2, 2] if matrix.shape == (3, 3) and np.isfinite(matrix).all() else np.zeros(2)
+    return float(np.rint(2 * centre[0] + 1)), float(np.rint(2 * centre[1] + 1))
+
+
 def build_intrinsics(
     source: Path | str,
     camera: str,
@@ -132,7 +138,8 @@ def describe_cameras(cameras: dict[str, CalibratedCamera]) -> dict[str, object]:
 def _camera_line(camera: CalibratedCamera) -> str:
     parts = []
     if (lens := camera.intrinsics) is not None:
-        parts.append(f"{lens.width} x {lens.height} px, f {lens.fx:.1f} {lens.fy:.1f}, {lens.model}")
+        size = f"{lens.width} x {lens.height} px" if camera.size_stated else "size not stated"
+        parts.append(f"{size}, f {lens.fx:.1f} {lens.fy:.1f}, {lens.model}")
     if camera.position is not None:
         parts.append("at " + " ".join(f"{value:.3f}" for value in camera.position))
     return ", ".join(parts)

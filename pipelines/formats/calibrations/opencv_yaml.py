@@ -6,6 +6,7 @@ ROS's camera_info YAML looks alike but has no `!!opencv-matrix`: it is another f
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from pipelines.formats.calibrations.camera_matrices import (
     intrinsics,
     invert_matrix,
     invert_rodrigues,
+    unstated_size,
 )
 from pipelines.formats.common.files import read_head, read_text
 from pipelines.geometry.arrays import Float
@@ -32,8 +34,9 @@ _MOST_CELLS = 64  # of a calibration's matrices; a larger size is a mistake and 
 class OpencvStorage:
     """Reader of the keys camera_matrix, distortion_coefficients, image_width, image_height.
 
-    Optional: camera_name (else "camera"), `fisheye_model: 1` or `distortion_model: equidistant`, and the pose
-    camera_from_world as R (3 x 3) or rvec with T or tvec, in metres.
+    Without a size, the pictures decide. Optional: camera_name (else "camera"), `fisheye_model: 1` or
+    `distortion_model: equidistant`, and the pose camera_from_world as R (3 x 3) or rvec with T or tvec, in
+    metres.
     """
 
     name = "opencv"
@@ -56,23 +59,23 @@ class OpencvStorage:
         Raises:
             DataError: FileStorage cannot parse it, keys are missing, or the numbers are no camera.
         """
-        storage = _Storage(path)
+        storage = Storage(path)
         name = storage.text("camera_name") or "camera"
         size = storage.vector("image_size") or [storage.number(_WIDTH), storage.number(_HEIGHT)]
-        if not all(size):
-            raise DataError(path, "states no picture size", "add image_width and image_height")
         matrix, distortion = storage.matrix(*_MATRIX), storage.matrix(*_DISTORTION)
         if matrix is None or distortion is None:
             raise DataError(path, "has no camera_matrix or no distortion_coefficients", "add them")
+        stated = any(size)
+        size = size if stated else [*unstated_size(matrix)]
         model = storage.text("distortion_model").lower()
         fisheye = bool(storage.number(("fisheye_model",))) or model in {"equidistant", "fisheye"}
         lens = intrinsics(
             path, name, size=size, matrix=matrix, distortion=distortion.ravel().tolist(), fisheye=fisheye
         )
-        return {name: _with_pose(path, name, storage, CalibratedCamera(lens))}
+        return {name: _with_pose(path, name, storage, CalibratedCamera(lens, size_stated=stated))}
 
 
-def _with_pose(path: Path, name: str, storage: _Storage, camera: CalibratedCamera) -> CalibratedCamera:
+def _with_pose(path: Path, name: str, storage: Storage, camera: CalibratedCamera) -> CalibratedCamera:
     rotation, translation = storage.matrix("R", "rvec"), storage.matrix("T", "tvec")
     if rotation is None and translation is None:
         return camera
@@ -84,10 +87,10 @@ def _with_pose(path: Path, name: str, storage: _Storage, camera: CalibratedCamer
         pose = invert_rodrigues(path, name, rotation.ravel(), translation.ravel())
     else:
         pose = invert_matrix(path, name, rotation, translation.ravel())
-    return CalibratedCamera(camera.intrinsics, *pose)
+    return replace(camera, position=pose[0], quaternion_xyzw=pose[1])
 
 
-class _Storage:
+class Storage:
     """Checked access to the top level of a FileStorage."""
 
     def __init__(self, path: Path) -> None:

@@ -146,16 +146,21 @@ def _is_number(cell: str) -> bool:
 
 
 def parse_stamps(
-    source: Path | str, texts: Sequence[str] | pa.ChunkedArray, unit: int = SECONDS
+    source: Path | str,
+    texts: Sequence[str] | pa.ChunkedArray,
+    unit: int = SECONDS,
+    *,
+    unit_stated: bool = True,
 ) -> tuple[Int64, Bool]:
     """Parse decimal stamps [N] as nanoseconds, rounded to the nearest (halves away from zero).
 
     No float stands between: a float64 holds 1700000000.123456789 s only to 0.2 us. `unit` is SECONDS,
     MILLISECONDS, MICROSECONDS or NANOSECONDS. The result is 0 where the second array is False, because the
-    text is no finite number that int64 nanoseconds can hold.
+    text is no finite number that int64 nanoseconds can hold. If the file does not state its unit, stamps that
+    would lie after the year 2262 are read in the unit in which they do not (EuRoC's `#timestamp`: ns).
 
     Raises:
-        DataError: most stamps are too large for the unit (after the year 2262), so the unit is wrong.
+        DataError: most stamps are too large for the stated unit (after the year 2262), so the unit is wrong.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -175,7 +180,10 @@ def parse_stamps(
         t_ns[index] = int(exact.to_integral_value(ROUND_HALF_UP))
         readable[index] = True
     if len(too_large) > np.count_nonzero(readable):
-        raise _wrong_unit(source, sorted(too_large)[len(too_large) // 2])
+        typical = sorted(too_large)[len(too_large) // 2]
+        if not unit_stated and typical < 10**20:
+            return parse_stamps(source, column, _likely_unit(typical))
+        raise _wrong_unit(source, typical)
     return t_ns, readable
 
 
@@ -212,8 +220,15 @@ def _decimal(text: str) -> Decimal | None:
     return value if value.is_finite() and abs(value.adjusted()) < 40 else None
 
 
+def _likely_unit(typical: Decimal) -> int:
+    """Return the unit in which a stamp too large for seconds is a time of our days."""
+    return NANOSECONDS if typical > 10**17 else MICROSECONDS if typical > 10**14 else MILLISECONDS
+
+
 def _wrong_unit(source: Path | str, typical: Decimal) -> DataError:
-    unit = "nanoseconds" if typical > 10**17 else "microseconds" if typical > 10**14 else "milliseconds"
+    unit = {NANOSECONDS: "nanoseconds", MICROSECONDS: "microseconds"}.get(
+        _likely_unit(typical), "milliseconds"
+    )
     return DataError(
         source,
         f"time stamps of about {typical:.3g} are too large for their unit; they look like {unit}",
@@ -246,6 +261,7 @@ class Heading:
     stamp: int  # the time's column
     unit: int  # the time's
     names: dict[str, int]  # columns by the names of `cell_name`; the first of each name
+    unit_stated: bool = True  # False if seconds are only assumed
 
 
 def find_heading(line: str, index: int = 0, delimiters: str = ",;\t") -> Heading | None:
@@ -256,7 +272,11 @@ def find_heading(line: str, index: int = 0, delimiters: str = ",;\t") -> Heading
     names: dict[str, int] = {}
     for column, cell in enumerate(cells):
         names.setdefault(cell_name(cell)[0], column)
-    return None if stamp is None else Heading(index, delimiter, len(cells), *stamp, names)
+    if stamp is None:
+        return None
+    name, unit = cell_name(cells[stamp[0]])
+    stated = bool(unit) or name not in _STAMP_NAMES
+    return Heading(index, delimiter, len(cells), *stamp, names, unit_stated=stated)
 
 
 def rows_below(

@@ -35,7 +35,7 @@ Source = Path | str
 # Larger stamps (after the year 2116) are no times, and their differences would not fit int64.
 LATEST_NS = 2**62
 
-_FISHEYE_MODELS = {"equidistant", "fisheye"}
+_FISHEYE_MODELS = {"equidistant", "fisheye", "kannala_brandt"}
 _RADTAN_MODELS = {"plumb_bob", "rational_polynomial", "radtan"}
 
 _SIGNATURES = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png"}

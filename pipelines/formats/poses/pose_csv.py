@@ -63,7 +63,9 @@ class PoseCsvFormat:
                 path, f"lacks the covariance columns {', '.join(missing)}", "give all 21 of them or none"
             )
         table = rows_below(path, heading, text, {}, columns)
-        t_ns, readable = parse_stamps(path, table.text["stamp"], heading.unit)
+        t_ns, readable = parse_stamps(
+            path, table.text["stamp"], heading.unit, unit_stated=heading.unit_stated
+        )
         return clean_poses(
             path,
             t_ns,

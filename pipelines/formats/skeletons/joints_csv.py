@@ -60,7 +60,9 @@ class JointsCsvFormat:
         table = rows_below(path, heading, text, words, {axis: names[axis] for axis in "xyz"})
         if table.truncated:
             raise DataError(path, "its last line broke off", "copy the file again, or delete that line")
-        stamps, readable = parse_stamps(path, table.text["stamp"], heading.unit)
+        stamps, readable = parse_stamps(
+            path, table.text["stamp"], heading.unit, unit_stated=heading.unit_stated
+        )
         if not readable.all():
             raise DataError(path, f"{np.count_nonzero(~readable)} rows have no readable time", "correct them")
         position = to_metres_z_up(path, table.stack(("x", "y", "z")), unit or "m", axes or "z-up")

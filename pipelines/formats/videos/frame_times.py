@@ -131,10 +131,10 @@ def _read_csv(path: Path) -> FrameStamps:
     if heading.columns == 1:
         # Blank lines count here: row k is frame k.
         lines = text.rstrip().split("\n")[heading.line + 1 :]
-        t_ns, readable = parse_stamps(path, lines, heading.unit)
+        t_ns, readable = parse_stamps(path, lines, heading.unit, unit_stated=heading.unit_stated)
         return _clean(path, np.arange(len(t_ns)), t_ns, None, {"no time": ~readable}, {})
     table = rows_below(path, heading, text, {} if column is None else {"frame": column}, {})
-    t_ns, readable = parse_stamps(path, table.text["stamp"], heading.unit)
+    t_ns, readable = parse_stamps(path, table.text["stamp"], heading.unit, unit_stated=heading.unit_stated)
     frame, numbered = np.arange(len(t_ns)), np.ones(len(t_ns), dtype=np.bool_)
     if column is not None:
         frame, numbered = _frame_numbers(table.text["frame"].to_pylist())

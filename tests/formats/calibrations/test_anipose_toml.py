@@ -19,6 +19,7 @@ from tests.real_data import real_data
 
 READER: CalibrationFormat = anipose_toml.FORMAT
 POSE2SIM = "pose2sim_single/calibration/Calib_qualisys.toml"
+TODAY = "second/caliscope_4cam_camera_array.toml"
 
 CAMERA = """
 [one]
@@ -36,15 +37,23 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
+def _vector(rotation: list[object]) -> np.ndarray:
+    """Return a rotation as Rodrigues' vector; today's caliscope writes a matrix."""
+    stated = np.array(rotation, dtype=np.float64)
+    return stated if stated.size == 3 else cv2.Rodrigues(stated)[0]
+
+
 @pytest.mark.parametrize(
-    "relative", [POSE2SIM, "calib/pose2sim_Calib_scene.toml", "calib/caliscope_base_config.toml"]
+    "relative", [POSE2SIM, "calib/pose2sim_Calib_scene.toml", "calib/caliscope_base_config.toml", TODAY]
 )
 def test_real_cameras_project_as_opencv_does(relative: str) -> None:
     path = real_data(relative)
     assert READER.recognises(path)
     cameras = READER.read_calibration(path)
     assert len(cameras) == 4
-    tables = {t.get("name", k): t for k, t in tomllib.loads(path.read_text()).items() if isinstance(t, dict)}
+    content = tomllib.loads(path.read_text())
+    content |= {f"cam_{key}": table for key, table in content.get("cameras", {}).items()}
+    tables = {t.get("name", k): t for k, t in content.items() if isinstance(t, dict)}
     # Points half a metre around one two metres ahead of the camera: all well inside the picture.
     ahead = np.array([[0, 0, 2.0], [0.5, -0.4, 2.0], [-0.3, 0.5, 2.5], [0.1, 0.2, 3.0]])
     for name, camera in cameras.items():
@@ -56,7 +65,7 @@ def test_real_cameras_project_as_opencv_does(relative: str) -> None:
         world = world_from_camera.apply(ahead) + camera.position
         expected, _ = cv2.projectPoints(
             world,
-            np.array(table["rotation"]),
+            _vector(table["rotation"]),
             np.array(table["translation"]),
             np.array(table["matrix"]),
             np.array(table["distortions"]),
@@ -127,7 +136,7 @@ def test_names_models_and_missing_poses(tmp_path: Path) -> None:
         ("translation = [1, 2, 3]", 'translation = ["a", 2, 3]', "translation is missing or not"),
         ("translation = [1, 2, 3]", "translation = [1, 2]", "are no pose"),
         ("rotation = [0.0, ", "rotation = [", "three numbers"),
-        ("matrix", "matrices", "no calibrated camera"),
+        ("matrix", "matrices", "no table with a matrix"),
         ("[one]", "[other]\nname = 'one'\nsize=1\nmatrix=1\n[one]", "camera one"),
     ],
 )
@@ -156,3 +165,8 @@ def test_other_toml_is_not_recognised(tmp_path: Path) -> None:
     assert not READER.recognises(real_data("pose2sim_single/Config.toml"))
     absent = tmp_path / "absent.toml"
     assert not READER.recognises(absent)
+
+
+def test_cameras_that_are_all_ignored_are_counted(tmp_path: Path) -> None:
+    with refuses(write(tmp_path, CAMERA + "ignore = true\n"), 1, "ignore"):
+        READER.read_calibration(tmp_path / "calib.toml")

@@ -89,10 +89,20 @@ def test_name_and_size_list(tmp_path: Path) -> None:
     assert (lens.width, lens.height) == (1920, 1080)
 
 
+def test_without_a_size_the_pictures_decide(tmp_path: Path) -> None:
+    """The size is then that of which the principal point is the middle: 2 * 330.5 + 1, 2 * 241.25 + 1."""
+    camera = only(store(tmp_path / "c.yml", image_width=None, image_height=None))
+    assert not camera.size_stated
+    assert camera.intrinsics is not None
+    assert (camera.intrinsics.width, camera.intrinsics.height) == (662, 484)
+    assert camera.intrinsics.fx == 800.0
+    assert only(store(tmp_path / "d.yml")).size_stated
+
+
 @pytest.mark.parametrize(
     ("values", "problem"),
     [
-        ({"image_width": None}, "no picture size"),
+        ({"image_width": None}, "0 x 480"),
         ({"camera_matrix": None}, "no camera_matrix"),
         ({"camera_matrix": 3.0}, "no camera_matrix"),
         ({"distortion_coefficients": None}, "no distortion_coefficients"),

@@ -213,6 +213,7 @@ def lens(value: Any, type_name: str = "sensor_msgs/msg/CameraInfo") -> Intrinsic
             (1, 2, 3, 4, 5, 6, 7, 8),
         ),
         ({"distortion_model": "equidistant", "d": [1, 2, 3, 4]}, "fisheye", (1, 2, 3, 4)),
+        ({"distortion_model": "kannala_brandt", "d": [1, 2, 3, 4]}, "fisheye", (1, 2, 3, 4)),
         ({"distortion_model": "fisheye", "d": np.zeros(4)}, "fisheye", (0, 0, 0, 0)),
     ],
 )

@@ -42,6 +42,27 @@ def test_euroc_ground_truth(tmp_path: Path) -> None:
     )
 
 
+def test_euroc_without_a_unit_is_nanoseconds(tmp_path: Path) -> None:
+    """Stamps beyond the year 2262 in seconds are read in the unit that fits; a stated unit is not doubted."""
+    stated = READER.read_trajectory(write(tmp_path, EUROC))
+    bare = READER.read_trajectory(write(tmp_path, EUROC.replace("timestamp [ns]", "timestamp")))
+    assert bare.t_ns.tolist() == stated.t_ns.tolist()
+    with refuses(write(tmp_path, EUROC.replace("[ns]", "[s]")), "t_ns"):
+        READER.read_trajectory(tmp_path / "poses.csv")
+
+
+def test_the_real_euroc_file_agrees_with_numpy() -> None:
+    path = real_data("second/euroc_V102_groundtruth.csv")
+    told = np.loadtxt(path, delimiter=",")
+    poses = READER.read_trajectory(path)
+    stamps = [int(line.split(",")[0]) for line in path.read_text().splitlines()[1:]]
+    assert poses.t_ns.tolist() == stamps
+    np.testing.assert_array_equal(poses.position, told[:, 1:4])
+    quaternion = told[:, [5, 6, 7, 4]]
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    np.testing.assert_allclose(poses.quaternion_xyzw, quaternion, rtol=0, atol=1e-12)
+
+
 def test_the_order_of_columns_is_free_and_others_are_ignored(tmp_path: Path) -> None:
     text = "note,qw,qx,qy,qz,pos_z,pos_y,pos_x,Time,vx\nhello,0.8,0,0,0.6,3,2,1,1700000000.123456789,9\n"
     poses = READER.read_trajectory(write(tmp_path, text))

@@ -103,7 +103,7 @@ def test_rows_that_cannot_be_used_are_counted_by_cause(tmp_path: Path) -> None:
         ("t\n", "no usable frame time .it has no rows"),
         ("frame,t\na,1\nb,2\n", "2 no frame number"),
         ("frame,t\n0,1\n1,2,3\n2,3\n", "line 3: 3 columns instead of 2"),
-        ("frame,t\n0,1700000000000\n1,1700000000100\n", "look like milliseconds"),
+        ("frame,t_s\n0,1700000000000\n1,1700000000100\n", "look like milliseconds"),
     ],
 )
 def test_what_is_no_csv_of_frame_times(tmp_path: Path, text: str, problem: str) -> None:

@@ -1,0 +1,103 @@
+"""KITTI odometry: twelve numbers a line, world_from_camera as 3 x 4 by rows; the times are in another file.
+
+KITTI's world is the first camera's: x right, y down, z forward. It is turned to x right, y forward, z up.
+The times are seconds, one a line, in a file beside the poses (`times.txt`, or `NAME_times.txt` for
+`NAME.txt`), or where the data set has them: `sequences/NAME/times.txt` for `poses/NAME.txt`.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.rows import parse_stamps, parse_table
+from pipelines.formats.poses.pose_rows import clean_poses, describe_trajectory
+from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.session.errors import DataError
+from pipelines.session.records import Trajectory
+
+_NUMBERS = 12
+_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # from x right, y down, z forward
+_ORTHOGONAL = 1e-2  # largest deviation of R R' from the identity that rounding of the numbers explains
+
+
+class KittiFormat:
+    """Reader of poses of a camera; row k has the time of line k."""
+
+    name = "kitti"
+    title = "KITTI trajectory"
+    suffixes: tuple[str, ...] = (".txt", ".kitti")
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if the first line is twelve numbers whose left part is a rotation."""
+        line = read_head(path, self.suffixes).lstrip().split("\n", 1)[0]
+        try:
+            rows = np.array([float(cell) for cell in line.split()]).reshape(3, 4)
+        except ValueError:
+            return False
+        return bool(_is_rotation(rows[None, :, :3])[0])
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe rows, times, gaps, bounding box and losses."""
+        return describe_trajectory(self.read_trajectory(path))
+
+    def read_trajectory(self, path: Path) -> Trajectory:
+        """Read every pose, and its time from the file of times.
+
+        Raises:
+            DataError: no file of times, another number of times than poses, a line without twelve numbers,
+                or no usable row.
+        """
+        table = parse_table(
+            path,
+            " ".join(read_text(path).split(" ")).strip(),
+            delimiter=" ",
+            columns=_NUMBERS,
+            text={},
+            numbers={str(column): column for column in range(_NUMBERS)},
+            first_line=1,
+        )
+        rows = table.stack([str(column) for column in range(_NUMBERS)]).reshape(-1, 3, 4)
+        times = _times_of(path)
+        t_ns, readable = parse_stamps(times, read_text(times).split())
+        if len(t_ns) < len(rows):
+            raise DataError(
+                times, f"has {len(t_ns)} times for {len(rows)} poses", "give the times of this trajectory"
+            )
+        turned = _is_rotation(rows[:, :, :3])
+        upright = np.where(turned[:, None, None], rows[:, :, :3], np.eye(3))
+        quaternion = quaternion_from_matrix(_WORLD @ upright)
+        quaternion[~turned] = np.nan
+        return clean_poses(
+            path,
+            t_ns[: len(rows)],
+            readable[: len(rows)],
+            rows[:, :, 3] @ _WORLD.T,
+            quaternion,
+            truncated=table.truncated,
+        )
+
+
+def _is_rotation(matrices: Float) -> Bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        products = matrices @ matrices.transpose(0, 2, 1)
+        near = np.abs(products - np.eye(3)).max(axis=(1, 2)) < _ORTHOGONAL
+        return np.asarray(near & (np.linalg.det(np.nan_to_num(matrices)) > 0), dtype=np.bool_)
+
+
+def _times_of(path: Path) -> Path:
+    places = (
+        path.with_name("times.txt"),
+        path.with_name(f"{path.stem}_times.txt"),
+        path.parent.parent / "sequences" / path.stem / "times.txt",
+    )
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        raise DataError(
+            path, "is a KITTI trajectory without times", "put KITTI's times.txt beside it, or save it as TUM"
+        )
+    return found
+
+
+FORMAT = KittiFormat()

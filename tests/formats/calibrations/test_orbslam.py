@@ -1,0 +1,100 @@
+"""ORB-SLAM's settings: a real file of version 2, and files of the versions by their public descriptions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.formats.calibrations import orbslam
+from pipelines.geometry.cameras import project
+from pipelines.session.registries import CalibrationFormat, recognise
+from tests.formats.refusals import refuses
+from tests.real_data import real_data
+
+READER: CalibrationFormat = orbslam.FORMAT
+
+# After Examples/Stereo-Inertial/TUM-VI.yaml and Examples/Stereo/EuRoC.yaml of ORB-SLAM 3, with other numbers.
+FISHEYE = """%YAML:1.0
+File.version: "1.0"
+Camera.type: "KannalaBrandt8"
+Camera1.fx: 190.5
+Camera1.fy: 190.25
+Camera1.cx: 254.5
+Camera1.cy: 256.75
+Camera1.k1: 0.0034
+Camera1.k2: 0.0007
+Camera1.k3: -0.002
+Camera1.k4: 0.0002
+Camera2.fx: 191.5
+Camera2.fy: 191.25
+Camera2.cx: 252.5
+Camera2.cy: 255.25
+Camera2.k1: 0.004
+Camera2.k2: 0.0
+Camera2.k3: 0.0
+Camera2.k4: 0.0
+Camera.width: 512
+Camera.height: 510
+Stereo.T_c1_c2: !!opencv-matrix
+   rows: 1
+   cols: 3
+   dt: f
+   data: [1.0, 0.0, 0.0]
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "settings.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_the_real_file_projects_as_opencv_does() -> None:
+    path = real_data("second/orbslam_aircap_basler.yaml")
+    assert recognise(path, CalibrationFormat, "calibration") is READER
+    stated = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    fx, fy, cx, cy, k1, k2, p1, p2 = (
+        stated.getNode(f"Camera.{key}").real() for key in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    )
+    [camera] = READER.read_calibration(path).values()
+    lens = camera.intrinsics
+    assert lens is not None
+    assert (lens.width, lens.height, camera.size_stated) == (2040, 1086, True)
+    points = np.array([[0.1, 0.2, 2.0], [-0.5, 0.3, 2.5]])
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array([k1, k2, p1, p2]))
+    np.testing.assert_allclose(project(points, lens), expected[:, 0], rtol=0, atol=1e-9)
+
+
+def test_two_fisheyes(tmp_path: Path) -> None:
+    cameras = READER.read_calibration(write(tmp_path, FISHEYE))
+    assert list(cameras) == ["Camera1", "Camera2"]
+    first, second = (camera.intrinsics for camera in cameras.values())
+    assert first is not None
+    assert second is not None
+    assert (first.model, first.distortion) == ("fisheye", (0.0034, 0.0007, -0.002, 0.0002))
+    assert (second.fx, second.width, second.height) == (191.5, 512, 510)
+
+
+def test_without_a_size_the_pictures_decide(tmp_path: Path) -> None:
+    text = "\n".join(line for line in FISHEYE.splitlines() if "width" not in line and "height" not in line)
+    first = READER.read_calibration(write(tmp_path, text))["Camera1"]
+    assert not first.size_stated
+    assert first.intrinsics is not None
+    assert (first.intrinsics.width, first.intrinsics.height) == (510, 514)  # 2 * 254.5 + 1, 2 * 256.75 + 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("KannalaBrandt8", "Rectified", "Rectified"),
+        ("Camera1.fy: 190.25", "Camera1.fy: 0", "190.5"),
+        ("Camera.height: 510", "", "512"),
+    ],
+)
+def test_faulty_settings_are_refused(tmp_path: Path, old: str, new: str, word: str) -> None:
+    with refuses(write(tmp_path, FISHEYE.replace(old, new)), word):
+        READER.read_calibration(tmp_path / "settings.yaml")
