@@ -250,7 +250,7 @@ class CameraText:
             return [
                 f"# pose: {{tum: {self._camera.name}.tum}}  # missing: nothing of that name has poses{loose}",
                 "#   or {csv: FILE}, {static: CALIBRATION}, {log: LOG, topic: TOPIC}, {log, parent, child},",
-                "#   {dji: SRT}, {ulog: FILE}, {ardupilot: FILE}, {log, preset: dji_osdk, mavros, px4}",
+                "#   {dji: FILE}, {ulog: FILE}, {ardupilot: FILE}, {tlog: FILE}, {log, preset: mavros}",
             ]
         taken = choice.taken
         remarks = [describe(taken)]

@@ -179,7 +179,7 @@ class StaticPose(Part):
 class PoseSource(Guess):
     """Source of a camera's poses."""
 
-    one_of = ("log", "tum", "csv", "static", "dji", "ulog", "ardupilot")
+    one_of = ("log", "tum", "csv", "static", "dji", "ulog", "ardupilot", "tlog")
     log: str | None = None
     topic: str | None = None
     parent: str | None = None
@@ -190,9 +190,10 @@ class PoseSource(Guess):
     tum: str | None = None
     csv: str | None = None
     static: StaticPose | None = None
-    dji: str | None = None  # subtitles beside a video
+    dji: str | None = None  # subtitles beside a video, or a flight record as CSV
     ulog: str | None = None  # PX4
     ardupilot: str | None = None  # DataFlash .bin
+    tlog: str | None = None  # of a ground station
     position: Literal["local", "global", "gps"] | None = None  # which of a drone's own estimates
     instance: int | None = Field(None, ge=0, le=255)
     time: Literal["gps", "boot"] | None = None
@@ -207,12 +208,12 @@ class PoseSource(Guess):
 
     @model_validator(mode="after")
     def _only_where_it_belongs(self) -> PoseSource:
-        autopilot = self.ulog is not None or self.ardupilot is not None
+        autopilot = any(part is not None for part in (self.ulog, self.ardupilot, self.tlog))
         allowed = {
             ("topic", "parent", "child", "preset", "attitude"): (self.log is not None, "from a log"),
             ("namespace",): (self.preset is not None, "by a preset"),
-            ("position",): (autopilot or self.preset is not None, "by ulog, ardupilot or a preset"),
-            ("instance", "time"): (autopilot, "by ulog or ardupilot"),
+            ("position",): (autopilot or self.preset is not None, "by ulog, ardupilot, tlog or a preset"),
+            ("instance", "time"): (autopilot, "by ulog, ardupilot or tlog"),
             ("altitude",): (self.dji is not None, "by dji"),
             ("axes",): (
                 not self.is_telemetry or self.attitude is not None,
@@ -242,7 +243,7 @@ class PoseSource(Guess):
     @property
     def is_telemetry(self) -> bool:
         """True if position and attitude come separately, from a drone's own log or its driver's topics."""
-        parts = (self.dji, self.ulog, self.ardupilot, self.preset, self.attitude)
+        parts = (self.dji, self.ulog, self.ardupilot, self.tlog, self.preset, self.attitude)
         return any(part is not None for part in parts)
 
 

@@ -86,7 +86,15 @@ def stated_paths(flight: Flight) -> list[str]:
         take(pose.tum, pose.csv, pose.static.path if pose.static else None, camera.intrinsics.path)
         take(camera.keypoints.path if camera.keypoints else None)
         gimbal_log = camera.gimbal.log if camera.gimbal else None
-        for log in (pose.log, pose.dji, pose.ulog, pose.ardupilot, camera.intrinsics.log, gimbal_log):
+        for log in (
+            pose.log,
+            pose.dji,
+            pose.ulog,
+            pose.ardupilot,
+            pose.tlog,
+            camera.intrinsics.log,
+            gimbal_log,
+        ):
             take_log(log)
         if times:
             take(times.csv, times.srt)

@@ -30,6 +30,7 @@ from tests.synthetic.drone_logs import (
     write_dataflash,
     write_record,
     write_srt,
+    write_tlog,
     write_ulog,
 )
 from tests.synthetic.flights import SyntheticFlight, write_flight
@@ -142,6 +143,11 @@ def _osdk(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"log": f"{name}.bag", "preset": "dji_osdk"}
 
 
+def _tlog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_tlog(folder / f"{name}.tlog", truth)
+    return {"tlog": f"{name}.tlog"}
+
+
 def _px4(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_mcap(folder / f"{name}.mcap", px4_entries(truth, "/px4_1"))
     return {"log": f"{name}.mcap", "preset": "px4", "namespace": "/px4_1"}
@@ -172,6 +178,7 @@ def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
         (_osdk, 1e-4, 1e-4),
         (_px4, 1e-4, 1e-4),
         (_px4_since_boot, 0.002, 0.1),  # receipt is 1 ms late, at 1 m/s and 60 deg/s
+        (_tlog, 0.015, 0.1),  # 1e-7 deg are 11 mm, and a ms of the boot time 1 mm and 0.06 deg
         (_record, 1e-3, 1e-4),  # 1e-9 deg are 0.1 mm
     ],
 )

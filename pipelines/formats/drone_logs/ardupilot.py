@@ -40,6 +40,7 @@ from pipelines.session.registries import need
 from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
 
 _START = b"\xa3\x95\x80"  # a FMT message: the first of every log
+_OLD_LOCAL = ("EKF1",)  # until 2015, when the estimator was logged without being flown by: only if asked for
 _HEAD = 3  # bytes before each message's fields
 _3D_FIX = 3
 _GPS_EPOCH_NS = 315_964_800_000_000_000  # 1980-01-06, UTC
@@ -180,6 +181,10 @@ class ArduPilotFormat:
         log = _Log(path)
         for name in ("CAM", "TRIG"):
             rows = log.first([name], choice.instance or 0, "I")
+            if rows is None and (timed := log.rows(name)) is not None and "GPSTime" in timed and len(timed):
+                week, ms = timed.integers("GPSWeek"), timed.integers("GPSTime")  # until 2014
+                gps_ns = week * _WEEK_NS + ms * 1_000_000 + _GPS_EPOCH_NS
+                return np.unique(gps_ns - _leap_ns(gps_ns))
             if rows is not None:
                 return pictures_on_gps_time(path, rows.t_ns(), _gps_time(log), choice)
         raise DataError(path, "holds no CAM or TRIG message", "take the times of frames otherwise")
@@ -194,7 +199,7 @@ def _position(
     instance = choice.instance or 0
     there = {
         "global": None if instance else log.first(["POS"]),  # the one that the autopilot flew by
-        "local": log.first(["XKF1", "NKF1"], instance, "C", "I"),
+        "local": log.first(["XKF1", "NKF1", *_OLD_LOCAL[: choice.position == "local"]], instance, "C", "I"),
         "gps": log.first(["GPS"], instance, "I"),
     }
     found = {kind: rows for kind, rows in there.items() if rows is not None}

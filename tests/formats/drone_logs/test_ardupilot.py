@@ -17,7 +17,16 @@ from pipelines.session.errors import DataError
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
-from tests.synthetic.drone_logs import BOOT_NS, HOME, DroneTruth, dataflash, drone_of, write_dataflash
+from tests.synthetic.drone_logs import (
+    BOOT_NS,
+    DATAFLASH,
+    HOME,
+    DroneTruth,
+    dataflash,
+    definition,
+    drone_of,
+    write_dataflash,
+)
 from tests.synthetic.flights import write_flight
 
 
@@ -209,3 +218,30 @@ def test_an_instance_is_that_of_an_estimator_and_never_that_of_a_mount(
             read(path, position=position, instance=1)
     with refuses(path, 2, "local"):
         read(path, instance=2)
+
+
+def test_the_old_estimator_is_read_if_it_is_asked_for() -> None:
+    """Read EKF1 of a real log from 2014; the drone flew by another estimate, so it is no default."""
+    path = real_data("second/erle_25.bin")
+    mavutil = pytest.importorskip("pymavlink.mavutil")
+    theirs = mavutil.mavlink_connection(str(path))
+    rows = {}
+    while (message := theirs.recv_match(type="EKF1")) is not None:
+        rows[message.TimeMS] = (message.PE, message.PN, -message.PD)
+    theirs.close()
+    track = read(path, position="local", time="boot").position
+    assert (track.on_earth, track.origin) == (False, None)
+    assert len(track.t_ns) == len(rows)
+    np.testing.assert_allclose(track.values, [rows[t // 10**6] for t in track.t_ns.tolist()], rtol=1e-6)
+    assert read(path, time="boot").position.name == "GPS"
+
+
+def test_pictures_of_2014_have_gps_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(DATAFLASH, "CAM", (15, "IHLL", "GPSTime,GPSWeek,Lat,Lng"))
+    path = tmp_path / "a.bin"
+    shots = [dataflash("CAM", 379_325_800 + 500 * k, 1813, 0, 0) for k in range(3)]
+    path.write_bytes(b"".join([definition("FMT"), definition("CAM"), *shots]))
+    # 1813 weeks and 379,325.8 s after 1980-01-06, less the 16 leap seconds of 2014
+    first_ns = (315_964_800 + 1813 * 604_800 + 379_325 - 16) * 10**9 + 800_000_000
+    expected = [first_ns + 500_000_000 * k for k in range(3)]
+    assert FORMAT.picture_times(path, TelemetryChoice()).tolist() == expected

@@ -1,0 +1,349 @@
+"""Ground stations' telemetry logs (.tlog): MAVLink packets, each behind the station's clock.
+
+Layout: 8 bytes of microseconds since 1970 (big endian), then one packet of MAVLink 1 or 2. Definitions of the
+messages come from pymavlink (extra `drones`); packets are found here, by their checksums, also behind damaged
+bytes. Position, attitude and gimbal become the columns of PX4's topics, which both autopilots share.
+"""
+
+from __future__ import annotations
+
+import binascii
+import mmap
+import re
+from array import array
+from collections import Counter
+from collections.abc import Iterator, Mapping, MutableMapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipelines.formats.common.files import first_bytes
+from pipelines.formats.drone_logs.telemetry_rows import damaged, describe_fit, of_angles, on_gps_time
+from pipelines.formats.drone_logs.ulog import Columns, Topic, telemetry_of
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.session.errors import DataError
+from pipelines.session.registries import need
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
+
+_STAMP = 8  # bytes of the station's clock before each packet
+_MARKS = re.compile(rb"[\xfd\xfe]")
+_SIGNED, _SIGNATURE = 1, 13  # flag in a packet of MAVLink 2, and the bytes of its signature
+_REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
+_FIRST_US, _LAST_US = 946_684_800_000_000, 4_102_444_800_000_000  # the years 2000 and 2100
+_UNIX_US = 10**15  # stamps in microseconds above it count from 1970, others from boot
+_YAW_IN_VEHICLE, _YAW_IN_EARTH = 32, 64  # GIMBAL_DEVICE_FLAGS
+
+_SYSTEM_TIME, _GPS_RAW_INT, _ATTITUDE, _ATTITUDE_QUATERNION = 2, 24, 30, 31
+_LOCAL_POSITION, _GLOBAL_POSITION, _ORIGIN = 32, 33, 49
+_MOUNT_ORIENTATION, _GIMBAL_DEVICE = 265, 285
+_WANTED = frozenset(
+    {_SYSTEM_TIME, _GPS_RAW_INT, _ATTITUDE, _ATTITUDE_QUATERNION, _LOCAL_POSITION, _GLOBAL_POSITION}
+    | {_ORIGIN, _MOUNT_ORIENTATION, _GIMBAL_DEVICE}
+)
+
+
+class TlogFormat:
+    """Reader of ground stations' logs of MAVLink (Mission Planner, QGroundControl, MAVProxy)."""
+
+    name = "tlog"
+    title = "ground station's log (MAVLink)"
+    suffixes: tuple[str, ...] = (".tlog", ".mavlink")
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if it begins with three packets behind plausible times."""
+        head = first_bytes(path, 1024, suffixes=self.suffixes)
+        place = 0
+        for _ in range(3):
+            stamp_us = int.from_bytes(head[place : place + _STAMP], "big")
+            size = _packet_size(head, place + _STAMP)
+            if size is None or not _FIRST_US < stamp_us < _LAST_US:
+                return False
+            place += _STAMP + size
+        return True
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe messages by name, vehicles, times, GPS time, losses of the radio link and damage."""
+        log = _read(path)
+        facts: dict[str, object] = {"messages": sum(log.counts.values())}
+        facts["span_s"] = round((log.last_us - log.first_us) / 1e6, 6)
+        facts["first_ns"] = log.first_us * 1000
+        facts["vehicles"] = [f"system {system}" for system in log.vehicles()]
+        for system in log.vehicles()[:1]:
+            if (fit := log.gps_time(system)) is not None:
+                facts["gps_time"] = describe_fit(fit)
+        facts["packets_missing"] = log.lost
+        facts |= {f"dropped: {cause}": count for cause, count in log.dropped.items()}
+        facts["topics"] = [f"{name} {count}" for name, count in sorted(log.named().items())]
+        return facts
+
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Read position, attitude and gimbal of one vehicle; `instance` is its system's number.
+
+        The position is GLOBAL_POSITION_INT (`global`), else LOCAL_POSITION_NED (`local`), else GPS_RAW_INT.
+        Times are UTC by SYSTEM_TIME; without it, those of the station.
+
+        Raises:
+            DataError: no such log, pymavlink is missing, several vehicles, or no position.
+        """
+        log = _read(path)
+        system = _vehicle(path, log, choice.instance)
+        notes = [f"took vehicle {system}"] if len(log.vehicles()) > 1 else []
+        fit, station = log.gps_time(system), None
+        if fit is None and choice.time is None:
+            fit = station = log.station_time(system)
+            if fit is not None:
+                notes.append("holds no GPS time: its stamps are turned to the ground station's clock")
+        else:
+            fit = on_gps_time(path, fit, choice.time, notes)
+        topics = _topics(log, system)
+        kinds = {"vehicle_global_position": "global", "vehicle_local_position": "local"}
+        there = next((kind for name, kind in kinds.items() if any(t.name == name for t in topics)), None)
+        asked = replace(choice, instance=None, position=choice.position or there)  # type: ignore[arg-type]
+        found = telemetry_of(path, topics, asked, fit, notes)
+        found = replace(found, dropped=dict(Counter(found.dropped) + Counter(log.dropped)))
+        return replace(found, clock="the ground station's clock", fit=None) if station else found
+
+
+def _vehicle(path: Path, log: _Packets, stated: int | None) -> int:
+    """Return the system's number that is stated, or the only one with positions."""
+    vehicles = log.vehicles()
+    listed = ", ".join(map(str, vehicles)) or "none"
+    if stated is not None:
+        if stated not in vehicles:
+            raise DataError(path, f"has no position of system {stated}", f"there are systems {listed}")
+        return stated
+    if not vehicles:
+        raise DataError(
+            path, "has no GLOBAL_POSITION_INT, LOCAL_POSITION_NED or GPS_RAW_INT", "give another log"
+        )
+    if len(vehicles) > 1:
+        raise DataError(
+            path, f"holds {len(vehicles)} vehicles (systems {listed})", "say which with `instance:`"
+        )
+    return vehicles[0]
+
+
+# --- content of a log ----------------------------------------------------------------------------------
+
+
+def _topics(log: _Packets, system: int) -> list[Topic]:
+    """Make PX4's topics of the messages of one vehicle."""
+    topics: list[Topic] = []
+
+    def add(name: str, columns: Columns) -> None:
+        if len(columns["timestamp"]):
+            topics.append(Topic(name, 0, columns))
+
+    place = log.columns(system, _GLOBAL_POSITION)
+    scaled = {"lat": place["lat"] * 1e-7, "lon": place["lon"] * 1e-7, "alt": place["alt"] * 1e-3}
+    if place["lat"].any() or place["lon"].any():
+        add("vehicle_global_position", {"timestamp": _boot_us(place), **scaled})
+    local, origin = log.columns(system, _LOCAL_POSITION), log.columns(system, _ORIGIN)
+    columns = {"timestamp": _boot_us(local), **{axis: local[axis] for axis in "xyz"}}
+    if len(origin["latitude"]):
+        names = (("ref_lat", "latitude", 1e-7), ("ref_lon", "longitude", 1e-7), ("ref_alt", "altitude", 1e-3))
+        columns |= {ref: np.full(len(local["x"]), origin[name][-1] * unit) for ref, name, unit in names}
+    add("vehicle_local_position", columns | {"xy_global": np.full(len(local["x"]), len(origin["latitude"]))})
+    gps = log.columns(system, _GPS_RAW_INT)
+    since_boot = gps["time_usec"] < _UNIX_US
+    fit = log.gps_time(system)
+    ahead_us = 0 if fit is None else fit.offset_ns // 1000
+    stamps = np.where(since_boot, gps["time_usec"], gps["time_usec"] - ahead_us)
+    fixes = {name: gps[name] for name in ("lat", "lon", "alt", "fix_type")}
+    add("vehicle_gps_position", {**fixes, "timestamp": stamps.astype(np.int64)})
+    turned = log.columns(system, _ATTITUDE_QUATERNION)
+    if len(turned["q1"]):
+        body = np.stack([turned[f"q{k}"] for k in range(1, 5)], axis=1)
+    else:
+        turned = log.columns(system, _ATTITUDE)
+        body = _wxyz(np.stack([turned[name] for name in ("yaw", "pitch", "roll")], axis=1))
+    add("vehicle_attitude", {"timestamp": _boot_us(turned), **_quaternion(body)})
+    device = log.columns(system, _GIMBAL_DEVICE)
+    if len(device["flags"]):
+        gimbal = np.stack([device[f"q[{k}]"] for k in range(4)], axis=1)
+        columns = {"timestamp": _boot_us(device), "device_flags": device["flags"], **_quaternion(gimbal)}
+        add("gimbal_device_attitude_status", columns)
+        return topics
+    mount = log.columns(system, _MOUNT_ORIENTATION)  # degrees; yaw_absolute is NaN where it is not known
+    from_north = np.isfinite(mount["yaw_absolute"])
+    yaw = np.where(from_north, mount["yaw_absolute"], mount["yaw"])
+    gimbal = _wxyz(np.radians(np.stack([yaw, mount["pitch"], mount["roll"]], axis=1)))
+    flags = np.where(from_north, _YAW_IN_EARTH, _YAW_IN_VEHICLE)
+    columns = {"timestamp": _boot_us(mount), "device_flags": flags, **_quaternion(gimbal)}
+    add("gimbal_device_attitude_status", columns)
+    return topics
+
+
+def _boot_us(columns: Columns) -> Int64:
+    return np.asarray(columns["time_boot_ms"] * 1000).astype(np.int64)
+
+
+def _wxyz(yaw_pitch_roll_rad: Float) -> Float:
+    x, y, z, w = of_angles(np.degrees(yaw_pitch_roll_rad)).T
+    return np.stack([w, x, y, z], axis=1)
+
+
+def _quaternion(wxyz: Float) -> dict[str, Float]:
+    return {f"q[{k}]": column for k, column in enumerate(wxyz.T)}
+
+
+# --- reading -------------------------------------------------------------------------------------------
+
+
+class _Packet(NamedTuple):
+    stamp_us: int
+    system: int
+    component: int
+    sequence: int
+    message: int
+    payload: bytes
+
+
+@dataclass
+class _Packets:
+    """Packets of a log: the wanted ones, and counts of all."""
+
+    dialect: Any
+    first_us: int = 0
+    last_us: int = 0
+    lost: int = 0  # packets between those that arrived, by their numbers
+    counts: Counter[int] = field(default_factory=Counter)
+    payloads: dict[tuple[int, int], bytearray] = field(default_factory=dict)  # by system and message
+    stamps_us: dict[tuple[int, int], array[int]] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    def named(self) -> dict[str, int]:
+        """Count the messages by name."""
+        names = self.dialect.mavlink_map
+        return {names[k].msgname if k in names else f"message {k}": n for k, n in self.counts.items()}
+
+    def vehicles(self) -> list[int]:
+        """List the systems that say where they are."""
+        positions = {_GLOBAL_POSITION, _LOCAL_POSITION, _GPS_RAW_INT}
+        return sorted({system for system, message in self.payloads if message in positions})
+
+    def columns(self, system: int, message: int) -> dict[str, Any]:
+        """Return the fields of all messages of a kind, [N] each; those of an array are `q[0]`, `q[1]`, ..."""
+        kind = self.dialect.mavlink_map[message]
+        names: list[str] = []
+        for name, length in zip(kind.ordered_fieldnames, kind.array_lengths, strict=True):
+            names += [f"{name}[{k}]" for k in range(length)] if length else [name]
+        rows = list(kind.unpacker.iter_unpack(bytes(self.payloads.get((system, message), b""))))
+        columns = zip(*rows, strict=True) if rows else ((),) * len(names)
+        return {name: np.array(column) for name, column in zip(names, columns, strict=True)}
+
+    def gps_time(self, system: int) -> ClockFit | None:
+        """Fit UTC to the time since boot; None if the vehicle does not know it."""
+        columns = self.columns(system, _SYSTEM_TIME)
+        unix_us = columns["time_unix_usec"].astype(np.int64)
+        known = unix_us > _UNIX_US
+        return fit_clock(_boot_us(columns)[known] * 1000, unix_us[known] * 1000)
+
+    def station_time(self, system: int) -> ClockFit | None:
+        """Fit the station's clock to the time since boot."""
+        for message in (_ATTITUDE, _GLOBAL_POSITION, _LOCAL_POSITION):
+            if stamps_us := self.stamps_us.get((system, message)):
+                boot_us = _boot_us(self.columns(system, message))
+                return fit_clock(boot_us * 1000, np.array(stamps_us, dtype=np.int64) * 1000)
+        return None
+
+
+def _read(path: Path) -> _Packets:
+    """Read all packets.
+
+    Raises:
+        DataError: pymavlink is missing, the file cannot be read, or holds no packet.
+    """
+    found = _Packets(need("pymavlink.dialects.v20.ardupilotmega", "drones"))
+    last: dict[tuple[int, int], int] = {}
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            for packet in _packets(content, found.dialect.mavlink_map, found.dropped):
+                found.first_us = found.first_us or packet.stamp_us
+                found.last_us = packet.stamp_us
+                found.counts[packet.message] += 1
+                sender = packet.system, packet.component
+                if sender in last:
+                    found.lost += (packet.sequence - last[sender] - 1) % 256
+                last[sender] = packet.sequence
+                if packet.message in _WANTED:
+                    key = packet.system, packet.message
+                    size = found.dialect.mavlink_map[packet.message].unpacker.size
+                    # MAVLink 2 leaves zeros at the end out; newer definitions are longer than older packets.
+                    found.payloads.setdefault(key, bytearray()).extend(
+                        packet.payload[:size].ljust(size, b"\0")
+                    )
+                    found.stamps_us.setdefault(key, array("q")).append(packet.stamp_us)
+    except (OSError, ValueError) as error:  # ValueError: an empty file cannot be mapped
+        raise damaged(path, error) from error
+    if not found.counts:
+        raise DataError(path, "holds no packet of MAVLink", "give the .tlog that the ground station wrote")
+    return found
+
+
+def _packets(
+    content: mmap.mmap, definitions: Mapping[int, Any], dropped: MutableMapping[str, int]
+) -> Iterator[_Packet]:
+    """Yield the packets whose checksum is right; stretches without any are counted."""
+    place, in_order = 0, True
+    while place + _STAMP < len(content):
+        packet = _packet(content, place, definitions)
+        if packet is not None:
+            in_order = True
+            yield packet
+            place += _STAMP + (_packet_size(content, place + _STAMP) or 0)
+            continue
+        following = _MARKS.search(content, place + _STAMP + 1)
+        if in_order:
+            cause = "cut off" if following is None else "damaged stretch"
+            dropped[cause] = dropped.get(cause, 0) + 1
+            in_order = False
+        if following is None:
+            return
+        place = following.start() - _STAMP
+    if place < len(content) and in_order:
+        dropped["cut off"] = dropped.get("cut off", 0) + 1
+
+
+def _packet(content: mmap.mmap, place: int, definitions: Mapping[int, Any]) -> _Packet | None:
+    """Read the packet behind a stamp; None if there is no whole one, or its checksum is wrong."""
+    start = place + _STAMP
+    size = _packet_size(content, start)
+    if size is None or start + size > len(content):
+        return None
+    packet = content[start : start + size]
+    if packet[0] == 0xFE:
+        head, (sequence, system, component, message) = 6, packet[2:6]
+    else:
+        head, (sequence, system, component), message = 10, packet[4:7], int.from_bytes(packet[7:10], "little")
+    end = head + packet[1]
+    if message in definitions:
+        stated = int.from_bytes(packet[end : end + 2], "little")
+        if _checksum(packet[1:end] + bytes([definitions[message].crc_extra])) != stated:
+            return None
+    elif start + size + _STAMP < len(content) and content[start + size + _STAMP] not in {0xFD, 0xFE}:
+        return None  # of an unknown message only its length can be tested
+    stamp_us = int.from_bytes(content[place:start], "big")
+    return _Packet(stamp_us, system, component, sequence, message, packet[head:end])
+
+
+def _packet_size(content: bytes | mmap.mmap, start: int) -> int | None:
+    """Return the size of a packet by its head; None if none begins there."""
+    head = content[start : start + 3]
+    if len(head) < 3 or head[0] not in {0xFD, 0xFE}:
+        return None
+    if head[0] == 0xFE:
+        return head[1] + 8
+    return int(head[1] + 12 + _SIGNATURE * (head[2] & _SIGNED))
+
+
+def _checksum(content: bytes) -> int:
+    """Compute MAVLink's checksum (CRC-16/MCRF4XX): that of `crc_hqx` with all bits reversed."""
+    reverse = binascii.crc_hqx(content.translate(_REVERSED), 0xFFFF)
+    return int(f"{reverse:016b}"[::-1], 2)
+
+
+FORMAT = TlogFormat()

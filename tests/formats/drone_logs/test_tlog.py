@@ -1,0 +1,155 @@
+"""Ground stations' logs of MAVLink: a real one against pymavlink, others byte by byte."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.drone_logs.tlog import FORMAT
+from pipelines.geometry.poses import rotate
+from pipelines.session.registries import FORMATS
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.formats.refusals import refuses
+from tests.real_data import real_data
+from tests.synthetic.drone_logs import DroneTruth, drone_of, mavlink, write_tlog
+from tests.synthetic.flights import write_flight
+
+
+def read(path: Path, **choice: Any) -> Telemetry:
+    return FORMAT.read_telemetry(path, TelemetryChoice(**choice))
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> DroneTruth:
+    folder = tmp_path_factory.mktemp("flight")
+    return drone_of(write_flight(folder, cameras=1, seconds=1.0, clean=True), 0)
+
+
+def test_a_real_log_has_the_messages_that_pymavlink_finds() -> None:
+    mavutil = pytest.importorskip("pymavlink.mavutil")
+    path = real_data("second/vtol.tlog")
+    assert [f.name for f in FORMATS.all() if f.recognises(path)] == ["tlog"]
+    places, turned, count = {}, {}, 0
+    reader = mavutil.mavlink_connection(str(path))
+    while (message := reader.recv_msg()) is not None:
+        count += 1
+        if message.get_type() == "GLOBAL_POSITION_INT":
+            places.setdefault(
+                message.time_boot_ms, (message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
+            )
+        elif message.get_type() == "ATTITUDE":
+            turned.setdefault(message.time_boot_ms, (message.yaw, message.pitch))
+    reader.close()
+    assert FORMAT.describe(path)["messages"] == count == 23894
+    telemetry = read(path, time="boot")
+    track, body = telemetry.position, telemetry.body
+    assert (track.on_earth, track.height, telemetry.gimbal, telemetry.dropped.get("cut off")) == (
+        True,
+        "sea level",
+        None,
+        None,
+    )
+    # Some packets came late: their stamps go back.
+    assert telemetry.dropped == {"stamp out of order": 3, "attitude stamp out of order": 2}
+    assert len(track.t_ns) == len(places) - 3
+    np.testing.assert_allclose(track.values, [places[t // 10**6] for t in track.t_ns.tolist()], rtol=1e-12)
+    assert body is not None
+    yaw, pitch = np.array([turned[t // 10**6] for t in body.t_ns.tolist()]).T
+    ahead = rotate(body.quaternion_xyzw, np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(np.arcsin(ahead[:, 2]), pitch, atol=1e-9)
+    np.testing.assert_allclose(ahead[:, 0], np.sin(yaw) * np.cos(pitch), atol=1e-9)
+    # UTC is that of SYSTEM_TIME: 1533737145.465 at 608.582 s since boot.
+    late_s = (read(path).position.t_ns[0] - track.t_ns[0]) / 1e9
+    assert late_s == pytest.approx(1533737145.465009 - 608.582, abs=2e-3)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_both_versions_of_mavlink(tmp_path: Path, truth: DroneTruth, version: int) -> None:
+    telemetry = read(write_tlog(tmp_path / "a.tlog", truth, version=version))
+    assert (telemetry.gimbal is None) == (version == 1)
+    assert telemetry.dropped == {}
+    np.testing.assert_allclose(telemetry.position.t_ns, truth.t_ns, atol=1_000_001)
+    np.testing.assert_allclose(telemetry.position.values[:, 0], truth.latitude_deg, atol=0.51e-7)
+
+
+@pytest.mark.parametrize("position", ["global", "local", "gps"])
+def test_every_position(tmp_path: Path, truth: DroneTruth, position: str) -> None:
+    track = read(write_tlog(tmp_path / "a.tlog", truth), position=position).position
+    assert track.on_earth == (position != "local")
+    assert (track.origin is None) == track.on_earth
+    expected = truth.enu if position == "local" else np.stack([truth.latitude_deg, truth.longitude_deg], 1)
+    np.testing.assert_allclose(track.values[:, : expected.shape[1]], expected, atol=1e-6)
+
+
+def test_without_gps_time_the_station_s_clock_counts(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_tlog(tmp_path / "a.tlog", truth, gps_time=False)
+    telemetry = read(path)
+    late_ns = telemetry.position.t_ns - truth.t_ns
+    assert np.abs(late_ns - 4_000_000_000).max() < 1_500_000  # the station's clock, and whole ms since boot
+    assert telemetry.fit is None
+    assert read(path, time="boot").position.t_ns[0] < 10**12
+    with refuses(path, "time: gps"):
+        read(path, time="gps")
+
+
+def test_a_mount_s_angles(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_tlog(tmp_path / "a.tlog", truth, version=1)
+    packets = [
+        mavlink("MOUNT_ORIENTATION", round(us / 1000), 0.0, -30.0, 5.0, yaw, stamp_ns=int(t))
+        for us, t, yaw in zip(truth.boot_us, truth.t_ns, [90.0] * 20 + [float("nan")] * 10, strict=True)
+    ]
+    path.write_bytes(path.read_bytes() + b"".join(packets))
+    gimbal = read(path).gimbal
+    assert gimbal is not None
+    ahead = rotate(gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(ahead[:20], [[0.75**0.5, 0, -0.5]] * 20, atol=1e-6)
+    # Without the angle from north, it counts from the nose. Its yaw moves by 1 deg at most in a row.
+    heading = np.radians(truth.body_ypr_deg[20:, 0] + 5)
+    np.testing.assert_allclose(ahead[20:, 0], np.sin(heading) * 0.75**0.5, atol=0.02)
+
+
+def test_several_vehicles_are_asked_for(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_tlog(tmp_path / "a.tlog", truth)
+    other = write_tlog(tmp_path / "b.tlog", truth, system=7)
+    path.write_bytes(path.read_bytes() + other.read_bytes())
+    with refuses(path, 2, "1, 7", "instance:"):
+        read(path)
+    with refuses(path, 3, "1, 7"):
+        read(path, instance=3)
+    assert len(read(path, instance=7).position.t_ns) == len(truth.t_ns)
+
+
+def test_damage_costs_the_packets_that_it_hits(tmp_path: Path, truth: DroneTruth) -> None:
+    whole = write_tlog(tmp_path / "a.tlog", truth)
+    data = bytearray(whole.read_bytes())
+    rows = len(read(whole).position.t_ns)
+    middle = len(data) // 2
+    data[middle : middle + 10] = bytes(10)
+    hit = tmp_path / "hit.tlog"
+    hit.write_bytes(data)
+    telemetry = read(hit)
+    assert telemetry.dropped["damaged stretch"] == 1
+    assert len(telemetry.position.t_ns) >= rows - 1
+    hit.write_bytes(whole.read_bytes()[:-5])
+    assert read(hit).dropped["cut off"] == 1
+    hit.write_bytes(whole.read_bytes()[: len(data) // 2])
+    assert rows // 2 <= len(read(hit).position.t_ns) <= rows // 2 + 1
+
+
+def test_refusals(tmp_path: Path, truth: DroneTruth) -> None:
+    empty = tmp_path / "empty.tlog"
+    empty.write_bytes(b"")
+    other = tmp_path / "other.tlog"
+    other.write_bytes(bytes(range(256)) * 20)
+    for path in (empty, other):
+        assert not FORMAT.recognises(path)
+        with refuses(path):
+            read(path)
+    nowhere = tmp_path / "nowhere.tlog"
+    nowhere.write_bytes(b"".join(mavlink("ATTITUDE", k, 0, 0, 0, 0, 0, 0, stamp_ns=10**18) for k in range(9)))
+    assert FORMAT.recognises(nowhere)
+    with refuses(nowhere, "GLOBAL_POSITION_INT"):
+        read(nowhere)
