@@ -42,7 +42,7 @@ _NEAREST_M, _FARTHEST_M = 1.5, 40.0
 
 _GRID_M = 0.8  # of patches: at most one point of a cloud in a cube of this size
 _MOST_PATCHES = 3000  # of all pairs together
-_MOST_OF_PAIR = 160
+_MOST_OF_PAIR = 120
 _AROUND_M = 1.5  # of a point, where its ground plane is fitted
 _NEIGHBOURS = 6  # needed there
 _ROUGH_M = 0.05  # rms of the neighbours about the plane, at most
@@ -50,7 +50,7 @@ _STEEPEST = 0.6  # cosine of the slope
 _GRAZING = 0.12  # sine of the angle between ray and ground, at least
 
 _PASSES = (2, 2, 1)  # of the comparison, each about what the one before found: one in so many patches
-_PAIRS_OF_STILLS = 4  # in which a patch is compared
+_PAIRS_OF_STILLS = 3  # in which a patch is compared
 _HALF_CELLS = 20  # of a patch, on each side of its centre
 _CELL_M = 0.03
 _FARTHEST_REACH_CELLS = 100  # of a search: patches that may lie farther off are found by chance

@@ -51,7 +51,7 @@ _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a wa
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
 _LOOSE_MOTION = 3.0  # times the accelerations of the prior, for the estimate of clocks and slow pose errors
-_ANY_MOTION = 100.0  # times the accelerations of the prior, for the error of single pictures
+_ANYWHERE_M = 100.0  # standard deviation of a joint that no picture shows
 _FAST_MOTION = 2.0  # times the accelerations of the prior, for joints beside correlated keypoint errors
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
@@ -294,12 +294,28 @@ def _joints_without_slow_errors(system: System, state: State, known: Knowledge) 
     initial = initial_state(problem, weighted, state.position)
     solved, found, at = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
     del at
-    problem = replace(problem, guides=None)
-    remembering = System(problem, known, solved.layout, BOUND**2)
+    remembering = System(replace(problem, guides=None), known, solved.layout, BOUND**2)
     own = covariances(remembering, eliminate(remembering, found))
-    alone = replace(weighted, acceleration=_ANY_MOTION**2 * known.acceleration)
-    single = System(problem, alone, solved.layout, BOUND**2)
-    return found.position, own, covariances(single, eliminate(single, found))
+    return found.position, own, _of_single_pictures(problem, known.pixel_scale, found.position)
+
+
+def _of_single_pictures(problem: Problem, pixel_scale: float, position: Float) -> Float:
+    """Compute the covariance [T, J, 3, 3] m^2 of joints from the pictures nearest to each time alone.
+
+    Pictures have the poses of the problem. A joint that fewer than two cameras see is known to `_ANYWHERE_M`
+    along its rays.
+    """
+    pictures = problem.pictures
+    nearest = _nearest(problem)
+    own = np.einsum("gji,gkj->gki", pictures.rotation, position[nearest] - pictures.position[:, None])
+    depth = np.where(own[..., 2] > 0.1, own[..., 2], np.inf)
+    across = np.broadcast_to(np.eye(3)[:2], (*depth.shape, 2, 3)).copy()
+    across[..., 2] = -own[..., :2] / depth[..., None]
+    across = across @ np.swapaxes(pictures.rotation, 1, 2)[:, None]
+    weight = pictures.trust * (pictures.sharpness / (pixel_scale * depth)) ** 2
+    information = np.tile(_ANYWHERE_M**-2 * np.eye(3), (*position.shape[:2], 1, 1))
+    np.add.at(information, nearest, weight[..., None, None] * np.swapaxes(across, -1, -2) @ across)
+    return np.linalg.inv(information)
 
 
 def _with_own(covariance: Float, own: Float, least: Float, guides: Bool | None, position: Float) -> Float:
@@ -626,14 +642,17 @@ def _spread(values: Float) -> float:
 def _residuals(problem: Problem, position: Float) -> tuple[Float, Float]:
     """Compute normalised residuals [G, J, 2] with the logged poses, and the depths of joints [G, J] (m)."""
     pictures = problem.pictures
-    when = pictures.when_s
-    nearest = pictures.first + np.argmin(
-        np.abs(problem.t_s[pictures.first[:, None] + np.arange(3)] - when[:, None]), axis=1
-    )
-    away = position[nearest] - pictures.position[:, None]
+    away = position[_nearest(problem)] - pictures.position[:, None]
     seen = np.einsum("gji,gkj->gki", pictures.rotation, away)
     depth = np.where(seen[..., 2] > 0.1, seen[..., 2], np.nan)
     return seen[..., :2] / depth[..., None] - pictures.rays, depth
+
+
+def _nearest(problem: Problem) -> Int64:
+    """Find the time of the skeleton that is nearest to each picture: its number [G]."""
+    first, when = problem.pictures.first, problem.pictures.when_s
+    apart = np.abs(problem.t_s[first[:, None] + np.arange(3)] - when[:, None])
+    return np.asarray(first + np.argmin(apart, axis=1), dtype=np.int64)
 
 
 # --- checks and results --------------------------------------------------------------------------------
