@@ -315,7 +315,7 @@ def _of_single_pictures(problem: Problem, pixel_scale: float, position: Float) -
     weight = pictures.trust * (pictures.sharpness / (pixel_scale * depth)) ** 2
     information = np.tile(_ANYWHERE_M**-2 * np.eye(3), (*position.shape[:2], 1, 1))
     np.add.at(information, nearest, weight[..., None, None] * np.swapaxes(across, -1, -2) @ across)
-    return np.linalg.inv(information)
+    return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
 def _with_own(covariance: Float, own: Float, least: Float, guides: Bool | None, position: Float) -> Float:
