@@ -361,7 +361,9 @@ def _nees(apart: Float, covariance: Float) -> float:
 def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, float]:
     """Compute the changing and the constant part of the attitude errors: RMS per axis over the cameras.
 
-    Attitudes are those that the method used: its own, or the logged ones.
+    Attitudes are those that the method used: its own, or the logged ones. A log's constant error turns the
+    camera. Attitudes relative to the background have one that turns the world, which would change along the
+    camera's axes as it pans. The constant part is the one that leaves less.
     """
     changing, constant = [], []
     own = session / "reconstruct" / "cameras.parquet"
@@ -371,9 +373,9 @@ def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, 
         if not len(poses):  # this camera stayed with its log
             poses = pd.read_parquet(session / "cameras" / name / "poses.parquet")
         quaternion = poses.sort_values("t_ns")[["qx", "qy", "qz", "qw"]].to_numpy()
-        error = (Rotation.from_matrix(attitude).inv() * Rotation.from_quat(quaternion)).as_rotvec(
-            degrees=True
-        )
+        true_inverse, found = Rotation.from_matrix(attitude).inv(), Rotation.from_quat(quaternion)
+        errors = [each.as_rotvec(degrees=True) for each in (true_inverse * found, found * true_inverse)]
+        error = min(errors, key=lambda each: float(each.var(axis=0).sum()))
         changing.append(error - error.mean(axis=0))
         constant.append(error.mean(axis=0))
     return float(np.sqrt(np.mean(np.square(changing)))), float(np.sqrt(np.mean(np.square(constant))))
