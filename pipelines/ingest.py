@@ -396,6 +396,9 @@ class _FlightReader:
             file = self._flight_path.parent / path
             occupancy = recognise(file, MapFormat, "map").read_map(file, resolution_m=stated.resolution_m)
             held, dropped = store_map(folder, self._near_origin(file, [occupancy])), occupancy.dropped
+            if occupancy.crs:
+                named = " ".join(occupancy.crs.split())[:60]
+                self._notes.append(f"{path}: its coordinates, of {named}, are taken to be the world's")
             if self._flight.world.frame == "ned":
                 self._notes.append(f"{path}: the map is taken to be in ENU axes although the world is NED")
         if dropped:

@@ -239,7 +239,8 @@ class VideoIndex:
 class Occupancy:
     """A voxel map: probability of being occupied, 0.5 and above is occupied, NaN where nothing is known.
 
-    `dropped` counts by cause what a reader left out of the file. It is not stored with the map.
+    `dropped` counts by cause what a reader left out of the file. `crs` is the coordinate reference system
+    that the file names for its axes (WKT or `EPSG:n`). Neither is stored with the map.
     """
 
     probability: NDArray[np.float32]  # [X, Y, Z]
@@ -247,3 +248,4 @@ class Occupancy:
     resolution_m: float
     from_ns: int = 0  # the time from which it holds
     dropped: dict[str, int] = field(default_factory=dict)
+    crs: str | None = None
