@@ -29,7 +29,7 @@ Part = TypeVar("Part")
 Result = TypeVar("Result")
 
 _SEGMENT = 256  # times of the skeleton
-_KEPT_BYTES = 300e6  # of a half's factors, before segments are factorised twice
+_KEPT_BYTES = 100e6  # of a half's factors, before segments are factorised twice
 _HELD = 1e10  # 1 / m^2, of a bone length
 
 
@@ -70,14 +70,19 @@ def covariances(system: System, at: Eliminated) -> Float:
     """Compute the posterior covariance [T, J, 3, 3] of every joint at every time."""
     shape = (system.problem.joints, 3, 3)
     whole = _last_covariance(at)
+    every = np.empty((len(system.problem.t_s), *shape))
 
-    def of_half(swept: _Swept, halt: Halt) -> Float:
+    def of_half(swept: _Swept, halt: Halt) -> None:
         covariance = np.zeros((len(swept.half.t_s), *shape))
         _visit_back(swept, swept.state, whole, covariance, 0, halt)
-        return covariance
+        # The times of the meeting are the first half's.
+        if swept.half.turned:
+            every[len(every) - len(covariance) + 2 :] = covariance[-3::-1]
+        else:
+            every[: len(covariance)] = covariance
 
-    first, second = _on_both(at.swept, of_half, system.problem.threads)
-    return np.concatenate([first, second[-3::-1]])
+    _on_both(at.swept, of_half, system.problem.threads)
+    return every
 
 
 def moments(system: System, state: State, at: Eliminated, *, every: int) -> Moments:
@@ -120,8 +125,23 @@ class _Front:
     gradient: Float  # [N]
     interval: int
 
-    def copy(self) -> _Front:
-        return _Front(self.matrix.copy(), self.gradient.copy(), self.interval)
+    def packed(self) -> _Packed:
+        return _Packed(self.matrix[np.tril_indices(len(self.matrix))], self.gradient.copy(), self.interval)
+
+
+@dataclass
+class _Packed:
+    """Front in half the memory."""
+
+    lower: Float  # [N (N + 1) / 2]
+    gradient: Float  # [N]
+    interval: int
+
+    def unpacked(self) -> _Front:
+        size = len(self.gradient)
+        matrix = np.zeros((size, size))
+        matrix[np.tril_indices(size)] = self.lower
+        return _Front(matrix, self.gradient.copy(), self.interval)
 
 
 @dataclass
@@ -130,7 +150,7 @@ class _Swept:
 
     half: Half
     state: State  # its part
-    fronts: list[_Front]  # at the start of every segment, to recompute its factors
+    fronts: list[_Packed]  # at the start of every segment, to recompute its factors
     factors: dict[int, Factors]  # of the segments whose factors are kept
     rest: _Front
     log_determinant: float
@@ -158,7 +178,7 @@ def _sweep(half: Half, state: State, halt: Halt) -> _Swept:
     bytes_per_time = 8 * 3 * system.problem.joints * system.size
     for index, (first, last) in enumerate(_segments(half)):
         halt.check()
-        fronts.append(front.copy())
+        fronts.append(front.packed())
         factors, part = _eliminate(half, state, front, first, last)
         log_determinant += part
         if bytes_per_time * last < _KEPT_BYTES or last == half.count:
@@ -267,7 +287,7 @@ def _factors_backwards(swept: _Swept, halt: Halt) -> Iterator[tuple[int, int, Fa
         halt.check()
         factors = swept.factors.get(index)
         if factors is None:
-            factors, _ = _eliminate(swept.half, swept.state, swept.fronts[index].copy(), *segments[index])
+            factors, _ = _eliminate(swept.half, swept.state, swept.fronts[index].unpacked(), *segments[index])
         yield *segments[index], factors
 
 

@@ -28,7 +28,7 @@ from pipelines.reconstruction.refinement.elimination import Eliminated, eliminat
 from pipelines.reconstruction.refinement.kernels import State
 from pipelines.reconstruction.refinement.problem import REMEMBERED, Knowledge, Problem, lay_out
 from pipelines.reconstruction.refinement.sweeps import Moments
-from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
+from pipelines.reconstruction.refinement.system import System, loss, misfit, prior_cost
 
 BOUND = 3.5
 """Residual, in standard deviations, beyond which an image point's weight falls: one good view in 450."""
@@ -92,7 +92,7 @@ def _growth(system: System, state: State, direction: State) -> float:
 
 def cost(system: System, state: State) -> float:
     """Compute minus twice the logarithm of the posterior, up to a constant."""
-    return misfit(system, state)[0] + prior_cost(system, state)
+    return loss(system, state) + prior_cost(system, state)
 
 
 def learn(
@@ -144,7 +144,8 @@ def evidence(problem: Problem, known: Knowledge, state: State) -> float:
     grown = system.grown(state)
     times = len(problem.t_s)
     value = -0.5 * cost(system, state) - at.log_determinant
-    value -= 2 * float(problem.pictures.trust.sum()) / known.memory * np.log(known.pixel_scale)
+    seen = np.isfinite(problem.pictures.rays[..., 0]).sum()
+    value -= 2 * float(seen) / known.memory * np.log(known.pixel_scale)
     # Motion and bones in units of the body's size, which has a flat prior.
     _, log_determinant = np.linalg.slogdet(known.acceleration / known.size_m**2)
     value -= 1.5 * (times - 2) * float(log_determinant)

@@ -53,7 +53,6 @@ class PictureArrays(NamedTuple):
     when_s: Float  # [G]
     rays: Float  # [G, J, 2]
     sharpness: Float  # [G, J]
-    trust: Float  # [G, J]
     position: Float  # [G, 3]
     rotation: Float  # [G, 3, 3]
     speed: Float  # [G, 3]
@@ -371,11 +370,11 @@ def linearise_picture(
 
 
 @helper
-def weigh(residual: Float, trust: Float, bound2: float, view_weight: Float) -> None:
+def weigh(residual: Float, bound2: float, view_weight: Float) -> None:
     """Compute the weights [J] of a picture's views from their residuals [J, 2]; 0 without a residual."""
     for joint in range(len(residual)):
         squared = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
-        view_weight[joint] = 0.0 if np.isnan(squared) else trust[joint] * confidence_of(squared, bound2)
+        view_weight[joint] = 0.0 if np.isnan(squared) else confidence_of(squared, bound2)
 
 
 @helper
@@ -443,7 +442,7 @@ def assemble(
     half = 0.0
     for g in range(first_picture, last_picture):
         linearise_picture(g, t_s, state, pictures, entries, picture)
-        weigh(picture.residual, pictures.trust[g], bound2, picture.view_weight)
+        weigh(picture.residual, bound2, picture.view_weight)
         normal_equations(picture, of_joints, across, of_numbers, joint_gradient, number_gradient)
         row = pictures.white_row[g]
         eliminated = np.isfinite(white_precision[row, 0, 0])
@@ -531,7 +530,7 @@ def whiten(equations: Equations, step: State) -> None:
         if not np.isfinite(white_precision[row, 0, 0]):
             continue
         linearise_picture(g, t_s, state, pictures, entries, picture)
-        weigh(residual, pictures.trust[g], bound2, picture.view_weight)
+        weigh(residual, bound2, picture.view_weight)
         numbers_of(
             pictures.camera[g], pictures.fraction[g], pictures.interval[g], entries, step.knots,
             step.shared, nothing, numbers_by,
@@ -562,22 +561,24 @@ def whiten(equations: Equations, step: State) -> None:
 
 
 @cached
-def misfit(equations: Equations, residuals: Float, numbers: Float) -> float:
-    """Compute the loss of all pictures; fill whitened residuals [G, J, 2] (NaN unseen), numbers [G, 10]."""
+def misfit(equations: Equations, first: int, total: float, residuals: Float, numbers: Float) -> float:
+    """Add the loss of G pictures from `first` on to a total.
+
+    Fill their whitened residuals [G, J, 2] (NaN unseen) and numbers [G, 10].
+    """
     t_s, state, pictures, entries, bound2, _ = equations
     picture = linearised(state.position.shape[1])
-    residual, trust = picture.residual, pictures.trust
-    total = 0.0
-    for g in range(len(residuals)):
+    residual = picture.residual
+    for g in range(first, first + len(residuals)):
         linearise_picture(g, t_s, state, pictures, entries, picture)
         for a in range(NUMBERS):
-            numbers[g, a] = picture.number[a]
+            numbers[g - first, a] = picture.number[a]
         for joint in range(len(residual)):
             for axis in range(2):
-                residuals[g, joint, axis] = residual[joint, axis]
+                residuals[g - first, joint, axis] = residual[joint, axis]
             value = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
             if not np.isnan(value):
-                total += trust[g, joint] * loss_of(value, bound2)
+                total += loss_of(value, bound2)
     return total
 
 
@@ -603,7 +604,7 @@ def posterior_of_picture(
     joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
     factor, own = np.zeros((WHITE, WHITE)), np.zeros((WHITE, WHITE))
     linearise_picture(g, t_s, state, pictures, entries, picture)
-    weigh(picture.residual, pictures.trust[g], bound2, picture.view_weight)
+    weigh(picture.residual, bound2, picture.view_weight)
     most = 2 * (entries.column.size + 1)
     column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
     unknowns = unknowns_of(pictures.camera[g], pictures.fraction[g], n, entries, column, of_number, share)

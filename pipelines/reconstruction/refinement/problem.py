@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import PoseErrors, Process
@@ -32,7 +31,6 @@ class Pictures:
     when_s: Float  # [G] on the skeleton's clock
     rays: Float  # [G, J, 2]
     sharpness: Float  # [G, J] 1 / standard deviation of an image point
-    trust: Float  # [G, J] 0 for points that must not be used
     position: Float  # [G, 3] m, the logged pose
     rotation: Float  # [G, 3, 3] world_from_camera
     speed: Float  # [G, 3] m/s, world
@@ -192,41 +190,60 @@ def build(
         threads: see `Problem`.
         guides: see `Problem`.
     """
-    parts, covariances, logged = [], [np.empty((0, 6, 6))], 0
-    for camera, sighting in enumerate(sightings):
-        parts.append(_pictures(t_s, sighting, camera, logged))
+    step = float(np.median(np.diff(t_s)))
+    covariances, logged = [np.empty((0, 6, 6))], 0
+    firsts, kepts = [], []
+    for sighting in sightings:
+        first, near = _first_of_three(t_s, sighting.t_s, step)
+        (kept,) = np.nonzero(near & sighting.range_of)
+        firsts.append(first[kept])
+        kepts.append(kept)
+    first = np.concatenate(firsts)
+    camera = np.repeat(np.arange(len(sightings)), [len(kept) for kept in kepts])
+    order = np.lexsort((camera, first))
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    pictures = _empty_pictures(len(order), sightings[0].rays.shape[1])
+    pictures.first[place], pictures.camera[place] = first, camera
+    for number, (sighting, kept) in enumerate(zip(sightings, kepts, strict=True)):
+        _fill(pictures, place[camera == number], sighting, kept, logged)
         if sighting.pose_covariance is not None:
             covariances.append(sighting.pose_covariance)
             logged += len(sighting.t_s)
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    order = np.lexsort((columns[2], columns[1], columns[0]))
-    pictures = Pictures(*(np.ascontiguousarray(column[order]) for column in columns))
     knots = max(int(np.ceil((t_s[-1] - t_s[0]) / KNOT_S)) + 1, 2)
     knot_t_s = np.linspace(t_s[0], t_s[-1], knots)
     return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances), threads, guides)
 
 
-def _pictures(t_s: Float, sighting: Sighting, camera: int, logged: int) -> tuple[NDArray[np.generic], ...]:
-    step = float(np.median(np.diff(t_s)))
-    first, near = _first_of_three(t_s, sighting.t_s, step)
-    (kept,) = np.nonzero(near & sighting.range_of)
+def _empty_pictures(count: int, joints: int) -> Pictures:
+    """Make room for pictures."""
+    return Pictures(
+        first=np.empty(count, dtype=np.int64),
+        camera=np.empty(count, dtype=np.int64),
+        logged=np.full(count, -1),
+        when_s=np.empty(count),
+        rays=np.empty((count, joints, 2)),
+        sharpness=np.empty((count, joints)),
+        position=np.empty((count, 3)),
+        rotation=np.empty((count, 3, 3)),
+        speed=np.empty((count, 3)),
+        turn=np.empty((count, 3)),
+    )
+
+
+def _fill(pictures: Pictures, place: Int64, sighting: Sighting, kept: Int64, logged: int) -> None:
+    """Write a camera's pictures to their places; its logged poses begin at row `logged`."""
     speed, turn = _rates(sighting)
     seen = ~np.isnan(sighting.rays[kept, :, 0]) & (sighting.confidence[kept] > 0)
     sharpness = np.where(seen, sighting.confidence[kept], 0.0) * sighting.focal_px / sighting.pixel_sigma
-    rays = np.where(seen[..., None], sighting.rays[kept], np.nan)
-    return (
-        first[kept],
-        np.full(len(kept), camera, dtype=np.int64),
-        np.full(len(kept), -1) if sighting.pose_covariance is None else logged + kept,
-        sighting.t_s[kept],
-        rays,
-        sharpness,
-        seen.astype(np.float64),
-        sighting.position[kept],
-        sighting.rotation[kept],
-        speed[kept],
-        turn[kept],
-    )
+    if sighting.pose_covariance is not None:
+        pictures.logged[place] = logged + kept
+    pictures.when_s[place] = sighting.t_s[kept]
+    pictures.rays[place] = np.where(seen[..., None], sighting.rays[kept], np.nan)
+    pictures.sharpness[place] = sharpness
+    pictures.position[place] = sighting.position[kept]
+    pictures.rotation[place] = sighting.rotation[kept]
+    pictures.speed[place], pictures.turn[place] = speed[kept], turn[kept]
 
 
 def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:

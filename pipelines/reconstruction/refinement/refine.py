@@ -141,26 +141,31 @@ def refine(
     """
     part = _participating(start)
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
-        return _none(sightings, start, "too few joints or times were triangulated")
+        return _none(len(clock_sigma_s), start, "too few joints or times were triangulated")
     sightings = [_take(sighting, part) for sighting in sightings]
     bones = _renumbered(bones, part)
     filled = _without_gaps(t_s, start[:, part])
     guides = None if guides is None else guides[part]
-    problem = build(t_s, sightings, bones, threads=threads, guides=guides)
+    chosen = _stretches(len(t_s))
+    stretches = build(t_s[chosen], sightings, bones, threads=threads, guides=guides)
+    problem = stretches
+    if len(chosen) < len(t_s):
+        problem = build(t_s, sightings, bones, threads=threads, guides=guides)
+    del sightings  # the problem has its own copy
     refused = None
     try:
         if prior is not None and not contested:
-            priors = _measured_prior(problem, sightings, filled, prior, clock_sigma_s)
+            priors = _measured_prior(stretches, filled[chosen], prior, clock_sigma_s)
         else:
-            priors = _priors(problem, sightings, filled, prior, clock_sigma_s)
+            priors = _priors(stretches, filled[chosen], prior, clock_sigma_s)
         for found in priors:
-            refined = _refined(problem, start, part, filled, found)
+            refined = _refined(problem, part, filled, found)
             if refined.fallback is None:
                 return refined
             refused = refused or refined
     except np.linalg.LinAlgError as error:
-        refused = refused or _none(sightings, start, str(error))
-    return refused or _none(sightings, start, "no prior could be found")
+        refused = refused or _none(len(clock_sigma_s), start, str(error))
+    return refused or _none(len(clock_sigma_s), start, "no prior could be found")
 
 
 @dataclass(frozen=True)
@@ -173,8 +178,10 @@ class _Prior:
     expected_m: float  # largest allowed move of the skeleton
 
 
-def _refined(problem: Problem, start: Float, part: Bool, filled: Float, prior: _Prior) -> Refined:
+def _refined(problem: Problem, part: Bool, filled: Float, prior: _Prior) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails.
+
+    Joints [J] that are not in `part` stay NaN.
 
     Raises:
         LinAlgError: its equations are singular.
@@ -203,13 +210,9 @@ def _refined(problem: Problem, start: Float, part: Bool, filled: Float, prior: _
         joints = state.position
     fallback = doubts or _too_far(joints, filled, prior.expected_m)
     shift = np.median(filled - joints, axis=(0, 1)) if as_logged else np.zeros(3)
-    position = np.full_like(start, np.nan)
-    position[:, part] = joints + shift
-    whole = np.full((*start.shape, 3), np.nan)
-    whole[:, part] = covariance
     return Refined(
-        position=position,
-        covariance=whole,
+        position=_of_all_joints(joints + shift, part),
+        covariance=_of_all_joints(covariance, part),
         corrections=_corrections(*slow, shift),
         clock_offset_s=clock_s,
         clock_sigma_s=clock_left_s,
@@ -367,7 +370,18 @@ def _participating(start: Float) -> Bool:
 
 
 def _take(sighting: Sighting, part: Bool) -> Sighting:
+    if part.all():
+        return sighting
     return replace(sighting, rays=sighting.rays[:, part], confidence=sighting.confidence[:, part])
+
+
+def _of_all_joints(values: Float, part: Bool) -> Float:
+    """Return values [T, P, ...] of the refined joints for all joints [T, J, ...], NaN for the others."""
+    if part.all():
+        return values
+    whole = np.full((len(values), len(part), *values.shape[2:]), np.nan)
+    whole[:, part] = values
+    return whole
 
 
 def _renumbered(bones: Int64, part: Bool) -> Int64:
@@ -394,8 +408,7 @@ def _without_gaps(t_s: Float, start: Float) -> Float:
 
 
 def _priors(
-    flight: Problem,
-    sightings: Sequence[Sighting],
+    problem: Problem,
     start: Float,
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
@@ -409,29 +422,28 @@ def _priors(
     Raises:
         LinAlgError: none of them explains the pictures.
     """
-    chosen = _stretches(len(flight.t_s))
-    problem = build(flight.t_s[chosen], sightings, flight.bones, threads=flight.threads, guides=flight.guides)
-    guess, image, disagreement_m, range_m = _first_guess(problem, start[chosen])
+    cameras = len(clock_sigma_s)
+    guess, image, disagreement_m, range_m = _first_guess(problem, start)
     stated_m = 0.0 if prior is None else float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
-    spread = _spread_of(len(sightings))
-    unlearned = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
-    state = initial_state(problem, unlearned, start[chosen])
+    spread = _spread_of(cameras)
+    unlearned = _unlearned(problem, start, (guess,) * cameras, clock_sigma_s)
+    state = initial_state(problem, unlearned, start)
     free, state = learn(problem, unlearned, state, poses=True, memory=True, rounds=_LEARNING_ROUNDS)
     if prior is None and free.memory >= _UNINFORMATIVE_MEMORY:
         # Keypoints determine no levels of lasting errors, which are possible all the same.
         position, rotation = UNKNOWN_SIGMA
         lasting = (Process(SHIFT_IN_WORLD, position), Process(ROTATION, rotation))
         usual = PoseErrors(guess.white, lasting, assumed=True)
-        for possible in _measured_prior(flight, sightings, start, [usual] * len(sightings), clock_sigma_s):
+        for possible in _measured_prior(problem, start, [usual] * cameras, clock_sigma_s):
             # Two views disagree across one line only, which says too little without a background.
-            yield replace(possible, learned=possible.learned or len(sightings) == 2)
+            yield replace(possible, learned=possible.learned or cameras == 2)
         return
     # The alternatives use the same motion, bones and image noise: from round to round, learning these changes
     # the evidence by more than the differences between right levels.
     found = {}
     if free.memory < _UNINFORMATIVE_MEMORY:
         found["estimated"] = (evidence(problem, free, state), free, state)
-    exact = (PoseErrors((0.0, 0.0), ()),) * len(sightings)
+    exact = (PoseErrors((0.0, 0.0), ()),) * cameras
     others = {} if prior is None else {"stated": tuple(prior)}
     if exact not in others.values():
         others["exact"] = exact
@@ -472,18 +484,15 @@ def _priors(
 
 
 def _measured_prior(
-    flight: Problem,
-    sightings: Sequence[Sighting],
+    problem: Problem,
     start: Float,
     prior: Sequence[PoseErrors],
     clock_sigma_s: Float,
 ) -> Iterator[_Prior]:
     """Yield the prior with measured pose errors; motion, bones and keypoint noise are learned beside them."""
-    chosen = _stretches(len(flight.t_s))
-    problem = build(flight.t_s[chosen], sightings, flight.bones, threads=flight.threads, guides=flight.guides)
-    _, _, disagreement_m, range_m = _first_guess(problem, start[chosen])
-    unlearned = _unlearned(problem, start[chosen], tuple(prior), clock_sigma_s)
-    state = initial_state(problem, unlearned, start[chosen])
+    _, _, disagreement_m, range_m = _first_guess(problem, start)
+    unlearned = _unlearned(problem, start, tuple(prior), clock_sigma_s)
+    state = initial_state(problem, unlearned, start)
     known, state = learn(problem, unlearned, state, poses=False, memory=True, rounds=_LEARNING_ROUNDS)
     levels = [known]
     if any(errors.assumed for errors in prior):
@@ -491,7 +500,7 @@ def _measured_prior(
         found = _with_constant_levels(problem, known, state)
         levels = [usual] if found is None else [found, usual]
     measured_m = float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
-    expected_m = _spread_of(len(sightings)) * max(_FARTHEST * disagreement_m, _FARTHEST_STATED * measured_m)
+    expected_m = _spread_of(len(prior)) * max(_FARTHEST * disagreement_m, _FARTHEST_STATED * measured_m)
     acceleration = shrunk(known.acceleration, problem.t_s, state.position)
     for number, level in enumerate(levels, 1):
         settled = replace(level, acceleration=acceleration)
@@ -789,13 +798,13 @@ def _levels(known: Knowledge) -> dict[str, float]:
     }
 
 
-def _none(sightings: Sequence[Sighting], start: Float, reason: str) -> Refined:
+def _none(cameras: int, start: Float, reason: str) -> Refined:
     return Refined(
         position=np.full_like(start, np.nan),
         covariance=np.full((*start.shape, 3), np.nan),
-        corrections=tuple((np.empty(0), np.empty((0, 10))) for _ in sightings),
-        clock_offset_s=np.zeros(len(sightings)),
-        clock_sigma_s=np.zeros(len(sightings)),
+        corrections=tuple((np.empty(0), np.empty((0, 10))) for _ in range(cameras)),
+        clock_offset_s=np.zeros(cameras),
+        clock_sigma_s=np.zeros(cameras),
         levels={},
         bone_lengths_m=np.empty(0),
         acceleration=np.empty((0, 0)),

@@ -21,6 +21,7 @@ from pipelines.reconstruction.refinement.problem import REMEMBERED, Knowledge, L
 from pipelines.reconstruction.refinement.sweeps import Sweep, Ties
 
 _ANYWHERE_M = 100.0  # prior sigma of an unseen joint around its start
+_AT_ONCE = 4096  # pictures whose residuals are in memory if only the loss is asked for
 _NO_GUIDE = 30**0.5  # factor on the standard deviation of keypoints that do not determine the cameras
 
 
@@ -54,7 +55,6 @@ class System:
                 when_s=seen.when_s,
                 rays=seen.rays,
                 sharpness=seen.sharpness / (known.pixel_scale * _blur(problem, known)),
-                trust=seen.trust,
                 position=seen.position,
                 rotation=seen.rotation,
                 speed=seen.speed,
@@ -137,8 +137,20 @@ def misfit(system: System, state: State) -> tuple[float, Float, Float]:
     """
     residual = np.empty(system.pictures.rays.shape)
     numbers = np.empty((len(residual), kernels.NUMBERS))
-    total = kernels.misfit(system.equations(state, system.problem.t_s, system.pictures), residual, numbers)
-    return total, residual, numbers
+    equations = system.equations(state, system.problem.t_s, system.pictures)
+    return kernels.misfit(equations, 0, 0.0, residual, numbers), residual, numbers
+
+
+def loss(system: System, state: State) -> float:
+    """Compute the loss of the pictures."""
+    equations = system.equations(state, system.problem.t_s, system.pictures)
+    pictures, joints, _ = system.pictures.rays.shape
+    residual, numbers = np.empty((_AT_ONCE, joints, 2)), np.empty((_AT_ONCE, kernels.NUMBERS))
+    total = 0.0
+    for first in range(0, pictures, _AT_ONCE):
+        rows = min(_AT_ONCE, pictures - first)
+        total = kernels.misfit(equations, first, total, residual[:rows], numbers[:rows])
+    return total
 
 
 def prior_cost(system: System, state: State) -> float:
