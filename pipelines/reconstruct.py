@@ -80,6 +80,7 @@ from pipelines.session.description import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
+from pipelines.session.memory import Waiting, return_freed_arrays
 from pipelines.session.people import LoggedActor, logged_actor, true_joints_at
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
@@ -164,6 +165,7 @@ def reconstruct(
     errors = disturbances(settings.disturb_poses, settings.trials)
     smoother(settings.smooth)
     _check_fill(settings.fill_s)
+    return_freed_arrays()
     with locked(folder) as session:
         ingested = session.intact_record("ingest")
         if ingested is None:
@@ -196,6 +198,8 @@ def reconstruct(
             calibrated=read_calibration(measured).probabilities if measured else None,
         )
         cameras, swaps = _without_swaps(cameras)
+        waiting = Waiting(run.folder)
+        cameras = waiting.put(cameras)
         progress.advance()
         followed = _followed(folder, cameras, left_out) if background or left_out else {}
         actor = logged_actor(folder, description)
@@ -205,7 +209,8 @@ def reconstruct(
             _stills(folder, cameras) if settings.method == "auto" else {},
             actor,
             ground_of(folder, description, actor),
-            load_truth(folder, description, cameras[0].detections.joints),
+            waiting.put(load_truth(folder, description, cameras[0].detections.joints)),
+            waiting,
         )
         attempts = (
             _attempt(
@@ -377,6 +382,7 @@ class _Flight:
     actor: LoggedActor | None
     ground: Ground | None
     truth: JointMotion | None
+    waiting: Waiting  # for large arrays of long flights
 
 
 @dataclass(frozen=True)
@@ -416,6 +422,7 @@ def _attempt(
         cameras, background["background"], warnings = _refine_cameras(
             cameras, flight.followed, description, settings
         )
+        cameras = flight.waiting.put(cameras)
     binding = None
     if len(flight.stills) > 1:
         binding = bind_positions(
@@ -489,12 +496,12 @@ def _triangulated(
     flight: _Flight, cameras: list[Camera], settings: Settings, workers: int
 ) -> tuple[_Seen, Views, Triangulation, Callable[[Views], Triangulation]]:
     """Observe and triangulate by the method, or by what it starts from; the last result is its solver."""
-    seen = _observe(flight, cameras, settings)
+    seen = flight.waiting.put(_observe(flight, cameras, settings))
     views = views_with_noise(cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers)
     solve = solver_for(
         settings.method, cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers
     )
-    return seen, views, solve(views), solve
+    return seen, views, flight.waiting.put(solve(views)), solve
 
 
 def _robust_flight(
@@ -522,6 +529,7 @@ def _robust_flight(
         pixel_sigma=settings.pixel_sigma,
         between=flight.description.pose_interpolation,
         threads=workers,
+        waiting=flight.waiting,
     )
 
 

@@ -307,6 +307,7 @@ def _shortest_path(cost: Float, change: Float, exchanged: float) -> Bool:
 _MOST_CAMERAS = 2  # cameras that are wrong at once
 _GAIN = 16.0  # squared misses, in variances, that an exchange must save
 _BAD, _GOOD = 5.0, 4.0  # mean squared miss of the rays of one camera before and after it; 2 is expected
+_AT_ONCE = 4096  # times whose rays are in memory together
 _CAP = 25.0  # a single ray counts up to five standard deviations
 
 
@@ -333,7 +334,13 @@ def swaps_across_views(
     counts: Counter[str] = Counter()
     limbs = [pairs for pairs in limb_pairs(joints).values() if len(pairs) > 1]
     for group in [*limbs, *([pair] for pair in mirrored_pairs(joints).values())]:
-        flipped, undecided = _wrong_views(xy[:, np.ravel(group)], position, rotation, sigma, len(group))
+        parts = [
+            _wrong_views(
+                xy[rows][:, np.ravel(group)], position[rows], rotation[rows], sigma[rows], len(group)
+            )
+            for rows in (slice(k, k + _AT_ONCE) for k in range(0, max(len(xy), 1), _AT_ONCE))
+        ]
+        flipped, undecided = (np.concatenate(each) for each in zip(*parts, strict=True))
         for left, right in group:
             for values in (xy, sides):
                 a, b = values[:, left], values[:, right]

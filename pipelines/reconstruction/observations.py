@@ -63,19 +63,25 @@ class Camera:
         middles = undistort(np.array([[0.0, y], [x, 0.0], [right, y], [x, bottom]]), self.intrinsics)
         return middles[np.arange(4), [0, 1, 0, 1]]
 
-    @cached_property
-    def rays(self) -> Float:
-        """Keypoints [F, D, J, 2] as undistorted normalised image coordinates; NaN where nothing was found."""
-        found = self.detections
-        dense = np.full((len(self.frame_t_ns), self._most_people, len(found.joints), 2), np.nan)
-        dense[found.frame, self._rank] = undistort(found.xy, self.intrinsics)
-        return dense
+    def seen(self) -> tuple[Float, Float]:
+        """Compute the keypoints of its frames.
 
-    @cached_property
-    def row_delay_s(self) -> Float:
-        """Delay (s) of each keypoint [F, D, J] against its frame's stamp (`cameras.row_delay_s`)."""
+        Returns:
+            Undistorted normalised image coordinates [F, D, J, 2], NaN where nothing was found, and their
+            confidences [F, D, J], 0 there.
+        """
         found = self.detections
-        dense = np.full((len(self.frame_t_ns), self._most_people, len(found.joints)), np.nan)
+        rays = np.full((len(self.frame_t_ns), self.most_people, len(found.joints), 2), np.nan)
+        confidence = np.zeros(rays.shape[:-1])
+        rays[found.frame, self._rank] = undistort(found.xy, self.intrinsics)
+        confidence[found.frame, self._rank] = found.confidence
+        confidence[np.isnan(rays[..., 0])] = 0.0
+        return rays, confidence
+
+    def row_delay_s(self) -> Float:
+        """Compute the delay (s) of each keypoint [F, D, J] against its frame's stamp."""
+        found = self.detections
+        dense = np.full((len(self.frame_t_ns), self.most_people, len(found.joints)), np.nan)
         dense[found.frame, self._rank] = row_delay_s(found.xy[..., 1], self.intrinsics)
         return dense
 
@@ -93,14 +99,6 @@ class Camera:
         return max(_FRAME_GAP_NS, int(_USUAL * period))
 
     @cached_property
-    def confidence(self) -> Float:
-        """Confidence [F, D, J] of those keypoints, 0 where nothing was found."""
-        found = self.detections
-        dense = np.zeros((len(self.frame_t_ns), self._most_people, len(found.joints)))
-        dense[found.frame, self._rank] = found.confidence
-        return np.where(np.isnan(self.rays[..., 0]), 0.0, dense)
-
-    @cached_property
     def _rank(self) -> NDArray[np.intp]:
         """Index of every detection among those of its frame; detections are sorted by frame."""
         frame = self.detections.frame
@@ -108,7 +106,8 @@ class Camera:
         return np.arange(len(frame)) - first_of_frame
 
     @cached_property
-    def _most_people(self) -> int:
+    def most_people(self) -> int:
+        """The most people in one of its pictures, at least 1."""
         return int(self._rank.max(initial=0)) + 1
 
     def poses_at(self, t_ns: Int64, between: Interpolation) -> tuple[Float, Float]:
@@ -172,15 +171,15 @@ def candidates(cameras: list[Camera], between: Interpolation) -> Candidates:
     """Collect all detections on one timeline that contains every frame of every camera."""
     t_ns = _timeline(cameras)
     frame = np.stack([_nearest_frame(camera.frame_t_ns, t_ns) for camera in cameras], axis=1)
-    people = max(camera.rays.shape[1] for camera in cameras)
-    joints = cameras[0].rays.shape[2]
+    people = max(camera.most_people for camera in cameras)
+    joints = len(cameras[0].detections.joints)
     rays = np.full((len(t_ns), len(cameras), people, joints, 2), np.nan)
     confidence = np.zeros(rays.shape[:-1])
     for c, camera in enumerate(cameras):
         (near,) = np.nonzero(frame[:, c] >= 0)
-        seen = camera.rays.shape[1]
-        rays[near, c, :seen] = camera.rays[frame[near, c]]
-        confidence[near, c, :seen] = camera.confidence[frame[near, c]]
+        own_rays, own_confidence = camera.seen()
+        rays[near, c, : camera.most_people] = own_rays[frame[near, c]]
+        confidence[near, c, : camera.most_people] = own_confidence[frame[near, c]]
     return Candidates(t_ns, frame, rays, confidence, *_poses_at(cameras, t_ns, between))
 
 
@@ -343,18 +342,24 @@ def _velocity(camera: Camera, rays: Float, delay_s: Float) -> Float:
 
 
 def _chosen(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float, Float]:
-    """Gather rays, confidence and delay (s) of each person's keypoints in the camera's frames, as taken."""
-    shape = (len(camera.frame_t_ns), choice.shape[1], camera.rays.shape[2])
+    """Gather rays, confidence and delay (s) of each person's keypoints in the camera's frames, as taken.
+
+    Delays of a global shutter are not gathered.
+    """
+    shape = (len(camera.frame_t_ns), choice.shape[1], len(camera.detections.joints))
     rays = np.full((*shape, 2), np.nan)
     confidence, delay_s = np.full(shape, np.nan), np.full(shape, np.nan)
+    own_rays, own_confidence = camera.seen()
+    own_delay_s = camera.row_delay_s() if camera.intrinsics.readout_s else None
     frame = found.frame[:, c]
     apart_ns = np.abs(found.t_ns - camera.frame_t_ns[frame])
     nearest_last = np.argsort(-apart_ns, kind="stable")
     for person in range(choice.shape[1]):
         rows = nearest_last[(frame[nearest_last] >= 0) & (choice[nearest_last, person] >= 0)]
-        rays[frame[rows], person] = camera.rays[frame[rows], choice[rows, person]]
-        confidence[frame[rows], person] = camera.confidence[frame[rows], choice[rows, person]]
-        delay_s[frame[rows], person] = camera.row_delay_s[frame[rows], choice[rows, person]]
+        rays[frame[rows], person] = own_rays[frame[rows], choice[rows, person]]
+        confidence[frame[rows], person] = own_confidence[frame[rows], choice[rows, person]]
+        if own_delay_s is not None:
+            delay_s[frame[rows], person] = own_delay_s[frame[rows], choice[rows, person]]
     confidence[np.isnan(rays[..., 0])] = np.nan
     return rays, confidence, delay_s
 

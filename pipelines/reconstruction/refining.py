@@ -37,6 +37,7 @@ from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corre
 from pipelines.reconstruction.results import poses_table
 from pipelines.reconstruction.solving import pictures_of
 from pipelines.session.description import Interpolation
+from pipelines.session.memory import Waiting
 from pipelines.session.skeletons import bones_of
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ class RobustFlight:
     between: Interpolation  # rules for interpolating between logged poses
     threads: int  # see `triangulate`
     only_guides: bool = False  # other joints are not refined
+    waiting: Waiting | None = None  # where the arrays wait meanwhile
 
     @property
     def guides(self) -> Bool:
@@ -185,9 +187,12 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
     start = started.points.reshape(-1, people, joints, 3)
     if flight.only_guides:
         start = np.where(flight.guides[:, None], start, np.nan)
+    sightings = [_sighting(flight, c, camera) for c, camera in enumerate(cameras)]
+    if flight.waiting is not None:
+        flight.waiting.release()
     return refine(
         flight.t_s,
-        [_sighting(flight, c, camera) for c, camera in enumerate(cameras)],
+        sightings,
         start.reshape(-1, people * joints, 3),
         rigid_pairs(flight.observations.joints, people),
         flight.prior,
@@ -285,13 +290,9 @@ def _keep_reconstructed_joints(refined: Refined, views: Views, threads: int) -> 
     gated = triangulate(views, method="robust", threads=threads)
     position, covariance = refined.position.reshape(-1, 3), refined.covariance.reshape(-1, 3, 3)
     ok = (gated.status == STATUS.index("ok")) & ~np.isnan(position[:, 0])
-    points = np.where(ok[:, None], position, gated.points)
-    return replace(
-        gated,
-        points=points,
-        covariance=np.where(ok[:, None, None], covariance, gated.covariance),
-        residual_px=reprojection_px(views, points),
-    )
+    np.copyto(gated.points, position, where=ok[:, None])
+    np.copyto(gated.covariance, covariance, where=ok[:, None, None])
+    return replace(gated, residual_px=reprojection_px(views, gated.points))
 
 
 def shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
