@@ -39,6 +39,15 @@ def test_without_pictures_it_is_the_refinement(tmp_path: Path) -> None:
     assert unasked["mpjpe_mm"] == refined["mpjpe_mm"]
 
 
+def left_to_robust(session: Path) -> dict[str, Any]:
+    """Reconstruct by both methods, and check that `auto` gives the joints of `robust`; return its metrics."""
+    unasked, skeleton = reconstructed(session)
+    _, of_robust = reconstructed(session, "--method", "robust")
+    assert skeleton == of_robust
+    assert not unasked["method_used"]["body"]["used"]
+    return unasked
+
+
 def test_a_flight_too_short_for_motion_and_bones_keeps_the_rest(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=0.5)
     for camera in flight.settings["cameras"].values():
@@ -46,10 +55,7 @@ def test_a_flight_too_short_for_motion_and_bones_keeps_the_rest(tmp_path: Path) 
     flight.save()
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
-    unasked, skeleton = reconstructed(session)
-    _, of_robust = reconstructed(session, "--method", "robust")
-    assert skeleton == of_robust
-    assert not unasked["method_used"]["body"]["used"]
+    unasked = left_to_robust(session)
     assert unasked["method_used"]["body"]["reason"] == unasked["refinement"]["fallback"]
     assert unasked["method_used"]["pose_noise"] == "none"
     said = mocap("reconstruct", session, "--force")
@@ -77,10 +83,7 @@ def test_calibrated_still_cameras_are_left_to_robust(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=1.5, static=True, pose_noise={})
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
-    unasked, skeleton = reconstructed(session)
-    _, of_robust = reconstructed(session, "--method", "robust")
-    assert skeleton == of_robust
-    assert not unasked["method_used"]["body"]["used"]
+    left_to_robust(session)
 
 
 @pytest.mark.slow
