@@ -42,7 +42,7 @@ from pipelines.reconstruction.refinement.problem import (
     Sighting,
     build,
 )
-from pipelines.reconstruction.refinement.system import System, misfit
+from pipelines.reconstruction.refinement.system import AT_ONCE, System, misfit
 
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
 _LEARNING_ROUNDS, _FEWER_ROUNDS = 8, 3
@@ -308,16 +308,17 @@ def _of_single_pictures(problem: Problem, pixel_scale: float, position: Float) -
     Pictures have the poses of the problem. A joint that fewer than two cameras see is known to `_ANYWHERE_M`
     along its rays.
     """
-    pictures = problem.pictures
-    nearest = _nearest(problem)
-    own = np.einsum("gji,gkj->gki", pictures.rotation, position[nearest] - pictures.position[:, None])
-    depth = np.where(own[..., 2] > 0.1, own[..., 2], np.inf)
-    across = np.broadcast_to(np.eye(3)[:2], (*depth.shape, 2, 3)).copy()
-    across[..., 2] = -own[..., :2] / depth[..., None]
-    across = across @ np.swapaxes(pictures.rotation, 1, 2)[:, None]
-    weight = pictures.trust * (pictures.sharpness / (pixel_scale * depth)) ** 2
+    pictures, whole = problem.pictures, _nearest(problem)
     information = np.tile(_ANYWHERE_M**-2 * np.eye(3), (*position.shape[:2], 1, 1))
-    np.add.at(information, nearest, weight[..., None, None] * np.swapaxes(across, -1, -2) @ across)
+    for rows in (slice(k, k + AT_ONCE) for k in range(0, len(whole), AT_ONCE)):
+        nearest, rotation = whole[rows], pictures.rotation[rows]
+        own = np.einsum("gji,gkj->gki", rotation, position[nearest] - pictures.position[rows, None])
+        depth = np.where(own[..., 2] > 0.1, own[..., 2], np.inf)
+        across = np.broadcast_to(np.eye(3)[:2], (*depth.shape, 2, 3)).copy()
+        across[..., 2] = -own[..., :2] / depth[..., None]
+        across = across @ np.swapaxes(rotation, 1, 2)[:, None]
+        weight = (pictures.sharpness[rows] / (pixel_scale * depth)) ** 2
+        np.add.at(information, nearest, weight[..., None, None] * np.swapaxes(across, -1, -2) @ across)
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 

@@ -20,8 +20,10 @@ from pipelines.reconstruction.refinement.kernels import Equations, PictureArrays
 from pipelines.reconstruction.refinement.problem import REMEMBERED, Knowledge, Layout, Problem
 from pipelines.reconstruction.refinement.sweeps import Sweep, Ties
 
+AT_ONCE = 4096
+"""Pictures whose residuals are in memory together where only a sum over them is asked for."""
+
 _ANYWHERE_M = 100.0  # prior sigma of an unseen joint around its start
-_AT_ONCE = 4096  # pictures whose residuals are in memory if only the loss is asked for
 _NO_GUIDE = 30**0.5  # factor on the standard deviation of keypoints that do not determine the cameras
 
 
@@ -145,10 +147,10 @@ def loss(system: System, state: State) -> float:
     """Compute the loss of the pictures."""
     equations = system.equations(state, system.problem.t_s, system.pictures)
     pictures, joints, _ = system.pictures.rays.shape
-    residual, numbers = np.empty((_AT_ONCE, joints, 2)), np.empty((_AT_ONCE, kernels.NUMBERS))
+    residual, numbers = np.empty((AT_ONCE, joints, 2)), np.empty((AT_ONCE, kernels.NUMBERS))
     total = 0.0
-    for first in range(0, pictures, _AT_ONCE):
-        rows = min(_AT_ONCE, pictures - first)
+    for first in range(0, pictures, AT_ONCE):
+        rows = min(AT_ONCE, pictures - first)
         total = kernels.misfit(equations, first, total, residual[:rows], numbers[:rows])
     return total
 
