@@ -15,6 +15,8 @@ _BLOCK = re.compile(rf"(?m)^{_TIMECODE} --> {_TIMECODE}[ \t]*$")
 _CLOCK = re.compile(
     r"(\d{4})[-.](\d{1,2})[-.](\d{1,2}) +(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d{3}))?(?:,(\d{3}))?(?!\d)"
 )
+# Some Mavic 2 write no display times: a number, then the clock time on a line of its own.
+_UNTIMED = re.compile(r"(?m)^\d+[ \t]*\n(?=\d{4}[-.]\d{1,2}[-.]\d{1,2} +\d)")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _SLOW_NS = 500_000_000  # subtitles further apart than this come once a second, with whole seconds
 
@@ -76,15 +78,22 @@ def read_subtitles(path: Path) -> Subtitles:
 
 
 def parse_subtitles(text: str) -> Subtitles:
-    """Parse the subtitles of a text; the result is empty if it has none."""
+    """Parse the subtitles of a text; the result is empty if it has none.
+
+    Subtitles without display times are taken to be shown from their clock times on, the first at 0.
+    """
     blocks = list(_BLOCK.finditer(text))
+    timed = bool(blocks)
+    blocks = blocks or list(_UNTIMED.finditer(text))
     ends = [block.start() for block in blocks[1:]] + [len(text)]
     texts = [text[block.end() : end] for block, end in zip(blocks, ends, strict=False)]
-    return Subtitles(
-        media_ns=np.array([_timecode_ns(block) for block in blocks], dtype=np.int64),
-        clock_ns=np.array([_clock_ns(each) or 0 for each in texts], dtype=np.int64),
-        texts=texts,
-    )
+    clock_ns = np.array([_clock_ns(each) or 0 for each in texts], dtype=np.int64)
+    if timed:
+        media_ns = np.array([_timecode_ns(block) for block in blocks], dtype=np.int64)
+    else:  # since the first clock time; a subtitle without one has the time of the one before
+        shown = np.maximum.accumulate(clock_ns)
+        media_ns = shown - clock_ns[:1]
+    return Subtitles(media_ns=media_ns, clock_ns=clock_ns, texts=texts)
 
 
 def _clock_ns(text: str) -> int | None:

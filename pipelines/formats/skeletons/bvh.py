@@ -20,12 +20,16 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.skeletons.joint_files import bone_joints
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import multiply, rotate
 from pipelines.session.errors import DataError
-from pipelines.session.records import SkeletalMotion
+from pipelines.session.records import JointMotion, SkeletalMotion
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+_CMU_M = 0.0254 / 0.45
+"""Unit of the CMU database's skeletons, and of the BVH files made of them."""
+_TALLEST_M, _SMALLEST_M = 2.3, 1.2  # rest poses of adults, from the toes to the top of the head
 AXES = ("y-up", "z-up")
 
 _MOST_STRETCH_M = 0.05
@@ -53,7 +57,10 @@ class _Contents:
 
 
 class BvhFormat:
-    """Description of a BVH file for `mocap info`; lengths are in the file's own, unstated unit."""
+    """Reader of the joints at which bones begin; the description is in the file's own, unstated unit.
+
+    Known bones get our joints' names (LeftUpLeg and lfemur are left_hip), others keep theirs.
+    """
 
     name = "bvh"
     title = "Biovision motion (BVH)"
@@ -80,6 +87,46 @@ class BvhFormat:
             "root_box_min": [round(v, 4) for v in place.min(axis=0).tolist()],
             "root_box_max": [round(v, 4) for v in place.max(axis=0).tolist()],
         }
+
+    def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
+        """Read every frame, the first at 0 s; `axes` is y-up unless stated.
+
+        Without a unit it is that of m, cm, mm, inch and CMU's in which the rest pose is as tall as an adult
+        (1.2 to 2.3 m): no two of them can be.
+
+        Raises:
+            DataError: no unit fits, or the file is faulty.
+        """
+        contents = _read(path)
+        axes = axes or "y-up"
+        metres = METRES[unit] if unit else _likely_unit(path, contents.bones, axes)
+        joints, turned = [], []
+        for bone in contents.bones:
+            place, _ = _bone_places(bone, contents.values)
+            own = _rotation(bone, contents.values)
+            if bone.parent >= 0:
+                place = joints[bone.parent] + rotate(turned[bone.parent], place)
+                own = multiply(turned[bone.parent], own)
+            joints.append(place)
+            turned.append(own)
+        position = np.stack(joints, axis=1)[..., _IN_WORLD[axes]] * metres
+        t_ns = np.rint(np.arange(len(position)) * (contents.frame_time_s * 1e9)).astype(np.int64)
+        return JointMotion(t_ns, bone_joints(tuple(bone.name for bone in contents.bones)), position[:, None])
+
+
+def _likely_unit(path: Path, bones: list[_Bone], axes: str) -> float:
+    """Return the length in m of the unit in which the rest pose is as tall as an adult."""
+    up = _IN_WORLD[axes][2]
+    places = _rest_places(bones)
+    tall = float(np.ptp(places, axis=0).max() if not np.ptp(places, axis=0)[up] else np.ptp(places[:, up]))
+    for metres in (*METRES.values(), _CMU_M):
+        if _SMALLEST_M <= tall * metres <= _TALLEST_M:
+            return metres
+    raise DataError(
+        path,
+        f"states no unit, and its rest pose of {tall:.3g} is an adult's in none",
+        "say truth: {joints: {path: FILE, unit: cm}}",
+    )
 
 
 def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:

@@ -1,5 +1,6 @@
 """Files of joints: their unit and axes, the names of their markers, and a constant rate."""
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -201,3 +202,34 @@ def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
         joint = _JOINTS.get(marker, marker)
         names.append(marker if joint in names else joint)
     return tuple(names)
+
+
+# Bones that begin at a joint, without side and separators: Biovision's, Acclaim's, Mixamo's, Blender's names.
+_BONES = {
+    "hip": ("upleg", "upperleg", "thigh", "femur"),
+    "knee": ("leg", "lowerleg", "shin", "calf", "tibia"),
+    "ankle": ("foot", "ankle"),
+    "shoulder": ("arm", "upperarm", "humerus"),
+    "elbow": ("forearm", "lowerarm", "radius"),
+    "wrist": ("wrist", "hand"),
+}
+_MIDDLE_BONES = {"hip": ("hips", "pelvis", "root"), "neck": ("neck", "lowerneck")}
+
+
+def bone_joints(bones: tuple[str, ...]) -> tuple[str, ...]:
+    """Name the joints at which bones begin: ours where the bone is known, else the bone's own name."""
+    plain = {bone: re.sub(r"[^a-z]", "", bone.rsplit(":", 1)[-1].lower()) for bone in bones}
+    named: dict[str, str] = {}
+    for side in ("left", "right"):
+        for joint, variants in _BONES.items():
+            for variant in variants:
+                ways = {f"{side}{variant}", f"{side[0]}{variant}", f"{variant}{side[0]}", f"{variant}{side}"}
+                found = next((bone for bone in bones if plain[bone] in ways and bone not in named), None)
+                if found:
+                    named[found] = f"{side}_{joint}"
+                    break
+    for joint, variants in _MIDDLE_BONES.items():
+        found = next((bone for variant in variants for bone in bones if plain[bone] == variant), None)
+        if found:
+            named[found] = joint
+    return tuple(named.get(bone, bone) for bone in bones)

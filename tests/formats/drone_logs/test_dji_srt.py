@@ -38,6 +38,18 @@ def read(path: Path, **choice: Any) -> Telemetry:
     return FORMAT.read_telemetry(path, TelemetryChoice(**choice))
 
 
+def test_real_subtitles_without_display_times_have_their_clock() -> None:
+    """Read a Mavic 2's file: 468 numbered blocks, one a second, each with its clock time and position."""
+    path = real_data("second/mavic_2_style.SRT")
+    text = path.read_text(encoding="utf-8-sig")
+    subtitles = read_subtitles(path)
+    assert len(subtitles.texts) == text.count("latitude") == 468
+    assert subtitles.media_ns[:3].tolist() == [0, 10**9, 2 * 10**9]
+    telemetry = read(path, altitude=30.0)
+    assert telemetry.position.t_ns[0] == 1501942311393525000  # 2017-08-05 14:11:51.393525, as if it were UTC
+    assert telemetry.position.values[0].tolist() == [-20.2533, 149.0251, 30.0]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_real_files_are_read_as_their_facts_state(name: str) -> None:
     path, told = real_data(f"logs/dji_srt/{name}"), facts(name)

@@ -296,6 +296,27 @@ def test_real_files_hold_what_others_read(name: str) -> None:
             np.testing.assert_allclose(found, expected, rtol=0, atol=6e-5)  # references have 4 decimals
 
 
+@pytest.mark.parametrize("name", ["cmu_10_04_walk", "cmu_10_01_soccer_kick"])
+def test_real_joints_are_where_others_find_them(name: str) -> None:
+    """Find CMU's unit, 0.0254 / 0.45 m, by the height of the rest pose; joints have our names."""
+    facts = json.loads(real_data("facts.json").read_text())[f"motion/{name}.bvh"]["fk_positions"]
+    truth = READER.read_joints(real_data(f"motion/{name}.bvh"), unit=None, axes=None)
+    for bone, joint in {"LeftHand": "left_wrist", "RightFoot": "right_ankle", "Head": "Head"}.items():
+        for frame, expected in facts[bone].items():
+            found = truth.position[int(frame.removeprefix("frame_")), 0, truth.joints.index(joint)]
+            expected_m = np.array(expected)[[2, 0, 1]] * 0.0254 / 0.45
+            np.testing.assert_allclose(found, expected_m, rtol=0, atol=6e-5)
+    assert truth.t_ns[1] == 8_333_300 or abs(int(truth.t_ns[1]) - 8_333_333) < 1000
+
+
+def test_a_rest_pose_of_no_adult_asks_for_the_unit(tmp_path: Path) -> None:
+    path = write(tmp_path, TEXT)
+    with refuses(path, "unit"):
+        READER.read_joints(path, unit=None, axes=None)
+    in_m, in_cm = (READER.read_joints(path, unit=unit, axes=None).position for unit in ("m", "cm"))
+    np.testing.assert_allclose(in_m, 100 * in_cm)
+
+
 def test_a_real_person_walks_towards_the_file_s_z() -> None:
     """Read CMU 10_04, who walks along +z: east in the world, with the left hip towards north."""
     motion = read_motion(real_data("motion/cmu_10_04_walk.bvh"), unit="cm", axes="y-up")
