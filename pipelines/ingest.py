@@ -8,7 +8,7 @@ own: an interrupted ingest continues with the cameras that it had not finished.
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -16,6 +16,7 @@ from typing import Self
 import numpy as np
 
 from pipelines.formats.common.files import leads_out
+from pipelines.geometry.arrays import Float
 from pipelines.session.description import (
     ActorEntry,
     CameraEntry,
@@ -30,7 +31,7 @@ from pipelines.session.description import (
     said_doubts,
 )
 from pipelines.session.errors import DataError, MocapError, NotYetReadError
-from pipelines.session.log_doubts import doubts_of_logs
+from pipelines.session.log_doubts import doubts_of_logs, doubts_of_places
 from pipelines.session.manifest import Axes, Camera, Flight, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
@@ -153,7 +154,9 @@ def ingest(
             warnings += said_assumptions(flight.assumptions)
             warnings += [f"{path}: {losses(causes)}: copy it again" for path, causes in damage.items()]
 
-            doubts = doubts_of_logs({name: (entry, _track(run, name)) for name, entry in entries.items()})
+            tracks = {name: _track(run, name) for name in entries}
+            doubts = doubts_of_logs({name: (entry, tracks[name]) for name, entry in entries.items()})
+            doubts += doubts_of_places(tracks, reader.map_box)
             warnings += said_doubts(doubts)
 
             description = Description(
@@ -204,6 +207,7 @@ class _FlightReader:
             flight_path, self._logs, self._files, self._poses, max_gap_ns=gap_ns, note=note
         )
         self._ahead: dict[str, CameraData] = {}
+        self.map_box: tuple[Float, Float] | None = None  # of the first map, once it is stored
 
     def __enter__(self) -> Self:
         """Return the reader itself."""
@@ -319,7 +323,8 @@ class _FlightReader:
         base = self._flight_path.parent
         motion = self._files.true_joints(truth.joints) if truth.joints else None
         if motion is not None and truth.joints is not None:
-            self._poses.refuse_projected(base / truth.joints.path, motion.position.reshape(-1, 3))
+            place = base / truth.joints.path
+            motion = replace(motion, position=self._poses.joints(place, motion.position))
             refuse_no_overlap(base / truth.joints.path, motion.t_ns, entries)
             write_table(folder / "truth.parquet", motion_table(motion), TRUTH)
         missing, dropped = self._note_truth_missing(motion) if motion else (0, {})
@@ -396,7 +401,7 @@ class _FlightReader:
             file = self._flight_path.parent / path
             occupancy = recognise(file, MapFormat, "map").read_map(file, resolution_m=stated.resolution_m)
             held, dropped = store_map(folder, self._near_origin(file, [occupancy])), occupancy.dropped
-            if occupancy.crs:
+            if occupancy.crs and not (stated.crs or self._poses.origin()):
                 named = " ".join(occupancy.crs.split())[:60]
                 self._notes.append(f"{path}: its coordinates, of {named}, are taken to be the world's")
             if self._flight.world.frame == "ned":
@@ -443,10 +448,13 @@ class _FlightReader:
             )
 
     def _near_origin(self, source: Path, maps: Iterable[Occupancy]) -> Iterator[Occupancy]:
-        """Yield maps; refuse projected coordinates if the world has an origin on Earth."""
+        """Yield maps in the world; errors as in `FlightPoses.map`."""
+        stated = self._flight.map
         for occupancy in maps:
-            self._poses.refuse_projected(source, occupancy.origin[None])
-            yield occupancy
+            placed = self._poses.map(source, occupancy, stated.crs if stated else None)
+            high = placed.origin + np.array(placed.probability.shape) * placed.resolution_m
+            self.map_box = self.map_box or (placed.origin, high)
+            yield placed
 
 
 def _store_cameras(

@@ -12,6 +12,10 @@ from pipelines.session.description import CameraEntry, Doubt
 from pipelines.session.records import Trajectory
 
 _MOMENTS = 60
+_ONE_FLIGHT_M = 5000.0  # no team films from farther apart
+_PROJECTED_M = 100_000.0  # UTM eastings begin at 166 km
+_TOO_FAST_MPS = 60.0
+_UNITS_M = {"cm": 0.01, "mm": 0.001}
 _SAME_PATH_M = 0.1
 _SAME_START_M = 0.5
 _ONE_BODY_DEG = 45.0  # cameras that are together and look alike are on one drone
@@ -26,6 +30,72 @@ def doubts_of_logs(cameras: Mapping[str, tuple[CameraEntry, Trajectory]]) -> lis
     moving = {name: camera for name, camera in cameras.items() if not camera[0].poses.static}
     found = (_doubt_of_two(dict(pair)) for pair in combinations(moving.items(), 2))
     return [doubt for doubt in found if doubt is not None]
+
+
+def doubts_of_places(cameras: Mapping[str, Trajectory], map_box: tuple[Float, Float] | None) -> list[Doubt]:
+    """Find cameras, and a map, that lie too far from the others to be of one flight.
+
+    Args:
+        cameras: logged poses by name.
+        map_box: smallest and largest corner [3] m of the first map.
+    """
+    middle = {name: np.median(track.position, axis=0) for name, track in cameras.items()}
+    doubts = []
+    for name, place in middle.items():
+        others = [other for key, other in middle.items() if key != name]
+        if not others or min(_apart_m(place, other) for other in others) < _ONE_FLIGHT_M:
+            continue
+        if len(others) == 1 and np.linalg.norm(place[:2]) < np.linalg.norm(others[0][:2]):
+            continue  # of two, the one that is farther from the origin
+        unit = _unit(place, cameras[name], others)
+        reason = "its unit is another" if unit else _elsewhere(place)
+        remedy = f"unit: {unit}" if unit else "world_from_source: {translation: [east, north, up]}"
+        doubts.append(
+            Doubt(
+                code="unit" if unit else "origin",
+                cameras=[name],
+                what=f"{name} flies far from the others: {reason}",
+                evidence={"apart_m": round(min(_apart_m(place, other) for other in others), 1)},
+                remedy=f"cameras.{name}.pose.{remedy}",
+            )
+        )
+    if map_box is not None and middle:
+        low, high = map_box
+        away_m = min(_apart_m(place, np.clip(place, low, high)) for place in middle.values())
+        if away_m > _ONE_FLIGHT_M:
+            doubts.append(
+                Doubt(
+                    code="origin",
+                    cameras=[],
+                    what=f"the map lies far from all cameras: {_elsewhere((low + high) / 2)}",
+                    evidence={"apart_m": round(away_m, 1)},
+                    remedy="map.crs: EPSG:32632  # that of its coordinates",
+                )
+            )
+    return doubts
+
+
+def _apart_m(one: Float, other: Float) -> float:
+    return float(np.linalg.norm(one[:2] - other[:2]))
+
+
+def _unit(place: Float, track: Trajectory, others: list[Float]) -> str | None:
+    """Return the unit in which a place would lie beside others, if the drone flew too fast for metres."""
+    passed_s = float(track.t_ns[-1] - track.t_ns[0]) / 1e9
+    flown_m = float(np.linalg.norm(np.diff(track.position, axis=0), axis=1).sum())
+    if passed_s <= 0 or flown_m / passed_s < _TOO_FAST_MPS:
+        return None
+    apart_m = {unit: min(_apart_m(place * m, other) for other in others) for unit, m in _UNITS_M.items()}
+    nearest = min(apart_m, key=lambda unit: apart_m[unit])
+    return nearest if apart_m[nearest] < _ONE_FLIGHT_M / 10 else None
+
+
+def _elsewhere(place: Float) -> str:
+    """Explain where a place lies, by its numbers."""
+    x_m, y_m = place[:2].tolist()
+    projected = max(abs(x_m), abs(y_m)) > _PROJECTED_M
+    reason = "coordinates of a map projection (UTM)" if projected else "it counts from elsewhere"
+    return f"about x {x_m:.0f} m, y {y_m:.0f} m, {reason}"
 
 
 def _doubt_of_two(pair: Mapping[str, tuple[CameraEntry, Trajectory]]) -> Doubt | None:

@@ -80,6 +80,7 @@ class World(Guess):
 
     frame: Axes = "enu"
     origin: Origin | None = None
+    crs: str | None = None  # of positions in metres that are those of a map projection: EPSG:32632
 
 
 class LogClock(Part):
@@ -394,6 +395,7 @@ class Map(Part):
     log: str | None = None
     topic: str | None = None
     parent: str | None = None  # the frame that is the log's world
+    crs: str | None = None  # of its coordinates [world.crs]
     unknown: Literal["free", "occupied"] = "free"
     resolution_m: float | None = Field(None, gt=0)
     height_m: float | None = Field(None, gt=0, le=1000)  # of obstacles on a logged floor plan

@@ -34,7 +34,7 @@ from pipelines.geometry.poses import (
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan, PoseSource
 from pipelines.session.manifest import Log as LogSource
-from pipelines.session.records import Trajectory
+from pipelines.session.records import Occupancy, Trajectory
 from pipelines.session.registries import FORMATS, Format, TrajectoryFormat, recognise
 from pipelines.session.telemetry import (
     AttitudeTrack,
@@ -46,6 +46,7 @@ from pipelines.session.telemetry import (
 )
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
+from pipelines.sources.projections import Projection
 from pipelines.sources.world import (
     as_stated,
     body_in_enu,
@@ -101,6 +102,9 @@ class FlightPoses:
         self._note = note
         self._origin: Origin | None = None
         self._telemetry: dict[str, Telemetry] = {}
+        self._stated: dict[str, tuple[Path, Trajectory]] = {}  # read for the origin
+        crs = flight.world.crs
+        self._projection = Projection(crs, f"{manifest}: world.crs") if crs else None
 
     # --- cameras ---------------------------------------------------------------------------------------
 
@@ -112,31 +116,55 @@ class FlightPoses:
         """
         pose = camera.pose
         if pose.static:
+            source, still = self._stated_poses(name, camera)
+            return replace(self._local(source, still), t_ns=np.array([first_frame_ns]))
+        if pose.is_telemetry:
+            return in_world(self._joined_trajectory(name, camera), pose.world_from_source)
+        source, stated = self._stated_poses(name, camera)
+        of_camera = self._is_of_camera(camera)
+        if of_camera and pose.log and pose.of is None and pose.child is None:
+            self._note(
+                f"{name}: poses in {pose.log} are taken as the camera's (say `of: body` with a mount if not)"
+            )
+        local = self._local(source, stated)
+        return in_world(local if of_camera else self._on_body(name, camera, local), pose.world_from_source)
+
+    def _stated_poses(self, name: str, camera: Camera) -> tuple[Path, Trajectory]:
+        """Read poses of a camera or of its body, in ENU axes, but not yet out of a map projection."""
+        if name in self._stated:
+            return self._stated.pop(name)
+        pose = camera.pose
+        if pose.static:
+            path = self._base / pose.static.path
             calibrated = self._files.camera(name, pose.static.path, pose.static.camera)
             if calibrated.position is None or calibrated.quaternion_xyzw is None:
-                path = self._base / pose.static.path
                 raise DataError(path, "holds intrinsics but no camera pose", "name a file with extrinsics")
             still = Trajectory(
-                t_ns=np.array([first_frame_ns]),
+                t_ns=np.zeros(1, dtype=np.int64),
                 position=calibrated.position[None],
                 quaternion_xyzw=calibrated.quaternion_xyzw[None],
             )
-            return self._local(self._base / pose.static.path, in_enu(still, self._axes(pose.axes)))
-        return in_world(self._moving_trajectory(name, camera), pose.world_from_source)
-
-    def _moving_trajectory(self, name: str, camera: Camera) -> Trajectory:
-        """Read world_from_camera over time, in the world of its source."""
-        pose = camera.pose
-        if pose.is_telemetry:
-            return self._joined_trajectory(name, camera)
+            return path, in_enu(still, self._axes(pose.axes))
         if pose.log:
-            return self._local(self._logs.paths(pose.log)[0], self._logged_trajectory(name, camera, pose.log))
+            settings = self._logs.settings(pose.log)
+            logged = self._logs.trajectory(
+                pose.log, pose.topic, pose.parent, pose.child, max_gap_ns=self._max_gap_ns
+            )
+            turned = self._turned(camera, as_stated(logged, pose), self._axes(pose.axes, settings.axes))
+            return self._logs.paths(pose.log)[0], in_world(turned, settings.world_from_log)
         stated = pose.tum or pose.csv or ""
-        trajectory = as_stated(self._filed_trajectory(stated, "tum" if pose.tum else "csv"), pose)
-        if pose.of != "body":
-            return self._local(self._base / stated, in_enu(trajectory, self._axes(pose.axes)))
-        turned = self._local(self._base / stated, body_in_enu(trajectory, self._axes(pose.axes)))
-        return self._on_body(name, camera, turned)
+        filed = as_stated(self._filed_trajectory(stated, "tum" if pose.tum else "csv"), pose)
+        return self._base / stated, self._turned(camera, filed, self._axes(pose.axes))
+
+    def _is_of_camera(self, camera: Camera) -> bool:
+        """Return True if stated poses are those of the camera, not of the body that carries it."""
+        pose = camera.pose
+        if not pose.log:
+            return pose.of != "body"
+        return pose.of == "camera" or (pose.of is None and camera.mount is None and camera.gimbal is None)
+
+    def _turned(self, camera: Camera, poses: Trajectory, axes: Axes) -> Trajectory:
+        return in_enu(poses, axes) if self._is_of_camera(camera) else body_in_enu(poses, axes)
 
     def _filed_trajectory(self, stated: str, kind: str) -> Trajectory:
         path = self._base / stated
@@ -148,24 +176,6 @@ class FlightPoses:
         if not len(trajectory.t_ns):
             raise DataError(path, f"holds no usable pose ({losses(trajectory.dropped)})", "mend the log")
         return trajectory
-
-    def _logged_trajectory(self, name: str, camera: Camera, log: str) -> Trajectory:
-        pose, settings = camera.pose, self._logs.settings(log)
-        trajectory = self._logs.trajectory(
-            log, pose.topic, pose.parent, pose.child, max_gap_ns=self._max_gap_ns
-        )
-        of_camera = pose.of == "camera" or (
-            pose.of is None and camera.mount is None and camera.gimbal is None
-        )
-        if of_camera and pose.of is None and pose.child is None:
-            self._note(
-                f"{name}: poses in {log} are taken as the camera's (say `of: body` with a mount if not)"
-            )
-        trajectory = as_stated(trajectory, pose)
-        axes = self._axes(pose.axes, settings.axes)
-        turned = in_enu(trajectory, axes) if of_camera else body_in_enu(trajectory, axes)
-        moved = in_world(turned, settings.world_from_log)
-        return moved if of_camera else self._on_body(name, camera, moved)
 
     def _mounted(self, name: str, mount: Mount | None) -> tuple[Float, Float]:
         try:
@@ -255,9 +265,51 @@ class FlightPoses:
         return next((axes for axes in stated if axes), self._flight.world.frame)
 
     def _local(self, source: Path | str, trajectory: Trajectory) -> Trajectory:
-        """Return the same trajectory; refuse projected coordinates if the world has an origin on Earth."""
+        """Return the trajectory in the world, out of the CRS of a map projection if one is stated.
+
+        Raises:
+            DataError: the coordinates are projected and no CRS is stated, or it is another.
+        """
+        origin = self.origin()
+        if self._projection is not None and origin is not None:
+            trajectory = self._projection.trajectory(source, trajectory, origin.place)
         self.refuse_projected(source, trajectory.position)
         return trajectory
+
+    def joints(self, source: Path, position: Float) -> Float:
+        """Return positions [..., 3] of people in the world; errors as for poses."""
+        origin = self.origin()
+        if self._projection is not None and origin is not None:
+            position = self._projection.points(source, position, origin.place)
+        self.refuse_projected(source, position.reshape(-1, 3))
+        return position
+
+    def map(self, source: Path, grid: Occupancy, crs: str | None) -> Occupancy:
+        """Return a map in the world; `crs` is the stated one of its coordinates, else its own counts.
+
+        Raises:
+            DataError: as for poses; also if a CRS is stated and the world's origin on Earth is not known.
+        """
+        origin = self.origin()
+        own = crs or (grid.crs if origin is not None else None)
+        projection = Projection(own, f"{self._manifest}: map.crs") if own else self._projection
+        if own and not crs:
+            self._note(f"{source}: placed on Earth by the CRS in it, {own}")
+        if projection is not None:
+            if origin is None:
+                raise DataError(
+                    f"{self._manifest}: map.crs",
+                    "places the map on Earth, and nothing says where the world's origin is",
+                    "write world.origin (latitude_deg, longitude_deg, altitude_m) or world.crs",
+                )
+            grid, error_m = projection.map(source, grid, origin.place)
+            if error_m > grid.resolution_m / 2:
+                self._note(
+                    f"{source}: the scale of {projection.name} is not applied to voxels, {error_m:.2g} m at"
+                    " its corners: crop it"
+                )
+        self.refuse_projected(source, grid.origin[None])
+        return grid
 
     def refuse_projected(self, source: Path | str, position: Float) -> None:
         """Refuse positions [N, 3] in projected coordinates if the world has an origin on Earth."""
@@ -362,8 +414,8 @@ class FlightPoses:
     def origin(self) -> Origin | None:
         """Return the world's origin: the stated one, or the first position on Earth of the first camera.
 
-        None if no camera has a position on Earth. The origin's height is 0 if that camera's heights count
-        from the take-off (or are stated), because these do not give the height of the ground.
+        None if no camera has a position on Earth and no CRS is stated. The origin's height is 0 if that
+        camera's heights count from the take-off (or are stated): these do not give the height of the ground.
         """
         if self._origin is not None:
             return self._origin
@@ -379,7 +431,11 @@ class FlightPoses:
             if first is not None:
                 self._origin = Origin(first, _stated(camera.pose))
                 return self._origin
-        return None
+        if self._projection is not None:  # the first position of the first camera
+            name, camera = next(iter(self._flight.cameras.items()))
+            self._stated[name] = source, poses = self._stated_poses(name, camera)
+            self._origin = Origin(self._projection.first_place(source, poses.position), str(source.name))
+        return self._origin
 
     def doubt_heights(self) -> None:
         """Note cameras whose heights have different references."""

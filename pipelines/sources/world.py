@@ -114,7 +114,7 @@ def refuse_projected(source: Path | str, position: Float, origin: Place) -> None
             f"lies about x {x_m:.0f} m, y {y_m:.0f} m (UTM or another map projection), {away_m / 1000:.0f} km"
             f" from the world's origin (latitude {origin.latitude_deg:.6f}, longitude"
             f" {origin.longitude_deg:.6f})",
-            "give metres east, north and up of that origin: subtract its projected coordinates",
+            "state the CRS, world: {crs: EPSG:32632} or map: {crs: ...}; or give metres from that origin",
         )
 
 
