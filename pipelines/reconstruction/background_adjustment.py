@@ -17,8 +17,9 @@ error is always possible, and one draw of it says little of its level, which the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -49,7 +50,9 @@ from pipelines.reconstruction.background_kernels import (
 )
 
 STRETCH = 1500
-"""Most pictures adjusted together: memory stays bounded, and so many poses average their white errors."""
+"""Pictures adjusted together: memory stays bounded, and so many poses average their white errors."""
+
+_REACH = 10  # a stretch has a tenth more pictures on each side, over which it hands over to its neighbour
 
 _PIXEL_SIGMA = (
     1.0  # px, of a followed point: 0.15 are seen, but neighbouring pictures and points share their errors
@@ -184,11 +187,9 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
         prior: standard deviations of the log's errors.
 
     Returns:
-        Adjusted poses, in stretches of some hundred pictures. If one stretch is refused, all logged poses
-        stay and `refused` gives the reason. Pictures without a pose stay without one.
+        Adjusted poses, in stretches of some hundred pictures that overlap. If one stretch is refused, all
+        logged poses stay and `refused` gives the reason. Pictures without a pose stay without one.
     """
-    new_position, new_rotation = position.copy(), rotation.copy()
-    covariance = prior.covariance(len(position))
     posed = np.flatnonzero(np.isfinite(position[:, 0]))
 
     def refused(reason: str) -> Adjusted:
@@ -199,23 +200,28 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
         return refused("none of its pictures has a pose")
     # Each stretch is built twice, so that a long flight's points need not be in memory together.
     parts = np.array_split(posed, -(-len(posed) // STRETCH))
-    unbound = sum(_Stretch.of(seen, rows, position, rotation).unbound for rows in parts)
+    unbound = points = 0
+    for rows in parts:
+        stretch = _Stretch.of(seen, rows, position, rotation)
+        unbound += stretch.unbound
+        points += len(stretch.points.inverse_depth)
     if unbound > _MOST_UNBOUND * (len(posed) - 1) or len(posed) < 2:
         return refused(
             f"{unbound} of {len(posed)} pictures share fewer than {_FEWEST_SHARED} points of the background"
             " with the one before"
         )
-    results, points = [], 0
-    for rows in parts:
-        stretch = _Stretch.of(seen, rows, position, rotation)
-        found = stretch.solve_with_levels(prior)
+    results = []
+    errors, covariance = np.zeros((len(position), 6)), prior.covariance(len(position))
+    covariance[posed] = 0.0
+    for rows, weight in _overlapping(parts):
+        found = _Stretch.of(seen, rows, position, rotation).solve_with_levels(prior)
         if found is None:
             return refused("the adjustment did not converge")
-        new_position[rows], new_rotation[rows] = stretch.poses(found.errors)
-        covariance[rows] = found.covariance
-        covariance[rows[:, None], range(3), range(3)] += prior.constant[0] ** 2
-        points += len(stretch.points.inverse_depth)
+        errors[rows] += weight[:, None] * found.errors
+        # The covariance of a mean is at most the mean of covariances, whatever the correlation.
+        covariance[rows] += weight[:, None, None] * found.covariance
         results.append(found)
+    covariance[posed[:, None], range(3), range(3)] += prior.constant[0] ** 2
     pixels = float(np.median(np.concatenate([found.missed for found in results])))
     if pixels > _WORST_PX:
         return refused(f"the background moves by {pixels:.1f} px against itself")
@@ -226,8 +232,7 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
     priors = [found.prior for found in results]
     slow = _rms_slow(priors) if prior.estimated else prior.slow
     return Adjusted(
-        new_position,
-        new_rotation,
+        *_without(errors, position, rotation),
         covariance,
         replace(
             _remaining(
@@ -240,6 +245,33 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
         pixels,
         None,
     )
+
+
+def _without(errors: Float, position: Float, rotation: Float) -> tuple[Float, Float]:
+    """Remove errors [T, 6] from logged poses: (p - e, R exp(-w))."""
+    back = matrix_from_quaternion(quaternion_from_rotation_vector(-errors[:, 3:]))
+    return position - errors[:, :3], rotation @ back
+
+
+def _overlapping(parts: Sequence[Int64]) -> Iterator[tuple[Int64, Float]]:
+    """Lengthen parts of a sequence on both sides, and weigh them so that all weights of a place add up to 1.
+
+    Stretches differ in what they cannot determine, as far as slow errors of the log go. Between two of them
+    poses change smoothly.
+    """
+    rows = np.concatenate(parts)
+    bounds = np.cumsum([0, *(len(part) for part in parts)])
+    reach = min(STRETCH // _REACH, min(len(part) for part in parts) // 2)
+    share = (np.arange(2 * reach) + 0.5) / max(2 * reach, 1)
+    rise = share**2 * (3 - 2 * share)
+    for begin, end in pairwise(bounds.tolist()):
+        longer = rows[max(begin - reach, 0) : end + reach]
+        weight = np.ones(len(longer))
+        if begin > 0:
+            weight[: 2 * reach] = rise
+        if end < len(rows):
+            weight[len(weight) - 2 * reach :] = 1 - rise
+        yield longer, weight
 
 
 def _rms(levels: Sequence[tuple[float, float]]) -> tuple[float, float]:
@@ -375,11 +407,6 @@ class _Stretch:
             int((_shared(first, picture, len(rows)) < _FEWEST_SHARED).sum()),
         )
 
-    def poses(self, errors: Float) -> tuple[Float, Float]:
-        """Remove errors from the logged poses: (p - e, R exp(-w))."""
-        back = matrix_from_quaternion(quaternion_from_rotation_vector(-errors[:, 3:]))
-        return self.position - errors[:, :3], self.rotation @ back
-
     def solve_with_levels(self, prior: PosePrior) -> _Solved | None:
         """Solve, with levels of errors estimated if they are unknown; None without convergence."""
         state = _State(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), np.zeros(9))
@@ -407,7 +434,7 @@ class _Stretch:
         missed = np.full(len(self.seen.picture), np.nan)
         size = int(max(self.place[-1], self.knot_place[-1])) + 6
         for _ in range(rounds):
-            at, turn = self.poses(state.errors)
+            at, turn = _without(state.errors, self.position, self.rotation)
             band, force, border = np.zeros((size, self._width())), np.zeros(size), np.zeros((size, 9))
             corner, pull = np.diag(steady), -steady * state.constant
             eliminate_points(

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, row_delay_s
-from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, GaussMarkov, PoseErrors, Process, disturb
+from pipelines.geometry.noise import (
+    ROTATION,
+    SHIFT_IN_WORLD,
+    GaussMarkov,
+    PoseErrors,
+    Process,
+    White,
+    disturb,
+    pose_errors,
+)
 from pipelines.geometry.poses import (
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -311,6 +320,32 @@ def test_a_few_pictures_more_than_a_stretch_cost_nothing(
     found = adjusted(picture, point, xy, (at, turned))
     assert found.refused is None
     assert np.median(turns_deg(found.rotation, rotation)) < np.median(turns_deg(turned, rotation))
+
+
+def test_poses_do_not_jump_where_a_stretch_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compare with stretches that do not overlap: each takes the path where its own log's errors are 0.
+
+    Handed over in 30 pictures, that difference is 1.5 / 30 of it from one picture to the next, at most.
+    """
+    monkeypatch.setattr(background_adjustment, "STRETCH", 150)
+    rng = np.random.default_rng(9)
+    position, rotation = flown(300, 12.0)
+    picture, point, xy = sighted(position, rotation, rng)
+    wander = GaussMarkov(position_m=0.3, rotation_deg=0.5, correlation_s=5.0)
+    models = (White(position_m=0.02, rotation_deg=0.2), wander)
+    t_ns = np.arange(300) * 10**9 // 30
+    at, quaternion = disturb(models, t_ns, position, quaternion_from_matrix(rotation), rng)
+    logs = at, matrix_from_quaternion(quaternion)
+    prior = PosePrior.of(pose_errors(models))
+    smooth = adjusted(picture, point, xy, logs, prior)
+    monkeypatch.setattr(background_adjustment, "_REACH", 1000)
+    apart = adjusted(picture, point, xy, logs, prior)
+    assert smooth.refused is None
+    steps, jumps = (np.linalg.norm(np.diff(of.position - position, axis=0), axis=1) for of in (smooth, apart))
+    usual = np.percentile(jumps, 95)
+    assert jumps[149] > 10 * usual
+    assert steps[134:164].max() < usual + 1.5 / 30 * jumps[149] + usual
+    assert (np.linalg.eigvalsh(smooth.covariance) > 0).all()
 
 
 @pytest.mark.parametrize(("posed", "reason"), [(True, "share fewer"), (False, "a pose")])
