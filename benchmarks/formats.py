@@ -88,7 +88,7 @@ def outcome(folder: Path, name: str, path: Path) -> tuple[str, str, str]:
         return f"refused: {message}", "", "refuses it, too" if "open_error" in counts else ""
     names = {f.title: f.name for f in FORMATS.all()}
     read = ", ".join(f"`{names[reading.title]}`" for reading in readings)
-    facts = readings[0].facts
+    facts = {key: value for reading in reversed(readings) for key, value in reading.facts.items()}
     counted = sorted(
         set(_COUNTS) & facts.keys(), key=lambda key: (key not in _OCCUPIED, [*_COUNTS].index(key))
     )

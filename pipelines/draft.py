@@ -57,12 +57,13 @@ from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat
 from pipelines.session.unknown_files import EXPECTED
 
 _FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
-_KEYS: dict[str, Literal["dji", "ulog", "ardupilot", "tlog"]] = {
+_KEYS: dict[str, Literal["dji", "ulog", "ardupilot", "tlog", "gopro"]] = {
     "dji": "dji",
     "dji_record": "dji",
     "ulog": "ulog",
     "ardupilot": "ardupilot",
     "tlog": "tlog",
+    "gopro": "gopro",
 }
 """The key in a manifest for each format of a drone's own log."""
 

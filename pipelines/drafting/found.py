@@ -136,7 +136,7 @@ class TopicFound:
 class DroneLog(Found):
     """A drone's own log: positions, and perhaps attitudes of body and gimbal."""
 
-    key: Literal["dji", "ulog", "ardupilot", "tlog"]  # its key in a manifest
+    key: Literal["dji", "ulog", "ardupilot", "tlog", "gopro"]  # its key in a manifest
     span: Span
     positions: int
     step_ns: int  # median step between positions

@@ -180,7 +180,7 @@ class StaticPose(Part):
 class PoseSource(Guess):
     """Source of a camera's poses."""
 
-    one_of = ("log", "tum", "csv", "static", "dji", "ulog", "ardupilot", "tlog")
+    one_of = ("log", "tum", "csv", "static", "dji", "ulog", "ardupilot", "tlog", "gopro")
     log: str | None = None
     topic: str | None = None
     parent: str | None = None
@@ -195,6 +195,7 @@ class PoseSource(Guess):
     ulog: str | None = None  # PX4
     ardupilot: str | None = None  # DataFlash .bin
     tlog: str | None = None  # of a ground station
+    gopro: str | None = None  # video with a track of GPMF
     position: Literal["local", "global", "gps"] | None = None  # which of a drone's own estimates
     instance: int | None = Field(None, ge=0, le=255)
     time: Literal["gps", "boot"] | None = None
@@ -244,7 +245,7 @@ class PoseSource(Guess):
     @property
     def is_telemetry(self) -> bool:
         """True if position and attitude come separately, from a drone's own log or its driver's topics."""
-        parts = (self.dji, self.ulog, self.ardupilot, self.tlog, self.preset, self.attitude)
+        parts = (self.dji, self.ulog, self.ardupilot, self.tlog, self.gopro, self.preset, self.attitude)
         return any(part is not None for part in parts)
 
 

@@ -92,6 +92,7 @@ def stated_paths(flight: Flight) -> list[str]:
             pose.ulog,
             pose.ardupilot,
             pose.tlog,
+            pose.gopro,
             camera.intrinsics.log,
             gimbal_log,
         ):

@@ -642,7 +642,9 @@ class FlightPoses:
 
 
 def _kind(pose: PoseSource) -> str:
-    return next(kind for kind in ("dji", "ulog", "ardupilot", "tlog") if getattr(pose, kind) is not None)
+    return next(
+        kind for kind in ("dji", "ulog", "ardupilot", "tlog", "gopro") if getattr(pose, kind) is not None
+    )
 
 
 def _reader(kind: str, path: Path) -> Format:
@@ -655,7 +657,7 @@ def _reader(kind: str, path: Path) -> Format:
 
 def _stated(pose: PoseSource) -> str:
     """Return the log as the manifest names it."""
-    return pose.dji or pose.ulog or pose.ardupilot or pose.tlog or pose.log or ""
+    return pose.dji or pose.ulog or pose.ardupilot or pose.tlog or pose.gopro or pose.log or ""
 
 
 def _first_place(track: PositionTrack) -> Place:

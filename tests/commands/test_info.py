@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM
-from pipelines.session.registries import FORMATS
 from pipelines.session.storage import read_json, write_json
 from tests.commands.runner import refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, spot_detector, write_spotted_flight
@@ -89,7 +88,7 @@ def test_a_study_tells_the_error_of_every_condition(tmp_path: Path) -> None:
     for tilt, condition in zip((0, 30), facts["mpjpe_mm"], strict=True):
         assert re.fullmatch(rf"{tilt} deg, 2 \w+, \w+ low", condition)
     (tmp_path / "summary.json").write_text("[1, 2]")  # a file of another program
-    assert all(name in refused("info", tmp_path / "summary.json") for name in FORMATS.names())
+    assert "JSON" in refused("info", tmp_path / "summary.json")
 
 
 @pytest.mark.parametrize("right", [True, False])

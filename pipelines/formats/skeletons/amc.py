@@ -134,8 +134,8 @@ def _built(sections: dict[str, list[list[str]]]) -> _Skeleton:
     turned = _turn(root.get("axis", ["XYZ"])[0], root.get("orientation", ["0", "0", "0"]), radians)
     bones = {"root": _Bone(axis=turned, dof=tuple(word.lower() for word in order))}
     known: dict[str, _Bone] = {}
-    for words in _blocks(sections["bonedata"]):
-        stated = {row[0].lower(): row[1:] for row in words}
+    for block in _blocks(sections["bonedata"]):
+        stated = {row[0].lower(): row[1:] for row in block}
         bone = _Bone(dof=tuple(word.lower() for word in stated.get("dof", [])))
         direction = np.array([float(word) for word in stated["direction"][:3]])
         bone.vector = direction * float(stated["length"][0])

@@ -100,7 +100,8 @@ class BvhFormat:
         contents = _read(path)
         axes = axes or "y-up"
         metres = METRES[unit] if unit else _likely_unit(path, contents.bones, axes)
-        joints, turned = [], []
+        joints: list[Float] = []
+        turned: list[Float] = []
         for bone in contents.bones:
             place, _ = _bone_places(bone, contents.values)
             own = _rotation(bone, contents.values)

@@ -7,6 +7,7 @@ damaged, and index / rate fails if the rate varies. A seek may land after the wa
 from __future__ import annotations
 
 import bisect
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -70,6 +71,7 @@ class VideoContainer:
             "picture": f"{index.width} x {index.height} px",
             "turned_deg": index.rotation_deg,
             "codec": index.codec,
+            **({"data_tracks": tracks} if (tracks := data_tracks(path)) else {}),
             **{f"dropped: {cause}": count for cause, count in index.dropped.items()},
         }
 
@@ -93,6 +95,30 @@ def index_video(path: Path) -> VideoIndex:
     """
     with VideoReader(path) as reader:
         return reader.index
+
+
+# Telemetry by the names of tracks (as their writers call them) or of codecs, with the way to read it.
+_TELEMETRY = (
+    (re.compile(r"GoPro MET"), "GoPro's telemetry (GPMF), read as `gopro`"),
+    (re.compile(r"(?i)djmd|DJI meta|CAM meta"), "DJI's telemetry (djmd), not read: convert it with ExifTool"),
+    (re.compile(r"klv"), "MISB KLV, not read: convert it to CSV with a tool for STANAG 4609"),
+)
+
+
+def data_tracks(path: Path) -> list[str]:
+    """Name the tracks beside pictures and sound: telemetry by its kind, others by the name in the file.
+
+    Raises:
+        DataError: the file cannot be opened as a video.
+    """
+    container, _ = open_container(path)
+    with container:
+        names = [
+            f"{stream.metadata.get('handler_name', '').strip()} {stream.name or ''}".strip()
+            for stream in container.streams
+            if stream.type == "data"
+        ]
+    return [next((kind for known, kind in _TELEMETRY if known.search(name)), name) for name in names]
 
 
 def created_ns(path: Path) -> int | None:

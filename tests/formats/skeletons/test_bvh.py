@@ -18,11 +18,11 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, multiply, rotate
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
-from pipelines.session.registries import Format
+from pipelines.session.registries import JointFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
-READER: Format = bvh.FORMAT
+READER: JointFormat = bvh.FORMAT
 
 HIERARCHY = """HIERARCHY
 ROOT Hips

@@ -1,0 +1,139 @@
+"""GoPro's telemetry: a real Karma's, and packets written byte by byte after GoPro's description."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.formats.drone_logs import gpmf
+from pipelines.formats.videos.video import FORMAT as VIDEO
+from pipelines.geometry.poses import rotate
+from pipelines.session.registries import VideoFormat, recognise
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.commands.runner import succeeds
+from tests.formats.refusals import refuses
+from tests.real_data import real_data
+
+READER = gpmf.FORMAT
+KARMA = "second/karma.mp4"
+
+
+def item(key: str, kind: str, size: int, count: int, data: bytes) -> bytes:
+    head = key.encode() + struct.pack(">BBH", ord(kind) if kind else 0, size, count)
+    return head + data + bytes(-len(data) % 4)
+
+
+def numbers(key: str, kind: str, rows: list[list[int]]) -> bytes:
+    letter = {"l": "i", "s": "h", "S": "H", "L": "I"}[kind]
+    data = b"".join(struct.pack(f">{len(row)}{letter}", *row) for row in rows)
+    return item(key, kind, len(data) // len(rows), len(rows), data)
+
+
+def nested(key: str, *inner: bytes) -> bytes:
+    data = b"".join(inner)
+    return item(key, "", 1, len(data), data)
+
+
+def fixes(utc: str, fix: int, rows: list[list[int]], *, sea: bool = False) -> bytes:
+    scale = numbers("SCAL", "l", [[10_000_000], [10_000_000], [1000], [1000], [100]])
+    above = item("GPSA", "c", 1, 4, b"MSLV") if sea else b""
+    about = [numbers("GPSF", "L", [[fix]]), item("GPSU", "c", 1, 16, utc.encode()), above, scale]
+    return nested("DEVC", nested("STRM", *about, numbers("GPS5", "l", rows)))
+
+
+def place(k: int) -> list[int]:
+    return [481_000_000 + 10 * k, 112_000_000 + 20 * k, 500_000 + 100 * k, 1000, 100]
+
+
+PACKETS = [
+    (0, 10**9, fixes("240102030405.500", 2, [place(0), place(1)])),
+    (10**9, 10**9, fixes("240102030406.500", 3, [place(2), place(3)])),
+    (2 * 10**9, 10**9, fixes("240102030407.500", 3, [place(4), place(5)])),
+]
+
+
+def read(monkeypatch: pytest.MonkeyPatch, packets: list[tuple[int, int, bytes]], **choice: str) -> Telemetry:
+    monkeypatch.setattr(gpmf, "_packets", lambda _: iter(packets))
+    return READER.read_telemetry(Path("a.mp4"), TelemetryChoice(**choice))  # type: ignore[arg-type]
+
+
+def test_fixes_are_spread_over_their_packets_in_utc(monkeypatch: pytest.MonkeyPatch) -> None:
+    telemetry = read(monkeypatch, PACKETS)
+    # 2024-01-02 03:04:06.5 UTC is 1704164646.5 s.
+    assert telemetry.position.t_ns.tolist() == [1704164646500000000 + 500_000_000 * k for k in range(4)]
+    expected = [[48.1 + 1e-6 * k, 11.2 + 2e-6 * k, 500 + 0.1 * k] for k in range(2, 6)]
+    np.testing.assert_allclose(telemetry.position.values, expected, rtol=0, atol=1e-9)
+    assert telemetry.position.height == "ellipsoid"
+    assert telemetry.dropped == {"no 3D fix": 2}
+    assert telemetry.body is None
+    boot = read(monkeypatch, PACKETS, time="boot")
+    assert boot.position.t_ns.tolist() == [10**9 + 500_000_000 * k for k in range(4)]
+
+
+def test_the_reference_of_heights_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    packets = [(0, 10**9, fixes("240102030405.500", 3, [place(0)], sea=True))]
+    assert read(monkeypatch, packets).position.height == "sea level"
+
+
+def test_a_packet_that_is_cut_costs_its_rows_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    start, length, content = PACKETS[2]
+    telemetry = read(monkeypatch, [*PACKETS[:2], (start, length, content[:-12])])
+    assert len(telemetry.position.t_ns) == 2
+    assert telemetry.dropped["item of telemetry cut off"] == 1
+
+
+def test_rows_of_hero_11_have_their_own_time_and_fix(monkeypatch: pytest.MonkeyPatch) -> None:
+    """2024-01-02 is day 8767 since 2000."""
+    scale = [10_000_000, 10_000_000, 1000, 1000, 100, 1, 1000, 100, 1]
+    rows = b"".join(struct.pack(">7i2H", *place(k)[:5], 8767, 11_045_500 + 100 * k, 120, 3) for k in range(3))
+    about = [item("TYPE", "c", 1, 9, b"lllllllSS"), numbers("SCAL", "l", [[each] for each in scale])]
+    content = nested("DEVC", nested("STRM", *about, item("GPS9", "?", 32, 3, rows)))
+    telemetry = read(monkeypatch, [(0, 300_000_000, content)])
+    assert telemetry.position.t_ns.tolist() == [1704164645500000000 + 100_000_000 * k for k in range(3)]
+
+
+def test_telemetry_without_positions_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    content = nested("DEVC", nested("STRM", numbers("ACCL", "s", [[1, 2, 3]])))
+    with refuses("a.mp4", "ACCL"):
+        read(monkeypatch, [(0, 10**9, content)])
+
+
+def test_a_real_karma_is_where_and_when_it_was_filmed() -> None:
+    """Compare with the video's time of creation, the drone's own heading and home, and gravity."""
+    path = real_data(KARMA)
+    assert READER.recognises(path)
+    assert recognise(path, VideoFormat, "video") is VIDEO
+    telemetry = READER.read_telemetry(path, TelemetryChoice())
+    assert len(telemetry.position.t_ns) == 47
+    made_s = 1492457277  # by ffprobe: 2017-04-17T19:27:57Z, whole seconds
+    assert abs(telemetry.position.t_ns[0] / 1e9 - made_s) < 2
+    track = gpmf._read(path)
+    home = np.concatenate(track.rows["BPOS"])[:, :2].mean(axis=0)
+    assert np.abs(telemetry.position.values[:, :2] - home).max() < 1e-3  # about 100 m
+    heading = np.radians(np.concatenate(track.rows["GLPI"])[:, 8])
+    assert telemetry.body is not None
+    nose = rotate(telemetry.body.quaternion_xyzw, np.array([1.0, 0, 0]))
+    said = np.stack([np.sin(heading), np.cos(heading)], axis=1)  # heading counts from north to east
+    level = nose[:, :2] / np.linalg.norm(nose[:, :2], axis=1, keepdims=True)
+    assert (level * said).sum(axis=1).min() > np.cos(np.radians(5))
+
+
+def test_accelerations_of_the_real_file_are_those_of_another_reader() -> None:
+    parser = pytest.importorskip("telemetry_parser").Parser(str(real_data(KARMA)))
+    packets = [each["Accelerometer"] for each in parser.telemetry() if "Accelerometer" in each]
+    told = [[row[axis] / each["Scale"] for axis in "xyz"] for each in packets for row in each["Data"]]
+    ours = np.concatenate(gpmf._read(real_data(KARMA)).rows["ACCL"])
+    np.testing.assert_allclose(ours, told, rtol=1e-12)
+
+
+def test_a_flight_takes_poses_from_the_video(tmp_path: Path) -> None:
+    (tmp_path / "karma.mp4").symlink_to(real_data(KARMA))
+    (tmp_path / "flight.yaml").write_text(
+        "schema: 1\ncameras:\n  drone1:\n    video: karma.mp4\n    frame_times: {start: 1492457277.5}\n"
+        "    pose: {gopro: karma.mp4}\n    mount: {looks: forward}\n"
+        "    intrinsics: {width: 854, height: 480, fx: 500, fy: 500, cx: 426.5, cy: 239.5}\n"
+    )
+    succeeds("ingest", tmp_path / "flight.yaml")
