@@ -19,6 +19,7 @@ from pipelines.geometry.arrays import Int64
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.faults import FREE, Fault, fit, picture_variance, undone
 from pipelines.reconstruction.doubts.hypotheses import (
+    TIMES,
     Hypothesis,
     Trial,
     higher_or_lower,
@@ -86,7 +87,6 @@ _COST_OF_NUMBER = 2.0  # of chi^2, as in Akaike's criterion
 _ALIKE_COST = 4.0  # of faults that are stated together
 _SAME_RESIDUAL = 1.1
 _DISCRETE = 0.8  # the largest penalty of a hypothesis without a free number
-_TIMES = ("clock", "frame_rate")
 
 
 @dataclass(frozen=True)
@@ -130,18 +130,20 @@ def doubts_of(
         last_map=last[0] if last else None,
         pose_noise=pose_noise,
     )
-    return min(map(diagnose, _distinct(known(chosen=chosen), known())), key=lambda found: found.score).doubts
+    return diagnose(_less_odd(known(chosen=chosen), known())).doubts
 
 
-def _distinct(chosen: Sampled | None, prominent: Sampled | None) -> list[Sampled | None]:
-    """Leave out the second of two flights with the same person in all pictures."""
+def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | None:
+    """Return the flight with the less odd person; the first if they are alike."""
     if chosen is None or prominent is None:
-        return [None]
+        return None
     same = all(
         np.array_equal(one.pixels, other.pixels, equal_nan=True)
         for one, other in zip(chosen.cameras, prominent.cameras, strict=True)
     )
-    return [chosen] if same else [chosen, prominent]
+    if same:
+        return chosen
+    return min(chosen, prominent, key=lambda flight: score(flight, scene_of(flight)).total)
 
 
 def diagnose(flight: Sampled | None) -> Diagnosis:
@@ -166,7 +168,7 @@ def diagnose(flight: Sampled | None) -> Diagnosis:
     if causes and causes[0].scene is not None and _is_noise(flight, causes[0].scene, hypotheses):
         causes = []
     if not causes or np.isfinite(causes[0].cost):
-        causes = _faults(hypotheses, stated.cost, described) or causes
+        causes = _faults([*_without_number(trial, hypotheses), *hypotheses], stated.cost, described) or causes
     doubts = [_doubt(each, found, described) for each in causes]
     if doubts or base.total >= DOUBTFUL:
         doubts += _oddities(found, described, flight)
@@ -189,7 +191,30 @@ def _causes(trial: Trial, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     causes: dict[str, Hypothesis] = {}
     for each in sorted(explaining, key=lambda each: (each.penalty > _DISCRETE, each.total)):
         causes.setdefault(each.code, each)
-    return list(causes.values())
+    discrete = [each for each in causes.values() if each.penalty <= _DISCRETE and each.scene is not None]
+    if len(discrete) > 1:  # alike in what is odd: the rays tell which of them fits
+        discrete.sort(key=partial(_cost, trial))
+    return [*discrete, *(each for each in causes.values() if each not in discrete)]
+
+
+def _cost(trial: Trial, hypothesis: Hypothesis) -> float:
+    """Return the chi^2 of a hypothesis without a free number, with constant errors of all poses."""
+    if hypothesis.scene is None:
+        raise ValueError(f"{hypothesis.what} has no scene")
+    return fit(trial.flight, hypothesis.scene, "none", 0).cost
+
+
+def _without_number(trial: Trial, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the best hypothesis without a free number with its cost, to compete with faults.
+
+    It need not explain as much as the margin asks: of what lowers the chi^2 as much, it is the simpler.
+    """
+    for each in hypotheses:
+        if each.total > trial.base.total - MARGIN_OF_TIMES:
+            break
+        if each.scene is not None and each.penalty <= _DISCRETE:
+            return [replace(each, cost=_cost(trial, each))]
+    return []
 
 
 def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
@@ -204,7 +229,7 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
     described = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
     same = score(trial.flight, described, trial.base)
     share = np.isfinite(described.rays[..., 0]).sum() / np.isfinite(trial.described.rays[..., 0]).sum()
-    margin = (MARGIN_OF_TIMES if hypothesis.code in _TIMES else MARGIN) / share
+    margin = (MARGIN_OF_TIMES if hypothesis.code in TIMES else MARGIN) / share
     if hypothesis.total > min(same.total, trial.base.total) - margin:
         return False
     missed = [residual_px(scene, solve(scene)) for scene in (described, hypothesis.scene)]
@@ -231,7 +256,7 @@ def _faults(hypotheses: list[Hypothesis], stated: float, scene: Scene) -> list[H
     if not best <= stated - GAIN * max(1.0, best / pictures):
         return []
     alike: dict[str, Hypothesis] = {}
-    for each in sorted(hypotheses, key=lambda each: each.cost):
+    for each in sorted(hypotheses, key=lambda each: (each.penalty > _DISCRETE, each.cost)):
         if each.cost <= best + _ALIKE_COST:
             alike.setdefault(each.code, each)
     return list(alike.values())

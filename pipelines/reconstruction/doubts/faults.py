@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import cross_matrix, matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.reconstruction.doubts.kernels import misses_of, normal_equations
 from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene
 from pipelines.reconstruction.doubts.score import STATURE_M, Solved, pixel_variance, solve, stature_m
 
@@ -149,17 +150,15 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     Also the covariance [n, n] of these numbers.
     """
     solved = solve(scene)
-    cameras, times, joints = solved.seen.shape
+    times = solved.seen.shape[1]
     used = solved.seen & (solved.views >= 2)
-    depth = np.where(used, np.maximum(np.abs(solved.depth), 0.5), 1.0)
-    toward = np.where(used[..., None], solved.joints[None] - scene.position[:, :, None, :], 0.0)
-    direction = solved.direction
-    across = np.eye(3) - direction[..., :, None] * direction[..., None, :]
-    residual = np.einsum("ctjik,ctjk->ctji", across, toward) / depth[..., None]
+    missed, depth = misses_of(
+        solved.joints, np.ascontiguousarray(scene.position), solved.direction, used, solved.depth
+    )
     varying2 = _varying2(scene.sigma[:, 5], scene.sigma[:, 3], times)[:, None, None]
     varying2 = varying2 + _varying2(scene.sigma[:, 4], scene.sigma[:, 2], times)[:, None, None] / depth**2
     variance = (pixel_variance(scene) / scene.focal_px**2)[:, None, None] + varying2
-    size = np.linalg.norm(residual, axis=-1) / np.sqrt(variance)
+    size = np.linalg.norm(missed, axis=-1) / np.sqrt(variance)
     if used.sum() < 60:
         free = FREE[fault.name]
         return np.inf, np.inf, np.zeros(errors.size + free), np.zeros((free, free))
@@ -172,39 +171,23 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     sigma = _constant_sigma(scene)
     cost = float((np.where(used, huber, 0.0) / seen).sum())
 
-    # Derivatives of (X - p) / depth - direction by the joint and by the camera's turn. The terms with the
-    # residual keep the scale: without them a smaller flight seems to fit better.
-    point = (across - residual[..., :, None] * direction[..., None, :]) / depth[..., None, None]
-    leaning = np.eye(3) + (direction + residual)[..., :, None] * residual[..., None, :]
-    turned = leaning @ cross_matrix(direction)
-    own = np.concatenate([-point, turned], axis=-1)  # [C, T, J, 3, 6]
-    numbers = _derivatives(scene, fault, own[fault.index], leaning[fault.index], direction[fault.index])
-    columns = 6 * cameras + FREE[fault.name]
-    of_points = np.einsum("ctjki,ctjkl->tjil", point, weight[..., None, None] * point)
-    at_points = np.einsum("ctjki,ctjk->tji", point, weight[..., None] * residual)
-    of_both = np.zeros((times, joints, 3, columns))
-    of_all, at_all = np.zeros((columns, columns)), np.zeros(columns)
-    for camera in range(cameras):
-        mine = np.arange(6 * camera, 6 * camera + 6)
-        design = own[camera]
-        if camera == fault.index and FREE[fault.name]:
-            mine = np.append(mine, np.arange(6 * cameras, columns))
-            design = np.concatenate([design, numbers], axis=-1)
-        weighted = weight[camera][..., None, None] * design
-        of_both[..., mine] = np.swapaxes(point[camera], -1, -2) @ weighted
-        rows = weighted.reshape(-1, len(mine))
-        of_all[mine[:, None], mine] = design.reshape(rows.shape).T @ rows
-        at_all[mine] = rows.T @ residual[camera].ravel()
     placed, pull, extra = _placed(flight, solved)
     sized = _size(solved)
     strain = float(((errors / sigma) ** 2).sum()) + extra + sized**2
     cost += strain
-    of_points = of_points + placed[..., None, None] * np.eye(3) + 1e-9 * np.eye(3)
-    at_points = at_points - pull
-    inverse = np.linalg.inv(of_points)
-    eliminated = (inverse @ of_both).reshape(-1, columns)
-    normal = of_all - of_both.reshape(-1, columns).T @ eliminated
-    right = at_all - eliminated.T @ at_points.ravel()
+    numbers = _basis(scene, fault)
+    zoomed = scene.rotation[fault.index][..., 2] if fault.name == "focal" else np.zeros((0, 3))
+    normal, right = normal_equations(
+        solved.direction,
+        missed,
+        depth,
+        weight,
+        placed,
+        pull,
+        fault.index,
+        numbers,
+        np.ascontiguousarray(np.nan_to_num(zoomed)),
+    )
     normal[range(errors.size), range(errors.size)] += 1 / sigma.ravel() ** 2
     right[: errors.size] += errors.ravel() / sigma.ravel() ** 2
     if fault.name in ("shift", "zero"):
@@ -215,26 +198,6 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     normal += 1e-9 * np.eye(len(normal))
     covariance = np.linalg.inv(normal)
     return cost, strain, -covariance @ right, covariance[errors.size :, errors.size :]
-
-
-def _derivatives(scene: Scene, fault: Fault, own: Float, leaning: Float, direction: Float) -> Float:
-    """Return the derivatives [T, J, 3, n] of a camera's residuals by the numbers of its fault.
-
-    Args:
-        scene: the scene.
-        fault: of which camera.
-        own: the derivatives [T, J, 3, 6] by its shift and turn.
-        leaning: those [T, J, 3, 3] by its rays.
-        direction: its rays [T, J, 3].
-    """
-    if fault.name != "focal":
-        derivatives: Float = own @ _basis(scene, fault)[:, None]
-        return derivatives
-    axis = scene.rotation[fault.index][:, None, :, 2]
-    cosine = (direction * axis).sum(axis=-1, keepdims=True)
-    inwards = cosine * (axis - cosine * direction)
-    zoomed: Float = -np.einsum("tjkl,tjl->tjk", leaning, inwards)[..., None]
-    return zoomed
 
 
 def picture_variance(scene: Scene) -> Float:

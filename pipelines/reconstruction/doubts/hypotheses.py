@@ -22,11 +22,17 @@ from pipelines.session.log_doubts import doubts_of_logs
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 """Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
 
+TIMES = ("clock", "frame_rate")
+"""Codes of what is tried on every flight."""
+
 _FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
 _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _FLU_FROM_FRD = np.diag([1.0, -1, -1])
 _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
 _SPARE = 2.0  # hypotheses whose scores are farther from the best need no exact score
+_LEAST_GAIN = 1.0  # nor do clocks and rates that explain less than this, half of what their margin asks
+_REACH = 10.0  # how much worse than the description the best of a grid may be, beside which a best may lie
+_REACH_OF_TIMES = 1.0  # the same of the finer grid of clocks
 _USUAL_STATURE = 0.17  # 95 % of grown-ups differ by less, logarithm
 _LONGEST_CLOCK_S = 3.0
 _LEAST_CLOCK_S = 0.05
@@ -73,19 +79,26 @@ class Trial:
         """Score a hypothesis."""
         if hypothesis.scene is None:
             return hypothesis
+        least = _LEAST_GAIN if hypothesis.code in TIMES else -_SPARE
         found = score(
             self.flight,
             hypothesis.scene,
             self.base,
             same_scatter=hypothesis.same_scatter,
-            limit=self.best_total + _SPARE,
+            limit=min(self.best_total + _SPARE, self.base.total - least),
         )
         scored = replace(hypothesis, score=found)
         self.best_total = min(self.best_total, scored.total)
         return scored
 
     def best(
-        self, make: Callable[[float], Hypothesis], low: float, high: float, count: int, least: float
+        self,
+        make: Callable[[float], Hypothesis],
+        low: float,
+        high: float,
+        count: int,
+        least: float,
+        reach: float = _REACH,
     ) -> Hypothesis | None:
         """Search the value of a hypothesis with one number: a grid, then a golden section about its best.
 
@@ -96,7 +109,7 @@ class Trial:
         tried = [self.scored(make(float(value))) for value in grid]
         best = min(range(count), key=lambda index: tried[index].total)
         chosen, at = tried[best], float(grid[best])
-        if np.isfinite(chosen.total) and chosen.total < self.base.total + 10:
+        if np.isfinite(chosen.total) and chosen.total < self.base.total + reach:
             inner, value = self._golden(
                 make, float(grid[max(best - 1, 0)]), float(grid[min(best + 1, count - 1)])
             )
@@ -232,6 +245,7 @@ def of_times(trial: Trial) -> Iterator[Hypothesis]:
                 _LONGEST_CLOCK_S,
                 61,
                 _LEAST_CLOCK_S,
+                _REACH_OF_TIMES,
             )
             if found is not None:
                 yield found

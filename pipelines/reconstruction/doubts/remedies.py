@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import get_args
 
 import numpy as np
@@ -93,9 +94,10 @@ def _vector(values: Sequence[float]) -> str:
 
 def _as_words(rotation: Float, translation: Sequence[float]) -> str | None:
     """State a mount as `looks` and `down_deg` where it is one."""
-    for looks in get_args(Looks):
-        level = matrix_from_quaternion(body_from_camera(looks))
+    for looks, level in _levels().items():
         tilt = level.T @ rotation
+        if abs(tilt[0, 0] - 1) > _SAME:
+            continue
         angle = float(np.degrees(np.arctan2(tilt[2, 1], tilt[1, 1])))
         for down_deg in (0.0,) if looks in ("down", "up") else (angle, -angle):
             if abs(down_deg) > 90:
@@ -105,6 +107,12 @@ def _as_words(rotation: Float, translation: Sequence[float]) -> str | None:
                 down = f", down_deg: {down_deg:.1f}" if abs(down_deg) >= 0.05 else ""
                 return f"{{looks: {looks}{down}, translation: {_vector(translation)}}}"
     return None
+
+
+@cache
+def _levels() -> dict[Looks, Float]:
+    """Return body_from_camera [3, 3] of every way to look, without a tilt."""
+    return {looks: matrix_from_quaternion(body_from_camera(looks)) for looks in get_args(Looks)}
 
 
 def pose(cameras: Sequence[Filmed], key: str) -> str:

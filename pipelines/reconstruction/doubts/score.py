@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.reconstruction.doubts.kernels import distances_of, joints_of
 from pipelines.reconstruction.doubts.scene import JOINTS, STEP_NS, Sampled, Scene
 
 IMPOSSIBLE = 99.0
@@ -79,7 +80,7 @@ class Solved(NamedTuple):
 
     joints: Float  # [T, J, 3] m; NaN where fewer than two cameras see one
     chi2: Float  # [T, J]
-    views: Float  # [T, J] how many cameras see it
+    views: Int64  # [T, J] how many cameras see it
     in_front: Bool  # [T, J]
     direction: Float  # [C, T, J, 3] unit rays in the world
     seen: Bool  # [C, T, J]
@@ -88,61 +89,15 @@ class Solved(NamedTuple):
 
 def solve(scene: Scene) -> Solved:
     """Triangulate by least squares of distances to rays, weighted by what keypoints and poses err by."""
-    ones = np.ones((*scene.rays.shape[:-1], 1))
-    local = np.concatenate([scene.rays, ones], axis=-1)
-    local /= np.linalg.norm(local, axis=-1, keepdims=True)
-    direction = np.einsum("ctij,cthj->cthi", scene.rotation, local)
-    posed = np.asarray(np.isfinite(scene.position).all(axis=-1))[..., None]
-    seen = np.isfinite(direction).all(axis=-1) & posed
-    direction = np.where(seen[..., None], direction, 0.0)
-    position = np.where(posed[..., None], np.nan_to_num(scene.position)[:, :, None, :], 0.0)
-    across = np.eye(3) - direction[..., :, None] * direction[..., None, :]
-    across_position = np.einsum("cthij,cthj->cthi", across, np.broadcast_to(position, direction.shape))
-    angle2 = (pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2)[:, None, None]
-    place2 = (scene.sigma[:, 0] ** 2)[:, None, None]
-    depth = np.full(seen.shape, 10.0)
-    for _ in range(2):
-        distance = np.clip(np.abs(depth), 1e-3, 1e5)
-        weight = np.where(seen, 1.0 / (distance**2 * angle2 + place2), 0.0)
-        joints = _solve_symmetric(
-            np.einsum("cth,cthij->thij", weight, across), np.einsum("cth,cthi->thi", weight, across_position)
-        )
-        offset = joints[None] - position
-        depth = (offset * direction).sum(axis=-1)
-    miss2 = ((offset - depth[..., None] * direction) ** 2).sum(axis=-1)
-    views = seen.sum(axis=0)
-    joints = np.where((views >= 2)[..., None], joints, np.nan)
-    in_front = ((depth > 0) | ~seen).all(axis=0)
-    return Solved(joints, (weight * miss2).sum(axis=0), views, in_front, direction, seen, depth)
+    angle2 = pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2
+    arrays = (scene.rays, scene.rotation, scene.position, angle2, scene.sigma[:, 0] ** 2)
+    return Solved(*joints_of(*(np.ascontiguousarray(array, dtype=np.float64) for array in arrays)))
 
 
 def pixel_variance(scene: Scene) -> Float:
     """Return the variance [C] px^2 of keypoints: it grows with the person in the picture."""
     variance: Float = _KEYPOINT_PX**2 + (_KEYPOINT_SHARE * scene.person_px) ** 2
     return variance
-
-
-def _solve_symmetric(matrix: Float, right: Float) -> Float:
-    """Solve systems [..., 3, 3] by the adjugate."""
-    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
-    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
-    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * first + b * second + c * third
-    determinant = np.where(np.abs(determinant) > 1e-30, determinant, 1e-30)
-    x, y, z = right[..., 0], right[..., 1], right[..., 2]
-    middle, last, cross = a * f - c * c, a * d - b * b, b * c - a * e
-    solved: Float = (
-        np.stack(
-            [
-                first * x + second * y + third * z,
-                second * x + middle * y + cross * z,
-                third * x + cross * y + last * z,
-            ],
-            axis=-1,
-        )
-        / determinant[..., None]
-    )
-    return solved
 
 
 @np.errstate(invalid="ignore", divide="ignore")
@@ -176,17 +131,17 @@ def score(
     gain = 0.0 if reference is None else SCATTER_WEIGHT * np.log(reference / SCATTER_RANGE[0])
     if total - gain > limit:
         return Score(total, misfit, np.inf, {"behind": behind}, np.nan)
+    scatter = _scatter(scene, solved)
+    if reference is not None:
+        total += SCATTER_WEIGHT * float(np.log(np.clip(scatter, *SCATTER_RANGE) / reference))
+        if total > limit:
+            return Score(total, misfit, scatter, {"behind": behind}, np.nan)
     person = _person(flight, scene, solved)
     if person is None:
         return Score(IMPOSSIBLE, misfit, np.inf, {}, np.nan)
     odd = {"parallax": _parallax(solved)} | person.odd
     total += sum(float(np.log1p(min(value, 50.0) ** 2)) for value in odd.values() if np.isfinite(value))
     odd["behind"] = behind
-    if total - gain > limit:
-        return Score(total, misfit, np.inf, odd, person.stature_m)
-    scatter = _scatter(scene, solved)
-    if reference is not None:
-        total += SCATTER_WEIGHT * float(np.log(np.clip(scatter, *SCATTER_RANGE) / reference))
     return Score(total, misfit, scatter, odd, person.stature_m)
 
 
@@ -216,10 +171,9 @@ def _parallax(solved: Solved) -> float:
     for one, other in combinations(range(len(solved.seen)), 2):
         both = solved.seen[one] & solved.seen[other]
         if both.any():
-            sine = np.linalg.norm(
-                np.cross(solved.direction[one][both], solved.direction[other][both]), axis=-1
-            )
-            best = max(best, float(np.median(sine)))
+            cosine = (solved.direction[one][both] * solved.direction[other][both]).sum(axis=-1)
+            sine = np.sqrt(np.maximum(0.0, 1.0 - cosine**2))
+            best = max(best, _median(sine))
     return max(0.0, 0.1 / max(best, 1e-4) - 1)
 
 
@@ -238,20 +192,18 @@ def _scatter(scene: Scene, solved: Solved) -> float:
 def _scatter_of_pair(
     scene: Scene, solved: Solved, distance: Float, variance: Float, pair: tuple[int, int]
 ) -> float | None:
-    """Fit constant errors of both poses to the rays' signed distances [T, J], and measure what they leave.
-
-    The distance of two rays along their common normal changes by the normal with a shift of a camera, and
-    by the lever (distance times ray) across the normal with a turn.
-    """
-    one, other = pair
-    normal = np.cross(solved.direction[one], solved.direction[other])
-    length = np.linalg.norm(normal, axis=-1)
-    used = solved.seen[one] & solved.seen[other] & (length > 0.15)
+    """Fit constant errors of both poses to the rays' distances, and measure what they leave."""
+    both = list(pair)
+    used, apart, design = distances_of(
+        solved.direction[both],
+        solved.seen[both],
+        scene.position[both],
+        scene.rotation[both],
+        distance[both],
+        scene.sigma[both, :2],
+    )
     if used.sum() < _FEWEST:
         return None
-    baseline = (scene.position[other] - scene.position[one])[:, None, :]
-    normal = normal / np.where(used, length, 1.0)[..., None]
-    apart = (normal * baseline).sum(axis=-1)[used]
     # What is new in every pose turns the person in the picture, besides moving them.
     white2 = _HALF_BODY_M**2 * scene.sigma[:, 3] ** 2
     noise2 = [
@@ -261,13 +213,7 @@ def _scatter_of_pair(
         for camera in pair
     ]
     noise = np.sqrt(_median((noise2[0] + noise2[1])[used]))
-    columns = []
-    for camera, sign in ((one, -1.0), (other, 1.0)):
-        lever = distance[camera][..., None] * np.cross(solved.direction[camera], normal)
-        turned = np.einsum("tki,tjk->tji", scene.rotation[camera], lever)
-        columns += [sign * normal * scene.sigma[camera, 0], sign * turned * scene.sigma[camera, 1]]
-    design = np.nan_to_num(np.concatenate(columns, axis=-1)[used])
-    apart = np.nan_to_num(apart)
+    design, apart = np.nan_to_num(design[used]), np.nan_to_num(apart[used])
     share = used.shape[0] / len(apart)  # a picture is one observation of a constant error
     weight = np.ones(len(apart))
     for _ in range(3):
