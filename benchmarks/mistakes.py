@@ -431,6 +431,11 @@ def same_topic(mistaken: Mistaken) -> None:
     mistaken.manifest["cameras"][first]["pose"]["tum"] = f"{second}.tum"
 
 
+def without_first(mistaken: Mistaken) -> None:
+    """Leave the first drone out: no mistake, but what a mistake in its poses can cost at most."""
+    del mistaken.manifest["cameras"][mistaken.names[0]]
+
+
 def own_origins(mistaken: Mistaken) -> None:
     for name in mistaken.names:
         stamps, (position, quaternion) = mistaken.poses[name]
@@ -667,6 +672,9 @@ def main() -> None:
         described = Described(flight, options.folder / flight.name)
         right, doubts, stopped = measured(mistaken(described, None))
         row(flight.name, "none", right, doubts[0]["code"] if doubts else stopped or "-", "", "")
+        if flight.drones > 2:  # what is lost where nothing is known of where a drone was
+            alone, *_ = measured(mistaken(described, without_first))
+            row(flight.name, "drone1 left out", alone, "", "", "")
         for mistake in MISTAKES:
             if mistake.fits(flight) and (not options.mistake or mistake.name in options.mistake):
                 tally = tried(described, mistake, right or float("nan"))

@@ -33,7 +33,7 @@ _LEAST_SIGMA = (0.02, np.radians(0.1))  # of constant errors, m and rad
 _LOOSE_M = 30.0  # sigma of a shift that is a fault: any is as likely
 _SIZE_SIGMA = 0.09  # of the logarithm of statures
 _PROBE_M = 0.05
-_PLACED_M = 0.3  # sigma of the logged actor's hips, and of the feet on the ground
+_PLACED_M = 0.3  # sigma of the logged actor's hips, of which `_FEW` are independent
 _HUBER = 1.5
 _FEW = 3
 _USUAL_M = 10.0  # distance of a person
@@ -260,8 +260,8 @@ def _placed(flight: Sampled, solved: Solved) -> tuple[Float, Float, float]:
     apart = flight.hips[:, None] - solved.joints[:, hips]
     known = np.asarray(np.isfinite(apart).all(axis=-1))
     apart = np.where(known[..., None], apart, 0.0)
-    each = 1 / (_PLACED_M**2 * max(int(known.sum()), 1))
+    # The way there counts besides the place: a log turned about its zero leads elsewhere.
+    each = _FEW / (_PLACED_M**2 * max(int(known.sum()), 1))
     weight[:, hips] = each * known
     pull[:, hips] = each * apart
-    middle = apart[known].mean(axis=0) if known.any() else np.zeros(3)
-    return weight, pull, float((middle**2).sum() / _PLACED_M**2)
+    return weight, pull, each * float((apart**2).sum())
