@@ -7,6 +7,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from pipelines.drafting.found import (
     Calibration,
     Driver,
@@ -29,19 +31,27 @@ from pipelines.drafting.found import (
     kind_of_format,
 )
 from pipelines.drafting.manifest_text import write_manifest
-from pipelines.drafting.matching import match
+from pipelines.drafting.matching import NO_DATE_NS, Alike, match
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.subtitles import read_subtitles
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
 from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
 from pipelines.formats.videos.frame_times import read_frame_times
+from pipelines.formats.videos.picture_motion import followed_points
+from pipelines.formats.videos.video import created_ns, index_video
 from pipelines.geometry.arrays import Int64
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.clocks import Followed, explain_motion
+from pipelines.geometry.geodesy import Place, enu_from_geodetic
+from pipelines.geometry.mounting import body_from_camera
+from pipelines.geometry.poses import interpolate_points, multiply
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import PoseSample
 from pipelines.session.registries import (
+    FORMATS,
     CalibrationFormat,
     Format,
     JointFormat,
@@ -53,7 +63,7 @@ from pipelines.session.registries import (
     VideoFormat,
 )
 from pipelines.session.storage import as_data_error
-from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat
+from pipelines.session.telemetry import Telemetry, TelemetryChoice, TelemetryFormat
 from pipelines.session.unknown_files import EXPECTED
 
 _FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
@@ -67,6 +77,11 @@ _KEYS: dict[str, Literal["dji", "ulog", "ardupilot", "tlog", "gopro"]] = {
 }
 """The key in a manifest for each format of a drone's own log."""
 
+_WATCHED_NS = 60_000_000_000  # of a video, to compare its motion with logs
+_NOMINAL_FOCAL = 0.8  # of a picture's width: an angle of view of 64 degrees
+_DOWN_DEG = (0.0, 30.0, 60.0, 90.0)  # of a camera whose mount nobody stated
+_BRIDGED_NS = 2_000_000_000  # between two positions of a log
+_MADE_WITHIN_NS = 5_000_000_000  # of the time when a video was made by its metadata, beside its length
 _TRANSFORMS_ASKED = 2000  # messages of a topic that are read for the names of its frames
 
 
@@ -115,7 +130,7 @@ def draft(
             [(path, reason)] = left_out.items()
         raise DataError(path, reason, EXPECTED)
 
-    flight = match(findings)
+    flight = match(findings, _Comparison())
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
     problem = _write(target, manifest.text)
     return Drafted(
@@ -221,7 +236,7 @@ def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
         return _recording(head, format_)
     if isinstance(format_, VideoFormat):
         index = format_.index(path)
-        return Video(*about, index.count, int(index.pts_ns[-1]))
+        return Video(*about, index.count, int(index.pts_ns[-1]), created_ns(path))
     if isinstance(format_, MapFormat):
         return Map(*about)
     if head.format == _FRAME_TIMES:
@@ -229,6 +244,64 @@ def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
         key: Literal["csv", "srt"] = "srt" if path.suffix.lower() == ".srt" else "csv"
         return FrameTimes(*about, key, len(stamps.t_ns), _span(stamps.t_ns))
     return None
+
+
+class _Comparison:
+    """Comparison of videos with drones' logs by their motion; each is read once."""
+
+    def __init__(self) -> None:
+        self._followed: dict[Path, Followed] = {}
+        self._telemetry: dict[Path, Telemetry | None] = {}
+
+    def __call__(self, video: Video, log: DroneLog) -> Alike | None:
+        """Return how well the poses in a log explain the motion in a video's pictures; None without poses.
+
+        The lens is taken to have an ordinary angle of view. Without a gimbal, the camera is taken to look
+        forward and down by the angle that explains most.
+        """
+        if video.path not in self._followed:
+            self._followed[video.path] = _followed_points(video.path)
+        if log.path not in self._telemetry:
+            self._telemetry[log.path] = _telemetry_of(log)
+        telemetry = self._telemetry[log.path]
+        if telemetry is None or (track := telemetry.gimbal or telemetry.body) is None:
+            return None
+        if telemetry.position.on_earth:
+            latitude, longitude, height = telemetry.position.values.T
+            place = Place(float(latitude[0]), float(longitude[0]), float(height[0]))
+            position = enu_from_geodetic(latitude, longitude, height, place)
+        else:
+            position = telemetry.position.values
+        moved = interpolate_points(telemetry.position.t_ns, position, track.t_ns, max_gap_ns=_BRIDGED_NS)
+        rows = np.isfinite(moved).all(axis=1)
+        if video.made_ns is not None and log.span.first_ns > NO_DATE_NS:  # it began or ended at that time
+            within_ns = 2 * video.length_ns + _MADE_WITHIN_NS
+            rows &= np.abs(track.t_ns - video.made_ns) <= within_ns
+        found: list[Alike] = []
+        for down_deg in (0.0,) if telemetry.gimbal else _DOWN_DEG:
+            turned = multiply(track.quaternion_xyzw[rows], body_from_camera("forward", down_deg))
+            explained = explain_motion(
+                track.t_ns[rows], moved[rows], turned, self._followed[video.path], max_gap_ns=_BRIDGED_NS
+            )
+            if explained is not None:
+                found.append(Alike(*explained))
+        return max(found, key=lambda alike: float(np.nansum(alike.gain)), default=None)
+
+
+def _followed_points(path: Path) -> Followed:
+    index = index_video(path)
+    focal_px = _NOMINAL_FOCAL * index.width
+    nominal = Intrinsics(
+        index.width, index.height, focal_px, focal_px, (index.width - 1) / 2, (index.height - 1) / 2
+    )
+    return followed_points(path, nominal, index.pts_ns[index.pts_ns <= _WATCHED_NS])
+
+
+def _telemetry_of(log: DroneLog) -> Telemetry | None:
+    reader = FORMATS.get(log.format)
+    if not isinstance(reader, TelemetryFormat):
+        return None
+    return reader.read_telemetry(log.path, TelemetryChoice(altitude=0.0 if log.height == "stated" else None))
 
 
 def _span(t_ns: Int64) -> Span:

@@ -111,6 +111,7 @@ class Video(Found):
 
     frames: int
     length_ns: int
+    made_ns: int | None = None  # its start or its end, in UTC, by its metadata
 
 
 @dataclass(frozen=True)

@@ -203,6 +203,10 @@ class CameraText:
         found = self._camera.poses.taken.found if self._camera.poses else None
         if not isinstance(found, DroneLog) or not self._film:
             return None
+        if self._camera.poses and self._camera.poses.start_ns is not None:
+            return (
+                Decimal(self._camera.poses.start_ns) / 10**9
+            ).normalize(), "when its pictures move as its poses"
         start_ns, source = found.video_start_ns, "by the subtitles' clock, local time taken as UTC"
         if start_ns is None:
             length_ns = self._film.length_ns
@@ -255,8 +259,8 @@ class CameraText:
         taken = choice.taken
         remarks = [describe(taken)]
         if not choice.named:
-            remarks.append("assumed: they are its own")
-            self._assume("pose", "that these poses are its own")
+            remarks.append(" ".join(["assumed: they are its own", choice.why]).strip(" ,"))
+            self._assume("pose", " ".join(["that these poses are its own", choice.why]).strip())
         if taken.is_true:
             remarks.append("assumed: these poses, called the truth, for there are no others")
             self._assume("pose", "what is called the truth, for there is nothing else")

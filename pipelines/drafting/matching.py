@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import numpy as np
+
 from pipelines.drafting.found import (
     Calibration,
     DroneLog,
@@ -54,11 +56,14 @@ from pipelines.drafting.labels import (
     order,
     unique,
 )
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.clocks import explains_better
 from pipelines.session.manifest import PoseSource
 
 _POSE_TYPES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "PoseInFrame", "TransformStamped")
 """Types of pose messages, the preferred first: odometry states its uncertainty. All others come last."""
 _GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "ptz", "camera", "cam"})
+NO_DATE_NS = 10**17  # stamps below it count from boot
 _MANY_CAMERAS = 200  # of one calibration file: more are the pictures of one moving camera
 
 
@@ -232,6 +237,8 @@ class Choice:
     taken: Candidate
     others: tuple[Candidate, ...] = ()
     named: bool = True  # True if its name matches; else it is the only one there is
+    why: str = ""  # the reason if neither is so
+    start_ns: int | None = None  # of the video, if that was found with it
 
     @property
     def all(self) -> tuple[Candidate, ...]:
@@ -277,8 +284,20 @@ class Draft:
     unused: list[Found]
 
 
-def match(findings: Findings) -> Draft:
-    """Find the cameras, and what belongs to each."""
+@dataclass(frozen=True)
+class Alike:
+    """Agreement of a video with a drone's log, by their motion."""
+
+    gain: Float  # [S] log-likelihood of each stretch of the video, over a camera that stands still
+    start_ns: int  # of the video, on the log's clock
+
+
+Compare = Callable[[Video, DroneLog], Alike | None]
+"""Comparison of a video with a drone's log; None if one of them shows no motion."""
+
+
+def match(findings: Findings, compare: Compare | None = None) -> Draft:
+    """Find the cameras, and what belongs to each; `compare` decides where neither names nor times do."""
     logs = _log_names(with_stamps(joined(findings.of(Recording))))
     cameras = _cameras(findings, logs)
     moving, still = _moving_poses(findings, logs), _calibrated(findings, "pose")
@@ -304,6 +323,7 @@ def match(findings: Findings) -> Draft:
         if camera.poses and (camera.poses.taken.of_body or camera.poses.taken.unturned):
             camera.gimbal = choose(gimbals)
 
+    _pair_drones(cameras, moving, compare)
     actors = [c for c in pose_topics if is_called(_topic_of(c), ACTOR)]
     mentioned = [*(c for camera in cameras for c in camera.mentioned()), *actors]
     used = {candidate.found.path for candidate in mentioned}
@@ -409,6 +429,58 @@ def _are_two(one: Label, other: Label) -> bool:
 
 
 # --- what belongs to a camera ---------------------------------------------------------------------------
+
+
+def _pair_drones(
+    cameras: Sequence[CameraDraft], moving: Sequence[Candidate], compare: Compare | None
+) -> None:
+    """Give videos without poses the drones' logs that no camera has: by time, else by motion."""
+    taken = {id(each) for camera in cameras if camera.poses for each in camera.poses.all}
+    free = [c for c in moving if isinstance(c.found, DroneLog) and id(c) not in taken]
+    filmed = [
+        (camera, video)
+        for camera in cameras
+        if camera.poses is None and camera.videos and isinstance(video := camera.videos[0].found, Video)
+    ]
+    possible = {camera.name: [log for log in free if _may_be_of(video, log)] for camera, video in filmed}
+    uses = Counter(id(log) for logs in possible.values() for log in logs)
+    found: dict[str, tuple[Candidate, Alike]] = {}
+    for camera, video in filmed:
+        logs = possible[camera.name]
+        if len(logs) == 1 and uses[id(logs[0])] == 1:
+            camera.poses = Choice(logs[0], named=False, why="by the times of video and log")
+        elif compare is not None and (own := _own_by_motion(video, logs, compare)) is not None:
+            found[camera.name] = own
+    for camera, _ in filmed:
+        own = found.get(camera.name)
+        if own is not None and sum(own[0] is log for log, _ in found.values()) == 1:
+            log, alike = own
+            camera.poses = Choice(log, named=False, why="by their motion", start_ns=alike.start_ns)
+
+
+def _own_by_motion(
+    video: Video, logs: Sequence[Candidate], compare: Compare
+) -> tuple[Candidate, Alike] | None:
+    """Return the log that explains a video's motion clearly, and clearly better than all others."""
+    known = [
+        (log, alike)
+        for log in logs
+        if isinstance(log.found, DroneLog) and (alike := compare(video, log.found)) is not None
+    ]
+    for log, alike in known:
+        others = [other.gain for each, other in known if each is not log]
+        if all(explains_better(alike.gain, other) for other in (np.zeros_like(alike.gain), *others)):
+            return log, alike
+    return None
+
+
+def _may_be_of(video: Video, log: Candidate) -> bool:
+    """Test if a log covers half of a video; its metadata have the time when it began, or when it ended."""
+    if video.made_ns is None or log.span is None or log.span.first_ns < NO_DATE_NS:
+        return True
+    length_ns = video.length_ns
+    began = [Span(video.made_ns, video.made_ns + length_ns), Span(video.made_ns - length_ns, video.made_ns)]
+    return max(log.span.overlap_ns(each) for each in began) >= length_ns / 2
 
 
 class _Chooser:

@@ -245,6 +245,40 @@ def fit_start(
     )
 
 
+def explain_motion(
+    t_ns: Int64, position: Float, quaternion_xyzw: Float, followed: Followed, *, max_gap_ns: int
+) -> tuple[Float, int] | None:
+    """Compute how well a camera's poses explain the motion of points, at the start that fits best.
+
+    Of several cameras' poses, those that explain a video clearly better than all others are its own
+    (`explains_better`), even with a calibration that is only nearly right. `fit_start` is stricter.
+
+    Args:
+        t_ns: [N] strictly increasing stamps of the poses.
+        position: [N, 3] m, of the camera in the world.
+        quaternion_xyzw: [N, 4] world_from_camera.
+        followed: the points.
+        max_gap_ns: there is no interpolation between poses further apart than this.
+
+    Returns:
+        The log-likelihood gain of each stretch [S] over a camera that stands still, and the start; None if
+        the poses cover less than half of the points, or there are none.
+    """
+    if not len(followed.stretch) or len(t_ns) < 2:
+        return None
+    search = _search(_path(t_ns, position, quaternion_xyzw, max_gap_ns), followed)
+    possible = np.isfinite(search.gain)
+    if not possible.any():
+        return None
+    start_s, _ = search.likeliest(possible)
+    return search.explained(start_s), int(t_ns[0]) + round(start_s * 1e9)
+
+
+def explains_better(gain: Float, other: Float) -> bool:
+    """Test if gains of `explain_motion` [S] are clearly above others of the same video, or above 0."""
+    return _is_clear(gain - other)
+
+
 def _path(t_ns: Int64, position: Float, quaternion_xyzw: Float, max_gap_ns: int) -> _Path:
     from scipy.ndimage import gaussian_filter1d
 

@@ -76,12 +76,12 @@ def drone_of(flight: SyntheticFlight, k: int, *, tilted: bool = True) -> DroneTr
         longitude_deg=np.array([place.longitude_deg for place in places]),
         altitude_m=np.array([place.altitude_m for place in places]),
         body=body,
-        body_ypr_deg=_angles(rotate(body, np.array([1.0, 0, 0])), -rotate(body, np.array([0, 1.0, 0]))),
-        gimbal_ypr_deg=_angles(axes[:, :, 2], axes[:, :, 0]),
+        body_ypr_deg=angles_of(rotate(body, np.array([1.0, 0, 0])), -rotate(body, np.array([0, 1.0, 0]))),
+        gimbal_ypr_deg=angles_of(axes[:, :, 2], axes[:, :, 0]),
     )
 
 
-def _angles(ahead: Float, right: Float) -> Float:
+def angles_of(ahead: Float, right: Float) -> Float:
     """Compute yaw, pitch, roll [N, 3] (deg) of an FRD body in NED, from its nose and right side in ENU."""
     yaw = np.arctan2(ahead[:, 0], ahead[:, 1])  # from north to east
     pitch = np.arcsin(np.clip(ahead[:, 2], -1, 1))  # up

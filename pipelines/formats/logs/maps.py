@@ -1,4 +1,4 @@
-"""Maps in logs: octomap_msgs/Octomap, nav_msgs/OccupancyGrid and sensor_msgs/PointCloud2.
+"""Maps in logs: octomap_msgs/Octomap, nav_msgs/OccupancyGrid, sensor_msgs/PointCloud2 and PointCloud.
 
 Consecutive octomaps and floor plans of a topic replace each other, as they did in flight. So every change is
 a map of its own, with the stamp from which it is valid. A log of any length needs the memory of its largest
@@ -29,7 +29,8 @@ from pipelines.session.records import Message, Occupancy, Trajectory
 
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-MAP_TYPES = (OCTOMAP, OCCUPANCY_GRID, POINT_CLOUD)
+_CLOUDS = (POINT_CLOUD, "sensor_msgs/msg/PointCloud")
+MAP_TYPES = (OCTOMAP, OCCUPANCY_GRID, *_CLOUDS)
 
 MOST_MAPS = 100
 """Limit of the maps kept; a replay computes the distance field of each, which takes seconds if large."""
@@ -91,7 +92,7 @@ def read_maps(read: Callable[[], Iterator[Message]], type_: str, about: MapTopic
     Raises:
         DataError: no map is usable, or one is too large.
     """
-    if type_ == POINT_CLOUD:
+    if type_ in _CLOUDS:
         return _accumulated(read(), about)
     return _changing(read, about)
 
@@ -369,11 +370,13 @@ def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
 
 
 def cloud_points(value: Any, source: str) -> Float:
-    """Return the points [N, 3] of a PointCloud2 in its own frame; NaN stays NaN.
+    """Return the points [N, 3] of a PointCloud2 or PointCloud in its own frame; NaN stays NaN.
 
     Raises:
         DataError: no x, y, z of float32 or float64, or fewer bytes than the message states.
     """
+    if hasattr(value, "points"):  # the PointCloud of ROS 1
+        return np.array([(at.x, at.y, at.z) for at in value.points], dtype=np.float64).reshape(-1, 3)
     width, height, stride = int(value.width), int(value.height), int(value.point_step)
     order = ">" if value.is_bigendian else "<"
     fields = {str(each.name): each for each in value.fields}

@@ -446,6 +446,18 @@ def test_cloud_is_that_of_a_file(tmp_path: Path, container: Container) -> None:
     assert list(found.dropped.values()) == [1]
 
 
+@pytest.mark.parametrize("container", ["ros1", "ros2-mcap"])
+def test_the_old_point_cloud_is_read_like_the_new_one(tmp_path: Path, container: Container) -> None:
+    points = [dict(zip("xyz", point.tolist(), strict=True)) for point in POINTS]
+    new = cloud_entry(cloud_fields(POINTS), T0)
+    old = Entry(
+        new.topic, "sensor_msgs/msg/PointCloud", T0, {"header": new.fields["header"], "points": points}
+    )
+    found = Read(tmp_path, [old], container=container)
+    same(found.only, Read(tmp_path / "new", [new], container=container).only)
+    assert list(found.dropped.values()) == [1]
+
+
 @settings(deadline=None)
 @given(
     points=arrays(

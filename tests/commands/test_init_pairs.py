@@ -1,0 +1,102 @@
+"""`mocap init` with several videos and drones' logs whose names say nothing: times and motion pair them."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from pipelines.draft import draft
+from pipelines.formats.poses.tum import FORMAT as TUM
+from pipelines.geometry.geodesy import place_at
+from pipelines.geometry.poses import matrix_from_quaternion
+from tests.synthetic.drone_logs import (
+    HOME,
+    DroneTruth,
+    angles_of,
+    ulog_rows,
+    write_dataflash,
+    write_ulog,
+)
+from tests.synthetic.videos import even_ticks, write_video
+
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
+NIGHT_NS = 3_600_000_000_000
+
+
+def drone_of_sample(name: str, later_ns: int = 0) -> DroneTruth:
+    """Return what a drone of the sample flight would log with its camera on a gimbal."""
+    flown = TUM.read_trajectory(SAMPLE / "truth" / f"{name}.tum")
+    axes = matrix_from_quaternion(flown.quaternion_xyzw)
+    places = [place_at(row, HOME) for row in flown.position]
+    count = len(flown.t_ns)
+    return DroneTruth(
+        t_ns=flown.t_ns + later_ns,
+        enu=flown.position,
+        latitude_deg=np.array([place.latitude_deg for place in places]),
+        longitude_deg=np.array([place.longitude_deg for place in places]),
+        altitude_m=np.array([place.altitude_m for place in places]),
+        body=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        body_ypr_deg=np.tile([90.0, 0.0, 0.0], (count, 1)),  # level, heading east
+        gimbal_ypr_deg=angles_of(axes[:, :, 2], axes[:, :, 0]),
+    )
+
+
+def cameras_of(folder: Path) -> dict[str, Any]:
+    stated = YAML(typ="safe", pure=True).load(draft([folder]).text)
+    cameras: dict[str, Any] = stated["cameras"]
+    return cameras
+
+
+def made_at(path: Path, t_ns: int) -> None:
+    """Copy a video with the time of its creation in its metadata."""
+    moved = path.with_name("moved.mp4")
+    with av.open(str(path)) as source, av.open(str(moved), "w") as target:
+        made = datetime.fromtimestamp(t_ns // 10**9, UTC)
+        target.metadata["creation_time"] = made.isoformat()
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    moved.replace(path)
+
+
+def test_videos_and_logs_of_one_flight_are_paired_by_motion(tmp_path: Path) -> None:
+    shutil.copyfile(SAMPLE / "drone1.mp4", tmp_path / "north.mp4")
+    shutil.copyfile(SAMPLE / "drone2.mp4", tmp_path / "lake.mp4")
+    write_ulog(tmp_path / "log_11_07.ulg", ulog_rows(drone_of_sample("drone2")))
+    write_dataflash(tmp_path / "00000042.bin", drone_of_sample("drone1"))
+    cameras = cameras_of(tmp_path)
+    assert cameras["north"]["pose"] == {"ardupilot": "00000042.bin", "assumed": True}
+    assert cameras["lake"]["pose"] == {"ulog": "log_11_07.ulg", "assumed": True}
+    true = YAML(typ="safe", pure=True).load((SAMPLE / "flight.yaml").read_text())["cameras"]
+    for name, drone in (("north", "drone1"), ("lake", "drone2")):
+        start_s = float(cameras[name]["frame_times"]["start"])
+        assert start_s == pytest.approx(float(true[drone]["frame_times"]["start"]), abs=0.1)
+
+
+def test_videos_and_logs_of_different_hours_are_paired_by_time(tmp_path: Path) -> None:
+    first = drone_of_sample("drone1")
+    for name, later_ns in (("a", 0), ("b", NIGHT_NS)):
+        write_ulog(
+            tmp_path / f"log_{3 if later_ns else 8}.ulg", ulog_rows(drone_of_sample("drone1", later_ns))
+        )
+        write_video(tmp_path / f"{name}.mp4", even_ticks(60))
+        made_at(tmp_path / f"{name}.mp4", int(first.t_ns[0]) + later_ns + 3_000_000_000)
+    cameras = cameras_of(tmp_path)
+    assert cameras["a"]["pose"] == {"ulog": "log_8.ulg", "assumed": True}
+    assert cameras["b"]["pose"] == {"ulog": "log_3.ulg", "assumed": True}
+
+
+def test_videos_that_show_no_motion_are_not_paired(tmp_path: Path) -> None:
+    for name, drone in (("north", "drone1"), ("lake", "drone2")):
+        write_video(tmp_path / f"{name}.mp4", even_ticks(60))
+        write_ulog(tmp_path / f"log_{drone[-1]}7.ulg", ulog_rows(drone_of_sample(drone)))
+    assert not any("pose" in camera for camera in cameras_of(tmp_path).values())
