@@ -130,7 +130,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--write", action="store_true", help="write the section of docs/results.md")
     arguments = parser.parse_args()
-    chosen = _chosen(arguments.flights, arguments.detector)
+    chosen = chosen_flights(arguments.flights, arguments.detector)
     methods = arguments.methods or list(ALWAYS)
     parts = [name for name in METHODS if not arguments.methods]
     found = measured(
@@ -145,8 +145,8 @@ def main() -> None:
         keep_numbers("accuracy", {arguments.detector: [f"    {command}", "", *lines]})
 
 
-def _chosen(names: Sequence[str], detector: str) -> list[Flight]:
-    """Choose flights by half or name; say which of them are not here."""
+def chosen_flights(names: Sequence[str], detector: str) -> list[Flight]:
+    """Choose flights by half (tuning, kept, all) or name; say which of them are not here."""
     halves: list[Half] = [half for half in HALVES if half in names or "all" in names]
     chosen = [f for f in flights() if f.half in halves or f.name in names]
     usable = []

@@ -72,6 +72,7 @@ _SLOW_S = 10.0  # over which slow errors are counted in the level of all errors
 _UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1] / 10)
 """Start of estimated levels. White positions that are free by more confuse far and near points at first."""
 
+_USUAL_ARM_M = 0.05  # constant shift in the camera: a lever arm that is wrong
 _DRAWS = 32  # of the posterior
 _LEVEL_ROUNDS = 6
 _LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; below it MacKay's rule leaps
@@ -93,7 +94,7 @@ class PosePrior:
         """Build the prior from stated pose errors; None for unknown ones."""
         if errors is None:
             slow = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]), _unknown(ROTATION, _UNKNOWN_RATE[1])
-            return cls(_UNKNOWN_WHITE, (*UNKNOWN_SIGMA, 0.0), slow, estimated=True)
+            return cls(_UNKNOWN_WHITE, (*UNKNOWN_SIGMA, _USUAL_ARM_M), slow, estimated=True)
         constant = dict.fromkeys((SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA), 0.0)
         changing: dict[int, list[Process]] = {SHIFT_IN_WORLD: [], ROTATION: []}
         for process in errors.processes:

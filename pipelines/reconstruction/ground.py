@@ -572,20 +572,23 @@ def _prior_sigma(cameras: Sequence[Camera]) -> Float:
 
 
 def _bent(camera: Camera) -> float:
-    """Compute the standard deviation (m) of what slow errors leave in a camera's constant position error.
+    """Compute the standard deviation (m) of what slow errors leave in the places of a camera's points.
 
-    The stills show it at some times; over a flight that is longer than an error lasts, it averages out.
+    An error that grows evenly over the path stretches the cloud: by its size over the path's length, which is
+    sqrt(12) times its standard deviation. Over a flight that is longer than an error lasts, it averages out.
     """
     if camera.static or camera.errors is None:
         return 0.0
     span_s = float(camera.frame_t_ns[-1] - camera.frame_t_ns[0]) / 1e9
+    way_m = float(np.linalg.norm(np.ptp(camera.trajectory.position, axis=0)))
+    stretched = max(np.sqrt(12) * _USUAL_RANGE_M / max(way_m, EXACT), 1.0)
     variance = 0.0
     for process in camera.errors.processes:
         if not process.constant:
             arm_m = _USUAL_RANGE_M if process.number == ROTATION else 1.0
             lasts = min(2 * process.correlation_s / max(span_s, EXACT), 1.0)
             variance += lasts * (arm_m * process.sigma0) ** 2
-    return float(np.sqrt(variance))
+    return float(stretched * np.sqrt(variance))
 
 
 def _solve(matches: _Matches, prior: Float, of_pairs_m: Float) -> tuple[_Solution, Bool]:
@@ -677,11 +680,7 @@ def _bound(
         own = float(np.trace(solution.covariance[place, place] - of_group)) / 3
         relative = own * len(group) / (len(group) - 1)
         sigma = float(
-            np.sqrt(
-                max(relative, 0.0)
-                + (0.0 if camera.static else _CAMERA_SIGMA_M**2 + _bent(camera) ** 2)
-                + EXACT**2
-            )
+            np.sqrt(max(relative, 0.0) + (0.0 if camera.static else _CAMERA_SIGMA_M) ** 2 + EXACT**2)
         )
         left_m[camera.name] = sigma
         turned = slice(3 * (total + c), 3 * (total + c) + 3)

@@ -185,9 +185,18 @@ def load_pose_errors(
 
 
 def _prior_of(models: Sequence[NoiseModel], camera: Camera) -> PoseErrors:
-    """Build the prior from stated models; for models of plug-ins, from the size of their errors alone."""
+    """Build the prior from stated models; for models of plug-ins, from the size of their errors alone.
+
+    A drift begins with the log, and has a size already in the first picture.
+    """
     try:
-        return pose_errors(models)
+        errors = pose_errors(models)
+        elapsed_s = max(float(camera.frame_t_ns[0] - camera.trajectory.t_ns[0]) / 1e9, 0.0)
+        processes = (
+            replace(process, sigma0=float(np.hypot(process.sigma0, process.rate * np.sqrt(elapsed_s))))
+            for process in errors.processes
+        )
+        return replace(errors, processes=tuple(processes))
     except ValueError:
         level = np.array(UNKNOWN_SIGMA) if camera.sigma is None else np.median(camera.sigma, axis=0)
         return errors_of_level(level)
