@@ -454,6 +454,7 @@ def test_the_old_point_cloud_is_read_like_the_new_one(tmp_path: Path, container:
         new.topic, "sensor_msgs/msg/PointCloud", T0, {"header": new.fields["header"], "points": points}
     )
     found = Read(tmp_path, [old], container=container)
+    (tmp_path / "new").mkdir()
     same(found.only, Read(tmp_path / "new", [new], container=container).only)
     assert list(found.dropped.values()) == [1]
 
