@@ -482,3 +482,27 @@ def test_a_rolling_shutter_does_not_bend_the_background(shutter: str) -> None:
     assert entries["drone1"]["used"]
     changing_deg = float(np.std(left - left.mean(axis=0)))
     assert changing_deg > 0.08 if shutter == "rolling, not stated" else changing_deg < 0.04
+
+
+def test_an_unstated_lever_arm_leaves_an_attitude_uncertain() -> None:
+    """A log whose camera is 0.15 m off along its own axes, round an arc of 60 degrees.
+
+    Along the arc this shift turns with the camera. Taken for one in the world it is 0.15 m * 60 deg over 8 m
+    of way, which an attitude error of more than 0.5 deg would explain; its standard deviation was 0.07 deg.
+    """
+    azimuth = np.radians(np.linspace(0, 60, 240))
+    forward = np.stack([-np.cos(azimuth), -np.sin(azimuth), np.full(240, -0.5)], axis=1)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    rotation = np.stack([right, np.cross(forward, right), forward], axis=2)
+    position = 8 * np.stack([np.cos(azimuth), np.sin(azimuth), np.full(240, 0.5)], axis=1)
+    rng = np.random.default_rng(4)
+    picture, point, xy = sighted(position, rotation, rng)
+    arm = rotation @ np.array([0.1, -0.05, 0.1])
+    found = adjusted(picture, point, xy, (position + arm, rotation), PosePrior.of(None))
+    assert found.refused is None
+    assert found.left is not None
+    constant = [p.sigma0 for p in found.left.processes if p.number == ROTATION and p.constant]
+    error = errors_deg(found.rotation, rotation).mean(axis=0)
+    assert np.linalg.norm(error) < 4 * np.degrees(np.linalg.norm(constant))

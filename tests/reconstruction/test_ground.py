@@ -1,6 +1,8 @@
 """Position errors between cameras, from pictures of a textured plane that are known in closed form."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -13,8 +15,9 @@ from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, UNKNOWN_SIGMA, Po
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks
 from pipelines.reconstruction.ground import bind_positions
+from pipelines.reconstruction.loading import load_pose_errors
 from pipelines.reconstruction.observations import Camera
-from pipelines.session.description import Interpolation
+from pipelines.session.description import Description, Interpolation
 from pipelines.session.records import Detections, Trajectory
 
 LENS = Intrinsics(640, 360, 400.0, 400.0, 319.5, 179.5)
@@ -231,3 +234,15 @@ def test_one_camera_alone_is_not_bound(missing: str) -> None:
     assert binding.bound == ()
     assert set(binding.reasons) == {each.name for each in cameras}
     assert binding.cameras == cameras
+
+
+def test_a_drift_has_a_size_in_the_first_picture() -> None:
+    """The log begins 4 s before the video: the walk has gone on for 4 s by then."""
+    (made, _), *_ = scene()
+    log = made.trajectory
+    early = replace(made, errors=None, trajectory=replace(log, t_ns=log.t_ns - 4_000_000_000))
+    description = cast(Description, SimpleNamespace(cameras={made.name: None}))
+    noise = "drift:position_m_per_sqrt_s=0.06,rotation_deg_per_sqrt_s=0.3"
+    (found,) = load_pose_errors(description, [early], noise) or []
+    sigma = {process.number: process.sigma0 for process in found.processes}
+    assert sigma == pytest.approx({SHIFT_IN_WORLD: 0.12, ROTATION: np.radians(0.6)}, rel=1e-6)
