@@ -70,6 +70,7 @@ _FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
 _KEYS: dict[str, Literal["dji", "ulog", "ardupilot", "tlog", "gopro"]] = {
     "dji": "dji",
     "dji_record": "dji",
+    "picture_tags": "dji",
     "ulog": "ulog",
     "ardupilot": "ardupilot",
     "tlog": "tlog",

@@ -51,8 +51,8 @@ _BEGINNINGS = (
 
 # Kinds that are known by their first bytes but not read, and the step that makes them usable.
 _UNREAD = (
-    (re.compile(rb"\xff\xd8\xff"), "a JPEG picture", "join a sequence of pictures to a video, by ffmpeg"),
-    (re.compile(rb"\x89PNG\r\n"), "a PNG picture", "join a sequence of pictures to a video, by ffmpeg"),
+    (re.compile(rb"\xff\xd8\xff"), "a JPEG picture", "of a sequence of pictures, name the folder"),
+    (re.compile(rb"\x89PNG\r\n"), "a PNG picture", "of a sequence of pictures, name the folder"),
     (re.compile(rb"P[1-6]\s"), "a PGM picture", "of a floor plan, name the .yaml beside it"),
     (re.compile(rb"(?s).{4}ftyp|\x1aE\xdf\xa3|RIFF....AVI "), "a video without pictures", _COPY),
     (re.compile(rb"%PDF"), "a PDF document", ""),

@@ -11,6 +11,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
+from pipelines.formats.videos.picture_folder import UNTIMED, taken_ns
 from pipelines.formats.videos.picture_motion import followed_points
 from pipelines.formats.videos.video import black_bars, created_ns
 from pipelines.geometry.arrays import Int64
@@ -133,6 +134,12 @@ class FlightCameras:
                 f"cameras.{name}: nothing says when its frames were taken",
                 "write frame_times: {start: SECONDS, fps: 30}",
             )
+        if video is not None and video.codec == UNTIMED:
+            raise DataError(
+                self._manifest,
+                f"cameras.{name}: its pictures have no times in EXIF that rise from one to the next",
+                "write frame_times: {start: SECONDS, fps: 30}, or give a csv",
+            )
         if logged is None:
             return replace(pictures, t_ns=self._start_ns(name, camera, times) + pictures.pts_ns)
         if times.has_start or times.start_from == "container":
@@ -183,14 +190,14 @@ class FlightCameras:
         if times.start_from is None:
             return times.start_ns
         path = self._base / (camera.video.path or "") if camera.video else None
-        made_ns = created_ns(path) if path is not None and camera.video and camera.video.path else None
+        made_ns = _made_ns(path) if path is not None and camera.video and camera.video.path else None
         if made_ns is None:
             raise DataError(
                 path or self._manifest,
                 "does not say when it was made",
                 f"write frame_times: {{start: SECONDS}} for camera {name}",
             )
-        if camera.clock is None:
+        if camera.clock is None and path is not None and not path.is_dir():
             self._note(
                 f"{name}: its video says that it was made at {made_ns / 1e9:.0f} s, to a second at best:"
                 " say clock: {sigma_s: 1}"
@@ -289,7 +296,8 @@ class FlightCameras:
             intrinsics = replace(intrinsics, readout_s=source.readout_s)
         if size := self._picture_size(camera, video, detections):
             bars = (0, 0, 0, 0)
-            if camera.video and camera.video.path and not is_resized(intrinsics, *size):
+            folder = bool(camera.video and camera.video.path and (self._base / camera.video.path).is_dir())
+            if camera.video and camera.video.path and not folder and not is_resized(intrinsics, *size):
                 bars = black_bars(self._base / camera.video.path)
             try:
                 intrinsics, note = fit_to_size(intrinsics, *size, bars)
@@ -329,6 +337,13 @@ def _ticks_ns(count: int, fps: Fraction) -> Int64:
     """Return the times of `count` frames from 0, each rounded to a ns; Python's integers never overflow."""
     period = Fraction(1_000_000_000) / fps
     return np.array([round(k * period) for k in range(count)], dtype=np.int64)
+
+
+def _made_ns(path: Path) -> int | None:
+    if not path.is_dir():
+        return created_ns(path)
+    times = taken_ns(path)
+    return None if times is None else int(times[0])
 
 
 def _with_size(intrinsics: Intrinsics, size: tuple[int, int] | None, source: Path) -> Intrinsics:

@@ -8,6 +8,7 @@ from typing import Protocol, Self
 
 from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.pictures import KNOWN, decode, is_known, later_pictures
+from pipelines.formats.videos.picture_folder import FolderPictures
 from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.arrays import Picture
 from pipelines.session.description import Description, MediaEntry
@@ -42,11 +43,15 @@ def open_pictures(session: Path, description: Description, camera: str) -> Itera
     refuse_changed_pictures(session, description, [camera])
     paths = [session / path for path in media.paths]
     opened: Pictures = (
-        VideoReader(paths[0]) if media.topic is None else LoggedPictures(paths, media.topic, media.stamps)
+        _filed(paths[0]) if media.topic is None else LoggedPictures(paths, media.topic, media.stamps)
     )
     with opened as pictures:
         yield pictures
     refuse_changed_pictures(session, description, [camera])
+
+
+def _filed(path: Path) -> VideoReader | FolderPictures:
+    return FolderPictures(path) if path.is_dir() else VideoReader(path)
 
 
 def refuse_changed_pictures(session: Path, description: Description, cameras: Iterable[str]) -> None:

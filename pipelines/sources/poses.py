@@ -648,8 +648,8 @@ def _kind(pose: PoseSource) -> str:
 
 
 def _reader(kind: str, path: Path) -> Format:
-    """Return the format of a drone's own log; DJI's comes as subtitles or as a flight record."""
-    several = ("dji_record", "dji_binary") if kind == "dji" else ()
+    """Return the format of a drone's own log; DJI's comes as subtitles, flight record or pictures."""
+    several = ("dji_record", "dji_binary", "picture_tags") if kind == "dji" else ()
     return next(
         (found for name in several if (found := FORMATS.get(name)).recognises(path)), FORMATS.get(kind)
     )

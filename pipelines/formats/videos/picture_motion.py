@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.videos.picture_folder import FolderPictures
 from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.arrays import Float, Float32, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics, rescaled, undistort
@@ -32,7 +33,7 @@ def followed_points(path: Path, intrinsics: Intrinsics, pts_ns: Int64) -> Follow
     begins: list[Float] = []
     ends: list[Float] = []
     spans: list[tuple[int, int]] = []
-    with VideoReader(path) as reader:
+    with FolderPictures(path) if path.is_dir() else VideoReader(path) as reader:
         before: _Grey | None = None
         first = last = 0
         begin = end = np.zeros((0, 1, 2), np.float32)

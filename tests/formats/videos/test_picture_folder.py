@@ -1,0 +1,135 @@
+"""Folders of pictures: EXIF written by Pillow, XMP by DJI's names, pixels by OpenCV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from pipelines.formats.drone_logs import picture_tags
+from pipelines.formats.videos import picture_folder
+from pipelines.formats.videos.picture_folder import UNTIMED, FolderPictures
+from pipelines.geometry.poses import rotate
+from pipelines.session.registries import VideoFormat, recognise
+from pipelines.session.telemetry import TelemetryChoice
+from tests.commands.runner import refused, succeeds
+
+READER: VideoFormat = picture_folder.FORMAT
+TAGS = picture_tags.FORMAT
+COUNT = 4
+START_NS = 1704164645_250_000_000  # 2024-01-02 03:04:05.25
+XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GpsLatitude="{lat:.9f}"
+ drone-dji:GpsLongtitude="11.5" drone-dji:RelativeAltitude="+30.{k}0" drone-dji:AbsoluteAltitude="+530.00"
+ drone-dji:GimbalYawDegree="+90.00" drone-dji:GimbalPitchDegree="-30.00" drone-dji:GimbalRollDegree="+0.00"
+ drone-dji:FlightYawDegree="+45.00" drone-dji:FlightPitchDegree="0.00" drone-dji:FlightRollDegree="0.00"
+ drone-dji:RtkFlag="50" drone-dji:RtkStdLon="0.03" drone-dji:RtkStdLat="0.04"/></x:xmpmeta>"""
+
+
+def write(folder: Path, *, exif: bool = True, xmp: bool = True, offset: str | None = None) -> Path:
+    """Write pictures 9, 10, 11, ... half a second apart: the order of numbers is not that of text."""
+    folder.mkdir(exist_ok=True)
+    for k in range(COUNT):
+        path = folder / f"DJI_{9 + k}.JPG"
+        picture = Image.fromarray(np.full((48, 64, 3), 40 * k, np.uint8))
+        tags = Image.Exif()
+        if exif:
+            half = 25 + 50 * k
+            own = {36867: f"2024:01:02 03:04:{5 + half // 100:02d}", 37521: f"{half % 100:02d}"}
+            tags[0x8769] = own | ({36881: offset} if offset else {})
+        text = XMP.format(lat=48.1 + 1e-6 * k, k=k).encode()
+        extra = {"xmp": text} if xmp else {}
+        picture.save(path, "JPEG", quality=95, exif=tags, **extra)
+    return folder
+
+
+def test_pictures_are_in_the_order_of_their_numbers_with_exif_times(tmp_path: Path) -> None:
+    folder = write(tmp_path / "film")
+    assert recognise(folder, VideoFormat, "video") is READER
+    index = READER.index(folder)
+    assert index.pts_ns.tolist() == [500_000_000 * k for k in range(COUNT)]
+    assert (index.start_ns, index.width, index.height) == (START_NS, 64, 48)
+    with FolderPictures(folder) as pictures:
+        grey = [float(picture.mean()) for _, picture in pictures.frames()]
+        assert pictures.read(COUNT) is None
+    np.testing.assert_allclose(grey, [0, 40, 80, 120], atol=1.5)  # JPEG of an even grey
+
+
+def test_a_stated_zone_moves_to_utc(tmp_path: Path) -> None:
+    assert READER.index(write(tmp_path / "film", offset="+01:00")).start_ns == START_NS - 3600 * 10**9
+
+
+def test_tags_of_dji_are_poses(tmp_path: Path) -> None:
+    folder = write(tmp_path / "film")
+    assert TAGS.recognises(folder)
+    telemetry = TAGS.read_telemetry(folder, TelemetryChoice())
+    assert telemetry.position.t_ns.tolist() == [START_NS + 500_000_000 * k for k in range(COUNT)]
+    expected = [[48.1 + 1e-6 * k, 11.5, 30 + 0.1 * k] for k in range(COUNT)]
+    np.testing.assert_allclose(telemetry.position.values, expected, rtol=0, atol=1e-9)
+    assert telemetry.position.height == "take-off"
+    assert telemetry.gimbal is not None
+    assert telemetry.body is not None
+    looks = rotate(telemetry.gimbal.quaternion_xyzw[0], np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(looks, [np.cos(np.pi / 6), 0, -0.5], atol=1e-9)  # east, 30 deg down
+    nose = rotate(telemetry.body.quaternion_xyzw[0], np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(nose, [np.sqrt(0.5), np.sqrt(0.5), 0], atol=1e-9)  # north-east
+    assert any("0.050 m" in note for note in telemetry.notes)  # of 0.03 and 0.04 m
+    absolute = TAGS.read_telemetry(folder, TelemetryChoice(altitude="absolute"))
+    assert absolute.position.values[:, 2].tolist() == [530.0] * COUNT
+
+
+def test_damaged_pictures_are_counted_and_missing_pictures_keep_the_numbers(tmp_path: Path) -> None:
+    folder = write(tmp_path / "film")
+    (folder / "DJI_11.JPG").write_bytes(b"\xff\xd8\xff")
+    telemetry = TAGS.read_telemetry(folder, TelemetryChoice())
+    assert telemetry.dropped["no time"] == 1
+    with FolderPictures(folder) as pictures:
+        assert [number for number, _ in pictures.frames()] == [0, 1, 3]
+    assert READER.index(folder).codec == UNTIMED
+
+
+@pytest.mark.parametrize("others", [0, 5])
+def test_folders_of_other_files_are_no_sequence(tmp_path: Path, others: int) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4, 3), np.uint8))
+    if others:
+        cv2.imwrite(str(tmp_path / "b.png"), np.zeros((4, 4, 3), np.uint8))
+    for k in range(others):
+        (tmp_path / f"{k}.bag").touch()
+    assert not READER.recognises(tmp_path)
+    assert not TAGS.recognises(tmp_path)
+
+
+MANIFEST = """schema: 1
+cameras:
+  drone1:
+    video: film
+    frame_times: {times}
+    pose: {{dji: film}}
+    intrinsics: {{width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5}}
+"""
+
+
+def test_a_flight_of_pictures_has_their_times_and_poses(tmp_path: Path) -> None:
+    write(tmp_path / "film")
+    manifest = tmp_path / "flight.yaml"
+    manifest.write_text(MANIFEST.format(times="{start_from: container}"))
+    succeeds("ingest", manifest)
+    stored = pd.read_parquet(tmp_path / "flight.session/cameras/drone1/frames.parquet")
+    assert stored["t_ns"].tolist() == [START_NS + 500_000_000 * k for k in range(COUNT)]
+    poses = pd.read_parquet(tmp_path / "flight.session/cameras/drone1/poses.parquet")
+    assert len(poses) == COUNT
+    assert poses["z"].iloc[-1] - poses["z"].iloc[0] == pytest.approx(0.3, abs=1e-5)
+
+
+def test_pictures_without_times_need_a_rate(tmp_path: Path) -> None:
+    write(tmp_path / "film", exif=False)
+    manifest = tmp_path / "flight.yaml"
+    text = MANIFEST.format(times="{start: 0}").replace("pose: {dji: film}", "pose: {tum: poses.tum}")
+    manifest.write_text(text)
+    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n5 1 0 0 0 0 0 1\n")
+    assert "fps" in refused("ingest", manifest)
+    manifest.write_text(text.replace("{start: 0}", "{start: 0, fps: 2}"))
+    succeeds("ingest", manifest)
