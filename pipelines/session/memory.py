@@ -8,6 +8,7 @@ import pickle
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TypeVar
+from weakref import WeakSet
 
 T = TypeVar("T")
 
@@ -37,7 +38,7 @@ class Waiting:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._maps: list[mmap.mmap] = []
+        self._maps: WeakSet[mmap.mmap] = WeakSet()  # a file goes with the last array in it
 
     def put(self, value: T) -> T:
         """Return a copy of a value whose arrays are in a file."""
@@ -56,7 +57,7 @@ class Waiting:
             file.truncate(end)
             file.flush()
             mapped = mmap.mmap(file.fileno(), end)
-        self._maps.append(mapped)
+        self._maps.add(mapped)
         whole = memoryview(mapped)
         copy: T = pickle.loads(head, buffers=[whole[place] for place in places])  # noqa: S301  # our own
         return copy
