@@ -666,6 +666,7 @@ def main() -> None:
     print("| flight | mistake | error mm | first doubt | named | after the remedy mm |")
     print("| --- | --- | --- | --- | --- | --- |")
     tallies: dict[int, list[tuple[bool, bool, bool]]] = {2: [], 3: []}
+    by_mistake: dict[str, list[tuple[bool, bool, bool]]] = {}
     for flight in KEPT_ASIDE if options.kept else FLIGHTS:
         if options.flights and flight.name not in options.flights:
             continue
@@ -680,11 +681,17 @@ def main() -> None:
                 tally = tried(described, mistake, right or float("nan"))
                 if tally is not None:
                     tallies[flight.drones].append(tally)
+                    by_mistake.setdefault(mistake.name, []).append(tally)
     for drones, found in tallies.items():
         if found:
             doubted, named, mended = (sum(column) for column in zip(*found, strict=True))
             print(f"{drones} drones: {len(found)} mistakes that cost more than 20 %: {doubted} doubted,")
             print(f"{named} named first ({named / len(found):.0%}), {mended} of those mended by the remedy")
+    print("\n| mistake | named | mended |\n| --- | --- | --- |")
+    for mistake in MISTAKES:
+        if made := by_mistake.get(mistake.name):
+            _, named, mended = (sum(column) for column in zip(*made, strict=True))
+            print(f"| {mistake.name} | {named} of {len(made)} | {mended} |")
 
 
 def tried(described: Described, mistake: Mistake, right: float) -> tuple[bool, bool, bool] | None:
