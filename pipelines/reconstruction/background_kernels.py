@@ -80,6 +80,14 @@ def _sighting(
 
 
 @helper
+def _hold(normal: Float) -> None:
+    """Make a point's equations positive definite; a point behind all of its pictures stays where it is."""
+    for i in range(3):
+        sighted = normal[0, 0] + normal[1, 1]
+        normal[i, i] += 1e-9 * sighted if sighted > 0.0 else 1.0
+
+
+@helper
 def _factor3(a: Float) -> None:
     """Replace a symmetric 3x3 matrix by its lower Cholesky factor."""
     for j in range(3):
@@ -132,8 +140,7 @@ def settle_points(
                         force[i] += weight * by_point[a, i] * residual[a]
                         for k in range(3):
                             normal[i, k] += weight * by_point[a, i] * by_point[a, k]
-            for i in range(3):
-                normal[i, i] += 1e-9 * (normal[0, 0] + normal[1, 1])
+            _hold(normal)
             _factor3(normal)
             _move(points, n, _solve3(normal, force))
 
@@ -231,8 +238,7 @@ def eliminate_points(
                         mixed[i, k] += share * by_point[a, k]
                     for k in range(i + 1):
                         band[at + k, i - k] += share * by_pose[a, k]
-        for i in range(3):
-            normal[i, i] += 1e-9 * (normal[0, 0] + normal[1, 1])
+        _hold(normal)
         _factor3(normal)
         # Whitened: mixed F^-T, and F^-1 pull.
         for i in range(3):

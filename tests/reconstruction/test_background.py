@@ -30,6 +30,7 @@ from pipelines.geometry.poses import (
 from pipelines.reconstruction import background_adjustment
 from pipelines.reconstruction.background import refine_cameras
 from pipelines.reconstruction.background_adjustment import Adjusted, Background, PosePrior, SeenPoints, adjust
+from pipelines.reconstruction.background_kernels import Points, Sightings, eliminate_points, settle_points
 from pipelines.reconstruction.background_tracks import Followed, Tracks, follow, off_people
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
@@ -359,6 +360,22 @@ def test_a_camera_of_which_nothing_is_seen_keeps_its_logged_poses(posed: bool, r
     assert reason in found.refused
     np.testing.assert_array_equal(found.position, position)
     np.testing.assert_allclose(found.covariance, PRIOR.covariance(40))
+
+
+def test_a_point_behind_all_of_its_pictures_spoils_nothing() -> None:
+    rays, sides = np.zeros((3, 2)), np.eye(3)[None, :2].copy()
+    seen = Sightings(np.array([0, 3]), np.arange(3), rays, 1e-3)
+    points = Points(np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.full(1, 0.05), sides)
+    place, turned, prior = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)), np.array([0.0, 0.01])
+    settle_points(seen, points, place, turned, 1.0, prior, 8)
+    np.testing.assert_array_equal(points.direction, [[0.0, 0.0, -1.0]])
+    assert np.isfinite(points.inverse_depth).all()
+    band, force, missed, kept = np.zeros((18, 18)), np.zeros(18), np.zeros(3), np.zeros((1, 12))
+    eliminate_points(seen, points, place, turned, 1.0, prior, 6 * np.arange(3), band, force, missed, kept)
+    assert not band.any()
+    assert not force.any()
+    assert np.isnan(missed).all()
+    assert np.isfinite(kept).all()
 
 
 def test_pictures_without_a_pose_stay_without() -> None:
