@@ -61,6 +61,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.legs
 	$(BIN)/python -m benchmarks.refine --seeds 1 --times 150
 	$(BIN)/python -m benchmarks.refine_clocks
+	$(BIN)/python -m benchmarks.seams
 	$(BIN)/python -m benchmarks.batch
 
 # Every table and figure of docs/results.md again, in some fifteen minutes.

@@ -38,7 +38,7 @@ _FPS, _LIVED, _BORN = 30, 30, 4
 _WHITE = White(position_m=0.02, rotation_deg=0.2)
 _NOISE: dict[str, Sequence[NoiseModel]] = {
     "white, constant 0.05 m": (_WHITE, Bias(position_m=0.05, rotation_deg=0.3)),
-    "white, 0.3 m that last for 20 s": (
+    "white, 0.3 m correlated over 20 s": (
         _WHITE,
         GaussMarkov(position_m=0.3, rotation_deg=0.5, correlation_s=20.0),
     ),
