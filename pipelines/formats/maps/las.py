@@ -24,6 +24,7 @@ from pipelines.session.registries import need
 _CHUNK = 1_000_000  # points
 _NOISE = (7, 18)  # low and high noise of ASPRS
 _GEO_KEYS = (3072, 2048)  # GeoTIFF: the projected, or else the geographic system's EPSG number
+_RECORD = 54  # bytes of the shortest variable length record
 _USER_DEFINED = 32767
 _COPY = "copy it again, or export it again"
 
@@ -107,6 +108,7 @@ class _Box:
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     laspy = need("laspy", "las")
+    _refuse_impossible_records(path)
     try:
         with laspy.open(path) as cloud:
             yield cloud
@@ -114,6 +116,15 @@ def _opened(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:  # laspy and its decompressor raise whatever they meet in a damaged header
         raise DataError(path, f"laspy cannot read it ({str(error)[:100]})", _COPY) from error
+
+
+def _refuse_impossible_records(path: Path) -> None:
+    """Refuse a header with more records than the file has room for: laspy would look for each of them."""
+    head = first_bytes(path, 375)
+    counts = [int.from_bytes(head[place : place + 4], "little") for place in (100, 243)]
+    counts = counts if head[25:26] >= b"\x04" and len(head) >= 375 else counts[:1]
+    if len(head) < 227 or sum(counts) * _RECORD > path.stat().st_size:
+        raise DataError(path, f"has a header that is cut off or states {sum(counts)} records", _COPY)
 
 
 def _through(path: Path, cloud: Any, take: Any) -> dict[str, int]:

@@ -132,6 +132,8 @@ def _built(sections: dict[str, list[list[str]]]) -> _Skeleton:
     root = {words[0].lower(): words[1:] for words in sections["root"]}
     order = root.get("order", ["TX", "TY", "TZ", "RX", "RY", "RZ"])
     turned = _turn(root.get("axis", ["XYZ"])[0], root.get("orientation", ["0", "0", "0"]), radians)
+    if any(not re.fullmatch("[tr][xyz]", word.lower()) for word in order):
+        raise ValueError(f"root has {' '.join(order)}")
     bones = {"root": _Bone(axis=turned, dof=tuple(word.lower() for word in order))}
     known: dict[str, _Bone] = {}
     for block in _blocks(sections["bonedata"]):
@@ -147,6 +149,8 @@ def _built(sections: dict[str, list[list[str]]]) -> _Skeleton:
         for child in words[1:] if len(words) > 1 else []:
             if words[0] not in bones:
                 raise ValueError(f"{words[0]} comes before its parent")
+            if child in bones:
+                raise ValueError(f"{child} has two parents")
             known[child].parent = words[0]
             bones[child] = known[child]
     length = float(units.get("length", "1"))
