@@ -201,11 +201,12 @@ def _refined(problem: Problem, part: Bool, filled: Float, prior: _Prior) -> Refi
     del at  # the next solutions have their own factors
     slow = system, state  # determines the poses
     if known.memory > REMEMBERED:
-        joints, own, least = _joints_without_slow_errors(*slow, freely)
-        covariance = _with_own(covariance, own, least, problem.guides, joints)
+        remembering, placed = _joints_without_slow_errors(*slow, freely)
+        joints = placed.position
+        covariance = _with_own(covariance, remembering, placed, problem.guides)
     elif _mainly_slow(problem, known, state):
         slow = _solve_with_loose_motion(problem, known, state)[:2]
-        joints = _joints_without_slow_errors(*slow, freely)[0]
+        joints = _joints_without_slow_errors(*slow, freely)[1].position
     else:
         joints = state.position
     fallback = doubts or _too_far(joints, filled, prior.expected_m)
@@ -270,14 +271,14 @@ def _solve_with_loose_motion(
     return solve(problem, loose, state, rounds=_ROUNDS)
 
 
-def _joints_without_slow_errors(system: System, state: State, known: Knowledge) -> tuple[Float, Float, Float]:
-    """Estimate the joints [T, J, 3] after removing slow pose errors, with the full weight of keypoints.
+def _joints_without_slow_errors(system: System, state: State, known: Knowledge) -> tuple[System, State]:
+    """Estimate the joints after removing slow pose errors, with the full weight of keypoints.
 
     Slow errors were estimated with correlated keypoints weighted less, or with a looser motion prior. That is
     right for slow errors and wrong for limbs: their motion would be smoothed away, or become jittery.
 
-    Returns the positions, and their covariance [T, J, 3, 3] if slow errors were known exactly. In that one,
-    correlated keypoints count less again.
+    Returns the estimate, and a system of the same poses in which correlated keypoints count less again, those
+    of all joints alike.
     """
     pictures = system.problem.pictures
     slow = state._replace(white=np.zeros_like(state.white))
@@ -295,11 +296,8 @@ def _joints_without_slow_errors(system: System, state: State, known: Knowledge) 
     freely = _FAST_MOTION**2 if known.memory > REMEMBERED else 1.0
     weighted = replace(known, memory=1.0, acceleration=freely * known.acceleration)
     initial = initial_state(problem, weighted, state.position)
-    solved, found, at = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
-    del at
-    remembering = System(replace(problem, guides=None), known, solved.layout, BOUND**2)
-    own = covariances(remembering, eliminate(remembering, found))
-    return found.position, own, _of_single_pictures(problem, known.pixel_scale, found.position)
+    solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
+    return System(replace(problem, guides=None), known, solved.layout, BOUND**2), found
 
 
 def _of_single_pictures(problem: Problem, pixel_scale: float, position: Float) -> Float:
@@ -322,7 +320,7 @@ def _of_single_pictures(problem: Problem, pixel_scale: float, position: Float) -
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
-def _with_own(covariance: Float, own: Float, least: Float, guides: Bool | None, position: Float) -> Float:
+def _with_own(covariance: Float, system: System, state: State, guides: Bool | None) -> Float:
     """Compute covariances [T, J, 3, 3] of joints: each has its own error, and one by slow pose errors.
 
     Where keypoint errors last longer than motion is smooth, a joint's own error is that of a single picture.
@@ -330,11 +328,13 @@ def _with_own(covariance: Float, own: Float, least: Float, guides: Bool | None, 
 
     Args:
         covariance: [T, J, 3, 3] of the estimate in which only guides determined the cameras.
-        own: [T, J, 3, 3] with slow pose errors known, correlated keypoints counting less.
-        least: [T, J, 3, 3] with slow pose errors known, of single pictures.
+        system: in it slow pose errors are removed, and correlated keypoints count less.
+        state: the estimate of this system.
         guides: [J]; None if every joint is one.
-        position: [T, J, 3] m.
     """
+    position = state.position
+    own = covariances(system, eliminate(system, state))
+    least = _of_single_pictures(system.problem, system.knowledge.pixel_scale, position)
     of = np.arange(position.shape[1]) if guides is None else np.flatnonzero(guides)
     single = np.trace(least, axis1=2, axis2=3) < np.trace(own, axis1=2, axis2=3)
     found = np.where(single[..., None, None], least, own)
