@@ -9,9 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipelines.session.errors import DataError
 from pipelines.session.storage import is_special
-from pipelines.session.yaml_files import plain_yaml
 
 _HEAD_BYTES = 64 * 1024
 _LARGEST_PARSED = 8 << 20  # bytes; larger text is described by its first line
@@ -185,10 +183,13 @@ def _of_toml(path: Path) -> Likeness:
 
 
 def _of_yaml(path: Path) -> Likeness:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
     content: object = None
-    with suppress(DataError, OSError, ValueError):
+    with suppress(YAMLError, OSError, ValueError, RecursionError):
         text = path.read_text(encoding="utf-8-sig")
-        content = plain_yaml(path, re.sub(r"\A%YAML:", "#", text))
+        content = YAML(typ="safe", pure=True).load(re.sub(r"\A%YAML:", "#", text))
     if not isinstance(content, dict):
         return Likeness("is YAML without names at its top")
     return Likeness(f"is YAML with {_keys(content)}")

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from pipelines.formats.drone_logs.picture_tags import picture_files, read_tags
+from pipelines.formats.common.exif import picture_files, read_tags
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import VideoIndex

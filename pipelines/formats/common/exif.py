@@ -1,0 +1,123 @@
+"""Tags of pictures: times and places in EXIF, and DJI's angles, heights and RTK in XMP.
+
+EXIF is that of JPEG and PNG (CIPA DC-008): the local time without its zone is taken as UTC, as for subtitles,
+unless the offset is there. XMP has DJI's names (`drone-dji:GimbalYawDegree`, ...), as attributes or elements.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SUFFIXES = (".jpg", ".jpeg", ".png")
+_HEAD = 512 * 1024  # bytes in which cameras write XMP
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_TAG = re.compile(rb"drone-dji:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
+_EXIF, _GPS = 0x8769, 0x8825
+_TAKEN, _OFFSET, _SUBSECOND = 36867, 36881, 37521
+NAMES = {
+    "latitude": ("GpsLatitude", "Latitude"),
+    "longitude": ("GpsLongitude", "GpsLongtitude", "Longitude"),
+    "relative": ("RelativeAltitude",),
+    "absolute": ("AbsoluteAltitude",),
+    "gb_yaw": ("GimbalYawDegree",),
+    "gb_pitch": ("GimbalPitchDegree",),
+    "gb_roll": ("GimbalRollDegree",),
+    "drone_yaw": ("FlightYawDegree",),
+    "drone_pitch": ("FlightPitchDegree",),
+    "drone_roll": ("FlightRollDegree",),
+    "rtk_flag": ("RtkFlag",),
+    "rtk_std_latitude": ("RtkStdLat",),
+    "rtk_std_longitude": ("RtkStdLon",),
+    "rtk_std_height": ("RtkStdHgt",),
+}
+
+
+@dataclass(frozen=True)
+class Tags:
+    """Tags of one picture; `values` has the columns of `NAMES` that it states."""
+
+    t_ns: int | None
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+def picture_files(folder: Path) -> list[Path]:
+    """Return the pictures of a folder in the order of the numbers in their names; empty for other folders.
+
+    Pictures must be at least half of its files, so that one picture among logs makes no sequence.
+    """
+    try:
+        files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    except OSError:
+        return []
+    found = [path for path in files if path.suffix.lower() in SUFFIXES]
+    if len(found) < 2 or 2 * len(found) < len(files):
+        return []
+    return sorted(found, key=lambda path: [(int(part), "") if part.isdecimal() else (-1, part)
+                                           for part in re.split(r"(\d+)", path.name)])  # fmt: skip
+
+
+def read_tags(path: Path) -> Tags:
+    """Read a picture's tags; one without them, or a damaged one, has none."""
+    from PIL import Image
+
+    try:
+        with path.open("rb") as file:
+            xmp = {name.decode(): text.decode("latin-1") for name, text in _TAG.findall(file.read(_HEAD))}
+        with Image.open(path) as picture:
+            exif = picture.getexif()
+            taken, gps = dict(exif.get_ifd(_EXIF)), dict(exif.get_ifd(_GPS))
+    except (OSError, ValueError, SyntaxError, TypeError, KeyError):
+        return Tags(None)
+    values = _from_gps(gps)
+    for column, names in NAMES.items():
+        for name in names:
+            number = _number(xmp.get(name))
+            if number is not None:
+                values[column] = number
+    return Tags(_taken_ns(taken), values)
+
+
+def _number(text: object) -> float | None:
+    try:
+        value = float(str(text))
+    except ValueError:
+        return None
+    return value if np.isfinite(value) else None
+
+
+def _taken_ns(exif: Mapping[int, Any]) -> int | None:
+    try:
+        taken = datetime.strptime(str(exif[_TAKEN])[:19], "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+    except (KeyError, ValueError):
+        return None
+    digits = re.sub(r"\D", "", str(exif.get(_SUBSECOND, "")))[:9]
+    offset = re.fullmatch(r"([+-])(\d\d):(\d\d)", str(exif.get(_OFFSET, "")).strip("\0 "))
+    if offset:
+        ahead = timedelta(hours=int(offset[2]), minutes=int(offset[3]))
+        taken -= ahead if offset[1] == "+" else -ahead
+    return (taken - _EPOCH) // timedelta(seconds=1) * 10**9 + int(digits.ljust(9, "0") or 0)
+
+
+def _from_gps(gps: Mapping[int, Any]) -> dict[str, float]:
+    """Return latitude, longitude and height of EXIF's own GPS tags."""
+    values: dict[str, float] = {}
+    for column, sign, tag in (("latitude", "S", 1), ("longitude", "W", 3)):
+        try:
+            degrees, minutes, seconds = (float(part) for part in gps[tag + 1])
+        except (KeyError, TypeError, ValueError, ZeroDivisionError):
+            continue
+        angle = degrees + minutes / 60 + seconds / 3600
+        if np.isfinite(angle):
+            values[column] = -angle if str(gps.get(tag, "")).startswith(sign) else angle
+    height = _number(gps.get(6))
+    if height is not None:
+        below = gps.get(5) in (1, b"\x01")
+        values["absolute"] = -height if below else height
+    return values
