@@ -2,14 +2,13 @@
 
 import json
 import re
+import stat
 import tomllib
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from pipelines.session.storage import is_special
 
 _HEAD_BYTES = 64 * 1024
 _LARGEST_PARSED = 8 << 20  # bytes; larger text is described by its first line
@@ -74,10 +73,11 @@ def describe_unknown(path: Path) -> Likeness:
     """Describe an existing file or folder that is not recognised. Never raise."""
     if path.is_dir():
         return _of_folder(path)
-    if is_special(path):
-        return Likeness("is a pipe, a socket or a device", "write what comes out of it to a file")
     try:
-        size = path.stat().st_size
+        of_path = path.stat()
+        if not stat.S_ISREG(of_path.st_mode):
+            return Likeness("is a pipe, a socket or a device", "write what comes out of it to a file")
+        size = of_path.st_size
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
     except (OSError, ValueError) as error:

@@ -159,7 +159,7 @@ def refine(
         else:
             priors = _priors(stretches, filled[chosen], prior, clock_sigma_s)
         for found in priors:
-            refined = _refined(problem, part, filled, found)
+            refined = _refined(problem, part, filled, found, measured=not contested)
             if refined.fallback is None:
                 return refined
             refused = refused or refined
@@ -178,10 +178,10 @@ class _Prior:
     expected_m: float  # largest allowed move of the skeleton
 
 
-def _refined(problem: Problem, part: Bool, filled: Float, prior: _Prior) -> Refined:
+def _refined(problem: Problem, part: Bool, filled: Float, prior: _Prior, *, measured: bool) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails.
 
-    Joints [J] that are not in `part` stay NaN.
+    Joints [J] that are not in `part` stay NaN. `measured` is True if the prior of the poses was measured.
 
     Raises:
         LinAlgError: its equations are singular.
@@ -203,7 +203,7 @@ def _refined(problem: Problem, part: Bool, filled: Float, prior: _Prior) -> Refi
     if known.memory > REMEMBERED:
         remembering, placed = _joints_without_slow_errors(*slow, freely)
         joints = placed.position
-        covariance = _with_own(covariance, remembering, placed, problem.guides)
+        covariance = _with_own(covariance, remembering, placed, problem.guides, measured=measured)
     elif _mainly_slow(problem, known, state):
         slow = _solve_with_loose_motion(problem, known, state)[:2]
         joints = _joints_without_slow_errors(*slow, freely)[1].position
@@ -320,24 +320,30 @@ def _of_single_pictures(problem: Problem, pixel_scale: float, position: Float) -
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
-def _with_own(covariance: Float, system: System, state: State, guides: Bool | None) -> Float:
+def _with_own(
+    covariance: Float, system: System, state: State, guides: Bool | None, *, measured: bool
+) -> Float:
     """Compute covariances [T, J, 3, 3] of joints: each has its own error, and one by slow pose errors.
 
     Where keypoint errors last longer than motion is smooth, a joint's own error is that of a single picture.
-    A joint that did not determine the cameras has the error by poses of the guide that is mostly the nearest.
+    Where pose errors were not measured, they and lasting keypoint errors look alike, and it stays wider. A
+    joint that did not determine the cameras has the error by poses of the guide that is mostly the nearest.
 
     Args:
         covariance: [T, J, 3, 3] of the estimate in which only guides determined the cameras.
         system: in it slow pose errors are removed, and correlated keypoints count less.
         state: the estimate of this system.
         guides: [J]; None if every joint is one.
+        measured: pose errors were measured, by backgrounds.
     """
     position = state.position
     own = covariances(system, eliminate(system, state))
-    least = _of_single_pictures(system.problem, system.knowledge.pixel_scale, position)
     of = np.arange(position.shape[1]) if guides is None else np.flatnonzero(guides)
-    single = np.trace(least, axis1=2, axis2=3) < np.trace(own, axis1=2, axis2=3)
-    found = np.where(single[..., None, None], least, own)
+    found = own.copy()
+    if measured:
+        least = _of_single_pictures(system.problem, system.knowledge.pixel_scale, position)
+        single = np.trace(least, axis1=2, axis2=3) < np.trace(own, axis1=2, axis2=3)
+        found[single] = least[single]
     for joint in range(position.shape[1]):
         away = np.linalg.norm(position[:, of] - position[:, joint, None], axis=-1)
         near = of[np.argmin(np.median(away, axis=0))]
