@@ -13,7 +13,8 @@ from typing import Literal
 import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
-from pipelines.formats.logs.presets import FIXES, read_pair, read_positions, read_preset
+from pipelines.formats.logs.presets import FIXES, px4_names, read_pair, read_positions, read_preset
+from pipelines.formats.logs.px4_topics import read_px4
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
@@ -380,7 +381,10 @@ class FlightPoses:
         """Read telemetry from a driver's usual topics, or from two named ones, at the log's own times."""
         with self._logs.open(pose.log or "") as opened:
             recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
-            if pose.preset:
+            if pose.preset == "px4":
+                names = px4_names(recording, source, pose.namespace)
+                found = read_px4(recording, source, names, choice, stamps)
+            elif pose.preset:
                 found = read_preset(recording, source, pose.preset, pose.namespace, choice, stamps)
             else:
                 axes = self._axes(pose.axes, opened.settings.axes)

@@ -35,7 +35,6 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     world_from_heading,
 )
 from pipelines.formats.logs.messages import FAULTS, Stamps, nanoseconds, unreadable
-from pipelines.formats.logs.px4_topics import read_px4
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
@@ -211,6 +210,18 @@ def _shared(one: str, other: str) -> int:
     )
 
 
+def px4_names(recording: Log, source: str, namespace: str | None) -> dict[str, str]:
+    """List the topics of one PX4 drone that have messages, by PX4's name of each (vehicle_attitude).
+
+    Raises:
+        DataError: no such topics, or several drones.
+    """
+    prefix = _prefix(source, "px4", namespace, [topic.name for topic in recording.topics])
+    with_messages = {topic.name for topic in recording.topics if topic.count}
+    there = {name for parts in parts_of("px4", prefix, with_messages) for name in parts}
+    return {_plain(name).rpartition("/")[2]: name for name in there}
+
+
 def read_preset(
     recording: Log,
     source: str,
@@ -221,7 +232,8 @@ def read_preset(
 ) -> Telemetry:
     """Read position, attitude and gimbal of a drone, from the usual topics of its driver.
 
-    A namespace is needed if the log holds several drones.
+    A namespace is needed if the log holds several drones. The autopilot's own topics, `px4`, have a reader of
+    their own, `px4_topics`.
 
     Raises:
         DataError: no such topics, several drones, or nothing usable.
@@ -242,10 +254,6 @@ def read_preset(
             f"has no {' or '.join(wanted)} position of {prefix}/{driver.names[0]}",
             f"there is {', '.join(others)}" if others else "record its topics",
         )
-    if preset == "px4":
-        there = {name for parts in parts_of(preset, prefix, with_messages) for name in parts}
-        asked = {_plain(name).rpartition("/")[2]: name for name in there}
-        return read_px4(recording, source, asked, choice, stamps)
     kind, place = next(iter(places.items()))
     dropped: dict[str, int] = {}
     notes = [f"{source}: took the {kind} position from {place}"]

@@ -13,10 +13,12 @@ from pipelines.formats.logs.presets import (
     namespaces,
     pairs_of,
     parts_of,
+    px4_names,
     read_pair,
     read_positions,
     read_preset,
 )
+from pipelines.formats.logs.px4_topics import read_px4
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import rotate
 from pipelines.session.errors import DataError
@@ -333,8 +335,10 @@ def odometry(frame: int, **more: Any) -> list[Entry]:
 def test_the_odometry_of_px4_is_turned_to_enu(tmp_path: Path) -> None:
     path = write_log(tmp_path, "a", "ros2-mcap", odometry(1))
     with recognise(path, LogFormat, "log").open_log([path]) as log:
-        telemetry = read_preset(log, str(path), "px4", None, TelemetryChoice(), "header")
-        other = read_preset(log, str(path), "px4", None, TelemetryChoice(position="local"), "receive")
+        telemetry = read_px4(log, str(path), px4_names(log, str(path), None), TelemetryChoice(), "header")
+        other = read_px4(
+            log, str(path), px4_names(log, str(path), None), TelemetryChoice(position="local"), "receive"
+        )
     np.testing.assert_allclose(telemetry.position.values, [[2, 1, 3]] * ROWS)
     np.testing.assert_array_equal(telemetry.position.t_ns, stamps())
     np.testing.assert_array_equal(other.position.t_ns, stamps())
@@ -344,13 +348,15 @@ def test_the_odometry_of_px4_is_turned_to_enu(tmp_path: Path) -> None:
     assert not any("FRD" in note for note in telemetry.notes)
     path = write_log(tmp_path, "b", "ros2-mcap", odometry(2))
     with recognise(path, LogFormat, "log").open_log([path]) as log:
-        telemetry = read_preset(log, str(path), "px4", None, TelemetryChoice(), "header")
+        telemetry = read_px4(log, str(path), px4_names(log, str(path), None), TelemetryChoice(), "header")
         assert any("FRD" in note for note in telemetry.notes)
         with pytest.raises(DataError, match=r"gps .*local"):
-            read_preset(log, str(path), "px4", None, TelemetryChoice(position="gps"), "header")
+            read_px4(
+                log, str(path), px4_names(log, str(path), None), TelemetryChoice(position="gps"), "header"
+            )
 
 
 def test_px4_without_definitions_asks_for_mcap(tmp_path: Path) -> None:
     path = write_ros2(tmp_path / "old", odometry(1), definitions=False)
     with recognise(path, LogFormat, "log").open_log([path]) as log, pytest.raises(DataError, match="MCAP"):
-        read_preset(log, str(path), "px4", None, TelemetryChoice(), "header")
+        read_px4(log, str(path), px4_names(log, str(path), None), TelemetryChoice(), "header")
