@@ -123,8 +123,7 @@ def test_as_a_command(tmp_path: Path) -> None:
     assert done.stdout.splitlines()[0] == "cameras: drone1, drone2"
     told = done.stderr.splitlines()
     left_out = [line for line in told if line.startswith(str(tmp_path))]
-    assert [line.split()[0] for line in left_out] == [f"{tmp_path}/frames/*.png:", f"{tmp_path}/notes.txt:"]
-    assert "30" in left_out[0]
+    assert [line.split()[0] for line in left_out] == [f"{tmp_path}/notes.txt:", f"{tmp_path}/frames:"]
     assert [line for line in told if line.startswith("assumed: ")]
     succeeds("ingest", tmp_path / "flight.yaml")
 

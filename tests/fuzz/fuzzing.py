@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.fuzz.mutations import damage_one
-from tests.fuzz.seeds import SEEDS, sown
+from tests.fuzz.seeds import HEADS, SEEDS, sown
 
 _WAIT_S = 120.0  # for an answer, however busy the machine is; the worker counts its own CPU time
 
@@ -78,7 +78,7 @@ def format_of(name: str) -> str:
 
 def _damaged_copy(source: Path, place: Path, choice: random.Random) -> tuple[Path, str]:
     """Copy a seed and damage one file; return the copy and the name of that file."""
-    together = source.parent if source.name in {"map.yaml", "flight.yaml"} else source
+    together = source.parent if source.name in HEADS else source
     if together.is_dir():
         target = place / together.name
         shutil.copytree(together, target)

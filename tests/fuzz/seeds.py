@@ -18,14 +18,18 @@ from tests.formats.calibrations import (
     test_colmap,
     test_kalibr,
     test_opencv_yaml,
+    test_orbslam,
     test_ros_camera_info,
 )
+from tests.formats.drone_logs import test_dji_records
 from tests.formats.exported import flown, recording, walking
 from tests.formats.keypoint_files import test_coco_results, test_mmpose
 from tests.formats.log_entries import entries
-from tests.formats.maps import test_grid_npz, test_octomap, test_pcd, test_ply, test_ros_map
-from tests.formats.poses import test_pose_csv
-from tests.formats.skeletons import test_bvh, test_c3d, test_trc
+from tests.formats.logs import test_gpx
+from tests.formats.maps import test_grid_npz, test_las, test_octomap, test_pcd, test_ply, test_ros_map
+from tests.formats.poses import test_kitti, test_pose_csv
+from tests.formats.skeletons import test_amc, test_bvh, test_c3d, test_trc
+from tests.formats.videos import test_picture_folder
 from tests.synthetic import drone_logs, logs, map_logs, videos
 from tests.synthetic.flights import write_flight
 from tests.synthetic.logged_flights import write_logged_flight
@@ -33,6 +37,9 @@ from tests.synthetic.logged_flights import write_logged_flight
 Writer = Callable[[Path], object]
 """Writer into an empty folder. A single entry is then read itself; of several entries, the folder is read."""
 
+
+HEADS = frozenset({"map.yaml", "flight.yaml", "10_04.amc", "00.txt"})
+"""Files that name others beside them, or need them."""
 
 TREE = test_octomap.at([7] * 13, [3.5, None, -2.0, [3.5, None] * 4, *[None] * 4])
 """A block of 8 x 8 x 8 of the finest voxels: a whole octant of the world would be refused."""
@@ -107,8 +114,14 @@ def _map_log(folder: Path) -> None:
     logs.write_mcap(folder / "maps.mcap", maps, "cdr", compression="none")
 
 
+def _gpx(folder: Path) -> None:
+    points = [test_gpx.point(k) for k in range(4)]
+    test_gpx.write(folder, test_gpx.track(*points), test_gpx.track(*points))
+
+
 SEEDS: dict[str, Writer] = {
     "alphapose": _keypoints("alphapose"),
+    "amc": test_amc.write,
     "anipose": _text("calib.toml", test_anipose_toml.CAMERA),
     "ardupilot": lambda folder: drone_logs.write_dataflash(folder / "a.bin", _truth(folder)),
     "bvh": _text("a.bvh", test_bvh.TEXT),
@@ -122,11 +135,17 @@ SEEDS: dict[str, Writer] = {
     "colmap as text": _colmap("text"),
     "csv": _text("poses.csv", test_pose_csv.EUROC * 2),
     "dji": lambda folder: drone_logs.write_srt(folder / "a.SRT", _truth(folder)),
+    "dji_binary": _text("FLY022.DAT", bytes(16) + b"BUILD" + bytes(221) + b"DJI_LOG_V3" + bytes(100)),
+    "dji_record": lambda folder: test_dji_records.airdata(folder / "a.csv"),
     "flight": lambda folder: write_flight(folder, seconds=0.2),
     "flight from logs": _logged_flight,
     "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),
+    "gopro without telemetry": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
+    "gpx": _gpx,
     "joints_csv": lambda folder: joints_csv.write_joints(folder / "joints.csv", walking(4)),
     "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),
+    "kitti": test_kitti.write,
+    "las": lambda folder: test_las.write(folder / "a.las"),
     "map log": _map_log,
     "mcap": lambda folder: logs.write_mcap(folder / "a.mcap", entries(0.2), "cdr", compression="none"),
     "mcap in chunks": lambda folder: logs.write_log(folder, "a", "mcap-ros1", entries(0.2)),
@@ -138,9 +157,12 @@ SEEDS: dict[str, Writer] = {
     "opencv": lambda folder: test_opencv_yaml.store(folder / "calib.yml"),
     "opencv as xml": lambda folder: test_opencv_yaml.store(folder / "calib.xml"),
     "openpose": _openpose,
+    "orbslam": lambda folder: test_orbslam.write(folder, test_orbslam.FISHEYE),
     "pcd": lambda folder: test_pcd.write(folder / "a.pcd", "ascii"),
     "pcd, binary": lambda folder: test_pcd.write(folder / "a.pcd", "binary"),
     "pcd, compressed": lambda folder: test_pcd.write(folder / "a.pcd", "binary_compressed"),
+    "picture_tags": lambda folder: test_picture_folder.write(folder / "film"),
+    "pictures": lambda folder: test_picture_folder.write(folder / "film", xmp=False),
     "ply": lambda folder: test_ply.write(folder / "a.ply", "ascii"),
     "ply, binary": lambda folder: test_ply.write(folder / "a.ply", "binary_little_endian"),
     "ros1": lambda folder: logs.write_ros1(folder / "a.bag", entries(0.2)),
@@ -149,6 +171,7 @@ SEEDS: dict[str, Writer] = {
     "ros2 in mcap": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), storage="mcap"),
     "ros2, compressed": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), compression="file"),
     "ros_map": test_ros_map.write,
+    "tlog": lambda folder: drone_logs.write_tlog(folder / "a.tlog", _truth(folder)),
     "trc": _export(trc.EXPORT),
     "trc of others": _text(
         "a.trc", test_trc.HEADER + "\n1\t0.0\t1000\t2000\t3000\t\t\t\n2\t0.0166\t1\t2\t3\t4\t5\t6\n"
@@ -168,7 +191,7 @@ def sown(folder: Path, names: list[str] | None = None) -> dict[str, Path]:
         place.mkdir(parents=True)
         SEEDS[name](place)
         inside = sorted(place.iterdir())
-        # A single file is read as it is; for a floor plan and a flight, the file that names the others.
-        heads = [entry for entry in inside if entry.name in {"map.yaml", "flight.yaml"}]
+        # A single file is read as it is; of several, the one that names the others or needs them.
+        heads = [entry for entry in inside if entry.name in HEADS]
         paths[name] = heads[0] if heads else inside[0] if len(inside) == 1 else place
     return paths

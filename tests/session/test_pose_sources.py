@@ -20,9 +20,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("pose", "problem"),
     [
-        ({"dji": "a.SRT", "instance": 1}, "instance: only a pose by ulog or ardupilot has that"),
+        ({"dji": "a.SRT", "instance": 1}, "instance: only a pose by ulog, ardupilot or tlog has that"),
         ({"dji": "a.SRT", "preset": "mavros"}, "preset: only a pose from a log has that"),
-        ({"log": "a.bag", "preset": "mavos"}, "preset: .*'dji_osdk' or 'mavros'"),
+        ({"log": "a.bag", "preset": "mavos"}, "preset: .*'dji_osdk', 'mavros' or 'px4'"),
         ({"ulog": "a.ulg", "altitude": 3}, "altitude: only a pose by dji has that"),
         ({"ulog": "a.ulg", "instanc": 3}, "unknown key, did you mean 'instance'"),
         ({"ardupilot": "a.bin", "dji": "b"}, "needs exactly one of"),

@@ -7,6 +7,7 @@ unless the offset is there. XMP has DJI's names (`drone-dji:GimbalYawDegree`, ..
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -70,9 +71,11 @@ def read_tags(path: Path) -> Tags:
     try:
         with path.open("rb") as file:
             xmp = {name.decode(): text.decode("latin-1") for name, text in _TAG.findall(file.read(_HEAD))}
-        with Image.open(path) as picture:
-            exif = picture.getexif()
-            taken, gps = dict(exif.get_ifd(_EXIF)), dict(exif.get_ifd(_GPS))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of damaged tags; the others are taken
+            with Image.open(path) as picture:
+                exif = picture.getexif()
+                taken, gps = dict(exif.get_ifd(_EXIF)), dict(exif.get_ifd(_GPS))
     except (OSError, ValueError, SyntaxError, TypeError, KeyError):
         return Tags(None)
     values = _from_gps(gps)

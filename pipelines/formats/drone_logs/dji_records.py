@@ -32,6 +32,8 @@ from pipelines.session.errors import DataError
 from pipelines.session.storage import as_data_error, refuse_special
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
+_FIRST_YEAR, _LAST_YEAR = 1970, 2200  # of dates; others are damage
+_LONGEST_S = 1e6  # of a record, from its start: more is damage
 _METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "metres": 1.0, "ft": 0.3048, "feet": 0.3048}
 _SECONDS = {"millisecond": 1e-3, "ms": 1e-3, "seconds": 1.0, "s": 1.0}
 _LENGTHS = {  # the preferred name first
@@ -227,8 +229,9 @@ class _Record:
         shown = self.clock_ns != 0
         if self.fine or not any_finite(self.columns["elapsed"]):
             return self.clock_ns, shown
-        known: Bool = np.isfinite(self.columns["elapsed"])
-        since_ns = np.round(np.where(known, self.columns["elapsed"], 0) * 1e9).astype(np.int64)
+        elapsed_s = self.columns["elapsed"]
+        known = np.asarray(np.abs(np.nan_to_num(elapsed_s, nan=np.inf)) < _LONGEST_S, dtype=np.bool_)
+        since_ns = np.round(np.where(known, elapsed_s, 0) * 1e9).astype(np.int64)
         both = np.flatnonzero(shown & known)
         if not len(both):
             return since_ns, known
@@ -439,6 +442,8 @@ def _since_epoch_ns(match: re.Match[str], day_first: bool) -> int:
     try:
         moment = datetime(year, month, day, hour, minute, int(match[6] or 0), tzinfo=UTC)
     except ValueError:
+        return 0
+    if not _FIRST_YEAR <= year < _LAST_YEAR:
         return 0
     return (moment - _EPOCH) // timedelta(microseconds=1) * 1000 + int((match[7] or "").ljust(9, "0"))
 

@@ -32,6 +32,7 @@ _STAMP = 8  # bytes of the station's clock before each packet
 _MARKS = re.compile(rb"[\xfd\xfe]")
 _SIGNED, _SIGNATURE = 1, 13  # flag in a packet of MAVLink 2, and the bytes of its signature
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
+_LARGEST_US = 2**62
 _FIRST_US, _LAST_US = 946_684_800_000_000, 4_102_444_800_000_000  # the years 2000 and 2100
 _UNIX_US = 10**15  # stamps in microseconds above it count from 1970, others from boot
 _YAW_IN_VEHICLE, _YAW_IN_EARTH = 32, 64  # GIMBAL_DEVICE_FLAGS
@@ -262,6 +263,9 @@ def _read(path: Path) -> _Packets:
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             for packet in _packets(content, found.dialect.mavlink_map, found.dropped):
+                if packet.stamp_us > _LARGEST_US:
+                    found.dropped["absurd stamp"] = found.dropped.get("absurd stamp", 0) + 1
+                    continue
                 found.first_us = found.first_us or packet.stamp_us
                 found.last_us = packet.stamp_us
                 found.counts[packet.message] += 1

@@ -75,7 +75,8 @@ class LasFormat:
         if not box.count:
             raise DataError(path, "holds no point that can be used", _COPY)
         low = np.floor(box.low / side)
-        shape = (np.floor(box.high / side) - low + 1).astype(np.int64)
+        cells = np.nan_to_num(np.floor(box.high / side) - low + 1, nan=np.inf)
+        shape = np.clip(cells, 1, 2**40).astype(np.int64)  # more is refused
         span = " x ".join(f"{v:.0f}" for v in box.high - box.low)
         check_size(
             path, shape.tolist(), side, f"crop it (its box is {span} m), or state a larger resolution_m"

@@ -28,6 +28,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion
 
 _INCH_M = 0.0254
+_LARGEST = 1e9  # of an angle or a place: more is damage
 _RATE_HZ = 120.0
 _AGAIN = "copy it again"
 
@@ -210,6 +211,8 @@ def _read_frames(path: Path, skeleton: _Skeleton) -> tuple[dict[str, Float], boo
             frames[-1][words[0]] = [float(word) for word in words[1:]]
         except ValueError as error:
             raise DataError(path, f"line {number}: {str(error)[:80]}", _AGAIN) from None
+        if not all(abs(value) < _LARGEST for value in frames[-1][words[0]]):
+            raise DataError(path, f"line {number}: holds an absurd number", _AGAIN)
     whole = [all(len(frame.get(name, ())) == count for name, count in moving.items()) for frame in frames]
     cut = bool(whole) and not whole[-1]
     frames, whole = (frames[:-1], whole[:-1]) if cut else (frames, whole)
