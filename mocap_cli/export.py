@@ -54,6 +54,11 @@ class _ListsFormats(click.Command):
 @click.option("--unit", metavar="m|cm|mm|inch", help="Unit of lengths, for formats that have a choice.")
 @click.option("--axes", metavar="z-up|y-up", help="Direction that is up, for formats that have a choice.")
 @click.option(
+    "--time",
+    metavar="zero|epoch",
+    help="Second 0 of formats with a choice (trc): the flight's first picture or the epoch. [default: zero]",
+)
+@click.option(
     "--pictures-hz",
     type=FiniteRange(0, 1000),
     help="Pictures per camera and second in mcap and rerun; 0 is none. [default: 2]",
@@ -66,6 +71,7 @@ def export_command(
     output: Path | None,
     unit: str | None,
     axes: str | None,
+    time: str | None,
     pictures_hz: float | None,
     overwrite: bool,
     shown: Shown,
@@ -87,6 +93,7 @@ def export_command(
             output,
             unit=unit,
             axes=axes,
+            time=time,
             pictures_hz=PICTURES_HZ if pictures_hz is None else pictures_hz,
             overwrite=overwrite,
             progress=progress,

@@ -22,7 +22,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Recording
-from pipelines.session.registries import EXPORTS, ChoiceOfAxes, Export
+from pipelines.session.registries import EXPORTS, ChoiceOfAxes, ChoiceOfTime, Export
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import open_session, session_name
 from pipelines.session.storage import as_data_error, read_json, remove_tree, sha256_of, write_json
@@ -57,6 +57,7 @@ def export(
     *,
     unit: str | None = None,
     axes: str | None = None,
+    time: str | None = None,
     pictures_hz: float = PICTURES_HZ,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -70,18 +71,21 @@ def export(
         output: the output folder; by default beside the session, with `.export` instead of `.session`.
         unit: of lengths, for formats that have a choice; by default that of each format.
         axes: z-up or y-up, for formats that have a choice; by default those of each format.
+        time: zero (the flight's first picture) or epoch (the session's own times), for formats in seconds
+            that have a choice; zero by default. `export.json` keeps the epoch of zero as `zero_ns`.
         pictures_hz: pictures of each camera per second, for recordings that hold pictures; 0 is none.
         overwrite: replace existing files that no export wrote, or that were changed since.
 
     Raises:
-        DataError: no such format, a format without a choice of unit or axes, nothing to export, tables or
-            pictures that were changed, or a file would be overwritten.
+        DataError: no such format, a format without a choice of unit, axes or time, nothing to export,
+            tables or pictures that were changed, or a file would be overwritten.
         BusyError: another process exports to the same folder.
     """
     progress = progress or Silent()
     exports = [EXPORTS.get(name) for name in dict.fromkeys(name.lower() for name in formats)]
     shapes = {format_.name: _shape(format_, unit, axes) for format_ in exports}
     _refuse_idle_choice(shapes, unit, axes)
+    zeros = {format_.name: _zero(format_, time) for format_ in exports}
     recording = load_recording(folder, pictures_hz=pictures_hz)
     target = output or folder.resolve().with_name(f"{session_name(folder)}.export")
     is_new = not target.exists()
@@ -94,12 +98,15 @@ def export(
                 own.mkdir()
                 notes = _Notes(progress)
                 unit_, axes_ = shapes[format_.name] or (None, None)
-                wanted = replace(recording, unit=unit_, axes=axes_, progress=notes)
+                zero = zeros[format_.name]
+                zero_ns = recording.zero_ns if zero == "zero" else 0
+                wanted = replace(recording, unit=unit_, axes=axes_, zero_ns=zero_ns, progress=notes)
                 for path in format_.write(wanted, own):
                     made[path] = {
                         "format": format_.name,
                         "unit": unit_ or "m",
                         "axes": axes_ or "z-up",
+                        **({} if zero is None else {"time": zero, "zero_ns": zero_ns}),
                         "notes": notes.kept,
                     }
             return _move(made, target, overwrite)
@@ -154,6 +161,25 @@ def _refuse_idle_choice(
         )
 
 
+def _zero(format_: Export, time: str | None) -> str | None:
+    """Choose the zero of a format's seconds; None if it has no choice.
+
+    Raises:
+        DataError: a choice for a format without one, or one that it does not have.
+    """
+    if not isinstance(format_, ChoiceOfTime):
+        if time is not None:
+            raise DataError(
+                format_.name,
+                "has no choice of time",
+                "leave --time out, or export the others by themselves",
+            )
+        return None
+    if time is not None and time not in format_.times:
+        raise DataError(format_.name, f"has no time {time}", f"there are {', '.join(format_.times)}")
+    return time or format_.times[0]
+
+
 # --- what is exported ----------------------------------------------------------------------------------
 
 
@@ -185,6 +211,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         maps=lambda: each_map(folder) if description.map else iter(()),
         pictures=_pictures(folder, description, record, pictures_hz),
         overlays=_overlays(folder, description, record, skeleton, pictures_hz),
+        zero_ns=description.start_ns,
     )
 
 

@@ -123,6 +123,7 @@ class Recording:
     """The same pictures with the skeleton drawn into them."""
     unit: str | None = None  # of lengths, if the user chooses one that the export has
     axes: str | None = None  # z-up or y-up, if the user chooses them
+    zero_ns: int = 0  # the time that formats in seconds count from, if they have the choice; 0 is the epoch
     progress: Progress = field(default_factory=Silent)  # receives notes on held, moved and thinned samples
 
     @property

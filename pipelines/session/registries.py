@@ -268,6 +268,15 @@ class ChoiceOfAxes(Export, Protocol):
         """The axes (z-up, y-up) that the export can write, the default first."""
 
 
+@runtime_checkable
+class ChoiceOfTime(Export, Protocol):
+    """An export in seconds that counts from `recording.zero_ns`."""
+
+    @property
+    def times(self) -> tuple[str, ...]:
+        """The zeros of time (zero: the flight's first picture; epoch: the session's own), default first."""
+
+
 class Registry(Generic[T]):
     """The objects that one group of entry points names, loaded on request."""
 

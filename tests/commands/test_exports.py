@@ -13,7 +13,7 @@ from filelock import FileLock
 from rosbags.highlevel import AnyReader
 
 from pipelines.export import export, load_recording
-from pipelines.formats.skeletons import c3d
+from pipelines.formats.skeletons import c3d, trc
 from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
@@ -22,6 +22,10 @@ from tests.commands.test_overlay import filmed_flight, session_of
 from tests.synthetic.flights import START_NS, write_flight
 
 RECORD = "export.json"
+
+
+def read_trc(path: Path) -> JointMotion:
+    return trc.FORMAT.read_joints(path, unit=None, axes=None)
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +142,21 @@ def test_units_and_axes_only_where_there_is_a_choice(filmed: Path, tmp_path: Pat
         line = refused("export", filmed, "--to", formats, option, value, "-o", out)
         assert all(name in line for name in names), line
     assert not out.exists()
+
+
+def test_seconds_count_from_the_first_picture_or_the_epoch(filmed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first = {}
+    for choice, zero_ns in (((), START_NS), (("--time", "zero"), START_NS), (("--time", "epoch"), 0)):
+        succeeds("export", filmed, "--to", "trc", *choice, "-o", out)
+        (path,) = out.glob("*.trc")
+        facts = json.loads((out / RECORD).read_text(encoding="utf-8"))["files"][path.name]
+        assert facts["zero_ns"] == zero_ns
+        first[facts["time"]] = read_trc(path).t_ns + zero_ns
+    np.testing.assert_array_equal(first["zero"], first["epoch"])
+    assert first["epoch"][0] == START_NS
+    assert "csv" in refused("export", filmed, "--to", "trc,csv", "--time", "zero", "-o", out)
+    assert "zero, epoch" in refused("export", filmed, "--to", "trc", "--time", "noon", "-o", out)
 
 
 def test_pictures_that_are_gone_cost_pictures_only(filmed: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ because OpenSim 4.6 ignores blank cells at the end of a line and refuses a file 
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -131,14 +131,15 @@ class TrcExport:
     """Writer of `<name>.trc`, or `<name>_person<k>.trc` for each of several people; default metres and y up.
 
     OpenSim's (x, y, z) is our world's (y, z, x). The header states the unit; no TRC states its axes. Times
-    are the session's own (seconds, nine decimals), so that a file fits its flight and can be read
-    as truth.
+    are seconds since `recording.zero_ns`, with nine decimals: by default since the flight's first picture,
+    because programs of biomechanics expect a trial to begin near zero.
     """
 
     name = "trc"
     title = "markers for OpenSim and Pose2Sim"
     units = ("m", "cm", "mm")
     axes = ("y-up", "z-up")
+    times = ("zero", "epoch")
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write every person with at least one known joint.
@@ -147,6 +148,7 @@ class TrcExport:
             DataError: there is no such person.
         """
         motion, files = people_of(recording, folder, ".trc")
+        motion = replace(motion, t_ns=motion.t_ns - recording.zero_ns)
         for person, path in files.items():
             write_joints(path, motion, person, unit=recording.unit or "m", axes=recording.axes or "y-up")
         return sorted(files.values())
