@@ -21,6 +21,7 @@ from pipelines.session.description import (
     ActorEntry,
     CameraEntry,
     Description,
+    Doubt,
     Interpolation,
     MapEntry,
     OriginEntry,
@@ -156,7 +157,7 @@ def ingest(
 
             tracks = {name: _track(run, name) for name in entries}
             doubts = doubts_of_logs({name: (entry, tracks[name]) for name, entry in entries.items()})
-            doubts += doubts_of_places(tracks, reader.map_box)
+            doubts += doubts_of_places(tracks, reader.map_box) + reader.map_doubts
             warnings += said_doubts(doubts)
 
             description = Description(
@@ -446,6 +447,11 @@ class _FlightReader:
                 f"has its first map at {from_ns / 1e9:.3f} s, after the pictures ({span_words(first, last)})",
                 "check its clock, or take `stamps: receive`",
             )
+
+    @property
+    def map_doubts(self) -> list[Doubt]:
+        """Doubts of the places of the maps that were stored."""
+        return self._poses.map_doubts
 
     def _near_origin(self, source: Path, maps: Iterable[Occupancy]) -> Iterator[Occupancy]:
         """Yield maps in the world; errors as in `FlightPoses.map`."""

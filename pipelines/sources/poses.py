@@ -32,6 +32,7 @@ from pipelines.geometry.poses import (
     multiply,
     quaternion_from_matrix,
 )
+from pipelines.session.description import Doubt
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan, PoseSource
 from pipelines.session.manifest import Log as LogSource
@@ -47,7 +48,7 @@ from pipelines.session.telemetry import (
 )
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
-from pipelines.sources.projections import Projection
+from pipelines.sources.projections import Projection, is_usable
 from pipelines.sources.world import (
     as_stated,
     body_in_enu,
@@ -60,6 +61,7 @@ from pipelines.sources.world import (
 )
 
 _FIXED = "fixed angles"
+_SAME_PLACE_M = 1.0  # datums of one continent differ by less, as ETRS89 and WGS84
 _ABOVE_TAKE_OFF = ("take-off", "stated")
 _ADD_ANGLES = (
     "add gimbal: {log, topic, relative_to: world} with the angles of another log, or"
@@ -106,6 +108,7 @@ class FlightPoses:
         self._stated: dict[str, tuple[Path, Trajectory]] = {}  # read for the origin
         crs = flight.world.crs
         self._projection = Projection(crs, f"{manifest}: world.crs") if crs else None
+        self.map_doubts: list[Doubt] = []
 
     # --- cameras ---------------------------------------------------------------------------------------
 
@@ -288,14 +291,17 @@ class FlightPoses:
     def map(self, source: Path, grid: Occupancy, crs: str | None) -> Occupancy:
         """Return a map in the world; `crs` is the stated one of its coordinates, else its own counts.
 
+        A stated CRS that puts the map elsewhere than its own is used, and is a doubt in `map_doubts`.
+
         Raises:
             DataError: as for poses; also if a CRS is stated and the world's origin on Earth is not known.
         """
         origin = self.origin()
-        own = crs or (grid.crs if origin is not None else None)
-        projection = Projection(own, f"{self._manifest}: map.crs") if own else self._projection
-        if own and not crs:
-            self._note(f"{source}: placed on Earth by the CRS in it, {own}")
+        stated = Projection(crs, f"{self._manifest}: map.crs") if crs else None
+        own = self._own_crs(source, grid) if grid.crs and origin is not None else None
+        projection = stated or own or self._projection
+        if own is not None and stated is None:
+            self._note(f"{source}: placed on Earth by the CRS in it, {own.name}")
         if projection is not None:
             if origin is None:
                 raise DataError(
@@ -303,6 +309,8 @@ class FlightPoses:
                     "places the map on Earth, and nothing says where the world's origin is",
                     "write world.origin (latitude_deg, longitude_deg, altitude_m) or world.crs",
                 )
+            if stated is not None and own is not None:
+                self._compare_crs(source, grid, stated, own, origin.place)
             grid, error_m = projection.map(source, grid, origin.place)
             if error_m > grid.resolution_m / 2:
                 self._note(
@@ -311,6 +319,33 @@ class FlightPoses:
                 )
         self.refuse_projected(source, grid.origin[None])
         return grid
+
+    def _own_crs(self, source: Path, grid: Occupancy) -> Projection | None:
+        """Return the CRS that a map's file names; None, with a note, if it places nothing on Earth."""
+        if grid.crs and is_usable(grid.crs):
+            return Projection(grid.crs, str(source))
+        self._note(f"{source}: its own CRS is not used: it is no projected or geographic one")
+        return None
+
+    def _compare_crs(
+        self, source: Path, grid: Occupancy, stated: Projection, own: Projection, origin: Place
+    ) -> None:
+        centre = (grid.origin + np.array(grid.probability.shape) * grid.resolution_m / 2)[None]
+        try:
+            places = [each.points(source, centre, origin)[0] for each in (stated, own)]
+            apart_m = float(np.linalg.norm(places[0] - places[1]))
+        except DataError:  # outside one of them
+            apart_m = np.inf
+        if apart_m > _SAME_PLACE_M:
+            self.map_doubts.append(
+                Doubt(
+                    code="origin",
+                    cameras=[],
+                    what=f"the map's file names {own.name}, flight.yaml {stated.name}, which is used",
+                    evidence={"apart_m": round(apart_m, 1)} if np.isfinite(apart_m) else {},
+                    remedy=f"map.crs: {own.name}",
+                )
+            )
 
     def refuse_projected(self, source: Path | str, position: Float) -> None:
         """Refuse positions [N, 3] in projected coordinates if the world has an origin on Earth."""

@@ -28,6 +28,20 @@ from pipelines.session.registries import need
 _NO_PLACE = "check the CRS: world.crs and map.crs are those of the numbers in the files"
 
 
+def is_usable(name: str) -> bool:
+    """Return True for a projected or geographic CRS that pyproj knows."""
+    return _crs(name) is not None
+
+
+def _crs(name: str) -> Any | None:
+    pyproj: Any = need("pyproj", "places")
+    try:
+        crs = pyproj.CRS.from_user_input(name).to_2d()
+    except pyproj.exceptions.CRSError:
+        return None
+    return crs if crs.is_projected or crs.is_geographic else None
+
+
 class Projection:
     """One CRS, of positions x east (or longitude), y north (or latitude) and height.
 
@@ -37,17 +51,15 @@ class Projection:
 
     def __init__(self, name: str, place: str) -> None:
         pyproj: Any = need("pyproj", "places")
-        try:
-            crs = pyproj.CRS.from_user_input(name).to_2d()
-        except pyproj.exceptions.CRSError:
-            crs = None
-        if crs is None or not (crs.is_projected or crs.is_geographic):
+        crs = _crs(name)
+        if crs is None:
             raise DataError(
                 place,
                 f"{name!r} is no projected or geographic CRS",
                 "write one like EPSG:32632 (UTM 32 north)",
             )
-        self.name = name
+        authority = crs.to_authority(min_confidence=100)
+        self.name = ":".join(authority) if authority else crs.name
         self._step = 1.0 if crs.is_projected else 1e-5  # a unit north by which grid north is found
         self._to_earth = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
 

@@ -20,6 +20,7 @@ from pipelines.session.records import Occupancy, Trajectory
 from pipelines.sources.projections import Projection
 from tests.commands.runner import refused
 from tests.commands.test_drone_flights import errors, session_of
+from tests.formats.maps.test_las import write as write_las
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import HOME
 from tests.synthetic.flights import SyntheticFlight, write_flight
@@ -198,3 +199,28 @@ def test_a_map_far_from_all_cameras_is_doubted(tmp_path: Path) -> None:
     assert (doubt.code, doubt.cameras) == ("origin", [])
     assert "map.crs" in doubt.remedy
     assert doubt.evidence["apart_m"] > 5_000_000
+
+
+@pytest.mark.parametrize(
+    ("own", "stated", "apart_m"),
+    [(32617, None, None), (32617, "EPSG:26917", None), (32618, ZONE, 500_000.0)],
+)
+def test_the_crs_in_a_cloud_places_it_unless_another_is_stated(
+    tmp_path: Path, own: int, stated: str | None, apart_m: float | None
+) -> None:
+    """NAD83 (26917) and WGS84 (32617) are one place here; zone 18 is 6 degrees away from zone 17."""
+    pyproj = pytest.importorskip("pyproj")
+    flight = flown_in_utm(tmp_path)
+    pillar = np.array([30.0, -20.0, 4.0])  # m from HOME
+    write_las(tmp_path / "site.laz", in_utm(pillar[None]), crs=pyproj.CRS.from_epsg(own))
+    flight.settings["map"] = {"path": "site.laz"} | ({"crs": stated} if stated else {})
+    flight.save()
+    doubts = ingest(flight.manifest).description.doubts
+    grid = read_grid(next((flight.manifest.with_suffix(".session") / "map").glob("*.npz")))
+    middles = grid.origin + (np.argwhere(grid.probability >= 0.5) + 0.5) * grid.resolution_m
+    assert np.abs(middles - pillar).max() < 0.5
+    if apart_m is None:
+        assert not doubts
+    else:
+        assert [doubt.code for doubt in doubts] == ["origin"]
+        assert doubts[0].evidence["apart_m"] == pytest.approx(apart_m, rel=0.5)

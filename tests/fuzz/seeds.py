@@ -146,6 +146,7 @@ SEEDS: dict[str, Writer] = {
     "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),
     "kitti": test_kitti.write,
     "las": lambda folder: test_las.write(folder / "a.las"),
+    "las, compressed": lambda folder: test_las.write(folder / "a.laz"),
     "map log": _map_log,
     "mcap": lambda folder: logs.write_mcap(folder / "a.mcap", entries(0.2), "cdr", compression="none"),
     "mcap in chunks": lambda folder: logs.write_log(folder, "a", "mcap-ros1", entries(0.2)),

@@ -2,14 +2,23 @@
 
 Points that the file marks as noise (classes 7 and 18) or as withheld are left out and counted. Coordinates
 are those of the file's reference system: usually a map projection, which the file may name.
+
+LAZ is decoded by a process of its own, which this module runs as its main program: the decompressor, which
+is compiled, aborts its process on some damaged files. What it decoded until then is used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -28,6 +37,11 @@ _RECORD = 54  # bytes of the shortest variable length record
 _USER_DEFINED = 32767
 _COPY = "copy it again, or export it again"
 
+# Limits of the process that decodes LAZ: no chunk needs more memory, and no file as much time.
+_MOST_BYTES = 4 << 30
+_LEAST_CPU_S, _SLOWEST_BYTES_PER_S = 60, 200_000
+_BLOCK = struct.Struct("<3Q")  # what comes before its points: their number, points of noise, withheld ones
+
 
 class LasFormat:
     """Reader of the points of all returns; a file that is cut off gives the points that it still holds."""
@@ -42,17 +56,10 @@ class LasFormat:
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe version, points, box, classes and the coordinate reference system."""
+        box = _Box()
         with _opened(path) as cloud:
-            header = cloud.header
-            facts: dict[str, object] = {
-                "version": f"{header.version.major}.{header.version.minor}",
-                "point_format": int(header.point_format.id),
-                "compressed": bool(header.are_points_compressed),
-                "points": int(header.point_count),
-                "crs": crs_of(header) or "not stated",
-            }
-            box = _Box()
-            dropped = _through(path, cloud, box.add)
+            dropped = cloud.hand_over(box.add)
+        facts: dict[str, object] = {**cloud.facts, "crs": cloud.crs or "not stated"}
         facts["finite_points"] = box.count
         facts |= {f"dropped: {cause}": count for cause, count in dropped.items()}
         if box.count:
@@ -71,7 +78,7 @@ class LasFormat:
         side = check_resolution(path, DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
         box = _Box()
         with _opened(path) as cloud:
-            dropped = _through(path, cloud, box.add)
+            dropped = cloud.hand_over(box.add)
         if not box.count:
             raise DataError(path, "holds no point that can be used", _COPY)
         low = np.floor(box.low / side)
@@ -87,9 +94,8 @@ class LasFormat:
             grid[*(np.floor(points / side) - low).astype(np.int64).T] = 1.0
 
         with _opened(path) as cloud:
-            _through(path, cloud, fill)
-            crs = crs_of(cloud.header)
-        return Occupancy(grid, low * side, side, dropped=dropped, crs=crs)
+            cloud.hand_over(fill)
+        return Occupancy(grid, low * side, side, dropped=dropped, crs=cloud.crs)
 
 
 class _Box:
@@ -106,17 +112,121 @@ class _Box:
             self.count += len(points)
 
 
+@dataclass(frozen=True)
+class _Block:
+    """Usable points of a chunk, and the number of those that the file marks."""
+
+    points: Float  # [N, 3]
+    noise: int
+    withheld: int
+
+
+@dataclass
+class _Cloud:
+    """Open file: what its header says, and its points, which can be taken once."""
+
+    facts: dict[str, object]
+    crs: str | None
+    blocks: Iterator[_Block] = field(repr=False)
+
+    def hand_over(self, take: Callable[[Float], None]) -> dict[str, int]:
+        """Hand over the usable points [N, 3] of each chunk; return counts of the others by cause."""
+        read = noise = withheld = 0
+        for block in self.blocks:
+            take(block.points)
+            noise, withheld = noise + block.noise, withheld + block.withheld
+            read += len(block.points) + block.noise + block.withheld
+        lost = {
+            "points marked as noise": noise,
+            "points marked as withheld": withheld,
+            "points cut off": int(str(self.facts["points"])) - read,
+        }
+        return {cause: count for cause, count in lost.items() if count}
+
+
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    laspy = need("laspy", "las")
+def _opened(path: Path) -> Iterator[_Cloud]:
+    need("laspy", "las")
     _refuse_impossible_records(path)
-    try:
-        with laspy.open(path) as cloud:
+    if first_bytes(path, 105)[104] & 0xC0 != 0x80:  # the bit of LAZ
+        with _opened_here(path) as cloud:
             yield cloud
-    except DataError:
-        raise
-    except Exception as error:  # laspy and its decompressor raise whatever they meet in a damaged header
+        return
+    pipe, silent = subprocess.PIPE, subprocess.DEVNULL
+    with subprocess.Popen(_decoder(path), stdin=silent, stdout=pipe, stderr=silent) as process:  # noqa: S603
+        assert process.stdout is not None  # noqa: S101
+        try:
+            yield _received(path, process.stdout, process)
+        finally:
+            process.kill()
+
+
+def _decoder(path: Path) -> list[str]:
+    return [sys.executable, "-m", __name__, str(path.absolute())]
+
+
+def _received(path: Path, pipe: IO[bytes], process: subprocess.Popen[bytes]) -> _Cloud:
+    """Return the file as the process that decodes it describes it.
+
+    Raises:
+        DataError: it refuses the file, or ended before it had read the header.
+    """
+    line = pipe.readline()
+    if not line.endswith(b"\n"):
+        status = process.wait()
+        raise DataError(path, f"cannot be decompressed (the decompressor ended with status {status})", _COPY)
+    stated = json.loads(line)
+    if "problem" in stated:
+        raise DataError(path, stated["problem"], _COPY)
+    return _Cloud(stated["facts"], stated["crs"], _received_blocks(pipe))
+
+
+def _received_blocks(pipe: IO[bytes]) -> Iterator[_Block]:
+    while len(head := pipe.read(_BLOCK.size)) == _BLOCK.size:
+        count, noise, withheld = _BLOCK.unpack(head)
+        content = pipe.read(count * 24)
+        if len(content) < count * 24:
+            return
+        yield _Block(np.frombuffer(content, np.float64).reshape(-1, 3), noise, withheld)
+
+
+def _send(path: Path, pipe: IO[bytes]) -> None:
+    """Decode a file for the process that waits at the pipe: a line of JSON, then its blocks."""
+    import resource
+
+    seconds = _LEAST_CPU_S + path.stat().st_size // _SLOWEST_BYTES_PER_S
+    for kind, most in ((resource.RLIMIT_DATA, _MOST_BYTES), (resource.RLIMIT_CPU, seconds)):
+        _, hard = resource.getrlimit(kind)
+        resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+    try:
+        with _opened_here(path) as cloud:
+            pipe.write(json.dumps({"facts": cloud.facts, "crs": cloud.crs}).encode() + b"\n")
+            for block in cloud.blocks:
+                pipe.write(_BLOCK.pack(len(block.points), block.noise, block.withheld))
+                pipe.write(np.ascontiguousarray(block.points).tobytes())
+    except DataError as error:
+        pipe.write(json.dumps({"problem": error.problem}).encode() + b"\n")
+
+
+@contextmanager
+def _opened_here(path: Path) -> Iterator[_Cloud]:
+    laspy = need("laspy", "las")
+    try:
+        cloud = laspy.open(path)
+    # The decompressor raises whatever it meets in a damaged header, its panics by the base of all exceptions.
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            raise
         raise DataError(path, f"laspy cannot read it ({str(error)[:100]})", _COPY) from error
+    with cloud:
+        header = cloud.header
+        facts: dict[str, object] = {
+            "version": f"{header.version.major}.{header.version.minor}",
+            "point_format": int(header.point_format.id),
+            "compressed": bool(header.are_points_compressed),
+            "points": int(header.point_count),
+        }
+        yield _Cloud(facts, crs_of(header), _blocks(path, cloud))
 
 
 def _refuse_impossible_records(path: Path) -> None:
@@ -128,33 +238,27 @@ def _refuse_impossible_records(path: Path) -> None:
         raise DataError(path, f"has a header that is cut off or states {sum(counts)} records", _COPY)
 
 
-def _through(path: Path, cloud: Any, take: Any) -> dict[str, int]:
-    """Hand over the usable points [N, 3] of each chunk; return counts of the others by cause."""
+def _blocks(path: Path, cloud: Any) -> Iterator[_Block]:
     header = cloud.header
-    stated = there = int(header.point_count)
+    there = int(header.point_count)
     if not header.are_points_compressed:
         room = path.stat().st_size - header.offset_to_point_data
-        there = max(0, min(stated, room // header.point_format.size))
-    read = noise = withheld = 0
+        there = max(0, min(there, room // header.point_format.size))
+    read = 0
     while read < there:
         try:
             chunk = cloud.read_points(min(_CHUNK, there - read))
-        except Exception:  # compressed points end where the file was cut, with any error
-            break
+        except BaseException as error:  # compressed points end where the file was cut, with any error
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            return
         if not len(chunk):
-            break
+            return
         read += len(chunk)
         bad = np.isin(np.asarray(chunk.classification), _NOISE)
         hidden = np.asarray(chunk.withheld).astype(bool) & ~bad
-        noise, withheld = noise + int(bad.sum()), withheld + int(hidden.sum())
         points = np.stack([np.asarray(chunk[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-        take(points[~bad & ~hidden])
-    lost = {
-        "points marked as noise": noise,
-        "points marked as withheld": withheld,
-        "points cut off": stated - read,
-    }
-    return {cause: count for cause, count in lost.items() if count}
+        yield _Block(points[~bad & ~hidden], int(bad.sum()), int(hidden.sum()))
 
 
 def crs_of(header: Any) -> str | None:
@@ -172,3 +276,10 @@ def crs_of(header: Any) -> str | None:
 
 
 FORMAT = LasFormat()
+
+if __name__ == "__main__":
+    try:
+        _send(Path(sys.argv[1]), sys.stdout.buffer)
+        sys.stdout.flush()
+    except (BrokenPipeError, KeyboardInterrupt):  # who asked has ended
+        os._exit(1)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import struct
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +22,12 @@ POINTS = np.array([[500000.1, 5300000.1, 400.1], [500000.2, 5300000.2, 400.2], [
                    [500000.1, 5300000.1, 400.9]])  # fmt: skip
 
 
-def write(path: Path, points: Float = POINTS, classes: list[int] | None = None, crs: bool = False) -> Path:
+def write(path: Path, points: Float = POINTS, classes: list[int] | None = None, crs: Any = None) -> Path:
     laspy = need("laspy", "las")
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.offsets, header.scales = np.floor(points.min(axis=0)), np.full(3, 0.001)
-    if crs:
-        header.add_crs(pytest.importorskip("pyproj").CRS.from_epsg(25832))
+    if crs is not None:
+        header.add_crs(crs)
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = points.T
     if classes:
@@ -52,10 +56,11 @@ def test_noise_and_withheld_points_are_left_out_and_counted(tmp_path: Path) -> N
 
 
 def test_the_reference_system_is_kept(tmp_path: Path) -> None:
-    path = write(tmp_path / "cloud.laz", crs=True)
+    pyproj = pytest.importorskip("pyproj")
+    path = write(tmp_path / "cloud.laz", crs=pyproj.CRS.from_epsg(25832))
     crs = READER.read_map(path).crs
     assert crs is not None
-    assert pytest.importorskip("pyproj").CRS.from_user_input(crs).to_epsg() == 25832
+    assert pyproj.CRS.from_user_input(crs).to_epsg() == 25832
 
 
 @pytest.mark.parametrize(("suffix", "least"), [(".las", 0.5), (".laz", 0.0)])
@@ -84,3 +89,23 @@ def test_damaged_headers_are_refused(tmp_path: Path, size: int) -> None:
     READER.recognises(path)
     with pytest.raises(DataError):
         READER.read_map(path)
+
+
+def test_a_decompressor_that_ends_its_process_ends_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was decoded until then is kept, and the rest is counted; without a header it is a refusal."""
+    path = write(tmp_path / "cloud.laz")
+    header = json.dumps({"facts": {"points": 4}, "crs": None}).encode() + b"\n"
+    block = struct.pack("<3Q", 2, 1, 0) + POINTS[:2].tobytes()
+    for sent, read in ((header + block + block[:30], 2), (header, 0), (b"", None)):
+        script = f"import os, sys; os.write(1, {sent!r}); os.abort()"
+        monkeypatch.setattr(las, "_decoder", lambda _, script=script: [sys.executable, "-c", script])
+        if read:
+            grid = READER.read_map(path, resolution_m=0.5)
+            assert (grid.dropped, int(np.nansum(grid.probability))) == (
+                {"points marked as noise": 1, "points cut off": 1}, 1,
+            )  # fmt: skip
+        else:
+            with pytest.raises(DataError):
+                READER.read_map(path, resolution_m=0.5)
