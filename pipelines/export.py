@@ -26,7 +26,7 @@ from pipelines.session.registries import EXPORTS, ChoiceOfAxes, ChoiceOfTime, Ex
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import open_session, session_name
 from pipelines.session.storage import as_data_error, read_json, remove_tree, sha256_of, write_json
-from pipelines.session.tables import FRAMES, POSES, SKELETON, motion_from, read_table, trajectory_from
+from pipelines.session.tables import ANGLES, FRAMES, POSES, SKELETON, motion_from, read_table, trajectory_from
 from pipelines.session.whole_folders import working_folder
 from pipelines.sources.pictures import open_pictures
 
@@ -211,6 +211,9 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         maps=lambda: each_map(folder) if description.map else iter(()),
         pictures=_pictures(folder, description, record, pictures_hz),
         overlays=_overlays(folder, description, record, skeleton, pictures_hz),
+        angles=lambda: (
+            None if record is None else read_table(folder / "reconstruct" / "angles.parquet", ANGLES)
+        ),
         zero_ns=description.start_ns,
     )
 

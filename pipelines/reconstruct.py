@@ -59,7 +59,14 @@ from pipelines.reconstruction.refining import (
     refine_flight,
     shifted,
 )
-from pipelines.reconstruction.results import assess, camera_poses_table, method_used, skeleton_table
+from pipelines.reconstruction.results import (
+    angles_parts,
+    assess,
+    camera_poses_table,
+    gait_of,
+    method_used,
+    skeleton_table,
+)
 from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import (
     are_calibrated,
@@ -87,13 +94,13 @@ from pipelines.session.records import JointMotion
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
-from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
+from pipelines.session.tables import ANGLES, CAMERA_POSES, GAIT, SKELETON, join_tables, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-RECONSTRUCT = Stage("reconstruct", revision=18)
+RECONSTRUCT = Stage("reconstruct", revision=19)
 
 _LONGEST_FILL_S = 10.0
 
@@ -232,14 +239,15 @@ def reconstruct(
             pose_noise=settings.pose_noise,
         )
         _refuse_nothing(folder, stored, doubts)
-        metrics = stored.metrics | {"doubts": [doubt.as_json() for doubt in doubts]}
+        gait, walks = gait_of(stored.observations, stored.result)
+        metrics = stored.metrics | {"gait": walks, "doubts": [doubt.as_json() for doubt in doubts]}
         _refuse_doubted(folder, metrics["doubts"], strict=strict)
         if settings.disturb_poses is not None:
             every = [metrics, *(attempt.metrics for attempt in attempts)]
             metrics = metrics | {"trials": summary_of_trials(every, settings.disturb_poses, settings.seed)}
             warnings.append(_disturbance_warning(settings))
         metrics = jsonable(metrics)
-        _write(run.folder, stored, metrics)
+        _write(run.folder, stored, gait, metrics)
         record = run.publish(
             counts=_counts(metrics, stored, swaps),
             warnings=[
@@ -340,9 +348,12 @@ def _disturbance_warning(settings: Settings) -> str:
     )
 
 
-def _write(folder: Path, attempt: _Attempt, metrics: Mapping[str, object]) -> None:
+def _write(folder: Path, attempt: _Attempt, gait: pd.DataFrame, metrics: Mapping[str, object]) -> None:
     skeleton = skeleton_table(attempt.observations, attempt.result)
     write_table(folder / "skeleton.parquet", skeleton, SKELETON)
+    parts = angles_parts(attempt.observations, attempt.views, attempt.result)
+    join_tables(folder / "angles.parquet", parts, ANGLES)
+    write_table(folder / "gait.parquet", gait, GAIT)
     if attempt.poses is not None:
         write_table(folder / "cameras.parquet", attempt.poses, CAMERA_POSES)
     write_json(folder / "metrics.json", metrics)

@@ -7,7 +7,7 @@ figures that could not be measured.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,8 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float, Int8, Int64
 from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, Series, intervals, stretch_samples
+from pipelines.geometry.gait import HEEL_STRIKE, SIDES, TOE_OFF, GaitEvents, gait_events, summary
+from pipelines.geometry.joint_angles import ANGLE_STATUS, ANGLES, joint_angles
 from pipelines.geometry.metrics import JointErrors, error_series, measure, measure_shape
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
@@ -290,6 +292,120 @@ def skeleton_table(observations: Observations, result: Triangulation) -> pd.Data
     table["views"] = result.views
     table["reprojection_px"] = _row_mean(used)
     table["status"] = np.array(STATUS, dtype=object)[result.status]
+    return table
+
+
+_SHARED = 0.5
+"""Share of the variance of a keypoint's error that the other keypoints of the person have too: a detector
+misplaces a limb as a whole. Chosen on flights of `benchmarks/corpus/tuning`, for the coverage of flexions."""
+_TIMES_AT_ONCE = 8192  # of the angles: their table is larger than the skeleton's arrays
+
+
+def angles_parts(observations: Observations, views: Views, result: Triangulation) -> Iterator[pd.DataFrame]:
+    """Yield the rows of `tables.ANGLES` in parts, sorted by time.
+
+    Standard deviations rest on `own_covariance`, without the errors that all joints share: these move and
+    turn the person as a whole, and hardly change an angle.
+    """
+    import pandas as pd
+
+    times, people, joints, _ = observations.confidence.shape
+    scale = _residual_scale(views, result)
+    names = np.array(list(ANGLES), dtype=object)
+    words = np.array(ANGLE_STATUS, dtype=object)
+    for start in range(0, times, _TIMES_AT_ONCE):
+        t_ns = observations.t_ns[start : start + _TIMES_AT_ONCE]
+        rows = slice(start * people * joints, (start + len(t_ns)) * people * joints)
+        shape = (len(t_ns), people, joints)
+        found = joint_angles(
+            observations.joints,
+            result.points[rows].reshape(*shape, 3),
+            own_covariance(views, result, rows, scale)[:, *np.triu_indices(3)].reshape(*shape, 6),
+            result.status[rows].reshape(shape),
+        )
+        yield pd.DataFrame(
+            {
+                "t_ns": np.repeat(t_ns, people * len(names)),
+                "person": np.tile(np.repeat(np.arange(people), len(names)), len(t_ns)),
+                "angle": np.tile(names, len(t_ns) * people),
+                "value_deg": found.value_deg.ravel(),
+                "sigma_deg": found.sigma_deg.ravel(),
+                "status": words[found.status.ravel()],
+            }
+        )
+
+
+def own_covariance(views: Views, result: Triangulation, rows: slice, scale: float) -> Float:
+    """Compute the covariance [N, 3, 3] m^2 of joints relative to the other joints of the person.
+
+    It is that of the pixels of their inlier views, scaled by the residuals, without the part that a person's
+    joints share. The stored covariance counts errors of camera poses, which move all joints of a picture
+    together. It is returned where it is the smaller one, or fewer than two views are inliers (filled).
+
+    Args:
+        views: the views of all joint-frames.
+        result: their triangulation.
+        rows: the N joint-frames.
+        scale: ratio of the residuals to `views.pixel_sigma`.
+    """
+    whole = result.covariance[rows]
+    index, points = views.pose_index[rows], result.points[rows]
+    normal = np.zeros((len(points), 3, 3))
+    for c in range(views.weight.shape[1]):
+        rotation = views.rotation[index, c]
+        away = np.einsum("nji,nj->ni", rotation, points - views.position[index, c])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            by_point = rotation[..., :2] - rotation[..., 2:] * (away[:, None, :2] / away[:, None, 2:])
+            whitening = views.weight[rows, c] * views.focal[c] / (views.pixel_sigma[c] * away[:, 2])
+        by_point *= whitening[:, None, None]
+        by_point[~(result.inlier[rows, c] & np.isfinite(by_point).all(axis=(1, 2)))] = 0.0
+        normal += by_point @ np.swapaxes(by_point, -1, -2)
+    sure = np.linalg.det(normal) > 0
+    own = np.full_like(normal, np.inf)
+    own[sure] = (1 - _SHARED) * scale**2 * np.linalg.inv(normal[sure])
+    smaller = np.trace(own, axis1=-2, axis2=-1) < np.trace(whole, axis1=-2, axis2=-1)
+    return np.where(smaller[:, None, None], own, whole)
+
+
+def _residual_scale(views: Views, result: Triangulation) -> float:
+    """Estimate the ratio of the inliers' residuals to their stated pixel noise; 1 without redundant views.
+
+    Root of the variance of unit weight: squared whitened residuals over the degrees of freedom, which are two
+    for each view and three fewer for each joint-frame.
+    """
+    (ok,) = np.nonzero(result.status == _OK)
+    used = result.inlier[ok]
+    whitened = np.where(used, views.weight[ok] * result.residual_px[ok] / views.pixel_sigma, 0.0)
+    freedom = np.maximum(2 * used.sum(axis=1) - 3, 0)
+    total = int(freedom.sum())
+    return float(np.sqrt((whitened[freedom > 0] ** 2).sum() / total)) if total else 1.0
+
+
+def gait_of(observations: Observations, result: Triangulation) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Find the gait of every person: the rows of `tables.GAIT`, and by person a summary or None."""
+    import pandas as pd
+
+    times, people, joints, _ = observations.confidence.shape
+    position = result.points.reshape(times, people, joints, 3)
+    parts: list[pd.DataFrame] = [_gait_rows(observations.t_ns[:0], 0, None)]
+    figures: dict[str, Any] = {}
+    for person in range(people):
+        events = gait_events(observations.joints, observations.t_ns, position[:, person])
+        parts.append(_gait_rows(observations.t_ns, person, events))
+        figures[str(person)] = events and summary(events, observations.t_ns, observations.joints)
+    return pd.concat(parts, ignore_index=True).sort_values(["t_ns", "person"], kind="stable"), figures
+
+
+def _gait_rows(t_ns: Int64, person: int, events: GaitEvents | None) -> pd.DataFrame:
+    import pandas as pd
+
+    row = np.zeros(0, np.int64) if events is None else events.row
+    table = pd.DataFrame({"t_ns": t_ns[row], "person": np.full(len(row), person)})
+    kept = events or GaitEvents(row, row, row > 0, np.zeros((0, 3)), *np.zeros((3, 0)))
+    table["side"] = np.array(SIDES, dtype=object)[kept.side]
+    table["event"] = np.where(kept.is_strike, HEEL_STRIKE, TOE_OFF).astype(object)
+    table[["x", "y", "z"]] = kept.foot
+    table["step_s"], table["step_m"], table["speed_mps"] = kept.step_s, kept.step_m, kept.speed_mps
     return table
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.progress import Progress, Silent
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 POINT_COVARIANCE_COLUMNS = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 """Upper triangle of a joint's covariance, m^2, as tables name it."""
@@ -121,6 +124,8 @@ class Recording:
     """Pictures of a camera in order, at the rate that was asked for: world time, [height, width, 3] BGR."""
     overlays: Callable[[str], Iterable[tuple[int, NDArray[np.uint8]]]] = field(default=lambda _: ())
     """The same pictures with the skeleton drawn into them."""
+    angles: Callable[[], pd.DataFrame | None] = field(default=lambda: None)
+    """Rows of `tables.ANGLES`, sorted by time, then person; None without a reconstruction."""
     unit: str | None = None  # of lengths, if the user chooses one that the export has
     axes: str | None = None  # z-up or y-up, if the user chooses them
     zero_ns: int = 0  # the time that formats in seconds count from, if they have the choice; 0 is the epoch

@@ -56,6 +56,23 @@ SKELETON = pa.schema(
     ]
 )
 
+ANGLES = pa.schema(
+    [
+        *(_T_NS, _PERSON, ("angle", pa.string())),
+        *((name, pa.float64()) for name in ("value_deg", "sigma_deg")),
+        _STATUS,
+    ]
+)
+"""reconstruct/angles.parquet, sorted by time, then person: every angle of `geometry.joint_angles.ANGLES`, NaN
+unless its status is ok or filled."""
+GAIT = pa.schema(
+    [
+        *(_T_NS, _PERSON, ("side", pa.string()), ("event", pa.string())),
+        *(*_XYZ, *((name, pa.float64()) for name in ("step_s", "step_m", "speed_mps"))),
+    ]
+)
+"""reconstruct/gait.parquet: heel strikes and toe-offs of people who walk; see `geometry.gait.GaitEvents`."""
+
 _SLOT = ("formation_yaw_rad", "slot_yaw_rad", "slot_tilt_rad", "slot_range_m", "tilt_rad")
 REPLAN = pa.schema(
     [

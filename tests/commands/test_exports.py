@@ -19,6 +19,7 @@ from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
 from tests.commands.runner import content, mocap_process, refusal, refused, succeeds
 from tests.commands.test_overlay import filmed_flight, session_of
+from tests.formats.skeletons.test_trc import opensim
 from tests.synthetic.flights import START_NS, write_flight
 
 RECORD = "export.json"
@@ -38,6 +39,7 @@ def test_help_lists_every_format_with_one_line() -> None:
     text = " ".join(succeeds("export", "--help").split())
     for line in (
         "bvh a rig of constant bones that follows the skeleton, for Blender; cm|m|mm|inch, y-up|z-up",
+        "angles joint angles with standard deviations, as CSV and for OpenSim (STO)",
         "trc markers for OpenSim and Pose2Sim; m|cm|mm, y-up|z-up",
         "parquet the same tables",
         "rerun a recording",
@@ -48,7 +50,7 @@ def test_help_lists_every_format_with_one_line() -> None:
 
 def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    names = "bvh,c3d,csv,mcap,parquet,rerun,trc,tum"
+    names = "angles,bvh,c3d,csv,mcap,parquet,rerun,trc,tum"
     result = json.loads(succeeds("export", filmed, "--to", names, "-o", out, "--pictures-hz", "5", "--json"))
     written = {Path(path).name for path in result["written"]}
     record = json.loads((out / RECORD).read_text(encoding="utf-8"))["files"]
@@ -59,6 +61,7 @@ def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_pa
         ("c3d", "mm", "z-up"),
         ("trc", "m", "y-up"),
         ("mcap", "m", "z-up"),
+        ("angles", "deg", "none"),
     } <= stated
     assert any("BVH" in note for facts in record.values() for note in facts["notes"])
     (log,) = out.glob("*.mcap")
@@ -186,3 +189,21 @@ def test_c3d_is_truth(tmp_path: Path) -> None:
     said = succeeds("info", tmp_path / "truth.c3d")
     assert "(C3D)" in said
     assert "POINT:UNITS" in said
+
+
+def test_opensim_reads_the_angles_of_the_session(filmed: Path, tmp_path: Path) -> None:
+    """The STO holds the table's degrees at seconds since the first picture."""
+    library = opensim()
+    written = export(filmed, ["angles"], tmp_path).written
+    assert [path.suffix for path in written] == [".csv", ".sto"]
+    table = pd.read_parquet(filmed / "reconstruct" / "angles.parquet")
+    pd.testing.assert_frame_equal(pd.read_csv(written[0]), table, check_dtype=False)
+    knee = table[table["angle"] == "left_knee_flexion"]
+    read = library.TimeSeriesTable(str(written[1]))
+    np.testing.assert_allclose(
+        list(read.getIndependentColumn()), (knee["t_ns"] - START_NS) / 1e9, rtol=0, atol=1e-9
+    )
+    for name, column in (("left_knee_flexion", "value_deg"), ("left_knee_flexion_sigma", "sigma_deg")):
+        values = read.getDependentColumn(name).to_numpy()
+        np.testing.assert_allclose(values, knee[column], rtol=0, atol=0.51e-4)  # four decimals
+    assert (knee["sigma_deg"] > 0).all()

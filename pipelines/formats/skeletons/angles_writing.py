@@ -1,0 +1,89 @@
+"""Export of joint angles: a long CSV, and OpenSim's storage (STO) for each person.
+
+STO: OpenSim documentation, "Storage (.sto) Files": a header that ends with `endheader`, then `time` and a
+column for each quantity, tab-separated.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.formats.common.exporting import safe_file_name
+from pipelines.formats.common.rows import format_seconds
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.joint_angles import ANGLES
+from pipelines.session.errors import DataError
+from pipelines.session.records import Recording
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_DECIMALS = 4  # of a degree
+
+
+class AnglesExport:
+    """Writer of `<name>_angles.csv` (the session's table) and `<name>_angles.sto` (`_person<k>` of several).
+
+    A STO has the angles in degrees and after them their standard deviations (`<angle>_sigma`), NaN where an
+    angle is not known. Its seconds count from `recording.zero_ns`; the CSV keeps `t_ns`.
+    """
+
+    name = "angles"
+    title = "joint angles with standard deviations, as CSV and for OpenSim (STO)"
+    units = ("deg",)
+    axes = ("none",)
+    times = ("zero", "epoch")
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write both files; a person without any angle gets no STO.
+
+        Raises:
+            DataError: no angle of any person is known.
+        """
+        table = recording.angles()
+        if table is None or not len(table) or table["value_deg"].isna().all():
+            raise DataError(
+                recording.name, "holds no joint angles to export", "run `mocap reconstruct` first"
+            )
+        name = safe_file_name(recording.name)
+        paths = [folder / f"{name}_angles.csv"]
+        table.to_csv(paths[0], index=False, lineterminator="\n")
+        t_ns, value, sigma = _dense(table)
+        known = np.flatnonzero(np.isfinite(value).any(axis=(0, 2))).tolist()
+        for person in known:
+            which = f"_person{person}" if value.shape[1] > 1 else ""
+            paths.append(folder / f"{name}_angles{which}.sto")
+            write_sto(paths[-1], t_ns - recording.zero_ns, value[:, person], sigma[:, person])
+        return sorted(paths)
+
+
+def _dense(table: pd.DataFrame) -> tuple[Int64, Float, Float]:
+    """Return times [T], and values and standard deviations [T, P, A], of rows in the order of the session."""
+    people = int(table["person"].max()) + 1
+    shape = (-1, people, len(ANGLES))
+    t_ns = table["t_ns"].to_numpy(np.int64).reshape(shape)[:, 0, 0]
+    value, sigma = (table[name].to_numpy(np.float64).reshape(shape) for name in ("value_deg", "sigma_deg"))
+    return t_ns, value, sigma
+
+
+def write_sto(path: Path, t_ns: Int64, value_deg: Float, sigma_deg: Float) -> None:
+    """Write angles and standard deviations [T, A] deg in the order of `ANGLES`."""
+    columns = ["time", *ANGLES, *(f"{name}_sigma" for name in ANGLES)]
+    lines = [
+        path.stem,
+        "version=1",
+        f"nRows={len(t_ns)}",
+        f"nColumns={len(columns)}",
+        "inDegrees=yes",
+        "endheader",
+        "\t".join(columns),
+    ]
+    for stamp, row in zip(format_seconds(t_ns), np.hstack([value_deg, sigma_deg]), strict=True):
+        lines.append("\t".join([stamp, *(f"{number:.{_DECIMALS}f}" for number in row.tolist())]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+EXPORT = AnglesExport()
