@@ -47,7 +47,7 @@ from pipelines.geometry.geodesy import Place, enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import interpolate_points, multiply
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import read_flight
+from pipelines.session.manifest import OwnLog, read_flight
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import PoseSample
 from pipelines.session.registries import (
@@ -67,14 +67,16 @@ from pipelines.session.telemetry import Telemetry, TelemetryChoice, TelemetryFor
 from pipelines.session.unknown_files import EXPECTED
 
 _FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
-_KEYS: dict[str, Literal["dji", "ulog", "ardupilot", "tlog", "gopro"]] = {
+_KEYS: dict[str, OwnLog] = {
     "dji": "dji",
     "dji_record": "dji",
+    "dji_video": "dji",
     "picture_tags": "dji",
     "ulog": "ulog",
     "ardupilot": "ardupilot",
     "tlog": "tlog",
     "gopro": "gopro",
+    "klv": "klv",
 }
 """The key in a manifest for each format of a drone's own log."""
 

@@ -15,7 +15,7 @@ from typing import Literal, TypeVar
 
 from pipelines.drafting.labels import OPTICAL, Label, Place, is_called, label_of, label_of_place
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import read_flight
+from pipelines.session.manifest import OwnLog, read_flight
 from pipelines.session.registries import (
     FORMATS,
     CalibrationFormat,
@@ -137,7 +137,7 @@ class TopicFound:
 class DroneLog(Found):
     """A drone's own log: positions, and perhaps attitudes of body and gimbal."""
 
-    key: Literal["dji", "ulog", "ardupilot", "tlog", "gopro"]  # its key in a manifest
+    key: OwnLog  # its key in a manifest
     span: Span
     positions: int
     step_ns: int  # median step between positions

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -177,10 +177,14 @@ class StaticPose(Part):
     camera: str | None = None
 
 
+OwnLog = Literal["dji", "ulog", "ardupilot", "tlog", "gopro", "klv"]
+"""The key of a drone's own log in a pose."""
+
+
 class PoseSource(Guess):
     """Source of a camera's poses."""
 
-    one_of = ("log", "tum", "csv", "static", "dji", "ulog", "ardupilot", "tlog", "gopro")
+    one_of = ("log", "tum", "csv", "static", *get_args(OwnLog))
     log: str | None = None
     topic: str | None = None
     parent: str | None = None
@@ -191,11 +195,12 @@ class PoseSource(Guess):
     tum: str | None = None
     csv: str | None = None
     static: StaticPose | None = None
-    dji: str | None = None  # subtitles beside a video, or a flight record as CSV
+    dji: str | None = None  # subtitles beside a video, a flight record as CSV, pictures, or a video
     ulog: str | None = None  # PX4
     ardupilot: str | None = None  # DataFlash .bin
     tlog: str | None = None  # of a ground station
     gopro: str | None = None  # video with a track of GPMF
+    klv: str | None = None  # of MISB, alone or in a video
     position: Literal["local", "global", "gps"] | None = None  # which of a drone's own estimates
     instance: int | None = Field(None, ge=0, le=255)
     time: Literal["gps", "boot"] | None = None
@@ -245,8 +250,18 @@ class PoseSource(Guess):
     @property
     def is_telemetry(self) -> bool:
         """True if position and attitude come separately, from a drone's own log or its driver's topics."""
-        parts = (self.dji, self.ulog, self.ardupilot, self.tlog, self.gopro, self.preset, self.attitude)
-        return any(part is not None for part in parts)
+        return self.own_log is not None or self.preset is not None or self.attitude is not None
+
+    @property
+    def own_log(self) -> tuple[OwnLog, str] | None:
+        """Key and path of the drone's own log; None for poses of another kind."""
+        keys: tuple[OwnLog, ...] = get_args(OwnLog)
+        return next(((key, stated) for key in keys if (stated := getattr(self, key)) is not None), None)
+
+    @property
+    def telemetry_source(self) -> str:
+        """The log of positions and attitudes as the manifest names it."""
+        return self.own_log[1] if self.own_log else self.log or ""
 
 
 class RigidTransform(Part):

@@ -88,11 +88,7 @@ def stated_paths(flight: Flight) -> list[str]:
         gimbal_log = camera.gimbal.log if camera.gimbal else None
         for log in (
             pose.log,
-            pose.dji,
-            pose.ulog,
-            pose.ardupilot,
-            pose.tlog,
-            pose.gopro,
+            pose.own_log[1] if pose.own_log else None,
             camera.intrinsics.log,
             gimbal_log,
         ):

@@ -298,7 +298,7 @@ def _clock_start(camera: Camera) -> Literal["stated", "assumed", "none"]:
 
 
 def _pose_source(pose: PoseSource) -> str:
-    drones_own = pose.dji or pose.ulog or pose.ardupilot or pose.tlog or pose.gopro
+    drones_own = pose.own_log[1] if pose.own_log else ""
     return pose.tum or pose.csv or drones_own or (pose.static.path if pose.static else pose.log) or ""
 
 

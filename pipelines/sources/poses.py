@@ -398,17 +398,17 @@ class FlightPoses:
 
     def _read(self, pose: PoseSource) -> Telemetry:
         """Read a drone's own log, at its own times; each log is read once."""
-        stated = _stated(pose)
         choice = TelemetryChoice(pose.position, pose.instance, pose.time, pose.altitude)
         key = pose.model_dump_json(exclude={"of"})
         if key not in self._telemetry:
-            if pose.log:
+            if pose.own_log is None:
                 self._telemetry[key] = self._logged_telemetry(pose, choice)
             else:
+                kind, stated = pose.own_log
                 path = self._one_file(stated)
-                reader = _reader(_kind(pose), path)
+                reader = _reader(kind, path)
                 if not isinstance(reader, TelemetryFormat):
-                    raise DataError(path, f"the format {_kind(pose)} reads no telemetry")
+                    raise DataError(path, f"the format {kind} reads no telemetry")
                 self._telemetry[key] = reader.read_telemetry(path, choice)
         return self._telemetry[key]
 
@@ -468,7 +468,7 @@ class FlightPoses:
             track = self._read(camera.pose).position
             first = track.origin or (_first_place(track) if track.on_earth else None)
             if first is not None:
-                self._origin = Origin(first, _stated(camera.pose))
+                self._origin = Origin(first, camera.pose.telemetry_source)
                 return self._origin
         if self._projection is not None:  # the first position of the first camera
             name, camera = next(iter(self._flight.cameras.items()))
@@ -543,7 +543,7 @@ class FlightPoses:
             self._note(note)
         body, gimbal = telemetry.body, self._gimbal(name, camera, telemetry)
         self._refuse_unturned(name, camera, telemetry, gimbal)
-        stated = _stated(pose)
+        stated = pose.telemetry_source
         settings = self._logs.settings(stated)
         track = telemetry.position
         since_ns = int(track.t_ns[0])
@@ -579,13 +579,13 @@ class FlightPoses:
         if gimbal is None:
             if own is None or camera.pose.of == "body":
                 return None
-            self._note(f"{name}: its camera is turned as {own.name} of {_stated(camera.pose)} say")
+            self._note(f"{name}: its camera is turned as {own.name} of {camera.pose.telemetry_source} say")
             return self._at_world_times(camera.pose, telemetry, own)
         if gimbal.fixed is None and gimbal.log is None:
             if own is None:
                 raise DataError(
                     self._manifest,
-                    f"cameras.{name}.gimbal: {_stated(camera.pose)} holds no gimbal angles",
+                    f"cameras.{name}.gimbal: {camera.pose.telemetry_source} holds no gimbal angles",
                     "name the log and topic that do, or fixed angles",
                 )
             moved = self._at_world_times(camera.pose, telemetry, own)
@@ -597,25 +597,25 @@ class FlightPoses:
             else:
                 raise DataError(
                     f"{self._manifest}: cameras.{name}.gimbal",
-                    f"{own.name} of {_stated(camera.pose)} cannot be taken relative to the {meant}",
+                    f"{own.name} of {camera.pose.telemetry_source} cannot be taken relative to the {meant}",
                     f"write relative_to: {moved.relative_to}",
                 )
             self._note(
-                f"{name}: its camera is turned as {own.name} of {_stated(camera.pose)} say, relative to the"
-                f" {meant} as stated"
+                f"{name}: its camera is turned as {own.name} of {camera.pose.telemetry_source} say,"
+                f" relative to the {meant} as stated"
             )
             return replace(moved, quaternion_xyzw=turned, relative_to=meant)
         return self._stated_angles(gimbal)
 
     def _at_world_times(self, pose: PoseSource, telemetry: Telemetry, track: AttitudeTrack) -> AttitudeTrack:
         since_ns = int(telemetry.position.t_ns[0])
-        return replace(track, t_ns=self._world_times(_stated(pose), track.t_ns, since_ns))
+        return replace(track, t_ns=self._world_times(pose.telemetry_source, track.t_ns, since_ns))
 
     def _refuse_unturned(
         self, name: str, camera: Camera, telemetry: Telemetry, gimbal: AttitudeTrack | None
     ) -> None:
         place = f"{self._manifest}: cameras.{name}"
-        stated = _stated(camera.pose)
+        stated = camera.pose.telemetry_source
         if telemetry.body is None and gimbal is None:
             raise DataError(
                 place, f"{stated} says where the drone was but not how it was turned", _ADD_ANGLES
@@ -680,23 +680,12 @@ class FlightPoses:
             )
 
 
-def _kind(pose: PoseSource) -> str:
-    return next(
-        kind for kind in ("dji", "ulog", "ardupilot", "tlog", "gopro") if getattr(pose, kind) is not None
-    )
-
-
 def _reader(kind: str, path: Path) -> Format:
-    """Return the format of a drone's own log; DJI's comes as subtitles, flight record or pictures."""
-    several = ("dji_record", "dji_binary", "picture_tags") if kind == "dji" else ()
+    """Return the format of a drone's own log; DJI's comes as subtitles, flight record, pictures or video."""
+    several = ("dji_record", "dji_binary", "dji_video", "picture_tags") if kind == "dji" else ()
     return next(
         (found for name in several if (found := FORMATS.get(name)).recognises(path)), FORMATS.get(kind)
     )
-
-
-def _stated(pose: PoseSource) -> str:
-    """Return the log as the manifest names it."""
-    return pose.dji or pose.ulog or pose.ardupilot or pose.tlog or pose.gopro or pose.log or ""
 
 
 def _first_place(track: PositionTrack) -> Place:

@@ -36,6 +36,7 @@ from tests.synthetic.drone_logs import (
 from tests.synthetic.flights import SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap, write_ros2
+from tests.synthetic.video_tracks import write_djmd, write_klv
 
 WORLD = {
     "origin": {
@@ -148,6 +149,16 @@ def _tlog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"tlog": f"{name}.tlog"}
 
 
+def _djmd(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_djmd(folder / f"{name}_of_dji.mp4", truth)
+    return {"dji": f"{name}_of_dji.mp4", "altitude": "absolute"}
+
+
+def _klv(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_klv(folder / f"{name}.ts", truth)
+    return {"klv": f"{name}.ts"}
+
+
 def _px4(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_mcap(folder / f"{name}.mcap", px4_entries(truth, "/px4_1"))
     return {"log": f"{name}.mcap", "preset": "px4", "namespace": "/px4_1"}
@@ -180,6 +191,8 @@ def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
         (_px4_since_boot, 0.002, 0.1),  # receipt is 1 ms late, at 1 m/s and 60 deg/s
         (_tlog, 0.015, 0.1),  # 1e-7 deg are 11 mm, and a ms of the boot time 1 mm and 0.06 deg
         (_record, 1e-3, 1e-4),  # 1e-9 deg are 0.1 mm
+        (_djmd, 2e-3, 0.12),  # a mm of height, 0.05 deg of every angle, the body's on a lever arm of 0.15 m
+        (_klv, 0.16, 5e-3),  # 0.15 m of height, 0.003 deg of the heading
     ],
 )
 def test_drones_that_log_body_and_gimbal(tmp_path: Path, write: Any, metres: float, degrees: float) -> None:

@@ -30,7 +30,7 @@ from tests.formats.maps import test_grid_npz, test_las, test_octomap, test_pcd, 
 from tests.formats.poses import test_kitti, test_pose_csv
 from tests.formats.skeletons import test_amc, test_bvh, test_c3d, test_trc
 from tests.formats.videos import test_picture_folder
-from tests.synthetic import drone_logs, logs, map_logs, videos
+from tests.synthetic import drone_logs, logs, map_logs, video_tracks, videos
 from tests.synthetic.flights import write_flight
 from tests.synthetic.logged_flights import write_logged_flight
 
@@ -137,6 +137,7 @@ SEEDS: dict[str, Writer] = {
     "dji": lambda folder: drone_logs.write_srt(folder / "a.SRT", _truth(folder)),
     "dji_binary": _text("FLY022.DAT", bytes(16) + b"BUILD" + bytes(221) + b"DJI_LOG_V3" + bytes(100)),
     "dji_record": lambda folder: test_dji_records.airdata(folder / "a.csv"),
+    "dji_video": lambda folder: video_tracks.write_djmd(folder / "a.mp4", _truth(folder)),
     "flight": lambda folder: write_flight(folder, seconds=0.2),
     "flight from logs": _logged_flight,
     "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),
@@ -145,6 +146,8 @@ SEEDS: dict[str, Writer] = {
     "joints_csv": lambda folder: joints_csv.write_joints(folder / "joints.csv", walking(4)),
     "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),
     "kitti": test_kitti.write,
+    "klv": lambda folder: video_tracks.write_klv(folder / "a.klv", _truth(folder)),
+    "klv in a video": lambda folder: video_tracks.write_klv(folder / "a.ts", _truth(folder), pictures=5),
     "las": lambda folder: test_las.write(folder / "a.las"),
     "las, compressed": lambda folder: test_las.write(folder / "a.laz"),
     "map log": _map_log,

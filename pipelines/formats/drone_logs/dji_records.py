@@ -15,7 +15,7 @@ import csv
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from itertools import islice
@@ -25,8 +25,7 @@ import numpy as np
 
 from pipelines.formats.common.files import first_bytes, read_head
 from pipelines.formats.common.rows import describe_times
-from pipelines.formats.drone_logs.dji_rows import angles_track, any_finite, choose_height, range_of
-from pipelines.formats.drone_logs.telemetry_rows import between_repeats, position_track
+from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, range_of, telemetry_of_rows
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.storage import as_data_error, refuse_special
@@ -108,35 +107,18 @@ class DjiRecordFormat:
             DataError: no flight record, no position, or no height while the user states none.
         """
         record = _read(path)
-        columns, (t_ns, timed) = record.columns, record.times
-        height, which, note_on_height = choose_height(path, columns, choice)
-        dropped = dict(record.dropped)
-        track = position_track(
-            path,
-            "its GPS",
+        t_ns, timed = record.times
+        placed = {"latitude": np.where(record.placed, record.columns["latitude"], np.nan)}
+        rows = DjiRows(
             t_ns,
-            np.stack([columns["latitude"], columns["longitude"], height], axis=1),
-            dropped,
-            on_earth=True,
-            height=which,
-            unusable={"no time": ~timed, "no position": ~record.placed},
+            timed,
+            {**record.columns, **placed},
+            record.clock,
+            body=record.angles("drone"),
+            gimbal=record.angles("gb"),
+            dropped=record.dropped,
         )
-        values, moved = between_repeats(track.t_ns, track.values)
-        body, gimbal = (
-            angles_track(name, t_ns[timed], record.angles(part)[timed], dropped, rows="rows")
-            for name, part in (("its body's angles", "drone"), ("its gimbal angles", "gb"))
-        )
-        notes = [*record.notes, note_on_height]
-        if moved:
-            notes.append(f"{moved} of {len(values)} positions repeat the one before: taken between them")
-        return Telemetry(
-            position=replace(track, values=values),
-            body=body,
-            gimbal=gimbal,
-            clock=record.clock,
-            notes=tuple(f"{path}: {note}" for note in notes),
-            dropped=dropped,
-        )
+        return telemetry_of_rows(path, rows, choice, record.notes)
 
 
 class DjiBinaryFormat:

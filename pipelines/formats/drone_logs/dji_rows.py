@@ -1,6 +1,7 @@
-"""Rows of DJI's subtitles and flight records: heights with their references, angles of body and gimbal."""
+"""Rows of DJI's subtitles, records, tags and videos: positions, heights with their references, angles."""
 
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,75 @@ from pipelines.formats.common.rows import longest_rising
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     between_refreshed_angles,
+    between_repeats,
     of_angles,
+    position_track,
     turned_as_stated,
     whatever_from,
 )
-from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.telemetry import AttitudeTrack, Height, TelemetryChoice
+from pipelines.session.telemetry import AttitudeTrack, Height, Telemetry, TelemetryChoice
 
 _HIGHEST_M = 500  # above the take-off: the largest height that DJI's drones reach
+
+
+@dataclass(frozen=True)
+class DjiRows:
+    """Rows of a file of DJI's, of whatever kind; NaN where a row does not hold a value."""
+
+    t_ns: Int64  # [N]
+    timed: Bool  # [N] True where the time is known
+    columns: Mapping[str, Float]  # [N] by name: latitude, longitude (deg), relative, absolute, altitude (m)
+    clock: str  # as in `Telemetry`
+    body: Float  # [N, 3] yaw, pitch, roll (deg)
+    gimbal: Float  # [N, 3] the same of the camera
+    names: tuple[str, str] = ("its body's angles", "its gimbal angles")
+    rows: str = "rows"  # name of the rows where losses are counted
+    repeats: bool = True  # a position is repeated until the next measurement
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+
+def telemetry_of_rows(
+    path: Path, found: DjiRows, choice: TelemetryChoice, notes: Sequence[str] = ()
+) -> Telemetry:
+    """Build positions and attitudes; a repeated position is replaced by linear interpolation.
+
+    Raises:
+        DataError: no position in any row, or no height while the user states none.
+    """
+    columns, dropped = found.columns, dict(found.dropped)
+    height, which, note_on_height = choose_height(path, columns, choice)
+    track = position_track(
+        path,
+        "its GPS",
+        found.t_ns,
+        np.stack([columns["latitude"], columns["longitude"], height], axis=1),
+        dropped,
+        on_earth=True,
+        height=which,
+        unusable={"no time": ~found.timed, "no position": ~np.isfinite(columns["latitude"])},
+    )
+    said = [*notes, note_on_height]
+    if found.repeats:
+        values, moved = between_repeats(track.t_ns, track.values)
+        track = replace(track, values=values)
+        if moved:
+            said.append(
+                f"{moved} of {len(values)} positions repeat the one before: taken between measurements"
+            )
+    body, gimbal = (
+        angles_track(name, found.t_ns[found.timed], angles[found.timed], dropped, rows=found.rows)
+        for name, angles in zip(found.names, (found.body, found.gimbal), strict=True)
+    )
+    return Telemetry(
+        position=track,
+        body=body,
+        gimbal=gimbal,
+        clock=found.clock,
+        notes=tuple(f"{path}: {note}" for note in said),
+        dropped=dropped,
+    )
 
 
 def choose_height(

@@ -15,16 +15,14 @@ Angles are those of an FRD body and gimbal in NED (docs/drones.md).
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import describe_times
-from pipelines.formats.drone_logs.dji_rows import angles_track, any_finite, choose_height, range_of
+from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, range_of, telemetry_of_rows
 from pipelines.formats.drone_logs.subtitles import Subtitles, parse_subtitles, read_subtitles
-from pipelines.formats.drone_logs.telemetry_rows import between_repeats, position_track
 from pipelines.geometry.arrays import Float
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
@@ -104,27 +102,17 @@ class DjiSrtFormat:
         subtitles = read_subtitles(path)
         columns = _columns(subtitles.texts)
         t_ns, timed = subtitles.times()
-        height, which, note_on_height = choose_height(path, columns, choice)
-        dropped: dict[str, int] = {}
-        track = position_track(
-            path,
-            "its GPS",
+        rows = DjiRows(
             t_ns,
-            np.stack([columns["latitude"], columns["longitude"], height], axis=1),
-            dropped,
-            on_earth=True,
-            height=which,
-            unusable={"no time": ~timed, "no position": ~np.isfinite(columns["latitude"])},
+            timed,
+            columns,
+            _clock_name(subtitles),
+            body=_angles(columns, "drone"),
+            gimbal=_angles(columns, "gb"),
+            names=("F.PRY", "its gimbal angles"),
+            rows="subtitles",
         )
-        values, moved = between_repeats(track.t_ns, track.values)
-        return Telemetry(
-            position=replace(track, values=values),
-            body=angles_track("F.PRY", t_ns[timed], _angles(columns, "drone")[timed], dropped),
-            gimbal=angles_track("its gimbal angles", t_ns[timed], _angles(columns, "gb")[timed], dropped),
-            clock=_clock_name(subtitles),
-            notes=tuple(f"{path}: {note}" for note in _notes(subtitles, note_on_height, moved, len(values))),
-            dropped=dropped,
-        )
+        return telemetry_of_rows(path, rows, choice, [_note_on_clock(subtitles)])
 
 
 # --- content of a subtitle -----------------------------------------------------------------------------
@@ -171,19 +159,12 @@ def _clock_name(subtitles: Subtitles) -> str:
     return "the drone's clock" if subtitles.has_clock.any() else "the video's start"
 
 
-def _notes(subtitles: Subtitles, height: str, moved: int, rows: int) -> list[str]:
-    """List notes about the choices made and about doubtful data."""
-    notes = []
+def _note_on_clock(subtitles: Subtitles) -> str:
     if not subtitles.has_clock.any():
-        notes.append("shows no clock: its times count from the video's start")
-    elif subtitles.are_slow:
-        notes.append("shows whole seconds of local time, taken as UTC: let clock.sigma_s be 1")
-    else:
-        notes.append("its clock is the drone's local time, taken as UTC")
-    notes.append(height)
-    if moved:
-        notes.append(f"{moved} of {rows} positions repeat the one before: taken between measurements")
-    return notes
+        return "shows no clock: its times count from the video's start"
+    if subtitles.are_slow:
+        return "shows whole seconds of local time, taken as UTC: let clock.sigma_s be 1"
+    return "its clock is the drone's local time, taken as UTC"
 
 
 FORMAT = DjiSrtFormat()

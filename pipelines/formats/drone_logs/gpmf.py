@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     describe_fit,
@@ -31,6 +30,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     position_track,
     turned_as_stated,
 )
+from pipelines.formats.drone_logs.video_tracks import track_packets
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.session.errors import DataError
@@ -83,11 +83,9 @@ class GoProFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if a video has a track of GPMF whose first packet begins with a device."""
-        if first_bytes(path, 12, suffixes=self.suffixes)[4:8] != b"ftyp":
-            return False
         try:
-            return next(_packets(path), None) is not None
-        except DataError:
+            return path.is_file() and next(_packets(path), None) is not None
+        except (DataError, OSError):
             return False
 
     def describe(self, path: Path) -> dict[str, object]:
@@ -171,33 +169,7 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
 
 
 def _packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """Yield start and length of each packet in video time, ns, and its bytes."""
-    import av
-    from av.stream import Discard
-
-    try:
-        # Named format and protocol, as for pictures: a playlist must not make FFmpeg open other files.
-        with av.open(f"file:{path.absolute()}", format="mov", metadata_errors="replace") as container:
-            tracks = [stream for stream in container.streams if stream.type == "data"]
-            for track in tracks:
-                for stream in container.streams:
-                    stream.discard = Discard.default if stream is track else Discard.all
-                container.seek(0)
-                found = False
-                for packet in container.demux(track):
-                    content, step = bytes(packet), track.time_base
-                    if packet.pts is None or step is None or not content:
-                        continue
-                    if not found and not content.startswith(b"DEVC"):
-                        break
-                    found = True
-                    start, length = (round(n * step * 10**9) for n in (packet.pts, packet.duration or 0))
-                    yield start, length, content
-                if found:
-                    return
-    except (av.error.FFmpegError, OSError, ValueError) as error:
-        problem = f"cannot be read ({str(error)[:100]})"
-        raise DataError(path, problem, "copy it from the camera again") from error
+    yield from track_packets(path, lambda content: content.startswith(b"DEVC"))
 
 
 def _read(path: Path) -> _Track:

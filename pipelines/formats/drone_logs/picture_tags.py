@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.exif import NAMES, Tags, picture_files, read_tags
-from pipelines.formats.drone_logs.dji_rows import angles_track, any_finite, choose_height
-from pipelines.formats.drone_logs.telemetry_rows import position_track
+from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, telemetry_of_rows
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
@@ -50,19 +49,7 @@ class PictureTags:
             DataError: no pictures, no time or position in any, or no height while the user states none.
         """
         t_ns, columns = _columns(path)
-        height, which, note = choose_height(path, columns, choice)
-        dropped: dict[str, int] = {}
-        track = position_track(
-            path,
-            "its GPS",
-            t_ns,
-            np.stack([columns["latitude"], columns["longitude"], height], axis=1),
-            dropped,
-            on_earth=True,
-            height=which,
-            unusable={"no time": t_ns == 0, "no position": ~np.isfinite(columns["latitude"])},
-        )
-        notes = ["its clock is the drone's local time, taken as UTC", note]
+        notes = ["its clock is the drone's local time, taken as UTC"]
         fixed = columns["rtk_flag"] == _RTK_FIXED
         if fixed.any():
             across = np.nanmax(np.hypot(columns["rtk_std_latitude"], columns["rtk_std_longitude"]))
@@ -70,16 +57,18 @@ class PictureTags:
                 f"{np.count_nonzero(fixed)} of {len(fixed)} positions are by RTK with a fix, by their own"
                 f" account within {across:.3f} m across"
             )
-        timed = t_ns != 0
-        angles = {part: _angles(columns, part)[timed] for part in ("drone", "gb")}
-        return Telemetry(
-            position=track,
-            body=angles_track("flight angles", t_ns[timed], angles["drone"], dropped, rows="pictures"),
-            gimbal=angles_track("gimbal angles", t_ns[timed], angles["gb"], dropped, rows="pictures"),
-            clock="the drone's clock",
-            notes=tuple(f"{path}: {each}" for each in notes),
-            dropped=dropped,
+        rows = DjiRows(
+            t_ns,
+            t_ns != 0,
+            columns,
+            "the drone's clock",
+            body=_angles(columns, "drone"),
+            gimbal=_angles(columns, "gb"),
+            names=("flight angles", "gimbal angles"),
+            rows="pictures",
+            repeats=False,
         )
+        return telemetry_of_rows(path, rows, choice, notes)
 
 
 def _columns(path: Path) -> tuple[Int64, dict[str, Float]]:

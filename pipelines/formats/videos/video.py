@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 
 from pipelines.formats.common.rows import describe_times
+from pipelines.formats.drone_logs.video_tracks import made_ns
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import VideoIndex
@@ -100,8 +101,8 @@ def index_video(path: Path) -> VideoIndex:
 # Telemetry by the names of tracks (as their writers call them) or of codecs, with the way to read it.
 _TELEMETRY = (
     (re.compile(r"GoPro MET"), "GoPro's telemetry (GPMF), read as `gopro`"),
-    (re.compile(r"(?i)djmd|DJI meta|CAM meta"), "DJI's telemetry (djmd), not read: convert it with ExifTool"),
-    (re.compile(r"klv"), "MISB KLV, not read: convert it to CSV with a tool for STANAG 4609"),
+    (re.compile(r"(?i)djmd|(DJI|CAM|HAL) meta"), "DJI's telemetry (djmd), read as `dji_video`"),
+    (re.compile(r"klv"), "MISB KLV, read as `klv`"),
 )
 
 
@@ -133,17 +134,7 @@ def created_ns(path: Path) -> int | None:
     container, stream = open_container(path)
     with container:
         texts = [{**container.metadata}.get("creation_time"), {**stream.metadata}.get("creation_time")]
-    for text in texts:
-        if not text:
-            continue
-        try:
-            made = datetime.fromisoformat(text)
-        except ValueError:
-            continue
-        elapsed = (made if made.tzinfo else made.replace(tzinfo=UTC)) - _EPOCH
-        if elapsed > _NO_DATE_BEFORE:  # MP4 counts from 1904, and a clock that was never set from 1970
-            return elapsed // timedelta(microseconds=1) * 1000
-    return None
+    return made_ns(texts)
 
 
 def frames(

@@ -1,0 +1,275 @@
+"""DJI's telemetry track (djmd) inside a video: one message of protobuf for each picture.
+
+DJI publishes no definition. The numbers of the fields are those of ExifTool's tables (Image::ExifTool::DJI),
+by the protocol that the first message names (`dvtm_Air3s.proto`). Field 3 is the picture. In it are a
+position (`GPSInfo`: 1 unit, 2 latitude, 3 longitude, in radians unless the unit is 1), the height absolute
+(mm) and above the take-off (mm), and angles in tenths of a degree: of the body as roll, pitch, yaw and of
+the gimbal as pitch, roll, yaw. A field that is 0 is left out, as everywhere in protobuf.
+
+The track has no date. Its times are those of the video, from its time of creation on.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, range_of, telemetry_of_rows
+from pipelines.formats.drone_logs.video_tracks import track_packets, video_made_ns
+from pipelines.geometry.arrays import Float
+from pipelines.session.errors import DataError
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
+
+_PROTOCOL = re.compile(rb"dvtm_[A-Za-z0-9_-]{1,40}\.proto")
+_VARINT, _FIXED_64, _BYTES, _FIXED_32 = 0, 1, 2, 5
+_PICTURE = 3
+_OTHER_WAY = "turn on subtitles on the drone and name the .SRT, or name a flight record: pose: {dji: ...}"
+
+Value = int | bytes
+Path_ = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Places of the fields in the message of a picture; None where the tables name none."""
+
+    position: Path_ = (3, 4)
+    relative: Path_ | None = (3, 5, 1)
+    body: Path_ | None = (3, 3)
+    gimbal: Path_ | None = (4, 3)
+    degrees: bool = False  # whatever the unit says
+
+
+_DRONE = _Layout()
+_RACER = _Layout(position=(4, 4), relative=(4, 5, 1), body=(4, 3), gimbal=None)
+_HAND = _Layout(position=(4, 2), relative=None, body=None, gimbal=None)
+_LAYOUTS = {
+    **dict.fromkeys(("Mini4_Pro", "Air3", "Air3s", "wm265e", "wm261", "pm320", "wa345e"), _DRONE),
+    **dict.fromkeys(("AVATA2", "dji_neo"), _RACER),
+    **dict.fromkeys(("ac203", "ac204", "ac206", "oq101"), _HAND),
+    "Mavic4": _Layout(gimbal=None, degrees=True),
+    "Mini5Pro": _Layout(relative=None, body=None, gimbal=None, degrees=True),
+}
+
+
+class DjiVideoFormat:
+    """Reader of the positions and angles in a DJI drone's video, for the models whose fields are public."""
+
+    name = "dji_video"
+    title = "DJI telemetry (djmd, in a video)"
+    suffixes: tuple[str, ...] = (".mp4", ".mov")
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if a video has a data track whose first message names a protocol of DJI's."""
+        try:
+            return path.is_file() and next(_packets(path), None) is not None
+        except (DataError, OSError):
+            return False
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe the model's protocol, and ranges of positions, heights and angles."""
+        protocol, rows = _read(path)
+        columns = rows.columns
+        facts: dict[str, object] = {
+            "protocol": protocol,
+            "messages": len(rows.t_ns),
+            "positions": int(np.count_nonzero(np.isfinite(columns["latitude"]))),
+            "clock": rows.clock,
+        }
+        for label, name, decimals in (
+            ("latitude_deg", "latitude", 7),
+            ("longitude_deg", "longitude", 7),
+            ("height_above_take_off_m", "relative", 3),
+            ("height_absolute_m", "absolute", 3),
+        ):
+            if any_finite(columns[name]):
+                facts[label] = range_of(columns[name], decimals)
+        for label, angles in (("gimbal", rows.gimbal), ("body", rows.body)):
+            if any_finite(angles):
+                facts[f"{label}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
+                facts[f"{label}_pitch_deg"] = range_of(angles[:, 1], 2)
+        return facts | {f"dropped: {cause}": count for cause, count in rows.dropped.items()}
+
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Read positions, and the angles of body and gimbal where the model's fields are public.
+
+        Raises:
+            DataError: no such track, a model whose fields are not public, no position, or no height.
+        """
+        _, rows = _read(path)
+        dated = rows.clock != "the video's start"
+        made = "its times count from the video's time of creation, whole seconds: let clock.sigma_s be 1"
+        return telemetry_of_rows(
+            path, rows, choice, [made if dated else "its times count from the video's start"]
+        )
+
+
+def _packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
+    yield from track_packets(path, lambda content: _PROTOCOL.search(content[:4096]) is not None)
+
+
+def _read(path: Path) -> tuple[str, DjiRows]:
+    """Return the name of the protocol and the rows of all messages.
+
+    Raises:
+        DataError: no such track, or a protocol that the tables do not have.
+    """
+    protocol, layout = "", _DRONE
+    at_ns: list[int] = []
+    rows: list[list[float]] = []
+    dropped: Counter[str] = Counter()
+    for start_ns, _, content in _packets(path):
+        if not protocol:
+            protocol, layout = _layout_of(path, content)
+        try:
+            picture = _inside(content, (_PICTURE,))
+            row = _row(picture, layout) if isinstance(picture, bytes) else [np.nan] * 10
+        except ValueError:
+            dropped["damaged messages"] += 1
+            continue
+        at_ns.append(start_ns)
+        rows.append(row)
+    if not protocol:
+        raise DataError(path, "has no track of DJI's telemetry", _OTHER_WAY)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 10)
+    names = ("latitude", "longitude", "relative", "absolute")
+    columns = dict(zip(names, table.T[:4], strict=True)) | {"altitude": np.full(len(table), np.nan)}
+    made_ns = video_made_ns(path)
+    return protocol, DjiRows(
+        np.array(at_ns, dtype=np.int64) + (made_ns or 0),
+        np.ones(len(table), dtype=np.bool_),
+        columns,
+        "the video's start" if made_ns is None else "the video's time of creation",
+        body=_filled(table[:, 4:7]),
+        gimbal=_filled(table[:, 7:10]),
+        rows="messages",
+        dropped=dropped,
+    )
+
+
+def _layout_of(path: Path, content: bytes) -> tuple[str, _Layout]:
+    named = _PROTOCOL.search(content)
+    protocol = named[0].decode().removesuffix(".proto") if named else ""
+    layout = _LAYOUTS.get(protocol.removeprefix("dvtm_"))
+    if layout is None:
+        raise DataError(path, f"holds DJI's telemetry as {protocol}, whose fields are not public", _OTHER_WAY)
+    return protocol, layout
+
+
+def _filled(angles_deg: Float) -> Float:
+    """Return angles [N, 3] of which none is measured if all are 0: a model without them logs zeros."""
+    return angles_deg if np.nan_to_num(angles_deg).any() else np.full_like(angles_deg, np.nan)
+
+
+def _row(picture: bytes, layout: _Layout) -> list[float]:
+    """Return latitude, longitude (deg), heights (m), and yaw, pitch, roll (deg) of body and gimbal.
+
+    Raises:
+        ValueError: the message is damaged.
+    """
+    latitude = longitude = relative = absolute = np.nan
+    place = _inside(picture, (*layout.position, 1))
+    if isinstance(place, bytes):
+        unit = _inside(place, (1,))
+        scale = 1.0 if layout.degrees or unit == 1 else 180.0 / np.pi
+        latitude, longitude = (_real(_inside(place, (number,))) * scale for number in (2, 3))
+    if isinstance(height := _inside(picture, (*layout.position, 2)), int):
+        absolute = _signed(height) / 1000
+    if layout.relative and _inside(picture, layout.relative[:-1]) is not None:
+        relative = _real(_inside(picture, layout.relative) or bytes(4)) / 1000
+    body = _angles(picture, layout.body, (3, 2, 1))
+    return [latitude, longitude, relative, absolute, *body, *_angles(picture, layout.gimbal, (3, 1, 2))]
+
+
+def _angles(picture: bytes, place: Path_ | None, order: tuple[int, int, int]) -> list[float]:
+    """Return yaw, pitch, roll (deg) whose fields have these numbers; NaN without the message."""
+    inner = _inside(picture, place) if place else None
+    if not isinstance(inner, bytes):
+        return [np.nan] * 3
+    values = [_inside(inner, (number,)) or 0 for number in order]
+    return [_signed(value) / 10 if isinstance(value, int) else np.nan for value in values]
+
+
+def _inside(message: bytes, place: Path_) -> Value | None:
+    """Return the field at a place in nested messages; None if it is left out.
+
+    Raises:
+        ValueError: the message is damaged.
+    """
+    for depth, number in enumerate(place, 1):
+        found: Value | None = None
+        for there, value in _fields(message):
+            if there == number:
+                found = value
+        if depth == len(place) or not isinstance(found, bytes):
+            return found if depth == len(place) else None
+        message = found
+    return None
+
+
+def _fields(message: bytes) -> Iterator[tuple[int, Value]]:
+    """Yield number and value of each field of a message of protobuf ("Encoding", protobuf.dev).
+
+    Raises:
+        ValueError: it breaks off, or has a type of the wire that is not in use.
+    """
+    place = 0
+    while place < len(message):
+        key, place = _varint(message, place)
+        kind = key & 7
+        if kind == _VARINT:
+            value: Value
+            value, place = _varint(message, place)
+            yield key >> 3, value
+            continue
+        if kind == _BYTES:
+            size, place = _varint(message, place)
+        elif kind in {_FIXED_64, _FIXED_32}:
+            size = 8 if kind == _FIXED_64 else 4
+        else:
+            raise ValueError(f"type {kind}")
+        if place + size > len(message):
+            raise ValueError("breaks off")
+        yield key >> 3, message[place : place + size]
+        place += size
+
+
+def _varint(message: bytes, place: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        if place >= len(message):
+            raise ValueError("breaks off")
+        byte = message[place]
+        place += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, place
+    raise ValueError("a number of more than 64 bits")
+
+
+def _signed(value: int) -> int:
+    value &= 2**64 - 1
+    return value - 2**64 if value >= 2**63 else value
+
+
+def _real(value: Value | None) -> float:
+    """Return a float or double; 0 where it is left out.
+
+    Raises:
+        ValueError: the field has another type.
+    """
+    if value is None:
+        return 0.0
+    kinds = {4: "<f", 8: "<d"}
+    if not isinstance(value, bytes) or len(value) not in kinds:
+        raise ValueError("is no real number")
+    return float(struct.unpack(kinds[len(value)], value)[0])
+
+
+FORMAT = DjiVideoFormat()

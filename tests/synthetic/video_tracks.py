@@ -1,0 +1,170 @@
+"""Telemetry tracks of videos, byte for byte: DJI's djmd and MISB KLV, beside pictures if they are wanted."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+
+from pipelines.geometry.poses import conjugate, rotate
+from tests.synthetic.drone_logs import DroneTruth, angles_of
+from tests.synthetic.videos import bar_code
+
+KLV_KEY = bytes.fromhex("060E2B34020B01010E01030101000000")
+
+
+def write_track(
+    path: Path,
+    stamped: Sequence[tuple[int, bytes]],
+    *,
+    codec: str,
+    made_s: int | None = None,
+    pictures: int = 0,
+) -> Path:
+    """Write packets at times (ns) into a data track; `pictures` at 30 Hz go into a track of their own."""
+    kind = "mp4" if codec == "bin_data" else "mpegts"
+    with av.open(str(path), "w", format=kind) as container:
+        if made_s is not None:
+            container.metadata["creation_time"] = datetime.fromtimestamp(made_s, UTC).isoformat()
+        video: Any = None
+        if pictures:
+            video = container.add_stream("libx264", rate=30)
+            video.width, video.height = bar_code(0).shape[1], bar_code(0).shape[0]
+            video.pix_fmt = "yuv420p"
+        track: Any = container.add_data_stream(codec)
+        track.time_base = Fraction(1, 90_000)
+        container.start_encoding()
+        for k in range(pictures):
+            container.mux(video.encode(av.VideoFrame.from_ndarray(bar_code(k), format="rgb24")))
+        if pictures:
+            container.mux(video.encode())
+        for t_ns, content in stamped:
+            packet = av.Packet(content)
+            packet.stream = track
+            packet.time_base = Fraction(1, 90_000)
+            packet.pts = packet.dts = round(t_ns * 90_000 / 10**9)
+            packet.duration = 1  # FFmpeg's reader drops a last packet without any
+            container.mux(packet)
+    return path
+
+
+# --- DJI -----------------------------------------------------------------------------------------------
+
+
+def proto(number: int, value: bytes | int | float, *, double: bool = False) -> bytes:
+    """Encode a field of protobuf: nested or text, a number (negative ones in ten bytes), or a real one."""
+    if isinstance(value, bytes):
+        return varint(number << 3 | 2) + varint(len(value)) + value
+    if isinstance(value, int):
+        return varint(number << 3) + varint(value % 2**64)
+    return varint(number << 3 | (1 if double else 5)) + struct.pack("<d" if double else "<f", value)
+
+
+def varint(value: int) -> bytes:
+    """Encode a number in groups of seven bits, the lowest first."""
+    out = bytearray()
+    while value >= 0x80:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def djmd_messages(truth: DroneTruth, protocol: str = "dvtm_Air3s.proto") -> list[tuple[int, bytes]]:
+    """Encode a message for each row, with the fields of a Mini 4 Pro; zeros are left out."""
+    messages = []
+    for row, stamp_ns in enumerate(truth.t_ns.tolist()):
+        body, gimbal = (
+            [round(10 * each) for each in part[row].tolist()]
+            for part in (truth.body_ypr_deg, truth.gimbal_ypr_deg)
+        )
+        place = b"".join(
+            proto(number, float(np.radians(each[row])), double=True)
+            for number, each in ((2, truth.latitude_deg), (3, truth.longitude_deg))
+        )
+        position = proto(1, place) + proto(2, round(1000 * float(truth.altitude_m[row])))
+        flown = [
+            proto(3, b"".join(proto(k, each) for k, each in zip((1, 2, 3), body[::-1], strict=True) if each)),
+            proto(4, position),
+            proto(5, proto(1, 1000 * float(truth.enu[row, 2]))),
+        ]
+        turned = [
+            proto(k, each) for k, each in zip((1, 2, 3), (gimbal[1], gimbal[2], gimbal[0]), strict=True)
+        ]
+        since_us = int(truth.boot_us[row])
+        picture = proto(1, proto(2, since_us)) + proto(3, b"".join(flown))
+        picture += proto(4, proto(3, b"".join(turned)))
+        head = proto(1, proto(1, proto(1, protocol.encode()))) if row == 0 else b""
+        messages.append((stamp_ns - int(truth.t_ns[0]), head + proto(3, picture)))
+    return messages
+
+
+def write_djmd(
+    path: Path, truth: DroneTruth, protocol: str = "dvtm_Air3s.proto", *, pictures: int = 0
+) -> Path:
+    """Write a video of DJI's whose time of creation is the first row's, which is a whole second."""
+    made_s = int(truth.t_ns[0]) // 10**9
+    messages = djmd_messages(truth, protocol)
+    return write_track(path, messages, codec="bin_data", made_s=made_s, pictures=pictures)
+
+
+# --- MISB ----------------------------------------------------------------------------------------------
+
+
+def klv_packet(items: Mapping[int, bytes]) -> bytes:
+    """Encode a packet of ST 0601, with its checksum."""
+    inside = b"".join(bytes([tag, len(value)]) + value for tag, value in items.items()) + bytes([1, 2])
+    length = len(inside) + 2
+    head = KLV_KEY + (bytes([length]) if length < 128 else bytes([0x81, length]))
+    summed = 0
+    for place, byte in enumerate(head + inside):
+        summed += byte << (8 * ((place + 1) % 2))
+    return head + inside + (summed % 65536).to_bytes(2)
+
+
+def klv_packets(truth: DroneTruth) -> list[tuple[int, bytes]]:
+    """Encode a packet for each row: the body's place and attitude, and the camera's angles in the body."""
+    yaw, pitch, roll = np.radians(truth.gimbal_ypr_deg).T
+    ahead = np.stack([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
+    level = np.stack([np.cos(yaw), -np.sin(yaw), np.zeros_like(yaw)], axis=1)
+    right = np.cos(roll)[:, None] * level + np.sin(roll)[:, None] * np.cross(ahead, level)
+    in_body = [rotate(conjugate(truth.body), each) for each in (ahead, right)]  # forward, left, up
+    relative = angles_of(*(np.stack([-v[:, 1], v[:, 0], v[:, 2]], axis=1) for v in in_body))
+    packets = []
+    for row, stamp_ns in enumerate(truth.t_ns.tolist()):
+        items = {
+            2: (stamp_ns // 1000).to_bytes(8),
+            5: _whole(truth.body_ypr_deg[row, 0] % 360, 2, 0, 360),
+            90: _part(truth.body_ypr_deg[row, 1], 4, 90),
+            91: _part(truth.body_ypr_deg[row, 2], 4, 90),
+            13: _part(truth.latitude_deg[row], 4, 90),
+            14: _part(truth.longitude_deg[row], 4, 180),
+            15: _whole(truth.altitude_m[row], 2, -900, 19000),
+            18: _whole(relative[row, 0] % 360, 4, 0, 360),
+            19: _part(relative[row, 1], 4, 180),
+            20: _whole(relative[row, 2] % 360, 4, 0, 360),
+        }
+        packets.append((stamp_ns - int(truth.t_ns[0]), klv_packet(items)))
+    return packets
+
+
+def write_klv(path: Path, truth: DroneTruth, *, pictures: int = 0) -> Path:
+    """Write the packets into a transport stream, or one after the other into a .klv."""
+    packets = klv_packets(truth)
+    if path.suffix == ".klv":
+        path.write_bytes(b"".join(content for _, content in packets))
+        return path
+    return write_track(path, packets, codec="klv", pictures=pictures)
+
+
+def _whole(value: float, size: int, low: float, high: float) -> bytes:
+    return round((value - low) / (high - low) * ((1 << 8 * size) - 1)).to_bytes(size)
+
+
+def _part(value: float, size: int, most: float) -> bytes:
+    return round(value / most * ((1 << (8 * size - 1)) - 1)).to_bytes(size, signed=True)
