@@ -16,6 +16,7 @@ $(STAMP): requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r requirements.lock
 	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true  # as pip does, on all cores
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	$(BIN)/python -m pipelines.precompile  # else the first reconstruction would compile them
 	touch $(STAMP)
 
 demo: setup
@@ -83,7 +84,7 @@ docs: setup
 
 # Make the sample flight again: the same logs and truth as in the repository, byte for byte.
 sample: setup
-	$(BIN)/mocap simulate sample_data/mound_walk.yaml -o sample_data/mound_walk --force
+	$(BIN)/mocap simulate --example mound_walk -o sample_data/mound_walk --force
 
 # Pin the newest versions that pyproject.toml allows (needs uv).
 lock:

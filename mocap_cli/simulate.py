@@ -7,6 +7,7 @@ import click
 from mocap_cli.options import (
     Shown,
     any_path,
+    example_option,
     force_option,
     output_options,
     overwrite_option,
@@ -16,7 +17,8 @@ from mocap_cli.terminal import print_json, print_table, say, watching
 
 
 @click.command("simulate", short_help="Make a flight with known truth.")
-@click.argument("scenario", type=any_path, metavar="SCENARIO.yaml")
+@click.argument("scenario", type=any_path, required=False, metavar="[SCENARIO.yaml]")
+@example_option("Simulate the scenario of the sample flight instead of one of yours.")
 @click.option("-o", "--output", type=any_path, required=True, help="Folder of the flight.")
 @click.option(
     "--no-video",
@@ -28,7 +30,8 @@ from mocap_cli.terminal import print_json, print_table, say, watching
 @force_option
 @output_options
 def simulate_command(
-    scenario: Path,
+    scenario: Path | None,
+    example: str | None,
     output: Path,
     no_video: bool,
     workers: int,
@@ -37,8 +40,12 @@ def simulate_command(
     shown: Shown,
 ) -> None:
     """Make the files of a flight (logs, videos, calibration, map) and the truth."""
-    from pipelines.simulate import simulate
+    from pipelines.simulate import example_scenario, simulate
 
+    if (scenario is None) == (example is None):
+        raise click.UsageError("State either a SCENARIO.yaml or --example NAME.")
+    if scenario is None:
+        scenario = example_scenario(str(example))
     with watching(shown.level) as progress:
         result = simulate(
             scenario,

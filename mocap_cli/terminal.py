@@ -7,6 +7,7 @@ in them that could control the terminal or start a new line are replaced by visi
 from __future__ import annotations
 
 import json
+import logging
 import sys
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
@@ -85,13 +86,41 @@ class _BarsOnStderr(_Notes):
 def watching(verbosity: int) -> Iterator[Progress]:
     """Make the progress of a stage: bars if stderr is a terminal, else notes; nothing with -q."""
     if verbosity < 0 or not sys.stderr.isatty():
-        yield _Notes(verbosity)
+        notes = _Notes(verbosity)
+        with _noting_compilation(notes):
+            yield notes
         return
     from rich.console import Console
     from rich.progress import Progress as Bars
 
     with Bars(console=Console(stderr=True), transient=True) as bars:
-        yield _BarsOnStderr(verbosity, bars)
+        shown = _BarsOnStderr(verbosity, bars)
+        with _noting_compilation(shown):
+            yield shown
+
+
+class _Noting(logging.Handler):
+    """Handler that turns records into notes."""
+
+    def __init__(self, notes: _Notes) -> None:
+        super().__init__()
+        self._notes = notes
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._notes.note(record.getMessage())
+
+
+@contextmanager
+def _noting_compilation(notes: _Notes) -> Iterator[None]:
+    """Note what `pipelines.geometry.compilation` logs; by its name, because the module imports numba."""
+    logger = logging.getLogger("pipelines.geometry.compilation")
+    handler = _Noting(notes)
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
 
 
 def say_warnings(warnings: Sequence[str], quiet: bool) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,11 @@ def simulate(
         write_json(making.folder / SIMULATION_MARK, summary)
         making.publish()
     return Simulated(folder, summary, skipped=False)
+
+
+def example_scenario(name: str) -> Path:
+    """Return the scenario of an example that is installed with the program."""
+    return Path(str(files("pipelines.simulation") / "data" / f"{name}.yaml"))
 
 
 def _refuse_to_lose_others(folder: Path) -> None:

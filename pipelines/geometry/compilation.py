@@ -2,9 +2,10 @@
 
 numba puts its cache beside the source, else in the user's cache folder, or in NUMBA_CACHE_DIR. It compiles
 again if the file of the outermost function changed. With this module, it does so also if the file of a
-helper changed.
+helper changed. The first compilation of a process is logged, because it takes seconds.
 """
 
+import logging
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
@@ -13,6 +14,10 @@ from pickle import UnpicklingError
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+from numba.core import event
+
+LOGGER = logging.getLogger(__name__)
+"""Logger of one line, at level INFO, when a process compiles for the first time."""
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -60,6 +65,30 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
         return result
 
     return call
+
+
+class _Announcement(event.Listener):  # type: ignore[misc]  # numba has no types
+    """Log line at the first compilation of the process; code from the cache is not compiled."""
+
+    def on_start(self, event: object) -> None:  # noqa: ARG002  # numba calls it so
+        """Log the line once."""
+        if not self._done:
+            self._done = True
+            LOGGER.info("compiling numerical functions for this processor, once: for up to a minute")
+
+    def on_end(self, event: object) -> None:
+        """Do nothing: only the beginning is announced."""
+
+    _done = False
+
+
+event.register("numba:compile", _Announcement())
+
+
+def dispatcher_of(function: Callable[..., object]) -> Any:
+    """Return numba's compiler of a function that `cached` or `helper` made; None of any other function."""
+    made = (getattr(cell, "cell_contents", None) for cell in function.__closure__ or ())
+    return next((one for one in (function, *made) if hasattr(one, "py_func")), None)
 
 
 def _watch_helpers(compiled: Any, function: Callable[..., object]) -> None:

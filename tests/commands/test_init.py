@@ -374,3 +374,11 @@ def test_real_keypoints_without_videos_are_drafted_with_a_rate_to_check(tmp_path
     edit(result.path, {"fps: 30": "fps: 60"})
     done = ingest(result.path)
     assert [c.frames.rate_hz for c in done.description.cameras.values()] == [pytest.approx(60)] * 4
+
+
+def test_an_example_flight_needs_no_files_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    written = json.loads(succeeds("init", "--example", "mound_walk", "--json"))
+    assert read_flight(tmp_path / written["flight"]).name == "Mound walk"
+    assert refused("init", exit_code=2)
+    assert refused("init", "--example", "mound_walk", ".", exit_code=2)

@@ -2,13 +2,16 @@
 
 import importlib
 import importlib.util
+import inspect
+import logging
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from pipelines.geometry.compilation import cached
+from pipelines.geometry.compilation import LOGGER, _Announcement, cached, dispatcher_of
+from pipelines.precompile import compile_function, entry_of, listed, type_of
 
 SOURCE = """
 from pipelines.geometry.compilation import cached, helper
@@ -127,3 +130,38 @@ def test_a_function_without_a_place_for_its_cache_still_runs() -> None:
     exec("def double(x):\n    return 2.0 * x", space)  # noqa: S102  # no file, so numba knows no place
 
     assert cached(space["double"])(2.0) == 4.0
+
+
+def test_the_first_compilation_of_a_process_is_announced_and_no_other(
+    load_quarter: Callable[[], Callable[[float], float]],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(_Announcement, "_done", False)
+    for listener in importlib.import_module("numba.core.event")._registered["numba:compile"]:
+        if isinstance(listener, _Announcement):
+            monkeypatch.setattr(listener, "_done", False)
+    with caplog.at_level(logging.INFO, logger=LOGGER.name):
+        load_quarter()(2.0)
+        load_quarter()(2)  # another type is compiled as well
+    assert [record.name for record in caplog.records] == [LOGGER.name]
+
+
+def test_what_was_compiled_ahead_is_found_in_the_cache(
+    load_quarter: Callable[[], Callable[[float], float]],
+) -> None:
+    load_quarter()
+    assert compile_function("quarters:quarter", [["float64"]])
+    load_quarter()
+    assert not compile_function("quarters:quarter", [["float64"]])
+    assert not compile_function("quarters:gone", [["float64"]])  # a list older than the code
+
+
+@pytest.mark.parametrize("name", sorted(listed()))
+def test_the_list_names_functions_with_their_arguments(name: str) -> None:
+    """Compare with the code; a list that lags behind it costs time at the first use, and nothing else."""
+    module, _, function = name.partition(":")
+    compiled = dispatcher_of(getattr(importlib.import_module(module), function))
+    for signature in listed()[name]:
+        assert len(signature) == len(inspect.signature(compiled.py_func).parameters)
+        assert [entry_of(type_of(entry)) for entry in signature] == signature

@@ -15,7 +15,7 @@ from pipelines.formats.poses.tum import FORMAT as TUM
 from pipelines.formats.skeletons.joints_csv import FORMAT as JOINTS_CSV
 from pipelines.formats.videos.video import FORMAT as VIDEO
 from pipelines.session.manifest import read_flight
-from pipelines.simulate import simulate
+from pipelines.simulate import example_scenario, simulate
 
 SAMPLE_DATA = Path(__file__).parents[2] / "sample_data"
 SAMPLE = SAMPLE_DATA / "mound_walk"
@@ -30,7 +30,7 @@ they fly the same way some millimetres apart (7 on another processor), after the
 def again(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make the flight again, without its videos: logs and truth do not depend on them."""
     folder = tmp_path_factory.mktemp("sample") / "flight"
-    simulate(SAMPLE_DATA / "mound_walk.yaml", folder, video=False)
+    simulate(example_scenario("mound_walk"), folder, video=False)
     return folder
 
 
@@ -78,7 +78,7 @@ def test_the_scenario_makes_the_truth_that_stands_in_the_repository(again: Path)
 def test_the_scenario_still_means_the_flight_that_was_made_of_it(tmp_path: Path) -> None:
     """Keys that scenarios got since, left out, change nothing: the flight is there and is not made again."""
     shutil.copy(SAMPLE / "simulation.json", tmp_path)
-    assert simulate(SAMPLE_DATA / "mound_walk.yaml", tmp_path).skipped
+    assert simulate(example_scenario("mound_walk"), tmp_path).skipped
 
 
 def test_it_is_small() -> None:
@@ -86,7 +86,7 @@ def test_it_is_small() -> None:
 
 
 def test_it_is_the_flight_of_its_scenario() -> None:
-    assert (SAMPLE / "scenario.yaml").read_text() == (SAMPLE_DATA / "mound_walk.yaml").read_text()
+    assert (SAMPLE / "scenario.yaml").read_text() == example_scenario("mound_walk").read_text()
     flight = read_flight(SAMPLE / "flight.yaml")
     assert flight.name == "Mound walk"
     assert tuple(flight.cameras) == DRONES

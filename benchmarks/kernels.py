@@ -1,0 +1,68 @@
+"""Processor time that compiling the numerical functions takes, and the list `pipelines/data/kernels.json`.
+
+python -m benchmarks.kernels SESSION...            # reconstructs and replays with an empty cache
+python -m benchmarks.kernels SESSION... --write    # and makes the list from what was compiled
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+LIST = Path(__file__).resolve().parents[1] / "pipelines" / "data" / "kernels.json"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sessions", nargs="+", type=Path, metavar="SESSION")
+    parser.add_argument("--write", action="store_true", help="write the list")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as cache:
+        os.environ["NUMBA_CACHE_DIR"] = cache  # before numba is imported
+        seconds, signatures = compiled_by(arguments.sessions)
+    for name, taken in sorted(seconds.items(), key=lambda item: -item[1]):
+        print(f"{taken:6.2f} s  {name}")
+    print(f"{sum(seconds.values()):6.2f} s  of processor time for {len(seconds)} functions")
+    if arguments.write:
+        slowest_first = {name: signatures[name] for name in sorted(signatures, key=lambda n: -seconds[n])}
+        LIST.write_text(f"{json.dumps(slowest_first, indent=0)}\n", encoding="utf-8")
+
+
+def compiled_by(sessions: list[Path]) -> tuple[dict[str, float], dict[str, list[list[object]]]]:
+    """Reconstruct and replay sessions; return seconds and types of the arguments of all that was compiled."""
+    from numba.core import event
+
+    from pipelines.precompile import entry_of
+    from pipelines.reconstruct import reconstruct
+    from pipelines.replan import replan
+
+    seconds: dict[str, float] = defaultdict(float)
+    signatures: dict[str, list[list[object]]] = defaultdict(list)
+    begun = threading.local()
+
+    class Listener(event.Listener):  # type: ignore[misc]  # numba has no types
+        def on_start(self, event: Any) -> None:  # noqa: ARG002  # numba calls it so
+            begun.stack = [*getattr(begun, "stack", []), time.thread_time()]
+
+        def on_end(self, event: Any) -> None:
+            start = begun.stack.pop()
+            if not begun.stack:  # helpers are compiled within the function that calls them
+                function = event.data["dispatcher"].py_func
+                name = f"{function.__module__}:{function.__qualname__}"
+                seconds[name] += time.thread_time() - start
+                signatures[name].append([entry_of(kind) for kind in event.data["args"]])
+
+    event.register("numba:compile", Listener())
+    for session in sessions:
+        reconstruct(session, force=True)
+        replan(session, force=True)
+    return seconds, signatures
+
+
+if __name__ == "__main__":
+    main()
