@@ -32,8 +32,22 @@ MESSAGE_LIMIT = 1 << 28  # bytes of a message that is compressed by itself
 ARRAY_LIMIT = 1 << 20  # entries of a fixed array; rosbags unrolls arrays of messages into code
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)+", re.ASCII)
 OCTOMAP = "octomap_msgs/msg/Octomap"
-# rosbags does not know this type, and logs of ROS 2 up to Humble carry no definitions.
-_OCTOMAP_DEFINITION = "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n"
+GRID_MAP = "grid_map_msgs/msg/GridMap"
+# rosbags does not know these types, and logs of ROS 2 up to Humble carry no definitions.
+_DEFINITIONS = {
+    OCTOMAP: {
+        OCTOMAP: "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n",
+    },
+    GRID_MAP: {
+        "grid_map_msgs/msg/GridMapInfo": (
+            "float64 resolution\nfloat64 length_x\nfloat64 length_y\ngeometry_msgs/Pose pose\n"
+        ),
+        GRID_MAP: (
+            "std_msgs/Header header\ngrid_map_msgs/GridMapInfo info\nstring[] layers\nstring[] basic_layers\n"
+            "std_msgs/Float32MultiArray[] data\nuint16 outer_start_index\nuint16 inner_start_index\n"
+        ),
+    },
+}
 _BASE64 = "base64"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
@@ -119,8 +133,8 @@ def typestore(schema: Schema) -> Typestore:
             types = _ros_types(schema)
             _check_arrays(types)
             store.register(types)
-        elif schema.type == OCTOMAP:
-            store.register(get_types_from_msg(_OCTOMAP_DEFINITION, OCTOMAP))
+        for name, definition in _DEFINITIONS.get(schema.type, {}).items() if not schema.definition else ():
+            store.register(get_types_from_msg(definition, name))
         store.get_msgdef(schema.type)
     except KeyError as error:
         raise ValueError(f"the log does not define {error}") from error
