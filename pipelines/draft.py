@@ -239,7 +239,8 @@ def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
         return _recording(head, format_)
     if isinstance(format_, VideoFormat):
         index = format_.index(path)
-        return Video(*about, index.count, int(index.pts_ns[-1]), created_ns(path))
+        made_ns = (index.start_ns or None) if path.is_dir() else created_ns(path)
+        return Video(*about, index.count, int(index.pts_ns[-1]), made_ns)
     if isinstance(format_, MapFormat):
         return Map(*about)
     if head.format == _FRAME_TIMES:

@@ -632,6 +632,8 @@ def _unused(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
     lines = ["", "# Recognised, but not used:"]
     for found in draft.unused:
         hint = "; if known to be true: truth: {joints: FILE}" if isinstance(found, Joints) else ""
+        if isinstance(found, Recording) and found.format == "gpx":
+            hint = "; if the person carried it: actor: {log: FILE, topic: /track}"
         lines.append(f"#   {flow(relative(found.path))}  ({one_line(found.title)}{hint or _held(found)})")
     return lines
 

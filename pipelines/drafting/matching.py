@@ -98,7 +98,11 @@ def _moving_poses(findings: Findings, logs: Mapping[str, Recording]) -> list[Can
 
 def _trajectories(findings: Findings) -> list[Poses]:
     """List trajectory files for whose format manifests have a key."""
-    return [found for found in findings.of(Poses) if found.format in PoseSource.one_of]
+    return [found for found in findings.of(Poses) if _key_of(found) in PoseSource.one_of]
+
+
+def _key_of(found: Poses) -> str:
+    return "tum" if found.format == "kitti" else found.format
 
 
 def _calibrated(findings: Findings, part: Literal["intrinsics", "pose"]) -> list[Candidate]:
@@ -128,7 +132,7 @@ def _of_file(found: Found, key: str = "path", span: Span | None = None) -> Candi
 
 
 def _of_trajectory(found: Poses) -> Candidate:
-    return replace(_of_file(found, found.format, found.span), rank=(0, 0, found.place))
+    return replace(_of_file(found, _key_of(found), found.span), rank=(0, 0, found.place))
 
 
 def _of_drone(found: DroneLog) -> Candidate:

@@ -62,6 +62,8 @@ _UNREAD = (
     (re.compile(rb"Kaydara FBX"), "an FBX scene", "export its motion as BVH"),
     (re.compile(rb"(?s)\s*(?:<\?xml.*?\?>\s*)?<calibration\b.*<camera "), "a Qualisys calibration (XML)",
      "convert it to TOML with Pose2Sim's calibration step"),
+    (re.compile(rb"(?s)(#[^\n]*\n)*\s*:version\b.{,4000}:root"), "the skeleton of Acclaim motion (ASF)",
+     "name the .amc that it belongs to"),
     (re.compile(rb"# Camera list|# Image list|# 3D point list"), "one file of a COLMAP model",
      "name the folder that holds it"),
     (re.compile(rb"(?s).{,200}rosbag2_bagfile_information:"), "the metadata of a ROS 2 bag",
@@ -122,6 +124,8 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
     for kind, magic, _ in _BEGINNINGS:
         if head.startswith(magic):
             return Likeness(f"begins as {kind} but is none that can be read", _COPY)
+    if path.suffix.lower() in {".tlog", ".laz", ".las"}:
+        return Likeness(f"is called {path.suffix} but holds nothing of that kind", _COPY)
     if b"\0" in head or _undecodable(head):
         return Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
     return None

@@ -234,8 +234,12 @@ def _refuse_impossible_records(path: Path) -> None:
     head = first_bytes(path, 375)
     counts = [int.from_bytes(head[place : place + 4], "little") for place in (100, 243)]
     counts = counts if head[25:26] >= b"\x04" and len(head) >= 375 else counts[:1]
-    if len(head) < 227 or sum(counts) * _RECORD > path.stat().st_size:
-        raise DataError(path, f"has a header that is cut off or states {sum(counts)} records", _COPY)
+    if len(head) < 227:
+        raise DataError(path, f"is cut off within its header ({len(head)} bytes)", _COPY)
+    if sum(counts) * _RECORD > path.stat().st_size:
+        raise DataError(
+            path, f"has a header that states {sum(counts)} records, more than it has room for", _COPY
+        )
 
 
 def _blocks(path: Path, cloud: Any) -> Iterator[_Block]:
