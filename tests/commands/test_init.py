@@ -475,5 +475,5 @@ def test_an_example_flight_needs_no_files_of_its_own(tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     written = json.loads(succeeds("init", "--example", "mound_walk", "--json"))
     assert read_flight(tmp_path / written["flight"]).name == "Mound walk"
-    assert mocap("init").exit_code == 2
-    assert mocap("init", "--example", "mound_walk", ".").exit_code == 2
+    assert mocap("init").returncode == 2
+    assert mocap("init", "--example", "mound_walk", ".").returncode == 2
