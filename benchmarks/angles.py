@@ -2,6 +2,7 @@
 
     python -m benchmarks.angles --flights tuning                        # constants may be tuned on these
     python -m benchmarks.angles --flights kept --write                  # and docs/angles.md gets the tables
+    python -m benchmarks.angles --opensim SESSION [--peer POSE2SIM.mot] # beside OpenSim's inverse kinematics
 
 Each flight is reconstructed by `auto` from logs with errors, and by `robust` from the true poses (the floor:
 what the detector alone leaves). Angles are compared with two truths:
@@ -13,6 +14,7 @@ what the detector alone leaves). Angles are compared with two truths:
 from __future__ import annotations
 
 import argparse
+import io
 import shlex
 import sys
 import tempfile
@@ -27,12 +29,14 @@ from unittest.mock import patch
 
 import cv2
 import numpy as np
+import pandas as pd
 
 from benchmarks.accuracy import FLOOR, METHODS, chosen_flights
 from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
 from benchmarks.corpus.stored import DETECTORS, Flight, flights
 from benchmarks.results_page import markdown_table
 from pipelines.detect import detect
+from pipelines.export import export
 from pipelines.follow import Following
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.gait import gait_events, summary
@@ -79,7 +83,12 @@ def main() -> None:
     parser.add_argument("--detector", choices=DETECTORS, default=DETECTORS[1])
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--write", action="store_true", help="write the tables of docs/angles.md")
+    parser.add_argument("--opensim", type=Path, help="compare a session's angles with OpenSim's instead")
+    parser.add_argument("--peer", type=Path, help="a motion of the same times by Pose2Sim's own chain")
     arguments = parser.parse_args()
+    if arguments.opensim:
+        print("\n".join(beside_opensim(arguments.opensim, arguments.peer)))
+        return
     chosen = chosen_flights(arguments.flights, arguments.detector)
     found: dict[str, dict[str, Measured]] = {}
     began_s = time.perf_counter()
@@ -257,6 +266,49 @@ def gait_table(found: Mapping[str, Mapping[str, Measured]]) -> list[str]:
         "",
         *markdown_table(header, rows),
     ]
+
+
+# --- beside OpenSim ------------------------------------------------------------------------------------
+
+_COORDINATES = {
+    "hip_flexion": "hip_flexion",
+    "hip_adduction": "hip_adduction",
+    "knee_flexion": "knee_angle",
+    "ankle_dorsiflexion": "ankle_angle",
+    "elbow_flexion": "elbow_flex",
+}
+"""Our angles, and the coordinates of Pose2Sim's model with the same sign."""
+
+
+def beside_opensim(session: Path, peer: Path | None) -> list[str]:
+    """Compare angles with OpenSim's of the same session, and those with another motion of the same times."""
+    with tempfile.TemporaryDirectory(prefix="angles-") as folder:
+        written = {path.name: path for path in export(session, ["osim", "angles"], Path(folder)).written}
+        solved = next(_storage(path) for name, path in written.items() if name.endswith(".mot"))
+        errors = next(_storage(path) for name, path in written.items() if name.endswith("_errors.sto"))
+        own = next(_storage(path) for name, path in written.items() if name.endswith("_angles.sto"))
+    both = None if peer is None else _storage(peer)
+    row = np.searchsorted(own["time"], solved["time"])
+    rms_mm = 1e3 * float(np.sqrt((errors["marker_error_RMS"] ** 2).mean()))
+    rows = []
+    for name, coordinate in _COORDINATES.items():
+        for side in SIDES:
+            column = f"{coordinate}_{side[0]}"
+            apart = own[f"{side}_{name}"].to_numpy()[row] - solved[column]
+            pair = "" if both is None else f"{(solved[column] - both[column]).abs().median():.1f}"
+            rows.append([f"{side}_{name}", f"{apart.abs().median():.1f}", f"{apart.median():.1f}", pair])
+    header = ["angle", "ours from OpenSim's, median deg", "with its sign", "OpenSim's from the peer's"]
+    return [
+        f"{len(solved)} times; markers are {rms_mm:.1f} mm (RMS) off the model's.",
+        "",
+        *markdown_table(header, rows),
+    ]
+
+
+def _storage(path: Path) -> pd.DataFrame:
+    """Read OpenSim's storage."""
+    text = path.read_text(encoding="utf-8").split("endheader\n", 1)[1]
+    return pd.read_csv(io.StringIO(text), sep=r"\s+")
 
 
 if __name__ == "__main__":

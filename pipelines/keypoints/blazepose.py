@@ -19,7 +19,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,20 +27,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Picture
-from pipelines.keypoints.blazepose_models import (
-    BLAZEPOSE_MODELS,
-    HEAVY_MODELS,
-    PERSON_MODELS,
-    PackagedModels,
-    find_file,
-)
 from pipelines.keypoints.crops import sampled
 from pipelines.session.errors import DataError
+from pipelines.session.model_files import ModelFile, NpmPackage, PackagedModels, Wheel, find_file
 from pipelines.session.registries import Measured, Person, Region
 from pipelines.session.skeletons import get_skeleton
 
 if TYPE_CHECKING:
     from ai_edge_litert.interpreter import Interpreter
+
+BLAZEPOSE_MODELS = PackagedModels(
+    detector="blazepose",
+    package=Wheel(
+        "mediapipe",
+        "0.10.21",  # the last one that ships models
+        tags=("3.11", "cp311", "manylinux_2_28_x86_64"),
+    ),
+    files=(
+        ModelFile(
+            "mediapipe/modules/pose_detection/pose_detection.tflite",
+            2_959_046,
+            "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
+        ),
+        ModelFile(
+            "mediapipe/modules/pose_landmark/pose_landmark_full.tflite",
+            6_440_512,
+            "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
+        ),
+    ),
+)
+PERSON_MODELS = replace(BLAZEPOSE_MODELS, files=BLAZEPOSE_MODELS.files[:1])
+"""Person detector alone, common to all BlazePose detectors."""
+
+HEAVY_MODELS = PackagedModels(
+    detector="blazepose-heavy",
+    # The wheel has no heavy network; this package's person detector is another one, and is left alone.
+    package=NpmPackage("@mediapipe/pose", "0.5.1675469404"),
+    files=(
+        ModelFile(
+            "package/pose_landmark_heavy.tflite",
+            27_709_200,
+            "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
+        ),
+    ),
+)
 
 _PICTURE_SIDE = 224  # of the person detector's input
 _CROP_SIDE = 256  # of the landmark network's input

@@ -277,6 +277,25 @@ class ChoiceOfTime(Export, Protocol):
         """The zeros of time (zero: the flight's first picture; epoch: the session's own), default first."""
 
 
+@runtime_checkable
+class FetchesModels(Protocol):
+    """A detector or an export that needs model files, which `mocap models fetch` gets."""
+
+    @property
+    def name(self) -> str:
+        """The name that the user writes after `fetch`."""
+
+    @property
+    def title(self) -> str:
+        """The name that `mocap models` prints."""
+
+    def models(self) -> dict[str, Path | None]:
+        """List the files that it needs: name to path, None for those that are missing."""
+
+    def fetch(self, source: Path | None = None) -> None:
+        """Get the missing files, from `source` if that holds them. A DataError says what to do."""
+
+
 class Registry(Generic[T]):
     """The objects that one group of entry points names, loaded on request."""
 
@@ -331,6 +350,16 @@ def find_detector(text: str) -> Detector:
     if colon:
         raise DataError(text, f"{name} takes nothing behind its name", f"write {name}")
     return found
+
+
+def find_models(text: str) -> FetchesModels:
+    """Find what has model files: an export that needs some, else the detector of a user's text.
+
+    Raises:
+        DataError: see `find_detector`.
+    """
+    export: object = EXPORTS.get(text) if text in EXPORTS.names() else None
+    return export if isinstance(export, FetchesModels) else find_detector(text)
 
 
 def advice_on(detector: Detector) -> list[str]:

@@ -18,16 +18,9 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.keypoints.blazepose import HEAVY
-from pipelines.keypoints.blazepose_models import (
-    BLAZEPOSE_MODELS,
-    HEAVY_MODELS,
-    ModelFile,
-    NpmPackage,
-    PackagedModels,
-    Wheel,
-)
+from pipelines.keypoints.blazepose import BLAZEPOSE_MODELS, HEAVY, HEAVY_MODELS
 from pipelines.session.errors import DataError
+from pipelines.session.model_files import ModelFile, NpmPackage, PackagedModels, Wheel
 
 TAGS = ("3.11", "cp311", "manylinux_2_28_x86_64")  # as pinned: not what this machine needs to be
 WHEEL = "mocap_test_models-1.2-cp311-cp311-manylinux_2_28_x86_64.whl"

@@ -6,6 +6,7 @@ column for each quantity, tab-separated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,7 @@ from pipelines.session.records import Recording
 if TYPE_CHECKING:
     import pandas as pd
 
-_DECIMALS = 4  # of a degree
+_DECIMALS = 6  # of a degree or a metre
 
 
 class AnglesExport:
@@ -71,17 +72,22 @@ def _dense(table: pd.DataFrame) -> tuple[Int64, Float, Float]:
 
 def write_sto(path: Path, t_ns: Int64, value_deg: Float, sigma_deg: Float) -> None:
     """Write angles and standard deviations [T, A] deg in the order of `ANGLES`."""
-    columns = ["time", *ANGLES, *(f"{name}_sigma" for name in ANGLES)]
+    columns = [*ANGLES, *(f"{name}_sigma" for name in ANGLES)]
+    write_storage(path, t_ns, columns, np.hstack([value_deg, sigma_deg]), degrees=True)
+
+
+def write_storage(path: Path, t_ns: Int64, columns: Sequence[str], values: Float, *, degrees: bool) -> None:
+    """Write OpenSim's storage (STO, MOT): quantities [T, C] by the names of their columns."""
     lines = [
         path.stem,
         "version=1",
         f"nRows={len(t_ns)}",
-        f"nColumns={len(columns)}",
-        "inDegrees=yes",
+        f"nColumns={len(columns) + 1}",
+        f"inDegrees={'yes' if degrees else 'no'}",
         "endheader",
-        "\t".join(columns),
+        "\t".join(["time", *columns]),
     ]
-    for stamp, row in zip(format_seconds(t_ns), np.hstack([value_deg, sigma_deg]), strict=True):
+    for stamp, row in zip(format_seconds(t_ns), values, strict=True):
         lines.append("\t".join([stamp, *(f"{number:.{_DECIMALS}f}" for number in row.tolist())]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 

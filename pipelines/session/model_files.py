@@ -1,4 +1,4 @@
-"""Model files of BlazePose: their place in the cache and their extraction from published packages.
+"""Model files of detectors and exports: their place in the cache, their extraction from published packages.
 
 The packages are downloaded and opened, never installed: mediapipe 0.10.21 would force an old numpy on
 everything, and of @mediapipe/pose only one file is wanted.
@@ -15,7 +15,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -311,40 +311,3 @@ def _write(path: Path, content: bytes) -> None:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
-
-
-BLAZEPOSE_MODELS = PackagedModels(
-    detector="blazepose",
-    package=Wheel(
-        "mediapipe",
-        "0.10.21",  # the last one that ships models
-        tags=("3.11", "cp311", "manylinux_2_28_x86_64"),
-    ),
-    files=(
-        ModelFile(
-            "mediapipe/modules/pose_detection/pose_detection.tflite",
-            2_959_046,
-            "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
-        ),
-        ModelFile(
-            "mediapipe/modules/pose_landmark/pose_landmark_full.tflite",
-            6_440_512,
-            "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
-        ),
-    ),
-)
-PERSON_MODELS = replace(BLAZEPOSE_MODELS, files=BLAZEPOSE_MODELS.files[:1])
-"""Person detector alone, common to all BlazePose detectors."""
-
-HEAVY_MODELS = PackagedModels(
-    detector="blazepose-heavy",
-    # The wheel has no heavy network; this package's person detector is another one, and is left alone.
-    package=NpmPackage("@mediapipe/pose", "0.5.1675469404"),
-    files=(
-        ModelFile(
-            "package/pose_landmark_heavy.tflite",
-            27_709_200,
-            "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
-        ),
-    ),
-)

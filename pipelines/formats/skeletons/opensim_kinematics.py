@@ -1,0 +1,369 @@
+"""Export to OpenSim itself: a model scaled to the person, and the angles of its inverse kinematics.
+
+The model, its markers for each skeleton and their weights are those of Pose2Sim 0.10.49 (BSD-3-Clause; Pagnon
+et al. 2022, "Pose2Sim: an open-source Python package for multiview markerless kinematics", JOSS 7:4362),
+fetched like the files of a detector. OpenSim (Seth et al. 2018) scales and solves; it is imported when it is
+used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.formats.common.exporting import people_of
+from pipelines.formats.skeletons.angles_writing import write_storage
+from pipelines.formats.skeletons.joint_files import marker_name, to_y_up
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.session.errors import DataError
+from pipelines.session.model_files import ModelFile, PackagedModels, Wheel
+from pipelines.session.records import JointMotion, Recording
+from pipelines.session.registries import need
+from pipelines.session.skeletons import SKELETONS
+
+_SETUP = "Pose2Sim/OpenSim_Setup/"
+_MODEL = "Model_Pose2Sim_simple.osim"
+_SET_OF = {
+    "blazepose33": ("BlazePose", "Blazepose"),
+    "body25": ("Body25", "Body25"),
+    "body25b": ("Body25b", "Body25b"),
+    "coco17": ("Coco17", "Coco17"),
+    "halpe26": ("Halpe26", "Halpe26"),
+}
+"""Pose2Sim's names of the marker set, and of the settings, of our skeletons."""
+
+MODELS = PackagedModels(
+    detector="osim",
+    package=Wheel("pose2sim", "0.10.49", tags=("3.11", "cp311", "manylinux_2_28_x86_64")),
+    files=(
+        ModelFile(
+            "pose2sim-0.10.49.dist-info/licenses/LICENSE",
+            1521,
+            "7f8a9ede713463b96d261a39c3ec404748c8e4f528c795e5f8cb18898ed944cf",
+        ),
+        *(
+            ModelFile(f"{_SETUP}{name}", size, sha256)
+            for name, size, sha256 in (
+                (_MODEL, 270672, "0b25e3efb09f1a6e8c35dbc9a90afe7248895cc74263e3f4f0dbd29519034707"),
+                (
+                    "Markers_BlazePose.xml",
+                    15482,
+                    "0de8eb64eaa25683caa4d6a9ddf1430009e56233faa4faad91e65b49cf2578a0",
+                ),
+                (
+                    "Markers_Body25.xml",
+                    14393,
+                    "1ea233cbb29ff8dc32e7ffe7d56c631dc291386e0cd65c9ecf46294b959cfc37",
+                ),
+                (
+                    "Markers_Body25b.xml",
+                    14357,
+                    "23f28b33dcb7fd0ad1fd1b28ceef7256eb84a3dc0599be591384773431e92acb",
+                ),
+                (
+                    "Markers_Coco17.xml",
+                    9619,
+                    "81c2aa3fbf9b717de4d3612d8e0f910e0822086fba6e340075c694f809fbb96e",
+                ),
+                (
+                    "Markers_Halpe26.xml",
+                    14805,
+                    "8261886fcc028f60736a80e3aad80c81a83cb30c234823b46b9ae395363df3e2",
+                ),
+                (
+                    "Scaling_Setup_Pose2Sim_Blazepose.xml",
+                    24135,
+                    "a2ef85eca690d04697d3f328fda9c1cb9d978c750080de458d97d8a15b682e85",
+                ),
+                (
+                    "Scaling_Setup_Pose2Sim_Body25.xml",
+                    30498,
+                    "8f3d332a06e132180e622dad9521518c23d064a643cf9c1ebdb1d6376455f357",
+                ),
+                (
+                    "Scaling_Setup_Pose2Sim_Body25b.xml",
+                    30754,
+                    "315ef2e64b2b6afea0701120d562c2e39f7d83e198acbd5d5dab2de1f619a8fe",
+                ),
+                (
+                    "Scaling_Setup_Pose2Sim_Coco17.xml",
+                    26122,
+                    "999338029c24d7b22d76e9265e2a04e5a7f7a9849ba534da53cdae62ce114075",
+                ),
+                (
+                    "Scaling_Setup_Pose2Sim_Halpe26.xml",
+                    31481,
+                    "cdabbae2e8346ffd942b30bd588e0e0f8341c8d4d9a55f8bb9b70e1c5c3fb2de",
+                ),
+                (
+                    "IK_Setup_Pose2Sim_Blazepose.xml",
+                    10952,
+                    "2ca03a9c9add43e83eda3f62cd6f749e06d271f9e6351a343e6f3cc94e3ac314",
+                ),
+                (
+                    "IK_Setup_Pose2Sim_Body25.xml",
+                    9734,
+                    "3434fc69f0e874fdad50f69ae54ca43933f9b46196f73bac58f9e1cb542b0f1a",
+                ),
+                (
+                    "IK_Setup_Pose2Sim_Body25b.xml",
+                    9754,
+                    "a3621365a4d030fde68c2ff7fb02c955871919f4971a76877f570f016b9513ee",
+                ),
+                (
+                    "IK_Setup_Pose2Sim_Coco17.xml",
+                    7661,
+                    "b8f0ac9155cc38d4726ce562cef1c635405e73f23e6f8994a6a7c0ef0410d31c",
+                ),
+                (
+                    "IK_Setup_Pose2Sim_Halpe26.xml",
+                    9939,
+                    "8dda7dce47fbde0c268cd1052213a0013b1240873d9e334dbf0a8515b3ed3769",
+                ),
+            )
+        ),
+    ),
+)
+
+_LEAST_MARKERS = 8  # of a frame: fewer leave limbs of the model where they were
+_WEIGHTS = (
+    0.01,
+    100.0,
+)  # of a marker by its covariance, against the median marker: no marker is all or nothing
+_ACCURACY = 1e-5  # of the solver, Pose2Sim's
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Result of inverse kinematics: C coordinates of the model at T times."""
+
+    t_ns: Int64  # [T] times with enough markers
+    coordinates: tuple[str, ...]
+    value: Float  # [T, C] deg or m
+    error_m: Float  # [T, M] distance of each marker from the model's, NaN where it was not measured
+
+
+class OpenSimExport:
+    """Writer of `<name>.osim`, `<name>_ik.mot` and `<name>_ik_marker_errors.sto` (`_person<k>` of several).
+
+    Each body of the model is scaled by the median lengths of the person's bones, both sides alike. Mass and
+    its distribution stay the model's: nothing measures them. A marker weighs at every time as in Pose2Sim's
+    settings, times the inverse of its variance over that of the median marker.
+    """
+
+    name = "osim"
+    title = "scaled model and inverse kinematics by OpenSim (extra opensim)"
+    units = ("m",)
+    axes = ("y-up",)
+    times = ("zero", "epoch")
+
+    def models(self) -> dict[str, Path | None]:
+        """List the files of Pose2Sim's model; see `registries.FetchesModels`."""
+        return MODELS.present()
+
+    def fetch(self, source: Path | None = None) -> None:
+        """Get missing files of Pose2Sim's model; see `registries.FetchesModels`."""
+        MODELS.fetch(source)
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write every person with at least one known joint.
+
+        Raises:
+            DataError: no such person, OpenSim or the model is missing, the skeleton has no marker set, or too
+                few joints of a person were measured.
+        """
+        motion, files = people_of(recording, folder, ".osim")
+        library = _opensim()
+        markers, settings = _set_of(motion)
+        paths = MODELS.verified()
+        written = []
+        for person, path in files.items():
+            model = library.Model(str(paths[_MODEL]))
+            model.set_MarkerSet(library.MarkerSet(str(paths[f"Markers_{markers}.xml"])))
+            scaling = library.ScaleTool(str(paths[f"Scaling_Setup_Pose2Sim_{settings}.xml"]))
+            unscaled = scale_model(library, model, scaling, motion, person)
+            if unscaled:
+                recording.progress.note(
+                    f"osim: {', '.join(unscaled)} could not be measured, and keep their size"
+                )
+            model.setName(path.stem)
+            model.printToXML(str(path))
+            # Objects of OpenSim are kept by name: their parts do not keep them alive.
+            tool = library.InverseKinematicsTool(str(paths[f"IK_Setup_Pose2Sim_{settings}.xml"]), False)
+            tasks = tool.getIKTaskSet()
+            weights = {tasks.get(k).getName(): tasks.get(k).getWeight() for k in range(tasks.getSize())}
+            found = solve(library, model, weights, motion, person)
+            if not len(found.t_ns):
+                raise DataError(recording.name, "has too few joints for OpenSim", "look at the report")
+            if left := len(motion.t_ns) - len(found.t_ns):
+                recording.progress.note(
+                    f"osim: {left} times have fewer than {_LEAST_MARKERS} markers; left out"
+                )
+            written += [path, *_written(path, found, recording.zero_ns)]
+            rms = 1e3 * float(np.sqrt(np.nanmean(found.error_m**2)))
+            recording.progress.note(f"osim: markers of {path.stem} are {rms:.1f} mm (RMS) off the model's")
+        return sorted(written)
+
+
+def _opensim() -> Any:
+    """Import OpenSim; keep it from writing opensim.log into the working folder, and from printing."""
+    library = need("opensim", "opensim")
+    library.Logger.removeFileSink()
+    library.Logger.setLevelString("error")
+    return library
+
+
+def _set_of(motion: JointMotion) -> tuple[str, str]:
+    """Return Pose2Sim's names for the skeleton that has these joints."""
+    for name, names in _SET_OF.items():
+        if set(SKELETONS[name].joints) == set(motion.joints):
+            return names
+    raise DataError(
+        "osim",
+        f"has no markers for a skeleton of {len(motion.joints)} joints",
+        f"there are {', '.join(_SET_OF)}",
+    )
+
+
+def scale_model(library: Any, model: Any, scaling: Any, motion: JointMotion, person: int) -> list[str]:
+    """Scale the bodies of a model in place; return the measurements that the person does not show."""
+    state = model.initSystem()
+    names = [marker_name(joint) for joint in motion.joints]
+    of_model = model.getMarkerSet()
+    scales, missing = library.ScaleSet(), []
+    measurements = scaling.getModelScaler().getMeasurementSet()
+    for index in range(measurements.getSize()):
+        measurement = measurements.get(index)
+        bodies = measurement.getBodyScaleSet()
+        ratios = []
+        for k in range(measurement.getNumMarkerPairs()):
+            pair = [measurement.getMarkerPair(k).getMarkerName(end) for end in range(2)]
+            if not set(pair).issubset(names):
+                continue
+            ends = [motion.position[:, person, names.index(name)] for name in pair]
+            places = [of_model.get(name).getLocationInGround(state).to_numpy() for name in pair]
+            length = np.linalg.norm(ends[1] - ends[0], axis=-1)
+            if np.isfinite(length).any():
+                ratios.append(float(np.nanmedian(length) / np.linalg.norm(places[1] - places[0])))
+        if not measurement.getApply() or not bodies.getSize():
+            continue
+        if not ratios:
+            missing.append(measurement.getName())
+            continue
+        for k in range(bodies.getSize()):
+            scale = library.Scale()
+            scale.setSegmentName(bodies.get(k).getName())
+            scale.setScaleFactors(library.Vec3(float(np.mean(ratios))))
+            scale.setApply(True)
+            scales.cloneAndAppend(scale)
+    model.scale(state, scales, True, model.getTotalMass(state))
+    return missing
+
+
+def solve(
+    library: Any, model: Any, weights: dict[str, float], motion: JointMotion, person: int
+) -> Kinematics:
+    """Run inverse kinematics over the times with enough markers.
+
+    Args:
+        library: OpenSim.
+        model: the scaled model.
+        weights: of markers by name, and of coordinates that are drawn to their default value; others do not
+            take part.
+        motion: of all people.
+        person: the one to solve for.
+    """
+    named = [(k, marker_name(joint)) for k, joint in enumerate(motion.joints)]
+    seen: Bool = np.asarray(np.isfinite(motion.position[:, person]).all(axis=-1).any(axis=0))
+    of_model = model.getMarkerSet()
+    used = [
+        (k, name) for k, name in named if seen[k] and weights.get(name, 0) > 0 and of_model.contains(name)
+    ]
+    columns = [k for k, _ in used]
+    names = [name for _, name in used]
+    position = to_y_up(motion.position[:, person, columns])
+    known: Bool = np.asarray(np.isfinite(position).all(axis=-1))
+    kept = np.flatnonzero(known.sum(axis=1) >= min(_LEAST_MARKERS, max(len(names), 1)))
+    weight = np.array([weights[name] for name in names]) * _by_covariance(motion, person, columns)
+    if not len(kept):
+        return Kinematics(motion.t_ns[:0], (), np.empty((0, 0)), np.empty((0, len(names))))
+
+    since_s = (motion.t_ns[kept] - motion.t_ns[kept[0]]) / 1e9
+    table = library.TimeSeriesTableVec3()
+    table.setColumnLabels(names)
+    for t_s, row in zip(since_s.tolist(), position[kept].tolist(), strict=True):
+        table.appendRow(t_s, library.RowVectorVec3([library.Vec3(*place) for place in row]))
+    table.addTableMetaDataString("Units", "m")
+    stated = library.SetMarkerWeights()
+    for name in names:
+        stated.cloneAndAppend(library.MarkerWeight(name, 1.0))
+    state = model.initSystem()
+    coordinates = [model.getCoordinateSet().get(k) for k in range(model.getCoordinateSet().getSize())]
+    rests = [
+        _at_rest(library, c, weights[c.getName()]) for c in coordinates if weights.get(c.getName(), 0) > 0
+    ]
+    reference, resting = library.MarkersReference(table, stated), library.SimTKArrayCoordinateReference()
+    for rest in rests:
+        resting.push_back(rest)
+    solver = library.InverseKinematicsSolver(model, reference, resting)
+    solver.setAccuracy(_ACCURACY)
+    state.setTime(0.0)
+    solver.assemble(state)
+    turns = np.array([c.getMotionType() == library.Coordinate.Rotational for c in coordinates])
+    values, errors = np.empty((len(kept), len(coordinates))), np.full((len(kept), len(names)), np.nan)
+    for row, time in enumerate(kept.tolist()):
+        state.setTime(float(since_s[row]))
+        for name, value in zip(names, weight[time].tolist(), strict=True):
+            solver.updateMarkerWeight(name, value)
+        solver.track(state)
+        values[row] = [coordinate.getValue(state) for coordinate in coordinates]
+        for column in np.flatnonzero(known[time]).tolist():
+            errors[row, column] = solver.computeCurrentMarkerError(names[column])
+    values[:, turns] = np.degrees(values[:, turns])
+    return Kinematics(motion.t_ns[kept], tuple(c.getName() for c in coordinates), values, errors)
+
+
+def _at_rest(library: Any, coordinate: Any, weight: float) -> Any:
+    """Return the wish that a coordinate keeps its default value."""
+    reference = library.CoordinateReference(
+        coordinate.getName(), library.Constant(coordinate.getDefaultValue())
+    )
+    reference.setWeight(weight)
+    return reference
+
+
+def _by_covariance(motion: JointMotion, person: int, columns: Sequence[int]) -> Float:
+    """Return weights [T, M]: the median variance over that of each marker; 1 without covariances."""
+    shape = (len(motion.t_ns), len(columns))
+    if motion.covariance is None:
+        return np.ones(shape)
+    variance = motion.covariance[:, person][:, list(columns)][..., [0, 3, 5]].sum(axis=-1)
+    known: Bool = np.asarray(np.isfinite(variance) & (variance > 0))
+    if not known.any():
+        return np.ones(shape)
+    ratio = np.median(variance[known]) / np.where(known, variance, np.inf)
+    return np.where(known, np.clip(ratio, *_WEIGHTS), 1.0)
+
+
+def _written(model: Path, found: Kinematics, zero_ns: int) -> list[Path]:
+    """Write the motion and the markers' errors beside a model."""
+    motion = model.with_name(f"{model.stem}_ik.mot")
+    errors = model.with_name(f"{model.stem}_ik_marker_errors.sto")
+    t_ns = found.t_ns - zero_ns
+    write_storage(motion, t_ns, found.coordinates, found.value, degrees=True)
+    squared = found.error_m**2
+    figures = [
+        np.nansum(squared, axis=1),
+        np.sqrt(np.nanmean(squared, axis=1)),
+        np.nanmax(found.error_m, axis=1),
+    ]
+    labels = ("total_squared_error", "marker_error_RMS", "marker_error_max")  # OpenSim's own
+    write_storage(errors, t_ns, labels, np.stack(figures, axis=1), degrees=False)
+    return [motion, errors]
+
+
+EXPORT = OpenSimExport()
