@@ -73,6 +73,8 @@ class KlvFormat:
     def recognises(self, path: Path) -> bool:
         """Return True for a file that begins with the key, or a video with a data track of such packets."""
         try:
+            if first_bytes(path, len(_KEY)) == _KEY:
+                return True
             return path.is_file() and next(_contents(path), None) is not None
         except (DataError, OSError):
             return False
@@ -202,7 +204,7 @@ def _take(found: _Packets, at_ns: int, content: bytes, place: int) -> int:
         end = begin + size
         if end > len(content):
             raise ValueError("breaks off")
-        items = dict(_items(content, begin, end))
+        items = dict(_items(content[begin:end]))
     except ValueError:
         found.dropped["damaged packets"] += 1
         return inside
@@ -231,8 +233,9 @@ def _mapped(number: int, size: int, signed: bool, low: float, high: float) -> fl
     return np.nan if number < -most else number * high / most
 
 
-def _items(content: bytes, place: int, end: int) -> Iterator[tuple[int, bytes]]:
+def _items(content: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield tag and value of each item; raise ValueError where they do not fit."""
+    place, end = 0, len(content)
     while place < end:
         tag = 0
         while True:
@@ -242,7 +245,7 @@ def _items(content: bytes, place: int, end: int) -> Iterator[tuple[int, bytes]]:
             tag, place = (tag << 7 | byte & 0x7F) & 0xFFFF, place + 1
             if byte < 0x80:
                 break
-        size, place = _length(content[:end], place)
+        size, place = _length(content, place)
         if place + size > end:
             raise ValueError("breaks off")
         yield tag, content[place : place + size]

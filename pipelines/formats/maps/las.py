@@ -162,7 +162,8 @@ def _opened(path: Path) -> Iterator[_Cloud]:
 
 
 def _decoder(path: Path) -> list[str]:
-    return [sys.executable, "-m", __name__, str(path.absolute())]
+    # -P: a folder that happens to be called like a package here must not be imported.
+    return [sys.executable, "-P", "-m", __name__, str(path.absolute())]
 
 
 def _received(path: Path, pipe: IO[bytes], process: subprocess.Popen[bytes]) -> _Cloud:
