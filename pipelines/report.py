@@ -28,6 +28,7 @@ from pipelines.session.stages import Session, locked, open_session, session_name
 from pipelines.session.storage import as_data_error, hash_of, read_json, sha256_of, write_whole
 from pipelines.session.tables import (
     ACTOR,
+    ANGLES,
     CAMERA_POSES,
     COST_MAP,
     FRAMES,
@@ -46,8 +47,8 @@ from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_p
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = Stage("report", revision=9)
-_FIGURES_REVISION = 3
+REPORT = Stage("report", revision=10)
+_FIGURES_REVISION = 4
 
 
 @dataclass(frozen=True)
@@ -313,6 +314,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         refined=_by_camera(folder, "reconstruct/cameras.parquet", records.get("reconstruct")),
         true_poses=_by_camera(folder, "truth_poses.parquet", records["ingest"]),
         hidden=_load_hidden(folder, description, records, maps),
+        angles=_load_angles(folder, records.get("reconstruct")),
         made_by=versions_of(folder),
         outdated=tuple(outdated(records, description.recorded)),
     )
@@ -329,6 +331,12 @@ def _load_hidden(
     except DataError:
         return {}
     return hidden_shares(flight, description, maps)
+
+
+def _load_angles(folder: Path, record: StageRecord | None) -> pd.DataFrame | None:
+    """Read the joint angles; None of a reconstruction without them."""
+    name = "reconstruct/angles.parquet"
+    return read_table(folder / name, ANGLES) if record is not None and name in record.outputs else None
 
 
 def _by_camera(folder: Path, name: str, record: StageRecord | None) -> dict[str, pd.DataFrame]:

@@ -53,6 +53,7 @@ class SessionContent:
     hidden: dict[str, float] = field(default_factory=dict)  # camera: share of moments, where a map is
     made_by: dict[str, dict[str, str]] = field(default_factory=dict)  # stage: program or library, and version
     outdated: tuple[str, ...] = ()  # stages whose inputs have changed since
+    angles: pd.DataFrame | None = None  # tables.ANGLES, where the reconstruction has them
     studies: tuple[StudyContent, ...] = ()  # that stand beside the flight
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.plates import WIDTH_IN, Plate, page_style, settled
-from pipelines.reporting.wording import cell_text
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.whole_folders import refuse_sessions
@@ -48,12 +47,9 @@ def write_figures(
     listed = []
     for plate in plates.values():
         names = _write_drawing(folder, plate.key, plate.figure)
-        for what, numbers in plate.numbers.items():
+        for what, numbers in plate.csv.items():
             name = f"{plate.key}-{what}.csv" if what else f"{plate.key}.csv"
-            texts = numbers.select_dtypes(exclude="number").map(cell_text)
-            numbers.assign(**texts).to_csv(
-                folder / name, index=False, float_format="%.9g", lineterminator="\n"
-            )
+            (folder / name).write_text(numbers, encoding="utf-8", newline="\n")
             names.append(name)
         words = {"title": plate.title, "caption": plate.caption, "description": plate.description}
         listed.append({"figure": plate.key, **words, "files": names})

@@ -7,7 +7,7 @@ the captions say so.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,16 +18,20 @@ from pipelines.reporting.from_above import draw_paths
 from pipelines.reporting.motion import Motion, side_of
 from pipelines.reporting.plates import (
     CAMERAS,
+    LINE_STYLES,
+    MOST_BINS,
     MUTED,
     PAPER,
     SIDES,
     STATUS_COLOURS,
+    TIME_LABEL,
     WIDTH_IN,
     Plate,
     new_figure,
     page_style,
     percentiles,
     quiet,
+    stacked,
     table,
     tabled,
     time_bins,
@@ -50,15 +54,35 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def draw_all(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> dict[str, Plate]:
-    """Draw every figure that the session has the data for, by its key."""
+SIDE_COLOURS = "Left in blue, right in orange."
+"""Words for the colours of limbs, which no camera has."""
+
+
+def draw_all(
+    summary: Summary,
+    poses: Mapping[str, pd.DataFrame],
+    residuals: Mapping[str, tuple[Float, Float]] | None = None,
+    angles: pd.DataFrame | None = None,
+) -> dict[str, Plate]:
+    """Draw every figure that the session has the data for, by its key.
+
+    Args:
+        residuals: of each camera the times in s and the distances in px, as `residuals_over_time` gives them.
+        angles: tables.ANGLES.
+    """
     motion = summary.motion
     plates = [_timeline(summary.cameras)]
     measured = motion is not None and bool(motion.measured.any())
     plates.append(draw_paths(summary.cameras, poses, motion if measured else None))
     if motion is not None:
         plates.append(draw_over_time(summary, motion))
+        if residuals:
+            plates.append(_residuals(summary, residuals))
+        if np.isfinite(motion.sigma_m).any():
+            plates.append(_sigmas(summary, motion))
         plates.append(_joint_bars(summary))
+    if angles is not None and (plate := _angles(summary, angles)) is not None:
+        plates.append(plate)
     if motion is not None and measured:
         plates.append(draw_snapshots(summary, motion))
         if summary.bones:
@@ -83,7 +107,7 @@ def _timeline(cameras: tuple[CameraRow, ...]) -> Plate:
                 axes.barh(k, end - start, 0.05, start, color=CAMERAS[k % len(CAMERAS)])
         axes.set_yticks(range(rows), [shortened(camera.name) for camera in cameras])
         axes.set_ylim(rows - 0.5, -0.5)
-        axes.set_xlabel("time (s)")
+        axes.set_xlabel(TIME_LABEL)
         quiet(axes, "x")
         title = "When each camera had frames and poses"
     description = " ".join(_describe(camera) for camera in cameras)
@@ -192,7 +216,7 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
         _draw_errors(upper, centres, middle, low, high)
         upper.set_ylabel(f"{what} ({unit})")
         _draw_percentages(lower, bins, shown)
-        lower.set_xlabel("time (s)")
+        lower.set_xlabel(TIME_LABEL)
         figure.legend(loc="outside upper left", ncols=len(STATUS))
         title = f"{what.capitalize()} over time, and the status of the joints"
         worst = int(np.nanargmax(middle)) if np.isfinite(middle).any() else None
@@ -214,6 +238,159 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
         **{f"{word}_percent": share for word, share in shown.items()},
     )
     return Plate("time", title, caption, description, figure, {"": numbers})
+
+
+def _residuals(summary: Summary, residuals: Mapping[str, tuple[Float, Float]]) -> Plate:
+    """Draw each camera's distance between keypoints and joints over time."""
+    names = [camera.name for camera in summary.cameras]
+    highest = [np.nanpercentile(px, 99) for _, px in residuals.values() if np.isfinite(px).any()]
+    with page_style():
+        figure = new_figure(2.1)
+        axes = figure.subplots()
+        for name, (t_s, px) in residuals.items():
+            k = names.index(name)
+            style = LINE_STYLES[k // len(CAMERAS) % len(LINE_STYLES)]
+            axes.plot(
+                t_s,
+                px,
+                color=CAMERAS[k % len(CAMERAS)],
+                linestyle=style,
+                linewidth=0.9,
+                label=shortened(name),
+            )
+        axes.set_ylim(0, 1.3 * max(highest, default=1.0) or 1.0)
+        axes.set_ylabel("residual (px)")
+        axes.set_xlabel(TIME_LABEL)
+        quiet(axes, "y")
+        axes.legend(loc="upper left", ncols=4)
+    known = [(name, px[np.isfinite(px)]) for name, (_, px) in residuals.items()]
+    listed = listing(f"{name} {quantity(float(np.median(px)), 'px')}" for name, px in known if len(px))
+    caption = (
+        "Median over the joints of a picture: the distance between the keypoint and the reconstructed joint. "
+        "A camera that rises alone has a wrong pose or clock there."
+    )
+    if any(
+        len(px) < camera.entry.frames.count
+        for camera in summary.cameras
+        for _, px in [residuals.get(camera.name, (None, np.empty(camera.entry.frames.count)))]
+    ):
+        caption += f" At most {MOST_BINS} pictures of a camera, evenly spread."
+    numbers = {
+        "": stacked([table(t_s=t_s, camera=name, residual_px=px) for name, (t_s, px) in residuals.items()])
+    }
+    return Plate("residuals", "Residuals of each camera over time", caption, f"{listed}.", figure, numbers)
+
+
+_SIGMA_COLUMNS = 2
+
+
+def _sigmas(summary: Summary, motion: Motion) -> Plate:
+    """Draw the standard deviation of each joint over time, left and right of a kind in one panel."""
+    seconds = (motion.t_ns - summary.origin_ns) / 1e9
+    bins = time_bins(seconds, 150)
+    centres = (bins[:-1] + bins[1:]) / 2
+    mm = 1000 * motion.sigma_m
+    middle = {name: percentiles(mm[..., j], seconds, bins)[0] for j, name in enumerate(motion.joints)}
+    kinds: dict[str, list[str]] = {}
+    for name in motion.joints:
+        if np.isfinite(middle[name]).any():
+            side = side_of(name)
+            kinds.setdefault(name.removeprefix(f"{side}_") if side else name, []).append(name)
+    rows = -(-len(kinds) // _SIGMA_COLUMNS)
+    top = 1.15 * max(float(np.nanpercentile(middle[name], 98)) for kind in kinds.values() for name in kind)
+    with page_style():
+        figure = new_figure(0.3 + 0.62 * rows)
+        panels = figure.subplots(rows, _SIGMA_COLUMNS, squeeze=False, sharex=True, sharey=True)
+        for axes in panels.flat[len(kinds) :]:
+            axes.set_axis_off()
+        for axes, (kind, names) in zip(panels.flat, kinds.items(), strict=False):
+            for name in names:
+                axes.plot(centres, middle[name], color=SIDES[side_of(name)], linewidth=0.9)
+            axes.set_ylim(0, top)
+            words = axes.text(
+                0.01, 0.97, shortened(joint_label(kind)), transform=axes.transAxes, va="top", fontsize=7
+            )
+            words.set_in_layout(False)  # a long name takes no room from the curves
+            quiet(axes, "y")
+        for axes in panels[-1]:
+            axes.set_xlabel(TIME_LABEL)
+        figure.supylabel("σ (mm)", fontsize=7.6, color=MUTED)
+    listed = listing(
+        f"{joint_label(name)} {quantity(float(np.nanmedian(mm[..., j])), 'mm')}"
+        for j, name in enumerate(motion.joints)
+        if np.isfinite(mm[..., j]).any()
+    )
+    caption = (
+        "The stated standard deviation per axis of the measured joints: the square root of a third of the "
+        f"covariance’s trace. {SIDE_COLOURS} Gaps: not measured."
+    )
+    if len(centres) < len(motion.t_ns):
+        caption += f" Each point is the median of {bins[1] - bins[0]:.2g} s."
+    numbers = {"": table(t_s=centres, **{f"{name}_mm": values for name, values in middle.items()})}
+    title = "Standard deviation of each joint over time"
+    return Plate("sigmas", title, caption, f"Medians: {listed}.", figure, numbers)
+
+
+_SHOWN_ANGLES = (
+    *("hip_flexion", "knee_flexion", "ankle_dorsiflexion"),
+    *("trunk_flexion", "shoulder_elevation", "elbow_flexion"),
+)
+
+
+def _angles(summary: Summary, angles: pd.DataFrame) -> Plate | None:
+    """Draw the first person's angles of both sides with their 95 % bands; None where none was determined."""
+    known = angles[(angles["person"] == angles["person"].min()) & np.isfinite(angles["value_deg"])]
+    series = {}
+    for name, rows in known.groupby("angle", sort=True):
+        kind = str(name).removeprefix("left_").removeprefix("right_")
+        if kind in _SHOWN_ANGLES:
+            series[str(name)] = (kind, rows)
+    if not series:
+        return None
+    kinds = [kind for kind in _SHOWN_ANGLES if any(kind == of for of, _ in series.values())]
+    times = (np.unique(angles["t_ns"]) - summary.origin_ns) / 1e9
+    bins = time_bins(times, 150)
+    centres = (bins[:-1] + bins[1:]) / 2
+    rows = -(-len(kinds) // _SIGMA_COLUMNS)
+    columns: dict[str, Float] = {}
+    with page_style():
+        figure = new_figure(0.3 + 1.05 * rows)
+        panels = figure.subplots(rows, _SIGMA_COLUMNS, squeeze=False, sharex=True)
+        for axes in panels.flat[len(kinds) :]:
+            axes.set_axis_off()
+        for axes, kind in zip(panels.flat, kinds, strict=False):
+            for name, (of, own) in series.items():
+                if of != kind:
+                    continue
+                t_s = (own["t_ns"].to_numpy() - summary.origin_ns) / 1e9
+                middle = percentiles(own["value_deg"].to_numpy(np.float64), t_s, bins)[0]
+                sigma = percentiles(own["sigma_deg"].to_numpy(np.float64), t_s, bins)[0]
+                colour = SIDES[side_of(name)]
+                axes.fill_between(
+                    centres,
+                    middle - 1.96 * sigma,
+                    middle + 1.96 * sigma,
+                    color=colour,
+                    alpha=0.18,
+                    linewidth=0,
+                )
+                axes.plot(centres, middle, color=colour, linewidth=0.9)
+                columns |= {f"{name}_deg": middle, f"{name}_sigma_deg": sigma}
+            axes.set_title(joint_label(kind), fontsize=7.2, color=MUTED, loc="left")
+            quiet(axes, "y")
+        for axes in panels[-1]:
+            axes.set_xlabel(TIME_LABEL)
+        figure.supylabel("angle (°)", fontsize=7.6, color=MUTED)
+    listed = listing(
+        f"{joint_label(name)} {fixed(float(own['value_deg'].min()), 0)}° to "
+        f"{fixed(float(own['value_deg'].max()), 0)}°"
+        for name, (_, own) in series.items()
+    )
+    caption = f"{SIDE_COLOURS} Bands: 95 %, from the stated standard deviations. Signs as in docs/angles.md."
+    if len(centres) < len(times):
+        caption += f" Each point is the median of {bins[1] - bins[0]:.2g} s."
+    numbers = {"": table(t_s=centres, **columns)}
+    return Plate("angles", "Joint angles over time", caption, f"Ranges: {listed}.", figure, numbers)
 
 
 def _draw_errors(axes: Axes, centres: Float, middle: Float, low: Float, high: Float) -> None:
@@ -270,10 +447,10 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
     """
     chosen = _fullest_times(motion)
     joints, position = with_derived(motion.joints, motion.measured_position[chosen, 0])
-    # The median over the snapshots: a joint far below the ground must not lift every body.
-    ground = float(np.median(np.nanmin(position[..., 2], axis=1)))
-    top = float(np.clip(np.nanmax(position[..., 2]) - ground + 0.1, 1.0, _TALLEST_M))
-    bottom = float(np.clip(np.nanmin(position[..., 2]) - ground, -_DEEPEST_M, 0.0)) - 0.05
+    ground = _feet_m(motion, chosen)
+    above = position[..., 2] - ground[:, None]
+    top = float(np.clip(np.nanmax(above) + 0.1, 1.0, _TALLEST_M))
+    bottom = float(np.clip(np.nanmin(above), -_DEEPEST_M, 0.0)) - 0.05
     width = _STRIDE_M * SNAPSHOTS
     with page_style():
         figure = new_figure(0.5 + (WIDTH_IN - 0.6) * (top - bottom) / width)
@@ -283,8 +460,8 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
         drawn = []
         for k, body in enumerate(position):
             aside, up = _three_quarter_view(body, joints)
-            _draw_body(axes, aside + _STRIDE_M * k, up - ground, joints)
-            drawn.append(np.stack([aside, up - ground], axis=-1))
+            _draw_body(axes, aside + _STRIDE_M * k, up - ground[k], joints)
+            drawn.append(np.stack([aside, up - ground[k]], axis=-1))
         axes.set_xlim(-_STRIDE_M / 2, width - _STRIDE_M / 2)
         axes.set_ylim(bottom, top)
         axes.set_yticks(np.arange(0.0, top, 0.5))
@@ -300,7 +477,7 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
     caption = (
         f"The fullest skeleton{whose} in each stretch of time, facing right and seen from its right, "
         "half from the front; left limbs in blue, right limbs in orange. "
-        "Heights count from where the feet stand."
+        "Heights count from the lowest joint at that moment, taken over two seconds."
     )
     places = np.concatenate(drawn)
     numbers = table(
@@ -310,6 +487,18 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
         above_ground_m=places[:, 1],
     )
     return Plate("body", title, caption, description, figure, {"": numbers})
+
+
+def _feet_m(motion: Motion, rows: Sequence[int]) -> Float:
+    """Return the height [N] on which the first person stands at rows of the motion.
+
+    It is the median over two seconds of the lowest joint, so that no single joint lifts a body.
+    """
+    height = motion.measured_position[:, 0, :, 2]
+    known = np.isfinite(height).any(axis=1)
+    lowest = np.where(np.isfinite(height), height, np.inf).min(axis=1)
+    near = [known & (np.abs(motion.t_ns - motion.t_ns[row]) <= 1_000_000_000) for row in rows]
+    return np.array([np.median(lowest[each]) if each.any() else 0.0 for each in near])
 
 
 def _fullest_times(motion: Motion) -> list[int]:

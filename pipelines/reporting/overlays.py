@@ -106,14 +106,7 @@ def collect_moments(
     motion = summary.motion
     if motion is None or not motion.measured.any():
         return ()
-    least = number(section(content.stages.get("reconstruct", {}), "settings"), "min_confidence") or 0.0
-    cameras = [
-        FilmedCamera.of(
-            name, content.session, content.frames[name], content.keypoints[name], least, content.poses[name]
-        )
-        for name in content.session.cameras
-        if name in content.keypoints
-    ]
+    cameras = _filmed_cameras(content)
     if not cameras:
         return ()
     chosen, worst = choose_moments(motion, summary.errors_mm)
@@ -135,6 +128,45 @@ def collect_moments(
             )
         )
     return tuple(moments)
+
+
+def _filmed_cameras(content: SessionContent) -> list[FilmedCamera]:
+    """Collect the cameras that have keypoints."""
+    least = number(section(content.stages.get("reconstruct", {}), "settings"), "min_confidence") or 0.0
+    return [
+        FilmedCamera.of(
+            name, content.session, content.frames[name], content.keypoints[name], least, content.poses[name]
+        )
+        for name in content.session.cameras
+        if name in content.keypoints
+    ]
+
+
+def residuals_over_time(
+    content: SessionContent, summary: Summary, most: int
+) -> dict[str, tuple[Float, Float]]:
+    """Compute each camera's median distance between keypoints and joints, in at most so many of its frames.
+
+    Args:
+        content: as for `collect_moments`.
+        most: the largest number of frames of a camera, evenly spread.
+
+    Returns:
+        For each camera with keypoints the times [N] of its frames in s, and the medians [N] in px, NaN where
+        nothing can be compared.
+    """
+    motion = summary.motion
+    if motion is None or not motion.measured.any():
+        return {}
+    found = {}
+    for camera in _filmed_cameras(content):
+        every = max(1, -(-len(camera.frame) // most))
+        at = np.arange(0, len(camera.frame), every)
+        status = status_at(motion, camera.frame_t_ns[at])
+        views = views_of(camera, at, motion, status, summary.origin_ns)
+        medians = [np.nan if view.median_px is None else view.median_px for view in views]
+        found[camera.name] = ((camera.frame_t_ns[at] - summary.origin_ns) / 1e9, np.array(medians))
+    return found
 
 
 def _largest_mm(error_mm: Float | None, row: int) -> float | None:

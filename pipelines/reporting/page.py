@@ -13,13 +13,13 @@ from pipelines.reporting import wording
 from pipelines.reporting.arm_figures import draw_arms
 from pipelines.reporting.content import SessionContent, as_reconstructed, number, section, text
 from pipelines.reporting.figures import draw_all
-from pipelines.reporting.overlays import ReadFrame, collect_moments
+from pipelines.reporting.overlays import ReadFrame, collect_moments, residuals_over_time
 from pipelines.reporting.panels import draw_overlays, draw_panel, picture_width
-from pipelines.reporting.plates import Plate
+from pipelines.reporting.plates import MOST_BINS, Plate
 from pipelines.reporting.replanned import Replan, summarise_replan
 from pipelines.reporting.studies import draw_studies, summarise_studies
 from pipelines.reporting.summary import Summary, errors_per_camera, measures, quality, summarise
-from pipelines.reporting.verdict import give_verdict
+from pipelines.reporting.verdict import at_a_glance, give_verdict
 from pipelines.reporting.viewer import make_scene
 from pipelines.reporting.wording import environment
 
@@ -50,6 +50,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
             started=wording.moment(summary.origin_ns),
             method=text(summary.metrics, "method"),
             verdict=give_verdict(content, summary),
+            glances=at_a_glance(summary),
             key_figures=_key_figures(summary),
             measures=measures(summary),
             errors_per_camera=errors_per_camera(summary),
@@ -83,7 +84,10 @@ def draw_session(content: SessionContent, read_frame: ReadFrame | None = None) -
 
 def _draw(summary: Summary, content: SessionContent, replan: Replan | None) -> dict[str, Plate]:
     of_arms = draw_arms(replan) if replan is not None else {}
-    return draw_all(summary, content.poses) | of_arms | draw_studies(content.studies)
+    residuals = residuals_over_time(as_reconstructed(content), summary, MOST_BINS)
+    return (
+        draw_all(summary, content.poses, residuals, content.angles) | of_arms | draw_studies(content.studies)
+    )
 
 
 def _replan(summary: Summary, content: SessionContent) -> Replan | None:

@@ -20,7 +20,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.reporting.wording import fixed
+from pipelines.reporting.wording import cell_text, fixed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 INK, MUTED, GRID, PAPER = "#22262a", "#666d74", "#dddcd6", "#fefdfb"
 SIDES = {"left": "#1f78b5", "right": "#c8561b", "": "#4a4f55"}
 """Colours of the sides of the body, by the words of `motion.side_of`."""
-CAMERAS = ("#0072b2", "#d55e00", "#009e73", "#b0528f", "#a87900", "#4f8fc4")
-"""Colours of cameras, after Okabe and Ito's for all kinds of colour vision, darkened for thin lines."""
+CAMERAS = ("#00785a", "#7d4fb5", "#8f7a00", "#5d7d1c", "#00808f", "#8c5a3c")
+"""Colours of cameras: none is near the blue and the orange of left and right."""
 LEVELS = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")
 """Colours of ordered values, from the least to the most: light to dark, on dark paper dark to light."""
 STATUS_COLOURS = {
@@ -142,6 +142,7 @@ def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
     buffer = io.StringIO()
     with page_style(), settled(figure):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        times = _time_axes(figure)
     drawing = buffer.getvalue()
     view = re.search(r'viewBox="([^"]+)"', drawing)
     if view is None:
@@ -156,10 +157,26 @@ def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
     body = re.sub(r"<[^<>]+>", lambda tag: _page_tag(tag.group(), referenced), body)
     body = re.sub(r">\s+<", "><", body)
     return (
-        f'<svg viewBox="{view.group(1)}" role="img" aria-labelledby="{key}-title" '
+        f'<svg viewBox="{view.group(1)}"{times} role="img" aria-labelledby="{key}-title" '
         f'aria-describedby="{key}-desc"><title id="{key}-title">{escape(title)}</title>'
         f'<desc id="{key}-desc">{escape(description)}</desc>{body.strip()}'
     )
+
+
+TIME_LABEL = "time (s)"
+"""Label of an axis on which the page's viewer shows and takes moments."""
+
+
+def _time_axes(figure: Figure) -> str:
+    """Describe the time axes for the viewer: left and right edge in the drawing, and the times there."""
+    width = 72 * figure.get_size_inches()[0]  # the unit of matplotlib's SVG is a point
+    found = [axes for axes in figure.axes if axes.get_xlabel() == TIME_LABEL]
+    parts = [
+        f"{width * axes.get_position().x0:.2f} {width * axes.get_position().x1:.2f} "
+        f"{axes.get_xlim()[0]:.4f} {axes.get_xlim()[1]:.4f}"
+        for axes in found
+    ]
+    return f' data-time="{";".join(parts)}"' if parts else ""
 
 
 def _page_tag(tag: str, referenced: Mapping[str, str]) -> str:
@@ -205,6 +222,20 @@ class Plate:
     def svg(self) -> str:
         """Figure as an `<svg>` element for the inside of a page."""
         return inline_svg(self.figure, f"figure-{self.key}", self.title, self.description)
+
+    @cached_property
+    def csv(self) -> Mapping[str, str]:
+        """Numbers as CSV, by name, with nine significant digits; empty cells are missing numbers.
+
+        No spreadsheet takes a text of it for a formula.
+        """
+        written = {}
+        for name, numbers in self.numbers.items():
+            texts = numbers.select_dtypes(exclude="number").map(cell_text)
+            written[name] = numbers.assign(**texts).to_csv(
+                index=False, float_format="%.9g", lineterminator="\n"
+            )
+        return written
 
 
 def table(**columns: object) -> pd.DataFrame:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.reporting.content import SessionContent, items, number, section, text
 from pipelines.reporting.summary import Summary, errors_per_camera, finite_median
 from pipelines.reporting.wording import (
@@ -42,6 +43,94 @@ class Verdict:
     quality: tuple[str, ...] = ()
     certainty: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Glance:
+    """A figure of the body that a person can judge, with the usual range of people."""
+
+    label: str
+    value: str
+    usual: str
+    odd: bool  # outside the usual range
+
+
+# Thigh and shank as parts of the stature, by Drillis and Contini (1966): Winter, Biomechanics and Motor
+# Control of Human Movement, 4th edition, figure 4.1.
+_LEG_OF_STATURE = 0.245 + 0.246
+_STATURE_M, _TRUNK_DEG, _FEET_M, _SPEED_MPS = (1.4, 2.05), 30.0, 0.2, 8.0
+_SPAN_NS = 500_000_000
+
+
+def at_a_glance(summary: Summary) -> list[Glance]:
+    """Compare the first person with people: stature, trunk, feet and speed; what is not known is left out."""
+    if summary.motion is None or not summary.motion.measured.any():
+        return []
+    glances = []
+    legs = {(bone.name, bone.side): bone.median_m for bone in summary.bones}
+    whole_legs = [
+        legs["thigh", side] + legs["shank", side]
+        for side in ("left", "right")
+        if ("thigh", side) in legs and ("shank", side) in legs
+    ]
+    if whole_legs:
+        stature = float(np.mean(whole_legs)) / _LEG_OF_STATURE
+        usual = f"roughly, from thigh and shank; adults {_STATURE_M[0]} to {_STATURE_M[1]} m"
+        is_odd = not _STATURE_M[0] <= stature <= _STATURE_M[1]
+        glances.append(Glance("Height", quantity(stature, "m", 2), usual, is_odd))
+    position, joints = summary.motion.measured_position[:, 0], summary.motion.joints
+    hips, shoulders = (_middle(position, joints, kind) for kind in ("hip", "shoulder"))
+    trunk = shoulders - hips
+    tilt = np.degrees(np.arctan2(np.linalg.norm(trunk[:, :2], axis=1), trunk[:, 2]))
+    if (middle := finite_median(tilt)) is not None:
+        usual = f"of the trunk from upright; walking people up to {_TRUNK_DEG:.0f}°"
+        glances.append(Glance("Upright", quantity(middle, "°"), usual, middle > _TRUNK_DEG))
+    feet = [
+        j for j, name in enumerate(joints) if name.endswith(("_ankle", "_heel", "_big_toe", "_foot_index"))
+    ]
+    lowest = np.where(np.isnan(position[:, feet, 2]), np.inf, position[:, feet, 2]).min(
+        axis=1, initial=np.inf
+    )
+    if (spread := _rise_of_feet(summary.motion.t_ns, lowest)) is not None:
+        usual = f"rise and fall of the lower foot; walking people up to {100 * _FEET_M:.0f} cm"
+        glances.append(Glance("Feet on the ground", quantity(100 * spread, "cm"), usual, spread > _FEET_M))
+    speed = _speeds(summary.motion.t_ns, hips)
+    if len(speed):
+        fast = float(np.percentile(speed, 95))
+        value = f"{quantity(float(np.median(speed)), 'm/s')}, up to {quantity(fast, 'm/s')}"
+        usual = f"median and 95 % of the time; running people up to {_SPEED_MPS:.0f} m/s"
+        glances.append(Glance("Speed", value, usual, fast > _SPEED_MPS))
+    return glances
+
+
+def _middle(position: Float, joints: tuple[str, ...], kind: str) -> Float:
+    """Return the middle [T, 3] of a left and a right joint; NaN where either is missing."""
+    pair = [joints.index(f"{side}_{kind}") for side in ("left", "right") if f"{side}_{kind}" in joints]
+    return position[:, pair].mean(axis=1) if len(pair) == 2 else np.full((len(position), 3), np.nan)
+
+
+def _rise_of_feet(t_ns: Int64, lowest: Float) -> float | None:
+    """Measure how far the lower foot is from its median over two seconds: 10th to 90th percentile, m."""
+    known = np.isfinite(lowest)
+    if not known.any():
+        return None
+    t_ns, lowest = t_ns[known], lowest[known]
+    around = np.stack([np.searchsorted(t_ns, t_ns - 10**9), np.searchsorted(t_ns, t_ns + 10**9)], axis=1)
+    some = range(0, len(t_ns), max(1, len(t_ns) // 2000))
+    above = [lowest[k] - np.median(lowest[slice(*around[k])]) for k in some]
+    low, high = np.percentile(above, [10, 90])
+    return float(high - low)
+
+
+def _speeds(t_ns: Int64, hips: Float) -> Float:
+    """Compute horizontal speeds of the hips over half a second, m/s, where they are known."""
+    after = np.searchsorted(t_ns, t_ns + _SPAN_NS)
+    start = np.flatnonzero(after < len(t_ns))
+    span_ns = t_ns[after[start]] - t_ns[start]
+    moved = np.linalg.norm((hips[after[start]] - hips[start])[:, :2], axis=1)
+    usable = np.isfinite(moved) & (span_ns < 2 * _SPAN_NS)
+    speeds: Float = moved[usable] / (span_ns[usable] / 1e9)
+    return speeds
 
 
 def give_verdict(content: SessionContent, summary: Summary) -> Verdict:

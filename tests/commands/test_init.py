@@ -5,31 +5,21 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 
 from pipelines.draft import Drafted, draft
-from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from tests.commands.runner import content, mocap, refused, succeeds
-from tests.formats.logs import test_gpx
-from tests.formats.maps import test_las
-from tests.formats.skeletons import test_amc
-from tests.formats.videos import test_picture_folder
 from tests.real_data import real_data
-from tests.synthetic.drone_logs import HOME, DroneTruth, drone_of, write_record, write_tlog
 from tests.synthetic.flights import LENS, START_NS, SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import LEVER_ARM, header, write_logged_flight
 from tests.synthetic.logs import Container, Entry, cut, write_mcap
-from tests.synthetic.video_tracks import write_djmd, write_klv
 from tests.synthetic.videos import even_ticks, write_video
 
 
@@ -115,91 +105,6 @@ def test_drafted_logs_are_ingested_as_they_were_flown(tmp_path: Path, container:
     edit(result.path, {mount % (0, [0, 0, 0]): mount % (30, list(LEVER_ARM))})
     ingest(result.path)
     assert tables(tmp_path / "flight.session") == tables(tmp_path / "written.session")
-
-
-def _kitti(folder: Path, name: str, flight: SyntheticFlight, k: int) -> None:
-    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from KITTI's axes: y down, z ahead
-    rotation = turn.T @ matrix_from_quaternion(flight.camera_quaternion[k])
-    position = flight.camera_position[k] @ turn
-    rows = np.concatenate([rotation, position[:, :, None]], axis=2).reshape(-1, 12)
-    np.savetxt(folder / f"{name}.txt", rows, fmt="%.12e")
-    np.savetxt(folder / "times.txt", (flight.t_ns - flight.t_ns[0]) / 1e9)
-
-
-def _euroc(folder: Path, name: str, flight: SyntheticFlight, k: int) -> None:
-    names = [f"p_RS_R_{axis} [m]" for axis in "xyz"] + [f"q_RS_{axis} []" for axis in "wxyz"]
-    poses = np.concatenate(
-        [flight.camera_position[k], np.roll(flight.camera_quaternion[k], 1, axis=1)], axis=1
-    )
-    rows = zip(flight.t_ns.tolist(), poses.tolist(), strict=True)
-    lines = [", ".join(["#timestamp", *names]), *(",".join(map(str, (t, *row))) for t, row in rows)]
-    (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
-
-
-def _own_log(write: Callable[[Path, DroneTruth], object], suffix: str) -> Any:
-    return lambda folder, name, flight, k: write(folder / f"{name}{suffix}", drone_of(flight, k))
-
-
-@pytest.mark.parametrize(
-    ("write", "key", "suffix", "metres"),
-    [
-        (_kitti, "tum", ".txt", 1e-4),
-        (_euroc, "csv", ".csv", 1e-4),
-        (
-            lambda f, name, flight, k: write_tlog(f / f"{name}.tlog", drone_of(flight, k)),
-            "tlog",
-            ".tlog",
-            0.17,
-        ),
-        (
-            lambda f, name, flight, k: write_record(f / f"{name}.csv", drone_of(flight, k)),
-            "dji",
-            ".csv",
-            0.17,
-        ),
-        (_own_log(write_djmd, ".mp4"), "dji", ".mp4", 0.17),
-        (_own_log(write_klv, ".klv"), "klv", ".klv", 0.32),
-    ],
-)
-def test_poses_of_other_kinds_are_drafted_as_ingest_takes_them(
-    tmp_path: Path, write: Any, key: str, suffix: str, metres: float
-) -> None:
-    """Drones' own logs are off by the lever arm of 0.147 m that nobody stated, and by their rounding."""
-    flight = write_flight(tmp_path, cameras=2, seconds=1.0, clean=True)
-    write_lenses(flight)
-    for path in (flight.manifest, tmp_path / "truth.csv", *tmp_path.glob("*.tum")):
-        path.unlink()
-    for k, name in enumerate(flight.cameras):
-        write(tmp_path, name, flight, k)
-    result, stated = drafted(tmp_path)
-    assert not result.missing
-    for name, camera in stated["cameras"].items():
-        assert camera["pose"][key] == f"{name}{suffix}"
-    if key not in {"tum", "csv"}:
-        place = {name: getattr(HOME, name) for name in ("latitude_deg", "longitude_deg", "altitude_m")}
-        edit(result.path, {"world: {frame: enu": f"world: {{origin: {place}, frame: enu"})
-    ingest(result.path)
-    first = np.array([flight.camera_position[k][0] for k in range(2)])
-    for k, name in enumerate(flight.cameras):
-        poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / name / "poses.parquet")
-        off = poses[["x", "y", "z"]].to_numpy()[0] - first[k]
-        assert np.abs(off).max() < metres
-
-
-def test_clouds_tracks_pictures_and_motion_are_drafted_or_named(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=2, seconds=1.0, clean=True)
-    flight.manifest.unlink()
-    test_las.write(tmp_path / "site.laz")
-    test_gpx.write(tmp_path, test_gpx.track(test_gpx.point(0), test_gpx.point(1)))
-    test_amc.write(tmp_path)
-    (tmp_path / "drone1.json").unlink()
-    test_picture_folder.write(tmp_path / "drone1")
-    result, stated = drafted(tmp_path)
-    assert stated["map"] == "site.laz"
-    assert stated["cameras"]["drone1"]["video"] == "drone1"
-    assert "actor: {log: FILE, topic: /track}" in result.text
-    assert "10_04.amc" in result.text
-    assert [path.name for path in result.left_out] == ["10.asf"]
 
 
 def test_as_a_command(tmp_path: Path) -> None:

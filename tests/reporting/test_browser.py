@@ -281,3 +281,34 @@ def test_arms_and_the_map_are_shown_as_chosen(
     choose("viewer-surface", "e.checked = false")
     assert with_map - pixels("--ink", any_drawn=True) > 200
     assert chromium.complaints == []
+
+
+def test_a_click_on_a_curve_and_its_arrow_keys_choose_the_moment(opened: Browser) -> None:
+    curve = "#figure-residuals .drawing"
+    left, right, first, last = (
+        float(value)
+        for value in opened.evaluate(f"document.querySelector('{curve} svg').dataset.time").split()
+    )
+    x, y = opened.middle_of(f"{curve} svg")  # of the drawing, which is wider than its axes
+    width = float(opened.evaluate(f"document.querySelector('{curve} svg').viewBox.baseVal.width"))
+    expected = first + (width / 2 - left) / (right - left) * (last - first)
+    for kind in ("mousePressed", "mouseReleased"):
+        opened.mouse(kind, x, y)
+    opened.wait_for(f"Math.abs({_NOW} - {expected}) < 0.05")  # a pixel, and two decimals
+    moments = opened.evaluate(
+        "Array.from(document.querySelectorAll('[name=moment]'), (e) => Number(e.dataset.t))"
+    )
+    chosen = opened.evaluate("Number(document.querySelector('[name=moment]:checked').dataset.t)")
+    now = opened.evaluate(_NOW)
+    assert chosen == min(moments, key=lambda t: abs(t - now))
+    opened.evaluate(f"document.querySelector('{curve}').focus()")
+    opened.press("ArrowRight")
+    opened.wait_for(f"{_NOW} > {now}")
+    opened.press("ArrowLeft")
+    opened.press("ArrowLeft")
+    opened.wait_for(f"{_NOW} < {now}")
+
+
+def test_a_narrow_window_scrolls_inside_tables_and_curves_alone(opened: Browser) -> None:
+    opened.show_as(width=390, height=800)
+    assert opened.evaluate("document.documentElement.scrollWidth <= 390")

@@ -8,7 +8,7 @@ import pytest
 
 from pipelines.reporting.content import SessionContent, items
 from pipelines.reporting.summary import summarise
-from pipelines.reporting.verdict import Verdict, give_verdict
+from pipelines.reporting.verdict import Verdict, _rise_of_feet, _speeds, give_verdict
 from pipelines.reporting.wording import STATUS_REASONS, STATUS_REMEDIES, joint_label
 
 from .conftest import STAGES, described, make_session, make_skeleton
@@ -135,3 +135,17 @@ def test_a_doubt_comes_before_everything_else(content: SessionContent) -> None:
     assert verdict.lead.index("W1") < verdict.lead.index("81.1")
     assert right.lead.split()[0] not in verdict.lead
     assert "R1" in verdict.doubts[0]
+
+
+def test_speed_and_feet_of_a_straight_climb() -> None:
+    """Walk east at 1.5 m/s up a slope of 10 %; feet that rise and fall by 4 cm in a second."""
+    t_ns = np.arange(0, 10 * 10**9, 10**9 // 50)
+    t_s = t_ns / 1e9
+    hips = np.stack([1.5 * t_s, 0 * t_s, 1 + 0.15 * t_s], axis=1)
+    np.testing.assert_allclose(_speeds(t_ns, hips), 1.5, rtol=1e-9)
+    # 10th to 90th percentile of a sine: 2 sin(0.4 pi) of its amplitude. A slope shows at both ends alone.
+    for lowest, expected in ((0.02 * np.sin(2 * np.pi * t_s), 0.04 * np.sin(0.4 * np.pi)), (0.15 * t_s, 0.0)):
+        rise = _rise_of_feet(t_ns, lowest)
+        assert rise is not None
+        assert abs(rise - expected) < 0.004
+    assert _rise_of_feet(t_ns, np.full(len(t_ns), np.inf)) is None

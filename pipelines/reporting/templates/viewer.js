@@ -427,10 +427,10 @@
     context.save();
     context.beginPath();
     context.ellipse(...eye.flat(q), ...radii, Math.atan2(2 * xy, xx - yy) / 2, 0, 2 * Math.PI);
-    Object.assign(context, { fillStyle: colours.sides[side], strokeStyle: colours.sides[side], globalAlpha: 0.1 });
+    Object.assign(context, { fillStyle: colours.sides[side], strokeStyle: colours.sides[side], globalAlpha: 0.04 });
     context.fill();
-    context.globalAlpha = 0.55;
-    context.lineWidth = 0.8;
+    context.globalAlpha = 0.4;
+    context.lineWidth = 0.7;
     context.stroke();
     context.restore();
   }
@@ -475,6 +475,7 @@
     if (view.whole && surface && shown("surface")) drawSurface(eye);
     if (shown("paths")) drawPaths(eye, at, t);
     const parts = [];
+    const around = []; // ellipsoids lie behind all bodies, which would else be hidden
     // Bones as thick as 4 cm, but never lost from afar nor clumsy from near.
     const width = Math.min(Math.max((0.04 * eye.focal) / eye.distance, 1.6), 5);
     for (let p = 0; p < people; p++) {
@@ -482,7 +483,7 @@
       drawShadow(eye, joints);
       parts.push(...boneParts(eye, joints, (side) => ({ strokeStyle: colours.sides[side], lineWidth: width })));
       parts.push(...jointParts(eye, joints, 0.75 * width + 0.4));
-      if (body.root && shown("ellipsoids")) parts.push(...ellipsoidParts(eye, joints, p, at));
+      if (body.root && shown("ellipsoids")) around.push(...ellipsoidParts(eye, joints, p, at));
       if (body.truth && shown("truth")) {
         const dash = width > 2.5 ? [4, 3.5] : [];
         const style = () => ({ strokeStyle: colours.ink, lineWidth: 1.1, globalAlpha: 0.85, dash, lineCap: "butt" });
@@ -491,7 +492,7 @@
     }
     shownCameras().forEach(([camera, c]) => parts.push(...cameraParts(eye, camera, c, at)));
     parts.sort((a, b) => b.depth - a.depth);
-    for (const part of parts) part.draw();
+    for (const part of [...around, ...parts]) part.draw();
     drawCompass(eye, step);
   }
 
@@ -525,6 +526,73 @@
     slider.setAttribute("aria-valuetext", seconds(clock.t));
     element("now").textContent = seconds(clock.t);
     element("said").textContent = said(at);
+    for (const curve of curves) curve.mark(clock.t);
+  }
+
+  // --- curves and pictures -------------------------------------------------------------------------------
+
+  /** The drawings with a time axis: each shows the moment, and a click or an arrow key chooses it. */
+  const curves = Array.from(document.querySelectorAll(".drawing[data-time]"), (drawing) => {
+    const svg = drawing.querySelector("svg");
+    const height = svg.viewBox.baseVal.height;
+    const axes = svg.dataset.time.split(";").map((axis) => axis.split(" ").map(Number));
+    const lines = axes.map(() => {
+      const line = document.createElementNS("http://www.w3.org/2000/svg", "line");
+      line.setAttribute("class", "now");
+      line.setAttribute("y1", 0);
+      line.setAttribute("y2", height);
+      return svg.appendChild(line);
+    });
+    const placeOf = ([left, right, from, to], t) => left + ((t - from) / (to - from)) * (right - left);
+    drawing.addEventListener("click", (event) => {
+      const x = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse()).x;
+      const axis = axes.find(([left, right]) => x >= left && x <= right);
+      if (axis) choose(axis[2] + ((x - axis[0]) / (axis[1] - axis[0])) * (axis[3] - axis[2]));
+    });
+    drawing.addEventListener("keydown", (event) => {
+      const count = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+      if (!count || event.ctrlKey || event.metaKey || event.altKey) return;
+      event.preventDefault();
+      step(event.shiftKey ? 10 * count : count);
+      showNearestPictures(clock.t);
+    });
+    return {
+      mark: (t) => axes.forEach((axis, k) => {
+        const x = Math.min(Math.max(placeOf(axis, t), axis[0]), axis[1]);
+        lines[k].setAttribute("x1", x);
+        lines[k].setAttribute("x2", x);
+      }),
+    };
+  });
+
+  const moments = Array.from(document.querySelectorAll("input[name=moment]"), (input) => ({ input, t: Number(input.dataset.t) }));
+
+  function showNearestPictures(t) {
+    const far = (moment) => Math.abs(moment.t - t);
+    if (moments.length) moments.reduce((best, moment) => (far(moment) < far(best) ? moment : best)).input.checked = true;
+  }
+
+  function choose(t) {
+    play(false);
+    seek(t);
+    showNearestPictures(t);
+  }
+
+  /** Save a drawing with the colours of the page: outside of it, its variables have no values. */
+  for (const button of document.querySelectorAll("button[data-save]")) {
+    button.hidden = false;
+    button.addEventListener("click", () => {
+      const svg = button.closest("figure").querySelector("svg").cloneNode(true);
+      for (const line of svg.querySelectorAll(".now")) line.remove();
+      svg.setAttribute("xmlns", "http://www.w3.org/2000/svg");
+      const style = getComputedStyle(document.documentElement);
+      const text = svg.outerHTML.replace(/var\((--[\w-]+)\)/g, (_, name) => style.getPropertyValue(name).trim());
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(new Blob([text], { type: "image/svg+xml" }));
+      link.download = button.dataset.save;
+      link.click();
+      URL.revokeObjectURL(link.href);
+    });
   }
 
   let asked = false;

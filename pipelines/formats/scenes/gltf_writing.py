@@ -1,0 +1,262 @@
+"""Export to glb: the moving skeleton and the cameras as glTF 2.0, for Blender and viewers of the web.
+
+Every joint is an octahedron and every bone a bar, both moved by animation; a missing one has the size zero. A
+camera is a glTF camera that follows its poses. Metres; glTF's axes are x right, y up and z towards the
+viewer: the (x, y, z) of the file are the world's (x, z, -y). Second 0 is `zero_ns` of the asset's extras, the
+skeleton's first time. At most 30 moments a second are written. The same recording gives the same bytes.
+
+Source: Khronos, glTF 2.0 Specification (2021): 3.6.2 accessors, 3.11 animations, 3.10 cameras, 4 GLB.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.formats.common.exporting import safe_file_name, thinned
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.poses import multiply
+from pipelines.session.errors import DataError
+from pipelines.session.records import JointMotion, Recording, Trajectory
+from pipelines.session.skeletons import bones_of, with_derived
+
+_HZ = 30.0
+_JOINT_M, _BONE_M = 0.022, 0.014  # radius of the spheres, half the width of the bars
+_FROM_WORLD = np.array([-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # about x by -90 degrees: z up becomes y up
+_AHEAD = np.array([1.0, 0.0, 0.0, 0.0])  # about x by 180 degrees: z forward and y down become -z and y up
+_FLOAT, _UINT16 = 5126, 5123
+_ARRAY_BUFFER, _INDEX_BUFFER = 34962, 34963
+_MATERIALS = {"": (0.30, 0.33, 0.36), "left": (0.01, 0.19, 0.46), "right": (0.58, 0.09, 0.01)}  # linear RGB
+_LARGEST = (1 << 32) - (1 << 16)  # bytes: a GLB counts them in 32 bits
+
+
+class GlbExport:
+    """Writer of `<name>.glb`: skeleton and cameras, animated."""
+
+    name = "glb"
+    title = "the moving skeleton and the cameras as glTF, for Blender and the web"
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write the skeleton of every person, and the cameras while it lasts.
+
+        Raises:
+            DataError: there are no joints, or so many moments that a GLB cannot hold them.
+        """
+        motion = recording.motion
+        if motion is None or np.isnan(motion.position).all():
+            raise DataError(recording.name, "holds no joints to export", "run `mocap reconstruct` first")
+        rows = thinned(motion.t_ns, _HZ)
+        if len(rows) < len(motion.t_ns):
+            recording.progress.note(
+                f"glb: {len(rows)} of {len(motion.t_ns)} moments, at most {_HZ:g} a second"
+            )
+        t_ns = motion.t_ns[rows]
+        asset = _Asset((t_ns - t_ns[0]) / 1e9)
+        spheres = {side: asset.mesh(*_octahedron(_JOINT_M), side) for side in _MATERIALS}
+        bars = {side: asset.mesh(*_bar(_BONE_M), side) for side in _MATERIALS}
+        for person in range(motion.position.shape[1]):
+            _add_person(asset, motion, rows, person, spheres, bars)
+        for name, track in recording.tracks.items():
+            if name in recording.lenses:
+                _add_camera(asset, name, track, recording.lenses[name], t_ns)
+        path = folder / f"{safe_file_name(recording.name)}.glb"
+        path.write_bytes(asset.packed(recording.name, int(t_ns[0])))
+        return [path]
+
+
+def _add_person(
+    asset: _Asset,
+    motion: JointMotion,
+    rows: Int64,
+    person: int,
+    spheres: dict[str, int],
+    bars: dict[str, int],
+) -> None:
+    joints, position = with_derived(motion.joints, motion.position[rows, person])
+    place = np.stack([position[..., 0], position[..., 2], -position[..., 1]], axis=-1)
+    label = f"person{person} " if motion.position.shape[1] > 1 else ""
+    for j, name in enumerate(joints):
+        known = np.isfinite(place[:, j, 0])
+        if known.any():
+            size = np.repeat(known[:, None], 3, axis=1).astype(np.float64)
+            asset.moving(f"{label}{name}", spheres[_side(name)], translation=_held(place[:, j]), scale=size)
+    for start, end in bones_of(joints):
+        low, span = place[:, joints.index(start)], place[:, joints.index(end)] - place[:, joints.index(start)]
+        length = np.linalg.norm(span, axis=1)
+        known = length > 0  # False for NaN
+        if known.any():
+            size = np.where(known[:, None], np.stack([known, length, known], axis=1), 0.0)
+            side = _side(start) if _side(start) == _side(end) else ""
+            asset.moving(
+                f"{label}{start} to {end}",
+                bars[side],
+                translation=_held(np.where(known[:, None], low, np.nan)),
+                rotation=_turned_to(_held(np.where(known[:, None], span, np.nan))),
+                scale=size,
+            )
+
+
+def _add_camera(asset: _Asset, name: str, track: Trajectory, lens: Intrinsics, t_ns: Int64) -> None:
+    """Add a camera with its poses nearest to the moments."""
+    after = np.clip(np.searchsorted(track.t_ns, t_ns), 0, len(track.t_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    is_before = np.abs(track.t_ns[before] - t_ns) < np.abs(track.t_ns[after] - t_ns)
+    nearest = np.where(is_before, before, after)
+    x, y, z = track.position[nearest].T
+    turn = multiply(multiply(_FROM_WORLD, track.quaternion_xyzw[nearest]), _AHEAD)
+    camera = {
+        "type": "perspective",
+        "perspective": {
+            "aspectRatio": lens.width * lens.fy / (lens.height * lens.fx),
+            "yfov": 2 * float(np.arctan(lens.height / 2 / lens.fy)),
+            "znear": 0.1,
+        },
+        "name": name,
+    }
+    asset.moving(name, None, camera=camera, translation=np.stack([x, z, -y], axis=1), rotation=turn)
+
+
+def _side(joint: str) -> str:
+    side = joint.partition("_")[0]
+    return side if side in _MATERIALS else ""
+
+
+def _held(values: Float) -> Float:
+    """Replace missing rows [T, 3] by the last known one, before the first by that; one must be known."""
+    known = np.isfinite(values[:, 0])
+    last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
+    return values[np.where(last < 0, int(np.argmax(known)), last)]
+
+
+def _turned_to(direction: Float) -> Float:
+    """Return the smallest turns [T, 4] xyzw of the y axis to directions [T, 3] of any length."""
+    x, y, z = (direction / np.linalg.norm(direction, axis=1, keepdims=True)).T
+    turn = np.stack([z, np.zeros_like(x), -x, 1 + y], axis=1)
+    turn[1 + y < 1e-12] = [1.0, 0.0, 0.0, 0.0]
+    turned: Float = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+    return turned
+
+
+def _octahedron(radius: float) -> tuple[Float, Int64]:
+    """Return corners [6, 3] and outward triangles [8, 3]."""
+    corners = radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    triangles = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+    return corners.astype(np.float64), np.array(triangles)
+
+
+def _bar(half_m: float) -> tuple[Float, Int64]:
+    """Return corners [6, 3] and triangles [8, 3] of a bar along y from 0 to 1, pointed at both ends."""
+    corners, triangles = _octahedron(1.0)
+    return corners * [half_m, 0.5, half_m] + [0.0, 0.5, 0.0], triangles
+
+
+@dataclass
+class _Asset:
+    """Parts of a glTF file, and its binary buffer."""
+
+    t_s: Float  # [T] of all animations
+    nodes: list[dict[str, Any]] = field(default_factory=list)
+    meshes: list[dict[str, Any]] = field(default_factory=list)
+    cameras: list[dict[str, Any]] = field(default_factory=list)
+    accessors: list[dict[str, Any]] = field(default_factory=list)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    channels: list[dict[str, Any]] = field(default_factory=list)
+    samplers: list[dict[str, Any]] = field(default_factory=list)
+    buffer: bytearray = field(default_factory=bytearray)
+
+    def __post_init__(self) -> None:
+        self._time = self.array(self.t_s[:, None], "SCALAR", bounded=True)
+
+    def array(self, values: Any, kind: str, *, target: int | None = None, bounded: bool = False) -> int:
+        """Add an array [N, columns] and return its accessor."""
+        code = "<u2" if target == _INDEX_BUFFER else "<f4"
+        stored = np.ascontiguousarray(values, dtype=code)
+        view = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": stored.nbytes}
+        self.views.append(view | ({} if target is None else {"target": target}))
+        self.buffer += stored.tobytes()
+        self.buffer += bytes(-len(self.buffer) % 4)
+        accessor = {
+            "bufferView": len(self.views) - 1,
+            "componentType": _UINT16 if target == _INDEX_BUFFER else _FLOAT,
+            "count": len(stored),
+            "type": kind,
+        }
+        if bounded:
+            accessor |= {"min": stored.min(axis=0).tolist(), "max": stored.max(axis=0).tolist()}
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+    def mesh(self, corners: Float, triangles: Int64, side: str) -> int:
+        """Add a mesh with flat faces in the colour of a side of the body."""
+        faces = corners[triangles]  # each face has corners of its own, so that no normals are needed
+        primitive = {
+            "attributes": {
+                "POSITION": self.array(faces.reshape(-1, 3), "VEC3", target=_ARRAY_BUFFER, bounded=True)
+            },
+            "indices": self.array(np.arange(faces.size // 3)[:, None], "SCALAR", target=_INDEX_BUFFER),
+            "material": list(_MATERIALS).index(side),
+        }
+        self.meshes.append({"primitives": [primitive]})
+        return len(self.meshes) - 1
+
+    def moving(
+        self, name: str, mesh: int | None, *, camera: dict[str, Any] | None = None, **paths: Float
+    ) -> None:
+        """Add a node that its paths [T, 3 or 4] move; sizes change at once, all else in straight lines."""
+        node: dict[str, Any] = {"name": name}
+        if mesh is not None:
+            node["mesh"] = mesh
+        if camera is not None:
+            self.cameras.append(camera)
+            node["camera"] = len(self.cameras) - 1
+        for path, values in paths.items():
+            node[path] = np.float32(values[0]).tolist()
+            sampler = {
+                "input": self._time,
+                "output": self.array(values, f"VEC{values.shape[1]}"),
+                "interpolation": "STEP" if path == "scale" else "LINEAR",
+            }
+            self.samplers.append(sampler)
+            target = {"node": len(self.nodes), "path": path}
+            self.channels.append({"sampler": len(self.samplers) - 1, "target": target})
+        self.nodes.append(node)
+
+    def packed(self, name: str, zero_ns: int) -> bytes:
+        """Return the GLB: header, chunk of JSON, binary chunk."""
+        materials = [
+            {
+                "name": side or "middle",
+                "pbrMetallicRoughness": {"baseColorFactor": [*colour, 1.0], "metallicFactor": 0.0},
+            }
+            for side, colour in _MATERIALS.items()
+        ]
+        document: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "mocap", "extras": {"zero_ns": str(zero_ns)}},
+            "scene": 0,
+            "scenes": [{"name": name, "nodes": list(range(len(self.nodes)))}],
+            "nodes": self.nodes,
+            "meshes": self.meshes,
+            "materials": materials,
+            "animations": [{"name": "motion", "channels": self.channels, "samplers": self.samplers}],
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": len(self.buffer)}],
+        }
+        if self.cameras:
+            document["cameras"] = self.cameras
+        text = json.dumps(document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        total = 12 + 8 + len(text) + 8 + len(self.buffer)
+        if total > _LARGEST:
+            raise DataError(name, "has more moments than a GLB can hold (4 GB)", "export bvh or parquet")
+        head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON")
+        return head + text + struct.pack("<I4s", len(self.buffer), b"BIN\0") + bytes(self.buffer)
+
+
+EXPORT = GlbExport()
