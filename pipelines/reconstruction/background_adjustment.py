@@ -12,7 +12,8 @@ one, so that the normal matrix has a band: the work grows linearly with the pict
 points off the background and lost tracks.
 
 Levels of errors that nobody stated are estimated by MacKay's rule, as in `refinement.estimate`. A constant
-error is always possible, and one draw of it says little of its level, which therefore stays wide.
+error is always possible, and one draw of it says little of its level. The position's stays wide; that of
+a rotation that the pictures determine is compared with the slow rotation's.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from pipelines.geometry.noise import (
     SHIFT_IN_WORLD,
     UNKNOWN_SIGMA,
     USUAL_CONSTANT,
+    USUAL_COUNT,
     PoseErrors,
     Process,
 )
@@ -73,6 +75,7 @@ _UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1
 """Start of estimated levels. White positions that are free by more confuse far and near points at first."""
 
 _USUAL_ARM_M = 0.05  # constant shift in the camera: a lever arm that is wrong
+_LEVEL_STEPS = 20  # of the constant rotation's level; it halves its distance in each
 _DRAWS = 32  # of the posterior
 _LEVEL_ROUNDS = 6
 _LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; below it MacKay's rule leaps
@@ -241,7 +244,12 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
             ),
             assumed=prior.estimated,
         ),
-        replace(prior, white=_rms([p.white for p in priors]), slow=slow),
+        replace(
+            prior,
+            white=_rms([p.white for p in priors]),
+            constant=(prior.constant[0], _rms([p.constant[:2] for p in priors])[1], prior.constant[2]),
+            slow=slow,
+        ),
         points,
         pixels,
         None,
@@ -418,6 +426,7 @@ class _Stretch:
                 return None
             state, factored, _ = found
             prior = self._estimated(state, self._draws(factored, 8), prior)
+            prior = with_constant_turn(prior, state.constant[3:6], factored.corner[3:6, 3:6])
         found = self._solve(state, prior, rounds=_ROUNDS)
         if found is None:
             return None
@@ -537,6 +546,31 @@ class _Stretch:
 
 
 _KINDS = (slice(0, 3), slice(3, 6))
+
+
+def with_constant_turn(prior: PosePrior, found: Float, covariance: Float) -> PosePrior:
+    """Estimate the level of the constant rotation, of which three numbers are known.
+
+    They say little, so a usual level, and that of the slow rotation, counts as `USUAL_COUNT` more (inverse
+    gamma prior; expectation maximisation). A rotation that is known well stays what it is; one that rests on
+    a drifting path gives way to the log. One of which the pictures say nothing keeps its wide level.
+
+    Args:
+        prior: levels with which the rotation was found.
+        found: [3] rad, posterior mean.
+        covariance: [3, 3] rad^2, posterior.
+    """
+    if 1 - np.trace(covariance) / (3 * prior.constant[1] ** 2) < _LEAST_DETERMINED:
+        return prior
+    precision = np.linalg.inv(covariance)
+    pull, of_data = precision @ found, precision - np.eye(3) / prior.constant[1] ** 2
+    variance = prior.constant[1] ** 2
+    usual = USUAL_CONSTANT[1] ** 2 + prior.slow[1].sigma0 ** 2
+    for _ in range(_LEVEL_STEPS):
+        posterior = np.linalg.inv(of_data + np.eye(3) / variance)
+        squares = np.sum((posterior @ pull) ** 2) + np.trace(posterior)
+        variance = (USUAL_COUNT * usual + squares) / (USUAL_COUNT + 3)
+    return replace(prior, constant=(prior.constant[0], float(np.sqrt(variance)), prior.constant[2]))
 
 
 def _parts(state: _State) -> tuple[Float, Float, Float]:

@@ -80,6 +80,13 @@ a million times.
 """
 _DETERMINED_PLACE = 0.7
 """Share of a triangulated point's error by slow pose errors; above it, pictures do not determine a place."""
+_BACK = 0.5
+"""Share of the way back to the triangulated place, where nobody knows the level of constant pose errors.
+
+The estimate's common shift then rests on assumed levels and on the detector's lasting errors (a camera sees
+a person 1 % too large or too small). The triangulation's rests on all poses alike. On 15 flights for tuning
+MPJPE was 0.84 of that of `robust` with the one, 0.82 with the other, 0.81 half way.
+"""
 _REFUSED = 0.5  # per picture: log evidence that stated levels may lie below the refused ones
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; "
 _INSTEAD = {"estimated": "it was estimated instead", "exact": "the poses were taken as they are"}
@@ -210,7 +217,8 @@ def _refined(problem: Problem, part: Bool, filled: Float, prior: _Prior, *, meas
     else:
         joints = state.position
     fallback = doubts or _too_far(joints, filled, prior.expected_m)
-    shift = np.median(filled - joints, axis=(0, 1)) if as_logged else np.zeros(3)
+    back = 1.0 if as_logged else _BACK if assumed else 0.0
+    shift = back * np.median(filled - joints, axis=(0, 1))
     return Refined(
         position=_of_all_joints(joints + shift, part),
         covariance=_of_all_joints(covariance, part),
