@@ -1,6 +1,9 @@
 """`mocap report`: a page about a session, and one about several."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +17,9 @@ from mocap_cli.options import (
 from mocap_cli.several import end, expanded, tell
 from mocap_cli.terminal import print_json, say, say_warnings, watching
 from pipelines.session.errors import MocapError
+
+if TYPE_CHECKING:
+    from pipelines.reporting.film_strip import Video
 
 
 @click.command("report", short_help="Write a page about each session, and one that compares them.")
@@ -39,6 +45,13 @@ from pipelines.session.errors import MocapError
     help="Write the page's figures there as PNG, SVG and PDF, too, with their numbers as CSV; of several "
     "sessions, those of the page that compares them.",
 )
+@click.option(
+    "--video",
+    type=click.Choice(["none", "small", "full"]),
+    default="small",
+    show_default=True,
+    help="Pictures of the videos beside the 3D view: none, at most 3 MB, or at most 15 MB.",
+)
 @force_option
 @overwrite_option
 @output_options
@@ -47,6 +60,7 @@ def report_command(
     output: Path | None,
     studies: tuple[Path, ...],
     figures: Path | None,
+    video: Video,
     force: bool,
     overwrite: bool,
     shown: Shown,
@@ -68,7 +82,7 @@ def report_command(
         progress.start("Writing pages", len(ones) + (len(ones) > 1) + (figures is not None))
         for session in ones:
             try:
-                results.append(report(session, studies=studies, force=force))
+                results.append(report(session, studies=studies, video=video, force=force))
             except MocapError as error:
                 if len(ones) == 1:
                     raise

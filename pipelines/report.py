@@ -17,6 +17,7 @@ from pipelines.reporting.comparison_figures import draw_comparison
 from pipelines.reporting.comparison_page import GENERATOR, render_comparison
 from pipelines.reporting.content import ReplanContent, SessionContent, StudyContent, section
 from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
+from pipelines.reporting.film_strip import Video
 from pipelines.reporting.page import draw_session, render_page
 from pipelines.reporting.studies import summarise_studies
 from pipelines.session.description import Description, read_description
@@ -60,11 +61,14 @@ class Reported:
     warnings: Sequence[str] = ()
 
 
-def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -> Reported:
+def report(
+    folder: Path, *, studies: Sequence[Path] = (), video: Video = "small", force: bool = False
+) -> Reported:
     """Write report/index.html of a session.
 
     Args:
         studies: folders of `mocap ablate` that the page shows as well.
+        video: the pictures beside the 3D view.
 
     Raises:
         DataError: not a session, or damaged; a table of it, or pictures, were changed; a folder that holds no
@@ -83,6 +87,7 @@ def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -
             "name": session_name(folder),
             "pictures": _pictures_there(folder, description),
             "studies": _named(studied),
+            "video": video,
         }
         run = session.begin(REPORT, settings=settings, inputs=inputs, force=force)
         page = folder / "report" / "index.html"
@@ -91,7 +96,7 @@ def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -
         with ExitStack() as stack:
             pictures, warnings = _open_pictures(folder, description, stack)
             content = replace(_load(folder, description, records), studies=tuple(studied))
-            html = render_page(content, read_frame=partial(_read_frame, pictures))
+            html = render_page(content, read_frame=partial(_read_frame, pictures), video=video)
         (run.folder / "index.html").write_text(html, encoding="utf-8")
         record = run.publish(counts={}, warnings=warnings)
     return Reported(page, skipped=False, warnings=record.warnings)

@@ -106,7 +106,7 @@ def collect_moments(
     motion = summary.motion
     if motion is None or not motion.measured.any():
         return ()
-    cameras = _filmed_cameras(content)
+    cameras = filmed_cameras(content)
     if not cameras:
         return ()
     chosen, worst = choose_moments(motion, summary.errors_mm)
@@ -130,7 +130,7 @@ def collect_moments(
     return tuple(moments)
 
 
-def _filmed_cameras(content: SessionContent) -> list[FilmedCamera]:
+def filmed_cameras(content: SessionContent) -> list[FilmedCamera]:
     """Collect the cameras that have keypoints."""
     least = number(section(content.stages.get("reconstruct", {}), "settings"), "min_confidence") or 0.0
     return [
@@ -159,7 +159,7 @@ def residuals_over_time(
     if motion is None or not motion.measured.any():
         return {}
     found = {}
-    for camera in _filmed_cameras(content):
+    for camera in filmed_cameras(content):
         every = max(1, -(-len(camera.frame) // most))
         at = np.arange(0, len(camera.frame), every)
         status = status_at(motion, camera.frame_t_ns[at])

@@ -13,6 +13,7 @@ from pipelines.reporting import wording
 from pipelines.reporting.arm_figures import draw_arms
 from pipelines.reporting.content import SessionContent, as_reconstructed, number, section, text
 from pipelines.reporting.figures import draw_all
+from pipelines.reporting.film_strip import Video, make_strips
 from pipelines.reporting.overlays import ReadFrame, collect_moments, residuals_over_time
 from pipelines.reporting.panels import draw_overlays, draw_panel, picture_width
 from pipelines.reporting.plates import MOST_BINS, Plate
@@ -24,19 +25,21 @@ from pipelines.reporting.viewer import make_scene
 from pipelines.reporting.wording import environment
 
 
-def render_page(content: SessionContent, read_frame: ReadFrame | None = None) -> str:
+def render_page(content: SessionContent, read_frame: ReadFrame | None = None, video: Video = "none") -> str:
     """Render the complete HTML of a session's report.
 
     The same content gives the same bytes: no dates of making, no paths of this machine.
     All text from the session's files is escaped. The page loads nothing; it runs the one script of
     its 3D viewer, which its policy names by hash, and nothing else. Without `read_frame`, which reads the
-    pictures behind the overlays, they are drawn on plain ground.
+    pictures behind the overlays, they are drawn on plain ground. `video` chooses how many pictures stand
+    beside the 3D view.
     """
     summary = summarise(content)
     replan = _replan(summary, content)
     plates = _draw(summary, content, replan)
     script = (files("pipelines.reporting") / "templates" / "viewer.js").read_text(encoding="utf-8")
     overlays = _overlays(as_reconstructed(content), summary, read_frame)
+    strips = make_strips(as_reconstructed(content), summary, read_frame, video)
     return (
         environment()
         .get_template("page.html.j2")
@@ -57,13 +60,15 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
             plates=plates,
             replan=replan,
             studies=summarise_studies(content.studies),
-            scene=make_scene(summary, content.poses | content.refined, replan),
+            scene=make_scene(summary, content.poses | content.refined, replan, strips),
             refined=bool(content.refined),
             quality=quality(content, summary),
             hidden=bool(content.hidden),
             made_by=_made_by(content),
             viewer_script=Markup(script),  # noqa: S704 - our own file
-            policy=_policy(script, pictures=overlays is not None and overlays["pictures"] > 0),
+            policy=_policy(
+                script, pictures=bool(strips) or (overlays is not None and overlays["pictures"] > 0)
+            ),
             overlays=overlays,
             # Our own drawing, in which every name was escaped when it was written.
             drawings={key: Markup(plate.svg) for key, plate in plates.items()},  # noqa: S704

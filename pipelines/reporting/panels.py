@@ -108,13 +108,13 @@ def window_of(view: View, size: tuple[int, int]) -> Window:
     inside = points[(points >= 0).all(axis=1) & (points < [width, height]).all(axis=1)]
     whole = float(max(size))
     if not len(inside):
-        return _centred(np.array([width, height]) / 2 - 0.5, whole, size)
+        return centred(np.array([width, height]) / 2 - 0.5, whole, size)
     low, high = inside.min(axis=0), inside.max(axis=0)
     wanted = _MARGIN * float((high - low).max())
-    return _centred((low + high) / 2, min(max(wanted, _LEAST_PX), whole), size)
+    return centred((low + high) / 2, min(max(wanted, _LEAST_PX), whole), size)
 
 
-def _centred(middle: Float, width: float, size: tuple[int, int]) -> Window:
+def centred(middle: Float, width: float, size: tuple[int, int]) -> Window:
     """Return a square around a point, on whole pixels, moved into the picture as far as it fits."""
     extent = np.ceil([width, width])
     room = np.array(size) - extent

@@ -8,13 +8,14 @@ origin. A missing value is the smallest integer of either kind, never 0.
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.reporting.film_strip import FULL_SCALE, Strip
 from pipelines.reporting.motion import Motion, full_covariance, middles, side_of
 from pipelines.reporting.replanned import Arm, Replan
 from pipelines.reporting.summary import CameraRow, Summary
@@ -46,16 +47,20 @@ class Scene:
     notes: tuple[str, ...]  # differences from the tables, in whole sentences
     arms: tuple[str, ...] = ()  # of a comparison of planners; their cameras can be shown as well
     surface: bool = False  # True if the map's surface is there
+    film: tuple[str, ...] = ()  # cameras with pictures
 
 
 def make_scene(
-    summary: Summary, poses: Mapping[str, pd.DataFrame], replan: Replan | None = None
+    summary: Summary,
+    poses: Mapping[str, pd.DataFrame],
+    replan: Replan | None = None,
+    strips: Sequence[Strip] = (),
 ) -> Scene | None:
     """Pack a session for the viewer; None where there is nothing to be seen.
 
     Every camera's pose (tables.POSES) is interpolated to the times of the skeleton, never across a gap as
     the session defines it. Without a measured skeleton the cameras alone are shown. The cameras of simulated
-    arms are packed beside those of the session, with the map around them.
+    arms are packed beside those of the session, with the map around them, and pictures where there are any.
     """
     motion = summary.motion if summary.motion is not None and summary.motion.measured.any() else None
     cameras = [camera for camera in summary.cameras if camera.name in poses]
@@ -88,6 +93,8 @@ def make_scene(
     if around is not None and around.voxels:
         points = _packed(1000 * (around.points - origin), np.int32)
         data["surface"] = {"cube": around.cube_m, "points": points}
+    if body is not None and strips:
+        data["film"] = [_packed_strip(strip, summary.origin_ns) for strip in strips]
     return Scene(
         data=data,
         people=body.people if body is not None else 0,
@@ -96,6 +103,7 @@ def make_scene(
         notes=tuple(_notes(every, len(all_t_ns), body, around)),
         arms=tuple(arm.name for arm in arms),
         surface="surface" in data,
+        film=tuple(strip.camera for strip in strips) if body is not None else (),
     )
 
 
@@ -114,6 +122,16 @@ def _notes(every: int, times: int, body: _Body | None, around: Surface | None) -
             f"{plural(len(around.points), 'cube')} of {quantity(around.cube_m, 'm', 2)}."
         )
     return notes
+
+
+def _packed_strip(strip: Strip, origin_ns: int) -> dict[str, object]:
+    """Return a camera's pictures as JSON."""
+    return {
+        "name": strip.camera,
+        "t": _packed(np.round((strip.t_ns - origin_ns) / 1e5), np.int32),
+        "pictures": list(strip.pictures),
+        "joints": _packed(FULL_SCALE * strip.joints, np.int16),
+    }
 
 
 # --- bodies --------------------------------------------------------------------------------------------

@@ -522,6 +522,7 @@
   function show() {
     const at = bracket(clock.t);
     for (const view of views) draw(view, at, clock.t);
+    for (const film of films) drawFilm(film, clock.t);
     slider.value = clock.t;
     slider.setAttribute("aria-valuetext", seconds(clock.t));
     element("now").textContent = seconds(clock.t);
@@ -593,6 +594,57 @@
       link.click();
       URL.revokeObjectURL(link.href);
     });
+  }
+
+  // --- the pictures of the cameras nearest to the moment -------------------------------------------------
+
+  const ON_PICTURE = ["#dfe2e5", "#59b7f5", "#ff9d5c"]; // as over the still pictures of the page
+  const films = (scene.film || []).map((film, k) => ({
+    canvas: element(`film-${k}`),
+    words: element(`film-time-${k}`),
+    time: Float64Array.from(numbers(film.t, Int32Array), (t) => t / 1e4),
+    joints: numbers(film.joints, Int16Array),
+    images: film.pictures.map(() => null),
+    pictures: film.pictures,
+  }));
+  const HELD = 60; // decoded pictures of a camera: a browser keeps no hour of them
+
+  function imageOf(film, row) {
+    if (!film.images[row]) {
+      const image = new Image();
+      image.addEventListener("load", showSoon);
+      image.src = `data:image/webp;base64,${film.pictures[row]}`;
+      film.images[row] = image;
+      film.order = [...(film.order || []), row];
+      if (film.order.length > HELD) film.images[film.order.shift()] = null;
+    }
+    return film.images[row];
+  }
+
+  function drawFilm(film, t) {
+    let row = 0;
+    for (let k = 1; k < film.time.length; k++) if (Math.abs(film.time[k] - t) < Math.abs(film.time[row] - t)) row = k;
+    const { canvas } = film;
+    const context = canvas.getContext("2d");
+    const size = Math.round(canvas.clientWidth * (window.devicePixelRatio || 1));
+    if (canvas.width !== size) canvas.width = canvas.height = size;
+    context.clearRect(0, 0, size, size);
+    const image = imageOf(film, row);
+    if (image.complete && image.naturalWidth) context.drawImage(image, 0, 0, size, size);
+    imageOf(film, Math.min(row + 1, film.time.length - 1));
+    film.words.textContent = seconds(film.time[row]);
+    const count = film.joints.length / 2 / film.time.length / people;
+    for (let p = 0; p < people; p++) {
+      const at = (j) => 2 * ((row * people + p) * count + j);
+      for (const [a, b, side] of body.bones) {
+        if (film.joints[at(a)] === MISSING[2] || film.joints[at(b)] === MISSING[2]) continue;
+        context.beginPath();
+        context.moveTo(...[0, 1].map((axis) => film.joints[at(a) + axis] / 1e4 * size));
+        context.lineTo(...[0, 1].map((axis) => film.joints[at(b) + axis] / 1e4 * size));
+        Object.assign(context, { strokeStyle: ON_PICTURE[side], lineWidth: size / 160, lineCap: "round" });
+        context.stroke();
+      }
+    }
   }
 
   let asked = false;
