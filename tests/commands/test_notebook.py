@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,11 @@ from pathlib import Path
 from tests.synthetic.flights import write_flight
 
 PAGE = Path(__file__).parents[2] / "docs" / "notebook.md"
+
+
+def test_the_page_of_functions_is_that_of_the_docstrings() -> None:
+    made = runpy.run_path(str(PAGE.with_name("api.py")))["page"]()
+    assert made == PAGE.with_name("api.md").read_text(encoding="utf-8"), "run `python docs/api.py --write`"
 
 
 def test_the_lines_of_the_notebook_run(tmp_path: Path) -> None:
