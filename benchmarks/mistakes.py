@@ -2,12 +2,17 @@
 
     python -m benchmarks.mistakes [--folder FOLDER] [--kept] [FLIGHT ...]
     python -m benchmarks.mistakes --right 40    # random right flights: none should be doubted
+    python -m benchmarks.mistakes --corpus tuning|kept [--draws 1] [FLIGHT ...]    # with film
 
 Right flights (simulated, modelled keypoints) are described anew with one mistake each. A mistake counts if
 the error of the skeleton grows by more than 20 %, or nothing can be reconstructed. `named`: the first doubt
 has the right code. `mended`: the lines of its remedy, put into the manifest, bring the error back to within
 10 % of the right one. The flights of `KEPT_ASIDE` are measured with --kept only; no constant was tuned on
 them.
+
+With --corpus, the flights are those of `benchmarks.corpus`: rendered pictures, keypoints of the real
+detector, backgrounds, and logs drawn anew. They are checked as they are, with and without a stated model of
+the poses' errors, and with mistakes in the times of all pictures, which backgrounds alone can tell.
 """
 
 from __future__ import annotations
@@ -20,14 +25,20 @@ import tempfile
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from unittest.mock import patch
 
 import numpy as np
 from ruamel.yaml import YAML
 
+from benchmarks.corpus.drawn import DrawnFlight, Given, kept_in_place_of_pictures
+from benchmarks.corpus.stored import DETECTORS, HALVES, Half, flights
+from benchmarks.corpus.stored import Flight as CorpusFlight
 from pipelines.check import check
+from pipelines.detect import detect
+from pipelines.follow import Following
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import (
@@ -40,7 +51,9 @@ from pipelines.geometry.poses import (
 )
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
+from pipelines.session.description import Doubt
 from pipelines.session.errors import MocapError
+from pipelines.session.stages import locked
 from pipelines.session.tables import POSES, read_table, trajectory_from
 from pipelines.simulate import simulate
 
@@ -652,16 +665,85 @@ def doubted_right_flights(folder: Path, count: int) -> None:
     print(f"{doubted} of {count} right flights doubted")
 
 
+def _later(cameras: dict[str, Any], names: list[str], seconds: float) -> None:
+    for name in names:
+        cameras[name]["clock"]["offset_s"] += seconds
+
+
+def _slower(cameras: dict[str, Any], fps: float) -> None:
+    for camera in cameras.values():
+        camera["frame_times"]["fps"] = fps
+
+
+# Changes of the cameras of flight.yaml, whose pictures come at a rate.
+CORPUS_MISTAKES: dict[str, tuple[str, Callable[[dict[str, Any], float], None]]] = {
+    "none": ("", lambda _, __: None),
+    "clock 0.5 s, all": ("clock", lambda cameras, _: _later(cameras, list(cameras), 0.5)),
+    "clock 0.3 s, one": ("clock", lambda cameras, _: _later(cameras, list(cameras)[:1], 0.3)),
+    "30 for 24 Hz, all": ("frame_rate", lambda cameras, rate_hz: _slower(cameras, 1.25 * rate_hz)),
+}
+
+
+def doubted_corpus(folder: Path, half: Half, draws: int, names: list[str]) -> None:
+    """Check the flights of the corpus, right and with mistakes in their times, and print what is said."""
+    counts: dict[tuple[str, bool], list[bool]] = {}
+    print("| flight | draw | errors | mistake | first doubt | gain |\n| --- | --- | --- | --- | --- | --- |")
+    for flight in flights([half]):
+        if flight.missing_motions or (names and flight.name not in names):
+            continue
+        drawn = DrawnFlight(flight, folder / flight.name)
+        drawn.write_shared()
+        off = any(flight.scenario.drones.clock_offsets_s)
+        for draw, given in product(range(draws), get_args(Given)):
+            with tempfile.TemporaryDirectory() as place:
+                drawn.session(Path(place) / "flight", draw, given, DETECTORS[0])
+                for mistake, (code, change) in CORPUS_MISTAKES.items():
+                    if not code or (flight.with_pictures and given == "model"):
+                        doubts = _doubted(flight, Path(place) / "flight", mistake, change)
+                        first = doubts[0] if doubts else None
+                        named = bool(first and first.code == code) if code else bool(doubts)
+                        counts.setdefault((mistake, off), []).append(named)
+                        said = f"{first.code}: {first.what}" if first else "nothing"
+                        gain = first.evidence.get("turning_gain", "") if first else ""
+                        print(
+                            f"| {flight.name} | {draw} | {given} | {mistake} | {said} | {gain} |", flush=True
+                        )
+    for (mistake, off), found in counts.items():
+        whose = "with clocks that are off" if off else "whose clocks are right"
+        what = "named first" if CORPUS_MISTAKES[mistake][0] else "doubted"
+        print(f"{mistake}, {whose}: {sum(found)} of {len(found)} {what}")
+
+
+def _doubted(
+    flight: CorpusFlight, place: Path, mistake: str, change: Callable[[dict[str, Any], float], None]
+) -> list[Doubt]:
+    yaml = YAML(typ="safe")
+    document = yaml.load((place / "flight.yaml").read_text(encoding="utf-8"))
+    change(document["cameras"], flight.scenario.drones.camera.rate_hz)
+    session = place / f"{mistake}.session"
+    ingest(written(document, place / f"{mistake}.yaml"), session)
+    with kept_in_place_of_pictures(flight, DETECTORS[0]), locked(session) as writable:
+        detect(writable, detector=DETECTORS[0])
+        if flight.with_pictures:
+            Following(writable).finish()
+    return check(session).doubts
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measure how mistakes in descriptions are named.")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "mocap_mistakes")
     parser.add_argument("--kept", action="store_true", help="The flights that were kept aside.")
     parser.add_argument("--mistake", action="append", default=[], help="Only these; repeat it for several.")
     parser.add_argument("--right", type=int, metavar="N", help="Check random right flights instead.")
+    parser.add_argument("--corpus", choices=HALVES, help="Check the flights of the corpus instead.")
+    parser.add_argument("--draws", type=int, default=1, help="Draws of the corpus's pose errors.")
     parser.add_argument("flights", nargs="*")
     options = parser.parse_args()
     if options.right:
         doubted_right_flights(options.folder, options.right)
+        return
+    if options.corpus:
+        doubted_corpus(options.folder / "corpus", options.corpus, options.draws, options.flights)
         return
     print("| flight | mistake | error mm | first doubt | named | after the remedy mm |")
     print("| --- | --- | --- | --- | --- | --- |")

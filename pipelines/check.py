@@ -6,14 +6,18 @@ detector looks at a few seconds in the middle of the flight, in a temporary copy
 
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipelines.detect import DETECT, cameras_to_detect, detect
+from pipelines.follow import BACKGROUND
 from pipelines.ingest import ingest
 from pipelines.reconstruct import chosen_detections, find_people
+from pipelines.reconstruction.background_tracks import Followed, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.loading import load_cameras
+from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import logged_actor
@@ -99,9 +103,18 @@ def _checked(
             description,
             cameras,
             chosen=chosen_detections(cameras, found, association),
+            followed=_followed(session, cameras),
             pose_noise=pose_noise,
         )
     return Checked(doubts, list(description.warnings), pictures)
+
+
+def _followed(session: WritableSession, cameras: Sequence[Camera]) -> dict[str, Followed]:
+    """Load the backgrounds that the session has."""
+    if session.intact_record(BACKGROUND.name) is None:
+        return {}
+    found = {camera.name: load_tracks(session.folder, camera) for camera in cameras if not camera.static}
+    return {name: tracks for name, tracks in found.items() if tracks is not None}
 
 
 def _detected(

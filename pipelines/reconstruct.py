@@ -236,6 +236,7 @@ def reconstruct(
             description,
             timed,
             chosen=chosen_detections(timed, stored.found, stored.association),
+            followed=followed,
             pose_noise=settings.pose_noise,
         )
         _refuse_nothing(folder, stored, doubts)

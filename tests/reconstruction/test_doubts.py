@@ -231,6 +231,19 @@ def test_a_gimbal_in_other_axes_is_named_and_mended(flight: Described, tmp_path:
     assert doubts_of(manifest) == []
 
 
+def test_drones_below_zero_count_z_downwards(flight: Described) -> None:
+    def downwards(mistaken: Mistaken) -> None:
+        of_poses(lambda pose: (pose[0] * [1, 1, -1], pose[1]))(mistaken)
+        for key in ("map", "actor", "logs"):  # which would say how high the ground is
+            del mistaken.manifest[key]
+
+    manifest = mistaken(flight, downwards)
+    first = doubts_of(manifest)[0]
+    assert first["code"] == "axes"
+    assert with_remedy(manifest, first["remedy"])
+    assert doubts_of(manifest) == []
+
+
 NOISY = Flight(
     "noisy3",
     3,

@@ -8,7 +8,7 @@ description does. If none does, the doubt is stated without a cause.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,9 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.geometry.arrays import Int64
+from pipelines.reconstruction.background_tracks import Followed
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.faults import FREE, Fault, fit, picture_variance, undone
 from pipelines.reconstruction.doubts.hypotheses import (
+    RATES,
     TIMES,
     Hypothesis,
     Trial,
@@ -32,6 +34,7 @@ from pipelines.reconstruction.doubts.hypotheses import (
 )
 from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
 from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, score, solve
+from pipelines.reconstruction.doubts.turning import Lateness, lateness, turns_of
 from pipelines.session.description import Description, Doubt
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
@@ -82,6 +85,8 @@ GAIN = 14.0
 DOUBTFUL = 6.0
 """Score of a description above which it is doubted although no mistake explains it."""
 
+_LEAST_LATE_S = 0.2  # of clocks by backgrounds: errors of attitudes that wander pass for less
+_BELOW_M = 1.0  # below zero, of drones
 _ALIKE = 1.0  # hypotheses whose scores are this close are stated together
 _COST_OF_NUMBER = 2.0  # of chi^2, as in Akaike's criterion
 _ALIKE_COST = 4.0  # of faults that are stated together
@@ -104,6 +109,7 @@ def doubts_of(
     cameras: Sequence[Camera],
     *,
     chosen: Sequence[Int64],
+    followed: Mapping[str, object],
     pose_noise: str | None = None,
 ) -> list[Doubt]:
     """Diagnose a session.
@@ -116,6 +122,7 @@ def doubts_of(
         description: its session.json.
         cameras: with their detections.
         chosen: which detection [F] of each camera's pictures the actor is, -1 for none.
+        followed: backgrounds of cameras by name; what is none is ignored.
         pose_noise: the value of `--pose-noise`, if any.
 
     Raises:
@@ -130,7 +137,14 @@ def doubts_of(
         last_map=last[0] if last else None,
         pose_noise=pose_noise,
     )
-    return diagnose(_less_odd(known(chosen=chosen), known())).doubts
+    between = description.pose_interpolation
+    turns = {
+        index: turns_of(camera, tracks)
+        for index, camera in enumerate(cameras)
+        if isinstance(tracks := followed.get(camera.name), Followed)
+    }
+    late = lateness(cameras, turns, between, RATES)
+    return diagnose(_less_odd(known(chosen=chosen), known()), late).doubts
 
 
 def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | None:
@@ -146,14 +160,19 @@ def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | No
     return min(chosen, prominent, key=lambda flight: score(flight, scene_of(flight)).total)
 
 
-def diagnose(flight: Sampled | None) -> Diagnosis:
-    """Find what is odd about a flight, and why; a flight whose cameras share no time is not doubted here."""
+def diagnose(flight: Sampled | None, late: Lateness | None = None) -> Diagnosis:
+    """Find what is odd about a flight, and why; a flight whose cameras share no time is not doubted here.
+
+    Args:
+        flight: the flight.
+        late: what the backgrounds tell of the cameras' times.
+    """
     if flight is None:
         return Diagnosis([], float("nan"), 0)
     described = scene_of(flight)
     base, found = base_of(flight, described)
     trial = Trial(flight, described, base)
-    hypotheses = [*of_logs(trial), *of_times(trial)]
+    hypotheses = [*of_logs(trial), *_of_turns(trial, late), *of_times(trial)]
     stated = fit(flight, described, "none", 0)
     explained = min((each.total for each in hypotheses), default=np.inf)
     odd = base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
@@ -169,6 +188,7 @@ def diagnose(flight: Sampled | None) -> Diagnosis:
         causes = []
     if not causes or np.isfinite(causes[0].cost):
         causes = _faults([*_without_number(trial, hypotheses), *hypotheses], stated.cost, described) or causes
+    causes = causes or _below_zero(trial)
     doubts = [_doubt(each, found, described) for each in causes]
     if doubts or base.total >= DOUBTFUL:
         doubts += _oddities(found, described, flight)
@@ -193,7 +213,9 @@ def _causes(trial: Trial, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         causes.setdefault(each.code, each)
     discrete = [each for each in causes.values() if each.penalty <= _DISCRETE and each.scene is not None]
     if len(discrete) > 1:  # alike in what is odd: the rays tell which of them fits
-        discrete.sort(key=partial(_cost, trial))
+        costs = {each.code: _cost(trial, each) for each in discrete}
+        least = min(costs.values()) + _ALIKE_COST  # where they do not tell, what is odd does
+        discrete.sort(key=lambda each: (max(costs[each.code], least), each.total))
     return [*discrete, *(each for each in causes.values() if each not in discrete)]
 
 
@@ -220,11 +242,18 @@ def _without_number(trial: Trial, hypotheses: Sequence[Hypothesis]) -> list[Hypo
 def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
     """Return True if a hypothesis explains markedly more than the description of the same moments.
 
-    Another clock leaves moments out: in fewer, errors that wander are smaller, and they say less. Nor may the
-    rays of a person in whom nothing is odd miss each other by more than before.
+    Another clock leaves moments out: in fewer, errors that wander are smaller, and they say less. Times of
+    all cameras alike must explain more than the same pictures do at the times that are stated. Nor may the
+    rays of a person in whom nothing is odd miss each other by more than before; and a number that is free
+    must fit the rays of such a person markedly better, constant errors of all poses included.
     """
     if hypothesis.scene is None:
         return True
+    is_odd = trial.base.total >= ODD
+    if not is_odd and hypothesis.penalty > _DISCRETE and hypothesis.code not in TIMES:
+        stated = fit(trial.flight, trial.described, "none", 0).cost
+        if _cost(trial, hypothesis) > stated - GAIN:
+            return False
     seen = np.isfinite(hypothesis.scene.rays[..., :1]).any(axis=2, keepdims=True)
     described = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
     same = score(trial.flight, described, trial.base)
@@ -232,8 +261,37 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
     margin = (MARGIN_OF_TIMES if hypothesis.code in TIMES else MARGIN) / share
     if hypothesis.total > min(same.total, trial.base.total) - margin:
         return False
+    if hypothesis.alike is not None:
+        flight, stated_scene = trial.as_stated(*hypothesis.alike)
+        unposed = float(np.log1p(same.odd.get("unposed", 0.0) ** 2))  # that is so at the stated times alone
+        if hypothesis.total > score(flight, stated_scene, trial.base).total + unposed - margin:
+            return False
     missed = [residual_px(scene, solve(scene)) for scene in (described, hypothesis.scene)]
-    return trial.base.total >= ODD or missed[1] <= _SAME_RESIDUAL * missed[0]
+    return is_odd or missed[1] <= _SAME_RESIDUAL * missed[0]
+
+
+def _below_zero(trial: Trial) -> list[Hypothesis]:
+    """Doubt drones that fly below zero all the time, where neither a map nor an actor says how high zero is.
+
+    Where all fly equally high, the rays are the same with z upwards and downwards.
+    """
+    located = trial.flight.hips is not None or trial.flight.ground is not None
+    height = trial.described.position[trial.moving, :, 2]
+    if located or not np.isfinite(height).any() or np.nanmax(height) > -_BELOW_M:
+        return []
+    place = trial.described.position.copy()
+    place[trial.moving, :, 2] *= -1
+    turned = trial.scored(
+        Hypothesis(
+            "axes",
+            trial.names,
+            "all drones fly below zero: their positions count z downwards, or zero is high above the ground",
+            remedies.pose(trial.flight.cameras, "z: down"),
+            _DISCRETE,
+            replace(trial.described, position=place),
+        )
+    )
+    return [turned] if turned.total <= trial.base.total + _ALIKE else []
 
 
 def _is_noise(flight: Sampled, cause: Scene, hypotheses: list[Hypothesis]) -> bool:
@@ -262,6 +320,27 @@ def _faults(hypotheses: list[Hypothesis], stated: float, scene: Scene) -> list[H
     return list(alike.values())
 
 
+def _of_turns(trial: Trial, late: Lateness | None) -> list[Hypothesis]:
+    """State the times that the backgrounds tell, where they tell them surely."""
+    if late is None or late.gain < GAIN + _COST_OF_NUMBER:
+        return []
+    if late.slower == 1 and not (np.isfinite(late.sigma_s) and abs(late.late_s) >= _LEAST_LATE_S):
+        return []
+    names, cameras = trial.names, trial.flight.cameras
+    whose = "all cameras" if len(late.cameras) == len(names) else names[late.cameras[0]]
+    by = "by how their backgrounds turn"
+    if late.slower != 1:
+        code, remedy = "frame_rate", remedies.frame_rate(cameras, late.cameras, late.slower)
+        what = f"the pictures of {whose} follow each other {late.slower:.3g} times as slowly as stated, {by}"
+    else:
+        code, remedy = "clock", remedies.clock(cameras, late.cameras, late.late_s)
+        what = f"the pictures of {whose} were taken {late.late_s:+.3f} s from where their clocks say, {by}"
+    found = {"turning_gain": round(late.gain, 1)}
+    found |= {"clock_sigma_s": _rounded(late.sigma_s)} if late.slower == 1 else {}
+    named = tuple(names[index] for index in late.cameras)
+    return [Hypothesis(code, named, what, remedy, 0.0, None, sigmas=found)]
+
+
 # --- faults of one camera's poses ----------------------------------------------------------------------
 
 
@@ -284,7 +363,12 @@ def _of_noise(trial: Trial, stated: float) -> Hypothesis | None:
     Args:
         trial: the flight.
         stated: the cost of a fit with the errors as stated.
+
+    Returns:
+        None if they do not, or nothing is stated of them.
     """
+    if not all(trial.flight.cameras[index].states_noise for index in trial.moving):
+        return None
     factors = [(factor, 1.0) for factor in _NOISE_FACTORS] + [(1.0, factor) for factor in _NOISE_FACTORS]
     found = [_noisier(trial, lasting, changing) for lasting, changing in factors]
     half = len(_NOISE_FACTORS)
@@ -393,8 +477,8 @@ def _doubt(cause: Hypothesis, described: Score, scene: Scene) -> Doubt:
             "score_if": round(cause.score.total, 2),
             "stature_m": _rounded(described.stature_m),
             "stature_m_if": _rounded(cause.score.stature_m),
-            **cause.sigmas,
         }
+    evidence |= cause.sigmas
     return Doubt(
         code=cause.code,
         cameras=list(cause.cameras),

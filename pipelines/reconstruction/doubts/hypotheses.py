@@ -56,6 +56,7 @@ class Hypothesis:
     same_scatter: bool = False
     cost: float = np.inf  # chi^2 of a fitted fault, with 2 for each of its numbers
     sigmas: Mapping[str, float] = field(default_factory=dict)  # of its numbers, as evidence has them
+    alike: tuple[float, float] | None = None  # of times of all cameras: seconds late, and factor between them
 
     @property
     def total(self) -> float:
@@ -167,6 +168,12 @@ class Trial:
         late_s[list(cameras)] = seconds
         return scene_of(self.flight, self.described, late_s=late_s)
 
+    def as_stated(self, late_s: float, slower: float) -> tuple[Sampled, Scene]:
+        """Look at the pictures that another time of all cameras shows, at the times that are stated."""
+        since = (self.flight.t_ns - self.flight.t_ns[0]) / slower - late_s * 1e9
+        flight = self.flight._replace(t_ns=self.flight.t_ns[0] + since.astype(np.int64), hips=None)
+        return flight, scene_of(flight)
+
     def focal(self, factor: float, cameras: Sequence[int]) -> Scene:
         """Multiply the focal lengths of cameras."""
         rays, focal_px = self.described.rays.copy(), self.described.focal_px.copy()
@@ -265,6 +272,7 @@ def of_times(trial: Trial) -> Iterator[Hypothesis]:
                     remedies.frame_rate(described, group, factor),
                     penalty,
                     scene_of(trial.flight, trial.described, slower=slower),
+                    alike=(0.0, factor) if len(group) == len(names) else None,
                 )
             )
 
@@ -633,6 +641,7 @@ def _each_number(trial: Trial) -> Iterator[Hypothesis | None]:
                 remedies.clock(cameras, every, seconds),
                 1.0 + abs(seconds) / 2,
                 trial.late(seconds, every),
+                alike=(seconds, 1.0),
             ),
             -_LONGEST_CLOCK_S,
             _LONGEST_CLOCK_S,

@@ -118,6 +118,11 @@ class Filmed:
         return self.camera.static
 
     @property
+    def states_noise(self) -> bool:
+        """False if the errors of its poses are a guess: those of usual flights."""
+        return self.sigma != PoseSigma(*_UNKNOWN)
+
+    @property
     def mount(self) -> Float | None:
         """body_from_camera [3, 3] where the camera is fixed to the body whose pose is logged, else None."""
         stored = self.entry.poses.mount

@@ -1,0 +1,239 @@
+"""Clocks by the backgrounds of pictures: how cameras turned between pictures, against what their logs say.
+
+Rays of people agree with each other where all cameras are late alike: drones that follow somebody carry the
+error along. The background does not move, so it tells when each camera turned by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.cameras import undistort
+from pipelines.geometry.poses import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    rotation_vector_from_quaternion,
+)
+from pipelines.reconstruction.background_tracks import Followed, Tracks
+from pipelines.reconstruction.doubts.scene import Camera
+from pipelines.session.description import Interpolation
+
+_SPAN_NS = 200_000_000  # between the two pictures of a turn
+_MOST_PARTS, _MOST_TURNS = 20, 200  # of a camera that are looked at, spread over the flight
+_FEWEST_POINTS, _POINTS = 12, 40  # that two pictures share, and of these that are looked at
+_FEWEST_TURNS = 10
+_STEPS = 3
+_BASELINE_M = 1e-3  # below it, a camera only turned
+_HUBER = 1.5
+_LONGEST_S, _STEP_S = 1.0, 0.1  # of clocks that are tried
+_USUAL_SHARE = 0.9  # of turns; the others are outliers
+_UNEXPLAINED = 0.5  # most of the turning that the logs may leave unexplained, to say anything
+
+
+class Turns(NamedTuple):
+    """Pairs of one camera's pictures, each with the background points that both show."""
+
+    first_ns: Int64  # [N] of the first picture of each, by its clock
+    second_ns: Int64  # [N]
+    before: Float  # [N, K, 3] unit rays to points of the background in the first
+    after: Float  # [N, K, 3] to the same points in the second
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """Times of pictures by which logs turn as their backgrounds do."""
+
+    cameras: tuple[int, ...]
+    late_s: float
+    slower: float  # factor of the times between pictures
+    gain: float  # chi^2 that the stated times cost more
+    sigma_s: float  # of `late_s`; NaN of a factor
+
+
+def turns_of(camera: Camera, followed: Followed) -> Turns:
+    """Choose pairs of pictures, 0.2 s apart, whose backgrounds tell how a camera turned between them."""
+    t_ns = camera.frame_t_ns[followed.rows]
+    step_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else np.inf
+    span = max(1, round(_SPAN_NS / step_ns))
+    last = len(followed.parts) - 1
+    chosen = (
+        np.unique(np.linspace(0, last, _MOST_PARTS).astype(np.intp)) if last >= 0 else np.empty(0, np.intp)
+    )
+    first: list[int] = []
+    pairs: list[tuple[Float, Float]] = []
+    for place, index in enumerate(chosen):
+        tracks = followed.parts[index]()
+        if not tracks.picture.size:
+            continue
+        rays = undistort(tracks.xy, camera.intrinsics)
+        rays = np.column_stack([rays, np.ones(len(rays))])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        begins = np.searchsorted(tracks.picture, np.arange(len(t_ns) + 1))
+        for k in range(int(tracks.picture[0]), int(tracks.picture[-1]) - span + 1, span):
+            one, other = _common(tracks, begins, k, k + span)
+            if len(one) >= _FEWEST_POINTS and len(first) < _MOST_TURNS * (place + 1) / len(chosen):
+                some = np.linspace(0, len(one) - 1, _POINTS).astype(np.intp)
+                pairs.append((rays[one[some]], rays[other[some]]))
+                first.append(k)
+    second = np.array(first, dtype=np.intp) + span
+    before, after = np.array(pairs).reshape(-1, 2, _POINTS, 3).swapaxes(0, 1)
+    return Turns(t_ns[second - span], t_ns[second], before, after)
+
+
+def _common(tracks: Tracks, begins: Int64, first: int, second: int) -> tuple[Int64, Int64]:
+    """Find the sightings of the points that two pictures share."""
+    one = np.arange(begins[first], begins[first + 1])
+    other = np.arange(begins[second], begins[second + 1])
+    _, in_one, in_other = np.intersect1d(tracks.point[one], tracks.point[other], return_indices=True)
+    return one[in_one], other[in_other]
+
+
+def _turned(before: Float, after: Float, logged: Float, moved: Float) -> Float:
+    """Return the rotation vectors [N, 3] that bring rays onto others, after what is logged of them.
+
+    Where the camera moved, a point tells the turn across the direction of that motion alone: how far away it
+    is does not matter.
+
+    Args:
+        before: [N, K, 3] at the first picture, in its camera.
+        after: [N, K, 3] at the second, in its own.
+        logged: [N, 3, 3] second camera from the first.
+        moved: [N, 3] m, from the second camera to where it was, in its own axes.
+    """
+    far = np.linalg.norm(moved, axis=1, keepdims=True) > _BASELINE_M
+    normal = np.cross(np.where(far, moved, [1.0, 0.0, 0.0])[:, None], after)
+    normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-9)
+    turn, weight = np.broadcast_to(np.eye(3), logged.shape), np.ones(after.shape[:2])
+    for _ in range(_STEPS):
+        toward = before @ np.swapaxes(turn @ logged, 1, 2)
+        design, miss = np.cross(toward, normal), (normal * (after - toward)).sum(axis=2)
+        weighted = np.swapaxes(design * weight[..., None], 1, 2)
+        step = np.linalg.solve(weighted @ design + 1e-9 * np.eye(3), weighted @ miss[..., None])
+        turn = matrix_from_quaternion(quaternion_from_rotation_vector(step[..., 0])) @ turn
+        left = np.abs(miss - (design @ step)[..., 0])
+        usual = _HUBER * (1.48 * np.median(left, axis=1, keepdims=True) + 1e-6)
+        weight = 1 / np.maximum(left / usual, 1.0)
+    return _vectors(turn)
+
+
+def _vectors(rotation: Float) -> Float:
+    vectors: Float = rotation_vector_from_quaternion(quaternion_from_matrix(rotation))
+    return vectors
+
+
+def lateness(
+    cameras: Sequence[Camera], turns: Mapping[int, Turns], between: Interpolation, factors: Sequence[float]
+) -> Lateness | None:
+    """Find the clock of all cameras or of one, or the frame rate of all, that the turns tell best.
+
+    Args:
+        cameras: of the flight.
+        turns: of those of them whose backgrounds were followed, by index.
+        between: how poses are interpolated.
+        factors: between the times of pictures that are tried.
+
+    Returns:
+        None if too little turns, or the logs turn otherwise at all times.
+    """
+    known = {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
+    if not known:
+        return None
+    grid = np.arange(-_LONGEST_S, _LONGEST_S + _STEP_S / 2, _STEP_S)
+    by_clock = {i: _gains(cameras[i], found, between, [(s, 1.0) for s in grid]) for i, found in known.items()}
+    by_rate = [_gains(cameras[i], found, between, [(0.0, f) for f in factors]) for i, found in known.items()]
+    everyone = tuple(range(len(cameras)))
+    tried = [_best_clock((i,), grid, [curve]) for i, curve in by_clock.items()]
+    if len(known) == len(cameras):
+        tried.append(_best_clock(everyone, grid, list(by_clock.values())))
+        for factor, each in zip(factors, zip(*by_rate, strict=True), strict=True):
+            gain, explained = _summed(each)
+            tried.append(Lateness(everyone, 0.0, factor, gain, float("nan")) if explained else None)
+    return max((each for each in tried if each is not None), key=lambda each: each.gain, default=None)
+
+
+def _gains(
+    camera: Camera, turns: Turns, between: Interpolation, times: Sequence[tuple[float, float]]
+) -> list[tuple[float, float, float]]:
+    """Return by how much other times lower the chi^2; the squares that they leave, and those of the turns.
+
+    The level of the logs' errors is estimated: N log of the ratio of mean squares.
+
+    Args:
+        camera: the camera.
+        turns: its turns.
+        between: how poses are interpolated.
+        times: seconds that are added, and factors of the times since the first picture.
+    """
+    start = int(camera.frame_t_ns[0])
+    stated, _ = _left(camera, turns, between, turns.first_ns, turns.second_ns)
+    found = []
+    for late_s, slower in times:
+        first_ns, second_ns = (
+            start + ((t_ns - start) * slower).astype(np.int64) + round(late_s * 1e9)
+            for t_ns in (turns.first_ns, turns.second_ns)
+        )
+        left, logged = _left(camera, turns, between, first_ns, second_ns)
+        both = np.isfinite(stated) & np.isfinite(left)
+        if both.sum() < _FEWEST_TURNS:
+            found.append((0.0, np.inf, 0.0))
+            continue
+        squares = [_mean_square(each[both]) for each in (stated, left, logged)]
+        found.append((float(both.sum() * np.log(squares[0] / squares[1])), squares[1], squares[2]))
+    return found
+
+
+def _left(
+    camera: Camera, turns: Turns, between: Interpolation, first_ns: Int64, second_ns: Int64
+) -> tuple[Float, Float]:
+    """Return the angles [N] by which the log turns otherwise at given times, and by which it turns.
+
+    They are NaN without poses.
+    """
+    start, before = camera.poses_at(first_ns, between)
+    end, after = camera.poses_at(second_ns, between)
+    back = np.swapaxes(after, 1, 2)
+    logged = back @ before
+    moved = np.einsum("nij,nj->ni", back, start - end)
+    known = np.isfinite(logged).all(axis=(1, 2)) & np.isfinite(moved).all(axis=1)
+    left, turned = np.full((2, len(logged)), np.nan)
+    found = _turned(turns.before[known], turns.after[known], logged[known], moved[known])
+    left[known] = np.linalg.norm(found, axis=1)
+    turned[known] = np.linalg.norm(_vectors(logged[known]), axis=1)
+    return left, turned
+
+
+def _mean_square(angles: Float) -> float:
+    """Return the mean square of angles, without the largest."""
+    most = np.quantile(angles, _USUAL_SHARE)
+    return float(np.mean(np.minimum(angles, most) ** 2)) + 1e-12
+
+
+def _summed(found: Sequence[tuple[float, float, float]]) -> tuple[float, bool]:
+    """Add the gains of cameras; say if their logs turn mostly as the pictures do."""
+    gain, left, turned = (sum(column) for column in zip(*found, strict=True))
+    return gain, left <= _UNEXPLAINED * turned
+
+
+def _best_clock(
+    group: tuple[int, ...], grid: Float, curves: Sequence[Sequence[tuple[float, float, float]]]
+) -> Lateness | None:
+    """Find the best clock of a group on a grid [S] of seconds, between its values by a parabola."""
+    summed = [_summed(each) for each in zip(*curves, strict=True)]
+    gains = np.array([gain if explained else -np.inf for gain, explained in summed])
+    best = int(np.argmax(gains))
+    if not np.isfinite(gains[best]):
+        return None
+    late_s, sigma_s = float(grid[best]), float("nan")
+    if 0 < best < len(grid) - 1 and np.isfinite(gains[[best - 1, best + 1]]).all():
+        below, at, above = gains[best - 1 : best + 2]
+        bend = float(2 * at - below - above)
+        if bend > 0:
+            late_s += _STEP_S * float(above - below) / (2 * bend)
+            sigma_s = _STEP_S * float(np.sqrt(2 / bend))
+    return Lateness(group, late_s, 1.0, float(gains[best]), sigma_s)

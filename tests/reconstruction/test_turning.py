@@ -1,0 +1,101 @@
+"""Clocks by the backgrounds of pictures: cameras that turn and move in front of known points."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.reconstruction.background_tracks import Followed, Tracks
+from pipelines.reconstruction.doubts.hypotheses import RATES
+from pipelines.reconstruction.doubts.turning import Lateness, lateness, turns_of
+from pipelines.session.description import Interpolation
+
+LENS = Intrinsics(width=1280, height=720, fx=800.0, fy=800.0, cx=640.0, cy=360.0)
+BETWEEN = Interpolation(max_gap_s=0.2, max_extrapolation_s=0.1)
+T_NS = (np.arange(0, 6, 1 / 30) * 1e9).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Turning:
+    """A camera that nods and swings, each with periods of its own, and moves sideways."""
+
+    phase: float
+    frame_t_ns: Int64
+    intrinsics: Intrinsics = LENS
+    swings: bool = True
+
+    def poses_at(self, t_ns: Int64, _: Interpolation) -> tuple[Float, Float]:
+        """Return position [N, 3] and world_from_camera [N, 3, 3], as the log has them."""
+        t_s = t_ns / 1e9
+        angle = np.zeros((len(t_s), 3))
+        angle[:, 1] = 0.2 * self.swings * np.sin(1.9 * t_s + self.phase)
+        angle[:, 0] = 0.1 * self.swings * np.sin(2.6 * t_s + 2 * self.phase)
+        position = np.stack([0.5 * t_s, np.zeros_like(t_s), np.zeros_like(t_s)], axis=1)
+        return position, matrix_from_quaternion(quaternion_from_rotation_vector(angle))
+
+    def followed(self) -> Followed:
+        """Follow points 8 to 30 m away, to 0.3 px, at the true times of the pictures."""
+        rng = np.random.default_rng(int(10 * self.phase))
+        points = np.column_stack(
+            [rng.uniform(-12, 15, 200), rng.uniform(-6, 6, 200), rng.uniform(8, 30, 200)]
+        )
+        position, rotation = self.poses_at(T_NS, BETWEEN)
+        seen = np.einsum("tji,tkj->tki", rotation, points[None] - position[:, None])
+        pixels = seen[..., :2] / seen[..., 2:] * LENS.fx + [LENS.cx, LENS.cy]
+        pixels += rng.normal(0, 0.3, pixels.shape)
+        inside = ((pixels > 0) & (pixels < [LENS.width, LENS.height])).all(axis=-1)
+        picture, point = np.nonzero(inside)
+        tracks = Tracks(picture, point, pixels[picture, point])
+        return Followed(np.arange(len(T_NS)), np.array([0]), [lambda: tracks])
+
+
+def found(cameras: list[Turning]) -> Lateness | None:
+    team: list[Any] = list(cameras)
+    turns = {index: turns_of(camera, camera.followed()) for index, camera in enumerate(team)}
+    return lateness(team, turns, BETWEEN, RATES)
+
+
+def late(seconds: float, phase: float, slower: float = 1.0) -> Turning:
+    """Return a camera whose clock says later times than are true, by seconds and a factor."""
+    return Turning(phase, (T_NS * slower).astype(np.int64) + round(seconds * 1e9))
+
+
+def test_a_right_clock_is_found_right() -> None:
+    right = found([late(0.0, 0.1), late(0.0, 1.3)])
+    assert right is not None
+    assert right.gain < 5
+    assert abs(right.late_s) < 0.05
+    assert right.slower == 1
+
+
+@pytest.mark.parametrize("seconds", [0.5, -0.3])
+def test_a_delay_that_all_cameras_have_is_found(seconds: float) -> None:
+    clocks = found([late(seconds, 0.1), late(seconds, 1.3)])
+    assert clocks is not None
+    assert clocks.cameras == (0, 1)
+    assert clocks.gain > 50
+    assert clocks.late_s == pytest.approx(-seconds, abs=0.03)  # of steps of 0.1 s, by a parabola
+
+
+def test_the_clock_of_one_camera_is_found() -> None:
+    clock = found([late(0.0, 0.1), late(0.4, 1.3)])
+    assert clock is not None
+    assert clock.cameras == (1,)
+    assert clock.late_s == pytest.approx(-0.4, abs=0.03)
+
+
+def test_a_frame_rate_is_found() -> None:
+    rate = found([late(0.0, 0.1, 1.2), late(0.0, 1.3, 1.2)])
+    assert rate is not None
+    assert rate.cameras == (0, 1)
+    assert rate.slower == pytest.approx(25 / 30)
+
+
+def test_cameras_that_do_not_turn_tell_nothing() -> None:
+    still = Turning(0.1, T_NS + 500_000_000, swings=False)
+    clock = found([still, still])
+    assert clock is None or clock.gain < 5
