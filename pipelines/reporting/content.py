@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.session.description import Description
 from pipelines.session.records import Occupancy
 
@@ -55,6 +56,20 @@ class SessionContent:
     outdated: tuple[str, ...] = ()  # stages whose inputs have changed since
     angles: pd.DataFrame | None = None  # tables.ANGLES, where the reconstruction has them
     studies: tuple[StudyContent, ...] = ()  # that stand beside the flight
+
+
+FULL_SCALE = 10_000
+"""Joints are stored as this part of a picture's side."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Pictures of one camera."""
+
+    camera: str
+    t_ns: Int64  # [N]
+    pictures: tuple[str, ...]  # [N] WebP in base64
+    joints: Float  # [N, P, K, 2] part of the picture's side from its upper left corner; NaN if missing
 
 
 def section(mapping: Mapping[str, object], key: str) -> dict[str, object]:

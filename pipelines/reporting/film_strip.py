@@ -6,13 +6,12 @@ The number of pictures follows from a budget of bytes, and their times are sprea
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64, Picture
-from pipelines.reporting.content import SessionContent
+from pipelines.reporting.content import SessionContent, Strip
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.overlays import FilmedCamera, ReadFrame, filmed_cameras, status_at, views_of
 from pipelines.reporting.panels import Window, centred, cut_out
@@ -26,18 +25,6 @@ _MOST_HZ = 15.0
 _MARGIN = 1.5  # side of a picture, relative to the body
 _LEAST_PX = 96.0
 _TRIED = 3  # pictures that are encoded to learn their size
-FULL_SCALE = 10_000
-"""Joints are stored as this part of a picture's side."""
-
-
-@dataclass(frozen=True)
-class Strip:
-    """Pictures of one camera."""
-
-    camera: str
-    t_ns: Int64  # [N]
-    pictures: tuple[str, ...]  # [N] WebP in base64
-    joints: Float  # [N, P, K, 2] part of the picture's side from its upper left corner; NaN if missing
 
 
 def make_strips(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.reporting.film_strip import FULL_SCALE, Strip
+from pipelines.reporting.content import FULL_SCALE, Strip
 from pipelines.reporting.motion import Motion, full_covariance, middles, side_of
 from pipelines.reporting.replanned import Arm, Replan
 from pipelines.reporting.summary import CameraRow, Summary
