@@ -84,8 +84,8 @@ _BACK = 0.5
 """Share of the way back to the triangulated place, where nobody knows the level of constant pose errors.
 
 The estimate's common shift then rests on assumed levels and on the detector's lasting errors (a camera sees
-a person 1 % too large or too small). The triangulation's rests on all poses alike. On 15 flights for tuning
-MPJPE was 0.84 of that of `robust` with the one, 0.82 with the other, 0.81 half way.
+a person a little too large or too small). The triangulation's rests on all poses alike. On the flights for
+tuning, some are better with the one, some with the other, and the mean is best half way.
 """
 _REFUSED = 0.5  # per picture: log evidence that stated levels may lie below the refused ones
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; "
