@@ -77,6 +77,7 @@ _KEYS: dict[str, OwnLog] = {
     "tlog": "tlog",
     "gopro": "gopro",
     "klv": "klv",
+    "parrot": "parrot",
 }
 """The key in a manifest for each format of a drone's own log."""
 

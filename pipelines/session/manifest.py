@@ -177,7 +177,7 @@ class StaticPose(Part):
     camera: str | None = None
 
 
-OwnLog = Literal["dji", "ulog", "ardupilot", "tlog", "gopro", "klv"]
+OwnLog = Literal["dji", "ulog", "ardupilot", "tlog", "gopro", "klv", "parrot"]
 """The key of a drone's own log in a pose."""
 
 
@@ -201,6 +201,7 @@ class PoseSource(Guess):
     tlog: str | None = None  # of a ground station
     gopro: str | None = None  # video with a track of GPMF
     klv: str | None = None  # of MISB, alone or in a video
+    parrot: str | None = None  # video with Parrot's track
     position: Literal["local", "global", "gps"] | None = None  # which of a drone's own estimates
     instance: int | None = Field(None, ge=0, le=255)
     time: Literal["gps", "boot"] | None = None

@@ -210,5 +210,6 @@ def _listed(names: Iterable[str]) -> str:
 
 def _quoted(first: bytes) -> str:
     """Write bytes as text if they are printable, else in hexadecimal."""
-    plain = first.isascii() and all(32 <= byte < 127 for byte in first.rstrip(b"\0\r\n"))
-    return repr(first.rstrip(b"\0\r\n").decode("ascii")) if plain else first.hex(" ")
+    shown = first.rstrip(b"\0\r\n")
+    plain = bool(shown) and all(32 <= byte < 127 for byte in shown)
+    return repr(shown.decode("ascii")) if plain else first.hex(" ")

@@ -36,7 +36,7 @@ from tests.synthetic.drone_logs import (
 from tests.synthetic.flights import SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap, write_ros2
-from tests.synthetic.video_tracks import write_djmd, write_klv
+from tests.synthetic.video_tracks import write_djmd, write_klv, write_parrot
 
 WORLD = {
     "origin": {
@@ -159,6 +159,11 @@ def _klv(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"klv": f"{name}.ts"}
 
 
+def _parrot(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_parrot(folder / f"{name}_of_parrot.mp4", truth)
+    return {"parrot": f"{name}_of_parrot.mp4"}
+
+
 def _px4(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_mcap(folder / f"{name}.mcap", px4_entries(truth, "/px4_1"))
     return {"log": f"{name}.mcap", "preset": "px4", "namespace": "/px4_1"}
@@ -193,6 +198,7 @@ def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
         (_record, 1e-3, 1e-4),  # 1e-9 deg are 0.1 mm
         (_djmd, 2e-3, 0.12),  # a mm of height, 0.05 deg of every angle, the body's on a lever arm of 0.15 m
         (_klv, 0.16, 5e-3),  # 0.15 m of height, 0.003 deg of the heading
+        (_parrot, 0.03, 0.02),  # 1.2e-7 deg are 13 mm, of two cameras and two axes; 1/32768 of each part
     ],
 )
 def test_drones_that_log_body_and_gimbal(tmp_path: Path, write: Any, metres: float, degrees: float) -> None:

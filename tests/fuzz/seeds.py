@@ -147,6 +147,7 @@ SEEDS: dict[str, Writer] = {
     "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),
     "kitti": test_kitti.write,
     "klv": lambda folder: video_tracks.write_klv(folder / "a.klv", _truth(folder)),
+    "parrot": lambda folder: video_tracks.write_parrot(folder / "p.mp4", _truth(folder)),
     "klv in a video": lambda folder: video_tracks.write_klv(folder / "a.ts", _truth(folder), pictures=5),
     "las": lambda folder: test_las.write(folder / "a.las"),
     "las, compressed": lambda folder: test_las.write(folder / "a.laz"),

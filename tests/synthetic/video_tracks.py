@@ -1,4 +1,4 @@
-"""Telemetry tracks of videos, byte for byte: DJI's djmd and MISB KLV, beside pictures if they are wanted."""
+"""Telemetry tracks of videos, byte for byte: DJI's djmd, Parrot's and MISB KLV, beside pictures if wanted."""
 
 from __future__ import annotations
 
@@ -111,6 +111,48 @@ def write_djmd(
     made_s = int(truth.t_ns[0]) // 10**9
     messages = djmd_messages(truth, protocol)
     return write_track(path, messages, codec="bin_data", made_s=made_s, pictures=pictures)
+
+
+# --- Parrot --------------------------------------------------------------------------------------------
+
+
+def parrot_records(truth: DroneTruth, version: int = 3) -> list[tuple[int, bytes]]:
+    """Encode a record for each row, with a timestamp (E1) after it, as libvideo-metadata packs them."""
+    records = []
+    for row, stamp_ns in enumerate(truth.t_ns.tolist()):
+        body, view = (
+            struct.pack(">4h", *(round(16384 * part) for part in _wxyz_in_ned(angles[row])))
+            for angles in (truth.body_ypr_deg, truth.gimbal_ypr_deg)
+        )
+        degrees = [round(float(each[row]) * 2**22) for each in (truth.latitude_deg, truth.longitude_deg)]
+        height = round(float(truth.altitude_m[row]) * 256) * 256 + 12  # satellites
+        flown = struct.pack(">i2ii4h", round(7.5 * 65536), *degrees, height, 256, -256, 128, -256)
+        if version == 3:
+            camera = bytes(8) + view + struct.pack(">6HI4B", 2048, 100, 1, 1, 17664, 11264, 5, 200, 90, 3, 0)
+        else:
+            camera = view + struct.pack(">2h2H4B", 0, -1234, 2048, 100, 3, 0, 200, 90)
+        inside = flown + body + camera + b"E1\0\2" + int(truth.boot_us[row]).to_bytes(8)
+        head = b"P%d" % version + (len(inside) // 4).to_bytes(2)
+        records.append((stamp_ns - int(truth.t_ns[0]), head + inside))
+    return records
+
+
+def write_parrot(path: Path, truth: DroneTruth, version: int = 3, *, pictures: int = 0) -> Path:
+    """Write a video of Parrot's whose time of creation is the first row's, which is a whole second."""
+    made_s = int(truth.t_ns[0]) // 10**9
+    records = parrot_records(truth, version)
+    return write_track(path, records, codec="bin_data", made_s=made_s, pictures=pictures)
+
+
+def _wxyz_in_ned(yaw_pitch_roll_deg: Any) -> tuple[float, float, float, float]:
+    """Return the quaternion of Tait-Bryan angles, as vmeta_euler_to_quat computes it."""
+    (cy, cp, cr), (sy, sp, sr) = (each(np.radians(yaw_pitch_roll_deg) / 2) for each in (np.cos, np.sin))
+    return (
+        float(cr * cp * cy + sr * sp * sy),
+        float(sr * cp * cy - cr * sp * sy),
+        float(cr * sp * cy + sr * cp * sy),
+        float(cr * cp * sy - sr * sp * cy),
+    )
 
 
 # --- MISB ----------------------------------------------------------------------------------------------

@@ -102,7 +102,7 @@ def index_video(path: Path) -> VideoIndex:
 _TELEMETRY = (
     (re.compile(r"GoPro MET"), "GoPro's telemetry (GPMF), read as `gopro`"),
     (re.compile(r"(?i)djmd|(DJI|CAM|HAL) meta"), "DJI's telemetry (djmd), read as `dji_video`"),
-    (re.compile(r"(?i)parrot"), "Parrot's telemetry, not read: convert it with ExifTool (-ee) to CSV"),
+    (re.compile(r"(?i)parrot"), "Parrot's telemetry, read as `parrot` if its records are P2 or P3"),
     (re.compile(r"klv"), "MISB KLV, read as `klv`"),
 )
 

@@ -1,4 +1,4 @@
-"""DJI's djmd and MISB KLV, written byte by byte after their public descriptions."""
+"""DJI's djmd, Parrot's records and MISB KLV, written byte by byte after their public descriptions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.drone_logs import djmd, klv
+from pipelines.formats.drone_logs import djmd, klv, parrot
 from pipelines.formats.videos.video import FORMAT as VIDEO
 from pipelines.session.registries import VideoFormat, recognise
 from pipelines.session.telemetry import TelemetryChoice
@@ -19,13 +19,15 @@ from tests.synthetic.video_tracks import (
     djmd_messages,
     klv_packet,
     klv_packets,
+    parrot_records,
     proto,
     write_djmd,
     write_klv,
+    write_parrot,
     write_track,
 )
 
-DJI, MISB = djmd.FORMAT, klv.FORMAT
+DJI, MISB, PARROT = djmd.FORMAT, klv.FORMAT, parrot.FORMAT
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +97,42 @@ def test_damaged_messages_are_counted(tmp_path: Path, truth: DroneTruth) -> None
     telemetry = DJI.read_telemetry(path, TelemetryChoice())
     assert telemetry.dropped == {"damaged messages": 1}
     assert len(telemetry.position.t_ns) == len(messages) - 1
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_parrots_records_hold_place_body_and_view(tmp_path: Path, truth: DroneTruth, version: int) -> None:
+    path = write_parrot(tmp_path / "P.MP4", truth, version, pictures=10)
+    assert [DJI.recognises(path), MISB.recognises(path), PARROT.recognises(path)] == [False, False, True]
+    telemetry = PARROT.read_telemetry(path, TelemetryChoice())
+    np.testing.assert_allclose(telemetry.position.t_ns, truth.t_ns, rtol=0, atol=6000)
+    # 22 bits of a degree, 8 of a metre, 14 of a quaternion's part, half of each.
+    np.testing.assert_allclose(telemetry.position.values[:, :2], places(truth), rtol=0, atol=1.2e-7)
+    np.testing.assert_allclose(telemetry.position.values[:, 2], truth.altitude_m, rtol=0, atol=0.002)
+    assert telemetry.position.height == "sea level"
+    assert telemetry.body is not None
+    assert telemetry.gimbal is not None
+    assert telemetry.gimbal.relative_to == "world"
+    alike = np.abs((telemetry.body.quaternion_xyzw * truth.body).sum(axis=1))
+    np.testing.assert_allclose(alike, 1, rtol=0, atol=1e-8)
+    facts = PARROT.describe(path)
+    assert (facts["version"], facts["records"]) == (f"P{version}", len(truth.t_ns))
+    pitch = truth.gimbal_ypr_deg[:, 1]
+    assert facts["view_pitch_deg"] == pytest.approx([pitch.min(), pitch.max()], abs=0.02)
+
+
+def test_parrots_records_without_a_fix_or_cut_off_are_counted(tmp_path: Path, truth: DroneTruth) -> None:
+    records = [content for _, content in parrot_records(truth)]
+    nowhere = (500 << 22).to_bytes(4)
+    records[1] = records[1][:8] + 2 * nowhere + records[1][16:]
+    records[2] = records[2][:60]
+    path = write_track(
+        tmp_path / "a.mp4", [(k * 10**8, each) for k, each in enumerate(records)], codec="bin_data"
+    )
+    telemetry = PARROT.read_telemetry(path, TelemetryChoice())
+    assert telemetry.dropped == {"no position": 1, "damaged records": 1}
+    assert len(telemetry.position.t_ns) == len(records) - 2
+    with refuses(write_djmd(tmp_path / "b.mp4", truth), "P2"):
+        PARROT.read_telemetry(tmp_path / "b.mp4", TelemetryChoice())
 
 
 @pytest.mark.parametrize("name", ["film.ts", "film.klv"])
