@@ -64,6 +64,8 @@ _UNREAD = (
      "convert it to TOML with Pose2Sim's calibration step"),
     (re.compile(rb"(?s)(#[^\n]*\n)*\s*:version\b.{,4000}:root"), "the skeleton of Acclaim motion (ASF)",
      "name the .amc that it belongs to"),
+    (re.compile(rb"(?:\xef\xbb\xbf)?\[Script Info\]"), "subtitles as ASS, which Autel's drones write",
+     "write their positions as a CSV of poses"),
     (re.compile(rb"# Camera list|# Image list|# 3D point list"), "one file of a COLMAP model",
      "name the folder that holds it"),
     (re.compile(rb"(?s).{,200}rosbag2_bagfile_information:"), "the metadata of a ROS 2 bag",

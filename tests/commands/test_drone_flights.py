@@ -337,7 +337,7 @@ def test_missing_gimbal_angles_are_refused_with_the_remedy(tmp_path: Path) -> No
     flight = with_poses(tmp_path, _srt)
     write_srt(tmp_path / "drone1.SRT", drone_of(flight, 0), gimbal=False)
     line = refused("ingest", flight.manifest)
-    assert "gimbal: {log, topic" in line
+    assert "gimbal:" in line
     camera = flight.settings["cameras"]["drone1"]
     camera["gimbal"] = {"fixed": {"yaw_deg": 1, "pitch_deg": 1}, "relative_to": "body"}
     flight.save()
