@@ -80,13 +80,6 @@ a million times.
 """
 _DETERMINED_PLACE = 0.7
 """Share of a triangulated point's error by slow pose errors; above it, pictures do not determine a place."""
-_BACK = 0.5
-"""Share of the way back to the triangulated place, where nobody knows the level of constant pose errors.
-
-The estimate's common shift then rests on assumed levels and on the detector's lasting errors (a camera sees
-a person a little too large or too small). The triangulation's rests on all poses alike. On the flights for
-tuning, some are better with the one, some with the other, and the mean is best half way.
-"""
 _REFUSED = 0.5  # per picture: log evidence that stated levels may lie below the refused ones
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; "
 _INSTEAD = {"estimated": "it was estimated instead", "exact": "the poses were taken as they are"}
@@ -217,8 +210,7 @@ def _refined(problem: Problem, part: Bool, filled: Float, prior: _Prior, *, meas
     else:
         joints = state.position
     fallback = doubts or _too_far(joints, filled, prior.expected_m)
-    back = 1.0 if as_logged else _BACK if assumed else 0.0
-    shift = back * np.median(filled - joints, axis=(0, 1))
+    shift = np.median(filled - joints, axis=(0, 1)) if as_logged else np.zeros(3)
     return Refined(
         position=_of_all_joints(joints + shift, part),
         covariance=_of_all_joints(covariance, part),
