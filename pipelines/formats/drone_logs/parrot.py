@@ -25,7 +25,7 @@ _DEGREE, _METRE, _WHOLE = 1 << 22, 1 << 8, 1 << 14
 
 
 class ParrotVideoFormat:
-    """Reader of the positions and attitudes in the videos of Parrot's Bebop 2, Disco and ANAFI."""
+    """Reader of the positions and attitudes in the videos of Parrot's drones whose records are P2 or P3."""
 
     name = "parrot"
     title = "Parrot's telemetry (in a video)"
