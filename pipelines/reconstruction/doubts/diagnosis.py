@@ -273,7 +273,8 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
 def _below_zero(trial: Trial) -> list[Hypothesis]:
     """Doubt drones that fly below zero all the time, where neither a map nor an actor says how high zero is.
 
-    Where all fly equally high, the rays are the same with z upwards and downwards.
+    Where all fly about equally high, the rays are alike with z upwards and downwards: the penalty of a
+    hypothesis, which has to explain more than the description, is not asked for.
     """
     located = trial.flight.hips is not None or trial.flight.ground is not None
     height = trial.described.position[trial.moving, :, 2]
@@ -291,7 +292,8 @@ def _below_zero(trial: Trial) -> list[Hypothesis]:
             replace(trial.described, position=place),
         )
     )
-    return [turned] if turned.total <= trial.base.total + _ALIKE else []
+    alike = turned.score is not None and turned.score.total <= trial.base.total + _ALIKE
+    return [turned] if alike else []
 
 
 def _is_noise(flight: Sampled, cause: Scene, hypotheses: list[Hypothesis]) -> bool:
