@@ -17,8 +17,8 @@ from pipelines.reporting.comparison_figures import draw_comparison
 from pipelines.reporting.comparison_page import GENERATOR, render_comparison
 from pipelines.reporting.content import ReplanContent, SessionContent, StudyContent, section
 from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
-from pipelines.reporting.film_strip import Video
 from pipelines.reporting.page import draw_session, render_page
+from pipelines.reporting.panels import Video
 from pipelines.reporting.studies import summarise_studies
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError

@@ -13,9 +13,8 @@ from pipelines.reporting import wording
 from pipelines.reporting.arm_figures import draw_arms
 from pipelines.reporting.content import SessionContent, as_reconstructed, number, section, text
 from pipelines.reporting.figures import draw_all
-from pipelines.reporting.film_strip import Video, make_strips
 from pipelines.reporting.overlays import ReadFrame, collect_moments, residuals_over_time
-from pipelines.reporting.panels import draw_overlays, draw_panel, picture_width
+from pipelines.reporting.panels import Video, draw_overlays, draw_panel, make_strips, picture_width
 from pipelines.reporting.plates import MOST_BINS, Plate
 from pipelines.reporting.replanned import Replan, summarise_replan
 from pipelines.reporting.studies import draw_studies, summarise_studies

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipelines.reporting.content import SessionContent, as_reconstructed
-from pipelines.reporting.film_strip import make_strips
+from pipelines.reporting.panels import make_strips
 from pipelines.reporting.summary import summarise
 
 
