@@ -28,6 +28,7 @@ STUDY_MARK = "summary.json"
 """The file that is in every folder of `mocap ablate`."""
 
 _LOCK = "lock"
+_RELEASED_S = 0.2  # a killed process can be gone some moments before the kernel has released its lock
 _OF_SESSIONS = {"session.json": "a session", "stage.json": "a stage of a session"}
 
 
@@ -45,7 +46,7 @@ def held(lock: Path, target: Path) -> Iterator[None]:
     """
     holder = lock.with_name(f"{lock.name}.pid")
     try:
-        acquired = FileLock(lock).acquire(timeout=0)
+        acquired = FileLock(lock).acquire(timeout=_RELEASED_S)
     except Timeout:
         raise BusyError(f"{target} is being written by {_process(holder)}; wait for it to finish") from None
     with acquired:
