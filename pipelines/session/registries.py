@@ -172,12 +172,13 @@ class KeypointNetworks(Protocol):
         """Locate the joints of one person in each region; `presence` says if there is one at all."""
 
 
-class Detector(Protocol):
-    """A keypoint detector."""
+@runtime_checkable
+class FetchesModels(Protocol):
+    """A detector or an export that needs model files, which `mocap models fetch` gets."""
 
     @property
     def name(self) -> str:
-        """The text after `--detector`, without paths. Name and model files together determine the results."""
+        """The name that the user writes after `fetch`."""
 
     @property
     def title(self) -> str:
@@ -188,6 +189,14 @@ class Detector(Protocol):
 
     def fetch(self, source: Path | None = None) -> None:
         """Get the missing files, from `source` if that holds them. A DataError says what to do."""
+
+
+class Detector(FetchesModels, Protocol):
+    """A keypoint detector."""
+
+    @property
+    def name(self) -> str:
+        """The text after `--detector`, without paths. Name and model files together determine the results."""
 
     def load(self, *, threads: int) -> KeypointNetworks:
         """Load the networks. Raise DataError if a file is missing or is not the expected one."""
@@ -275,25 +284,6 @@ class ChoiceOfTime(Export, Protocol):
     @property
     def times(self) -> tuple[str, ...]:
         """The zeros of time (zero: the flight's first picture; epoch: the session's own), default first."""
-
-
-@runtime_checkable
-class FetchesModels(Protocol):
-    """A detector or an export that needs model files, which `mocap models fetch` gets."""
-
-    @property
-    def name(self) -> str:
-        """The name that the user writes after `fetch`."""
-
-    @property
-    def title(self) -> str:
-        """The name that `mocap models` prints."""
-
-    def models(self) -> dict[str, Path | None]:
-        """List the files that it needs: name to path, None for those that are missing."""
-
-    def fetch(self, source: Path | None = None) -> None:
-        """Get the missing files, from `source` if that holds them. A DataError says what to do."""
 
 
 class Registry(Generic[T]):

@@ -94,7 +94,7 @@ def test_damaged_headers_are_refused(tmp_path: Path, size: int) -> None:
 def test_a_decompressor_that_ends_its_process_ends_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was decoded until then is kept, and the rest is counted; without a header it is a refusal."""
+    """Expect what was decoded until then, with the rest counted; a refusal without a header."""
     path = write(tmp_path / "cloud.laz")
     header = json.dumps({"facts": {"points": 4}, "crs": None}).encode() + b"\n"
     block = struct.pack("<3Q", 2, 1, 0) + POINTS[:2].tobytes()
