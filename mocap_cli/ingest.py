@@ -10,7 +10,7 @@ import click
 from mocap_cli.options import (
     FiniteRange,
     Shown,
-    any_path,
+    any_place,
     force_option,
     output_options,
     overwrite_option,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option(
     "-o",
     "--output",
-    type=any_path,
+    type=any_place,
     help="Session folder, or of several flights the folder around them [default: the manifest's name with"
     " .session].",
 )

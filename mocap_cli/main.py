@@ -11,7 +11,7 @@ from mocap_cli.terminal import one_line, say
 from pipelines.session.errors import MocapError
 
 COMMANDS = (
-    *("init", "ingest", "check", "reconstruct", "replan-compare", "report"),
+    *("init", "ingest", "check", "reconstruct", "replan-compare", "replan-sweep", "report"),
     *("batch", "export", "simulate", "ablate"),
     *("info", "models"),
 )

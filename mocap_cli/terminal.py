@@ -33,7 +33,14 @@ def one_line(text: str) -> str:
 
 
 def say(text: str = "", *, err: bool = False) -> None:
-    """Print one line; control characters, line breaks and bytes that are no text become question marks."""
+    """Print one line; control characters, line breaks and bytes that are no text become question marks.
+
+    Copies of what lies in an object store are called by its URL.
+    """
+    if "/mocap/stores/" in text:
+        from pipelines.session.stores import as_urls
+
+        text = as_urls(text)
     click.echo("".join(c if _is_shown(c) else "?" for c in text), err=err)
 
 

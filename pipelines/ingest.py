@@ -5,7 +5,6 @@ are counted and reported. Unusable data are refused, with the file at fault. Eac
 own: an interrupted ingest continues with the cameras that it had not finished.
 """
 
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +30,7 @@ from pipelines.session.description import (
     said_assumptions,
     said_doubts,
 )
-from pipelines.session.errors import DataError, MocapError, NotYetReadError
+from pipelines.session.errors import DataError, MocapError
 from pipelines.session.log_doubts import doubts_of_logs, doubts_of_places
 from pipelines.session.manifest import Axes, Camera, Flight, read_flight
 from pipelines.session.maps import store_map
@@ -41,6 +40,7 @@ from pipelines.session.registries import MapFormat, noise_models, recognise
 from pipelines.session.stage_records import Stage, StageRecord, note_sources
 from pipelines.session.stages import Run, locked
 from pipelines.session.storage import read_json, write_json
+from pipelines.session.stores import as_urls, located, media_path, named
 from pipelines.session.tables import (
     ACTOR,
     CAMERA_POSES,
@@ -56,7 +56,7 @@ from pipelines.session.tables import (
 )
 from pipelines.sources.cameras import FlightCameras
 from pipelines.sources.files import FlightFiles
-from pipelines.sources.hashes import hash_sources, refuse_written, source_stamps, stated_paths
+from pipelines.sources.hashes import fetch_sources, hash_sources, refuse_written, source_stamps, stated_paths
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.maps import maps_of_log
 from pipelines.sources.parts import (
@@ -115,7 +115,7 @@ def ingest(
     """
     progress = progress or Silent()
     flight = read_flight(flight_path)
-    _refuse_unread_parts(flight, flight_path)
+    fetch_sources(flight, flight_path.parent, progress)
     _refuse_ways_out(flight, flight_path)
     target = session or flight_path.with_suffix(".session")
     _refuse_other_flight(target, flight, overwrite)
@@ -124,7 +124,7 @@ def ingest(
         "flight": flight.model_dump(mode="json"),
         "cameras": list(flight.cameras),  # their order breaks ties
         "pose_interpolation": interpolation.model_dump(),
-        "flight_from_session": Path(os.path.relpath(flight_path.parent, target)).as_posix(),  # for media
+        "flight_from_session": media_path(flight_path.parent, "", target),
     }
 
     with _FlightReader(flight, flight_path, target, interpolation) as reader:
@@ -146,7 +146,7 @@ def ingest(
             entries, warnings = _store_cameras(run, reader, list(flight.cameras), check_sources, progress)
             _check_overlap(flight_path, entries)
             truth = reader.store_truth(run.folder, entries)
-            actor = reader.store_actor(run.folder, entries)
+            actors = reader.store_actors(run.folder, entries)
             map_ = reader.store_map(run.folder, entries)
             plan = reader.store_plan(run.folder, entries)
             origin = reader.origin()
@@ -168,7 +168,8 @@ def ingest(
                 pose_interpolation=interpolation,
                 origin=origin,
                 cameras=entries,
-                actor=actor,
+                actor=actors[0] if actors else None,
+                actors=actors if flight.actors else [],
                 map=map_,
                 truth=truth,
                 plan=plan,
@@ -219,7 +220,7 @@ class _FlightReader:
         self._logs.__exit__(*exception)
 
     def _take_note(self, line: str) -> None:
-        self._notes.append(line)
+        self._notes.append(as_urls(line))
 
     def read_ahead(self) -> Iterator[str]:
         """Read cameras in advance for `store_camera`, one after the other, up to `_AHEAD_ROWS` rows.
@@ -255,11 +256,16 @@ class _FlightReader:
             self._interpolation,
             base=self._flight_path.parent,
             stamps=self._logs.settings(camera.pose.log).stamps if camera.pose.log else None,
-            axes=self._gimbal_axes(camera),
+            axes=(self._pose_axes(camera), self._gimbal_axes(camera)),
             note=self._take_note,
         )
         warnings = list(dict.fromkeys(data.notes + self.take_notes()))
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
+
+    def _pose_axes(self, camera: Camera) -> Axes:
+        """Return the axes that the poses of a camera or its body are in."""
+        pose = camera.pose
+        return pose.axes or (pose.log and self._logs.settings(pose.log).axes) or self._flight.world.frame
 
     def _gimbal_axes(self, camera: Camera) -> Axes:
         """Return the axes that the angles of a camera's gimbal are in."""
@@ -324,9 +330,9 @@ class _FlightReader:
         base = self._flight_path.parent
         motion = self._files.true_joints(truth.joints) if truth.joints else None
         if motion is not None and truth.joints is not None:
-            place = base / truth.joints.path
+            place = located(base, truth.joints.path)
             motion = replace(motion, position=self._poses.joints(place, motion.position))
-            refuse_no_overlap(base / truth.joints.path, motion.t_ns, entries)
+            refuse_no_overlap(named(base, truth.joints.path), motion.t_ns, entries)
             write_table(folder / "truth.parquet", motion_table(motion), TRUTH)
         missing, dropped = self._note_truth_missing(motion) if motion else (0, {})
         poses_dropped = {}
@@ -362,24 +368,29 @@ class _FlightReader:
             self._notes.append(f"truth: {missing} of {is_missing.size} positions of joints are missing")
         return missing, motion.dropped
 
-    def store_actor(self, folder: Path, entries: Mapping[str, CameraEntry]) -> ActorEntry | None:
-        """Write the actor's logged positions."""
-        actor = self._flight.actor
-        if actor is None:
-            return None
-        trajectory = self._poses.actor(actor.log, actor.topic)
-        refuse_no_overlap(self._flight_path.parent / actor.log, trajectory.t_ns, entries)
-        write_table(folder / "actor.parquet", actor_table(trajectory), ACTOR)
-        if trajectory.dropped:
-            self._notes.append(f"actor: dropped: {losses(trajectory.dropped)}")
-        return ActorEntry(
-            source=actor.log,
-            sources=self._logs.settings(actor.log).path,
-            topic=actor.topic,
-            point=actor.point,
-            count=len(trajectory.t_ns),
-            dropped=trajectory.dropped,
-        )
+    def store_actors(self, folder: Path, entries: Mapping[str, CameraEntry]) -> list[ActorEntry]:
+        """Write the logged positions of people."""
+        found, tracks = [], []
+        for name, actor in self._flight.logged_people.items():
+            trajectory = self._poses.actor(actor.log, actor.topic, name)
+            refuse_no_overlap(named(self._flight_path.parent, actor.log), trajectory.t_ns, entries)
+            if trajectory.dropped:
+                self._notes.append(f"{name or 'actor'}: dropped: {losses(trajectory.dropped)}")
+            tracks.append(trajectory)
+            found.append(
+                ActorEntry(
+                    name=name,
+                    source=actor.log,
+                    sources=self._logs.settings(actor.log).path,
+                    topic=actor.topic,
+                    point=actor.point,
+                    count=len(trajectory.t_ns),
+                    dropped=trajectory.dropped,
+                )
+            )
+        if tracks:
+            write_table(folder / "actor.parquet", actor_table(tracks), ACTOR)
+        return found
 
     def store_map(self, folder: Path, entries: Mapping[str, CameraEntry]) -> MapEntry | None:
         """Write the map of obstacles: one from a file, or those of a log that replaced each other."""
@@ -399,7 +410,7 @@ class _FlightReader:
             held, dropped = store_map(folder, self._near_origin(log, logged.maps)), logged.dropped
         else:
             path = stated.path or ""
-            file = self._flight_path.parent / path
+            file = located(self._flight_path.parent, path)
             occupancy = recognise(file, MapFormat, "map").read_map(file, resolution_m=stated.resolution_m)
             held, dropped = store_map(folder, self._near_origin(file, [occupancy])), occupancy.dropped
             if occupancy.crs and not (stated.crs or self._poses.origin()):
@@ -431,7 +442,7 @@ class _FlightReader:
         for name in (camera for camera in self._flight.cameras if camera in plan.cameras):
             stated = plan.files.get(name) or plan.log_of(name)
             sent = self._poses.planned(name, plan)
-            refuse_no_overlap(self._flight_path.parent / stated, sent.t_ns, entries)
+            refuse_no_overlap(named(self._flight_path.parent, stated), sent.t_ns, entries)
             if sent.dropped:
                 self._notes.append(f"{name}: commands dropped: {losses(sent.dropped)}")
             tables.append(pose_table(sent).assign(camera=name))
@@ -505,7 +516,7 @@ def _refuse_losses(flight_path: Path, description: Description) -> None:
         )
     }
     parts |= description.damage
-    parts["actor"] = description.actor.dropped if description.actor else {}
+    parts |= {actor.name or "actor": actor.dropped for actor in description.logged_people}
     parts["truth"] = description.truth.dropped if description.truth else {}
     poses_dropped = description.truth.poses_dropped if description.truth else {}
     parts |= {f"{name}: true poses": dropped for name, dropped in poses_dropped.items()}
@@ -517,16 +528,6 @@ def _refuse_losses(flight_path: Path, description: Description) -> None:
             flight_path,
             f"is not whole, and --strict was given ({'; '.join(lost)})",
             "copy what is damaged again, or ingest without --strict",
-        )
-
-
-def _refuse_unread_parts(flight: Flight, path: Path) -> None:
-    """Refuse, in one line, parts that are valid in a manifest but have no reader in this version."""
-    if flight.actors:
-        raise NotYetReadError(
-            path,
-            "actors: this version has no reader for it yet",
-            "leave it out, or give the same data in a format of `mocap info --help`",
         )
 
 

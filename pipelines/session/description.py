@@ -67,6 +67,13 @@ class MountEntry(Entry):
     rotation_xyzw: tuple[float, float, float, float]
 
 
+class PlaceEntry(Entry):
+    """Zero and north of a log, as `pose.world_from_source` states them."""
+
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m
+    yaw_deg: float = 0.0
+
+
 class PosesEntry(Entry):
     """The poses of a camera, and the number of frames without a pose."""
 
@@ -83,6 +90,11 @@ class PosesEntry(Entry):
     gimbal: str | None = None  # what the angles of a gimbal with a topic are relative to
     gimbal_axes: Literal["enu", "ned"] = "enu"  # that they are in
     mount: MountEntry | None = None  # None where poses are the camera's own, or a gimbal turns it
+    in_gimbal: MountEntry | None = None  # how the camera sits in the gimbal that turns it
+    axes: Literal["enu", "ned"] = "enu"  # that the source's poses are read in
+    inverse: bool = False  # the source's poses are read as camera_from_world
+    z: Literal["up", "down"] = "up"  # where its positions are taken to count to
+    world_from_source: PlaceEntry = PlaceEntry()
 
 
 class KeypointsEntry(Entry):
@@ -164,8 +176,9 @@ _HIP_ABOVE_M = {"hip": 0.0, "centre": 0.0, "feet": 0.95, "head": -0.70}  # of a 
 
 
 class ActorEntry(Entry):
-    """The logged positions of the actor."""
+    """The logged positions of the actor, or of one of several people."""
 
+    name: str = ""  # of one of several
     source: str
     sources: list[str] = []  # the files of that log as `Description.sources` names them
     topic: str | None = None  # as the manifest states it
@@ -276,7 +289,8 @@ class Description(Entry):
     pose_interpolation: Interpolation
     origin: OriginEntry | None = None
     cameras: dict[str, CameraEntry]
-    actor: ActorEntry | None = None
+    actor: ActorEntry | None = None  # the only one who was logged, or the first of `actors`
+    actors: list[ActorEntry] = []  # person 0, 1, ..., if the manifest names them
     map: MapEntry | None = None
     truth: TruthEntry | None
     plan: dict[str, PlannedEntry] | None = None  # by camera
@@ -295,6 +309,16 @@ class Description(Entry):
         if strange:
             raise ValueError(f"{strange[0]!r} is no camera of this flight")
         return self
+
+    @property
+    def logged_people(self) -> list[ActorEntry]:
+        """The people who were logged: person 0, 1, ... in this order."""
+        return self.actors or ([self.actor] if self.actor else [])
+
+    def names_of_people(self, count: int) -> list[str]:
+        """Name person 0 to `count` - 1: as the manifest names the logged ones, else person0, person1, ..."""
+        named = [actor.name for actor in self.actors[:count]]
+        return named + [f"person{k}" for k in range(len(named), count)]
 
     @property
     def has_true_joints(self) -> bool:
@@ -318,9 +342,9 @@ class Description(Entry):
             for name, entry in self.cameras.items()
             if entry.media is not None
         }
-        if self.actor is not None:
-            log = [self.sources.get(source) for source in self.actor.sources]
-            recorded["log of the actor"] = hash_of([log, self.actor.topic, self.actor.point])
+        for actor in self.logged_people:
+            log = [self.sources.get(source) for source in actor.sources]
+            recorded[f"log of {actor.name or 'the actor'}"] = hash_of([log, actor.topic, actor.point])
         return recorded
 
     @property

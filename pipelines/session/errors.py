@@ -26,9 +26,5 @@ class DataError(MocapError):
         super().__init__(f"{source}: {problem}" + (f"; {remedy}" if remedy else ""))
 
 
-class NotYetReadError(DataError):
-    """A valid part of `flight.yaml` whose reader is not part of this version."""
-
-
 class BusyError(MocapError):
     """Another process is writing the session."""

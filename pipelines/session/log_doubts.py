@@ -108,7 +108,9 @@ def _doubt_of_two(pair: Mapping[str, tuple[CameraEntry, Trajectory]]) -> Doubt |
     turned_deg = float(np.median(_turned_deg(one, other, t_ns)))
     starts_apart_m = float(np.linalg.norm(one.position[0] - other.position[0]))
     first, second = pair
-    if apart_m < _SAME_PATH_M and turned_deg < _ONE_BODY_DEG:
+    poses = [entry.poses for entry, _ in pair.values()]
+    one_source = (poses[0].source, poses[0].topic) == (poses[1].source, poses[1].topic)
+    if apart_m < _SAME_PATH_M and (turned_deg < _ONE_BODY_DEG or one_source):
         return Doubt(
             code="pose",
             cameras=[first, second],
@@ -150,5 +152,7 @@ def _topic(pair: Mapping[str, CameraEntry]) -> str:
         poses = pair[name].poses
         stated = poses.topic or poses.source
         if other in stated and name not in stated:
-            return f"cameras.{name}.pose.{poses.key}: {stated.replace(other, name)}"
+            log = f"cameras.{name}.pose.log: {poses.source.replace(other, name)}; "
+            named = f"cameras.{name}.pose.{poses.key}: {stated.replace(other, name)}"
+            return log + named if poses.topic and other in poses.source else named
     return "; ".join(f"cameras.{name}.pose: {{log: ..., topic: ...}}  # that of {name}" for name in pair)

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from pipelines.geometry.mounting import RelativeTo
-from pipelines.session.storage import refuse_camera_names
+from pipelines.session.storage import refuse_camera_names, refuse_names_of_people
 from pipelines.session.yaml_files import Part, SecondsAsNs, nanoseconds, read_yaml_model
 
 SCHEMA = 1
@@ -123,6 +123,9 @@ class Video(Guess):
 _COUNTED = (("start", "start_ns"), ("start_from", "start_from"), ("fps", "fps"))  # not with other keys
 
 
+TriggerLog = Literal["ulog", "ardupilot", "tlog"]
+
+
 class FrameTimes(Guess):
     """Source of the frames' times; by default the container's stamps, counted from `start`."""
 
@@ -137,10 +140,11 @@ class FrameTimes(Guess):
     srt: str | None = None
     ulog: str | None = None  # triggers that an autopilot logged, one for each frame
     ardupilot: str | None = None
+    tlog: str | None = None
 
     @model_validator(mode="after")
     def _from_one_place(self) -> FrameTimes:
-        every = ("csv", "srt", "log", "ulog", "ardupilot")
+        every = ("csv", "srt", "log", "ulog", "ardupilot", "tlog")
         stated = [name for name in every if getattr(self, name) is not None]
         counted = [key for key, name in _COUNTED if name in self.model_fields_set]
         if len(stated) > 1 or (stated and counted):
@@ -158,8 +162,18 @@ class FrameTimes(Guess):
     @property
     def is_placed(self) -> bool:
         """True if the times are world times: more than a rate, or the container's stamps from 0 on."""
-        named = (self.start_from, self.csv, self.log, self.srt, self.ulog, self.ardupilot)
+        named = (self.start_from, self.csv, self.log, self.srt, self.triggers)
         return self.has_start or any(source is not None for source in named)
+
+    @property
+    def triggers(self) -> tuple[TriggerLog, str] | None:
+        """Format and log of the triggers in a drone's own log; None without one."""
+        stated: dict[TriggerLog, str | None] = {
+            "ulog": self.ulog,
+            "ardupilot": self.ardupilot,
+            "tlog": self.tlog,
+        }
+        return next(((kind, log) for kind, log in stated.items() if log is not None), None)
 
 
 class Clock(Guess):
@@ -490,7 +504,7 @@ class Flight(Part):
     simulated: bool = False
     clock_reference: str | None = None
     logs: dict[str, Log] = {}
-    cameras: dict[str, Camera] = Field(min_length=1)
+    cameras: dict[str, Camera] = Field(min_length=1, max_length=128)
     actor: Actor | None = None
     actors: dict[str, Actor] = {}
     map: Map | None = None
@@ -500,6 +514,9 @@ class Flight(Part):
     @model_validator(mode="after")
     def _names_exist(self) -> Flight:
         refuse_camera_names(self.cameras)
+        refuse_names_of_people(self.actors)
+        if self.actor is not None and self.actors:
+            raise ValueError("actor and actors: leave one of them out")
         named = [self.clock_reference] if self.clock_reference else []
         named += list(self.truth.poses) if self.truth else []
         named += self.plan.cameras if self.plan else []
@@ -510,6 +527,11 @@ class Flight(Part):
                     f"{name!r} is no camera of this flight" + (f", did you mean {near[0]!r}?" if near else "")
                 )
         return self
+
+    @property
+    def logged_people(self) -> dict[str, Actor]:
+        """The people who were logged, by name; whom `actor:` states has none (the empty name)."""
+        return {"": self.actor} if self.actor else self.actors
 
     @property
     def assumptions(self) -> list[str]:

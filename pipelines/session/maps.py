@@ -32,8 +32,8 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 from pipelines.session.storage import as_data_error, jsonable, read_json, write_json
 
-MOST_VOXELS = 500_000_000
-"""The most voxels of a grid (2 GB as float32); a larger one is refused."""
+MOST_VOXELS = 200_000_000
+"""The most voxels of a grid (0.8 GB as float32); a larger one is refused."""
 
 FINEST_M, COARSEST_M = 1e-4, 1e4
 """The smallest and the largest side of a voxel; anything else is a mistake in the file."""

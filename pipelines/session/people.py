@@ -28,18 +28,30 @@ class LoggedActor:
 
 
 def logged_actor(folder: Path, description: Description) -> LoggedActor | None:
-    """Load the actor of a session; None where none was logged.
+    """Load the actor of a session, the first of several; None where none was logged.
 
     Raises:
         DataError: the table is damaged.
     """
-    if description.actor is None:
-        return None
+    return next(iter(logged_people(folder, description)), None)
+
+
+def logged_people(folder: Path, description: Description) -> list[LoggedActor]:
+    """Load all people of a session who were logged: person 0, 1, ... in this order.
+
+    Raises:
+        DataError: the table is damaged.
+    """
+    entries = description.logged_people
+    if not entries:
+        return []
     table = read_table(folder / "actor.parquet", ACTOR)
-    above_m = np.array([0.0, 0.0, description.actor.hip_above_m])
-    return LoggedActor(
-        table["t_ns"].to_numpy(np.int64), table[["x", "y", "z"]].to_numpy(np.float64) + above_m
-    )
+    person, t_ns = table["person"].to_numpy(np.int64), table["t_ns"].to_numpy(np.int64)
+    place = table[["x", "y", "z"]].to_numpy(np.float64)
+    return [
+        LoggedActor(t_ns[person == k], place[person == k] + [0.0, 0.0, entry.hip_above_m])
+        for k, entry in enumerate(entries)
+    ]
 
 
 _MOST_STREAMS = 8  # most cameras or trackers with interleaved samples

@@ -6,7 +6,7 @@ quaternions xyzw, transforms named target_from_source, missing is NaN and never 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,7 @@ class Trajectory:
     quaternion_xyzw: Float  # [N, 4] unit, world_from_body
     covariance: Float | None = None  # [N, 6, 6] position in world (m^2), then rotation vector in body (rad^2)
     dropped: dict[str, int] = field(default_factory=dict)
+    body_xyzw: Float | None = None  # [N, 4] unit, world_from_body of what carries a camera on a gimbal
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,8 @@ class Recording:
     """The same pictures with the skeleton drawn into them."""
     angles: Callable[[], pd.DataFrame | None] = field(default=lambda: None)
     """Rows of `tables.ANGLES`, sorted by time, then person; None without a reconstruction."""
+    doubts: Callable[[], Sequence[str]] = tuple
+    """Sentences on what contradicts itself in the flight."""
     unit: str | None = None  # of lengths, if the user chooses one that the export has
     axes: str | None = None  # z-up or y-up, if the user chooses them
     zero_ns: int = 0  # the time that formats in seconds count from, if they have the choice; 0 is the epoch

@@ -346,10 +346,15 @@ def find_models(text: str) -> FetchesModels:
     """Find what has model files: an export that needs some, else the detector of a user's text.
 
     Raises:
-        DataError: see `find_detector`.
+        DataError: neither has that name; the message lists what does. Else see `find_detector`.
     """
-    export: object = EXPORTS.get(text) if text in EXPORTS.names() else None
-    return export if isinstance(export, FetchesModels) else find_detector(text)
+    exports = {export.name: export for export in EXPORTS.all() if isinstance(export, FetchesModels)}
+    if text in exports:
+        return exports[text]
+    if text.partition(":")[0] not in DETECTORS.names():
+        names = ", ".join([*DETECTORS.names(), *exports])
+        raise DataError(text, "nothing of that name has model files", f"there are {names}")
+    return find_detector(text)
 
 
 def advice_on(detector: Detector) -> list[str]:

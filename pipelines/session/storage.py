@@ -47,6 +47,22 @@ def refuse_camera_names(names: Collection[str]) -> None:
         raise ValueError("two cameras differ in case only: their folders would be one on some systems")
 
 
+def refuse_names_of_people(names: Collection[str]) -> None:
+    """Refuse names of people that cannot be parts of file names, or that unnamed people have.
+
+    Raises:
+        ValueError: a name is not allowed, is `person` with a number, or two names differ in case only.
+    """
+    bad = [name for name in names if not CAMERA_NAME.fullmatch(name)]
+    if bad:
+        raise ValueError(f"name {bad[0]!r} of a person: use 1 to 64 of A-Z a-z 0-9 _ -, it is in file names")
+    taken = [name for name in names if name.lower().startswith("person") and name[6:].isdigit()]
+    if taken:
+        raise ValueError(f"name {taken[0]!r} of a person: people without a log are called so")
+    if len({name.lower() for name in names}) < len(names):
+        raise ValueError("two people differ in case only: their files would be one on some systems")
+
+
 def is_special(path: Path) -> bool:
     """Return True for a pipe, a socket or a device, of which reading may never end. Never raise."""
     try:

@@ -33,6 +33,7 @@ COVARIANCE_COLUMNS = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
 
 FRAMES = pa.schema([_FRAME, _T_NS, ("pts_ns", pa.int64())])
 POSES = pa.schema([_T_NS, *_POSE])
+BODY_COLUMNS = ("body_qx", "body_qy", "body_qz", "body_qw")
 POSES_WITH_COVARIANCE = pa.schema([*POSES, *[(name, pa.float64()) for name in COVARIANCE_COLUMNS]])
 KEYPOINTS = pa.schema([_FRAME, _T_NS, _PERSON, _JOINT, *_XY, ("confidence", pa.float64())])
 TRACKS = pa.schema([_FRAME, ("point", pa.int32()), ("x", pa.float32()), ("y", pa.float32())])
@@ -143,12 +144,14 @@ def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
     """Read a table and check that it holds the columns of `schema` (more are allowed and kept).
 
     Raises:
-        DataError: not a Parquet file, truncated, or columns are missing.
+        DataError: not a Parquet file, truncated, or columns are missing; or a small file of many equal rows,
+            which no stage writes.
     """
     import pyarrow.parquet as pq
 
     try:
         with path.open("rb") as file:
+            _refuse_bomb(path, pq.ParquetFile(file).metadata)
             table = pq.read_table(file)
     except (OSError, pa.ArrowException) as error:
         raise DataError(
@@ -158,9 +161,40 @@ def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
     if missing:
         raise DataError(path, f"lacks the columns {', '.join(missing)}", "run the stage again with --force")
     frame: pd.DataFrame = table.to_pandas()
+    _refuse_absurd_numbers(path, frame[schema.names])
     return frame
 
 
+def _refuse_absurd_numbers(path: Path, frame: pd.DataFrame) -> None:
+    """Refuse numbers that no stage writes, before they overflow in a later step; NaN is missing."""
+    again = "run the stage that wrote it again with --force"
+    if list(frame.columns) == POSES.names and (np.diff(frame["t_ns"].to_numpy()) <= 0).any():
+        raise DataError(path, "holds times that do not increase", again)
+    for name in map(str, frame.columns):
+        values = frame[name].to_numpy()
+        largest = _LATEST_NS if name.endswith("_ns") else _LARGEST
+        if values.dtype.kind in "if" and len(values):
+            wrong = (values > largest) | (values < -largest)
+            if name not in (*_POSITION, *_QUATERNION):
+                wrong &= np.isfinite(values)
+            if wrong.any():
+                row = int(np.argmax(wrong))
+                raise DataError(path, f"holds {values[row]:g} as {name} in row {row}", again)
+
+
+def _refuse_bomb(path: Path, metadata: Any) -> None:
+    """Refuse a table that takes far more memory than its file, before it is read."""
+    groups = [metadata.row_group(k).total_byte_size for k in range(metadata.num_row_groups)]
+    size = max(metadata.num_rows * metadata.num_columns * _CELL, sum(groups))
+    if size > max(_INFLATED, _MOST_EXPANSION * path.stat().st_size):
+        problem = f"holds {metadata.num_rows} rows, {size} bytes, in a file of {path.stat().st_size}"
+        raise DataError(path, problem, "run the stage that wrote it again with --force")
+
+
+_LARGEST = 1e15  # of any number; squares of much larger ones overflow
+_LATEST_NS = 2**62 - 1  # differences of two such times fit int64
+_CELL = 8  # bytes
+_INFLATED, _MOST_EXPANSION = 1 << 28, 100  # bytes of any table, and for each byte of its file
 _POSITION = ["x", "y", "z"]
 _QUATERNION = ["qx", "qy", "qz", "qw"]
 
@@ -179,17 +213,21 @@ def rows_between(since_ns: Int64, start_s: float | None, end_s: float | None) ->
     return range(first, max(first, stop))
 
 
-def actor_table(trajectory: Trajectory) -> pd.DataFrame:
-    """Make rows of `tables.ACTOR` from the actor's trajectory; the person is 0."""
+def actor_table(trajectories: Sequence[Trajectory]) -> pd.DataFrame:
+    """Make rows of `tables.ACTOR` from the trajectories of person 0, 1, ..., one after the other."""
     import pandas as pd
 
-    table = pd.DataFrame({"t_ns": trajectory.t_ns, "person": 0})
-    table[_POSITION] = trajectory.position
+    tables = [
+        pd.DataFrame({"t_ns": trajectory.t_ns, "person": person})
+        for person, trajectory in enumerate(trajectories)
+    ]
+    table = pd.concat(tables, ignore_index=True)
+    table[_POSITION] = np.concatenate([trajectory.position for trajectory in trajectories])
     return table
 
 
 def pose_table(trajectory: Trajectory) -> pd.DataFrame:
-    """Make rows of `tables.POSES` from a trajectory, with its covariance if it has one."""
+    """Make rows of `pose_schema` from a trajectory."""
     import pandas as pd
 
     table = pd.DataFrame({"t_ns": trajectory.t_ns})
@@ -197,7 +235,16 @@ def pose_table(trajectory: Trajectory) -> pd.DataFrame:
     table[_QUATERNION] = trajectory.quaternion_xyzw
     if trajectory.covariance is not None:
         table[list(COVARIANCE_COLUMNS)] = trajectory.covariance[:, *np.triu_indices(6)]
+    if trajectory.body_xyzw is not None:
+        table[list(BODY_COLUMNS)] = trajectory.body_xyzw
     return table
+
+
+def pose_schema(trajectory: Trajectory) -> pa.Schema:
+    """Return the columns of a trajectory: `POSES`, with covariances and the attitude of a body if known."""
+    known = POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE
+    body = () if trajectory.body_xyzw is None else BODY_COLUMNS
+    return pa.schema([*known, *((name, pa.float64()) for name in body)])
 
 
 def trajectory_from(table: pd.DataFrame) -> Trajectory:
@@ -213,6 +260,9 @@ def trajectory_from(table: pd.DataFrame) -> Trajectory:
         position=table[_POSITION].to_numpy(np.float64),
         quaternion_xyzw=table[_QUATERNION].to_numpy(np.float64),
         covariance=covariance,
+        body_xyzw=table[list(BODY_COLUMNS)].to_numpy(np.float64)
+        if set(BODY_COLUMNS) <= set(table.columns)
+        else None,
     )
 
 

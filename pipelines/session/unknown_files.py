@@ -161,6 +161,9 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
         if len(cells) > 2 and len(lines) > 1 and lines[1].count(mark) > len(cells) // 2:
             named = sum(bool(re.match(r"[A-Za-z_]", cell)) for cell in cells) > len(cells) / 2
             columns = f"the columns {_listed(cells)}" if named else f"{len(cells)} columns without names"
+            if {"latitude", "longitude"} <= {cell.lower() for cell in cells}:
+                problem = f"is a table of places on Earth whose writer is not known, with {columns}"
+                return Likeness(problem, "poses need attitudes, too: give the drone's own log")
             remedy = "poses need a time, x, y, z, qx, qy, qz, qw; joints person, joint, x, y, z"
             return Likeness(f"is a table with {columns}", f"{remedy}, by name in the first line")
     return Likeness(f"is text that begins with {lines[0][:_WIDEST]!r}")

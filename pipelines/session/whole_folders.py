@@ -33,13 +33,13 @@ _OF_SESSIONS = {"session.json": "a session", "stage.json": "a stage of a session
 
 
 @contextmanager
-def held(lock: Path, target: Path) -> Iterator[None]:
+def held(lock: Path, target: Path | str) -> Iterator[None]:
     """Hold a lock of the kernel, which ends with the process, however that ends.
 
     Args:
         lock: the file of the lock. The holder's process id is in a file of its own beside it, because some
             versions of filelock empty the lock file.
-        target: the folder that is written meanwhile, for the message.
+        target: the folder, or the URL, that is written meanwhile, for the message.
 
     Raises:
         BusyError: another process holds it.

@@ -143,21 +143,41 @@ def _plain(annotation: Any) -> Any:
 
 
 _MOST_BITS = 1024  # a float holds integers of fewer
+_MOST_MARKS = 100_000  # signs that separate values: the parser reads 20,000 in a second
+_MOST_MERGED = 100_000  # entries that merge keys copy
 
 
 def plain_yaml(path: Path, text: str) -> object:
     """Parse YAML into plain types only.
 
     Raises:
-        DataError: no valid YAML; the message names the line if it is known. Or a value that no program
-            can use: a text that cannot be written, an integer beyond any float.
+        DataError: no valid YAML; the message names the line if it is known. Or it is beyond reason, as
+            merges of merges. Or a value that no program can use: a text that cannot be written, an integer
+            beyond any float.
     """
     from ruamel.yaml import YAML
+    from ruamel.yaml.constructor import ConstructorError, SafeConstructor
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+    class Constructor(SafeConstructor):
+        merged = 0
+
+        def flatten_mapping(self, node: Any) -> Any:
+            super().flatten_mapping(node)
+            self.merged += len(getattr(node, "merge", None) or ())
+            if self.merged > _MOST_MERGED:
+                raise ConstructorError(
+                    None, None, f"merges more than {_MOST_MERGED} entries", node.start_mark
+                )
+
+    marks = sum(map(text.count, "\n,:[{-?&*"))
+    if marks > _MOST_MARKS:
+        raise DataError(path, f"holds about {marks} values", f"at most {_MOST_MARKS} are read")
     remedy = "mend it, or copy the file again if it was cut off"
+    parser = YAML(typ="safe", pure=True)
+    parser.Constructor = Constructor
     try:
-        value: object = YAML(typ="safe", pure=True).load(text)
+        value: object = parser.load(text)
     except MarkedYAMLError as error:
         line = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
         problem = " ".join(str(error.problem or error.context).split())

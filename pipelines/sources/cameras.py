@@ -1,12 +1,11 @@
 """Pictures of a camera: the times at which they were taken, and intrinsics for their size."""
 
-import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -19,13 +18,14 @@ from pipelines.geometry.cameras import Intrinsics, fit_to_size, is_resized
 from pipelines.geometry.clocks import fit_start
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Camera, FrameTimes, IntrinsicsSource
+from pipelines.session.manifest import Camera, FrameTimes, IntrinsicsSource, TriggerLog
 from pipelines.session.records import Detections, Trajectory, VideoIndex
+from pipelines.session.stores import located, media_path
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs, Frames
 from pipelines.sources.parts import CameraFrames
 
-_MOST_FRAMES = 20_000_000  # a week at 30 Hz; a larger number was misread from a date
+_MOST_FRAMES = 2_000_000  # 18 hours at 30 Hz; a larger number was misread from a date
 _WATCHED_NS = 120 * 10**9  # of a video, to estimate when it began
 
 # Of half the picture's size: cameras' principal points lie nearer to the middle (a few per cent), while
@@ -44,7 +44,7 @@ class PosesOfCameras(Protocol):
     def trajectory(self, name: str, camera: Camera, first_frame_ns: int) -> Trajectory:
         """Read world_from_camera over time."""
 
-    def triggers(self, kind: Literal["ulog", "ardupilot"], stated: str) -> Int64:
+    def triggers(self, kind: TriggerLog, stated: str) -> Int64:
         """Read the trigger times of pictures from a drone's own log, at world times."""
 
 
@@ -119,15 +119,13 @@ class FlightCameras:
             start_ns = self._start_ns(name, camera, times)
             return CameraFrames(np.arange(count), start_ns + since_start, since_start, topic, lost)
         if times.csv or times.srt:
-            return self._frames_of_file(self._base / (times.csv or times.srt or ""), pictures)
+            return self._frames_of_file(located(self._base, times.csv or times.srt or ""), pictures)
         if times.log is not None:
             triggers = self._logs.triggers(times.log, times.topic)
             stamped = triggers or self._logs.frames(times.log, times.topic)
             return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
-        if times.ulog or times.ardupilot:
-            kind: Literal["ulog", "ardupilot"] = "ulog" if times.ulog else "ardupilot"
-            triggered = self._poses.triggers(kind, times.ulog or times.ardupilot or "")
-            return self._frames_by_stamps(triggered, {}, pictures)
+        if times.triggers is not None:
+            return self._frames_by_stamps(self._poses.triggers(*times.triggers), {}, pictures)
         if pictures is None:
             raise DataError(
                 self._manifest,
@@ -159,7 +157,7 @@ class FlightCameras:
         count = int(detections.frames_listed[-1]) + 1
         if count > _MOST_FRAMES:
             raise DataError(
-                self._base / camera.keypoints.path,
+                located(self._base, camera.keypoints.path),
                 f"numbers its frames up to {count - 1}",
                 "say with first_frame which number the first frame bears",
             )
@@ -189,7 +187,7 @@ class FlightCameras:
             return 0  # estimated later, from the pictures and the poses
         if times.start_from is None:
             return times.start_ns
-        path = self._base / (camera.video.path or "") if camera.video else None
+        path = located(self._base, camera.video.path or "") if camera.video else None
         made_ns = _made_ns(path) if path is not None and camera.video and camera.video.path else None
         if made_ns is None:
             raise DataError(
@@ -219,7 +217,7 @@ class FlightCameras:
                 poses.t_ns,
                 poses.position,
                 poses.quaternion_xyzw,
-                followed_points(self._base / camera.video.path, intrinsics, frames.pts_ns[:some]),
+                followed_points(located(self._base, camera.video.path), intrinsics, frames.pts_ns[:some]),
                 max_gap_ns=self._max_gap_ns,
                 near_ns=near_ns,
             )
@@ -259,7 +257,7 @@ class FlightCameras:
             return None
         stated = self._logs.settings(video.log).path if video.log else [video.path or ""]
         return MediaEntry(
-            paths=[Path(os.path.relpath(self._base / path, session)).as_posix() for path in stated],
+            paths=[media_path(self._base, path, session) for path in stated],
             sources=stated,
             topic=frames.topic,
             stamps=self._logs.settings(video.log).stamps if video.log else "header",
@@ -281,12 +279,12 @@ class FlightCameras:
             calibrated = self._files.camera(name, source.path, source.camera)
             if calibrated.intrinsics is None:
                 raise DataError(
-                    self._base / source.path, "holds poses but no intrinsics", "name one with both"
+                    located(self._base, source.path), "holds poses but no intrinsics", "name one with both"
                 )
             intrinsics = calibrated.intrinsics
             if not calibrated.size_stated:
                 size = self._picture_size(camera, video, detections)
-                intrinsics = _with_size(intrinsics, size, self._base / source.path)
+                intrinsics = _with_size(intrinsics, size, located(self._base, source.path))
                 self._note(f"{name}: its calibration states no picture size; that of its pictures is taken")
         elif source.log:
             intrinsics = self._logs.intrinsics(source.log, source.topic).intrinsics
@@ -296,9 +294,10 @@ class FlightCameras:
             intrinsics = replace(intrinsics, readout_s=source.readout_s)
         if size := self._picture_size(camera, video, detections):
             bars = (0, 0, 0, 0)
-            folder = bool(camera.video and camera.video.path and (self._base / camera.video.path).is_dir())
-            if camera.video and camera.video.path and not folder and not is_resized(intrinsics, *size):
-                bars = black_bars(self._base / camera.video.path)
+            stated = camera.video.path if camera.video else None
+            file = located(self._base, stated) if stated else None
+            if file is not None and not file.is_dir() and not is_resized(intrinsics, *size):
+                bars = black_bars(file)
             try:
                 intrinsics, note = fit_to_size(intrinsics, *size, bars)
             except ValueError as error:

@@ -16,6 +16,7 @@ from pipelines.session.registries import (
     VideoFormat,
     recognise,
 )
+from pipelines.session.stores import located
 from pipelines.sources.world import losses
 
 _FARTHEST_M = 10_000  # in any flight a person's joints are closer to their median than this
@@ -32,7 +33,7 @@ class FlightFiles:
 
     def keypoints(self, source: KeypointSource) -> tuple[Detections, str]:
         """Read the keypoints that the manifest gives for a camera; return them with their format's name."""
-        path = self._base / source.path
+        path = located(self._base, source.path)
         if source.format:
             reader = FORMATS.get(source.format)
             if not isinstance(reader, KeypointFormat):
@@ -50,13 +51,13 @@ class FlightFiles:
         """Return the index of a camera's video file; None if it has none."""
         if camera.video is None or camera.video.path is None:
             return None
-        path = self._base / camera.video.path
+        path = located(self._base, camera.video.path)
         return recognise(path, VideoFormat, "video").index(path)
 
     def camera(self, name: str, path: str, camera: str | None) -> CalibratedCamera:
         """Return the camera that is asked for, or the one of this name, or the only one of the file."""
         if path not in self._calibrations:
-            file = self._base / path
+            file = located(self._base, path)
             self._calibrations[path] = recognise(file, CalibrationFormat, "calibration").read_calibration(
                 file
             )
@@ -66,7 +67,7 @@ class FlightFiles:
         if (camera or name) not in cameras:
             listed = ", ".join(sorted(cameras)[:20])
             raise DataError(
-                self._base / path,
+                located(self._base, path),
                 f"holds no camera {camera or name!r} (there are {listed})",
                 "say which with {path: ..., camera: ...}",
             )
@@ -78,7 +79,7 @@ class FlightFiles:
         Raises:
             DataError: the file cannot be used, its axes are unknown, or no position is left.
         """
-        path = self._base / source.path
+        path = located(self._base, source.path)
         named = FORMATS.get(source.format) if source.format else None
         reader = named or recognise(path, JointFormat, "file of true joints")
         if not isinstance(reader, JointFormat):

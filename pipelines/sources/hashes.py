@@ -11,6 +11,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
 from pipelines.session.progress import Progress
 from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
+from pipelines.session.stores import fetched, located, named, source_url
 
 _HASHERS = 4
 
@@ -24,11 +25,11 @@ def hash_sources(
     """
     unique = stated_paths(flight)
     for path in unique:  # before anything waits for one of them
-        refuse_special(base / path)
+        refuse_special(located(base, path))
     progress.start("Hashing sources", len(unique))
     hashes, damage = {}, {}
     with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the GIL, so long logs run in parallel
-        hashing = {path: pool.submit(_hash_of, base / path) for path in unique}
+        hashing = {path: pool.submit(_hash_of, located(base, path)) for path in unique}
         try:
             while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
                 pass
@@ -43,6 +44,20 @@ def hash_sources(
     return hashes, damage
 
 
+def fetch_sources(flight: Flight, base: Path, progress: Progress) -> None:
+    """Fetch the files that a manifest states by URL, where the copies in the cache are not as in the store.
+
+    Raises:
+        DataError: a store cannot be read, or holds no such file.
+    """
+    urls = [url for path in stated_paths(flight) if (url := source_url(base, path))]
+    if urls:
+        progress.start("Fetching sources", len(urls))
+    for url in urls:
+        fetched(url, fresh=True)
+        progress.advance()
+
+
 def source_stamps(flight: Flight, base: Path) -> dict[str, str]:
     """Return the stamp of every file that is read, by the manifest's path.
 
@@ -50,7 +65,8 @@ def source_stamps(flight: Flight, base: Path) -> dict[str, str]:
         DataError: one of them is missing or cannot be read.
     """
     stamps = {
-        path: [file_stamp(file) for file in _source_files(base / path)] for path in stated_paths(flight)
+        path: [file_stamp(file) for file in _source_files(located(base, path))]
+        for path in stated_paths(flight)
     }
     return {path: own[0] if len(own) == 1 else hash_of(own) for path, own in stamps.items()}
 
@@ -64,7 +80,7 @@ def refuse_written(flight: Flight, base: Path, stamps: Mapping[str, str]) -> Non
     for path, stamp in source_stamps(flight, base).items():
         if stamp != stamps[path]:
             raise DataError(
-                base / path,
+                named(base, path),
                 "was written to while it was being read",
                 "run `mocap ingest` again when it is complete",
             )
@@ -95,13 +111,13 @@ def stated_paths(flight: Flight) -> list[str]:
             take_log(log)
         if times:
             take(times.csv, times.srt)
-            for log in (times.log, times.ulog, times.ardupilot):
+            for log in (times.log, times.triggers[1] if times.triggers else None):
                 take_log(log)
         if video:
             take(video.path)
             take_log(video.log)
-    if flight.actor:
-        take_log(flight.actor.log)
+    for actor in flight.logged_people.values():
+        take_log(actor.log)
     if flight.map:
         take(flight.map.path)
         take_log(flight.map.log)

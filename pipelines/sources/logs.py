@@ -35,6 +35,7 @@ from pipelines.session.manifest import Flight
 from pipelines.session.manifest import Log as LogSource
 from pipelines.session.records import IntrinsicsSample, PictureSample, Trajectory
 from pipelines.session.registries import Log, LogFormat, recognise
+from pipelines.session.stores import located
 from pipelines.sources.world import world_times
 
 _KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 MB
@@ -156,7 +157,7 @@ class FlightLogs:
 
     def paths(self, log: str) -> list[Path]:
         """Return the files of a log."""
-        return [self._base / path for path in self.settings(log).path]
+        return [located(self._base, path) for path in self.settings(log).path]
 
     @contextmanager
     def open(self, log: str) -> Iterator[FlightLog]:

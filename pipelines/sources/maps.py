@@ -95,8 +95,7 @@ def _poses_taken(flight: Flight, logs: FlightLogs, log: str) -> list[tuple[str |
     """Return topic and parent of all poses that the flight takes from a log."""
     poses = [camera.pose for camera in flight.cameras.values()]
     taken = [(pose.log, pose.topic, pose.parent) for pose in poses]
-    if actor := flight.actor:
-        taken.append((actor.log, actor.topic, None))
+    taken += [(actor.log, actor.topic, None) for actor in flight.logged_people.values()]
     paths = logs.paths(log)
     return [(topic, parent) for name, topic, parent in taken if name and logs.paths(name) == paths]
 

@@ -23,18 +23,19 @@ from pipelines.session.description import (
     LogClockEntry,
     MediaEntry,
     MountEntry,
+    PlaceEntry,
     PosesEntry,
 )
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, Camera, PoseSource
 from pipelines.session.records import Detections, Trajectory
+from pipelines.session.stores import named
 from pipelines.session.tables import (
     FRAMES,
     KEYPOINTS,
-    POSES,
-    POSES_WITH_COVARIANCE,
     frames_table,
     keypoints_table,
+    pose_schema,
     pose_table,
     write_table,
 )
@@ -86,8 +87,7 @@ def store_camera(data: CameraData, folder: Path) -> None:
     """Write the tables of one camera."""
     frames, poses = data.frames, data.trajectory
     write_table(folder / "frames.parquet", frames_table(frames.frame, frames.t_ns, frames.pts_ns), FRAMES)
-    columns = POSES if poses.covariance is None else POSES_WITH_COVARIANCE
-    write_table(folder / "poses.parquet", pose_table(poses), columns)
+    write_table(folder / "poses.parquet", pose_table(poses), pose_schema(poses))
     if data.detections is not None:
         keypoints = keypoints_table(data.detections, frames.frame, frames.t_ns)
         write_table(folder / "keypoints.parquet", keypoints, KEYPOINTS)
@@ -101,10 +101,12 @@ def camera_entry(
     *,
     base: Path,
     stamps: str | None,
-    axes: Axes,
+    axes: tuple[Axes, Axes],
     note: Callable[[str], None],
 ) -> CameraEntry:
     """Describe a camera for session.json; note doubts about its poses, and losses, one line each.
+
+    `axes` are those that its poses are in, and those of its gimbal's angles.
 
     Raises:
         DataError: no frame has a pose.
@@ -150,7 +152,7 @@ def _poses_entry(
     *,
     base: Path,
     stamps: str | None,
-    axes: Axes,
+    axes: tuple[Axes, Axes],
     note: Callable[[str], None],
 ) -> PosesEntry:
     pose, trajectory, frames_t_ns = camera.pose, data.trajectory, data.frames.t_ns
@@ -162,7 +164,7 @@ def _poses_entry(
         if without_pose == len(frames_t_ns):
             frames, poses = (span_words(*t_ns[[0, -1]]) for t_ns in (frames_t_ns, trajectory.t_ns))
             raise DataError(
-                base / _pose_source(pose),
+                named(base, _pose_source(pose)),
                 f"has a pose for none of the {without_pose} frames of camera {name}: frames span {frames},"
                 f" poses {poses} at {_rate(trajectory.t_ns) or 0:.3g} Hz",
                 "check clocks and units, or raise --max-pose-gap",
@@ -190,8 +192,15 @@ def _poses_entry(
         key=_pose_key(pose),
         topic=pose.topic,
         gimbal=camera.gimbal.relative_to if camera.gimbal and camera.gimbal.topic else None,
-        gimbal_axes=axes,
-        mount=_mount_entry(camera),
+        gimbal_axes=axes[1],
+        axes=axes[0],
+        mount=None if camera.gimbal else _mount_entry(camera),
+        in_gimbal=_mount_entry(camera) if camera.gimbal else None,
+        inverse=pose.inverse,
+        z=pose.z,
+        world_from_source=PlaceEntry(
+            translation=tuple(pose.world_from_source.translation), yaw_deg=pose.world_from_source.yaw_deg
+        ),
     )
 
 
@@ -309,8 +318,8 @@ def _pose_key(pose: PoseSource) -> str:
 
 
 def _mount_entry(camera: Camera) -> MountEntry | None:
-    """Describe how a camera is fixed to the body whose poses are logged; None where it is not fixed."""
-    if camera.mount is None or camera.gimbal is not None:
+    """Describe how a camera is fixed to what turns it; None where nothing is said of that."""
+    if camera.mount is None:
         return None
     translation, rotation_xyzw = mounted(camera.mount)
     return MountEntry(translation=tuple(translation.tolist()), rotation_xyzw=tuple(rotation_xyzw.tolist()))
@@ -331,7 +340,7 @@ def span_words(first_ns: int, last_ns: int) -> str:
     return f"{first_ns / 1e9:.3f} to {last_ns / 1e9:.3f} s"
 
 
-def refuse_no_overlap(source: Path, t_ns: Int64, entries: Mapping[str, CameraEntry]) -> None:
+def refuse_no_overlap(source: Path | str, t_ns: Int64, entries: Mapping[str, CameraEntry]) -> None:
     """Refuse data that share no time with the pictures.
 
     Raises:

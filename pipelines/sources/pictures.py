@@ -17,6 +17,7 @@ from pipelines.session.records import PictureSample
 from pipelines.session.registries import Log, LogFormat, recognise
 from pipelines.session.stage_records import noted_stamps
 from pipelines.session.storage import file_stamp, sha256_of
+from pipelines.session.stores import located
 
 
 class Pictures(Protocol):
@@ -41,7 +42,7 @@ def open_pictures(session: Path, description: Description, camera: str) -> Itera
     """
     media = _media(description, camera)
     refuse_changed_pictures(session, description, [camera])
-    paths = [session / path for path in media.paths]
+    paths = [located(session, path) for path in media.paths]
     opened: Pictures = (
         _filed(paths[0]) if media.topic is None else LoggedPictures(paths, media.topic, media.stamps)
     )
@@ -67,7 +68,7 @@ def refuse_changed_pictures(session: Path, description: Description, cameras: It
     for camera in cameras:
         media = _media(description, camera)
         for stated, source in zip(media.paths, media.sources, strict=True):
-            path = (session / stated).resolve()
+            path = located(session, stated).resolve()
             if not path.exists():
                 continue
             stamp = file_stamp(path)

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -34,10 +33,11 @@ from pipelines.geometry.poses import (
 )
 from pipelines.session.description import Doubt
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan, PoseSource
+from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan, PoseSource, TriggerLog
 from pipelines.session.manifest import Log as LogSource
 from pipelines.session.records import Occupancy, Trajectory
 from pipelines.session.registries import FORMATS, Format, TrajectoryFormat, recognise
+from pipelines.session.stores import located
 from pipelines.session.telemetry import (
     AttitudeTrack,
     PositionTrack,
@@ -139,7 +139,7 @@ class FlightPoses:
             return self._stated.pop(name)
         pose = camera.pose
         if pose.static:
-            path = self._base / pose.static.path
+            path = located(self._base, pose.static.path)
             calibrated = self._files.camera(name, pose.static.path, pose.static.camera)
             if calibrated.position is None or calibrated.quaternion_xyzw is None:
                 raise DataError(path, "holds intrinsics but no camera pose", "name a file with extrinsics")
@@ -158,7 +158,7 @@ class FlightPoses:
             return self._logs.paths(pose.log)[0], in_world(turned, settings.world_from_log)
         stated = pose.tum or pose.csv or ""
         filed = as_stated(self._filed_trajectory(stated, "tum" if pose.tum else "csv"), pose)
-        return self._base / stated, self._turned(camera, filed, self._axes(pose.axes))
+        return located(self._base, stated), self._turned(camera, filed, self._axes(pose.axes))
 
     def _is_of_camera(self, camera: Camera) -> bool:
         """Return True if stated poses are those of the camera, not of the body that carries it."""
@@ -171,7 +171,7 @@ class FlightPoses:
         return in_enu(poses, axes) if self._is_of_camera(camera) else body_in_enu(poses, axes)
 
     def _filed_trajectory(self, stated: str, kind: str) -> Trajectory:
-        path = self._base / stated
+        path = located(self._base, stated)
         kitti = FORMATS.get("kitti")
         reader = kitti if kitti.recognises(path) else FORMATS.get(kind)
         if not isinstance(reader, TrajectoryFormat):
@@ -215,6 +215,7 @@ class FlightPoses:
             quaternion_xyzw=quaternion[known],
             covariance=covariance,
             dropped=dropped,
+            body_xyzw=body.quaternion_xyzw[known] if camera.gimbal and camera.gimbal.topic else None,
         )
 
     def _on_gimbal(
@@ -354,8 +355,8 @@ class FlightPoses:
 
     # --- people, commands, truth -----------------------------------------------------------------------
 
-    def actor(self, log: str, topic: str | None) -> Trajectory:
-        """Read the actor's logged positions; the rotation has no meaning."""
+    def actor(self, log: str, topic: str | None, name: str = "") -> Trajectory:
+        """Read the logged positions of the actor, or of one of several; the rotation has no meaning."""
         with self._logs.open(log) as opened:
             if topic is not None and opened.type_of(topic) in FIXES:
                 dropped: dict[str, int] = {}
@@ -364,7 +365,7 @@ class FlightPoses:
                 )
                 track = replace(track, t_ns=opened.world_times(track.t_ns))
                 dropped = dict(Counter(dropped) + opened.lost)
-                return replace(self._points("actor", log, track), dropped=dropped)
+                return replace(self._points(name or "actor", log, track), dropped=dropped)
         settings = self._logs.settings(log)
         trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return self._local(
@@ -375,7 +376,7 @@ class FlightPoses:
     def planned(self, camera: str, plan: Plan) -> Trajectory:
         """Read the commanded positions of a drone; the rotation has no meaning."""
         if camera in plan.files:
-            path = self._base / plan.files[camera]
+            path = located(self._base, plan.files[camera])
             filed = recognise(path, TrajectoryFormat, "file of commanded poses").read_trajectory(path)
             return self._local(path, in_enu(filed, self._flight.world.frame))
         log, topic = plan.log_of(camera), plan.topics[camera].topic
@@ -390,7 +391,7 @@ class FlightPoses:
 
     def true_poses(self, stated: str) -> Trajectory:
         """Read the true poses of one camera."""
-        path = self._base / stated
+        path = located(self._base, stated)
         trajectory = recognise(path, TrajectoryFormat, "camera trajectory").read_trajectory(path)
         return self._local(path, in_enu(trajectory, self._flight.world.frame))
 
@@ -430,7 +431,7 @@ class FlightPoses:
         """Return the fit of a drone's log clock to GPS time; None without one."""
         return self._read(camera.pose).fit if camera.pose.is_telemetry else None
 
-    def triggers(self, kind: Literal["ulog", "ardupilot"], stated: str) -> Int64:
+    def triggers(self, kind: TriggerLog, stated: str) -> Int64:
         """Read the trigger times of pictures from a drone's own log, at world times."""
         reader, path = FORMATS.get(kind), self._one_file(stated)
         if not isinstance(reader, TriggerFormat):

@@ -14,6 +14,7 @@ from pipelines.geometry.poses import (
     enu_from_ned,
     invert,
     matrix_from_quaternion,
+    multiply,
     quaternion_from_rotation_vector,
 )
 from pipelines.session.errors import DataError
@@ -91,7 +92,14 @@ def in_world(trajectory: Trajectory, place: WorldFromLog) -> Trajectory:
         rotated = np.eye(6)
         rotated[:3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
         covariance = carried_covariance(rotated, covariance)
-    return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
+    body = trajectory.body_xyzw
+    return replace(
+        trajectory,
+        position=position,
+        quaternion_xyzw=quaternion,
+        covariance=covariance,
+        body_xyzw=None if body is None else multiply(turn, body),
+    )
 
 
 def refuse_projected(source: Path | str, position: Float, origin: Place) -> None:
