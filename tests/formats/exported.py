@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
@@ -91,4 +92,18 @@ def recording(count: int = 60, progress: Listener | None = None) -> Recording:
         pictures=lambda _: stills,
         overlays=lambda _: stills,
         progress=progress or Listener(),
+    )
+
+
+def angles_of_two() -> pd.DataFrame:
+    """Make a table of angles: two people at the first time, one at the second; one angle is missing."""
+    return pd.DataFrame(
+        {
+            "t_ns": stamps(2)[[0, 0, 0, 1]],
+            "person": [0, 0, 1, 0],
+            "angle": ["left_knee_flexion", "left_hip_flexion", "left_knee_flexion", "left_knee_flexion"],
+            "value_deg": [180.0, np.nan, 90.0, 60.0],
+            "sigma_deg": [18.0, np.nan, 9.0, np.nan],
+            "status": ["ok", "missing", "ok", "ok"],
+        }
     )

@@ -8,8 +8,11 @@ from functools import partial
 from pathlib import Path
 
 from pipelines.formats.videos.frame_times import read_frame_times
-from pipelines.formats.videos.video import frames
+from pipelines.formats.videos.picture_folder import FolderPictures
+from pipelines.formats.videos.video import VideoReader
 from pipelines.ingest import ingest
+from pipelines.reconstruct import reconstruct
+from pipelines.report import report
 from pipelines.session.errors import MocapError
 from pipelines.session.registries import (
     FORMATS,
@@ -29,12 +32,13 @@ class NotOneLineError(AssertionError):
     """Refusal that a terminal would show on several lines."""
 
 
-def read_or_refuse(path: Path, stated: str) -> tuple[int, int]:
+def read_or_refuse(path: Path, stated: str, lines: list[str] | None = None) -> tuple[int, int]:
     """Read a file in every way; count the ways that worked, and those that refused it in one line.
 
     Args:
-        path: the file, the folder, or a flight.yaml.
+        path: the file, the folder, a flight.yaml, or a session.
         stated: the format that a user names, independent of the content.
+        lines: takes the refusals.
 
     Raises:
         Exception: any exception of a reader other than a refusal.
@@ -46,6 +50,8 @@ def read_or_refuse(path: Path, stated: str) -> tuple[int, int]:
             read += 1
         except MocapError as error:
             refused += 1
+            if lines is not None:
+                lines.append(str(error))
             if "\n" in str(error).strip():
                 raise NotOneLineError(str(error)) from error
     return read, refused
@@ -54,6 +60,10 @@ def read_or_refuse(path: Path, stated: str) -> tuple[int, int]:
 def _ways(path: Path, stated: str) -> Iterator[Callable[[], object]]:
     if path.name == "flight.yaml":
         yield partial(_ingest, path)
+        return
+    if path.suffix == ".session":
+        yield partial(reconstruct, path)
+        yield partial(report, path)
         return
     for format_ in FORMATS.all():
         if format_.recognises(path) or format_.name == stated:  # the first never raises, as it promises
@@ -79,11 +89,18 @@ def _ways_of(format_: Format, path: Path) -> Iterator[Callable[[], object]]:
     if isinstance(format_, LogFormat):
         yield lambda: _messages(format_, path)
     if isinstance(format_, VideoFormat):
-        yield lambda: (format_.index(path), list(frames(path)))
+        yield lambda: format_.index(path)
+        yield partial(_look, path)
     if isinstance(format_, TelemetryFormat):
         yield lambda: format_.read_telemetry(path, TelemetryChoice())
     if isinstance(format_, TriggerFormat):
         yield lambda: format_.picture_times(path, TelemetryChoice())
+
+
+def _look(path: Path) -> None:
+    with FolderPictures(path) if path.is_dir() else VideoReader(path) as pictures:
+        for _ in pictures.frames():
+            pass
 
 
 def _messages(format_: LogFormat, path: Path) -> None:

@@ -85,6 +85,12 @@ def _ulog(folder: Path) -> None:
     drone_logs.write_ulog(folder / "a.ulg", drone_logs.ulog_rows(_truth(folder)))
 
 
+def _tlog(folder: Path) -> None:
+    truth = _truth(folder)
+    path = drone_logs.write_tlog(folder / "a.tlog", truth)
+    path.write_bytes(path.read_bytes() + drone_logs.tlog_pictures(truth))
+
+
 def _colmap(kind: str) -> Writer:
     def write(folder: Path) -> None:
         every = dict(enumerate(test_colmap.PARAMETERS.items(), start=1))
@@ -148,6 +154,7 @@ SEEDS: dict[str, Writer] = {
     "kitti": test_kitti.write,
     "klv": lambda folder: video_tracks.write_klv(folder / "a.klv", _truth(folder)),
     "parrot": lambda folder: video_tracks.write_parrot(folder / "p.mp4", _truth(folder)),
+    "parrot, protobuf": lambda folder: video_tracks.write_parrot(folder / "p.mp4", _truth(folder), 4),
     "klv in a video": lambda folder: video_tracks.write_klv(folder / "a.ts", _truth(folder), pictures=5),
     "las": lambda folder: test_las.write(folder / "a.las"),
     "las, compressed": lambda folder: test_las.write(folder / "a.laz"),
@@ -176,7 +183,7 @@ SEEDS: dict[str, Writer] = {
     "ros2 in mcap": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), storage="mcap"),
     "ros2, compressed": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), compression="file"),
     "ros_map": test_ros_map.write,
-    "tlog": lambda folder: drone_logs.write_tlog(folder / "a.tlog", _truth(folder)),
+    "tlog": _tlog,
     "trc": _export(trc.EXPORT),
     "trc of others": _text(
         "a.trc", test_trc.HEADER + "\n1\t0.0\t1000\t2000\t3000\t\t\t\n2\t0.0166\t1\t2\t3\t4\t5\t6\n"

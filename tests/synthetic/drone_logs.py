@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,6 +240,8 @@ MAVLINK = {
     "LOCAL_POSITION_NED": (32, 185, "<Iffffff"),
     "GLOBAL_POSITION_INT": (33, 104, "<IiiiihhhH"),
     "GPS_GLOBAL_ORIGIN": (49, 39, "<iii"),
+    "CAMERA_TRIGGER": (112, 174, "<QI"),
+    "CAMERA_FEEDBACK": (180, 52, "<QiiffffffHBBB"),
     "MOUNT_ORIENTATION": (265, 26, "<Iffff"),
     "GIMBAL_DEVICE_ATTITUDE_STATUS": (285, 137, "<I4ffffIHBB"),
 }
@@ -297,6 +299,24 @@ def write_tlog(
             )
     path.write_bytes(b"".join(log))
     return path
+
+
+def tlog_pictures(
+    truth: DroneTruth,
+    name: str = "CAMERA_FEEDBACK",
+    clock: Literal["boot", "utc"] = "utc",
+    *,
+    lost: int | None = None,
+    version: int = 2,
+) -> bytes:
+    """Encode the packet of a picture for each row, at the row's time; that of the row `lost` is left out."""
+    stamps_us = truth.boot_us if clock == "boot" else truth.t_ns // 1000
+    packets = []
+    for row, us in enumerate(stamps_us.tolist()):
+        values = (us, *(0,) * 8, 300 + row, 1, 0, 0) if name == "CAMERA_FEEDBACK" else (us, row)
+        if row != lost:
+            packets.append(mavlink(name, *values, stamp_ns=int(truth.t_ns[row]), version=version))
+    return b"".join(packets)
 
 
 # --- ULog ----------------------------------------------------------------------------------------------

@@ -182,6 +182,11 @@ def _actor(t_s: Float) -> Float:
     return walk(t_s, speed_mps=_SPEED_MPS, start=(_CIRCLE_M, 0.0), heading_deg=90.0, radius_m=_CIRCLE_M)
 
 
+def bystander_at(t_ns: Int64) -> Float:
+    """Return the true joints [T, J, 3] of the bystander."""
+    return _bystander(_seconds(t_ns))
+
+
 def _bystander(t_s: Float) -> Float:
     return walk(t_s, speed_mps=0.9, start=(-3.0, -2.0), heading_deg=20.0, height_m=1.62)
 

@@ -137,10 +137,30 @@ def parrot_records(truth: DroneTruth, version: int = 3) -> list[tuple[int, bytes
     return records
 
 
+def parrot_messages(truth: DroneTruth, *, utc: bool = True, sea: bool = True) -> list[tuple[int, bytes]]:
+    """Encode an empty sample and a message of protobuf for each row, by the fields of vmeta.proto."""
+    messages = [(0, b"_ATEMON_")]
+    for row, stamp_ns in enumerate(truth.t_ns.tolist()):
+        body, view = (
+            b"".join(proto(k, part) for k, part in enumerate(_wxyz_in_ned(angles[row]), 1))
+            for angles in (truth.body_ypr_deg, truth.gimbal_ypr_deg)
+        )
+        height = float(truth.altitude_m[row])
+        place = [(1, float(truth.latitude_deg[row])), (2, float(truth.longitude_deg[row])), (3, height + 47)]
+        place += [(7, height)] if sea else []
+        location = b"".join(proto(k, value, double=True) for k, value in place) + proto(4, 12)
+        camera = proto(1, int(truth.boot_us[row])) + proto(2, proto(1, 1.0)) + proto(3, view) + proto(8, 1.2)
+        camera += proto(10, stamp_ns // 1000) + proto(11, 500) if utc else proto(10, 77)
+        drone = proto(1, body) + proto(2, location) + proto(3, 7.5, double=True) + proto(5, 180)
+        links = proto(3, proto(1, proto(1, 17664)))
+        messages.append((stamp_ns - int(truth.t_ns[0]), proto(1, drone) + proto(2, camera) + links))
+    return messages
+
+
 def write_parrot(path: Path, truth: DroneTruth, version: int = 3, *, pictures: int = 0) -> Path:
-    """Write a video of Parrot's whose time of creation is the first row's, which is a whole second."""
+    """Write a video of Parrot's whose time of creation is the first row's, a whole second; 4 is protobuf."""
     made_s = int(truth.t_ns[0]) // 10**9
-    records = parrot_records(truth, version)
+    records = parrot_messages(truth) if version == 4 else parrot_records(truth, version)
     return write_track(path, records, codec="bin_data", made_s=made_s, pictures=pictures)
 
 

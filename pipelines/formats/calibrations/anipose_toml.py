@@ -22,6 +22,8 @@ from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 
+_MOST_DOTS = 100  # of a key; files have two
+
 
 class AniposeToml:
     """Reader of anipose's tables; a camera has the name in `name`, or else the name of its table.
@@ -73,8 +75,12 @@ class AniposeToml:
 
 
 def _tables(path: Path) -> dict[str, dict[str, object]]:
+    text = read_text(path)
+    if any(piece.count(".") > _MOST_DOTS for piece in re.split(r"[=,{\n]", text)):
+        # The parser needs the square of a key's parts.
+        raise DataError(path, f"has a key of more than {_MOST_DOTS} parts", "write it again")
     try:
-        content = tomllib.loads(read_text(path))
+        content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise DataError(path, f"is not TOML ({error})", "it may be truncated; write it again") from error
     tables = {key: value for key, value in content.items() if isinstance(value, dict)}

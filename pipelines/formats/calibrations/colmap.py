@@ -72,6 +72,9 @@ class _Image:
     wxyz_xyz: tuple[float, ...]  # camera_from_world as the file has it
 
 
+_MOST_IMAGES = 50_000
+
+
 class ColmapModel:
     """Reader of COLMAP models: one camera for each image, named after it without folder and suffix.
 
@@ -257,7 +260,9 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Intrinsics]]:
 
 def _binary_images(path: Path) -> Iterator[_Image]:
     data = _Bytes(path)
-    for _ in range(data.integer("Q")):
+    for number in range(data.integer("Q")):
+        if number == _MOST_IMAGES:
+            raise DataError(path, f"holds more than {_MOST_IMAGES} images", "export those of this flight")
         data.skip(4)  # the image's number
         pose, camera, name = data.take("7d"), data.integer("I"), data.name()
         data.skip(24 * data.integer("Q"))  # its points: x, y and the 3D point's number

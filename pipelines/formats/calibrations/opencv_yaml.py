@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,8 @@ _MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
 _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
 _WIDTH = ("image_width", "image_Width", "width")
 _HEIGHT = ("image_height", "image_Height", "height")
+_LARGEST = 1 << 20  # characters
+_DEEPEST = 200
 _MOST_CELLS = 64  # of a calibration's matrices; a larger size is a mistake and is never allocated
 
 
@@ -90,6 +93,15 @@ def _with_pose(path: Path, name: str, storage: Storage, camera: CalibratedCamera
     return replace(camera, position=pose[0], quaternion_xyzw=pose[1])
 
 
+def _depth(text: str) -> int:
+    """Return a bound of the levels to which a file's elements, brackets or indented blocks are nested."""
+    tags = re.findall(r"<[^!?][^<>]*", text) if text.lstrip().startswith("<") else []
+    steps = [-1 if tag[1] == "/" else 0 if tag.endswith("/") else 1 for tag in tags]
+    brackets = [1 if sign in "[{" else -1 for sign in re.findall(r"[][{}]", text)]
+    indented = max(map(len, re.findall(r"(?m)^[ \t?:-]+", text)), default=0)
+    return max(indented, *accumulate(steps, initial=0), *accumulate(brackets, initial=0))
+
+
 class Storage:
     """Checked access to the top level of a FileStorage."""
 
@@ -98,9 +110,13 @@ class Storage:
 
         self._path = path
         self._cv2 = cv2
+        text = read_text(path)
+        if len(text) > _LARGEST or _depth(text) > _DEEPEST:
+            # OpenCV's parser calls itself for each level, until the process ends.
+            raise DataError(path, "is too large or nested too deeply", "write the calibration again")
         try:
             # From memory: OpenCV's own file access fails on some names, and unpacks archives.
-            self._file = cv2.FileStorage(read_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+            self._file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
             self._root = self._file.root()
             whole = self._root.isMap()
         except (

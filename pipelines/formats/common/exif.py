@@ -73,10 +73,11 @@ def read_tags(path: Path) -> Tags:
             xmp = {name.decode(): text.decode("latin-1") for name, text in _TAG.findall(file.read(_HEAD))}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of damaged tags; the others are taken
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # no picture is decoded here
             with Image.open(path) as picture:
                 exif = picture.getexif()
                 taken, gps = dict(exif.get_ifd(_EXIF)), dict(exif.get_ifd(_GPS))
-    except (OSError, ValueError, SyntaxError, TypeError, KeyError):
+    except (OSError, ValueError, SyntaxError, TypeError, KeyError, Image.DecompressionBombError):
         return Tags(None)
     values = _from_gps(gps)
     for column, names in NAMES.items():

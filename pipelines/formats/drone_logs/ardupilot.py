@@ -28,6 +28,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     on_one_clock,
     pictures_on_gps_time,
     position_track,
+    refuse_marks,
     turned_as_stated,
     world_from_heading,
 )
@@ -361,6 +362,7 @@ def _index(path: Path) -> Any:
         with path.open("rb") as file:
             if file.read(len(_START)) != _START:
                 raise DataError(path, "is no ArduPilot log", "give the .bin that the autopilot wrote")
+        refuse_marks(path, _START[:2])
     except OSError as error:
         raise damaged(path, error) from error
     kind = need("pymavlink.DFReader", "drones").DFReader_binary

@@ -12,37 +12,39 @@ The track has no date. Its times are those of the video, from its time of creati
 from __future__ import annotations
 
 import re
-import struct
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, range_of, telemetry_of_rows
-from pipelines.formats.drone_logs.video_tracks import track_packets, video_made_ns
+from pipelines.formats.drone_logs.video_tracks import (
+    Place,
+    field_at,
+    has_track,
+    real_number,
+    signed_number,
+    track_packets,
+    video_made_ns,
+)
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 _PROTOCOL = re.compile(rb"dvtm_[A-Za-z0-9_-]{1,40}\.proto")
-_VARINT, _FIXED_64, _BYTES, _FIXED_32 = 0, 1, 2, 5
 _PICTURE = 3
 _OTHER_WAY = "turn on subtitles on the drone and name the .SRT, or name a flight record: pose: {dji: ...}"
-
-Value = int | bytes
-Path_ = tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class _Layout:
     """Places of the fields in the message of a picture; None where the tables name none."""
 
-    position: Path_ = (3, 4)
-    relative: Path_ | None = (3, 5, 1)
-    body: Path_ | None = (3, 3)
-    gimbal: Path_ | None = (4, 3)
+    position: Place = (3, 4)
+    relative: Place | None = (3, 5, 1)
+    body: Place | None = (3, 3)
+    gimbal: Place | None = (4, 3)
     degrees: bool = False  # whatever the unit says
 
 
@@ -67,10 +69,7 @@ class DjiVideoFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if a video has a data track whose first message names a protocol of DJI's."""
-        try:
-            return path.is_file() and next(_packets(path), None) is not None
-        except (DataError, OSError):
-            return False
+        return has_track(path, _names_a_protocol)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe the model's protocol, and ranges of positions, heights and angles."""
@@ -110,8 +109,8 @@ class DjiVideoFormat:
         )
 
 
-def _packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    yield from track_packets(path, lambda content: _PROTOCOL.search(content[:4096]) is not None)
+def _names_a_protocol(content: bytes) -> bool:
+    return _PROTOCOL.search(content[:4096]) is not None
 
 
 def _read(path: Path) -> tuple[str, DjiRows]:
@@ -124,11 +123,11 @@ def _read(path: Path) -> tuple[str, DjiRows]:
     at_ns: list[int] = []
     rows: list[list[float]] = []
     dropped: Counter[str] = Counter()
-    for start_ns, _, content in _packets(path):
+    for start_ns, _, content in track_packets(path, _names_a_protocol):
         if not protocol:
             protocol, layout = _layout_of(path, content)
         try:
-            picture = _inside(content, (_PICTURE,))
+            picture = field_at(content, (_PICTURE,))
             row = _row(picture, layout) if isinstance(picture, bytes) else [np.nan] * 10
         except ValueError:
             dropped["damaged messages"] += 1
@@ -174,102 +173,26 @@ def _row(picture: bytes, layout: _Layout) -> list[float]:
         ValueError: the message is damaged.
     """
     latitude = longitude = relative = absolute = np.nan
-    place = _inside(picture, (*layout.position, 1))
+    place = field_at(picture, (*layout.position, 1))
     if isinstance(place, bytes):
-        unit = _inside(place, (1,))
+        unit = field_at(place, (1,))
         scale = 1.0 if layout.degrees or unit == 1 else 180.0 / np.pi
-        latitude, longitude = (_real(_inside(place, (number,))) * scale for number in (2, 3))
-    if isinstance(height := _inside(picture, (*layout.position, 2)), int):
-        absolute = _signed(height) / 1000
-    if layout.relative and _inside(picture, layout.relative[:-1]) is not None:
-        relative = _real(_inside(picture, layout.relative) or bytes(4)) / 1000
+        latitude, longitude = (real_number(field_at(place, (number,))) * scale for number in (2, 3))
+    if isinstance(height := field_at(picture, (*layout.position, 2)), int):
+        absolute = signed_number(height) / 1000
+    if layout.relative and field_at(picture, layout.relative[:-1]) is not None:
+        relative = real_number(field_at(picture, layout.relative) or bytes(4)) / 1000
     body = _angles(picture, layout.body, (3, 2, 1))
     return [latitude, longitude, relative, absolute, *body, *_angles(picture, layout.gimbal, (3, 1, 2))]
 
 
-def _angles(picture: bytes, place: Path_ | None, order: tuple[int, int, int]) -> list[float]:
+def _angles(picture: bytes, place: Place | None, order: tuple[int, int, int]) -> list[float]:
     """Return yaw, pitch, roll (deg) whose fields have these numbers; NaN without the message."""
-    inner = _inside(picture, place) if place else None
+    inner = field_at(picture, place) if place else None
     if not isinstance(inner, bytes):
         return [np.nan] * 3
-    values = [_inside(inner, (number,)) or 0 for number in order]
-    return [_signed(value) / 10 if isinstance(value, int) else np.nan for value in values]
-
-
-def _inside(message: bytes, place: Path_) -> Value | None:
-    """Return the field at a place in nested messages; None if it is left out.
-
-    Raises:
-        ValueError: the message is damaged.
-    """
-    for depth, number in enumerate(place, 1):
-        found: Value | None = None
-        for there, value in _fields(message):
-            if there == number:
-                found = value
-        if depth == len(place) or not isinstance(found, bytes):
-            return found if depth == len(place) else None
-        message = found
-    return None
-
-
-def _fields(message: bytes) -> Iterator[tuple[int, Value]]:
-    """Yield number and value of each field of a message of protobuf ("Encoding", protobuf.dev).
-
-    Raises:
-        ValueError: it breaks off, or has a type of the wire that is not in use.
-    """
-    place = 0
-    while place < len(message):
-        key, place = _varint(message, place)
-        kind = key & 7
-        if kind == _VARINT:
-            value: Value
-            value, place = _varint(message, place)
-            yield key >> 3, value
-            continue
-        if kind == _BYTES:
-            size, place = _varint(message, place)
-        elif kind in {_FIXED_64, _FIXED_32}:
-            size = 8 if kind == _FIXED_64 else 4
-        else:
-            raise ValueError(f"type {kind}")
-        if place + size > len(message):
-            raise ValueError("breaks off")
-        yield key >> 3, message[place : place + size]
-        place += size
-
-
-def _varint(message: bytes, place: int) -> tuple[int, int]:
-    value = 0
-    for shift in range(0, 70, 7):
-        if place >= len(message):
-            raise ValueError("breaks off")
-        byte = message[place]
-        place += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, place
-    raise ValueError("a number of more than 64 bits")
-
-
-def _signed(value: int) -> int:
-    value &= 2**64 - 1
-    return value - 2**64 if value >= 2**63 else value
-
-
-def _real(value: Value | None) -> float:
-    """Return a float or double; 0 where it is left out.
-
-    Raises:
-        ValueError: the field has another type.
-    """
-    if value is None:
-        return 0.0
-    kinds = {4: "<f", 8: "<d"}
-    if not isinstance(value, bytes) or len(value) not in kinds:
-        raise ValueError("is no real number")
-    return float(struct.unpack(kinds[len(value)], value)[0])
+    values = [field_at(inner, (number,)) or 0 for number in order]
+    return [signed_number(value) / 10 if isinstance(value, int) else np.nan for value in values]
 
 
 FORMAT = DjiVideoFormat()

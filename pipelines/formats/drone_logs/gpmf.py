@@ -30,7 +30,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     position_track,
     turned_as_stated,
 )
-from pipelines.formats.drone_logs.video_tracks import track_packets
+from pipelines.formats.drone_logs.video_tracks import has_track, track_packets
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.session.errors import DataError
@@ -83,10 +83,7 @@ class GoProFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if a video has a track of GPMF whose first packet begins with a device."""
-        try:
-            return path.is_file() and next(_packets(path), None) is not None
-        except (DataError, OSError):
-            return False
+        return has_track(path, _begins_with_a_device)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe the streams by their rows, the positions, and the clock."""
@@ -168,13 +165,13 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
 # --- track ---------------------------------------------------------------------------------------------
 
 
-def _packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    yield from track_packets(path, lambda content: content.startswith(b"DEVC"))
+def _begins_with_a_device(content: bytes) -> bool:
+    return content.startswith(b"DEVC")
 
 
 def _read(path: Path) -> _Track:
     track = _Track()
-    for start_ns, length_ns, content in _packets(path):
+    for start_ns, length_ns, content in track_packets(path, _begins_with_a_device):
         for key, _, _, device in _items(content, track):
             if key == "DEVC":
                 for inner, _, _, stream in _items(device, track):

@@ -22,7 +22,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     turned_as_stated,
     whatever_from,
 )
-from pipelines.formats.drone_logs.video_tracks import track_packets
+from pipelines.formats.drone_logs.video_tracks import has_track, track_packets
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.telemetry import AttitudeTrack, Height, Telemetry, TelemetryChoice
@@ -72,12 +72,7 @@ class KlvFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True for a file that begins with the key, or a video with a data track of such packets."""
-        try:
-            if first_bytes(path, len(_KEY)) == _KEY:
-                return True
-            return path.is_file() and next(_contents(path), None) is not None
-        except (DataError, OSError):
-            return False
+        return _is_bare(path) or has_track(path, _has_key)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe packets, times, ranges of the values, and when the video began by them."""
@@ -175,12 +170,20 @@ def _video_start_ns(found: _Packets) -> int | None:
     return int(np.median(np.array(began, dtype=np.int64) - began[0])) + began[0] if began else None
 
 
+def _is_bare(path: Path) -> bool:
+    return first_bytes(path, len(_KEY)) == _KEY
+
+
+def _has_key(content: bytes) -> bool:
+    return _KEY in content[:64]
+
+
 def _contents(path: Path) -> Iterator[tuple[int, bytes]]:
     """Yield the time in the video (ns, -1 outside one) and the bytes of each packet of the container."""
-    if first_bytes(path, len(_KEY)) == _KEY:
+    if _is_bare(path):
         yield -1, path.read_bytes()
         return
-    for start_ns, _, content in track_packets(path, lambda content: _KEY in content[:64]):
+    for start_ns, _, content in track_packets(path, _has_key):
         yield start_ns, content
 
 

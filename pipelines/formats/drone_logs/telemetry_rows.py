@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, MutableMapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -216,6 +217,26 @@ def on_gps_time(
         return None
     notes.append(f"its stamps are turned to UTC: {describe_fit(fit)}")
     return fit
+
+
+def refuse_marks(path: Path, *marks: bytes) -> None:
+    """Refuse a log with more beginnings of messages than messages fit into it: a parser tries each of them.
+
+    Raises:
+        DataError: there are more than 100,000, and more than one for eight bytes.
+        OSError: the file cannot be read.
+    """
+    size = path.stat().st_size
+    if size < _FEW_MARKS:
+        return
+    with path.open("rb") as file:
+        found = sum(block.count(mark) for block in iter(partial(file.read, 1 << 20), b"") for mark in marks)
+    if found > max(_FEW_MARKS, size // _SMALLEST_MESSAGE):
+        raise DataError(path, f"has {found} beginnings of messages in {size} bytes", "copy it again")
+
+
+_FEW_MARKS = 100_000
+_SMALLEST_MESSAGE = 8  # bytes
 
 
 def damaged(path: Path, error: Exception) -> DataError:

@@ -2,7 +2,8 @@
 
 Layout: 8 bytes of microseconds since 1970 (big endian), then one packet of MAVLink 1 or 2. Definitions of the
 messages come from pymavlink (extra `drones`); packets are found here, by their checksums, also behind damaged
-bytes. Position, attitude and gimbal become the columns of PX4's topics, which both autopilots share.
+bytes. Position, attitude and gimbal become the columns of PX4's topics, which both autopilots share. Pictures
+are timed by the camera's own message (CAMERA_FEEDBACK) or by the trigger (CAMERA_TRIGGER).
 """
 
 from __future__ import annotations
@@ -20,7 +21,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
-from pipelines.formats.drone_logs.telemetry_rows import damaged, describe_fit, of_angles, on_gps_time
+from pipelines.formats.drone_logs.telemetry_rows import (
+    damaged,
+    describe_fit,
+    of_angles,
+    on_gps_time,
+    pictures_on_gps_time,
+    refuse_marks,
+)
 from pipelines.formats.drone_logs.ulog import Columns, Topic, telemetry_of
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
@@ -40,9 +48,13 @@ _YAW_IN_VEHICLE, _YAW_IN_EARTH = 32, 64  # GIMBAL_DEVICE_FLAGS
 _SYSTEM_TIME, _GPS_RAW_INT, _ATTITUDE, _ATTITUDE_QUATERNION = 2, 24, 30, 31
 _LOCAL_POSITION, _GLOBAL_POSITION, _ORIGIN = 32, 33, 49
 _MOUNT_ORIENTATION, _GIMBAL_DEVICE = 265, 285
+_CAMERA_TRIGGER, _CAMERA_FEEDBACK = 112, 180
+_POSITIONS = frozenset({_GLOBAL_POSITION, _LOCAL_POSITION, _GPS_RAW_INT})
+_PICTURES = frozenset({_CAMERA_FEEDBACK, _CAMERA_TRIGGER})
 _WANTED = frozenset(
-    {_SYSTEM_TIME, _GPS_RAW_INT, _ATTITUDE, _ATTITUDE_QUATERNION, _LOCAL_POSITION, _GLOBAL_POSITION}
-    | {_ORIGIN, _MOUNT_ORIENTATION, _GIMBAL_DEVICE}
+    _POSITIONS
+    | _PICTURES
+    | {_SYSTEM_TIME, _ATTITUDE, _ATTITUDE_QUATERNION, _ORIGIN, _MOUNT_ORIENTATION, _GIMBAL_DEVICE}
 )
 
 
@@ -90,7 +102,7 @@ class TlogFormat:
             DataError: no such log, pymavlink is missing, several vehicles, or no position.
         """
         log = _read(path)
-        system = _vehicle(path, log, choice.instance)
+        system = _vehicle(path, log, choice.instance, _POSITIONS)
         notes = [f"took vehicle {system}"] if len(log.vehicles()) > 1 else []
         fit, station = log.gps_time(system), None
         if fit is None and choice.time is None:
@@ -107,19 +119,60 @@ class TlogFormat:
         found = replace(found, dropped=dict(Counter(found.dropped) + Counter(log.dropped)))
         return replace(found, clock="the ground station's clock", fit=None) if station else found
 
+    def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
+        """Read the times of pictures, ns [N], increasing: CAMERA_FEEDBACK, else CAMERA_TRIGGER.
 
-def _vehicle(path: Path, log: _Packets, stated: int | None) -> int:
-    """Return the system's number that is stated, or the only one with positions."""
-    vehicles = log.vehicles()
+        Stamps since boot are turned to UTC as those of `read_telemetry`, also to the station's clock; stamps
+        that are UTC already stay. Pictures are assigned to stamps in order, so none may be lost between them.
+
+        Raises:
+            DataError: no such log, pymavlink is missing, several vehicles, no picture, by their numbers some
+                were lost on the radio link, they are in UTC where time since boot is asked for, or some are
+                in UTC and the others cannot be turned to it.
+        """
+        log = _read(path)
+        system = _vehicle(path, log, choice.instance, _PICTURES)
+        kind = _CAMERA_FEEDBACK if (system, _CAMERA_FEEDBACK) in log.payloads else _CAMERA_TRIGGER
+        columns = log.columns(system, kind)
+        number = columns["img_idx" if kind == _CAMERA_FEEDBACK else "seq"].astype(np.int64)
+        stamps_us = columns["time_usec"].astype(np.float64)
+        timed = (stamps_us > 0) & (stamps_us < _LAST_US)
+        stamps_us, numbers = columns["time_usec"][timed].astype(np.int64), np.unique(number[timed])
+        drones_own = "take the times of frames from the drone's own log (.bin, .ulg) or otherwise"
+        if not len(stamps_us):
+            raise DataError(path, "states no time for any of its pictures", drones_own)
+        if (lost := int(numbers[-1] - numbers[0]) + 1 - len(numbers)) > 0:
+            problem = f"lacks {lost} of the pictures between {numbers[0]} and {numbers[-1]}"
+            raise DataError(path, f"{problem}: their packets did not arrive", drones_own)
+        is_utc = stamps_us > _UNIX_US
+        boot_ns, utc_ns = stamps_us[~is_utc] * 1000, stamps_us[is_utc] * 1000
+        if choice.time == "boot" and len(utc_ns):
+            raise DataError(path, "states the times of its pictures in UTC", "leave time: boot out")
+        if not len(boot_ns):
+            return np.unique(utc_ns)
+        fit = log.gps_time(system)
+        if fit is None and choice.time is None:
+            fit = log.station_time(system)
+        if fit is None and len(utc_ns):
+            raise DataError(path, "mixes times of pictures since boot and in UTC", drones_own)
+        return np.union1d(pictures_on_gps_time(path, boot_ns, fit, choice), utc_ns)
+
+
+def _vehicle(path: Path, log: _Packets, stated: int | None, messages: frozenset[int]) -> int:
+    """Return the system's number that is stated, or the only one that sent any of the messages.
+
+    Raises:
+        DataError: no system sent one, not the stated one, or several did.
+    """
+    vehicles = log.vehicles(messages)
     listed = ", ".join(map(str, vehicles)) or "none"
+    names = " or ".join(sorted(log.dialect.mavlink_map[message].msgname for message in messages))
     if stated is not None:
         if stated not in vehicles:
-            raise DataError(path, f"has no position of system {stated}", f"there are systems {listed}")
+            raise DataError(path, f"has no {names} of system {stated}", f"there are systems {listed}")
         return stated
     if not vehicles:
-        raise DataError(
-            path, "has no GLOBAL_POSITION_INT, LOCAL_POSITION_NED or GPS_RAW_INT", "give another log"
-        )
+        raise DataError(path, f"has no {names}", "give another log")
     if len(vehicles) > 1:
         raise DataError(
             path, f"holds {len(vehicles)} vehicles (systems {listed})", "say which with `instance:`"
@@ -221,10 +274,9 @@ class _Packets:
         names = self.dialect.mavlink_map
         return {names[k].msgname if k in names else f"message {k}": n for k, n in self.counts.items()}
 
-    def vehicles(self) -> list[int]:
-        """List the systems that say where they are."""
-        positions = {_GLOBAL_POSITION, _LOCAL_POSITION, _GPS_RAW_INT}
-        return sorted({system for system, message in self.payloads if message in positions})
+    def vehicles(self, messages: frozenset[int] = _POSITIONS) -> list[int]:
+        """List the systems that sent any of the messages; by default, those that say where they are."""
+        return sorted({system for system, message in self.payloads if message in messages})
 
     def columns(self, system: int, message: int) -> dict[str, Any]:
         """Return the fields of all messages of a kind, [N] each; those of an array are `q[0]`, `q[1]`, ..."""
@@ -261,6 +313,7 @@ def _read(path: Path) -> _Packets:
     found = _Packets(need("pymavlink.dialects.v20.ardupilotmega", "drones"))
     last: dict[tuple[int, int], int] = {}
     try:
+        refuse_marks(path, b"\xfe", b"\xfd")
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             for packet in _packets(content, found.dialect.mavlink_map, found.dropped):
                 if packet.stamp_us > _LARGEST_US:

@@ -1,7 +1,8 @@
-"""Data tracks inside videos: packets of telemetry at their times, and when a video was made."""
+"""Data tracks inside videos: their packets and the times of these, fields of protobuf, and a video's date."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -63,6 +64,14 @@ def track_packets(path: Path, is_wanted: Callable[[bytes], bool]) -> Iterator[tu
         raise DataError(path, problem, "copy it from the camera again") from error
 
 
+def has_track(path: Path, is_wanted: Callable[[bytes], bool]) -> bool:
+    """Return True if a video has a data track whose first packet is wanted; False if it cannot be read."""
+    try:
+        return path.is_file() and next(track_packets(path, is_wanted), None) is not None
+    except (DataError, OSError):
+        return False
+
+
 def made_ns(texts: Iterable[str | None]) -> int | None:
     """Return the first time of creation that was ever set, ns since the epoch; None without one."""
     for text in texts:
@@ -91,3 +100,87 @@ def video_made_ns(path: Path) -> int | None:
             return made_ns(texts)
     except (av.error.FFmpegError, OSError, ValueError):
         return None
+
+
+# --- messages of protobuf ------------------------------------------------------------------------------
+
+Value = int | bytes  # a varint; the bytes of a message, a text or a number of fixed size
+Place = tuple[int, ...]  # numbers of fields, from the outermost message to the innermost
+_VARINT, _FIXED_64, _BYTES, _FIXED_32 = 0, 1, 2, 5
+
+
+def field_at(message: bytes, place: Place) -> Value | None:
+    """Return the field at a place in nested messages; None if it is left out.
+
+    Raises:
+        ValueError: the message is damaged.
+    """
+    for depth, number in enumerate(place, 1):
+        found: Value | None = None
+        for there, value in fields_of(message):
+            if there == number:
+                found = value
+        if depth == len(place) or not isinstance(found, bytes):
+            return found if depth == len(place) else None
+        message = found
+    return None
+
+
+def fields_of(message: bytes) -> Iterator[tuple[int, Value]]:
+    """Yield number and value of each field of a message of protobuf ("Encoding", protobuf.dev).
+
+    Raises:
+        ValueError: it breaks off, or has a type of the wire that is not in use.
+    """
+    place = 0
+    while place < len(message):
+        key, place = _varint(message, place)
+        kind = key & 7
+        if kind == _VARINT:
+            value: Value
+            value, place = _varint(message, place)
+            yield key >> 3, value
+            continue
+        if kind == _BYTES:
+            size, place = _varint(message, place)
+        elif kind in {_FIXED_64, _FIXED_32}:
+            size = 8 if kind == _FIXED_64 else 4
+        else:
+            raise ValueError(f"type {kind}")
+        if place + size > len(message):
+            raise ValueError("breaks off")
+        yield key >> 3, message[place : place + size]
+        place += size
+
+
+def _varint(message: bytes, place: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        if place >= len(message):
+            raise ValueError("breaks off")
+        byte = message[place]
+        place += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, place
+    raise ValueError("a number of more than 64 bits")
+
+
+def signed_number(value: int) -> int:
+    """Return the number of an int32 or int64, whose negative ones take 64 bits."""
+    value &= 2**64 - 1
+    return value - 2**64 if value >= 2**63 else value
+
+
+def real_number(value: Value | None) -> float:
+    """Return a float or double; 0 where it is left out.
+
+    Raises:
+        ValueError: the field has another type.
+    """
+    if value is None:
+        return 0.0
+    kinds = {4: "<f", 8: "<d"}
+    if not isinstance(value, bytes) or len(value) not in kinds:
+        raise ValueError("is no real number")
+    return float(struct.unpack(kinds[len(value)], value)[0])

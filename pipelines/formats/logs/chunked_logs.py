@@ -33,12 +33,24 @@ from pipelines.formats.logs.recordings import (
     require_content,
 )
 from pipelines.geometry.arrays import Int64
+from pipelines.session.errors import DataError
 
-CHUNK_LIMIT = 1 << 30  # bytes of a chunk, compressed or not: a larger one is taken for damage
+CHUNK_LIMIT = 1 << 28  # bytes of a chunk, compressed or not: a larger one is taken for damage
 _CACHE = 64 << 20  # bytes of chunks kept in memory, for files whose chunks overlap in time
-
+_CACHED = 1000  # chunks, as empty ones have no bytes
+# A small file may inflate to anything. Logs compress to a tenth, black pictures to a hundredth. The stamps of
+# messages differ, so that a message takes a byte at the least.
+_INFLATED = 1 << 30  # bytes of all chunks in any file
+_MOST_EXPANSION = 100  # bytes for one in the file
+_RECORDS = 100_000  # in the chunks of any file; one more for each of its bytes
 
 _KEPT = 16 << 20  # bytes that freed chunks may hold
+RECORD_AGAIN = "no recorder writes this; copy it again from the drone"
+
+
+def inflated_limit(file_size: int) -> int:
+    """Return the most bytes to which a compressed log may inflate."""
+    return max(_INFLATED, _MOST_EXPANSION * file_size)
 
 
 @dataclass
@@ -84,6 +96,8 @@ class ChunkedPart(LogPart):
         self.chunks: list[Chunk] = []
         self.messages_stated: int | None = None  # by the file's summary
         self._cache: dict[int, memoryview | None] = {}
+        self._cached = 0  # bytes
+        self._records_left = _RECORDS + file_size
         # glibc returns freed memory to the system and gets it again, page by page, for every chunk. Once it
         # has freed a block of this size, it keeps as much (mallopt(3), M_MMAP_THRESHOLD). So ROS 1 chunks
         # of 1 MB are read at 8 GB/s instead of 2.7.
@@ -91,6 +105,7 @@ class ChunkedPart(LogPart):
         try:
             end, closed = self.walk()
             self._note_end(end, closed)
+            self._refuse_bombs()
             self._look_into_chunks(closed)
             self.take(self._table())
             self._compare_with_stated()
@@ -110,6 +125,16 @@ class ChunkedPart(LogPart):
     @abstractmethod
     def look(self, content: memoryview) -> Content:
         """Find the records of a chunk."""
+
+    def count_record(self) -> None:
+        """Count a record that was found in a chunk.
+
+        Raises:
+            DataError: there are more than any recorder can have put into a file of this size.
+        """
+        self._records_left -= 1
+        if self._records_left < 0:
+            raise DataError(self.path, "inflates to more messages than it has bytes", RECORD_AGAIN)
 
     @abstractmethod
     def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
@@ -131,6 +156,7 @@ class ChunkedPart(LogPart):
         """Forget the losses, and free the chunks of the last reading."""
         super().forget()
         self._cache.clear()
+        self._cached = 0
 
     def read(self, rows: Int64) -> Iterator[tuple[int, memoryview]]:
         """Yield the bytes of messages, as views into their chunk."""
@@ -148,7 +174,7 @@ class ChunkedPart(LogPart):
             content = self._content(block)
             if last_of_block[block] == k:
                 # The next chunk then uses the same memory, which is in the processor's cache.
-                del self._cache[block]
+                self._drop(block)
             if content is None:
                 self.lose(int(rows[k]), DAMAGED)
                 continue
@@ -169,7 +195,7 @@ class ChunkedPart(LogPart):
                 continue
             number, places = int(table.block[block_rows[0]]), table.place[block_rows]
             content = self._content(number)
-            del self._cache[number]
+            self._drop(number)
             if content is None:
                 self.lose(block_rows, DAMAGED)
                 continue
@@ -237,10 +263,20 @@ class ChunkedPart(LogPart):
 
     def _content(self, number: int) -> memoryview | None:
         if number not in self._cache:
-            self._cache[number] = self._inflated(self.chunks[number])
-            while len(self._cache) > 1 and sum(len(c or b"") for c in self._cache.values()) > _CACHE:
-                del self._cache[next(iter(self._cache))]
+            content = self._cache[number] = self._inflated(self.chunks[number])
+            self._cached += len(content or b"")
+            while len(self._cache) > 1 and (self._cached > _CACHE or len(self._cache) > _CACHED):
+                self._drop(next(iter(self._cache)))
         return self._cache[number]
+
+    def _drop(self, number: int) -> None:
+        self._cached -= len(self._cache.pop(number) or b"")
+
+    def _refuse_bombs(self) -> None:
+        """Refuse a file whose chunks inflate beyond reason; none is inflated to more than it states."""
+        sizes = [chunk.size for chunk in self.chunks if chunk.size <= CHUNK_LIMIT]
+        if sum(sizes) > inflated_limit(self.file_size):
+            raise DataError(self.path, f"inflates from {self.file_size} to {sum(sizes)} bytes", RECORD_AGAIN)
 
     def _inflated(self, chunk: Chunk) -> memoryview | None:
         if max(chunk.size, chunk.length) > CHUNK_LIMIT:

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace as Fields
-from typing import Self
+from typing import IO, Self
 from xml.etree import ElementTree as ET
 
 from pipelines.formats.common.files import first_bytes
@@ -118,7 +118,7 @@ def _tracks(path: Path, dropped: Counter[str]) -> list[list[_Fix]]:
     tracks: list[list[_Fix]] = []
     try:
         with path.open("rb") as file:
-            for event, element in ET.iterparse(file, events=("start", "end")):  # noqa: S314
+            for event, element in ET.iterparse(_Growing(file), events=("start", "end")):  # noqa: S314
                 name = element.tag.rpartition("}")[2]
                 if event == "start" and name == "trk":
                     tracks.append([])
@@ -134,6 +134,21 @@ def _tracks(path: Path, dropped: Counter[str]) -> list[list[_Fix]]:
             raise DataError(path, f"is no valid XML ({str(error)[:80]})", "export it again") from error
         dropped["file cut off or damaged"] += 1
     return tracks
+
+
+class _Growing:
+    """File that is read in parts as large as all before.
+
+    The parser reads an unfinished tag anew with each part.
+    """
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self.close = file.close
+
+    def read(self, length: int = 0, /) -> bytes:
+        """Return at least `length` bytes; fewer at the end."""
+        return self._file.read(max(length, self._file.tell()))
 
 
 def _fix(point: ET.Element, dropped: Counter[str]) -> _Fix | None:

@@ -144,6 +144,7 @@ class McapPart(ChunkedPart):
                 end = position + _HEAD.size + length
                 if end > len(content):
                     break
+                self.count_record()
                 if kind == _MESSAGE:
                     index.append(_message_row(content, position))
                 elif kind in {_SCHEMA, _CHANNEL}:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 Decoder = Callable[[memoryview | bytes], Any]
 
 MESSAGE_LIMIT = 1 << 28  # bytes of a message that is compressed by itself
+_DEFINITION_LIMIT = 1 << 18  # bytes; the largest of ROS have some 10,000, and the parser is slow
 ARRAY_LIMIT = 1 << 20  # entries of a fixed array; rosbags unrolls arrays of messages into code
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)+", re.ASCII)
 OCTOMAP = "octomap_msgs/msg/Octomap"
@@ -68,7 +69,6 @@ def ros2_name(name: str) -> str:
     return f"{package}/msg/{rest}" if rest and "/" not in rest else name
 
 
-@lru_cache(maxsize=256)
 def decoder(schema: Schema) -> Decoder:
     """Make the function that decodes messages of a schema; it raises ValueError for bytes that do not fit.
 
@@ -80,6 +80,24 @@ def decoder(schema: Schema) -> Decoder:
     Raises:
         ValueError: messages of this schema cannot be decoded; the text gives the reason.
     """
+    found = _decoder_or_reason(schema)
+    if isinstance(found, str):
+        raise ValueError(found)
+    return found
+
+
+@lru_cache(maxsize=256)
+def _decoder_or_reason(schema: Schema) -> Decoder | str:
+    """Return the decoder, or why there is none: also that is found once for the many topics of a type."""
+    try:
+        return _decoder(schema)
+    except ValueError as error:
+        return str(error)
+
+
+def _decoder(schema: Schema) -> Decoder:
+    if len(schema.definition) > _DEFINITION_LIMIT:
+        raise ValueError(f"the definition of {schema.type[:100]} has {len(schema.definition)} bytes")
     if schema.encoding in {"ros1", "cdr"}:
         return _ros_decoder(schema)
     if schema.encoding == "json":

@@ -38,6 +38,7 @@ UNINDEXED = "damaged blocks without an index"
 NOT_FOUND = "messages stated but not found"
 
 _BATCH = 1 << 16  # messages whose places are Python integers at a time: 10 MB
+_MOST_TYPES = 2000  # each takes a millisecond to understand; PX4 has 250
 _HEADS = 4096  # messages whose heads are read at a time
 
 
@@ -75,6 +76,7 @@ class LogPart(ABC):
         self.lost: Counter[str] = Counter()  # losses of the file as a whole
         self.table = _empty_table()
         self._fates: NDArray[np.uint8] = np.zeros(0, np.uint8)
+        self._rows: dict[int, Int64] = {}  # of each channel, in the order of the file
         self._causes = [""]
 
     @abstractmethod
@@ -113,7 +115,16 @@ class LogPart(ABC):
                 yield batch[list(which)], np.array(sizes, np.int64), joined_heads(heads, length)
 
     def take(self, table: MessageTable) -> None:
-        """Keep the table of found messages, without those of undefined channels, which are counted."""
+        """Keep the table of found messages, without those of undefined channels, which are counted.
+
+        Raises:
+            DataError: the channels have more types than any log.
+        """
+        types = len({channel.schema for channel in self.channels.values()})
+        if types > _MOST_TYPES:
+            raise DataError(
+                self.path, f"defines {types} types of messages", "no drone has so many; copy the log again"
+            )
         named = np.isin(table.channel, list(self.channels))
         if strangers := int(np.count_nonzero(~named)):
             self.lost[UNNAMED] += strangers
@@ -126,6 +137,10 @@ class LogPart(ABC):
             )
         self.table = table
         self._fates = np.zeros(len(table.channel), np.uint8)
+        by_channel = np.argsort(table.channel, kind="stable")
+        numbers, first = np.unique(table.channel[by_channel], return_index=True)
+        rows = np.split(by_channel.astype(np.int64), first[1:]) if len(numbers) else []
+        self._rows = dict(zip(numbers.tolist(), rows, strict=True))
 
     def lose(self, rows: Int64 | int, cause: str) -> None:
         """Note why messages could not be read; a second reading counts them once only."""
@@ -145,8 +160,9 @@ class LogPart(ABC):
 
     def rows_of(self, channels: Collection[int]) -> Int64:
         """Return the rows of some channels, in the order of receipt; equal stamps keep the file's order."""
-        rows = np.flatnonzero(np.isin(self.table.channel, list(channels)))
-        return rows[np.argsort(self.table.stamp_ns[rows], kind="stable")].astype(np.int64)
+        found = [rows for channel in dict.fromkeys(channels) if (rows := self._rows.get(channel)) is not None]
+        rows = np.sort(np.concatenate([np.zeros(0, np.int64), *found]))
+        return rows[np.argsort(self.table.stamp_ns[rows], kind="stable")]
 
 
 class OpenLog:
@@ -155,7 +171,8 @@ class OpenLog:
     def __init__(self, parts: Sequence[LogPart], lost: Counter[str]) -> None:
         self.parts = parts
         self._lost = lost
-        keys = {_key(channel) for part in parts for channel in part.channels.values()}
+        self._channels = [_channels_by_key(part) for part in parts]
+        keys = {key for channels in self._channels for key in channels}
         self._topics = {key: self._summary(*key) for key in sorted(keys)}
 
     def __enter__(self) -> OpenLog:
@@ -196,8 +213,7 @@ class OpenLog:
         Raises:
             UnlikeError: the messages of a file are not of one channel and one length.
         """
-        for part in self.parts:
-            channels = _channels_of(part, topic)
+        for part, channels in self._channels_of(topic):
             if len(channels) > 1:
                 raise UnlikeError
             for rows, data in part.read_alike(np.sort(part.rows_of(channels))):
@@ -215,7 +231,7 @@ class OpenLog:
 
     def schemas(self, topic: Topic) -> set[Schema]:
         """Return the schemas of a topic's messages; parts may differ."""
-        return {part.channels[c].schema for part in self.parts for c in _channels_of(part, topic)}
+        return {part.channels[c].schema for part, channels in self._channels_of(topic) for c in channels}
 
     def stamps(self, topic: Topic) -> Int64:
         """Return the stamps of receipt of a topic's messages, sorted."""
@@ -227,18 +243,27 @@ class OpenLog:
 
     def problem(self, topic: Topic) -> str:
         """Return why the messages of a topic cannot be decoded; empty if they can."""
-        for part in self.parts:
-            for channel in _channels_of(part, topic):
-                try:
-                    decoder(part.channels[channel].schema)
-                except ValueError as error:
-                    return str(error)
+        for schema in dict.fromkeys(
+            part.channels[channel].schema
+            for part, channels in self._channels_of(topic)
+            for channel in channels
+        ):
+            try:
+                decoder(schema)
+            except ValueError as error:
+                return str(error)
         return ""
+
+    def _channels_of(self, topic: Topic) -> Iterator[tuple[LogPart, list[int]]]:
+        """Yield the numbers of a topic's channels by part."""
+        key = topic.name, topic.type, topic.encoding
+        for part, channels in zip(self.parts, self._channels, strict=True):
+            yield part, channels.get(key, [])
 
     def _rows_of(self, topic: Topic) -> Iterator[tuple[LogPart, Int64]]:
         """Yield the rows of a topic's messages by part, in the order of receipt."""
-        for part in self.parts:
-            yield part, part.rows_of(_channels_of(part, topic))
+        for part, channels in self._channels_of(topic):
+            yield part, part.rows_of(channels)
 
     def _of_part(self, part: LogPart, topics: frozenset[str]) -> Iterator[Message]:
         decoders = {}
@@ -358,7 +383,11 @@ def describe_log(log: OpenLog) -> dict[str, object]:
     }
     if first is not None and last is not None:
         facts |= {"first_ns": first, "last_ns": last, "span_s": (last - first) / 1e9}
-    facts["topics"] = {_unambiguous(topic, topics): _describe_topic(log, topic) for topic in topics}
+    named = Counter(topic.name for topic in topics)
+    facts["topics"] = {
+        topic.name if named[topic.name] == 1 else f"{topic.name} ({topic.type})": _describe_topic(log, topic)
+        for topic in topics
+    }
     return facts | {f"dropped: {cause}": count for cause, count in log.dropped.items()}
 
 
@@ -380,18 +409,15 @@ def _describe_topic(log: OpenLog, topic: Topic) -> dict[str, object]:
     return facts
 
 
-def _unambiguous(topic: Topic, topics: Sequence[Topic]) -> str:
-    alone = sum(other.name == topic.name for other in topics) == 1
-    return topic.name if alone else f"{topic.name} ({topic.type})"
-
-
 def _key(channel: Channel) -> tuple[str, str, str]:
     return channel.topic, channel.schema.type, channel.schema.encoding
 
 
-def _channels_of(part: LogPart, topic: Topic) -> list[int]:
-    key = topic.name, topic.type, topic.encoding
-    return [number for number, channel in part.channels.items() if _key(channel) == key]
+def _channels_by_key(part: LogPart) -> dict[tuple[str, str, str], list[int]]:
+    found: dict[tuple[str, str, str], list[int]] = {}
+    for number, channel in part.channels.items():
+        found.setdefault(_key(channel), []).append(number)
+    return found
 
 
 def _empty_table() -> MessageTable:

@@ -118,6 +118,7 @@ class _Bag(ChunkedPart):
                 fields, data_at, length = _parse_record(content, position)
                 if data_at + length > len(content):
                     break
+                self.count_record()
                 if fields[b"op"][0] == _MESSAGE:
                     stamp = _stamp(fields)
                     index.append((_U32.unpack(fields[b"conn"])[0], stamp, position))

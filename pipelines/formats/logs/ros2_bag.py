@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -24,6 +23,7 @@ import apsw
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT, RECORD_AGAIN, inflated_limit
 from pipelines.formats.logs.mcap_log import open_mcap
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import (
@@ -62,7 +62,11 @@ _MOST_ATTEMPTS = 10_000  # attempts to continue after damage
 _UNREADABLE = (apsw.Error, UnicodeDecodeError)  # text in a damaged file may be invalid UTF-8
 
 _INFORMATION = "rosbag2_bagfile_information"
-_METADATA_LIMIT = 16 << 20  # bytes of a metadata.yaml
+_METADATA_LIMIT = 2 << 20  # bytes of a metadata.yaml; the parser is slow
+_VIEWS = (
+    "SELECT count(*) FROM sqlite_master WHERE name IN ('messages', 'topics') AND sql NOT LIKE 'CREATE TABLE%'"
+)
+_COPIED = 1 << 20  # bytes of a compressed file at a time
 _SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 
@@ -146,10 +150,14 @@ def _open_compressed(path: Path) -> LogPart:
     with TemporaryDirectory() as folder, source:
         inflated = Path(folder) / path.stem
         whole = True
+        most = inflated_limit(path.stat().st_size)
         with inflated.open("wb") as target:
             try:
                 with ZstdFile(source) as content:
-                    shutil.copyfileobj(content, target)
+                    while part_of := content.read(_COPIED):
+                        target.write(part_of)
+                        if target.tell() > most:
+                            raise DataError(path, f"inflates to more than {most} bytes", RECORD_AGAIN)
             except (ZstdError, EOFError):
                 whole = False
         # The folder is deleted while the part is open, which keeps its file by the handle.
@@ -243,7 +251,9 @@ class Sqlite3Part(LogPart):
         super().__init__(path, file_size)
         self.storage = ["sqlite3"]
         self.database = _connect(database)
+        self.database.limit(apsw.SQLITE_LIMIT_LENGTH, CHUNK_LIMIT)
         try:
+            self._refuse_views(path)
             self._read_topics()
             self.take(self._list_messages())
             self._check_length(database)
@@ -318,6 +328,15 @@ class Sqlite3Part(LogPart):
         except _UNREADABLE:
             pass
         yield from super().read_heads(rows[done:], length)
+
+    def _refuse_views(self, path: Path) -> None:
+        """Refuse a bag whose messages or topics are computed: a view can go on without end."""
+        try:
+            ((views,),) = self.database.execute(_VIEWS).fetchall()
+        except _UNREADABLE:  # the list of tables is damaged
+            return
+        if views:
+            raise DataError(path, "has a view in place of a table", "give the bag that was recorded")
 
     def _query(self, rows: Int64, places: Sequence[int]) -> apsw.Cursor:
         """Query the rows from the first place to the last, of the topics of some messages."""

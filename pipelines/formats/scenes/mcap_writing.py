@@ -4,6 +4,9 @@
 | --- | --- | --- |
 | /skeleton | visualization_msgs/MarkerArray | bones and joints, at every time of the skeleton |
 | /uncertainty | visualization_msgs/MarkerArray | 95 % ellipsoids of the joints, at most 10 times a second |
+| /angles, /angles/sigma | sensor_msgs/JointState | angles of the joints and their standard deviations, rad |
+| /sigma | sensor_msgs/JointState | standard deviations of the joints, per axis, m, in the field `position` |
+| /doubts | rcl_interfaces/Log | what contradicts itself in the flight, as warnings at the beginning |
 | /tf | tf2_msgs/TFMessage | the cameras in `world`, at most 50 times a second |
 | /frustums | visualization_msgs/MarkerArray | the cameras' views, in their own frames, every second |
 | /CAMERA/path | nav_msgs/Path | the camera's path, at most 10 poses a second, written once |
@@ -18,7 +21,7 @@ bytes; frames are written one after the other and are never all in memory.
 
 import heapq
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +43,13 @@ _LINE_LIST, _SPHERE, _SPHERE_LIST = 5, 2, 7
 _DELETE_ALL = {"header": {"frame_id": "world"}, "action": 3}
 _COLOURS = {"left": (0.35, 0.72, 0.96), "right": (1.0, 0.62, 0.36), "": (0.87, 0.89, 0.90)}
 _FLOAT32 = 7
+_WARNING = 30
 
 Entry = tuple[int, str, str, Mapping[str, Any]]  # time, topic, type, fields
 
 
 class McapExport:
-    """Writer of `<name>.mcap`: skeleton, uncertainty, cameras, pictures and map."""
+    """Writer of `<name>.mcap`: skeleton, uncertainty, series of angles and sigmas, doubts, cameras, map."""
 
     name = "mcap"
     title = "a log of ROS 2 messages to look at in Foxglove: skeleton, cameras, map, pictures"
@@ -68,7 +72,7 @@ class McapExport:
                 recording.name, "has times outside of 1970 to 2038, which ROS cannot count", "export csv"
             )
         topics = _topics(list(tracks))
-        streams = [_map(recording, start_ns)]
+        streams = [_map(recording, start_ns), _doubts(recording, start_ns)]
         for name, track in tracks.items():
             lens = recording.lenses.get(name)
             streams += [_path(topics[name], track, start_ns), _transforms(name, track)]
@@ -76,8 +80,9 @@ class McapExport:
                 streams.append(_pictures(recording, name, topics[name], lens, (start_ns, end_ns)))
         streams.append(_frustums(recording.lenses, list(tracks), (start_ns, end_ns)))
         if motion is not None:
-            streams += [_skeleton(motion), _uncertainty(motion)]
+            streams += [_skeleton(motion), _uncertainty(motion), _sigmas(motion)]
             recording.progress.start("Writing mcap", len(motion.t_ns))
+        streams.append(_angles(recording, (start_ns, end_ns)))
         path = folder / f"{safe_file_name(recording.name)}.mcap"
         with Ros2Recording(path) as log:
             for stamp_ns, topic, type_, fields in heapq.merge(*streams, key=lambda entry: entry[0]):
@@ -164,6 +169,47 @@ def _uncertainty(motion: JointMotion) -> Iterator[Entry]:
                     }
                 )
         yield t_ns, "/uncertainty", "visualization_msgs/msg/MarkerArray", {"markers": markers}
+
+
+# --- series: JointState, which Foxglove, PlotJuggler and rqt plot by the names in it ---------------------
+
+
+def _series(
+    t_ns: int, topic: str, names: Sequence[str], people: Sequence[int], values: Sequence[float]
+) -> Entry:
+    """Return one message; the names of other people than the first begin with their number."""
+    labels = [f"{person}/{name}" if person else name for name, person in zip(names, people, strict=True)]
+    fields = {"header": {"stamp": t_ns, "frame_id": ""}, "name": labels, "position": list(values)}
+    return t_ns, topic, "sensor_msgs/msg/JointState", fields
+
+
+def _sigmas(motion: JointMotion) -> Iterator[Entry]:
+    """Yield the standard deviation of each joint that has one: the root mean square of its three axes'."""
+    if motion.covariance is None:
+        return
+    for t_ns, covariance, at in zip(motion.t_ns.tolist(), motion.covariance, motion.position, strict=True):
+        sigma = np.sqrt(covariance[..., [0, 3, 5]].mean(axis=-1))  # xx, yy, zz
+        person, joint = np.nonzero(np.isfinite(sigma) & np.isfinite(at).all(axis=-1))
+        names = [motion.joints[k] for k in joint.tolist()]
+        yield _series(t_ns, "/sigma", names, person.tolist(), sigma[person, joint].tolist())
+
+
+def _angles(recording: Recording, span_ns: tuple[int, int]) -> Iterator[Entry]:
+    """Yield the angles that are known and their standard deviations, in rad as JointState asks for."""
+    table = recording.angles()
+    if table is None:
+        return
+    known = table[np.isfinite(table["value_deg"]) & table["t_ns"].between(*span_ns)]
+    for t_ns, rows in known.groupby("t_ns", sort=True):
+        names, people = rows["angle"].tolist(), rows["person"].tolist()
+        for topic, column in (("/angles", "value_deg"), ("/angles/sigma", "sigma_deg")):
+            yield _series(int(t_ns), topic, names, people, np.radians(rows[column].to_numpy()).tolist())
+
+
+def _doubts(recording: Recording, start_ns: int) -> Iterator[Entry]:
+    for text in recording.doubts():
+        fields = {"stamp": start_ns, "level": _WARNING, "name": "mocap", "msg": text}
+        yield start_ns, "/doubts", "rcl_interfaces/msg/Log", fields
 
 
 # --- the cameras ---------------------------------------------------------------------------------------

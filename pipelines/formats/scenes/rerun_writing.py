@@ -7,6 +7,9 @@
     world/cameras/<camera>            its pose (the refined one if there is one), over time
     world/cameras/<camera>/image      pinhole, and pictures with the skeleton drawn into them (JPEG, 960 px)
     world/paths/<camera>              its path
+    angles/person<k>/<angle>          series in degrees; in `<angle>/sigma` its standard deviation
+    doubts                            what contradicts itself in the flight, as warnings at the beginning
+    sigma/person<k>/<joint>           series of a joint's standard deviation per axis, m
 
 The timeline `time` is the session's own: a date, or seconds if the flight has no date. Missing joints
 are left out. The viewer's pinhole has no distortion, but the pictures keep the lens's distortion.
@@ -19,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, shown_surface, thinned
-from pipelines.geometry.arrays import Int64
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
@@ -34,7 +37,7 @@ _LAST_WITHOUT_DATE_NS = 10**9 * 10**8  # 1973: smaller stamps count from the sta
 
 
 class RerunExport:
-    """Writer of `<name>.rrd`: skeleton, uncertainty, cameras, pictures with the skeleton, and map."""
+    """Writer of `<name>.rrd`: skeleton, uncertainty, series, cameras, pictures with the skeleton, and map."""
 
     name = "rerun"
     title = "a recording to look at in Rerun: skeleton, cameras, map, pictures (extra rerun)"
@@ -59,6 +62,10 @@ class RerunExport:
             recording.progress.advance()
             if motion is not None:
                 _log_people(rr, stream, motion)
+                _log_sigmas(rr, stream, motion)
+            _log_angles(rr, stream, recording)
+            times = [track.t_ns for track in tracks.values()] + ([motion.t_ns] if motion is not None else [])
+            _log_doubts(rr, stream, recording, min(int(t_ns[0]) for t_ns in times if len(t_ns)))
             recording.progress.advance()
             for camera, track in tracks.items():
                 _log_track(rr, stream, camera, track)
@@ -115,6 +122,41 @@ def _log_people(rr: Any, stream: Any, motion: JointMotion) -> None:
                 colors=colours[np.nonzero(stated)[1]],
             ).partition(stated.sum(axis=1)),
         )
+
+
+def _log_sigmas(rr: Any, stream: Any, motion: JointMotion) -> None:
+    """Log the standard deviation of each joint where it is there: root mean square of its axes'."""
+    if motion.covariance is None:
+        return
+    sigma = np.sqrt(motion.covariance[..., [0, 3, 5]].mean(axis=-1))  # xx, yy, zz
+    sigma[~np.isfinite(motion.position).all(axis=-1)] = np.nan
+    for person in range(sigma.shape[1]):
+        for joint, name in enumerate(motion.joints):
+            _log_series(rr, stream, f"sigma/person{person}/{name}", motion.t_ns, sigma[:, person, joint])
+
+
+def _log_angles(rr: Any, stream: Any, recording: Recording) -> None:
+    table = recording.angles()
+    if table is None:
+        return
+    for (person, name), rows in table.groupby(["person", "angle"], sort=True):
+        for entity, column in ((name, "value_deg"), (f"{name}/sigma", "sigma_deg")):
+            values = rows[column].to_numpy()
+            _log_series(rr, stream, f"angles/person{person}/{entity}", rows["t_ns"].to_numpy(), values)
+
+
+def _log_doubts(rr: Any, stream: Any, recording: Recording, start_ns: int) -> None:
+    if texts := recording.doubts():
+        at = np.full(len(texts), start_ns, dtype=np.int64)
+        logged = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
+        stream.send_columns("doubts", [_times(rr, at)], logged)
+
+
+def _log_series(rr: Any, stream: Any, entity: str, t_ns: Int64, values: Float) -> None:
+    """Log the values [N] that are finite."""
+    known = np.isfinite(values)
+    if known.any():
+        stream.send_columns(entity, [_times(rr, t_ns[known])], rr.Scalars.columns(scalars=values[known]))
 
 
 def _log_track(rr: Any, stream: Any, name: str, track: Trajectory) -> None:

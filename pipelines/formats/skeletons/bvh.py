@@ -12,7 +12,6 @@ person who faces the file's +z, with the left hand towards +x, faces the world's
 towards +y.
 """
 
-import math
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +31,9 @@ _CMU_M = 0.0254 / 0.45
 _TALLEST_M, _SMALLEST_M = 2.3, 1.2  # rest poses of adults, from the toes to the top of the head
 AXES = ("y-up", "z-up")
 
+_MOST_BONES = 5000
+_LARGEST = 1e9  # of an angle or a place, in the file's unit: more is damage
+_LONGEST_S = 3600  # of a frame
 _MOST_STRETCH_M = 0.05
 """Largest movement of a bone against its parent, either way, for which its mean position is used."""
 
@@ -255,7 +257,7 @@ def _read(path: Path) -> _Contents:
     lines = tail.split("\n", maxsplit=3) + [""] * 3
     frames = _stated(path, lines[1], "Frames:", first_line + 1)
     frame_time_s = _stated(path, lines[2], "Frame Time:", first_line + 2)
-    if not (frame_time_s > 0 and math.isfinite(frame_time_s)):
+    if not 0 < frame_time_s <= _LONGEST_S:
         raise DataError(path, f"line {first_line + 2}: a frame time of {frame_time_s:g} s", "correct it")
     values = _numbers(path, lines[3], channels, frames, first_line + 3)
     return _Contents(bones, frame_time_s, values)
@@ -264,6 +266,7 @@ def _read(path: Path) -> _Contents:
 def _bones(path: Path, lines: list[str]) -> list[_Bone]:
     """Parse the hierarchy, parents first, in the order of the file."""
     bones: list[_Bone] = []
+    names: set[str] = set()
     open_blocks: list[int | None] = []  # bones, and None for an end site
     coming: int | None = None
     channels = 0
@@ -280,8 +283,11 @@ def _bones(path: Path, lines: list[str]) -> list[_Bone]:
                 above = open_blocks[-1] if open_blocks else None
                 if not name or (above is None) != (word == "ROOT") or (bones and word == "ROOT"):
                     raise _bad_line(path, number, line)
-                if any(bone.name == name for bone in bones):
+                if name in names:
                     raise DataError(path, f"line {number}: a second bone is called {name}", "rename one")
+                if len(bones) >= _MOST_BONES:
+                    raise DataError(path, f"has more than {_MOST_BONES} bones", _EXPORT_AGAIN)
+                names.add(name)
                 bones.append(_Bone(name, -1 if above is None else above, np.zeros(3), [], channels))
                 coming = len(bones) - 1
             elif word == "END" and rest and rest[0].upper() == "SITE":
@@ -338,7 +344,7 @@ def _offset(path: Path, words: list[str], number: int, line: str) -> Float:
         offset = np.array([float(word) for word in words])
     except ValueError as error:
         raise _bad_line(path, number, line) from error
-    if offset.shape != (3,) or not np.isfinite(offset).all():
+    if offset.shape != (3,) or not (np.abs(offset) < _LARGEST).all():
         raise _bad_line(path, number, line)
     return offset
 
@@ -370,7 +376,7 @@ def _numbers(path: Path, body: str, channels: int, frames: float, first_line: in
     except (DeprecationWarning, ValueError):
         values = np.empty(0)
     rows = sum(1 for line in body.split("\n") if line.strip())
-    if not channels or not rows or values.size != rows * channels or not np.isfinite(values).all():
+    if not channels or not rows or values.size != rows * channels or not (np.abs(values) < _LARGEST).all():
         raise _first_bad_frame(path, body, channels, first_line)
     if rows != frames:
         last = first_line + body.rstrip().count("\n")
@@ -396,12 +402,14 @@ def _first_bad_frame(path: Path, body: str, channels: int, first_line: int) -> D
             return DataError(path, f"line {first_line + k} has {len(words)} of {channels} numbers", remedy)
         for word in words:
             try:
-                usable = math.isfinite(float(word))
+                usable = abs(float(word)) < _LARGEST
             except ValueError:
                 usable = False
             if not usable:
                 return DataError(
-                    path, f"line {first_line + k}: {word[:40]!r} is no finite number", _EXPORT_AGAIN
+                    path,
+                    f"line {first_line + k}: {word[:40]!r} is no finite number below {_LARGEST:g}",
+                    _EXPORT_AGAIN,
                 )
     return DataError(path, "holds numbers that cannot be read", _EXPORT_AGAIN)
 

@@ -197,11 +197,13 @@ _JOINTS = {
 
 def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
     """Return our names of known markers; if two markers mean one joint, only the first gets its name."""
-    names: list[str] = []
+    names: dict[str, None] = {}
+    given = []
     for marker in markers:
         joint = _JOINTS.get(marker, marker)
-        names.append(marker if joint in names else joint)
-    return tuple(names)
+        given.append(marker if joint in names else joint)
+        names[given[-1]] = None
+    return tuple(given)
 
 
 # Bones that begin at a joint, without side and separators: Biovision's, Acclaim's, Mixamo's, Blender's names.

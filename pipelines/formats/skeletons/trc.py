@@ -8,6 +8,7 @@ because OpenSim 4.6 ignores blank cells at the end of a line and refuses a file 
 
 import math
 import re
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -96,7 +97,7 @@ def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
         raise DataError(
             path, f"names {len(markers)} markers above {columns} columns of coordinates", "export it again"
         )
-    twice = sorted({marker for marker in markers if markers.count(marker) > 1})
+    twice = sorted(marker for marker, count in Counter(markers).items() if count > 1)
     if twice:
         raise DataError(path, f"names the marker {twice[0]} more than once", "rename one")
     keys = zip(lines[1].split("\t"), lines[2].split("\t"), strict=False)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
 
@@ -13,6 +16,7 @@ from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import VideoIndex
 
+_MOST_PIXELS = 1 << 27  # as of videos
 UNTIMED = "pictures without times"
 """Codec of an index whose stamps only count the pictures, because EXIF has no times or they do not rise."""
 
@@ -87,13 +91,17 @@ class FolderPictures:
     def read(self, number: int) -> Picture | None:
         """Read one picture, BGR, upright by its EXIF; None if it cannot be decoded or has another size."""
         import cv2
+        from PIL import Image
 
         if not 0 <= number < len(self.files):
             return None
         try:
             content = np.fromfile(self.files[number], dtype=np.uint8)
-            picture = cv2.imdecode(content, cv2.IMREAD_COLOR) if len(content) else None
-        except (OSError, cv2.error):
+            # The header tells the size: OpenCV takes gigabytes for a picture of a few bytes.
+            with _silence(), Image.open(self.files[number]) as header:
+                small = math.prod(header.size) <= _MOST_PIXELS
+            picture = cv2.imdecode(content, cv2.IMREAD_COLOR) if small else None
+        except (OSError, ValueError, SyntaxError, cv2.error, Image.DecompressionBombError):
             return None
         if picture is None:
             return None
@@ -106,6 +114,14 @@ class FolderPictures:
             picture = self.read(number)
             if picture is not None:
                 yield number, picture
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep Pillow's warnings of damaged tags and of large pictures off the terminal."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 FORMAT = PictureFolder()

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.stream import VideoStream
 
+_SHORTEST_S = 1e-5  # of a frame: the fastest cameras take 100,000 in a second
 _LATEST_S = 4 * 10**9  # the year 2096, counted from the epoch; int64 ns hold 292 years
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _NO_DATE_BEFORE = timedelta(days=365 * 15)  # 1985: there were no drones
@@ -330,7 +331,7 @@ def _scan(path: Path) -> _Scan:
         ]
         # Only a complete table, like that of MP4, lists frames beyond the file's end.
         lost = {e.pos: e.timestamp for e in stream.index_entries if e.size > 0 and e.pos + e.size > size}
-        tick_s = Fraction(stream.time_base or 0)
+        tick_s, listed = Fraction(stream.time_base or 0), stream.frames
     whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
     first_lost = min(lost.values(), default=0)
@@ -345,6 +346,12 @@ def _scan(path: Path) -> _Scan:
     furthest_s = max(abs(int(ticks[0])), abs(int(ticks[-1]))) * tick_s
     if tick_s <= 0 or furthest_s > _LATEST_S:
         raise DataError(path, f"stamps its frames up to {float(furthest_s):.3g} s", "its header is damaged")
+    shown_s = float((int(ticks[-1]) - int(ticks[0])) * tick_s)
+    # With ticks of a second the edit list, in ticks of its own, ends before most frames.
+    hidden = tick_s >= 1 and 2 * len(ticks) < listed
+    if hidden or shown_s < _SHORTEST_S * (len(ticks) - 1):
+        problem = f"shows {len(ticks)} of its {listed} frames within {shown_s:.3g} s"
+        raise DataError(path, problem, "its time scale is damaged: copy it again, or export it as MP4")
     counts = {
         "cut off": len(lost) + len(stamped) - len(sure),
         "no stamp": len(whole) - len(stamped),

@@ -56,7 +56,7 @@ PACKETS = [
 
 
 def read(monkeypatch: pytest.MonkeyPatch, packets: list[tuple[int, int, bytes]], **choice: str) -> Telemetry:
-    monkeypatch.setattr(gpmf, "_packets", lambda _: iter(packets))
+    monkeypatch.setattr(gpmf, "track_packets", lambda *_: iter(packets))
     return READER.read_telemetry(Path("a.mp4"), TelemetryChoice(**choice))  # type: ignore[arg-type]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from pipelines.session.registries import FORMATS
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
-from tests.synthetic.drone_logs import DroneTruth, drone_of, mavlink, write_tlog
+from tests.synthetic.drone_logs import DroneTruth, drone_of, mavlink, tlog_pictures, write_tlog
 from tests.synthetic.flights import write_flight
 
 
@@ -111,6 +111,51 @@ def test_a_mount_s_angles(tmp_path: Path, truth: DroneTruth) -> None:
     # Without the angle from north, it counts from the nose. Its yaw moves by 1 deg at most in a row.
     heading = np.radians(truth.body_ypr_deg[20:, 0] + 5)
     np.testing.assert_allclose(ahead[20:, 0], np.sin(heading) * 0.75**0.5, atol=0.02)
+
+
+def with_pictures(
+    path: Path, truth: DroneTruth, name: str, clock: Literal["boot", "utc"], **how: int
+) -> Path:
+    path.write_bytes(path.read_bytes() + tlog_pictures(truth, name, clock, **how))
+    return path
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("name", ["CAMERA_TRIGGER", "CAMERA_FEEDBACK"])
+@pytest.mark.parametrize("clock", ["boot", "utc"])
+def test_times_of_pictures(
+    tmp_path: Path, truth: DroneTruth, name: str, clock: Literal["boot", "utc"], version: int
+) -> None:
+    path = with_pictures(write_tlog(tmp_path / "a.tlog", truth), truth, name, clock, version=version)
+    t_ns = FORMAT.picture_times(path, TelemetryChoice())
+    # Whole microseconds, and a clock since boot that is fitted to whole milliseconds.
+    assert np.abs(t_ns - truth.t_ns).max() <= (1_000 if clock == "utc" else 1_000_000)
+    if clock == "boot":
+        boot = FORMAT.picture_times(path, TelemetryChoice(time="boot"))
+        assert boot.tolist() == (truth.boot_us * 1000).tolist()
+    else:
+        with refuses(path, "time: boot"):
+            FORMAT.picture_times(path, TelemetryChoice(time="boot"))
+
+
+def test_without_gps_time_pictures_follow_the_station_s_clock(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_tlog(tmp_path / "a.tlog", truth, gps_time=False)
+    with_pictures(path, truth, "CAMERA_TRIGGER", "boot")
+    late_ns = FORMAT.picture_times(path, TelemetryChoice()) - truth.t_ns
+    assert np.abs(late_ns - 4_000_000_000).max() < 1_500_000
+
+
+def test_pictures_that_cannot_be_counted(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_tlog(tmp_path / "a.tlog", truth)
+    with refuses(path, "CAMERA_FEEDBACK", "CAMERA_TRIGGER"):
+        FORMAT.picture_times(path, TelemetryChoice())
+    with_pictures(path, truth, "CAMERA_FEEDBACK", "utc", lost=3)
+    with refuses(path, 1, 300, 300 + len(truth.t_ns) - 1):
+        FORMAT.picture_times(path, TelemetryChoice())
+    without = write_tlog(tmp_path / "b.tlog", truth)
+    without.write_bytes(without.read_bytes() + mavlink("CAMERA_TRIGGER", 0, 1, stamp_ns=int(truth.t_ns[0])))
+    with refuses(without):
+        FORMAT.picture_times(without, TelemetryChoice())
 
 
 def test_several_vehicles_are_asked_for(tmp_path: Path, truth: DroneTruth) -> None:

@@ -19,6 +19,7 @@ from tests.synthetic.video_tracks import (
     djmd_messages,
     klv_packet,
     klv_packets,
+    parrot_messages,
     parrot_records,
     proto,
     write_djmd,
@@ -131,8 +132,45 @@ def test_parrots_records_without_a_fix_or_cut_off_are_counted(tmp_path: Path, tr
     telemetry = PARROT.read_telemetry(path, TelemetryChoice())
     assert list(telemetry.dropped.values()) == [1, 1]
     assert len(telemetry.position.t_ns) == len(records) - 2
-    with refuses(write_djmd(tmp_path / "b.mp4", truth), "P2"):
+    with refuses(write_djmd(tmp_path / "b.mp4", truth)):
         PARROT.read_telemetry(tmp_path / "b.mp4", TelemetryChoice())
+
+
+@pytest.mark.parametrize(("utc", "sea"), [(True, True), (False, False)])
+def test_parrots_messages_of_protobuf(tmp_path: Path, truth: DroneTruth, utc: bool, sea: bool) -> None:
+    messages = parrot_messages(truth, utc=utc, sea=sea)
+    path = write_track(tmp_path / "P.MP4", messages, codec="bin_data", made_s=1_700_000_123)
+    assert [DJI.recognises(path), MISB.recognises(path), PARROT.recognises(path)] == [False, False, True]
+    telemetry = PARROT.read_telemetry(path, TelemetryChoice())
+    # UTC is whole microseconds; the track's own times are ticks of 1/90000 s.
+    expected_ns = truth.t_ns if utc else truth.t_ns - truth.t_ns[0] + 1_700_000_123 * 10**9
+    np.testing.assert_allclose(telemetry.position.t_ns, expected_ns, rtol=0, atol=1000 if utc else 6000)
+    np.testing.assert_allclose(telemetry.position.values[:, :2], places(truth), rtol=0, atol=1e-12)
+    height = truth.altitude_m + (0 if sea else 47)
+    np.testing.assert_allclose(telemetry.position.values[:, 2], height, rtol=0, atol=1e-9)
+    assert telemetry.position.height == ("sea level" if sea else "ellipsoid")
+    assert telemetry.body is not None
+    assert telemetry.gimbal is not None
+    alike = np.abs((telemetry.body.quaternion_xyzw * truth.body).sum(axis=1))
+    np.testing.assert_allclose(alike, 1, rtol=0, atol=1e-6)  # single precision
+    facts = PARROT.describe(path)
+    assert (facts["version"], facts["records"]) == ("protobuf", len(truth.t_ns))
+    assert facts.get("video_began_s") == (pytest.approx(truth.t_ns[0] / 1e9, abs=1e-3) if utc else None)
+    pitch = truth.gimbal_ypr_deg[:, 1]
+    assert facts["view_pitch_deg"] == pytest.approx([pitch.min(), pitch.max()], abs=0.02)
+
+
+def test_parrots_messages_without_a_place_a_time_or_an_end(tmp_path: Path, truth: DroneTruth) -> None:
+    messages = parrot_messages(truth)
+    without = proto(2, proto(3, proto(1, 1.0)))  # a view and nothing else
+    messages[4], messages[5] = (messages[4][0], without), (messages[5][0], messages[5][1][:40])
+    path = write_track(tmp_path / "P.MP4", messages, codec="bin_data")
+    telemetry = PARROT.read_telemetry(path, TelemetryChoice())
+    assert list(telemetry.dropped.values())[:2] == [1, 1]
+    assert len(telemetry.position.t_ns) == len(truth.t_ns) - 2
+    assert telemetry.gimbal is not None
+    # The message without a time is where the video has it.
+    np.testing.assert_allclose(telemetry.gimbal.t_ns[3], truth.t_ns[3], rtol=0, atol=12_000)
 
 
 @pytest.mark.parametrize("name", ["film.ts", "film.klv"])

@@ -25,6 +25,7 @@ from tests.formats.exported import (
     START_NS,
     VOXEL_M,
     Listener,
+    angles_of_two,
     flown,
     recording,
     stamps,
@@ -68,6 +69,7 @@ def test_the_mcap_reader_finds_every_topic_with_a_schema_that_parses(log: Path) 
         "/cam_1/image/compressed": 4,
         "/skeleton": 60,
         "/uncertainty": 20,
+        "/sigma": 60,
     }
     assert stamps_ns == sorted(stamps_ns)
     reference = get_typestore(Stores.ROS2_HUMBLE)
@@ -95,6 +97,30 @@ def test_the_skeleton_is_there_at_its_own_times(log: Path) -> None:
         assert len(joints.points) == 19 - (row == 7)
     # One bone ends in the wrist, which is missing in frame 7.
     assert len(read[6][1].markers[1].points) - len(read[7][1].markers[1].points) == 2
+
+
+def test_sigmas_and_angles_are_series_by_name(tmp_path: Path) -> None:
+    made = recording()
+    assert made.motion is not None
+    (path,) = WRITER.write(replace(made, angles=angles_of_two), tmp_path)
+    (first, both), (second, one) = messages(path, "/angles")
+    assert [first, second] == made.motion.t_ns[:2].tolist()
+    assert (both.name, one.name) == (["left_knee_flexion", "1/left_knee_flexion"], ["left_knee_flexion"])
+    np.testing.assert_allclose(both.position, [np.pi, np.pi / 2], rtol=1e-15)
+    sigmas = [message.position for _, message in messages(path, "/angles/sigma")]
+    np.testing.assert_allclose(np.concatenate(sigmas), [np.pi / 10, np.pi / 20, np.nan], rtol=1e-15)
+    read = messages(path, "/sigma")
+    assert [len(message.name) for _, message in read] == [17 - (row == 7) for row in range(60)]
+    # The root mean square of the three axes.
+    np.testing.assert_allclose(read[0][1].position, np.sqrt(np.mean(np.square(SIGMA_M))), rtol=1e-12)
+
+
+def test_doubts_are_warnings_at_the_beginning(tmp_path: Path) -> None:
+    (path,) = WRITER.write(replace(recording(), doubts=lambda: ["one", "two"]), tmp_path)
+    read = messages(path, "/doubts")
+    assert [(stamp, entry.level, entry.msg) for stamp, entry in read] == [
+        (START_NS, entry.WARN, text) for (_, entry), text in zip(read, ["one", "two"], strict=True)
+    ]
 
 
 def test_ellipsoids_hold_95_percent(log: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ from pipelines.formats.scenes import rerun_writing
 from pipelines.session import registries
 from pipelines.session.errors import DataError
 from pipelines.session.registries import Export
-from tests.formats.exported import LENS, SIGMA_M, flown, recording, stamps
+from tests.formats.exported import LENS, SIGMA_M, angles_of_two, flown, recording, stamps
 
 rerun_chunk = pytest.importorskip("rerun.chunk", reason="the extra rerun is not installed")
 WRITER: Export = rerun_writing.EXPORT
@@ -22,8 +25,12 @@ FLOAT32 = 2.0**-24
 @pytest.fixture(scope="module")
 def chunks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
     """Return record batches by entity."""
-    (path,) = WRITER.write(recording(), tmp_path_factory.mktemp("rerun"))
+    made = replace(recording(), angles=angles_of_two, doubts=lambda: ["one", "two"])
+    (path,) = WRITER.write(made, tmp_path_factory.mktemp("rerun"))
     assert path.name == "Mound_walk.rrd"
+    verify = [sys.executable, "-m", "rerun_cli", "rrd", "verify", str(path)]
+    done = subprocess.run(verify, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr
     found: dict[str, list[Any]] = {}
     for chunk in rerun_chunk.RrdReader(str(path)).stream():
         found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
@@ -34,6 +41,23 @@ def column(chunks: dict[str, list[Any]], entity: str, name: str) -> list[Any]:
     """Return a column of an entity, row by row."""
     batches = [batch for batch in chunks[entity] if name in batch.schema.names]
     return [row for batch in batches for row in batch.column(name).to_pylist()]
+
+
+def test_sigmas_and_angles_are_series(chunks: dict[str, list[Any]]) -> None:
+    name = "Scalars:scalars"
+    knee = "/angles/person0/left_knee_flexion"
+    assert column(chunks, knee, name) == [[180.0], [60.0]]
+    assert column(chunks, f"{knee}/sigma", name) == [[18.0]]
+    assert column(chunks, knee.replace("person0", "person1"), name) == [[90.0]]
+    assert not any("hip_flexion" in entity for entity in chunks)
+    wrist = column(chunks, "/sigma/person0/left_wrist", name)
+    assert len(wrist) == 59  # it is missing in frame 7
+    np.testing.assert_allclose(wrist, np.sqrt(np.mean(np.square(SIGMA_M))), rtol=1e-12)
+
+
+def test_doubts_are_warnings(chunks: dict[str, list[Any]]) -> None:
+    assert column(chunks, "/doubts", "TextLog:text") == [["one"], ["two"]]
+    assert column(chunks, "/doubts", "TextLog:level") == [["WARN"], ["WARN"]]
 
 
 def test_joints_and_ellipsoids_come_back(chunks: dict[str, list[Any]]) -> None:

@@ -1,0 +1,1355 @@
+"""Crafted inputs: small files that ask for much time or memory, or state absurd numbers, in classes.
+
+Each class is a generator of inputs. An input is written into an empty folder, and one entry of it is read.
+"""
+
+from __future__ import annotations
+
+import bz2
+import json
+import shutil
+import sqlite3
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from backports import zstd
+from ruamel.yaml import YAML
+
+from pipelines.ingest import ingest
+from pipelines.reconstruct import reconstruct
+from tests.commands.runner import as_if_written
+from tests.formats.calibrations import test_anipose_toml
+from tests.formats.maps import test_octomap
+from tests.synthetic import drone_logs, video_tracks, videos
+from tests.synthetic.flights import write_flight
+
+MB = 1 << 20
+Writer = Callable[[Path], object]
+
+
+@dataclass(frozen=True)
+class Crafted:
+    """One input."""
+
+    kind: str
+    what: str
+    stated: str  # the format that a user names
+    write: Writer  # into an empty folder
+    entry: str  # the path in that folder to read
+
+
+_Input = tuple[str, str, str, Writer | bytes | str]
+"""What it is, the stated format, the entry, and its content or writer."""
+
+KINDS: dict[str, Callable[[], Iterable[_Input]]] = {}
+
+
+def _kind(name: str) -> Callable[[Callable[[], Iterable[_Input]]], Callable[[], Iterable[_Input]]]:
+    def register(make: Callable[[], Iterable[_Input]]) -> Callable[[], Iterable[_Input]]:
+        KINDS[name] = make
+        return make
+
+    return register
+
+
+def crafted(kinds: Collection[str] | None = None) -> Iterator[Crafted]:
+    """Yield all inputs, class by class; nothing is written yet, and large contents are made one at a time.
+
+    Args:
+        kinds: the classes; all by default.
+    """
+    for kind in kinds or KINDS:
+        make = KINDS[kind]
+        for what, stated, entry, content in make():
+            write = content if callable(content) else _writer(entry, content)
+            yield Crafted(kind, what, stated, write, entry)
+
+
+def _writer(entry: str, content: bytes | str) -> Writer:
+    data = content.encode("utf-8", "surrogateescape") if isinstance(content, str) else content
+    return lambda folder: (folder / entry).write_bytes(data)
+
+
+# --- MCAP ----------------------------------------
+
+_MCAP = b"\x89MCAP0\r\n"
+
+
+def _op(kind: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", kind, len(content)) + content
+
+
+def _text(value: str) -> bytes:
+    return struct.pack("<I", len(value.encode())) + value.encode()
+
+
+def _schema(number: int, name: str, definition: bytes, encoding: str = "ros2msg") -> bytes:
+    head = struct.pack("<H", number) + _text(name) + _text(encoding)
+    return _op(3, head + struct.pack("<I", len(definition)) + definition)
+
+
+def _channel(number: int, schema: int, topic: str, encoding: str = "cdr") -> bytes:
+    return _op(4, struct.pack("<HH", number, schema) + _text(topic) + _text(encoding) + bytes(4))
+
+
+def _message(channel: int, stamp: int, data: bytes = b"\0\1\0\0\1\0\0\0\0") -> bytes:
+    return _op(5, struct.pack("<HIQQ", channel, 0, stamp, stamp) + data)
+
+
+def _chunk(content: bytes, compression: str = "", size: int | None = None) -> bytes:
+    stated = 0 if size is None else size
+    head = struct.pack("<QQQI", 0, 0, stated, 0) + _text(compression)
+    return _op(6, head + struct.pack("<Q", len(content)) + content)
+
+
+def _index(channel: int, rows: Iterable[tuple[int, int]]) -> bytes:
+    content = b"".join(struct.pack("<QQ", *row) for row in rows)
+    return _op(7, struct.pack("<HI", channel, len(content)) + content)
+
+
+def _mcap(*records: bytes, closed: bool = True) -> bytes:
+    end = _op(15, bytes(4)) + _op(2, bytes(20)) + _MCAP if closed else b""
+    return _MCAP + _op(1, _text("ros2") + _text("test")) + b"".join(records) + end
+
+
+_STRING = _schema(1, "std_msgs/msg/String", b"string data")
+
+
+@_kind("MCAP: many channels")
+def _mcap_channels() -> Iterator[_Input]:
+    n = 60_000
+    topics = b"".join(_channel(k, 1, f"/topic{k}") for k in range(n))
+    yield "60,000 topics", "mcap", "a.mcap", _mcap(_STRING, topics)
+    messages = b"".join(_message(k, k) for k in range(n))
+    yield "60,000 topics with a message each", "mcap", "a.mcap", _mcap(_STRING, topics, messages)
+    one = b"".join(_channel(k, 1, "/topic") for k in range(n))
+    yield "60,000 channels of one topic", "mcap", "a.mcap", _mcap(_STRING, one, messages)
+    schemas = b"".join(
+        _schema(k + 1, f"a/msg/T{k}", b"float64 x\n") + _channel(k, k + 1, f"/t{k}") for k in range(n)
+    )
+    yield "60,000 types", "mcap", "a.mcap", _mcap(schemas, messages)
+    inside = _STRING + topics + messages
+    yield "60,000 topics in a chunk", "mcap", "a.mcap", _mcap(_chunk(inside, size=len(inside)))
+    other = b"".join(_channel(k, 0, f"/t{k}", "none" + str(k)) for k in range(n))
+    yield "60,000 unknown encodings", "mcap", "a.mcap", _mcap(other, messages)
+
+
+@_kind("MCAP: inflated chunks")
+def _mcap_bombs() -> Iterator[_Input]:
+    for name, press in (("zstd", zstd.compress), ("lz4", lz4.frame.compress)):
+        large = press(bytes(1000 * MB))
+        yield f"{name}, 1,000 MB of zeros", "mcap", "a.mcap", _mcap(_chunk(large, name, 1000 * MB))
+        yield f"{name}, states 100 bytes", "mcap", "a.mcap", _mcap(_chunk(large, name, 100))
+        yield f"{name}, states 2^63", "mcap", "a.mcap", _mcap(_chunk(large, name, 2**63))
+        body = _STRING + _channel(1, 1, "/a") + _message(1, 1, bytes(900 * MB))
+        yield f"{name}, one message of 900 MB", "mcap", "a.mcap", _mcap(_chunk(press(body), name, len(body)))
+        some = press(bytes(60 * MB))
+        yield f"{name}, 400 times 60 MB", "mcap", "a.mcap", _mcap(*[_chunk(some, name, 60 * MB)] * 400)
+    messages = _STRING + _channel(1, 1, "/a") + _message(1, 1) * 1_500_000
+    pressed = zstd.compress(messages)
+    yield "zstd, 1,500,000 messages", "mcap", "a.mcap", _mcap(_chunk(pressed, "zstd", len(messages)))
+
+
+@_kind("MCAP: chunks and indices")
+def _mcap_indices() -> Iterator[_Input]:
+    head = _STRING + _channel(1, 1, "/a")
+    body = head + _message(1, 1)
+    rows = [(1, len(head))] * 1_000_000
+    yield "300,000 empty chunks", "mcap", "a.mcap", _mcap(*[_chunk(b"")] * 300_000)
+    yield (
+        "1,000,000 rows for one message",
+        "mcap",
+        "a.mcap",
+        _mcap(_chunk(body, size=len(body)), _index(1, rows)),
+    )
+    empty = _index(1, []) * 300_000
+    yield "300,000 empty indices", "mcap", "a.mcap", _mcap(_chunk(body, size=len(body)), empty)
+    far = _index(1, [(2**63 - 1, 2**63 - 1)])
+    yield "places of 2^63 - 1", "mcap", "a.mcap", _mcap(_chunk(body, size=len(body)), far)
+    late = _index(1, [(2**64 - 1, 0)])
+    yield "stamps of 2^64 - 1", "mcap", "a.mcap", _mcap(_chunk(body, size=len(body)), late)
+    yield "500,000 unknown records", "mcap", "a.mcap", _mcap(head, _op(99, b"") * 500_000, _message(1, 1))
+    yield "a record of 2^63 bytes", "mcap", "a.mcap", _mcap(head, struct.pack("<BQ", 5, 2**63), closed=False)
+    count = _op(11, struct.pack("<QHIIIIQQI", 2**64 - 1, 1, 1, 0, 0, 1, 0, 0, 0))
+    yield "2^64 - 1 messages stated", "mcap", "a.mcap", _mcap(head, _message(1, 1), count)
+    mixed = b"".join(_message(1, k) + _op(99, b"") for k in range(200_000))
+    yield "200,000 runs of one message", "mcap", "a.mcap", _mcap(head, mixed)
+
+
+@_kind("messages: definitions")
+def _definitions() -> Iterator[_Input]:
+    def log(definition: str, data: bytes = bytes(64)) -> bytes:
+        return _mcap(
+            _schema(1, "a/msg/A", definition.encode()),
+            _channel(1, 1, "/a"),
+            _message(1, 1, b"\0\1\0\0" + data),
+        )
+
+    rule = "\n" + "=" * 80 + "\nMSG: a/"
+    yield "100,000 fields", "mcap", "a.mcap", log("\n".join(f"float64 x{k}" for k in range(100_000)))
+    deep = "B0 x" + "".join(f"{rule}B{k}\nB{k + 1} x" for k in range(2000)) + f"{rule}B2000\nfloat64 x"
+    yield "2,000 types deep", "mcap", "a.mcap", log(deep)
+    wide = "B0[10] x" + "".join(f"{rule}B{k}\nB{k + 1}[10] x" for k in range(12)) + f"{rule}B12\nfloat64 x"
+    yield "arrays of arrays, 10^13 numbers", "mcap", "a.mcap", log(wide)
+    shared = _schema(1, "a/msg/A", f"{deep}\nfloat".encode()) + b"".join(
+        _channel(k, 1, f"/t{k}") for k in range(30_000)
+    )
+    yield "30,000 topics of one faulty type", "mcap", "a.mcap", _mcap(shared)
+    yield "an array of 10^12", "mcap", "a.mcap", log("float64[1000000000000] x")
+    yield "a type within itself", "mcap", "a.mcap", log("A x")
+    yield "two types within each other", "mcap", "a.mcap", log(f"B x{rule}B\nA x")
+    yield "a sequence of 2^32 - 1", "mcap", "a.mcap", log("float64[] x", b"\xff\xff\xff\xff" + bytes(8))
+    yield "2^32 - 1 empty strings", "mcap", "a.mcap", log("string[] x", b"\xff\xff\xff\xff" + bytes(64))
+    empty = log(f"B[] x{rule}B\n", b"\xff\xff\xff\xff" + bytes(8))
+    yield "2^32 - 1 messages without fields", "mcap", "a.mcap", empty
+    yield "a name of 1 MB", "mcap", "a.mcap", log("float64 " + "x" * MB)
+    bomb = _mcap(_STRING, _channel(1, 1, "/a"), _message(1, 1, zstd.compress(bytes(1000 * MB))))
+    yield "a compressed message of 1,000 MB", "mcap", "a.mcap", bomb
+
+
+@_kind("messages: JSON and protobuf")
+def _other_messages() -> Iterator[_Input]:
+    def log(data: bytes, encoding: str = "json", schema: bytes = b"{}", name: str = "a.A") -> bytes:
+        kind = {"json": "jsonschema", "protobuf": "protobuf"}[encoding]
+        return _mcap(_schema(1, name, schema, kind), _channel(1, 1, "/a", encoding), _message(1, 1, data))
+
+    yield "JSON nested 100,000 deep", "mcap", "a.mcap", log(b"[" * 100_000)
+    yield "JSON with an integer of 100,000 digits", "mcap", "a.mcap", log(b'{"a": ' + b"9" * 100_000 + b"}")
+    schema = b'{"a":' * 50_000 + b"{}" + b"}" * 50_000
+    yield "a JSON schema 50,000 deep", "mcap", "a.mcap", log(b"{}", schema=schema)
+    yield "a protobuf schema of zeros", "mcap", "a.mcap", log(b"", "protobuf", bytes(MB))
+    deep = b""
+    for _ in range(5000):
+        deep = b"\x1a" + _varint(len(deep)) + deep
+    yield (
+        "protobuf types nested deep",
+        "mcap",
+        "a.mcap",
+        log(b"", "protobuf", b"\x0a" + _varint(len(deep)) + deep),
+    )
+
+
+def _varint(value: int) -> bytes:
+    found = bytearray()
+    while value > 127:
+        found.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*found, value])
+
+
+# --- ROS bags ----------------------------------------
+
+
+def _bag_record(fields: dict[str, bytes], data: bytes = b"") -> bytes:
+    parts = [name.encode() + b"=" + value for name, value in fields.items()]
+    header = b"".join(struct.pack("<I", len(part)) + part for part in parts)
+    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
+
+
+def _bag(*records: bytes, chunks: int = 0) -> bytes:
+    head = {"op": b"\3", "index_pos": struct.pack("<Q", 13), "conn_count": bytes(4)}
+    return (
+        b"#ROSBAG V2.0\n" + _bag_record(head | {"chunk_count": struct.pack("<I", chunks)}) + b"".join(records)
+    )
+
+
+def _bag_chunk(content: bytes, compression: str = "none", size: int | None = None) -> bytes:
+    stated = len(content) if size is None else size
+    fields = {"op": b"\5", "compression": compression.encode(), "size": struct.pack("<I", stated)}
+    return _bag_record(fields, content)
+
+
+def _bag_topic(number: int, topic: str, definition: bytes = b"string data") -> bytes:
+    about = {
+        "topic": topic.encode(),
+        "type": b"std_msgs/String",
+        "md5sum": b"*",
+        "message_definition": definition,
+    }
+    data = _bag_record(about)[4:-4]
+    fields = {"op": b"\7", "conn": struct.pack("<I", number), "topic": topic.encode()}
+    return _bag_record(fields, data)
+
+
+def _bag_message(number: int, data: bytes = bytes(4)) -> bytes:
+    return _bag_record({"op": b"\2", "conn": struct.pack("<I", number), "time": bytes(8)}, data)
+
+
+def _bag_index(number: int, rows: bytes) -> bytes:
+    fields = {"op": b"\4", "ver": b"\1\0\0\0", "conn": struct.pack("<I", number)}
+    return _bag_record(fields | {"count": struct.pack("<I", len(rows) // 12)}, rows)
+
+
+@_kind("ROS 1: inflated chunks")
+def _bag_bombs() -> Iterator[_Input]:
+    large = bz2.compress(bytes(1000 * MB))
+    yield "bz2, 1,000 MB of zeros", "ros1", "a.bag", _bag(_bag_chunk(large, "bz2", 1000 * MB))
+    yield "bz2, states 100 bytes", "ros1", "a.bag", _bag(_bag_chunk(large, "bz2", 100))
+    yield "bz2, states 2^32 - 1", "ros1", "a.bag", _bag(_bag_chunk(large, "bz2", 2**32 - 1))
+    some = bz2.compress(bytes(60 * MB))
+    yield "bz2, 100 times 60 MB", "ros1", "a.bag", _bag(_bag_chunk(some, "bz2", 60 * MB) * 100)
+    large = lz4.frame.compress(bytes(1000 * MB))
+    yield "lz4, 1,000 MB of zeros", "ros1", "a.bag", _bag(_bag_chunk(large, "lz4", 1000 * MB))
+    frames = lz4.frame.compress(bytes(1000)) * 100_000
+    yield "lz4, 100,000 frames", "ros1", "a.bag", _bag(_bag_chunk(frames, "lz4", 100_000_000))
+    tail = bz2.compress(_bag_topic(0, "/a") + _bag_message(0) * 1_000_000)
+    size = len(_bag_topic(0, "/a") + _bag_message(0) * 1_000_000)
+    yield "bz2, 1,000,000 messages", "ros1", "a.bag", _bag(_bag_chunk(tail, "bz2", size))
+
+
+@_kind("ROS 1: records")
+def _bag_records() -> Iterator[_Input]:
+    yield "300,000 empty chunks", "ros1", "a.bag", _bag(_bag_chunk(b"") * 300_000, chunks=300_000)
+    bad = _bag_chunk(b"\0", "bz2", 5) * 300_000
+    yield "300,000 damaged chunks", "ros1", "a.bag", _bag(bad, chunks=300_000)
+    small = bz2.compress(_bag_topic(0, "/a") + _bag_message(0))
+    both = _bag_chunk(small, "bz2", len(_bag_topic(0, "/a") + _bag_message(0)))
+    yield "50,000 chunks of a message", "ros1", "a.bag", _bag(both * 50_000, chunks=50_000)
+    topics = b"".join(_bag_topic(k, f"/t{k}") for k in range(60_000))
+    yield "60,000 topics", "ros1", "a.bag", _bag(topics)
+    messages = b"".join(_bag_message(k) for k in range(60_000))
+    yield "60,000 topics with a message each", "ros1", "a.bag", _bag(topics, _bag_chunk(messages))
+    content = _bag_topic(0, "/a") + _bag_message(0)
+    place = struct.pack("<III", 0, 0, len(_bag_topic(0, "/a")))
+    rows = _bag_index(0, place * 1_000_000)
+    yield "1,000,000 rows for one message", "ros1", "a.bag", _bag(_bag_chunk(content), rows, chunks=1)
+    empty = _bag_index(0, b"") * 300_000
+    yield "300,000 empty indices", "ros1", "a.bag", _bag(_bag_chunk(content), empty, chunks=1)
+    fields = struct.pack("<I", 2) + b"a="
+    header = fields * (MB // 6)
+    record = (struct.pack("<I", len(header)) + header + bytes(4)) * 20
+    yield "headers of 170,000 fields", "ros1", "a.bag", _bag(record)
+    topic = _bag_chunk(_bag_topic(0, "/a") * 100_000 + _bag_message(0))
+    first = _bag_index(0, bytes(12) * 1000)
+    yield "an index that points before 100,000 topics", "ros1", "a.bag", _bag(topic, first, chunks=1)
+
+
+@_kind("ROS 2: databases")
+def _databases() -> Iterator[_Input]:
+    topics = (
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,"
+        " offered_qos_profiles TEXT)"
+    )
+    plain = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+    named = "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr', '')"
+
+    def database(*statements: str) -> Writer:
+        def write(folder: Path) -> None:
+            made = sqlite3.connect(folder / "a.db3")
+            with made:
+                for statement in statements:
+                    made.execute(statement)
+            made.close()
+
+        return write
+
+    many = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 60000)"
+    yield (
+        "60,000 topics",
+        "ros2",
+        "a.db3",
+        database(
+            topics,
+            plain,
+            "INSERT INTO topics "  # noqa: S608  # of constants
+            + many
+            + " SELECT i, '/t' || i, 'std_msgs/msg/String', 'cdr', '' FROM n",
+        ),
+    )
+    endless = (
+        "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+        " SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"
+    )
+    yield "a view without end", "ros2", "a.db3", database(topics, named, endless)
+    zeros = "SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, zeroblob(999000000) AS data"
+    yield "a view of 1 GB", "ros2", "a.db3", database(topics, named, f"CREATE VIEW messages AS {zeros}")
+    no_topics = (
+        "CREATE VIEW topics AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS id"
+    )
+    yield (
+        "a view of topics without end",
+        "ros2",
+        "a.db3",
+        database(
+            f"{no_topics}, '/t' || i AS name, 'a/msg/A' AS type, 'cdr' AS serialization_format FROM n", plain
+        ),
+    )
+    yield (
+        "1,000,000 messages",
+        "ros2",
+        "a.db3",
+        database(
+            topics,
+            plain,
+            named,
+            "INSERT INTO messages "  # noqa: S608  # of constants
+            + many.replace("60000", "1000000")
+            + " SELECT i, 1, i, x'000100000100000000' FROM n",
+        ),
+    )
+    yield (
+        "texts in place of numbers",
+        "ros2",
+        "a.db3",
+        database(topics, plain, named, "INSERT INTO messages VALUES (1, '1', 'x', 5), (2, 1, 1e308, NULL)"),
+    )
+    yield (
+        "stamps of 2^63 - 1",
+        "ros2",
+        "a.db3",
+        database(
+            topics,
+            plain,
+            named,
+            "INSERT INTO messages VALUES (1, 1, 9223372036854775807, x'0001'), (2, 1, -5, x'00')",
+        ),
+    )
+    generated = plain.replace("data BLOB", "data BLOB AS (zeroblob(900000000))")
+    yield (
+        "generated columns of 900 MB",
+        "ros2",
+        "a.db3",
+        database(
+            topics,
+            generated,
+            named,
+            "INSERT INTO messages(id, topic_id, timestamp) VALUES (1, 1, 1), (2, 1, 2)",
+        ),
+    )
+
+
+@_kind("ROS 2: folders")
+def _bag_folders() -> Iterator[_Input]:
+    def bag(metadata: str, **files: bytes) -> Writer:
+        def write(folder: Path) -> None:
+            place = folder / "bag"
+            place.mkdir()
+            (place / "metadata.yaml").write_text(metadata, encoding="utf-8")
+            for name, content in files.items():
+                (place / name.replace("__", ".")).write_bytes(content)
+
+        return write
+
+    def stated(names: Iterable[str]) -> str:
+        listed = "".join(f"    - {name}\n" for name in names)
+        return f"rosbag2_bagfile_information:\n  message_count: 1\n  relative_file_paths:\n{listed}"
+
+    log = _mcap(_STRING, _channel(1, 1, "/a"), _message(1, 1))
+    yield (
+        "metadata of 10,000 files",
+        "ros2",
+        "bag",
+        bag(stated(f"{k}.mcap" for k in range(10_000)), a__mcap=log),
+    )
+    yield "one file named 2,000 times", "ros2", "bag", bag(stated(["a.mcap"] * 2000), a__mcap=log)
+    yield "metadata of aliases", "ros2", "bag", bag(_laughs(), a__mcap=log)
+    yield "metadata nested deep", "ros2", "bag", bag("[" * 100_000, a__mcap=log)
+    yield "metadata of 15 MB", "ros2", "bag", bag("a: [" + "1, " * 5_000_000 + "1]", a__mcap=log)
+    bomb = zstd.compress(bytes(4000 * MB))
+    yield "a zstd file of 4 GB", "ros2", "bag", bag(stated(["a.db3.zstd"]), a__db3__zstd=bomb)
+    nested = zstd.compress(zstd.compress(log))
+    yield "zstd in zstd", "ros2", "bag", bag(stated(["a.mcap.zstd.zstd"]), a__mcap__zstd__zstd=nested)
+
+
+# --- YAML, TOML, XML ----------------------------------------
+
+
+def _laughs(levels: int = 9, each: int = 9) -> str:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * each)}]" for k in range(1, levels + 1)]
+    return "\n".join(lines) + "\n"
+
+
+_LENS = (
+    "  camera_model: pinhole\n  distortion_model: none\n  distortion_coeffs: []\n"
+    "  intrinsics: [500, 500, 320, 240]\n  resolution: [640, 480]\n"
+)
+
+
+@_kind("YAML: calibrations")
+def _yaml_calibrations() -> Iterator[_Input]:
+    chain = "".join(f"cam{k}:\n{_LENS}" for k in range(10_000))
+    yield "10,000 cameras", "kalibr", "chain.yaml", chain
+    yield (
+        "5,000 cameras, under 1 MB",
+        "kalibr",
+        "chain.yaml",
+        "".join(f"cam{k}:\n{_LENS}" for k in range(5000)),
+    )
+    aliases = f"cam0: &c\n{_LENS}" + "".join(f"cam{k}: *c\n" for k in range(1, 50_000))
+    yield "50,000 cameras by aliases", "kalibr", "chain.yaml", aliases
+    head = f"cam0:\n{_LENS}"
+    yield "aliases of aliases", "kalibr", "chain.yaml", head + _laughs()
+    keys = ["m0: &m0 {a: 1}"] + [
+        f"m{k}: &m{k} {{<<: [{', '.join([f'*m{k - 1}'] * 9)}]}}" for k in range(1, 9)
+    ]
+    yield "merges of merges", "kalibr", "chain.yaml", head + "\n".join(keys)
+    yield "nested 100,000 deep", "kalibr", "chain.yaml", head + "a: " + "[" * 100_000
+    yield "blocks 700 deep", "kalibr", "chain.yaml", head + "".join(" " * k + "a:\n" for k in range(700))
+    yield "a scalar of 900 kB", "kalibr", "chain.yaml", head + "a: " + "9" * 900_000
+    yield "100,000 anchors", "kalibr", "chain.yaml", head + "".join(f"k{k}: &n{k} 1\n" for k in range(50_000))
+    yield "400,000 short items", "kalibr", "chain.yaml", head + "a: [" + "1," * 400_000 + "1]"
+    yield (
+        "a date with 100,000 digits",
+        "kalibr",
+        "chain.yaml",
+        head + "a: 2001-01-01 00:00:00." + "0" * 100_000,
+    )
+    yield "a sexagesimal number", "kalibr", "chain.yaml", head + "a: 1" + ":59" * 100_000
+    yield "an integer in base 2", "kalibr", "chain.yaml", head + "a: 0b" + "1" * 500_000
+    tags = "".join(f"%TAG !t{k}! tag:x,{k}:\n" for k in range(20_000))
+    yield "20,000 tags", "kalibr", "chain.yaml", tags + "---\n" + head
+    yield "%50,000 questions", "kalibr", "chain.yaml", head + "? " * 50_000
+
+
+@_kind("YAML: flights")
+def _yaml_flights() -> Iterator[_Input]:
+    def flight(change: Callable[[str], str]) -> Writer:
+        def write(folder: Path) -> None:
+            made = write_flight(folder, cameras=1, seconds=0.2)
+            made.manifest.write_text(change(made.manifest.read_text(encoding="utf-8")), encoding="utf-8")
+
+        return write
+
+    def cameras(text: str, count: int) -> str:
+        raw = YAML(typ="safe", pure=True).load(text)
+        one = next(iter(raw["cameras"].values()))
+        raw["cameras"] = {f"drone{k}": one for k in range(count)}
+        return json.dumps(raw)
+
+    yield "10,000 cameras", "", "flight.yaml", flight(lambda text: cameras(text, 10_000))
+    yield "1,000 cameras", "", "flight.yaml", flight(lambda text: cameras(text, 1000))
+    yield "128 cameras", "", "flight.yaml", flight(lambda text: cameras(text, 128))
+    yield "aliases of aliases", "", "flight.yaml", flight(lambda text: text + _laughs())
+    yield "nested 100,000 deep", "", "flight.yaml", flight(lambda text: text + "a: " + "{a: " * 100_000)
+    yield (
+        "30,000 unknown keys",
+        "",
+        "flight.yaml",
+        flight(lambda text: text + "".join(f"key{k}: 1\n" for k in range(30_000))),
+    )
+    yield "a name of 900 kB", "", "flight.yaml", flight(lambda text: text + "name: " + "x" * 900_000)
+    yield "999 kB of blanks", "", "flight.yaml", flight(lambda text: text + " " * 900_000)
+
+
+@_kind("TOML, INI: calibrations")
+def _toml() -> Iterator[_Input]:
+    def cameras(count: int) -> str:
+        return "".join(test_anipose_toml.CAMERA.replace("one", f"cam_{k}") for k in range(count))
+
+    yield "10,000 cameras", "anipose", "calib.toml", cameras(10_000)
+    yield "nested 100,000 deep", "anipose", "calib.toml", cameras(1) + "a = " + "[" * 100_000
+    yield "a key of 100,000 dots", "anipose", "calib.toml", cameras(1) + "a" + ".a" * 100_000 + " = 1\n"
+    yield "an integer of 500,000 digits", "anipose", "calib.toml", cameras(1) + "a = " + "9" * 500_000 + "\n"
+    yield (
+        "40,000 tables",
+        "anipose",
+        "calib.toml",
+        cameras(1) + "".join(f"[a.b.c{k}]\n" for k in range(40_000)),
+    )
+    yield (
+        "an INI of 200,000 keys",
+        "camera_info",
+        "left.ini",
+        "[image]\n" + "".join(f"k{k}\n1\n" for k in range(200_000)),
+    )
+
+
+@_kind("XML")
+def _xml() -> Iterator[_Input]:
+    entities = '<!ENTITY a0 "xxxxxxxxxx">' + "".join(
+        f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 10)
+    )
+    head = '<?xml version="1.0"?>'
+    gpx = '<gpx version="1.1" creator="a"><trk><trkseg>'
+    point = '<trkpt lat="1" lon="2"><ele>3</ele><time>2024-01-01T00:00:0%dZ</time></trkpt>'
+    points = point % 1 + point % 2
+    close = "</trkseg></trk></gpx>"
+    yield (
+        "entities of entities, GPX",
+        "gpx",
+        "a.gpx",
+        (f"{head}<!DOCTYPE gpx [{entities}]>{gpx}<name>&a9;</name>{points}{close}"),
+    )
+    yield (
+        "an external entity, GPX",
+        "gpx",
+        "a.gpx",
+        (f'{head}<!DOCTYPE gpx [<!ENTITY a SYSTEM "file:///dev/zero">]>{gpx}<name>&a;</name>{points}{close}'),
+    )
+    yield "nested 200,000 deep, GPX", "gpx", "a.gpx", head + gpx + "<a>" * 200_000
+    yield "an attribute of 20 MB, GPX", "gpx", "a.gpx", f'{head}{gpx}<a b="{"x" * 20 * MB}"/>{points}{close}'
+    yield (
+        "100,000 attributes, GPX",
+        "gpx",
+        "a.gpx",
+        (f"{head}{gpx}<a {' '.join(f'a{k}=' + chr(34) * 2 for k in range(100_000))}/>{points}{close}"),
+    )
+    huge = points.replace('lat="1"', 'lat="1e308"')
+    yield "1e308 degrees, GPX", "gpx", "a.gpx", head + gpx + huge + close
+    digits = points.replace("<ele>3", "<ele>" + "9" * 100_000)
+    yield "a height of 100,000 digits, GPX", "gpx", "a.gpx", head + gpx + digits + close
+    yield (
+        "300,000 segments, GPX",
+        "gpx",
+        "a.gpx",
+        f"{head}{gpx}{'</trkseg><trkseg>' * 300_000}{points}{close}",
+    )
+    cv = f"{head}<opencv_storage><camera_matrix>"
+    yield "nested 50,000 deep, OpenCV", "opencv", "calib.xml", cv + "<a>" * 50_000
+    matrix = '<?xml version="1.0"?><opencv_storage><camera_matrix type_id="opencv-matrix">'
+    yield (
+        "a matrix of 2^31 rows, OpenCV",
+        "opencv",
+        "calib.xml",
+        (
+            f"{matrix}<rows>2147483647</rows><cols>2147483647</cols><dt>d</dt><data>1</data></camera_matrix>"
+            "</opencv_storage>"
+        ),
+    )
+
+
+# --- keypoints ----------------------------------------
+
+
+@_kind("keypoints: frame numbers")
+def _frame_numbers() -> Iterator[_Input]:
+    def person(image: object) -> dict[str, object]:
+        return {"image_id": image, "category_id": 1, "keypoints": [100.0, 100.0, 0.9] * 17, "score": 2.0}
+
+    def flight(people: list[dict[str, object]]) -> Writer:
+        def write(folder: Path) -> None:
+            write_flight(folder, cameras=2, seconds=0.2)
+            (folder / "drone1.json").write_text(json.dumps(people), encoding="utf-8")
+
+        return write
+
+    for number in (5_000_000, 10**9, 10**15, 2**62 - 1):
+        yield f"the only frame is {number:,}", "", "flight.yaml", flight([person(f"{number}.jpg")])
+        both = [person("0.jpg"), person(f"{number}.jpg")]
+        yield f"frames 0 and {number:,}", "", "flight.yaml", flight(both)
+    yield "frame 5,000,000 alone, read", "alphapose", "a.json", json.dumps([person("5000000.jpg")])
+    yield "frame -5,000,000", "coco", "a.json", json.dumps([person(-5_000_000)])
+    yield "frame 1e300", "coco", "a.json", json.dumps([person(1e300)])
+
+
+@_kind("keypoints: JSON")
+def _keypoint_json() -> Iterator[_Input]:
+    person = {"image_id": "0.jpg", "category_id": 1, "keypoints": [100.0, 100.0, 0.9] * 17, "score": 2.0}
+    text = json.dumps(person)
+    yield "30,000 people in a frame", "alphapose", "a.json", "[" + ",".join([text] * 30_000) + "]"
+    yield "nested 1,000,000 deep", "alphapose", "a.json", "[" * 1_000_000
+    yield (
+        "an integer of 1,000,000 digits",
+        "alphapose",
+        "a.json",
+        f"[{text[:-1]}, {chr(34)}idx{chr(34)}: {'9' * 10**6}}}]",
+    )
+    long = json.dumps(person | {"keypoints": [1.0] * 3_000_000})
+    yield "1,000,000 keypoints in a person", "alphapose", "a.json", f"[{long}]"
+    yield "a key of 20 MB", "coco", "a.json", f'[{{"{"x" * 20 * MB}": 1}}]'
+    yield "2,000,000 empty lists", "mmpose", "a.json", '{"instance_info": [' + "[]," * 2_000_000 + "[]]}"
+    deep: object = 1.0
+    for _ in range(60):
+        deep = [deep]
+    yield (
+        "keypoints of 60 dimensions",
+        "coco",
+        "a.json",
+        json.dumps([person | {"image_id": 1, "keypoints": deep}]),
+    )
+    yield (
+        "coordinates of 1e308",
+        "coco",
+        "a.json",
+        json.dumps([person | {"image_id": 1, "keypoints": [1e308] * 51}]),
+    )
+
+    def folder_of(files: int, content: str) -> Writer:
+        def write(folder: Path) -> None:
+            (folder / "drone").mkdir()
+            for k in range(files):
+                (folder / "drone" / f"a_{k:012d}_keypoints.json").write_text(content, encoding="utf-8")
+
+        return write
+
+    yield (
+        "10,000 files without people",
+        "openpose",
+        "drone",
+        folder_of(10_000, '{"version": 1.3, "people": []}'),
+    )
+    yield (
+        "one file, 30,000 people",
+        "openpose",
+        "drone",
+        folder_of(
+            1, json.dumps({"version": 1.3, "people": [{"pose_keypoints_2d": [1.0, 2.0, 0.5] * 25}] * 30_000})
+        ),
+    )
+
+
+# --- text tables ----------------------------------------
+
+
+@_kind("text tables")
+def _tables() -> Iterator[_Input]:
+    row = "1700000000.0 0 0 0 0 0 0 1\n"
+    for name, entry, good in (
+        ("tum", "a.tum", row),
+        ("kitti", "00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"),
+        ("csv", "poses.csv", "t_ns,x,y,z,qw,qx,qy,qz\n1,0,0,0,1,0,0,0\n"),
+    ):
+        separator = "," if name == "csv" else " "
+        yield f"{name}: a line of 30 MB", name, entry, good + (f"1{separator}") * (15 * MB)
+        yield f"{name}: a number of 1,000,000 digits", name, entry, good + "9" * 1_000_000 + good[1:]
+        yield f"{name}: 1e308", name, entry, good + good.splitlines()[-1].replace("0", "1e308") + "\n"
+        yield f"{name}: 10 MB of line ends", name, entry, good + "\n" * (10 * MB)
+    yield "csv: 200,000 columns", "csv", "poses.csv", ",".join(f"c{k}" for k in range(200_000)) + "\n"
+    yield "csv: an open quote over 20 MB", "csv", "poses.csv", 't_ns,x\n1,"' + "a\n" * (10 * MB)
+    joints = "t_ns,person,joint,x,y,z\n"
+    many = "".join(f"{k},0,joint{k},0,0,0\n" for k in range(20_000))
+    yield "joints: 20,000 joints at 20,000 times", "joints_csv", "joints.csv", joints + many
+    people = "".join(f"{k},{k},nose,0,0,0\n" for k in range(20_000))
+    yield "joints: 20,000 people at 20,000 times", "joints_csv", "joints.csv", joints + people
+    yield (
+        "joints: person 10^12",
+        "joints_csv",
+        "joints.csv",
+        joints + f"1,{10**12},nose,0,0,0\n2,0,nose,0,0,0\n",
+    )
+    yield "frame times: frame 10^15", "frame_times", "f.csv", f"frame,t_ns\n0,1\n{10**15},2\n"
+    yield "frame times: frame 5,000,000", "frame_times", "f.csv", "frame,t_ns\n0,1\n5000000,2\n"
+    wide = ",".join(
+        ["time(millisecond)", "datetime(utc)", "latitude", "longitude"] + [f"c{k}" for k in range(10**5)]
+    )
+    yield "DJI record: 100,000 columns", "dji_record", "a.csv", wide + "\n1,2024-01-01 00:00:00,1,2\n"
+
+
+@_kind("skeletons: BVH")
+def _bvh() -> Iterator[_Input]:
+    def motion(head: str, channels: int, frames: int = 1) -> str:
+        return f"{head}MOTION\nFrames: {frames}\nFrame Time: 0.01\n" + ("0 " * channels + "\n") * frames
+
+    root = "HIERARCHY\nROOT r\n{\nOFFSET 0 0 0\nCHANNELS 3 Xrotation Yrotation Zrotation\n"
+    n = 50_000
+    deep = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\n" for k in range(n)) + "}\n" * (n + 1)
+    yield "nested 50,000 deep", "bvh", "a.bvh", motion(root + deep, 3)
+    turned = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\nCHANNELS 1 Xrotation\n" for k in range(n)) + "}\n" * (
+        n + 1
+    )
+    yield "nested 50,000 deep with channels", "bvh", "a.bvh", motion(root + turned, 3 + n)
+    wide = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\n}}\n" for k in range(n)) + "}\n"
+    yield "50,000 bones side by side", "bvh", "a.bvh", motion(root + wide, 3)
+    yield (
+        "10^9 frames stated",
+        "bvh",
+        "a.bvh",
+        motion(root + "}\n", 3).replace("Frames: 1", "Frames: 1000000000"),
+    )
+    yield "2,000,000 frames", "bvh", "a.bvh", motion(root + "}\n", 3, 2_000_000)
+    many = root.replace("CHANNELS 3 Xrotation Yrotation Zrotation", "CHANNELS 90000" + " Xrotation" * 90_000)
+    yield "90,000 channels of a bone", "bvh", "a.bvh", motion(many + "}\n", 90_000)
+    yield (
+        "an offset of 1e308",
+        "bvh",
+        "a.bvh",
+        motion(root + "JOINT a\n{\nOFFSET 1e308 0 0\nJOINT b\n{\nOFFSET 1e308 1e308 0\n}\n}\n}\n", 3),
+    )
+    yield "one line of 500,000 braces", "bvh", "a.bvh", motion(root + "{" * 500_000 + "}" * 500_001, 3)
+    yield "a frame time of 1e300", "bvh", "a.bvh", motion(root + "}\n", 3, 3).replace("0.01", "1e300")
+    sites = "End Site\n{\nOFFSET 0 1 0\n}\n" * 100_000
+    yield "100,000 end sites", "bvh", "a.bvh", motion(root + sites + "}\n", 3)
+
+
+@_kind("skeletons: C3D, TRC, AMC")
+def _skeletons() -> Iterator[_Input]:
+    head = "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n"
+    for markers in (10**9, 2**62):
+        text = f"{head}60\t60\t1\t{markers}\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t0.0\t1\t2\t3\n"
+        yield f"TRC: {markers:,} markers stated", "trc", "a.trc", text
+    names = "\t\t\t".join(f"m{k}" for k in range(20_000))
+    places = "\t".join(f"X{k}\tY{k}\tZ{k}" for k in range(20_000))
+    text = (
+        f"{head}60\t60\t1\t20000\tmm\nFrame#\tTime\t{names}\n\t\t{places}\n\n1\t0.0" + "\t1" * 60_000 + "\n"
+    )
+    yield "TRC: 20,000 markers", "trc", "a.trc", text
+    same = text.replace("m0\t", "m1\t")
+    yield "TRC: a marker twice", "trc", "a.trc", same
+    rate = f"{head}1e-300\t1e308\t1\t1\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t1e308\t1\t2\t3\n"
+    yield "TRC: a time of 1e308", "trc", "a.trc", rate
+    c3d = bytearray(512 * 2)
+    c3d[:2] = b"\x02\x50"
+    struct.pack_into(
+        "<HHHHHfHHf", c3d, 2, 65535, 65535, 1, 65535, 10, -1.0, 3, 4, 1e-30
+    )  # counts, first and last frame
+    c3d[512:516] = b"\0\0\xff\x54"
+    yield "C3D: 65,535 points in 65,535 frames", "c3d", "a.c3d", bytes(c3d)
+    struct.pack_into("<HHHHHf", c3d, 2, 1, 0, 1, 1, 10, -1.0)
+    looped = bytearray(c3d)
+    looped[516:524] = struct.pack("<bbBBhbb", 5, 1, 65, 65, 0, 0, 0)
+    yield "C3D: a parameter that leads to itself", "c3d", "a.c3d", bytes(looped)
+    back = bytearray(c3d)
+    back[516:522] = struct.pack("<bbBBh", 2, 1, 65, 65, -2)
+    yield "C3D: a parameter that leads back", "c3d", "a.c3d", bytes(back)
+    dimensions = bytearray(c3d)
+    dimensions[516 : 516 + 20] = struct.pack(
+        "<bbBBhbB7BB4B", 2, 1, 65, 65, 500, 4, 7, *[255] * 7, 0, 0, 0, 0, 0
+    )
+    yield "C3D: an array of 255^7", "c3d", "a.c3d", bytes(dimensions)
+
+    def acclaim(bones: int, lines: int) -> Writer:
+        def write(folder: Path) -> None:
+            data = "".join(
+                f"begin\nid {k}\nname b{k}\ndirection 0 1 0\nlength 1\naxis 0 0 0 XYZ\n"
+                "dof rx\nlimits (-1 1)\nend\n"
+                for k in range(1, bones + 1)
+            )
+            chain = "".join(
+                f"{a} {b}\n" for a, b in pairwise(["root", *(f"b{k}" for k in range(1, bones + 1))])
+            )
+            (folder / "10.asf").write_text(
+                ":version 1.10\n:name a\n:units\nmass 1\nlength 0.45\nangle deg\n:root\n"
+                "order TX TY TZ RX RY RZ\naxis XYZ\nposition 0 0 0\norientation 0 0 0\n"
+                f":bonedata\n{data}:hierarchy\nbegin\n{chain}end\n",
+                encoding="utf-8",
+            )
+            frame = "root 0 0 0 0 0 0\n" + "".join(f"b{k} 0\n" for k in range(1, bones + 1))
+            (folder / "10_04.amc").write_text(
+                ":FULLY-SPECIFIED\n:DEGREES\n" + "".join(f"{k + 1}\n{frame}" for k in range(lines)),
+                encoding="utf-8",
+            )
+
+        return write
+
+    yield "AMC: 20,000 bones in a chain", "amc", "10_04.amc", acclaim(20_000, 1)
+    yield "AMC: 100,000 frames", "amc", "10_04.amc", acclaim(1, 100_000)
+
+
+# --- tables of sessions ----------------------------------------
+
+_SKELETON, _POSES, _KEYPOINTS = (
+    "reconstruct/skeleton.parquet",
+    "cameras/drone1/poses.parquet",
+    "cameras/drone1/keypoints.parquet",
+)
+
+
+def _session(table: str, change: Callable[[Path], object]) -> Writer:
+    """Write a session with a changed table, which its stage then claims to have written."""
+
+    def write(folder: Path) -> None:
+        made = write_flight(folder / "f", cameras=2, seconds=0.3)
+        session = folder / "a.session"
+        ingest(made.manifest, session)
+        if table.startswith("reconstruct"):
+            reconstruct(session)
+        change(session / table)
+        as_if_written(session, table, "reconstruct" if table.startswith("reconstruct") else "ingest")
+
+    return write
+
+
+@_kind("sessions: large tables")
+def _parquet() -> Iterator[_Input]:
+    def repeated(rows: int) -> Callable[[Path], object]:
+        """Repeat the first row, which takes a few bytes for any number of rows."""
+
+        def change(path: Path) -> None:
+            first = pq.read_table(path).slice(0, 1)
+            part = pa.concat_tables([first]).take(np.zeros(10**6, np.int64))
+            with pq.ParquetWriter(path, first.schema, compression="zstd", use_dictionary=True) as writer:
+                for _ in range(rows // 10**6):
+                    writer.write_table(part, row_group_size=10**6)
+
+        return change
+
+    def wide(path: Path) -> None:
+        table = pq.read_table(path)
+        for k in range(5000):
+            table = table.append_column(f"c{k}", pa.nulls(len(table)))
+        pq.write_table(table, path)
+
+    def text(path: Path) -> None:
+        table = pq.read_table(path)
+        named = pa.array(["x" * 1000 * MB] + [""] * (len(table) - 1))
+        pq.write_table(table.append_column("note", named), path, compression="zstd")
+
+    for name, table in (("poses", _POSES), ("keypoints", _KEYPOINTS), ("joints", _SKELETON)):
+        yield f"50,000,000 equal {name}", "", "a.session", _session(table, repeated(50_000_000))
+    yield "5,000 columns", "", "a.session", _session(_POSES, wide)
+    yield "a text of 1,000 MB", "", "a.session", _session(_POSES, text)
+
+
+@_kind("sessions: absurd numbers")
+def _sessions() -> Iterator[_Input]:
+    def changed(table: str, column: str, value: float) -> Writer:
+        def change(path: Path) -> None:
+            content = pq.read_table(path)
+            place = content.column_names.index(column)
+            field = content.schema.field(place)
+            values = content.column(column).to_numpy().copy()
+            values[len(values) // 2] = value
+            pq.write_table(content.set_column(place, field, pa.array(values, field.type)), path)
+
+        return _session(table, change)
+
+    for value in (1e308, -1e308, float("inf")):
+        yield f"a joint at {value:g} m", "", "a.session", changed(_SKELETON, "x", value)
+        yield f"a camera at {value:g} m", "", "a.session", changed(_POSES, "x", value)
+        yield f"a keypoint at {value:g} px", "", "a.session", changed(_KEYPOINTS, "x", value)
+    yield "a stamp of 2^62 ns", "", "a.session", changed(_SKELETON, "t_ns", 2**62)
+    yield "a pose at 2^62 ns", "", "a.session", changed(_POSES, "t_ns", 2**62)
+    yield "frame 2^62", "", "a.session", changed(_KEYPOINTS, "frame", 2**31 - 1)
+
+
+# --- maps ----------------------------------------
+
+
+@_kind("maps: point clouds")
+def _clouds() -> Iterator[_Input]:
+    pcd = (
+        "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEIGHT 1\n"
+        "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {data}\n"
+    )
+    yield "PCD: 10^12 points", "pcd", "a.pcd", pcd.format(n=10**12, data="binary").encode() + bytes(120)
+    lzf = struct.pack("<II", 3 * 4_000_000, 264 * 4_000_000) + b"\xe0\xff\x00" * 4_000_000
+    yield (
+        "PCD: LZF to 1 GB",
+        "pcd",
+        "a.pcd",
+        pcd.format(n=88_000_000, data="binary_compressed").encode() + lzf,
+    )
+    short = struct.pack("<II", 12, 2**32 - 1) + bytes(12)
+    yield (
+        "PCD: LZF to 2^32 - 1",
+        "pcd",
+        "a.pcd",
+        pcd.format(n=357_913_941, data="binary_compressed").encode() + short,
+    )
+    count = pcd.replace("COUNT 1 1 1", "COUNT 1 1 1000000000000")
+    yield "PCD: a count of 10^12", "pcd", "a.pcd", count.format(n=1, data="ascii") + "1 2 3\n"
+    fields = pcd.replace("x y z", "x y z" + " a" * 5000).replace("4 4 4", "4" + " 4" * 5002)
+    fields = fields.replace("F F F", "F" + " F" * 5002).replace("1 1 1", "1" + " 1" * 5002)
+    yield (
+        "PCD: 5,003 fields",
+        "pcd",
+        "a.pcd",
+        fields.format(n=1000, data="ascii") + ("1 " * 5003 + "\n") * 1000,
+    )
+    far = "\n".join(["0 0 0", "1e308 0 0", "-1e308 1e308 1e38"])
+    yield "PCD: points at 1e308", "pcd", "a.pcd", pcd.format(n=3, data="ascii") + far
+    box = "\n".join(["0 0 0", "9000 9000 9000"])
+    yield "PCD: two points 9 km apart", "pcd", "a.pcd", pcd.format(n=2, data="ascii") + box
+    ply = "ply\nformat {kind} 1.0\nelement vertex {n}\nproperty float x\nproperty float y\nproperty float z\n"
+    yield (
+        "PLY: 10^15 points",
+        "ply",
+        "a.ply",
+        ply.format(kind="binary_little_endian", n=10**15) + "end_header\n",
+    )
+    lists = ply.format(kind="binary_little_endian", n=1) + "property list uint uint a\nend_header\n"
+    yield "PLY: a list of 2^32 - 1", "ply", "a.ply", lists.encode() + bytes(12) + b"\xff" * 4
+    before = "ply\nformat ascii 1.0\nelement face 1000000000\nproperty float a\nelement vertex 1\n"
+    rest = "property float x\nproperty float y\nproperty float z\nend_header\n0\n"
+    yield "PLY: 10^9 faces before", "ply", "a.ply", before + rest
+    many = "".join(f"element e{k} 1\nproperty float a\n" for k in range(1500))
+    yield "PLY: 1,500 elements", "ply", "a.ply", ply.format(kind="ascii", n=1) + many + "end_header\n0 0 0\n"
+    las = bytearray(227 + 40)
+    las[:4] = b"LASF"
+    las[24:26] = b"\1\2"
+    struct.pack_into("<HII", las, 94, 227, 227, 2**32 - 1)
+    struct.pack_into("<BHI", las, 104, 0, 20, 2**32 - 1)
+    struct.pack_into("<dddddd", las, 131, 1e-3, 1e-3, 1e-3, 0, 0, 0)
+    yield "LAS: 2^32 - 1 records and points", "las", "a.las", bytes(las)
+    none = bytearray(las)
+    struct.pack_into("<I", none, 100, 0)
+    struct.pack_into("<BHI", none, 104, 0, 0, 2**32 - 1)
+    yield "LAS: points of no length", "las", "a.las", bytes(none)
+    packed = bytearray(las)
+    struct.pack_into("<I", packed, 100, 0)
+    packed[104] = 128
+    yield "LAZ: 2^32 - 1 points", "las", "a.laz", bytes(packed)
+
+
+@_kind("maps: grids")
+def _grids() -> Iterator[_Input]:
+    def npz(shape: str, data: bytes = b"", kind: str = "<f4", level: int = 9) -> bytes:
+        file = BytesIO()
+        header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}"
+        header = header.ljust((len(header) + 10) // 64 * 64 + 53) + "\n"
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=level) as archive:
+            with archive.open("probability.npy", "w", force_zip64=True) as member:
+                member.write(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header.encode())
+                member.write(data)
+            for name, value in (("origin", np.zeros(3)), ("resolution_m", np.array(0.2))):
+                part = BytesIO()
+                np.save(part, value)
+                archive.writestr(f"{name}.npy", part.getvalue())
+        return file.getvalue()
+
+    yield "npz: 1,000 MB of zeros", "npz", "site.npz", npz("(250, 1000, 1000)", bytes(1000 * 10**6))
+    yield "npz: 2^60 voxels stated", "npz", "site.npz", npz(f"({2**20}, {2**20}, {2**20})")
+    yield "npz: 60 dimensions", "npz", "site.npz", npz("(" + "1, " * 60 + ")", bytes(4))
+    yield "npz: objects", "npz", "site.npz", npz("(1, 1, 1)", b"cos\nsystem\n(S'true'\ntR.", "|O")
+    yield "npz: a header nested deep", "npz", "site.npz", npz("(" * 3000 + ")" * 3000)
+    text = BytesIO()
+    with zipfile.ZipFile(text, "w", zipfile.ZIP_DEFLATED) as archive:
+        for k in range(60_000):
+            archive.writestr(f"a{k}", "")
+        archive.writestr("origin.npy", "")
+        archive.writestr("probability.npy", "")
+    yield "npz: 60,000 members", "npz", "site.npz", text.getvalue()
+
+    def ros(about: str, name: str, picture: bytes) -> Writer:
+        def write(folder: Path) -> None:
+            (folder / "map.yaml").write_text(f"image: {name}\n{about}", encoding="utf-8")
+            (folder / name).write_bytes(picture) if "/" not in name else None
+
+        return write
+
+    about = "resolution: {r}\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    usual = about.format(r=0.05)
+    yield (
+        "map.yaml: 2^31 pixels wide",
+        "ros_map",
+        "map.yaml",
+        ros(usual, "a.pgm", b"P5\n2147483647 2147483647\n255\n\0"),
+    )
+    yield "map.yaml: PNG of 10^9 pixels", "ros_map", "map.yaml", ros(usual, "a.png", _png(31_000, 31_000))
+    yield (
+        "map.yaml: PNG of 400,000,000 pixels",
+        "ros_map",
+        "map.yaml",
+        ros(usual, "a.png", _png(20_000, 20_000)),
+    )
+    yield (
+        "map.yaml: voxels of 1e-300 m",
+        "ros_map",
+        "map.yaml",
+        ros(about.format(r=1e-300), "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"),
+    )
+    yield (
+        "map.yaml: voxels of 1e300 m",
+        "ros_map",
+        "map.yaml",
+        ros(about.format(r=1e300), "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"),
+    )
+    yield "map.yaml: the picture is a device", "ros_map", "map.yaml", ros(usual, "/dev/zero", b"")
+    turned = usual.replace("[0, 0, 0]", "[1e308, -1e308, 0.7]")
+    yield (
+        "map.yaml: an origin of 1e308",
+        "ros_map",
+        "map.yaml",
+        ros(turned, "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"),
+    )
+
+
+def _png(width: int, height: int) -> bytes:
+    def part(kind: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        )
+
+    press = zlib.compressobj(9)
+    row = bytes(width // 8 + 2)  # one bit for a pixel
+    data = b"".join(press.compress(row) for _ in range(height)) + press.flush()
+    head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", data) + part(b"IEND", b"")
+
+
+@_kind("maps: OctoMap")
+def _octomaps() -> Iterator[_Input]:
+    tree = test_octomap.at([7] * 13, [3.5, None, -2.0, [3.5, None] * 4, *[None] * 4])
+    good = test_octomap.file_of(tree)
+    for resolution in ("1e-300", "1e300", "nan", "0", "-0.1"):
+        changed = b"\n".join(
+            b"res " + resolution.encode() if line.startswith(b"res ") else line for line in good.split(b"\n")
+        )
+        yield f"voxels of {resolution} m", "octomap", "a.bt", changed
+    head, _, _ = good.partition(b"data\n")
+    full = struct.pack("<H", 0xFFFF)
+    yield "only inner nodes", "octomap", "a.bt", head + b"data\n" + full * 2_000_000
+    corners = b"\n".join(
+        b"size 999999999999" if line.startswith(b"size ") else line for line in good.split(b"\n")
+    )
+    yield "a size of 10^12", "octomap", "a.bt", corners
+    yield "the whole world in eight leaves", "octomap", "a.bt", head + b"data\n" + struct.pack("<H", 0xAAAA)
+    ends = test_octomap.file_of([3.5, None, None, None, None, None, None, test_octomap.at([7] * 15, 3.5)])
+    yield "an octant and a voxel", "octomap", "a.bt", ends
+
+
+# --- calibrations in binary, pictures, videos ----------------------------------------
+
+
+@_kind("COLMAP")
+def _colmap() -> Iterator[_Input]:
+    def model(cameras: bytes, images: bytes = bytes(8), **others: bytes) -> Writer:
+        def write(folder: Path) -> None:
+            place = folder / "model"
+            place.mkdir()
+            (place / "cameras.bin").write_bytes(cameras)
+            (place / "images.bin").write_bytes(images)
+            (place / "points3D.bin").write_bytes(others.get("points", bytes(8)))
+
+        return write
+
+    camera = struct.pack("<QIiQQddd", 1, 1, 0, 640, 480, 500.0, 320.0, 240.0)
+    image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1)
+    yield "2^64 - 1 cameras", "colmap", "model", model(struct.pack("<Q", 2**64 - 1) + camera[8:])
+    yield (
+        "2^64 - 1 images",
+        "colmap",
+        "model",
+        model(camera, struct.pack("<Q", 2**64 - 1) + image + b"a\0" + bytes(8)),
+    )
+    yield (
+        "2^60 points of an image",
+        "colmap",
+        "model",
+        model(camera, struct.pack("<Q", 1) + image + b"a\0" + struct.pack("<Q", 2**60)),
+    )
+    yield (
+        "a name without an end",
+        "colmap",
+        "model",
+        model(camera, struct.pack("<Q", 1) + image + b"a" * (20 * MB)),
+    )
+    many = struct.pack("<Q", 200_000) + b"".join(
+        struct.pack("<I7dI", k, 1, 0, 0, 0, 0, 0, 0, 1) + f"{k}.jpg".encode() + b"\0" + bytes(8)
+        for k in range(200_000)
+    )
+    yield "200,000 images", "colmap", "model", model(camera, many)
+    wide = struct.pack("<QIiQQddd", 1, 1, 0, 2**63, 2**63, 1e308, 1e308, 1e308)
+    yield (
+        "pictures of 2^63 pixels",
+        "colmap",
+        "model",
+        model(wide, struct.pack("<Q", 1) + image + b"a\0" + bytes(8)),
+    )
+
+
+@_kind("pictures")
+def _pictures() -> Iterator[_Input]:
+    def film(content: Callable[[int], bytes], count: int = 3, suffix: str = "png") -> Writer:
+        def write(folder: Path) -> None:
+            (folder / "film").mkdir()
+            for k in range(count):
+                (folder / "film" / f"{k:06d}.{suffix}").write_bytes(content(k))
+
+        return write
+
+    large = _png(30_000, 30_000)
+    yield "PNG of 900,000,000 pixels", "pictures", "film", film(lambda _: large)
+    medium = _png(12_000, 12_000)
+    yield "PNG of 144,000,000 pixels", "pictures", "film", film(lambda _: medium)
+    small = _png(16, 16)
+    yield "10,000 pictures", "pictures", "film", film(lambda _: small, 10_000)
+    yield "another size each", "pictures", "film", film(lambda k: _png(16 + k, 16), 50)
+    first = _png(16, 16)
+    lied = bytearray(first)
+    struct.pack_into(">II", lied, 16, 2**31 - 1, 2**31 - 1)
+    struct.pack_into(">I", lied, 29, zlib.crc32(bytes(lied[12:29])))
+    yield "PNG that states 2^31 - 1", "pictures", "film", film(lambda _: bytes(lied))
+
+    def jpeg(tags: bytes) -> bytes:
+        exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + tags
+        return b"\xff\xd8\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + b"\xff\xd9"
+
+    looped = struct.pack("<H", 1) + struct.pack("<HHII", 0x8769, 4, 1, 8) + struct.pack("<I", 8)
+    yield "EXIF that leads to itself", "picture_tags", "film", film(lambda _: jpeg(looped), suffix="jpg")
+    counted = struct.pack("<H", 1) + struct.pack("<HHII", 0x0132, 2, 2**32 - 1, 0) + bytes(4)
+    yield "EXIF of 2^32 - 1 letters", "picture_tags", "film", film(lambda _: jpeg(counted), suffix="jpg")
+    many = struct.pack("<H", 5000) + struct.pack("<HHII", 0x0132, 2, 60_000, 0) * 5000
+    yield "EXIF of 5,000 tags", "picture_tags", "film", film(lambda _: jpeg(many), suffix="jpg")
+
+
+def _box(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", 8 + len(content)) + kind + content
+
+
+@_kind("videos: boxes")
+def _boxes() -> Iterator[_Input]:
+    def changed(change: Callable[[bytearray], object], suffix: str = "mp4") -> Writer:
+        def write(folder: Path) -> None:
+            path = videos.write_video(folder / f"a.{suffix}", videos.even_ticks(15))
+            content = bytearray(path.read_bytes())
+            change(content)
+            path.write_bytes(content)
+
+        return write
+
+    def number(kind: bytes, offset: int, value: int) -> Callable[[bytearray], object]:
+        def change(content: bytearray) -> None:
+            place = content.find(kind)
+            while place >= 0:
+                struct.pack_into(">I", content, place + 4 + offset, value)
+                place = content.find(kind, place + 4)
+
+        return change
+
+    for scale in (0, 1, 2**31 - 1, 2**31, 2**32 - 1):
+        yield f"mdhd: a time scale of {scale}", "video", "a.mp4", changed(number(b"mdhd", 12, scale))
+        yield f"mvhd: a time scale of {scale}", "video", "a.mp4", changed(number(b"mvhd", 12, scale))
+    for kind, offset in ((b"stts", 4), (b"stsz", 8), (b"stsc", 4), (b"stco", 4), (b"ctts", 4), (b"elst", 4)):
+        yield f"{kind.decode()}: 2^32 - 1 entries", "video", "a.mp4", changed(number(kind, offset, 2**32 - 1))
+    yield "stts: a step of 2^32 - 1", "video", "a.mp4", changed(number(b"stts", 12, 2**32 - 1))
+    yield "stts: 2^31 - 1 pictures", "video", "a.mp4", changed(number(b"stts", 8, 2**31 - 1))
+    yield "tkhd: 2^31 wide", "video", "a.mp4", changed(number(b"tkhd", 76, 2**31 - 1))
+    deep = _box(b"ftyp", b"isom\0\0\0\0")
+    nested = b""
+    for _ in range(20_000):
+        nested = struct.pack(">I", 8 + len(nested)) + b"moov" + nested if len(nested) < 60_000 else nested
+    yield "boxes nested deep", "video", "a.mp4", deep + nested
+    yield "200,000 empty boxes", "video", "a.mp4", deep + _box(b"free", b"") * 200_000
+    tracks = _box(b"moov", _box(b"trak", b"") * 50_000)
+    yield "50,000 empty tracks", "video", "a.mp4", deep + tracks
+    yield "a box of no length", "video", "a.mp4", deep + bytes(4) + b"moov" + bytes(100)
+
+
+# --- telemetry ----------------------------------------
+
+
+def _drone(folder: Path) -> drone_logs.DroneTruth:
+    truth = drone_logs.drone_of(write_flight(folder / "f", cameras=1, seconds=0.3, clean=True), 0)
+    shutil.rmtree(folder / "f")
+    return truth
+
+
+@_kind("PX4 logs")
+def _ulogs() -> Iterator[_Input]:
+    head = b"ULog\x01\x12\x35\x01" + bytes(8)
+
+    def log(*formats: str, rest: bytes = b"") -> bytes:
+        return head + b"".join(drone_logs.ulog_record("F", text.encode()) for text in formats) + rest
+
+    nested = [f"t{k}:t{k + 1}[10] a;" for k in range(12)]
+    yield "arrays of arrays", "ulog", "a.ulg", log("t12:float a;", *nested)
+    yield "a type within itself", "ulog", "a.ulg", log("a:a x;")
+    yield "a chain of 5,000 types", "ulog", "a.ulg", log(*(f"t{k}:t{k + 1} a;" for k in range(5000)))
+    yield (
+        "60,000 formats",
+        "ulog",
+        "a.ulg",
+        log(*(f"t{k}:uint64_t timestamp;float x;" for k in range(60_000))),
+    )
+    topic = log("a:uint64_t timestamp;float x;")
+    subscribed = b"".join(drone_logs.ulog_record("A", struct.pack("<BH", 0, k) + b"a") for k in range(60_000))
+    yield "60,000 subscriptions", "ulog", "a.ulg", topic + subscribed
+    rows = drone_logs.ulog_record("D", struct.pack("<HQf", 0, 1, 2.0)) * 1_000_000
+    yield "1,000,000 equal rows", "ulog", "a.ulg", topic + drone_logs.ulog_record("A", bytes(3) + b"a") + rows
+    yield "300,000 dropouts", "ulog", "a.ulg", topic + drone_logs.ulog_record("O", bytes(2)) * 300_000
+    info = drone_logs.ulog_record("M", b"\0" + b"\x06char[2]aab"[:9] + b"xx")
+    yield "100,000 pieces of information", "ulog", "a.ulg", topic + info * 100_000
+    parameter = drone_logs.ulog_record("P", b"\x09float ABC" + struct.pack("<f", 1e38))
+    yield "300,000 parameters", "ulog", "a.ulg", topic + parameter * 300_000
+    yield "an array of 999,999,999", "ulog", "a.ulg", log("a:uint64_t timestamp;float[999999999] x;")
+
+
+@_kind("other telemetry")
+def _telemetry() -> Iterator[_Input]:
+    def dataflash(definitions: int, rows: bytes) -> bytes:
+        made = b"".join(
+            b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", k % 120 + 1, 3, b"A%03d" % (k % 1000), b"", b"")
+            for k in range(definitions)
+        )
+        return made + rows
+
+    own = b"\xa3\x95\x80" + struct.pack(
+        "<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"
+    )
+    yield "ArduPilot: 200,000 definitions", "ardupilot", "a.bin", own + dataflash(200_000, b"")
+    yield (
+        "ArduPilot: messages of no length",
+        "ardupilot",
+        "a.bin",
+        own
+        + b"\xa3\x95\x80"
+        + struct.pack("<BB4s16s64s", 1, 0, b"GPS", b"QBIHBcLLefffB", b"TimeUS")
+        + b"\xa3\x95\x01" * 100_000,
+    )
+    yield "ArduPilot: 20 MB of marks", "ardupilot", "a.bin", own + b"\xa3\x95" * (10 * MB)
+    packet = struct.pack(">Q", 1_700_000_000_000_000) + b"\xfe\x00\x00\x01\x01\x00\x00\x00"
+    yield "MAVLink: 1,000,000 empty packets", "tlog", "a.tlog", packet * 1_000_000
+    yield "MAVLink: 20 MB of marks", "tlog", "a.tlog", packet + b"\xfe" * (20 * MB)
+    yield "MAVLink: 20 MB of version 2 marks", "tlog", "a.tlog", packet + b"\xfd\x00" * (10 * MB)
+    key = bytes.fromhex("060e2b34020b01010e01030101000000")
+    yield "KLV: a length of 2^64", "klv", "a.klv", key + b"\x88" + b"\xff" * 8 + bytes(100)
+    yield "KLV: a length of 127 bytes", "klv", "a.klv", key + b"\xff" + b"\xff" * 127 + bytes(100)
+    yield "KLV: 500,000 empty packets", "klv", "a.klv", (key + b"\0") * 500_000
+    yield "KLV: a tag of 1,000,000 bytes", "klv", "a.klv", key + b"\x83\x0f\x42\x40" + b"\xff" * 10**6
+    place = "[latitude: 1.0] [longitude: 2.0] [rel_alt: 1.0 abs_alt: 2.0]"
+    cue = "{k}\n00:00:00,{a:03d} --> 00:00:00,{b:03d}\n" + place + "\n\n"
+    cues = "".join(cue.format(k=k, a=k % 1000, b=k % 1000 + 1) for k in range(200_000))
+    yield "SRT: 200,000 cues that go back", "dji", "a.SRT", cues
+    one = cue.format(k=1, a=0, b=33)
+    yield (
+        "SRT: an hour of 20 digits",
+        "dji",
+        "a.SRT",
+        one.replace("00:00:00,033", "9" * 20 + ":00:00,033") + one,
+    )
+    yield (
+        "SRT: 1,000,000 brackets",
+        "dji",
+        "a.SRT",
+        one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[" * 1_000_000,
+    )
+    yield "SRT: a latitude of 1e308", "dji", "a.SRT", (one + one).replace("1.0]", "1e308]")
+    yield (
+        "SRT: 500,000 pairs in a cue",
+        "dji",
+        "a.SRT",
+        one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[a: 1] " * 500_000,
+    )
+
+
+@_kind("telemetry in videos")
+def _tracks() -> Iterator[_Input]:
+    def nested(depth: int) -> bytes:
+        content = b"\x08\x01"
+        for _ in range(depth):
+            content = video_tracks.proto(3, content)
+        return content
+
+    def djmd(*added: bytes) -> Writer:
+        def write(folder: Path) -> None:
+            sound = video_tracks.djmd_messages(_drone(folder))
+            later = [(sound[-1][0] + (k + 1) * 10**8, content) for k, content in enumerate(added)]
+            video_tracks.write_track(folder / "a.mp4", [*sound, *later], codec="bin_data")
+
+        return write
+
+    yield "DJI: fields nested 5,000 deep", "dji_video", "a.mp4", djmd(nested(5000))
+    yield "DJI: a length of 2^63", "dji_video", "a.mp4", djmd(b"\x0a" + b"\xff" * 9 + b"\x7f")
+    yield "DJI: 2,000,000 fields", "dji_video", "a.mp4", djmd(b"\x08\x01" * 2_000_000)
+    yield "DJI: 50,000 empty packets", "dji_video", "a.mp4", djmd(*[b"\x08\x01"] * 50_000)
+
+    def gpmf(content: bytes) -> Writer:
+        return lambda folder: video_tracks.write_track(
+            folder / "a.mp4", [(0, content), (10**9, content)], codec="bin_data"
+        )
+
+    def item(key: bytes, kind: bytes, size: int, count: int, data: bytes) -> bytes:
+        return key + kind + struct.pack(">BH", size, count) + data + bytes(-len(data) % 4)
+
+    deep = b""
+    for _ in range(7000):
+        deep = item(b"DEVC", b"\0", 1, len(deep), deep) if len(deep) < 60_000 else deep
+    yield "GPMF: nested 7,000 deep", "gopro", "a.mp4", gpmf(deep)
+    empty = item(b"DEVC", b"\0", 1, 60_000, item(b"STRM", b"\0", 0, 0, b"") * 7500)
+    yield "GPMF: 7,500 empty streams", "gopro", "a.mp4", gpmf(empty)
+    rows = item(b"GPS5", b"l", 20, 65_535, b"")
+    yield "GPMF: more rows than bytes", "gopro", "a.mp4", gpmf(item(b"DEVC", b"\0", 1, len(rows), rows))
+    types = item(b"TYPE", b"c", 1, 60, b"l[99999999]" * 5) + item(b"SYST", b"?", 255, 1, bytes(255))
+    yield "GPMF: a type of 10^8 numbers", "gopro", "a.mp4", gpmf(item(b"DEVC", b"\0", 1, len(types), types))

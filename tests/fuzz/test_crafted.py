@@ -1,0 +1,28 @@
+"""Crafted files are read or refused in little time and memory: some classes of `tests.fuzz --crafted`."""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+
+from tests.fuzz.attacking import MOST_MB, MOST_S, attack
+from tests.fuzz.crafted import KINDS, Crafted, crafted
+
+QUICK = ("messages: JSON and protobuf", "videos: boxes")
+
+
+def test_quick_classes_make_no_trouble(tmp_path: Path) -> None:
+    def write(folder: Path) -> None:
+        (folder / "a.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n", encoding="utf-8")
+
+    sound = Crafted("sound", "a trajectory", "tum", write, "a.tum")
+    first, *met = attack(chain([sound], crafted(QUICK)), tmp_path)
+    assert (first.read, first.refused, first.trouble) == (2, 0, "")
+    assert 50 < first.mb < MOST_MB
+    assert len(KINDS) >= 25
+    assert {each.kind for each in met} == set(QUICK)
+    assert [(each.what, each.trouble) for each in met if each.trouble] == []
+    hiding = {f"mdhd: a time scale of {scale}" for scale in (0, 1, 2**32 - 1)}  # one picture of 15
+    assert {each.what for each in met if each.refused and not each.read} >= hiding
+    assert max(each.cpu_s for each in met) < MOST_S
+    assert max(each.mb for each in met) < MOST_MB
