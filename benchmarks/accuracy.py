@@ -278,7 +278,7 @@ def measure_draw(drawn: DrawnFlight, cases: Sequence[Case]) -> Iterator[tuple[Ca
             for case in cases:
                 timed = case is first and not case.draw
                 method = METHODS["robust" if case.method in _POSES else case.method]
-                settings = Settings(**method, detector=first.detector)
+                settings = Settings(**method, people=1, detector=first.detector)
                 began_s = time.process_time()
                 try:
                     with nullcontext() if timed else patch("pipelines.reconstruct.doubts_of", _no_doubts):

@@ -2,7 +2,10 @@
 
     python -m benchmarks.mistakes [--folder FOLDER] [--kept] [FLIGHT ...]
     python -m benchmarks.mistakes --right 40    # random right flights: none should be doubted
-    python -m benchmarks.mistakes --corpus tuning|kept [--draws 1] [FLIGHT ...]    # with film
+    python -m benchmarks.mistakes --acrobats 40    # the same of people who lie or turn cartwheels
+    python -m benchmarks.mistakes --corpus tuning|kept [--draws 1] [--mistake none] [FLIGHT ...]  # film
+    python -m benchmarks.mistakes --time    # of the doubts in `reconstruct`, and of `check` on ten minutes
+    python -m benchmarks.mistakes --late    # why clocks that are all late are not told without film
 
 Right flights (simulated, modelled keypoints) are described anew with one mistake each. A mistake counts if
 the error of the skeleton grows by more than 20 %, or nothing can be reconstructed. `named`: the first doubt
@@ -22,11 +25,12 @@ import csv
 import json
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from time import perf_counter, process_time
 from typing import Any, get_args
 from unittest.mock import patch
 
@@ -51,6 +55,11 @@ from pipelines.geometry.poses import (
 )
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruction.doubts.diagnosis import Diagnosis, doubts_of
+from pipelines.reconstruction.doubts.faults import fit
+from pipelines.reconstruction.doubts.hypotheses import Trial
+from pipelines.reconstruction.doubts.scene import Sampled, Scene, scene_of
+from pipelines.reconstruction.doubts.score import base_of, score
 from pipelines.session.description import Doubt
 from pipelines.session.errors import MocapError
 from pipelines.session.stages import locked
@@ -500,6 +509,7 @@ class Mistake:
     codes: tuple[str, ...]
     change: Change
     fits: Callable[[Flight], bool] = lambda _: True
+    loses_place: Callable[[Flight], bool] = lambda _: False  # of the world: root-relative errors are compared
 
 
 def _mistakes() -> list[Mistake]:
@@ -539,7 +549,7 @@ def _mistakes() -> list[Mistake]:
             of_poses(lambda pose: compose((still, turned("z", 20)), pose), one),
         ),
         Mistake("heading 8 deg, one", ("pose",), of_poses(heading(8), one)),
-        Mistake("own origins", ("origin",), own_origins),
+        Mistake("own origins", ("origin",), own_origins, loses_place=lambda flight: not flight.actor),
         Mistake("another's topic", ("pose",), same_topic),
         Mistake("camera_from_world", ("convention",), of_poses(lambda pose: invert(*pose))),
         Mistake("w x y z", ("convention",), of_poses(lambda pose: (pose[0], np.roll(pose[1], 1, axis=-1)))),
@@ -579,17 +589,17 @@ def mistaken(described: Described, change: Change | None) -> Path:
     return description.write(described.folder)
 
 
-def measured(manifest: Path) -> tuple[float | None, list[dict[str, Any]], str]:
-    """Ingest and reconstruct; return MPJPE (mm, None without), doubts, and what stopped it."""
+def measured(manifest: Path, error: str = "mpjpe_mm") -> tuple[float | None, list[dict[str, Any]], str]:
+    """Ingest and reconstruct; return an error (MPJPE, None without), doubts, and what stopped it."""
     session = manifest.with_suffix(".session")
     shutil.rmtree(session, ignore_errors=True)
     try:
         ingest(manifest, session)
         metrics = reconstruct(session, Settings(method="robust")).metrics
-    except MocapError as error:
+    except MocapError as stop:
         doubts = check(session).doubts if (session / "session.json").exists() else []
-        return None, [doubt.as_json() for doubt in doubts], str(error)
-    return metrics["mpjpe_mm"], metrics["doubts"], ""
+        return None, [doubt.as_json() for doubt in doubts], str(stop)
+    return metrics[error], metrics["doubts"], ""
 
 
 def with_remedy(manifest: Path, remedy: str) -> bool:
@@ -652,17 +662,206 @@ def right_flight(seed: int) -> Flight:
     )
 
 
-def doubted_right_flights(folder: Path, count: int) -> None:
-    """Check random right flights, and print those that are doubted."""
-    doubted = 0
-    for seed in range(100, 100 + count):
-        flight = right_flight(seed)
+def doubted_right_flights(folder: Path, flights: Iterable[Flight]) -> None:
+    """Check right flights, and print those that are doubted."""
+    doubted = count = 0
+    for flight in flights:
+        count += 1
         manifest = mistaken(Described(flight, folder / flight.name), None)
         doubts = check(manifest).doubts
         doubted += bool(doubts)
         if doubts:
             print(f"{flight}\n  {doubts[0].code}: {doubts[0].what} {doubts[0].evidence}", flush=True)
     print(f"{doubted} of {count} right flights doubted")
+
+
+# Angles (deg) by which bones turn about z, y and x; y is up, z ahead, and at rest the arms point aside.
+_ARMS_DOWN: dict[str, tuple[float, ...]] = {"LeftArm": (-75, 0, 0), "RightArm": (75, 0, 0)}
+_STAR: dict[str, tuple[float, ...]] = {
+    "LeftArm": (60, 0, 0),
+    "RightArm": (-60, 0, 0),
+    "LeftUpLeg": (35, 0, 0),
+    "RightUpLeg": (-35, 0, 0),
+}
+_BONES = (  # name, the bone it hangs on, offset from it in cm
+    ("Hips", None, (0, 0, 0)),
+    ("Spine", "Hips", (0, 12, 0)),
+    ("Chest", "Spine", (0, 22, 0)),
+    ("Neck", "Chest", (0, 20, 0)),
+    ("Head", "Neck", (0, 10, 2)),
+    *(
+        bone
+        for side, sign in (("Left", 1), ("Right", -1))
+        for bone in (
+            (f"{side}Arm", "Chest", (18 * sign, 16, 0)),
+            (f"{side}ForeArm", f"{side}Arm", (28 * sign, 0, 0)),
+            (f"{side}Hand", f"{side}ForeArm", (25 * sign, 0, 0)),
+            (f"{side}UpLeg", "Hips", (9 * sign, -6, 0)),
+            (f"{side}Leg", f"{side}UpLeg", (0, -42, 0)),
+            (f"{side}Foot", f"{side}Leg", (0, -42, 0)),
+            (f"{side}ToeBase", f"{side}Foot", (0, -6, 14)),
+        )
+    ),
+)
+_Key = tuple[float, tuple[float, float, float], tuple[float, float, float], dict[str, tuple[float, ...]]]
+# Time (s), place (cm) and turn (deg, about z, y, x) of the hips, and of bones.
+ACROBATICS: dict[str, tuple[_Key, ...]] = {
+    "lies down and gets up": (
+        (0, (0, 96, 0), (0, 0, 0), _ARMS_DOWN),
+        (1.5, (0, 14, 60), (0, 0, -90), _ARMS_DOWN),
+        (4.0, (0, 14, 60), (0, 0, -90), _STAR),
+        (6, (0, 96, 0), (0, 0, 0), _ARMS_DOWN),
+    ),
+    "lies on the back": (
+        (0, (0, 14, 0), (0, 0, -90), _ARMS_DOWN),
+        (2, (0, 14, 0), (0, 0, -90), _STAR),
+        (4, (0, 14, 0), (0, 0, -90), _ARMS_DOWN),
+        (6, (0, 14, 0), (0, 0, -90), _STAR),
+    ),
+    "lies on the face": (
+        (0, (0, 14, 0), (0, 0, 90), _ARMS_DOWN),
+        (3, (0, 14, 0), (0, 0, 90), _STAR),
+        (6, (0, 14, 0), (0, 0, 90), _ARMS_DOWN),
+    ),
+    "lies on the side": (
+        (0, (0, 20, 0), (90, 0, 0), _ARMS_DOWN),
+        (3, (0, 20, 0), (90, 0, 0), _STAR),
+        (6, (0, 20, 0), (90, 0, 0), _ARMS_DOWN),
+    ),
+    "turns cartwheels": (
+        (0, (0, 96, 0), (0, 0, 0), _ARMS_DOWN),
+        (0.8, (0, 90, 0), (0, 0, 0), _STAR),
+        (2.3, (-220, 90, 0), (360, 0, 0), _STAR),
+        (3.2, (-230, 90, 0), (360, 0, 0), _STAR),
+        (4.7, (-450, 90, 0), (720, 0, 0), _STAR),
+        (6, (-450, 96, 0), (720, 0, 0), _ARMS_DOWN),
+    ),
+}
+
+
+def write_bvh(keys: tuple[_Key, ...], path: Path, rate_hz: int = 60) -> None:
+    """Write a motion as BVH, cm and y up, with angles that are linear between its keys."""
+    lines: list[str] = ["HIERARCHY"]
+
+    def bone(name: str, offset: tuple[int, int, int], depth: int) -> None:
+        indent = "  " * depth
+        channels = "6 Xposition Yposition Zposition" if depth == 0 else "3"
+        lines.extend([f"{indent}{'JOINT' if depth else 'ROOT'} {name}", indent + "{"])
+        lines.append(f"{indent}  OFFSET {offset[0]} {offset[1]} {offset[2]}")
+        lines.append(f"{indent}  CHANNELS {channels} Zrotation Yrotation Xrotation")
+        order.append(name)
+        children = [each for each in _BONES if each[1] == name]
+        for child, _, its_offset in children:
+            bone(child, its_offset, depth + 1)
+        if not children:
+            lines.extend([f"{indent}  End Site", indent + "  {", f"{indent}    OFFSET 0 5 0", indent + "  }"])
+        lines.append(indent + "}")
+
+    order: list[str] = []
+    bone("Hips", (0, 0, 0), 0)
+    times = [key[0] for key in keys]
+    rows = [
+        [*key[1], *key[2], *(v for name in order[1:] for v in key[3].get(name, (0, 0, 0)))] for key in keys
+    ]
+    at = np.arange(0, times[-1] + 0.5 / rate_hz, 1 / rate_hz)
+    columns = [np.interp(at, times, column) for column in zip(*rows, strict=True)]
+    lines += ["MOTION", f"Frames: {len(at)}", f"Frame Time: {1 / rate_hz:.6f}"]
+    lines += [" ".join(f"{value:.4f}" for value in row) for row in zip(*columns, strict=True)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def acrobatic_flight(seed: int, folder: Path) -> Flight:
+    """Draw a right flight as `right_flight` does, of somebody who lies or turns cartwheels."""
+    names = list(ACROBATICS)
+    motion = names[seed % len(names)]
+    path = (folder / f"{motion.replace(' ', '_')}.bvh").resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    write_bvh(ACROBATICS[motion], path)
+    return replace(right_flight(seed), name=f"acrobat{seed}", motion=f"{{bvh: {path}}}")
+
+
+_LONG = Flight(
+    "long3",
+    3,
+    "{steps: [walk: {distance_m: 6, turn_deg: 90}, turn: {deg: 90}], repeat: true}",
+    "{radius_m: 10, tilt_deg: 15, yaw_deg: 20, yaw_rate_deg_per_s: 2}",
+    1,
+    carried=False,
+    actor=True,
+    map=True,
+    seconds=600,
+)
+
+
+def print_times(folder: Path) -> None:
+    """Print processor seconds: of the doubts in `reconstruct` of the sample, of `check` on ten minutes."""
+    sample = Path(__file__).parents[1] / "sample_data" / "mound_walk" / "flight.yaml"
+    session = folder / "sample.session"
+    shutil.rmtree(session, ignore_errors=True)
+    ingest(sample, session)
+    detect_s = process_time()
+    with locked(session) as writable:
+        detect(writable, detector=DETECTORS[0])
+    detect_s = process_time() - detect_s
+    seconds: list[float] = []
+
+    def timed(*arguments: Any, **named: Any) -> list[Doubt]:
+        start = process_time()
+        found = doubts_of(*arguments, **named)
+        seconds.append(process_time() - start)
+        return found
+
+    with patch("pipelines.reconstruct.doubts_of", timed):
+        start = process_time()
+        reconstruct(session, Settings())
+        whole = process_time() - start
+    print("| | processor s | s | doubts |\n| --- | --- | --- | --- |")
+    print(f"| detection of the sample | {detect_s:.1f} | | |")
+    print(f"| `reconstruct` of the sample, with doubts | {whole:.1f} | | |")
+    print(f"| of that, doubts | {seconds[0]:.2f} | | |")
+    manifest = mistaken(Described(_LONG, folder / _LONG.name), None)
+    for said, path in (("", manifest), (", ingested", folder / _LONG.name / "first.session")):
+        start, clock_s = process_time(), perf_counter()
+        doubts = check(path).doubts
+        took, took_s = process_time() - start, perf_counter() - clock_s
+        print(f"| `check` of 600 s{said} | {took:.1f} | {took_s:.1f} | {len(doubts)} |")
+    print(f"doubts take {seconds[0] / (whole - seconds[0]):.1%} on top of the rest of `reconstruct`")
+
+
+_LATE_S = 0.5
+
+
+def print_late(folder: Path) -> None:
+    """Print how well flights whose clocks are all late fit: as stated, at the right times, and at best."""
+
+    def misfit(sampled: Sampled, scene: Scene) -> float:
+        """Return the chi^2 for each picture: other times show fewer."""
+        pictures = int(np.isfinite(scene.rays[..., 0]).any(axis=-1).sum())
+        return fit(sampled, scene, "none", 0).cost / pictures
+
+    print("| flight | chi^2 a picture, as stated | right | best | at s | score as stated | right |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for flight in FLIGHTS:
+        manifest = mistaken(Described(flight, folder / flight.name), of_cameras(clock(_LATE_S)))
+        seen: list[Sampled] = []
+
+        def kept(sampled: Sampled | None, *_: object, seen: list[Sampled] = seen) -> Diagnosis:
+            seen.extend([] if sampled is None else [sampled])
+            return Diagnosis([], float("nan"), 0)
+
+        with patch("pipelines.reconstruction.doubts.diagnosis.diagnose", kept):
+            check(manifest)
+        described = scene_of(seen[0])
+        base, stated = base_of(seen[0], described)
+        trial = Trial(seen[0], described, base)
+        late_s = np.linspace(-1, 1, 21)
+        scenes = [trial.late(float(late), trial.every) for late in late_s]
+        costs = [misfit(seen[0], scene) for scene in scenes]
+        right = int(np.argmin(np.abs(late_s + _LATE_S)))
+        best = int(np.argmin(costs))
+        chi2 = f"{costs[late_s.size // 2]:.2f} | {costs[right]:.2f} | {costs[best]:.2f} | {late_s[best]:+.1f}"
+        total = score(seen[0], scenes[right], base).total
+        print(f"| {flight.name} | {chi2} | {stated.total:.1f} | {total:.1f} |", flush=True)
 
 
 def _later(cameras: dict[str, Any], names: list[str], seconds: float) -> None:
@@ -684,7 +883,7 @@ CORPUS_MISTAKES: dict[str, tuple[str, Callable[[dict[str, Any], float], None]]] 
 }
 
 
-def doubted_corpus(folder: Path, half: Half, draws: int, names: list[str]) -> None:
+def doubted_corpus(folder: Path, half: Half, draws: int, names: list[str], only: list[str]) -> None:
     """Check the flights of the corpus, right and with mistakes in their times, and print what is said."""
     counts: dict[tuple[str, bool], list[bool]] = {}
     print("| flight | draw | errors | mistake | first doubt | gain |\n| --- | --- | --- | --- | --- | --- |")
@@ -698,6 +897,8 @@ def doubted_corpus(folder: Path, half: Half, draws: int, names: list[str]) -> No
             with tempfile.TemporaryDirectory() as place:
                 drawn.session(Path(place) / "flight", draw, given, DETECTORS[0])
                 for mistake, (code, change) in CORPUS_MISTAKES.items():
+                    if only and mistake not in only:
+                        continue
                     if not code or (flight.with_pictures and given == "model"):
                         doubts = _doubted(flight, Path(place) / "flight", mistake, change)
                         first = doubts[0] if doubts else None
@@ -735,15 +936,32 @@ def main() -> None:
     parser.add_argument("--kept", action="store_true", help="The flights that were kept aside.")
     parser.add_argument("--mistake", action="append", default=[], help="Only these; repeat it for several.")
     parser.add_argument("--right", type=int, metavar="N", help="Check random right flights instead.")
+    parser.add_argument(
+        "--acrobats", type=int, metavar="N", help="The same of people who lie or turn wheels."
+    )
+    parser.add_argument("--time", action="store_true", help="Measure what the doubts cost.")
+    parser.add_argument("--late", action="store_true", help="Look at flights whose clocks are all late.")
     parser.add_argument("--corpus", choices=HALVES, help="Check the flights of the corpus instead.")
     parser.add_argument("--draws", type=int, default=1, help="Draws of the corpus's pose errors.")
     parser.add_argument("flights", nargs="*")
     options = parser.parse_args()
     if options.right:
-        doubted_right_flights(options.folder, options.right)
+        doubted_right_flights(options.folder, map(right_flight, range(100, 100 + options.right)))
+        return
+    if options.acrobats:
+        seeds = range(1000, 1000 + options.acrobats)
+        doubted_right_flights(options.folder, (acrobatic_flight(seed, options.folder) for seed in seeds))
+        return
+    if options.time:
+        print_times(options.folder)
+        return
+    if options.late:
+        print_late(options.folder)
         return
     if options.corpus:
-        doubted_corpus(options.folder / "corpus", options.corpus, options.draws, options.flights)
+        doubted_corpus(
+            options.folder / "corpus", options.corpus, options.draws, options.flights, options.mistake
+        )
         return
     print("| flight | mistake | error mm | first doubt | named | after the remedy mm |")
     print("| --- | --- | --- | --- | --- | --- |")
@@ -778,19 +996,24 @@ def main() -> None:
 
 def tried(described: Described, mistake: Mistake, right: float) -> tuple[bool, bool, bool] | None:
     """Make a mistake; return whether it was doubted, named and mended, None if it costs no more than 20 %."""
+    compared = "mpjpe_mm"
+    if mistake.loses_place(described.flight):
+        compared = "root_mpjpe_mm"
+        right = measured(mistaken(described, None), compared)[0] or float("nan")
     manifest = mistaken(described, mistake.change)
-    error, doubts, stopped = measured(manifest)
+    error, doubts, stopped = measured(manifest, compared)
     first = doubts[0] if doubts else None
     named = first is not None and first["code"] in mistake.codes
     after, why = None, ""
     if first is not None and named and with_remedy(manifest, first["remedy"]):
         with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):  # only the error is looked at
-            after, _, why = measured(manifest)
+            after, _, why = measured(manifest, compared)
     mended = after is not None and after <= 1.1 * right
     said = f"{first['code']}: {first['what']}" if first else (stopped or "nothing")
     counts = error is None or error > 1.2 * right
     verdict = ("yes" if named else "NO") if counts else f"({'yes' if named else 'no'})"
-    row(described.flight.name, mistake.name, error, said, verdict, f"{after:.0f}" if after else why)
+    mending = f"{after or 0:.0f}" + (f", root-relative; right: {right:.0f}" if compared != "mpjpe_mm" else "")
+    row(described.flight.name, mistake.name, error, said, verdict, mending if after else why)
     return (first is not None, named, mended) if counts else None
 
 

@@ -134,6 +134,10 @@ def _load_camera(
     if calibrated is not None and entry.keypoints is None:
         raw, joint = confident["confidence"].to_numpy(np.float64), confident["joint"].to_numpy(str)
         confident = confident.assign(confidence=calibrated(raw, joint))
+    if (keypoints["frame"] > frames["frame"].max()).any():
+        raise DataError(
+            source.table, "holds keypoints of frames that are not there", "run it again with --force"
+        )
     detections = detections_from(confident, joints)
     detections, crowd = most_confident(detections, _MOST_PEOPLE)
     if crowd:

@@ -17,7 +17,7 @@ from pipelines.geometry.arrays import Float, Int8, Int64
 from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, Series, intervals, stretch_samples
 from pipelines.geometry.gait import HEEL_STRIKE, SIDES, TOE_OFF, GaitEvents, gait_events, summary
 from pipelines.geometry.joint_angles import ANGLE_STATUS, ANGLES, joint_angles
-from pipelines.geometry.metrics import JointErrors, error_series, measure, measure_shape
+from pipelines.geometry.metrics import JointErrors, error_series, measure, measure_shape, tracking_errors
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.observations import Camera, Observations
@@ -99,6 +99,39 @@ def assess(
         "clock_offsets_s": {},
         "intervals": _intervals(position, own, status, residual, observations.joints, observations.t_ns),
         "per_joint": per_joint,
+    }
+
+
+def of_people(
+    names: Sequence[str], observations: Observations, result: Triangulation, truth: Float | None
+) -> dict[str, Any]:
+    """Compute the figures of each person, and with truth who was missed and confused.
+
+    Args:
+        names: of the reconstructed people.
+        observations: the triangulated observations.
+        result: their triangulation.
+        truth: as in `assess`.
+
+    Returns:
+        `by_person`: for each name the `coverage` (share of the times with any measured joint), the
+        `reconstructed_share` of joint-frames, and with truth the `mpjpe_mm`; `tracking`: see
+        `tracking_errors`, None without truth.
+    """
+    shape = observations.confidence.shape[:3]
+    ok = result.status.reshape(shape) == _OK
+    position = np.where(ok[..., None], result.points.reshape(*shape, 3), np.nan)
+    own = None if truth is None else _own_truth(position, truth)
+    return {
+        "by_person": {
+            name: {
+                "coverage": float(ok[:, k].any(axis=1).mean()),
+                "reconstructed_share": float(ok[:, k].mean()),
+                "mpjpe_mm": None if own is None else _mean_mm(position[:, k] - own[:, k]),
+            }
+            for k, name in enumerate(names)
+        },
+        "tracking": None if truth is None else tracking_errors(position, truth),
     }
 
 

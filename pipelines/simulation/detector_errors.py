@@ -46,8 +46,8 @@ SWAP_FRAMES = (2, 6)
 # does: the area under the ROC curve is 0.84 to 0.90 over tilts of 60 to 15 degrees, measured was 0.88.
 _CONFIDENCE_RANGE, _CONFIDENCE_NOISE, _OUTLIER_DOUBT = 0.14, 0.05, 0.3
 
-# Half the errors are shorter than this many sigmas of a coordinate (Rayleigh distribution).
-_MEDIAN_PER_SIGMA = np.sqrt(2 * np.log(2))
+MEDIAN_PER_SIGMA = float(np.sqrt(2 * np.log(2)))
+"""Median length of a keypoint's error over the standard deviation of a coordinate (Rayleigh)."""
 
 _LIMBS = (
     ("elbow", "wrist", "pinky", "index", "thumb"),
@@ -218,7 +218,7 @@ def detect_keypoints(
     if errors.scale == 0:
         outlier, swapped = np.zeros_like(outlier), np.zeros_like(swapped)
 
-    sigma_px = errors.scale * apparent_height_px[:, None] * median_share / _MEDIAN_PER_SIGMA
+    sigma_px = errors.scale * apparent_height_px[:, None] * median_share / MEDIAN_PER_SIGMA
     ordinary = unit_error * (sigma_px * np.where(visible, 1.0, HIDDEN_ERROR))[..., None]
     gross = (far * apparent_height_px[:, None])[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     found = pixels + np.where(outlier[..., None], gross, ordinary)

@@ -177,7 +177,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
         lines += [*_pictures(flight, drone, video), *_poses(flight, drone, true_poses)]
     poses = ", ".join(f"{drone.name}: truth/{drone.name}.tum" for drone in flight.drones)
     lines += [
-        f"actor: {{log: drone1, topic: {flight.people[0].topic}, point: hip}}",
+        *_logged_people(flight),
         "map: site.bt",
         "truth:",
         "  joints: truth/joints.csv",
@@ -185,6 +185,16 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
         "",
     ]
     return "\n".join(lines)
+
+
+def _logged_people(flight: SimulatedFlight) -> list[str]:
+    """Write who was logged: by name where the scenario has `actors`."""
+    if flight.scenario.actors is None:
+        return [f"actor: {{log: drone1, topic: {flight.people[0].topic}, point: hip}}"]
+    return [
+        "actors:",
+        *(f"  {person.name}: {{log: drone1, topic: {person.topic}, point: hip}}" for person in flight.people),
+    ]
 
 
 def _shot(flight: SimulatedFlight) -> list[str]:

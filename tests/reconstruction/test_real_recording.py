@@ -43,6 +43,29 @@ def reconstructed(folder: Path, keypoints: str, *options: str) -> tuple[pd.DataF
     return pd.read_parquet(session / "reconstruct" / "skeleton.parquet"), metrics
 
 
+def test_a_right_recording_is_not_doubted_and_its_mistakes_are(tmp_path: Path) -> None:
+    def doubted(text: str) -> list[dict[str, Any]]:
+        manifest.write_text(text, encoding="utf-8")
+        found: list[dict[str, Any]] = json.loads(succeeds("check", manifest, "--json"))["doubts"]
+        return found
+
+    manifest = manifest_of(tmp_path, "pose-associated")
+    right = manifest.read_text(encoding="utf-8")
+    assert doubted(right) == []
+    late = right.replace("{fps: 60}", "{fps: 60, start: 0.3}", 1)
+    first = doubted(late)[0]
+    assert (first["code"], first["cameras"]) == ("clock", ["cam01"])
+    offset_s = float(first["remedy"].removeprefix("cameras.cam01.clock.offset_s: "))
+    assert offset_s == pytest.approx(-0.3, abs=1 / 60)  # a picture
+    assert doubted(late.replace("start: 0.3}", f"start: 0.3}}, clock: {{offset_s: {offset_s}}}")) == []
+    exchanged = right.replace("/cam01_json", "/?").replace("/cam02_json", "/cam01_json")
+    assert doubted(exchanged.replace("/?", "/cam02_json"))[0]["code"] == "videos_swapped"
+    assert (
+        doubted(right.replace("{fps: 60}", "{fps: 50}", 1))[0]["remedy"]
+        == "cameras.cam01.frame_times.fps: 60"
+    )
+
+
 def distance_to_peer_mm(skeleton: pd.DataFrame, every: int = 1) -> Any:
     peer = TRC.read_joints(real_data("pose2sim_single/pose-3d/single_0-99.trc"), unit=None, axes=None)
     ours = motion_from(skeleton, peer.joints)

@@ -18,7 +18,15 @@ import numpy as np
 from pipelines.geometry.arrays import Int64
 from pipelines.reconstruction.background_tracks import Followed
 from pipelines.reconstruction.doubts import remedies
-from pipelines.reconstruction.doubts.faults import FREE, Fault, fit, picture_variance, undone
+from pipelines.reconstruction.doubts.faults import (
+    FREE,
+    Fault,
+    fit,
+    origins,
+    picture_variance,
+    undone,
+    zoom,
+)
 from pipelines.reconstruction.doubts.hypotheses import (
     RATES,
     TIMES,
@@ -26,7 +34,6 @@ from pipelines.reconstruction.doubts.hypotheses import (
     Trial,
     higher_or_lower,
     of_descriptions,
-    of_logs,
     of_times,
     pair_of,
     relative_to,
@@ -36,6 +43,7 @@ from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample
 from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, score, solve
 from pipelines.reconstruction.doubts.turning import Lateness, lateness, turns_of
 from pipelines.session.description import Description, Doubt
+from pipelines.session.log_doubts import doubts_of_logs
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
 
@@ -86,6 +94,7 @@ DOUBTFUL = 6.0
 """Score of a description above which it is doubted although no mistake explains it."""
 
 _LEAST_LATE_S = 0.2  # of clocks by backgrounds: errors of attitudes that wander pass for less
+_HOVERING_M = 0.5  # apart: too little to tell own origins from positions in a smaller unit
 _BELOW_M = 1.0  # below zero, of drones
 _ALIKE = 1.0  # hypotheses whose scores are this close are stated together
 _COST_OF_NUMBER = 2.0  # of chi^2, as in Akaike's criterion
@@ -172,7 +181,7 @@ def diagnose(flight: Sampled | None, late: Lateness | None = None) -> Diagnosis:
     described = scene_of(flight)
     base, found = base_of(flight, described)
     trial = Trial(flight, described, base)
-    hypotheses = [*of_logs(trial), *_of_turns(trial, late), *of_times(trial)]
+    hypotheses = [*_of_logs(trial), *_of_turns(trial, late), *of_times(trial)]
     stated = fit(flight, described, "none", 0)
     explained = min((each.total for each in hypotheses), default=np.inf)
     odd = base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
@@ -191,7 +200,7 @@ def diagnose(flight: Sampled | None, late: Lateness | None = None) -> Diagnosis:
     causes = causes or _below_zero(trial)
     doubts = [_doubt(each, found, described) for each in causes]
     if doubts or base.total >= DOUBTFUL:
-        doubts += _oddities(found, described, flight)
+        doubts += _oddities(found, described, flight, alone=not doubts)
     return Diagnosis(doubts, base.total, len(hypotheses))
 
 
@@ -214,8 +223,8 @@ def _causes(trial: Trial, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     discrete = [each for each in causes.values() if each.penalty <= _DISCRETE and each.scene is not None]
     if len(discrete) > 1:  # alike in what is odd: the rays tell which of them fits
         costs = {each.code: _cost(trial, each) for each in discrete}
-        least = min(costs.values()) + _ALIKE_COST  # where they do not tell, what is odd does
-        discrete.sort(key=lambda each: (max(costs[each.code], least), each.total))
+        least = min(costs.values()) + _ALIKE_COST  # where they do not tell, what is odd does, to a tenth
+        discrete.sort(key=lambda each: (max(costs[each.code], least), round(each.total, 1), costs[each.code]))
     return [*discrete, *(each for each in causes.values() if each not in discrete)]
 
 
@@ -229,12 +238,13 @@ def _cost(trial: Trial, hypothesis: Hypothesis) -> float:
 def _without_number(trial: Trial, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the best hypothesis without a free number with its cost, to compete with faults.
 
-    It need not explain as much as the margin asks: of what lowers the chi^2 as much, it is the simpler.
+    It need not explain as much as the margin asks: of what lowers the chi^2 as much, it is the simpler. Other
+    times do not compete: they show other pictures, or fewer, so that their chi^2 is another sum.
     """
     for each in hypotheses:
         if each.total > trial.base.total - MARGIN_OF_TIMES:
             break
-        if each.scene is not None and each.penalty <= _DISCRETE:
+        if each.scene is not None and each.penalty <= _DISCRETE and each.code not in TIMES:
             return [replace(each, cost=_cost(trial, each))]
     return []
 
@@ -244,18 +254,19 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
 
     Another clock leaves moments out: in fewer, errors that wander are smaller, and they say less. Times of
     all cameras alike must explain more than the same pictures do at the times that are stated. Nor may the
-    rays of a person in whom nothing is odd miss each other by more than before; and a number that is free
-    must fit the rays of such a person markedly better, constant errors of all poses included.
+    rays of a person in whom nothing is odd miss each other by more than before; with constant errors of all
+    poses, they must fit markedly better. So must times of all cameras; those of one must fit about as well.
     """
     if hypothesis.scene is None:
         return True
     is_odd = trial.base.total >= ODD
-    if not is_odd and hypothesis.penalty > _DISCRETE and hypothesis.code not in TIMES:
-        stated = fit(trial.flight, trial.described, "none", 0).cost
-        if _cost(trial, hypothesis) > stated - GAIN:
-            return False
     seen = np.isfinite(hypothesis.scene.rays[..., :1]).any(axis=2, keepdims=True)
     described = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
+    if hypothesis.code in TIMES or not is_odd:
+        of_one_clock = hypothesis.code in TIMES and hypothesis.alike is None
+        least = -_ALIKE_COST if of_one_clock else GAIN
+        if _cost(trial, hypothesis) > fit(trial.flight, described, "none", 0).cost - least:
+            return False
     same = score(trial.flight, described, trial.base)
     share = np.isfinite(described.rays[..., 0]).sum() / np.isfinite(trial.described.rays[..., 0]).sum()
     margin = (MARGIN_OF_TIMES if hypothesis.code in TIMES else MARGIN) / share
@@ -287,7 +298,7 @@ def _below_zero(trial: Trial) -> list[Hypothesis]:
             "axes",
             trial.names,
             "all drones fly below zero: their positions count z downwards, or zero is high above the ground",
-            remedies.pose(trial.flight.cameras, "z: down"),
+            remedies.upside_down(trial.flight.cameras),
             _DISCRETE,
             replace(trial.described, position=place),
         )
@@ -341,6 +352,33 @@ def _of_turns(trial: Trial, late: Lateness | None) -> list[Hypothesis]:
     found |= {"clock_sigma_s": _rounded(late.sigma_s)} if late.slower == 1 else {}
     named = tuple(names[index] for index in late.cameras)
     return [Hypothesis(code, named, what, remedy, 0.0, None, sigmas=found)]
+
+
+def _of_logs(trial: Trial) -> Iterator[Hypothesis]:
+    """Find cameras that fly the same path, or start at the same place: no picture is needed for that.
+
+    Pictures tell where the logs have their zeros.
+
+    Drones that hover together may also be apart in another unit: then the zeros have to explain more.
+    """
+    cameras = trial.flight.cameras
+    logs = {camera.name: (camera.entry, camera.camera.trajectory) for camera in cameras}
+    for doubt in doubts_of_logs(logs):
+        remedy, sigmas, scene = doubt.remedy, dict[str, float](), None
+        if doubt.code == "origin":
+            shifts, sigma = origins(trial.flight, trial.described)
+            if np.isfinite(shifts).all() and sigma.any():
+                remedy = remedies.own_origins(cameras, shifts)
+                sigmas = {"shift_sigma_m": round(float(sigma.max()), 2)}
+                if doubt.evidence["apart_m"] < _HOVERING_M:
+                    moved = trial.described.position + shifts[:, None]
+                    scene = replace(trial.described, position=moved)
+        penalty = 0.0 if scene is None else 1.1 * (len(trial.moving) - 1)
+        names = tuple(doubt.cameras)
+        found = Hypothesis(
+            doubt.code, names, doubt.what, remedy, penalty, scene, same_scatter=True, sigmas=sigmas
+        )
+        yield trial.scored(found)
 
 
 # --- faults of one camera's poses ----------------------------------------------------------------------
@@ -446,12 +484,12 @@ def _of_fault(trial: Trial, fault: Fault, penalty: float) -> Hypothesis:
         "heading": f"the heading of {name} is {degrees:+.0f} deg from what is logged",
         "pitch": f"{name} looks {abs(degrees):.0f} deg {higher_or_lower(degrees)} than stated",
         "roll": f"{name} is rolled by {degrees:+.0f} deg about the optical axis",
-        "focal": f"the focal length of {name} is {np.exp(fault.turn_rad):.3g} times what is stated",
+        "focal": f"the focal length of {name} is {zoom(fault.turn_rad):.3g} times what is stated",
     }[fault.name]
     codes = {"heading": "pose", "pitch": "mount", "roll": "mount", "focal": "intrinsics"}
     code = codes.get(fault.name, "origin")
     if code == "intrinsics":
-        remedy = remedies.intrinsics(cameras, [index], float(np.exp(fault.turn_rad)))
+        remedy = remedies.intrinsics(cameras, [index], zoom(fault.turn_rad))
     elif code == "origin":
         remedy = remedies.origin(cameras, index, fault.shift, degrees)
     elif mounted:
@@ -517,8 +555,11 @@ _ODD = {
 _LEAST_ODD = 2.0  # standard deviations
 
 
-def _oddities(described: Score, scene: Scene, flight: Sampled) -> list[Doubt]:
-    """State what is odd about the description as such, the oddest of each code, the oddest first."""
+def _oddities(described: Score, scene: Scene, flight: Sampled, *, alone: bool) -> list[Doubt]:
+    """State what is odd about the description as such, the oddest of each code, the oddest first.
+
+    Where no cause is stated beside it (`alone`), the rays are what is odd if nothing else is.
+    """
     names = [camera.name for camera in flight.cameras]
     residual = residual_px(scene, solve(scene))
     odd = sorted(described.odd.items(), key=lambda item: -item[1])
@@ -529,7 +570,7 @@ def _oddities(described: Score, scene: Scene, flight: Sampled) -> list[Doubt]:
             what = said.format(stature=described.stature_m, usual=STATURE_M)
             evidence = {name: round(float(value), 2)}
             found.setdefault(code, Doubt(code=code, cameras=names, what=what, evidence=evidence, remedy=""))
-    if described.misfit > _LEAST_ODD or "residual" in found or not found:
+    if described.misfit > _LEAST_ODD or "residual" in found or (alone and not found):
         times = f"{described.misfit:.1f} times"
         what = f"the rays miss each other by {times} what keypoints and poses are stated to err by"
         evidence = {

@@ -18,18 +18,30 @@ from pipelines.reconstruction.doubts.kernels import misses_of, normal_equations
 from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene
 from pipelines.reconstruction.doubts.score import STATURE_M, Solved, pixel_variance, solve, stature_m
 
-FREE = {"none": 0, "shift": 3, "heading": 1, "north": 1, "zero": 4, "pitch": 1, "roll": 1, "focal": 1}
+FREE = {
+    "none": 0,
+    "origins": 0,
+    "shift": 3,
+    "heading": 1,
+    "north": 1,
+    "zero": 4,
+    "pitch": 1,
+    "roll": 1,
+    "focal": 1,
+}
 """Faults by name, and how many numbers they have.
 
 `shift`: the log has its zero elsewhere; `north`: it has its north elsewhere; `zero`: both. `heading`,
 `pitch`, `roll`: the camera is turned where it is, about the vertical or its own x and z axes. `focal`: its
-focal length is another; the turn is then the logarithm of the factor.
+focal length is another; the turn is then the logarithm of the factor. `origins`: every log counts from a
+place of its own; the shifts are then the constant errors, which nothing bounds.
 """
 
 _STEPS = 20
 _MOST_ZOOM = 3.0  # logarithm of the factor on a focal length
 _CONVERGED = 0.05  # of the cost
 _LEAST_SIGMA = (0.02, np.radians(0.1))  # of constant errors, m and rad
+_NOSE_TO_ANKLES = 0.9  # share of the stature; Winter 2009
 _LOOSE_M = 30.0  # sigma of a shift that is a fault: any is as likely
 _SIZE_SIGMA = 0.09  # of the logarithm of statures
 _PROBE_M = 0.05
@@ -50,7 +62,10 @@ class Fault:
     shift: Float  # [3] m
     turn_rad: float
     scene: Scene  # without the fault; constant errors stay
-    covariance: Float  # [n, n] of its numbers: what the constant errors leave of it, m and rad
+    errors: Float  # [C, 6] of all poses, m and rad, besides it
+    covariance: (
+        Float  # [n, n] of its numbers: what the constant errors leave of it; for `origins` of all errors
+    )
 
     @property
     def sigmas(self) -> dict[str, float]:
@@ -80,8 +95,8 @@ def fit(flight: Sampled, scene: Scene, name: str, index: int, start_rad: float =
     """
     nothing = np.zeros(3)
     first = undone(scene, name, index, nothing, start_rad)
-    fault = Fault(name, index, np.inf, np.inf, nothing, start_rad, first, np.zeros((0, 0)))
     errors = np.zeros((len(scene.focal_px), 6))
+    fault = Fault(name, index, np.inf, np.inf, nothing, start_rad, first, errors, np.zeros((0, 0)))
     best, last = fault, np.inf
     for _ in range(_STEPS):
         cost, strain, change, covariance = _step(flight, _with_errors(fault.scene, errors), fault, errors)
@@ -89,7 +104,7 @@ def fit(flight: Sampled, scene: Scene, name: str, index: int, start_rad: float =
         settled = abs(cost - last) < _CONVERGED
         last = cost
         if cost < best.cost:
-            best = replace(fault, cost=cost, strain=strain, covariance=covariance)
+            best = replace(fault, cost=cost, strain=strain, errors=errors, covariance=covariance)
         if settled or not np.isfinite(cost) or cost > 4 * best.cost + 100:
             break
         errors = errors + change[: errors.size].reshape(errors.shape)
@@ -107,7 +122,7 @@ def undone(scene: Scene, name: str, index: int, shift: Float, turn_rad: float) -
     """Return the scene without a fault of one camera."""
     if name == "focal":
         factor = np.ones(len(scene.focal_px))
-        factor[index] = np.exp(np.clip(turn_rad, -_MOST_ZOOM, _MOST_ZOOM))
+        factor[index] = zoom(turn_rad)
         return replace(scene, rays=scene.rays / factor[:, None, None, None], focal_px=scene.focal_px * factor)
     rotation, position = scene.rotation.copy(), scene.position.copy()
     turn = _rotation(_axis(name) * turn_rad)
@@ -119,6 +134,59 @@ def undone(scene: Scene, name: str, index: int, shift: Float, turn_rad: float) -
         position[index] = position[index] @ turn.T
     position[index] = position[index] + shift
     return replace(scene, rotation=rotation, position=position)
+
+
+def origins(flight: Sampled, scene: Scene) -> tuple[Float, Float]:
+    """Place the logs of all drones, of which each counts from a place of its own.
+
+    The search begins where each camera by itself sees a person of usual stature: as far away as they are
+    tall in its pictures. Then all shifts are fitted to the rays, the stature and the logged actor. Without
+    an actor, nothing says where the world is: it is that of the first log.
+
+    Args:
+        flight: the flight.
+        scene: the scene as described.
+
+    Returns:
+        Shifts [C, 3] m of the cameras' positions, 0 where a camera keeps its place, and their standard
+        deviations [C], of all axes together.
+    """
+    hips = [JOINTS.index("left_hip"), JOINTS.index("right_hip")]
+    away_m = scene.focal_px * STATURE_M * _NOSE_TO_ANKLES / np.maximum(scene.person_px, 1.0)
+    rays = np.concatenate([scene.rays[:, :, hips], np.ones((*scene.rays.shape[:2], 2, 1))], axis=-1)
+    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).mean(axis=2)
+    seen = scene.position + away_m[:, None, None] * np.einsum("ctij,ctj->cti", scene.rotation, rays)
+    place = seen[0] if flight.hips is None else flight.hips
+    start = np.zeros((len(seen), 3))
+    moved = _moved(flight)
+    start[moved] = [_median_of(place - seen[index]) for index in moved]
+    begun = replace(scene, position=scene.position + start[:, None])
+    found = fit(flight, begun, "origins", 0)
+    shifts = np.zeros_like(start)
+    shifts[moved] = start[moved] + found.errors[moved, :3]
+    sigma = np.zeros(len(start))
+    if found.covariance.size:
+        sigma[moved] = [
+            np.sqrt(np.diag(found.covariance)[6 * index : 6 * index + 3].sum()) for index in moved
+        ]
+    return shifts, sigma
+
+
+def _moved(flight: Sampled) -> list[int]:
+    """Return the cameras whose places are open where every log counts from a place of its own."""
+    moving = [index for index, camera in enumerate(flight.cameras) if not camera.static]
+    return moving if flight.hips is not None or len(moving) < len(flight.cameras) else moving[1:]
+
+
+def _median_of(apart: Float) -> Float:
+    """Return the median [3] of vectors [T, 3] that are known; 0 if none is."""
+    known = apart[np.isfinite(apart).all(axis=-1)]
+    return np.median(known, axis=0) if len(known) else np.zeros(3)
+
+
+def zoom(logarithm: float) -> float:
+    """Return the factor of a focal length from the logarithm that a fit found, which may have run away."""
+    return float(np.exp(np.clip(logarithm, -_MOST_ZOOM, _MOST_ZOOM)))
 
 
 def _axis(name: str) -> Float:
@@ -169,6 +237,8 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     weight = np.where(used, robust / (variance * seen), 0.0)
     huber = np.where(size > _HUBER, _HUBER * (2 * size - _HUBER), size**2)
     sigma = _constant_sigma(scene)
+    if fault.name == "origins":
+        sigma[_moved(flight), :3] = _LOOSE_M
     cost = float((np.where(used, huber, 0.0) / seen).sum())
 
     placed, pull, extra = _placed(flight, solved)
@@ -195,9 +265,15 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
         slope = _size_by_shift(scene, fault.index, sized)
         normal[shift, shift] += np.outer(slope, slope) + np.eye(3) / _LOOSE_M**2
         right[shift] += slope * sized + fault.shift / _LOOSE_M**2
+    for camera in _moved(flight) if fault.name == "origins" else ():
+        slope = np.zeros(len(normal))
+        slope[6 * camera : 6 * camera + 3] = _size_by_shift(scene, camera, sized)
+        normal += np.outer(slope, slope)
+        right += slope * sized
     normal += 1e-9 * np.eye(len(normal))
     covariance = np.linalg.inv(normal)
-    return cost, strain, -covariance @ right, covariance[errors.size :, errors.size :]
+    kept = 0 if fault.name == "origins" else errors.size
+    return cost, strain, -covariance @ right, covariance[kept:, kept:]
 
 
 def picture_variance(scene: Scene) -> Float:

@@ -13,11 +13,11 @@ from itertools import permutations
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
+from pipelines.geometry.mounting import level_heading
+from pipelines.geometry.poses import interpolate_poses, matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene, scene_of
-from pipelines.reconstruction.doubts.score import STATURE_M, Base, Score, score, solve, stature_m
-from pipelines.session.log_doubts import doubts_of_logs
+from pipelines.reconstruction.doubts.score import Base, Score, score, solve
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 """Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
@@ -28,6 +28,7 @@ TIMES = ("clock", "frame_rate")
 _FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
 _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _FLU_FROM_FRD = np.diag([1.0, -1, -1])
+_BODY_AXES = {"enu": "FLU", "ned": "FRD"}
 _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
 _SPARE = 2.0  # hypotheses whose scores are farther from the best need no exact score
 _LEAST_GAIN = 1.0  # nor do clocks and rates that explain less than this, half of what their margin asks
@@ -237,25 +238,24 @@ def turn_about(axis: str, degrees: float) -> Float:
 def of_times(trial: Trial) -> Iterator[Hypothesis]:
     """Try clocks of single cameras, and the frame rate of all."""
     described, names = trial.flight.cameras, trial.names
-    if trial.moving:
-        for index in trial.every:
-            found = trial.best(
-                lambda seconds, index=index: Hypothesis(  # type: ignore[misc]
-                    "clock",
-                    pair_of(trial, [index]),
-                    f"the pictures of {names[index]} were taken {seconds:+.3f} s from where their clock says",
-                    remedies.clock(described, [index], seconds),
-                    1.0 + abs(seconds) / 2,
-                    trial.late(seconds, [index]),
-                ),
-                -_LONGEST_CLOCK_S,
-                _LONGEST_CLOCK_S,
-                61,
-                _LEAST_CLOCK_S,
-                _REACH_OF_TIMES,
-            )
-            if found is not None:
-                yield found
+    for index in trial.every:
+        found = trial.best(
+            lambda seconds, index=index: Hypothesis(  # type: ignore[misc]
+                "clock",
+                pair_of(trial, [index]),
+                f"the pictures of {names[index]} were taken {seconds:+.3f} s from where their clock says",
+                remedies.clock(described, [index], seconds),
+                1.0 + abs(seconds) / 2,
+                trial.late(seconds, [index]),
+            ),
+            -_LONGEST_CLOCK_S,
+            _LONGEST_CLOCK_S,
+            61,
+            _LEAST_CLOCK_S,
+            _REACH_OF_TIMES,
+        )
+        if found is not None:
+            yield found
     groups = [
         (list(trial.every), "all cameras", 0.5),
         *(([index], names[index], 0.8) for index in trial.every),
@@ -287,23 +287,12 @@ def of_descriptions(trial: Trial) -> Iterator[Hypothesis]:
     yield from _continuous(trial)
 
 
-def of_logs(trial: Trial) -> Iterator[Hypothesis]:
-    """Find cameras that fly the same path, or start at the same place: no picture is needed for that."""
-    cameras = trial.flight.cameras
-    logs = {camera.name: (camera.entry, camera.camera.trajectory) for camera in cameras}
-    for doubt in doubts_of_logs(logs):
-        remedy, scene = doubt.remedy, trial.apart() if doubt.code == "origin" else None
-        # Where the rays place the cameras, but not on top of each other with a dwarf between them.
-        if scene is not None and abs(np.log(stature_m(solve(scene).joints) / STATURE_M)) < _USUAL_STATURE:
-            remedy = remedies.own_origins(cameras, scene.position - trial.described.position)
-        yield Hypothesis(doubt.code, tuple(doubt.cameras), doubt.what, remedy, 0.0, None)
-
-
 def _discrete(trial: Trial) -> Iterator[Hypothesis]:
     yield from _permuted(trial)
     yield from _mounted(trial)
     yield from _tilts_negated(trial)
     yield from _gimbals(trial)
+    yield from _gimbals_of_others(trial)
     yield from _conventions(trial)
     yield from _pixels(trial)
 
@@ -397,6 +386,69 @@ def _gimbals(trial: Trial) -> Iterator[Hypothesis]:
         )
 
 
+_MEANT = {
+    "world": "relative to the world",
+    "body": "relative to the body",
+    "heading": "relative to the body's heading and the horizon",
+}
+
+
+def _gimbals_of_others(trial: Trial) -> Iterator[Hypothesis]:
+    """Try gimbals' angles that are relative to something else: the world, the body, or its heading."""
+    cameras = trial.flight.cameras
+    logged = [index for index in trial.moving if cameras[index].camera.trajectory.body_xyzw is not None]
+    stated = [index for index in logged if cameras[index].entry.poses.gimbal in _MEANT]
+    turns = {index: _references(trial, index) for index in stated}
+    for meant, said in _MEANT.items():
+        turned = [index for index in stated if cameras[index].entry.poses.gimbal != meant]
+        if not turned:
+            continue
+        rotation = trial.described.rotation.copy()
+        for index in turned:
+            of, axes = cameras[index].entry.poses.gimbal or "world", cameras[index].entry.poses.gimbal_axes
+            known = np.swapaxes(turns[index][of, axes], -1, -2) @ rotation[index]
+            rotation[index] = turns[index][meant, axes] @ known
+        yield Hypothesis(
+            "gimbal",
+            tuple(trial.names[index] for index in turned),
+            f"the gimbals' angles are {said}",
+            "; ".join(f"cameras.{trial.names[index]}.gimbal.relative_to: {meant}" for index in turned),
+            0.5,
+            trial.described.with_rotation(rotation),
+        )
+
+
+def _references(trial: Trial, index: int) -> dict[tuple[str, str], Float]:
+    """Return what turns the angles of a camera's gimbal [T, 3, 3], by what they are relative to and axes."""
+    frames = _frames(_body(trial, index))
+    in_ned = {name: _ENU_FROM_NED if name == "world" else _FLU_FROM_FRD for name in frames}
+    return {(name, "enu"): frame for name, frame in frames.items()} | {
+        (name, "ned"): frame @ in_ned[name] for name, frame in frames.items()
+    }
+
+
+def _body(trial: Trial, index: int) -> Float:
+    """Return the attitudes [T, 3, 3] of the body that carries a camera on a gimbal."""
+    track, t_ns = trial.flight.cameras[index].camera.trajectory, trial.flight.t_ns
+    if track.body_xyzw is None:
+        raise ValueError(f"{trial.names[index]} has no body")
+    gap_ns = trial.flight.between.max_gap_ns
+    xyzw = interpolate_poses(
+        track.t_ns, track.position, track.body_xyzw, t_ns, max_gap_ns=gap_ns, max_extrapolation_ns=gap_ns
+    )[1]
+    return matrix_from_quaternion(xyzw)
+
+
+def _frames(body: Float) -> dict[str, Float]:
+    """Return what angles of a gimbal may be relative to [T, 3, 3], by name, on a body [T, 3, 3]."""
+    level = level_heading(quaternion_from_matrix(np.where(np.isfinite(body), body, np.eye(3))))
+    return {
+        "world": np.broadcast_to(np.eye(3), body.shape),
+        "body": body,
+        "heading": np.where(np.isfinite(body), matrix_from_quaternion(level), np.nan),
+    }
+
+
 def _after(turn: Float) -> Callable[[Float], Float]:
     """Return what turns a mount about the camera's axes."""
     return lambda mount: mount @ turn
@@ -427,33 +479,42 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
     mounts = np.stack([trial.mount(index) for index in trial.every])[:, None]
     camera, place = scene.rotation, scene.position
     body = camera @ np.swapaxes(mounts, -1, -2)
+    for index in trial.moving:
+        if cameras[index].camera.trajectory.body_xyzw is not None:
+            body[index] = _body(trial, index)
+
+    def carried_by(bodies: Float) -> Float:
+        """Return the attitudes [C, T, 3, 3] of the cameras on bodies that are turned otherwise."""
+        turned = bodies @ mounts
+        for index in trial.moving:
+            of = cameras[index].entry.poses.gimbal
+            if of is not None and cameras[index].camera.trajectory.body_xyzw is not None:
+                before, after = _frames(body[index])[of], _frames(bodies[index])[of]
+                turned[index] = after @ np.swapaxes(before, -1, -2) @ camera[index]
+        return turned
+
     camera_inverse, body_inverse = np.swapaxes(camera, -1, -2), np.swapaxes(body, -1, -2)
+    # The exchange of axes is its own inverse.
+    right_axes = "enu" if cameras[trial.moving[0]].entry.poses.axes == "ned" else "ned"
     yield from (
         hypothesis(
             "axes",
-            "the poses are in NED, of a body with FRD axes",
-            remedies.pose(cameras, "axes: ned"),
-            _ENU_FROM_NED @ body @ _FLU_FROM_FRD @ mounts,
+            f"the poses are in {right_axes.upper()}, of a body with {_BODY_AXES[right_axes]} axes",
+            remedies.pose(cameras, f"axes: {right_axes}"),
+            carried_by(_ENU_FROM_NED @ body @ _FLU_FROM_FRD),
             place @ _ENU_FROM_NED.T,
         ),
         hypothesis(
             "axes",
-            "the poses are in NED, of the camera",
-            remedies.pose(cameras, "axes: ned"),
+            f"the poses are in {right_axes.upper()}, of the camera",
+            remedies.pose(cameras, f"axes: {right_axes}"),
             _ENU_FROM_NED @ camera,
             place @ _ENU_FROM_NED.T,
         ),
         hypothesis(
             "axes",
-            "the poses are in ENU, and are taken for NED",
-            remedies.pose(cameras, "axes: enu"),
-            _ENU_FROM_NED.T @ body @ _FLU_FROM_FRD @ mounts,
-            place @ _ENU_FROM_NED,
-        ),
-        hypothesis(
-            "axes",
             "the positions count z downwards, the attitudes do not",
-            remedies.pose(cameras, "z: down"),
+            remedies.upside_down(cameras),
             camera,
             place * [1.0, 1.0, -1.0],
         ),
@@ -461,15 +522,15 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
         hypothesis(
             "convention",
             "the poses are camera_from_world",
-            remedies.pose(cameras, "inverse: true"),
+            remedies.inverse(cameras),
             camera_inverse,
             -np.einsum("ctij,ctj->cti", camera_inverse, place),
         ),
         hypothesis(
             "convention",
             "the poses are body_from_world",
-            remedies.pose(cameras, "inverse: true"),
-            body_inverse @ mounts,
+            remedies.inverse(cameras),
+            carried_by(body_inverse),
             -np.einsum("ctij,ctj->cti", body_inverse, place),
         ),
         hypothesis(
@@ -501,7 +562,7 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
             place,
         ),
     )
-    if any(cameras[index].mount is not None for index in trial.moving):
+    if any(cameras[index].entry.poses.mount is not None for index in trial.moving):
         # Of poses of the camera itself, it would be a roll by 180 deg.
         yield hypothesis(
             "axes",
@@ -510,7 +571,7 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
             body @ _FLU_FROM_FRD @ mounts,
             place,
         )
-    for attitudes, carried in ((camera, np.eye(3)), (body, mounts)):
+    for attitudes, of_cameras in ((camera, np.asarray), (body, carried_by)):
         quaternion = quaternion_from_matrix(np.where(np.isfinite(attitudes), attitudes, np.eye(3)))
         for roll, order in ((-1, "wxyz"), (1, "xyzw")):
             turned = matrix_from_quaternion(np.roll(quaternion, roll, axis=-1))
@@ -518,9 +579,13 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
                 "convention",
                 f"the quaternions are written as {' '.join(order)}",
                 remedies.pose(cameras, f"quaternion: {order}"),
-                turned @ carried,
+                of_cameras(turned),
                 place,
             )
+    # Lever arms are stated in metres, whatever the log's unit.
+    levers = np.array([camera.lever_m for camera in cameras])
+    arms = np.einsum("ctij,cj->cti", body, levers)
+    arms[still] = place[still]
     for factor, unit in (
         (0.3048, "ft"),
         (1e-3, "mm"),
@@ -536,7 +601,7 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
             known if factor < 1 else f"{known}, and {factor:.3g} times what is read",
             remedies.pose(cameras, f"unit: {unit}"),
             0.5,
-            replace(scene, position=place * factor),
+            replace(scene, position=(place - arms) * factor + arms),
             same_scatter=True,
         )
 
@@ -583,7 +648,9 @@ def _continuous(trial: Trial) -> Iterator[Hypothesis]:
                 "origin",
                 trial.names,
                 "every log counts positions from a place of its own",
-                remedies.own_origins(trial.flight.cameras, scene.position - trial.described.position),
+                remedies.own_origins(
+                    trial.flight.cameras, np.nanmedian(scene.position - trial.described.position, axis=1)
+                ),
                 1.1 * (len(trial.moving) - 1),
                 scene,
             )

@@ -62,7 +62,7 @@ def mount(cameras: Sequence[Filmed], group: Sequence[int], turned: Callable[[Flo
     """Turn body_from_camera [3, 3] of cameras; of a camera without a mount, state what turns its pose."""
 
     def said(camera: Filmed) -> str:
-        stored = camera.entry.poses.mount
+        stored = camera.entry.poses.mount or camera.entry.poses.in_gimbal
         if stored is None:
             forwards = matrix_from_quaternion(body_from_camera("forward"))
             rotation = quaternion_from_matrix(forwards.T @ turned(forwards))
@@ -118,6 +118,24 @@ def _levels() -> dict[Looks, Float]:
 def pose(cameras: Sequence[Filmed], key: str) -> str:
     """State how the poses of the moving cameras are written."""
     return _lines(cameras, _moving(cameras), lambda _: f"pose.{key}")
+
+
+def inverse(cameras: Sequence[Filmed]) -> str:
+    """State that the poses of the moving cameras are inverse to what they are read as."""
+    return _lines(
+        cameras,
+        _moving(cameras),
+        lambda camera: f"pose.inverse: {'false' if camera.entry.poses.inverse else 'true'}",
+    )
+
+
+def upside_down(cameras: Sequence[Filmed]) -> str:
+    """State that the positions of the moving cameras count z the other way."""
+    return _lines(
+        cameras,
+        _moving(cameras),
+        lambda camera: f"pose.z: {'up' if camera.entry.poses.z == 'down' else 'down'}",
+    )
 
 
 def of_body(cameras: Sequence[Filmed]) -> str:
@@ -182,13 +200,19 @@ def pose_noise(cameras: Sequence[Filmed], lasting: float, changing: float) -> st
 
 
 def origin(cameras: Sequence[Filmed], index: int, shift: Float | None, yaw_deg: float | None) -> str:
-    """Place the world of a camera's log in the flight's."""
-    translation = "[east, north, up]" if shift is None else _vector(np.round(shift, 2).tolist())
-    turn = f", yaw_deg: {yaw_deg:.1f}" if yaw_deg else ""
+    """Place the world of a camera's log in the flight's, beside what is stated of that already."""
+    translation, stated = "[east, north, up]", cameras[index].entry.poses.world_from_source
+    if shift is not None:
+        about_up = np.array(
+            [0.0, 0.0, np.sin(np.radians(yaw_deg or 0) / 2), np.cos(np.radians(yaw_deg or 0) / 2)]
+        )
+        placed = shift + matrix_from_quaternion(about_up) @ np.array(stated.translation)
+        translation = _vector((np.round(placed, 2) + 0.0).tolist())
+    turn = f", yaw_deg: {stated.yaw_deg + (yaw_deg or 0):.1f}" if yaw_deg or stated.yaw_deg else ""
     return _lines(cameras, [index], lambda _: f"pose.world_from_source: {{translation: {translation}{turn}}}")
 
 
 def own_origins(cameras: Sequence[Filmed], shifts: Float) -> str:
-    """Place the worlds of all logs; `shifts` [C, T, 3] are constant in time."""
-    moved = [index for index in range(len(cameras)) if np.nanmax(np.abs(shifts[index])) > 0]
-    return "; ".join(origin(cameras, index, np.nanmedian(shifts[index], axis=0), None) for index in moved)
+    """Place the worlds of all logs, which are moved by `shifts` [C, 3] m."""
+    moved = [index for index in range(len(cameras)) if np.abs(shifts[index]).max() > 0]
+    return "; ".join(origin(cameras, index, shifts[index], None) for index in moved)

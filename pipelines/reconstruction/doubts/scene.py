@@ -124,9 +124,18 @@ class Filmed:
 
     @property
     def mount(self) -> Float | None:
-        """body_from_camera [3, 3] where the camera is fixed to the body whose pose is logged, else None."""
-        stored = self.entry.poses.mount
+        """body_from_camera [3, 3] of a camera that is fixed to the body whose pose is logged, else None.
+
+        Of a camera on a gimbal, gimbal_from_camera.
+        """
+        stored = self.entry.poses.mount or self.entry.poses.in_gimbal
         return None if stored is None else matrix_from_quaternion(np.array(stored.rotation_xyzw))
+
+    @property
+    def lever_m(self) -> Float:
+        """The camera's place [3] on the body whose pose is logged; 0 where nothing is said of it."""
+        stored = self.entry.poses.mount or self.entry.poses.in_gimbal
+        return np.zeros(3) if stored is None else np.array(stored.translation)
 
 
 @dataclass(frozen=True)

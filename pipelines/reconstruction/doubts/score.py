@@ -52,6 +52,10 @@ _ANKLE_ABOVE_GROUND_M = 0.08
 _WALK_NS = 1_000_000_000  # how far apart two moments may be that tell where somebody walks
 _LEAST_PACE_MPS = 0.3  # over the flight, of somebody who walks
 _FASTEST_MPS = 6.0
+_LYING = 1.2  # the most that lying counts, and bending down or a cartwheel: people do that, if seldom
+_WALKING = 0.7  # least cosine of a body against the vertical, of somebody who walks
+_WALKING_SHARE = 0.8  # least share of the moments in which they do: else they lie down, or turn cartwheels
+_HEAD_DOWN = -0.3  # cosine of a body against the vertical: less is head down for most of a flight
 _HALF_BODY_M = 0.5
 SCATTER_WEIGHT = 12.0
 SCATTER_RANGE = (0.4, 30.0)  # what is less is no better: keypoints scatter by themselves
@@ -293,6 +297,9 @@ class _Body:
         self.hips = (self["left_hip"] + self["right_hip"]) / 2
         self.shoulders = (self["left_shoulder"] + self["right_shoulder"]) / 2
         self.ankles = (self["left_ankle"] + self["right_ankle"]) / 2
+        upwards = self.shoulders - self.ankles
+        # Of the body, against the vertical.
+        self.cosine: Float = upwards[:, 2] / np.linalg.norm(upwards, axis=-1)
 
     def __getitem__(self, name: str) -> Float:
         joint: Float = self.joints[:, _INDEX[name]]
@@ -305,9 +312,12 @@ class _Body:
 
     def posture(self) -> dict[str, float]:
         """Say how far the person is from upright, and from a face in front."""
-        cosine = self._cosine()
+        cosine = self.cosine
         middle = _median(cosine)
-        odd = {"upright": (1 - middle) / 0.15, "wander": _median(np.abs(cosine - middle)) / 0.1}
+        odd = {
+            "upright": min((1 - middle) / 0.15, _LYING) + max(0.0, _HEAD_DOWN - middle) / 0.05,
+            "wander": min(_median(np.abs(cosine - middle)) / 0.1, _LYING),
+        }
         forwards = self._forwards()
         nose = ((self["nose"] - (self["left_ear"] + self["right_ear"]) / 2) * forwards).sum(axis=-1)
         nose = nose[np.isfinite(nose)]
@@ -315,16 +325,11 @@ class _Body:
             odd["face"] = max(0.0, 0.6 - float((nose > 0).mean())) / 0.06
         return odd
 
-    def _cosine(self) -> Float:
-        """Return the cosine [T] of the body against the vertical."""
-        upwards = self.shoulders - self.ankles
-        cosine: Float = upwards[:, 2] / np.linalg.norm(upwards, axis=-1)
-        return cosine
-
     def _forwards(self) -> Float:
-        """Return a horizontal vector [T, 3] to where the hips face."""
-        up = np.array([0.0, 0.0, 1.0 if _median(self._cosine()) > 0 else -1.0])
-        forwards: Float = np.cross(up, self["right_hip"] - self["left_hip"])
+        """Return a vector [T, 3] to where the hips face, also of somebody who lies or is on their head."""
+        upwards = self.shoulders - self.hips
+        upwards /= np.linalg.norm(upwards, axis=-1, keepdims=True)
+        forwards: Float = np.cross(upwards, self["right_hip"] - self["left_hip"])
         return forwards
 
     def motion(self, flight: Sampled, stature: float, white_m: float, keypoint_m: float) -> dict[str, float]:
@@ -357,7 +362,7 @@ class _Body:
     def _ahead(self, flight: Sampled, white_m: float) -> float:
         """Return the cosine of where the person walks, over the flight, against where they face.
 
-        It is 1 of somebody who hardly walks.
+        It is 1 of somebody who hardly walks, or is not upright most of the time.
         """
         first = np.arange(len(flight.t_ns))
         second = np.searchsorted(flight.t_ns, flight.t_ns + _WALK_NS, side="right") - 1
@@ -369,6 +374,11 @@ class _Body:
         across = forwards[:, 0] * moved[:, 1] - forwards[:, 1] * moved[:, 0]
         # Steps weigh by their squared length in time, as those of equal noise do; none faster than people.
         known = np.isfinite(along) & (np.hypot(along, across) < _FASTEST_MPS * step_s + 3 * white_m)
+        # Only somebody who is upright walks: a cartwheel leads sideways, and lying down often backwards.
+        walks = self.cosine * np.sign(_median(self.cosine)) > _WALKING
+        if walks.sum() < _WALKING_SHARE * np.isfinite(self.cosine).sum():
+            return 1.0
+        known &= walks[first] & walks[second]
         weight = float((step_s[known] ** 2).sum())
         if not weight:
             return 1.0

@@ -130,6 +130,8 @@ def learn(
             if tau > REMEMBERED:
                 tau = memory_of_whole_error(tau, known.pixel_scale)
             known = replace(known, memory=tau)
+            if not poses and tau > REMEMBERED:
+                break  # nothing is left to be learned
     return known, state
 
 

@@ -124,8 +124,6 @@ class Problem:
     """Covariances [L, 6, 6] of logged white pose errors: world shift (m), camera rotation vector (rad)."""
     threads: int = 1
     """Largest number of threads; the results do not depend on it."""
-    guides: Bool | None = None
-    """Joints [J] whose keypoints determine the cameras where keypoint errors last; None for all of them."""
 
     @property
     def joints(self) -> int:
@@ -179,7 +177,6 @@ def build(
     bones: Int64,
     *,
     threads: int = 1,
-    guides: Bool | None = None,
 ) -> Problem:
     """Build the problem: sort pictures by the skeleton's times around them; leave out those near none.
 
@@ -188,7 +185,6 @@ def build(
         sightings: keypoints and poses of each camera.
         bones: [B, 2] joints with a nearly constant distance.
         threads: see `Problem`.
-        guides: see `Problem`.
     """
     step = float(np.median(np.diff(t_s)))
     covariances, logged = [np.empty((0, 6, 6))], 0
@@ -212,7 +208,7 @@ def build(
             logged += len(sighting.t_s)
     knots = max(int(np.ceil((t_s[-1] - t_s[0]) / KNOT_S)) + 1, 2)
     knot_t_s = np.linspace(t_s[0], t_s[-1], knots)
-    return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances), threads, guides)
+    return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances), threads)
 
 
 def _empty_pictures(count: int, joints: int) -> Pictures:

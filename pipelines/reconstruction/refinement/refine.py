@@ -142,30 +142,81 @@ def refine(
     part = _participating(start)
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
         return _none(len(clock_sigma_s), start, "too few joints or times were triangulated")
-    sightings = [_take(sighting, part) for sighting in sightings]
-    bones = _renumbered(bones, part)
-    filled = _without_gaps(t_s, start[:, part])
-    guides = None if guides is None else guides[part]
-    chosen = _stretches(len(t_s))
-    stretches = build(t_s[chosen], sightings, bones, threads=threads, guides=guides)
-    problem = stretches
-    if len(chosen) < len(t_s):
-        problem = build(t_s, sightings, bones, threads=threads, guides=guides)
-    del sightings  # the problem has its own copy
+    whole = _Views(
+        t_s,
+        tuple(_of_joints(sighting, part) for sighting in sightings),
+        _renumbered(bones, part),
+        _without_gaps(t_s, start[:, part]),
+        threads,
+    )
+    del sightings  # a clock's offset and the choice of joints made copies
+    guiding = np.ones(int(part.sum()), dtype=np.bool_) if guides is None else guides[part]
+    few = [] if guiding.all() or guiding.sum() < 3 else [whole.of(guiding)]
     refused = None
     try:
-        if prior is not None and not contested:
-            priors = _measured_prior(stretches, filled[chosen], prior, clock_sigma_s)
-        else:
-            priors = _priors(stretches, filled[chosen], prior, clock_sigma_s)
-        for found in priors:
-            refined = _refined(problem, part, filled, found, measured=not contested)
-            if refined.fallback is None:
-                return refined
-            refused = refused or refined
+        for views in (*few, whole):
+            stretches, filled = views.stretches()
+            if prior is not None and not contested:
+                priors = _measured_prior(stretches, filled, prior, clock_sigma_s)
+            else:
+                priors = _priors(stretches, filled, prior, clock_sigma_s)
+            for found in priors:
+                if views is not whole and found.known.memory <= REMEMBERED:
+                    break  # all joints tell of the cameras
+                refined = _refined(views, whole, guiding, found, measured=not contested)
+                refined = replace(
+                    refined,
+                    position=_of_all_joints(refined.position, part),
+                    covariance=_of_all_joints(refined.covariance, part),
+                )
+                if refined.fallback is None:
+                    return refined
+                refused = refused or refined
+            else:
+                break
     except np.linalg.LinAlgError as error:
         refused = refused or _none(len(clock_sigma_s), start, str(error))
     return refused or _none(len(clock_sigma_s), start, "no prior could be found")
+
+
+@dataclass(frozen=True)
+class _Views:
+    """What a problem is built of."""
+
+    t_s: Float  # [T]
+    sightings: tuple[Sighting, ...]
+    bones: Int64  # [B, 2]
+    start: Float  # [T, J, 3] m, without gaps
+    threads: int
+
+    def of(self, joints: Bool) -> _Views:
+        """Take some of the joints [J]."""
+        sightings = tuple(_of_joints(sighting, joints) for sighting in self.sightings)
+        return replace(
+            self, sightings=sightings, bones=_renumbered(self.bones, joints), start=self.start[:, joints]
+        )
+
+    def corrected_by(self, corrections: Sequence[tuple[Float, Float]]) -> _Views:
+        """Correct the poses of each camera by errors [F, 10] at times [F]."""
+        sightings = []
+        for sighting, (at_s, numbers) in zip(self.sightings, corrections, strict=True):
+            if len(at_s):
+                every = np.stack([np.interp(sighting.t_s, at_s, column) for column in numbers.T], axis=1)
+                position, rotation = corrected(sighting.position, sighting.rotation, every)
+                sightings.append(replace(sighting, position=position, rotation=rotation))
+            else:
+                sightings.append(sighting)
+        return replace(self, sightings=tuple(sightings))
+
+    def problem(self) -> Problem:
+        """Build the problem of the whole flight."""
+        return build(self.t_s, self.sightings, self.bones, threads=self.threads)
+
+    def stretches(self) -> tuple[Problem, Float]:
+        """Build that of the stretches from which the prior is learned, and take their start [T', J, 3]."""
+        chosen = _stretches(len(self.t_s))
+        problem = build(self.t_s[chosen], self.sightings, self.bones, threads=self.threads)
+        return problem, self.start[chosen]
 
 
 @dataclass(frozen=True)
@@ -178,21 +229,27 @@ class _Prior:
     expected_m: float  # largest allowed move of the skeleton
 
 
-def _refined(problem: Problem, part: Bool, filled: Float, prior: _Prior, *, measured: bool) -> Refined:
+def _refined(views: _Views, whole: _Views, guiding: Bool, prior: _Prior, *, measured: bool) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails.
 
-    Joints [J] that are not in `part` stay NaN. `measured` is True if the prior of the poses was measured.
+    Poses and clocks are estimated from the joints of `views`: all of the whole, or those that are `guiding`
+    [J]. The others are placed afterwards. `measured` is True if the prior of the poses was measured.
 
     Raises:
         LinAlgError: its equations are singular.
     """
-    known, cameras = prior.known, len(prior.known.poses)
-    state = initial_state(problem, known, filled)
+    known, cameras, problem = prior.known, len(prior.known.poses), views.problem()
+    state = initial_state(problem, known, views.start)
     clock_s, clock_left_s = _clocks(problem, known, state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)
     freely = replace(known, acceleration=limber(known.acceleration, _spread_of(cameras)))
-    system, state, at = solve(problem, freely, state, rounds=_ROUNDS)
+    lasting = freely
+    if known.memory > REMEMBERED:
+        # A detector's lasting errors do not average out, however long a flight is.
+        longer = len(views.t_s) / len(_stretches(len(views.t_s)))
+        lasting = replace(freely, memory=known.memory * longer)
+    system, state, at = solve(problem, lasting, state, rounds=_ROUNDS)
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
     as_stated = not prior.learned and _scale_unseen(system, state, at)
@@ -200,26 +257,34 @@ def _refined(problem: Problem, part: Bool, filled: Float, prior: _Prior, *, meas
     as_logged = prior.learned and not assumed and _position_undetermined(system, state, at, covariance)
     del at  # the next solutions have their own factors
     slow = system, state  # determines the poses
+    of_all = freely
     if known.memory > REMEMBERED:
-        remembering, placed = _joints_without_slow_errors(*slow, freely)
+        still = _without_slow_errors(system, state)
+        begin = state.position
+        if views is not whole:
+            still, begin, of_all = _with_all_joints(whole, guiding, system, state, freely)
+        remembering, placed = _joints_without_slow_errors(still, begin, of_all)
         joints = placed.position
-        covariance = _with_own(covariance, remembering, placed, problem.guides, measured=measured)
+        covariance = _with_own(covariance, remembering, placed, guiding, measured=measured)
+        state = placed
     elif _mainly_slow(problem, known, state):
         slow = _solve_with_loose_motion(problem, known, state)[:2]
-        joints = _joints_without_slow_errors(*slow, freely)[1].position
+        joints = _joints_without_slow_errors(_without_slow_errors(*slow), slow[1].position, freely)[
+            1
+        ].position
     else:
         joints = state.position
-    fallback = doubts or _too_far(joints, filled, prior.expected_m)
-    shift = np.median(filled - joints, axis=(0, 1)) if as_logged else np.zeros(3)
+    fallback = doubts or _too_far(joints, whole.start, prior.expected_m)
+    shift = np.median(whole.start - joints, axis=(0, 1)) if as_logged else np.zeros(3)
     return Refined(
-        position=_of_all_joints(joints + shift, part),
-        covariance=_of_all_joints(covariance, part),
+        position=joints + shift,
+        covariance=covariance,
         corrections=_corrections(*slow, shift),
         clock_offset_s=clock_s,
         clock_sigma_s=clock_left_s,
-        levels=_levels(known),
-        bone_lengths_m=state.shared[system.layout.bone_column :],
-        acceleration=freely.acceleration,
+        levels=_levels(replace(of_all, poses=known.poses)),
+        bone_lengths_m=state.shared[len(state.shared) - len(whole.bones) :],
+        acceleration=of_all.acceleration,
         learned=prior.learned,
         warnings=(
             *prior.warnings,
@@ -271,33 +336,63 @@ def _solve_with_loose_motion(
     return solve(problem, loose, state, rounds=_ROUNDS)
 
 
-def _joints_without_slow_errors(system: System, state: State, known: Knowledge) -> tuple[System, State]:
-    """Estimate the joints after removing slow pose errors, with the full weight of keypoints.
+def _without_slow_errors(system: System, state: State) -> Problem:
+    """Remove slow pose errors from the pictures' poses."""
+    pictures = system.problem.pictures
+    _, _, numbers = misfit(system, state._replace(white=np.zeros_like(state.white)))
+    position, rotation = corrected(pictures.position, pictures.rotation, numbers)
+    return replace(system.problem, pictures=replace(pictures, position=position, rotation=rotation))
+
+
+def _with_all_joints(
+    whole: _Views, guiding: Bool, system: System, state: State, known: Knowledge
+) -> tuple[Problem, Float, Knowledge]:
+    """Learn the motion, bones and keypoint errors of all joints with the poses that guides determined.
+
+    Returns the problem of all joints in which slow pose errors are removed, its start and its prior.
+    """
+    slow = state._replace(white=np.zeros_like(state.white))
+    moved = np.mean(state.position - whole.start[:, guiding], axis=1, keepdims=True)
+    begin = whole.start + moved
+    begin[:, guiding] = state.position
+    views = replace(whole.corrected_by(_corrections(system, slow, np.zeros(3))), start=begin)
+    stretches, start = views.stretches()
+    unlearned = _unlearned(stretches, start, _white_only(system.problem, known), known.clock_sigma_s)
+    first = initial_state(stretches, unlearned, start)
+    learned, first = learn(stretches, unlearned, first, poses=False, memory=True, rounds=_LEARNING_ROUNDS)
+    acceleration = shrunk(learned.acceleration, stretches.t_s, first.position)
+    of_all = replace(
+        learned,
+        poses=known.poses,
+        acceleration=limber(acceleration, _spread_of(len(known.poses))),
+        memory=max(learned.memory, known.memory),
+    )
+    return views.problem(), begin, of_all
+
+
+def _white_only(problem: Problem, known: Knowledge) -> tuple[PoseErrors, ...]:
+    """Return the levels of pose errors where slow ones are removed."""
+    knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
+    levels = [(errors, errors.white_with_stray(knot_s)) for errors in known.poses]
+    return tuple(PoseErrors((float(w[0]), float(w[1])), (), errors.logged) for errors, w in levels)
+
+
+def _joints_without_slow_errors(problem: Problem, start: Float, known: Knowledge) -> tuple[System, State]:
+    """Estimate the joints after the removal of slow pose errors, with the full weight of keypoints.
 
     Slow errors were estimated with correlated keypoints weighted less, or with a looser motion prior. That is
-    right for slow errors and wrong for limbs: their motion would be smoothed away, or become jittery.
+    right for slow errors and wrong for limbs: their motion would be smoothed away, or become jittery. Clocks
+    and the motion that depends on them stay unknowns.
 
-    Returns the estimate, and a system of the same poses in which correlated keypoints count less again, those
-    of all joints alike.
+    Returns the estimate, and a system of the same poses in which correlated keypoints count less again.
     """
-    pictures = system.problem.pictures
-    slow = state._replace(white=np.zeros_like(state.white))
-    _, _, numbers = misfit(system, slow)
-    position, rotation = corrected(pictures.position, pictures.rotation, numbers)
-    # Clocks and the motion that depends on them stay unknowns.
-    problem = replace(system.problem, pictures=replace(pictures, position=position, rotation=rotation))
-    knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
-    poses = []
-    for errors in known.poses:
-        white = errors.white_with_stray(knot_s)
-        poses.append(PoseErrors((float(white[0]), float(white[1])), (), errors.logged))
-    known = replace(known, poses=tuple(poses))
+    known = replace(known, poses=_white_only(problem, known))
     # Beside correlated keypoints the motion is learned only at first, and kicks would be smoothed.
     freely = _FAST_MOTION**2 if known.memory > REMEMBERED else 1.0
     weighted = replace(known, memory=1.0, acceleration=freely * known.acceleration)
-    initial = initial_state(problem, weighted, state.position)
+    initial = initial_state(problem, weighted, start)
     solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
-    return System(replace(problem, guides=None), known, solved.layout, BOUND**2), found
+    return System(problem, known, solved.layout, BOUND**2), found
 
 
 def _of_single_pictures(problem: Problem, pixel_scale: float, position: Float) -> Float:
@@ -320,9 +415,7 @@ def _of_single_pictures(problem: Problem, pixel_scale: float, position: Float) -
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
-def _with_own(
-    covariance: Float, system: System, state: State, guides: Bool | None, *, measured: bool
-) -> Float:
+def _with_own(covariance: Float, system: System, state: State, guiding: Bool, *, measured: bool) -> Float:
     """Compute covariances [T, J, 3, 3] of joints: each has its own error, and one by slow pose errors.
 
     Where keypoint errors last longer than motion is smooth, a joint's own error is that of a single picture.
@@ -330,15 +423,15 @@ def _with_own(
     joint that did not determine the cameras has the error by poses of the guide that is mostly the nearest.
 
     Args:
-        covariance: [T, J, 3, 3] of the estimate in which only guides determined the cameras.
+        covariance: [T, G, 3, 3] of the estimate of the guides and cameras, or [T, J, 3, 3] of all joints.
         system: in it slow pose errors are removed, and correlated keypoints count less.
         state: the estimate of this system.
-        guides: [J]; None if every joint is one.
+        guiding: [J]
         measured: pose errors were measured, by backgrounds.
     """
     position = state.position
     own = covariances(system, eliminate(system, state))
-    of = np.arange(position.shape[1]) if guides is None else np.flatnonzero(guides)
+    of = np.flatnonzero(guiding) if covariance.shape[1] < position.shape[1] else np.arange(position.shape[1])
     found = own.copy()
     if measured:
         least = _of_single_pictures(system.problem, system.knowledge.pixel_scale, position)
@@ -346,8 +439,8 @@ def _with_own(
         found[single] = least[single]
     for joint in range(position.shape[1]):
         away = np.linalg.norm(position[:, of] - position[:, joint, None], axis=-1)
-        near = of[np.argmin(np.median(away, axis=0))]
-        by_poses = covariance[:, near] - own[:, near]
+        near = np.argmin(np.median(away, axis=0))
+        by_poses = covariance[:, near] - own[:, of[near]]
         variance, axes = np.linalg.eigh(0.5 * (by_poses + by_poses.swapaxes(-1, -2)))
         found[:, joint] += np.einsum("tij,tj,tkj->tik", axes, np.maximum(variance, 0.0), axes)
     return found
@@ -376,7 +469,7 @@ def _participating(start: Float) -> Bool:
     return part
 
 
-def _take(sighting: Sighting, part: Bool) -> Sighting:
+def _of_joints(sighting: Sighting, part: Bool) -> Sighting:
     if part.all():
         return sighting
     return replace(sighting, rays=sighting.rays[:, part], confidence=sighting.confidence[:, part])

@@ -17,14 +17,13 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.noise import EXACT, PoseErrors
 from pipelines.reconstruction.refinement import kernels
 from pipelines.reconstruction.refinement.kernels import Equations, PictureArrays, State
-from pipelines.reconstruction.refinement.problem import REMEMBERED, Knowledge, Layout, Problem
+from pipelines.reconstruction.refinement.problem import Knowledge, Layout, Problem
 from pipelines.reconstruction.refinement.sweeps import Sweep, Ties
 
 AT_ONCE = 4096
 """Pictures whose residuals are in memory together where only a sum over them is asked for."""
 
 _ANYWHERE_M = 100.0  # prior sigma of an unseen joint around its start
-_NO_GUIDE = 30**0.5  # factor on the standard deviation of keypoints that do not determine the cameras
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class System:
                 camera=seen.camera,
                 when_s=seen.when_s,
                 rays=seen.rays,
-                sharpness=seen.sharpness / (known.pixel_scale * _blur(problem, known)),
+                sharpness=seen.sharpness / (known.pixel_scale * np.sqrt(known.memory)),
                 position=seen.position,
                 rotation=seen.rotation,
                 speed=seen.speed,
@@ -88,14 +87,6 @@ class System:
         """Compute the ratio of the body's size to the one for which the prior of motion and bones holds."""
         lengths = state.shared[self.layout.bone_column :]
         return float(lengths.mean() / self.knowledge.size_m) if len(lengths) else 1.0
-
-
-def _blur(problem: Problem, known: Knowledge) -> Float:
-    """Compute the factor [J] on the standard deviations of image points by the memory of their errors."""
-    blur = np.full(problem.joints, np.sqrt(known.memory))
-    if problem.guides is not None and known.memory > REMEMBERED:
-        blur[~problem.guides] *= _NO_GUIDE
-    return blur
 
 
 def _white_errors(problem: Problem, poses: Sequence[PoseErrors]) -> tuple[Int64, Float]:

@@ -1,0 +1,95 @@
+"""Flights longer than the stretches from which the refinement learns: `auto` beside `robust`.
+
+    python -m benchmarks.long_flights            # the table of docs/measurements-refined.md
+
+Simulated, modelled keypoints with a detector's lasting errors; noise stated, and nothing stated. There is no
+film and so no background: keypoints alone tell of the cameras. Odd seeds drift; half of the flights have
+three drones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+
+import yaml  # type: ignore[import-untyped]
+
+from benchmarks.results_page import markdown_table
+from pipelines.ingest import ingest
+from pipelines.reconstruct import Settings, reconstruct
+from pipelines.simulate import simulate
+
+SAMPLE = Path(__file__).parents[1] / "sample_data" / "mound_walk" / "scenario.yaml"
+NOISE = (
+    {
+        "white": {"position_m": 0.02, "rotation_deg": 0.2},
+        "bias": {"position_m": 0.05, "rotation_deg": 0.3},
+    },
+    {
+        "white": {"position_m": 0.02, "rotation_deg": 0.2},
+        "gauss-markov": {"position_m": 0.1, "rotation_deg": 0.4, "correlation_s": 20},
+    },
+)
+COLUMNS = ("flight", "stated", "robust mm", "auto mm", "root-relative, robust", "the same, auto", "refused")
+
+
+def scenario(seed: int, seconds: float) -> dict[str, object]:
+    """Return the sample's scenario with a longer walk, another seed, and two or three drones."""
+    document: dict[str, object] = yaml.safe_load(SAMPLE.read_text())
+    turn = (-75, 60, 80, 45)[seed % 4]
+    walk = {"walk": {"distance_m": 16, "turn_deg": turn, "speed_mps": 1.3}}
+    actor, drones = document["actor"], document["drones"]
+    assert isinstance(actor, dict)
+    assert isinstance(drones, dict)
+    actor["motion"] = [walk] * (int(seconds / 12) + 1)
+    drones["count"], drones["pose_noise"] = 2 + seed // 2 % 2, NOISE[seed % 2]
+    return document | {"seed": seed, "duration_s": seconds}
+
+
+def main() -> None:
+    """Fly, reconstruct and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--first", type=int, default=300, help="seed of the first flight")
+    parser.add_argument("--count", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=90.0)
+    arguments = parser.parse_args()
+    rows = []
+    for seed in range(arguments.first, arguments.first + arguments.count):
+        with tempfile.TemporaryDirectory() as folder:
+            place = Path(folder)
+            plan = scenario(seed, arguments.seconds)
+            (place / "scenario.yaml").write_text(yaml.safe_dump(plan))
+            simulate(place / "scenario.yaml", place / "made", video=False)
+            manifest = yaml.safe_load((place / "made" / "flight.yaml").read_text())
+            for stated in (True, False):
+                if not stated:
+                    for camera in manifest["cameras"].values():
+                        del camera["pose_noise"]
+                (place / "made" / "flown.yaml").write_text(yaml.safe_dump(manifest))
+                session = place / f"{stated}.session"
+                ingest(place / "made" / "flown.yaml", session)
+                found = {}
+                for method in ("robust", "auto"):
+                    reconstruct(session, Settings(method=method))
+                    found[method] = json.loads((session / "reconstruct" / "metrics.json").read_text())
+                drones = plan["drones"]
+                assert isinstance(drones, dict)
+                noise = "drifting" if seed % 2 else "constant"
+                rows.append(
+                    [
+                        f"{seed}, {drones['count']} drones, {noise}",
+                        "yes" if stated else "no",
+                        *(f"{found[method]['mpjpe_mm']:.0f}" for method in ("robust", "auto")),
+                        *(f"{found[method]['root_mpjpe_mm']:.0f}" for method in ("robust", "auto")),
+                        "yes" if found["auto"]["refinement"].get("fallback") else "",
+                    ]
+                )
+    print("\n".join(markdown_table(COLUMNS, rows)))
+
+
+if __name__ == "__main__":
+    main()
