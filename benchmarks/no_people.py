@@ -36,7 +36,7 @@ from pipelines.reconstruct import find_people, ground_of
 from pipelines.reconstruction.loading import load_cameras, load_truth
 from pipelines.reconstruction.observations import Candidates
 from pipelines.session.description import Description, read_description
-from pipelines.session.people import logged_actor, true_joints_at
+from pipelines.session.people import logged_people, true_joints_at
 from pipelines.session.stages import locked
 from pipelines.simulate import simulate
 
@@ -130,14 +130,14 @@ def print_rows(session: Path, detector: str, name: str, search: str) -> None:
         pose_noise=None,
         calibrated=read_calibration(measured).probabilities if measured else None,
     )
-    actor = logged_actor(session, description)
+    actors = logged_people(session, description)
     fields = np.array([camera.field for camera in cameras])
     for known in [description, replace_map(description)] if description.map else [description]:
-        ground = ground_of(session, known, actor)
-        kind = "map" if known.map else "log" if actor else "people"
+        ground = ground_of(session, known, actors[0] if actors else None)
+        kind = "map" if known.map else "log" if actors else "people"
         with patch.object(association, "tell_no_people", wraps=tell_no_people) as telling:
             found, _, _ = find_people(
-                cameras, description.pose_interpolation, actor, people=3, scene=Scene(ground, fields)
+                cameras, description.pose_interpolation, actors, people=3, scene=Scene(ground, fields)
             )
         arguments = telling.call_args.args
         seen, things = arguments[0], tell_no_people(*arguments)

@@ -39,7 +39,30 @@ def grouped(name: str, make: Callable[..., Any], *options: Option) -> Callable[[
     return decorated
 
 
-any_path = click.Path(path_type=Path)
+any_place = click.Path(path_type=Path)
+"""A path or URL that click does not check: the function that reads it reports what is wrong with it."""
+
+
+class _PathHere(click.Path):
+    """Path on this machine."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Refuse a URL, of which a folder with a strange name would be made."""
+        if is_url(value):
+            self.fail(f"{str(value)!r} is a URL, and must be a path here.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+def is_url(place: Path | str) -> bool:
+    """Return True for a place in an object store."""
+    if ":/" not in str(place):
+        return False
+    from pipelines.session.stores import url_of
+
+    return url_of(place) is not None
+
+
+any_path = _PathHere(path_type=Path)
 """A path that click does not check: the function that reads it reports a missing path or a wrong kind."""
 
 overwrite_option = click.option(

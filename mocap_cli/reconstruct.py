@@ -27,6 +27,20 @@ if TYPE_CHECKING:
     from pipelines.reconstruct import Reconstructed, Settings
 
 
+class People(click.ParamType["int | str"]):
+    """A number of people, or `auto`."""
+
+    name = "people"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        """Convert the value, or raise a usage error."""
+        if value == "auto":
+            return "auto"
+        if not str(value).isdecimal() or not 1 <= int(value) <= 20:
+            self.fail(f"{value!r} is neither auto nor a number from 1 to 20.", param, ctx)
+        return int(value)
+
+
 def _settings(
     start_s: float | None, end_s: float | None, detector: str, provider: str | None, **others: Any
 ) -> Settings:
@@ -60,10 +74,11 @@ _settings_options = grouped(
     click.option(
         "--persons",
         "people",
-        type=click.IntRange(1, 20),
-        default=1,
-        show_default=True,
-        help="Number of people to reconstruct.",
+        type=People(),
+        metavar="N|auto",
+        help="Number of people to reconstruct. auto: those who were logged, and everybody else whom two"
+        " cameras see for a second, on the ground, of a person's size [default: auto if flight.yaml has"
+        " `actors:`, else 1].",
     ),
     click.option(
         "--min-confidence",

@@ -2,13 +2,14 @@
 
 import functools
 import glob
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
-from mocap_cli.options import any_path
+from mocap_cli.options import any_place, is_url
 from mocap_cli.terminal import one_line, print_json, say
 from pipelines.session.errors import DataError, MocapError
 
@@ -26,11 +27,65 @@ def expanded(paths: Iterable[str | Path]) -> list[Path]:
         if not glob.has_magic(text) or Path(text).exists():
             found[Path(text)] = None
             continue
+        if is_url(text):
+            found.update(dict.fromkeys(map(Path, _matching(text))))
+            continue
         matches = sorted(glob.glob(text, recursive=True))  # noqa: PTH207  # Path's knows no absolute pattern
         if not matches:
             raise DataError(text, "matches nothing", "check the pattern")
         found.update(dict.fromkeys(map(Path, matches)))
     return list(found)
+
+
+def _matching(pattern: str) -> list[str]:
+    from pipelines.session.stores import matching, url_of
+
+    found = matching(url_of(pattern) or pattern)
+    if not found:
+        raise DataError(pattern, "matches nothing", "check the pattern")
+    return found
+
+
+@contextmanager
+def session_here(place: Path, *, create: bool = False, quiet: bool = True) -> Iterator[Path]:
+    """Yield the folder of a session; one in an object store is fetched, and published when it has changed.
+
+    Args:
+        create: allow a URL at which there is no session yet.
+        quiet: do not print what was published.
+    """
+    if not is_url(place):
+        yield place
+        return
+    from pipelines.session.stores import staged, url_of
+
+    with staged(url_of(place) or "", create=create) as copy:
+        yield copy.folder
+        if copy.publish() and not quiet:
+            say(f"published: {copy.version}")
+
+
+def _here(stack: ExitStack, argument: str, suffix: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Return a command's options with places of object stores replaced by copies, until the stack ends."""
+    place, output = options[argument], options.get("output")
+    quiet = bool(options.get("as_json") or options.get("quiet"))
+    own: dict[str, Any] = {}
+    if is_url(place):
+        from pipelines.session.stores import fetched, holds_session, url_of
+
+        url = url_of(place) or ""
+        if argument == "session" or (argument == "path" and holds_session(url)):
+            own[argument] = stack.enter_context(session_here(place, quiet=quiet))
+            if suffix and output is None:  # beside the session is nowhere: into the working directory
+                own["output"] = Path(place.name).with_suffix(suffix)
+        else:
+            own[argument] = fetched(url, fresh=True)
+            output = output or (place.with_suffix(suffix) if argument == "flight" else None)
+    if output is not None and is_url(output):
+        if argument != "flight":
+            raise DataError(output, "is a URL, and must be a path here", "write it here, and copy it there")
+        own["output"] = stack.enter_context(session_here(output, create=True, quiet=quiet))
+    return options | own
 
 
 def each(
@@ -48,12 +103,16 @@ def each(
     """
 
     def decorated(command: Command) -> Callable[..., None]:
-        @click.argument("paths", nargs=-1, required=True, type=any_path, metavar=f"{metavar}...")
+        def run_one(**options: Any) -> dict[str, Any] | None:
+            with ExitStack() as stack:
+                return command(**_here(stack, argument, suffix, options))
+
+        @click.argument("paths", nargs=-1, required=True, type=any_place, metavar=f"{metavar}...")
         @functools.wraps(command)
         def run(*, paths: tuple[Path, ...], **options: Any) -> None:
             ones = expanded(paths)
             if len(ones) == 1:
-                result = command(**{argument: ones[0]}, **options)
+                result = run_one(**{argument: ones[0]}, **options)
                 if result is not None:
                     print_json(result)
                 return
@@ -62,7 +121,7 @@ def each(
                 for mine, output in zip(own, _outputs(ones, options["output"], suffix), strict=True):
                     mine["output"] = output
             show = titled and not (options.get("as_json") or options.get("quiet"))
-            calls = [functools.partial(command, **options | mine) for mine in own]
+            calls = [functools.partial(run_one, **options | mine) for mine in own]
             _run_all(calls, ones, as_json=bool(options.get("as_json")), titled=show)
 
         return run

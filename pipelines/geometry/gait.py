@@ -113,7 +113,8 @@ def _runs(t_ns: Int64, known: Bool, step_ns: float) -> list[slice]:
     begins = known & np.concatenate([[True], ~known[:-1] | (np.diff(t_ns) > _LONGEST_STEP * step_ns)])
     starts = np.flatnonzero(begins)
     runs = []
-    for start, limit in zip(starts, [*starts[1:], len(known)], strict=True):
+    limits = [*starts[1:], len(known)][: len(starts)]  # none where no frame is known
+    for start, limit in zip(starts, limits, strict=True):
         stop = start + int(np.argmin(np.append(known[start:limit], False)))
         if (stop - start) * step_ns >= _LEAST_RUN_S * 1e9:
             runs.append(slice(int(start), stop))

@@ -67,6 +67,7 @@ _RAISED = np.radians(20.0)  # the least elevation of an arm that shows its plane
 _HINGE = np.sin(np.radians(15.0))  # bend at which a knee's own plane and the hips' line weigh the same
 _UPRIGHT = 0.3  # of a line's length: with less of it level, the hips' line has no heading
 _STEP_M = 1e-6  # of the derivatives: their relative error is about this step over a segment's length
+_UNKNOWN_M2 = 1e12  # the variance of a place on Earth that nobody knows
 _AT_ONCE = 2048  # person-times: what a processor's cache holds
 
 
@@ -75,7 +76,7 @@ class JointAngles:
     """Angles of P people at T times, in the order of `ANGLES`."""
 
     value_deg: Float  # [T, P, A], NaN unless `status` is ok or filled
-    sigma_deg: Float  # [T, P, A] standard deviation, NaN without covariances
+    sigma_deg: Float  # [T, P, A] standard deviation, NaN without covariances or with infinite ones
     status: NDArray[np.int8]  # [T, P, A] index of `ANGLE_STATUS`: that of the worst joint it rests on
 
 
@@ -111,7 +112,7 @@ def joint_angles(
     for start in range(0, count, _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
         points = np.ascontiguousarray(flat[part].transpose(1, 2, 0))
-        spreads = None if spread is None else np.ascontiguousarray(spread[part].transpose(1, 2, 0))
+        spreads = None if spread is None else np.ascontiguousarray(_known(spread[part]).transpose(1, 2, 0))
         for group in groups:
             of = [joints.index(name) for name in group.joints]
             to = [column[name] for name in group.angles]
@@ -131,6 +132,11 @@ def _worst(status: NDArray[np.int8]) -> NDArray[np.int8]:
     lost = (status != _OK) & (status != _FILLED)
     first = np.where(lost.any(axis=1), lost.argmax(axis=1), (status == _FILLED).argmax(axis=1))
     return np.take_along_axis(status, first[:, None], axis=1)
+
+
+def _known(covariance: Float) -> Float:
+    """Return covariances m^2 with NaN in place of those that say nothing, which may be infinite."""
+    return np.where(np.abs(covariance) < _UNKNOWN_M2, covariance, np.nan)
 
 
 def _sigma(group: _Group, points: Float, found: Float, covariance: Float) -> Float:

@@ -402,3 +402,61 @@ def align_each(source: Float, target: Float, *, with_scale: bool) -> Alignment:
         rotation=np.where(determined[..., None, None], rotation, np.nan),
         translation=np.where(determined[..., None], translation, np.nan),
     )
+
+
+def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> dict[str, float]:
+    """Count who was found, missed and confused over time, as the field does for several people.
+
+    A reconstructed person is at a true one if the mean difference of their common joints is at most
+    `within_m`. At each time a person's last pair stays if it holds, and the others are assigned with
+    the least sum of distances (CLEAR MOT: Bernardin and Stiefelhagen 2008). A true person who is paired with
+    somebody else than the last time counts as a switch. For IDF1 (Ristani et al. 2016) each reconstructed
+    person is paired with one true person for the whole flight.
+
+    Args:
+        position: [T, P, J, 3] m, NaN for what was not reconstructed.
+        truth: [T, Q, J, 3] m, NaN where unknown.
+        within_m: the largest distance.
+
+    Returns:
+        `present`: joint times of true people; of these `misses`; `phantoms`: reconstructed people at no true
+        one; `switches`; `mota`: 1 - (misses + phantoms + switches) / present; `idf1`; `within_m`. NaN for the
+        two shares if no true person is present.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    offset = position[:, :, None] - truth[:, None]
+    both: Bool = np.isfinite(offset[..., 0])
+    mean = np.where(both[..., None], offset, 0.0).sum(axis=3) / np.maximum(both.sum(axis=3), 1)[..., None]
+    distance: Float = np.where(both.sum(axis=3) > 0, np.linalg.norm(mean, axis=-1), np.inf)
+    distance[distance > within_m] = np.inf
+    found, total = (int(np.isfinite(own[..., 0]).any(axis=2).sum()) for own in (position, truth))
+    last: dict[int, int] = {}
+    matches = switches = 0
+    for near in distance:
+        pairs: dict[int, int] = {}
+        for q, p in sorted(last.items()):
+            if near[p, q] < np.inf and p not in pairs.values():
+                pairs[q] = p
+        free = near.copy()
+        free[list(pairs.values())] = np.inf
+        free[:, list(pairs)] = np.inf
+        cost = np.where(free < np.inf, free, 1e6)
+        for p, q in np.transpose(linear_sum_assignment(cost)).tolist():
+            if free[p, q] < np.inf:
+                pairs[q] = p
+                switches += last.get(q, p) != p
+        last |= pairs
+        matches += len(pairs)
+    at = (distance < np.inf).sum(axis=0)
+    same = int(at[linear_sum_assignment(at, maximize=True)].sum())
+    misses, phantoms = total - matches, found - matches
+    return {
+        "within_m": within_m,
+        "present": total,
+        "misses": misses,
+        "phantoms": phantoms,
+        "switches": switches,
+        "mota": 1 - (misses + phantoms + switches) / total if total else np.nan,
+        "idf1": 2 * same / (total + found) if total else np.nan,
+    }

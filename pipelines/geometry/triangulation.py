@@ -270,7 +270,7 @@ def _explaining_sigma(views: Views, result: Triangulation) -> Float:
     variance = views.pixel_sigma**2 + seen**2 * _pose_variance_px(views, result.points)  # of confidence 1
     whitened = np.nansum((seen * result.residual_px) ** 2 / variance, axis=1)
     freedom = 2.0 * result.views - 3.0
-    ok = freedom > 0
+    ok = (freedom > 0) & np.isfinite(whitened)  # wrong poses put points into a camera's own plane
     if not ok.any():
         return views.pixel_sigma
     # Median of the chi-square distribution by Wilson and Hilferty (1931).

@@ -1,16 +1,27 @@
-"""Association: one detection per camera and time for the actor, if several people are seen."""
+"""Association: one detection per camera and time for each person, if several people are seen."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.keypoints.grouping import Followed, follow
-from pipelines.keypoints.no_people import Scene, tell_no_people
+from pipelines.keypoints.no_people import (
+    Body,
+    Ground,
+    Scene,
+    Views,
+    level_of_most_seen,
+    tell_no_people,
+    why_no_person,
+)
 
 Int64 = NDArray[np.int64]
 
@@ -19,12 +30,13 @@ _FAR = 25.0  # beyond 5 sigma a track is not the actor at that time
 _BODY_M = 0.5  # the log's point (hip, a tag, a phone) against the middle of the joints seen
 _PACE_M_PER_S = 3.0  # a lost person is not resumed further away than a run
 _REACH_M = 1.0
+_MOST_PEOPLE = 12
 _OVERLAP = 0.05  # largest share of a track's frames that may overlap with the person it continues
 
 
 @dataclass(frozen=True)
 class Association:
-    """Assignment of detections to people. T times, C cameras, P people; person 0 is the actor."""
+    """Assignment of detections to people. T times, C cameras, P people; those who were logged come first."""
 
     choice: Int64  # [T, C, P] index into the detections of the camera at that time, -1 none
     views: Int64  # [P] camera-frames chosen
@@ -37,6 +49,7 @@ class Association:
     no_people: dict[
         str, Int64
     ]  # [C] detections by the causes of `NoPeople`, which are not used; and those kept
+    phantoms: dict[str, int]  # bodies that two cameras see and that are no people, by `why_no_person`
     reasons: tuple[str, ...]  # messages for the user, one line each
 
 
@@ -60,18 +73,19 @@ def associate(
     rotation: Float,
     sigma: Float,
     *,
-    actor: Float | None = None,
+    actors: Float | None = None,
     actor_sigma_m: float = 1.0,
-    people: int = 1,
+    people: int | None = 1,
     scene: Scene | None = None,
 ) -> Association:
-    """Choose the detections of the actor, then of other people, most seen first.
+    """Choose the detections of the people who were logged, then of others, most seen first.
 
     Detections of different cameras are grouped into bodies by how near their viewing rays pass each
     other, in units of the stated angular noise, and bodies are followed over time by the continuity of
-    each camera's picture and by their place (see `grouping`). The actor is the body nearest the logged
-    actor; without a log the one seen in most camera-frames by two cameras or more, ties by confidence.
-    The order of detections within a camera and frame does not matter.
+    each camera's picture and by their place (see `grouping`). Of the bodies each logged person is the one
+    that fits their log best, so that the sum over all of them is greatest; nobody stands in for a logged
+    person whom no camera sees. Others are those seen in most camera-frames by two cameras or more, ties by
+    confidence. The order of detections within a camera and frame does not matter.
 
     Args:
         time_s: [T] seconds, strictly increasing.
@@ -82,9 +96,11 @@ def associate(
         rotation: [T, C, 3, 3] world_from_camera.
         sigma: [T, C] rad, standard deviation of a viewing ray on each axis: pixel and pose noise, and
             clock error times the actor's angular speed.
-        actor: [T, 3] m, the logged actor, NaN where unknown.
-        actor_sigma_m: standard deviation of the log on each axis.
-        people: number of people to choose.
+        actors: [T, A, 3] m, the people who were logged, person 0 first, NaN where unknown. If no log is
+            near anybody, none is used.
+        actor_sigma_m: standard deviation of the logs on each axis.
+        people: number of people to choose; None: those who were logged and whoever else is a person as far
+            as two cameras or more can tell (`why_no_person`), at least one.
         scene: the surroundings, by which things that are no people are dropped; by default nothing is.
 
     Returns:
@@ -93,31 +109,30 @@ def associate(
     if confidence.shape[2] == 0:  # no detections at all: make room for one absent person
         xy = np.full((*xy.shape[:2], 1, *xy.shape[3:]), np.nan)
         confidence = np.zeros(xy.shape[:-1])
-    logged = None if actor is None else np.c_[actor, np.full(len(actor), actor_sigma_m)]
-    seen = follow(time_s, xy, confidence, position, rotation, sigma, logged)
+    logs = None
+    logged = [] if actors is None else [actors[:, k] for k in range(actors.shape[1])]
+    if logged:
+        logs = np.stack([np.c_[log, np.full(len(log), actor_sigma_m)] for log in logged], axis=1)
+    seen = follow(time_s, xy, confidence, position, rotation, sigma, logs)
     dropped: dict[str, Int64] = {}
     if scene is not None:
         things = tell_no_people(seen, xy, confidence, position, rotation, sigma, scene)
         dropped = {cause: which.sum((0, 2)) for cause, which in things._asdict().items()}
         if (out := things.ground | things.alone).any():
             confidence = np.where(out[..., None], 0.0, confidence)
-            seen = follow(time_s, xy, confidence, position, rotation, sigma, logged)
+            seen = follow(time_s, xy, confidence, position, rotation, sigma, logs)
     tracks = _tracks(seen, np.where(np.isfinite(xy).all(-1) & (confidence > 0), confidence, 0.0))
-    chosen = np.full((*seen.track.shape[:2], people), -1, np.int64)
-    resumed = np.zeros(people, np.int64)
-    reasons: list[str] = []
-    for person in range(people):
-        log = actor if person == 0 else None
-        if log is not None and tracks and not any(_likeness(one, log, actor_sigma_m) > 0 for one in tracks):
-            reasons.append(_far_from_log(tracks, log))
-            log = None
-        owner, taken = _chain(tracks, time_s, log, actor_sigma_m)
-        chosen[:, :, person] = _detections(seen.track, owner, taken)
-        resumed[person] = max(0, len(taken) - 1)
-        tracks = [one for one in tracks if one.identity not in taken]
+    chains, tracks, reasons = _chains(tracks, time_s, logged, actor_sigma_m, people)
+    refused: Counter[str] = Counter()
+    if people is None:
+        views = Views(xy, confidence, position, rotation, sigma)
+        ground = None if scene is None else scene.ground or level_of_most_seen(seen)
+        refused = _add_people(chains, tracks, time_s, seen.track, views, ground)
+    chosen = np.stack([_detections(seen.track, chain.owner, chain.taken) for chain in chains], axis=-1)
+    resumed = np.array([max(0, len(chain.taken) - 1) for chain in chains], np.int64)
     if not np.any(chosen >= 0):
         reasons.append(_nobody(seen.nearest))
-    return _counted(chosen, seen, resumed, dropped, tuple(reasons))
+    return _counted(chosen, seen, resumed, dropped, refused, tuple(reasons))
 
 
 def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
@@ -158,36 +173,124 @@ def _likeness(track: _Track, log: Float | None, sigma_m: float) -> float:
     return float(np.nansum(track.views * (_NEAR - np.minimum(_squares(track, log, sigma_m), _FAR))))
 
 
-def _chain(tracks: list[_Track], time_s: Float, log: Float | None, sigma_m: float) -> tuple[Int64, list[int]]:
-    """Chain tracks into one person.
+class _Chain:
+    """Tracks that are one person, one after the other."""
 
-    The first track is the one nearest the log, or the one seen most. Other tracks fill the times at which
-    no camera saw it.
+    def __init__(self, time_s: Float, log: Float | None, sigma_m: float) -> None:
+        self.owner = np.full(len(time_s), -1, np.int64)  # track at each time, -1 none, -2 refused by the log
+        self.place = np.full((len(time_s), 3), np.nan)
+        self.taken: list[int] = []
+        self._time_s, self._log, self._sigma_m = time_s, log, sigma_m
+
+    def likeness(self, track: _Track) -> float:
+        """Compute the evidence that a track is this person by the log; 0 without a log."""
+        return _likeness(track, self._log, self._sigma_m)
+
+    def offer(self, track: _Track) -> bool:
+        """Take a track for the times at which no camera saw the person, if it has any."""
+        free = self.owner[track.time] < 0
+        if not free.any():
+            return False
+        far = np.zeros(len(track.time), bool)
+        if self._log is not None:
+            far = _squares(track, self._log, self._sigma_m) > _FAR
+        self.owner[track.time[free & ~far]] = track.identity
+        self.owner[track.time[free & far]] = -2
+        self.place[track.time[free]] = track.middle[free]
+        self.taken.append(track.identity)
+        return True
+
+    def offer_without_log(self, track: _Track) -> bool:
+        """Take a track on which the log says nothing, if nobody or this person was seen before it."""
+        if self.taken and not _continues(track, self.owner, self.place, self._time_s):
+            return False
+        return self.offer(track)
+
+
+def _chains(
+    tracks: list[_Track], time_s: Float, logs: list[Float], sigma_m: float, people: int | None
+) -> tuple[list[_Chain], list[_Track], list[str]]:
+    """Chain tracks into people: those with logs together, each of the others after the one before.
 
     Returns:
-        The identity of the track at each time [T] (-1 none, -2 refused by the log), and all identities used.
+        The people (at least one), the tracks that are nobody's, and messages.
     """
-    owner = np.full(len(time_s), -1, np.int64)
-    place = np.full((len(time_s), 3), np.nan)
-    taken: list[int] = []
-    likeness = {one.identity: _likeness(one, log, sigma_m) for one in tracks}
-    ranked = sorted(
-        (one for one in tracks if likeness[one.identity] >= 0),
-        key=lambda one: (-likeness[one.identity], -one.views.sum(), -one.confidence, one.identity),
-    )
-    for one in ranked:
-        logged = likeness[one.identity] > 0
-        if taken and not logged and not _continues(one, owner, place, time_s):
+    tracks = sorted(tracks, key=lambda one: (-one.views.sum(), -one.confidence, one.identity))
+    reasons: list[str] = []
+    nobody = [k for k, log in enumerate(logs) if not any(_likeness(t, log, sigma_m) > 0 for t in tracks)]
+    if tracks and len(nobody) == len(logs):
+        reasons += [_far_from_log(tracks, log) for log in logs]
+        logs = []
+    elif len(logs) > 1:
+        reasons += [f"nobody is seen near the log of person {k}" for k in nobody]
+    chains = [_Chain(time_s, log, sigma_m) for log in logs]
+    tracks = _by_logs(tracks, chains)
+    chains = chains[:people]  # all of them for None
+    while len(chains) < (people or 1):
+        chain, tracks = _next_chain(tracks, time_s)
+        chains.append(chain)
+    return chains, tracks, reasons
+
+
+def _next_chain(tracks: list[_Track], time_s: Float) -> tuple[_Chain, list[_Track]]:
+    """Chain the track seen most, and what continues it, into a person; also return the tracks left over."""
+    chain = _Chain(time_s, None, 1.0)
+    return chain, [one for one in tracks if not chain.offer_without_log(one)]
+
+
+def _add_people(
+    chains: list[_Chain],
+    tracks: list[_Track],
+    time_s: Float,
+    track: Int64,
+    views: Views,
+    ground: Ground | None,
+) -> Counter[str]:
+    """Add everybody else who is a person; return how many bodies are none, by `why_no_person`.
+
+    Bodies come in the order of how much they are seen. After one that is seen too shortly there are only
+    pieces of bodies, which are not counted.
+    """
+
+    def body(chain: _Chain) -> Body:
+        middle = np.where((chain.owner >= 0)[:, None], chain.place, np.nan)
+        return Body(_detections(track, chain.owner, chain.taken), middle)
+
+    refused: Counter[str] = Counter()
+    people = [body(chain) for chain in chains if chain.taken]
+    while tracks and len(chains) < _MOST_PEOPLE:
+        chain, tracks = _next_chain(tracks, time_s)
+        candidate = body(chain)
+        cause = why_no_person(candidate, people, time_s, views, ground)
+        if cause == "short":
+            break
+        if cause:
+            refused[cause] += 1
             continue
-        free = owner[one.time] < 0
-        if not free.any():
-            continue
-        far = np.zeros(len(one.time), bool) if log is None else _squares(one, log, sigma_m) > _FAR
-        owner[one.time[free & ~far]] = one.identity
-        owner[one.time[free & far]] = -2
-        place[one.time[free]] = one.middle[free]
-        taken.append(one.identity)
-    return owner, taken
+        chains.append(chain)
+        people.append(candidate)
+    return refused
+
+
+def _by_logs(tracks: list[_Track], chains: list[_Chain]) -> list[_Track]:
+    """Give tracks to logged people, as many at once as there are people, best sum first; return the rest."""
+    if not chains or not tracks:
+        return tracks
+    likeness = np.array([[chain.likeness(one) for chain in chains] for one in tracks])
+    left = np.ones(len(tracks), bool)
+    spent = np.zeros(len(tracks), bool)
+    while (open_ := np.flatnonzero(left & ~spent & (likeness > 0).any(axis=1))).size:
+        row, person = linear_sum_assignment(np.maximum(likeness[open_], 0.0), maximize=True)
+        for k, p in zip(open_[row].tolist(), person.tolist(), strict=True):
+            if likeness[k, p] > 0:
+                left[k] = not chains[p].offer(tracks[k])
+                spent[k] = True
+    for k, one in enumerate(tracks):
+        said_nothing = left[k] and (likeness[k] == 0).any() and not (likeness[k] > 0).any()
+        if said_nothing:
+            ready = (chains[p] for p in np.flatnonzero(likeness[k] == 0).tolist() if chains[p].taken)
+            left[k] = not any(chain.offer_without_log(one) for chain in ready)
+    return [one for k, one in enumerate(tracks) if left[k]]
 
 
 def _continues(track: _Track, owner: Int64, place: Float, time_s: Float) -> bool:
@@ -237,7 +340,12 @@ def _nobody(nearest: Float) -> str:
 
 
 def _counted(
-    chosen: Int64, seen: Followed, resumed: Int64, dropped: dict[str, Int64], reasons: tuple[str, ...]
+    chosen: Int64,
+    seen: Followed,
+    resumed: Int64,
+    dropped: dict[str, Int64],
+    phantoms: Mapping[str, int],
+    reasons: tuple[str, ...],
 ) -> Association:
     """Build the result: the choice with its counts."""
     at = np.maximum(chosen.transpose(2, 0, 1), 0)[..., None]  # [P, T, C, 1]
@@ -262,5 +370,6 @@ def _counted(
         people=np.rint(standing.sum((1, 2))).astype(np.int64),
         unused=(seen.track >= 0).sum((0, 2)) - present.sum((0, 1)),
         no_people=dropped,
+        phantoms=dict(sorted(phantoms.items())),
         reasons=reasons,
     )

@@ -12,8 +12,8 @@ unless another one of its camera fits better.
 
 The sum of squares over a whole assignment matters: a pose error moves all people in a picture equally, so
 the assignment that keeps people apart wins even where one wrong pair happens to fit better than a right
-one (exchanging two people costs 2 (their separation)^2 for any pose error). A logged actor takes
-part as the only detection of one more camera.
+one (exchanging two people costs 2 (their separation)^2 for any pose error). People who were logged take
+part as the detections of one more camera.
 
 `follow` is the one function called from outside. `grouping_rays` compares detections and places groups.
 """
@@ -29,7 +29,7 @@ from pipelines.geometry.compilation import cached, helper
 from pipelines.keypoints.grouping_rays import (
     FEW_JOINTS,
     Nodes,
-    add_logged_node,
+    add_logged_nodes,
     collect_nodes,
     compare_nodes,
     empty_nodes,
@@ -61,7 +61,7 @@ class Tracks(NamedTuple):
 
 
 def empty_tracks(slots: int, cameras: int, joints: int) -> Tracks:
-    """Allocate tracks without any person; the logged actor is one more camera."""
+    """Allocate tracks without any person; the logged people are one more camera."""
     return Tracks(
         identity=np.full(slots, -1, np.int64),
         views=np.zeros(slots, np.int64),
@@ -84,7 +84,8 @@ def recognise_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, scratch: 
             nodes.known[a, k] = 0.0
             if c == cameras:
                 held = tracks.identity[k] >= 0 and tracks.held_s[k, c] > -np.inf
-                nodes.known[a, k] = 1.0 if held else 0.0
+                own = tracks.held[k, c, 0, 0] == nodes.detection[a]  # which of the logs; they have no picture
+                nodes.known[a, k] = 1.0 if held and own else 0.0
                 continue
             wait = now - tracks.held_s[k, c]
             if tracks.identity[k] < 0 or wait > _HOLD_S:
@@ -192,6 +193,8 @@ def remember_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Fl
                 for j in range(nodes.points.shape[1]):
                     for axis in range(2):
                         tracks.held[k, c, j, axis] = nodes.points[a, j, axis]
+                if c == cameras - 1:
+                    tracks.held[k, c, 0, 0] = nodes.detection[a]
                 for other in range(k):
                     if nodes.member[other, c] >= 0:
                         tracks.apart[k, other] = True
@@ -462,7 +465,7 @@ def _follow(
     position: Float,
     rotation: Float,
     sigma: Float,
-    log: Float,
+    logs: Float,
     nodes: Nodes,
     tracks: Tracks,
     followed: Followed,
@@ -477,9 +480,8 @@ def _follow(
     for t in range(times):
         now = time_s[t]
         n = collect_nodes(nodes, xy[t], confidence[t], rotation[t], sigma[t], needed, scratch)
-        if not math.isnan(log[t, 0]):
-            n = add_logged_node(nodes, n, cameras)
-        followed.nearest[t] = compare_nodes(nodes, n, position[t], sigma[t], log[t], needed, scratch)
+        n = add_logged_nodes(nodes, n, cameras, logs[t])
+        followed.nearest[t] = compare_nodes(nodes, n, position[t], sigma[t], logs[t], needed, scratch)
         recognise_tracks(nodes, n, tracks, now, scratch)
         begin_groups(nodes, n, slots)
         join_groups(nodes, n, tracks)
@@ -513,7 +515,7 @@ def follow(
     position: Float,
     rotation: Float,
     sigma: Float,
-    log: Float | None = None,
+    logs: Float | None = None,
 ) -> Followed:
     """Group the detections of every frame into people and follow these over time.
 
@@ -524,11 +526,13 @@ def follow(
         position: [T, C, 3] m, world_from_camera, NaN without a pose.
         rotation: [T, C, 3, 3] world_from_camera.
         sigma: [T, C] rad, standard deviation of a viewing ray on each axis.
-        log: [T, 4] m, the logged actor's place and its standard deviation on each axis, NaN where unknown.
+        logs: [T, A, 4] m, the places of logged people and their standard deviation on each axis, NaN where
+            unknown.
     """
     posed = np.isfinite(position).all(-1) & np.isfinite(rotation).all((-1, -2)) & (sigma > 0)
     times, cameras, detections, joints = confidence.shape
-    room = cameras * detections + 1  # the log is one more
+    logs = np.full((times, 1, 4), np.nan) if logs is None else np.ascontiguousarray(logs, np.float64)
+    room = cameras * detections + logs.shape[1]
     slots = room + _SPARE
     followed = Followed(
         track=np.full(confidence.shape[:3], -1, np.int64),
@@ -548,7 +552,7 @@ def follow(
         np.ascontiguousarray(position, np.float64),
         np.ascontiguousarray(rotation, np.float64),
         np.where(posed, sigma, np.nan),
-        np.full((times, 4), np.nan) if log is None else np.ascontiguousarray(log, np.float64),
+        logs,
         nodes,
         tracks,
         followed,

@@ -37,7 +37,7 @@ class Nodes(NamedTuple):
 
 
 def empty_nodes(room: int, slots: int, cameras: int, joints: int) -> Nodes:
-    """Allocate arrays for the detections of any frame; the logged actor is one more camera."""
+    """Allocate arrays for the detections of any frame; the logged people are one more camera."""
     return Nodes(
         camera=np.zeros(room, np.int64),
         detection=np.zeros(room, np.int64),
@@ -150,17 +150,22 @@ def _describe(nodes: Nodes, n: int, xy: Float, confidence: Float, rotation: Floa
 
 
 @helper
-def add_logged_node(nodes: Nodes, n: int, cameras: int) -> int:
-    """Add the logged actor as the only detection of one more camera, which has no picture."""
-    nodes.camera[n] = cameras
-    for j in range(nodes.points.shape[1]):
-        nodes.points[n, j, 0] = nodes.points[n, j, 1] = np.nan
-    return n + 1
+def add_logged_nodes(nodes: Nodes, n: int, cameras: int, logs: Float) -> int:
+    """Add the people who are logged [A, 4] now as detections of one more camera, which has no picture."""
+    for person in range(len(logs)):
+        if math.isnan(logs[person, 0]):
+            continue
+        nodes.camera[n] = cameras
+        nodes.detection[n] = person
+        for j in range(nodes.points.shape[1]):
+            nodes.points[n, j, 0] = nodes.points[n, j, 1] = np.nan
+        n += 1
+    return n
 
 
 @helper
 def compare_nodes(
-    nodes: Nodes, n: int, position: Float, sigma: Float, log: Float, needed: int, scratch: Float
+    nodes: Nodes, n: int, position: Float, sigma: Float, logs: Float, needed: int, scratch: Float
 ) -> float:
     """Weigh every pair of detections of different cameras and return the smallest s (NaN without a pair).
 
@@ -171,9 +176,12 @@ def compare_nodes(
     for a in range(n):
         for b in range(a):
             weight = 0.0
-            if nodes.camera[a] == len(sigma):
+            if nodes.camera[a] == nodes.camera[b]:
+                pass
+            elif nodes.camera[a] == len(sigma):
+                log = logs[nodes.detection[a]]
                 weight = _AGREE - _distance_from_log(nodes, b, position, sigma, log, scratch)
-            elif nodes.camera[a] != nodes.camera[b]:
+            else:
                 square, joints = _disagreement(nodes, a, b, position, sigma, scratch)
                 if joints >= needed:
                     weight = (_AGREE - square) * joints / (joints + FEW_JOINTS)
@@ -257,7 +265,7 @@ def _distance_from_log(
 
 @helper
 def size_of_group(nodes: Nodes, label: int) -> int:
-    """Count the detections of a group, the logged actor included."""
+    """Count the detections of a group, the log included."""
     size = 0
     for c in range(nodes.member.shape[1]):
         if nodes.member[label, c] >= 0:

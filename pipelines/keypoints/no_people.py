@@ -49,6 +49,106 @@ class Scene(NamedTuple):
     fields: Float  # [C, 4] left, top, right, bottom of each camera's picture, normalised
 
 
+_LEAST_S = 1.0  # of sight by two cameras before somebody counts as a person
+_ALONGSIDE_M = (
+    0.5  # a second body nearer than this to a person, and never beside them in a picture, is theirs
+)
+_LARGEST_MISFIT = 4.0  # median of chi-square per degree of freedom; its expectation is 1
+_SAMPLES = 200  # times at which a body is triangulated
+_DOUBTED = 0.5  # of the ground's doubt: where a level is all that is known, a crown at 3 m is not on it
+
+
+class Views(NamedTuple):
+    """All detections of a flight, as `tell_no_people` takes them."""
+
+    xy: Float  # [T, C, D, J, 2]
+    confidence: Float  # [T, C, D, J]
+    position: Float  # [T, C, 3]
+    rotation: Float  # [T, C, 3, 3]
+    sigma: Float  # [T, C]
+
+
+class Body(NamedTuple):
+    """Detections that may be one person over time."""
+
+    choice: Int64  # [T, C] index of the detection in each camera, -1 none
+    middle: Float  # [T, 3] m, NaN where fewer than two cameras see the body
+
+
+def why_no_person(body: Body, people: list[Body], time_s: Float, views: Views, ground: Ground | None) -> str:
+    """Say why a body that two cameras see is no further person; empty if it is one.
+
+    Args:
+        body: the detections in question.
+        people: those already taken for people.
+        time_s: [T] s, increasing.
+        views: all detections.
+        ground: the surroundings, if known.
+
+    Returns:
+        "short": seen by two cameras for less than a second, or never together with anybody, as the pieces
+        of one lost person; "same": alongside a person, and never with them in one picture; "ground": too
+        high or too low; "size": not of a person's extent; "misfit": the views do not fit each other.
+    """
+    step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    there: Bool = np.isfinite(body.middle[:, 0])
+    together = np.zeros(len(there), np.bool_)
+    for other in people:
+        both = there & np.isfinite(other.middle[:, 0])
+        together |= both
+        side_by_side: Bool = np.asarray(((body.choice >= 0) & (other.choice >= 0)).any(axis=1))
+        apart = np.linalg.norm(body.middle - other.middle, axis=1)
+        if both.any() and np.median(apart[both]) < _ALONGSIDE_M and np.mean(side_by_side[both]) < _COMPANY:
+            return "same"
+    if (there if not people else together).sum() * step_s < _LEAST_S:
+        return "short"
+    if ground is not None:
+        height, doubt = _heights(ground, body.middle[there])
+        known = np.isfinite(height)
+        slack = _DOUBTED * doubt[known]
+        off = (height[known] - slack > _USUAL_HEIGHT_M[1]) | (height[known] + slack < _HEIGHT_M[0])
+        if known.any() and off.mean() > _MOST:
+            return "ground"
+    rows = np.flatnonzero(there)
+    extent_m, misfit = _body_of(body.choice, rows[:: -(-len(rows) // _SAMPLES)], views)
+    if not _USUAL_EXTENT_M[0] <= extent_m <= _EXTENT_M[1]:
+        return "size"
+    return "misfit" if misfit > _LARGEST_MISFIT else ""
+
+
+def _body_of(choice: Int64, rows: NDArray[np.intp], views: Views) -> tuple[float, float]:
+    """Triangulate a body at some times [N] by least squares on its viewing rays.
+
+    Returns:
+        The median over the times of the diagonal of the box about its joints (m), and the median of the
+        whitened squares per degree of freedom (2 per view, less 3) of its joints; NaN without any.
+    """
+    time, camera = rows[:, None], np.arange(choice.shape[1])
+    taken = np.maximum(choice[rows], 0)
+    xy = views.xy[time, camera, taken]
+    confidence = np.where((choice[rows] >= 0)[..., None], views.confidence[time, camera, taken], 0.0)
+    seen = (confidence > 0) & np.isfinite(xy).all(axis=-1) & np.isfinite(views.position[rows])[..., :1]
+    several = seen.sum(axis=1) > 1
+    ray = np.concatenate([np.where(seen[..., None], xy, 0.0), np.ones((*seen.shape, 1))], axis=-1)
+    ray = np.einsum("ncij,nckj->ncki", np.nan_to_num(views.rotation[rows]), ray)
+    ray /= np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-12)
+    origin = np.nan_to_num(views.position[rows])[:, :, None]
+    across = np.where(seen[..., None, None], np.eye(3) - ray[..., :, None] * ray[..., None, :], 0.0)
+    normal = across.sum(axis=1) + np.where(several, 1e-9, 1.0)[..., None, None] * np.eye(3)
+    target = np.einsum("nckij,nckj->nki", across, np.broadcast_to(origin, ray.shape))
+    points = np.where(several[..., None], np.linalg.solve(normal, target[..., None])[..., 0], np.nan)
+    box = np.nanmax(points, axis=1, initial=-np.inf) - np.nanmin(points, axis=1, initial=np.inf)
+    extent = np.linalg.norm(box[several.sum(axis=1) > 1], axis=-1)
+    sight = points[:, None] - origin
+    reach = np.linalg.norm(sight, axis=-1)
+    sine = np.linalg.norm(np.cross(ray, sight), axis=-1) / np.maximum(reach, 1e-9)
+    square = np.where(seen & several[:, None], (sine / views.sigma[rows][..., None]) ** 2, 0.0).sum(axis=1)
+    misfit = (square / np.maximum(2 * seen.sum(axis=1) - 3, 1))[several]
+    if not len(extent):
+        return np.nan, np.nan
+    return float(np.median(extent)), float(np.median(misfit))
+
+
 class NoPeople(NamedTuple):
     """Detections [T, C, D] that are no people, by cause."""
 
@@ -96,7 +196,7 @@ def tell_no_people(
     """
     found = NoPeople(*(np.zeros(seen.track.shape, np.bool_) for _ in NoPeople._fields))
     if scene.ground is None:
-        scene = scene._replace(ground=_ground_under_most_seen(seen))
+        scene = scene._replace(ground=level_of_most_seen(seen))
     for c in range(seen.track.shape[1]):
         at = np.nonzero(seen.track[:, c] >= 0)
         if not len(at[0]):
@@ -121,7 +221,7 @@ def tell_no_people(
     return found
 
 
-def _ground_under_most_seen(seen: Followed) -> Ground | None:
+def level_of_most_seen(seen: Followed) -> Ground | None:
     """Return the level of the person whom several cameras see most; None without one."""
     placed = seen.spread < _PLACED_M
     people, views = np.unique(seen.track[placed], return_counts=True)

@@ -52,7 +52,7 @@ def test_usage_errors_are_clicks_own_otherwise() -> None:
     wrong = mocap("reconstruct", "a.session", "--persons", "0")
     assert wrong.returncode == 2
     assert " reconstruct [OPTIONS] SESSION" in wrong.stderr.splitlines()[0]
-    assert "'--persons': 0 " in wrong.stderr
+    assert "'--persons': '0' " in wrong.stderr
 
 
 @pytest.mark.parametrize("evil", EVIL)

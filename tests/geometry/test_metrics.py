@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.metrics import bone_lengths, common, measure, measure_shape
+from pipelines.geometry.metrics import bone_lengths, common, measure, measure_shape, tracking_errors
 
 JOINTS = ("left_hip", "right_hip", "left_knee", "right_knee", "nose")
 STANCE = np.array([[0.0, 0.1, 1.0], [0, -0.1, 1.0], [0.02, 0.12, 0.5], [-0.02, -0.12, 0.5], [0.05, 0, 1.7]])
@@ -240,3 +240,22 @@ def test_shape_of_nothing_is_null() -> None:
     json.dumps(found, allow_nan=False)
     assert found["bone_spread_mm"] is None
     assert found["jerk_m_s3"] is None
+
+
+def test_who_was_missed_and_confused_is_counted() -> None:
+    """Count by hand: two people 3 m apart for 10 times, who exchange their numbers at the sixth.
+
+    The first is not found at times 0 and 1, and a third number is 2 m from everybody at time 9. That is 20
+    true ones, 2 misses, 1 phantom and 2 switches; each number is the same person at 5 times at most, the
+    first at 5 and the second at 5 (or at 3 and 5).
+    """
+    truth = np.zeros((10, 2, 2, 3))
+    truth[:, 1, :, 0] = 3.0
+    position = np.full((10, 3, 2, 3), np.nan)
+    position[:5, :2], position[5:, :2] = truth[:5], truth[5:, ::-1]
+    position[:2, 0] = np.nan
+    position[9, 2] = [-2.0, 0.0, 0.0]
+    found = tracking_errors(position + np.array([0.3, 0.0, 0.0]), truth)
+    assert (found["present"], found["misses"], found["phantoms"], found["switches"]) == (20, 2, 1, 2)
+    assert found["mota"] == pytest.approx(1 - 5 / 20)
+    assert found["idf1"] == pytest.approx(2 * 10 / (20 + 19))

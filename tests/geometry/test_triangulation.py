@@ -13,6 +13,7 @@ from pipelines.geometry.triangulation import (
     STATUS,
     Method,
     Triangulation,
+    _explaining_sigma,
     _pair_table,
     estimate_noise,
     locate,
@@ -348,6 +349,16 @@ def test_estimated_noise_is_at_least_the_stated_one() -> None:
     unseen = replace(views, weight=np.zeros_like(views.weight))
     assert estimate_noise(unseen) == pytest.approx(2.0)
     assert estimate_noise(ring(5, 1)[1]) == pytest.approx(2.0)
+
+
+def test_points_without_end_leave_the_stated_noise() -> None:
+    _, views = ring(20, 3)
+    result = triangulate(views, method="robust")
+    residual_px = np.full_like(result.residual_px, np.inf)  # as in a camera's own plane
+
+    found = _explaining_sigma(views, replace(result, residual_px=residual_px))
+
+    assert found == pytest.approx(2.0)
 
 
 def test_white_pose_noise_that_was_told_needs_no_more_pixel_noise() -> None:

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.keypoints.association import Association, associate
+from pipelines.keypoints.no_people import Scene as Surroundings
 
 Int64 = NDArray[np.int64]
 Path = Callable[[Float], Float]  # seconds [T] to places on the ground [T, 2]
+Shape = Callable[[Float], Float]  # joints [T, J, 3] to other joints
 
 RATE_HZ = 15.0
 RANGE_M = 10.0
@@ -39,8 +41,9 @@ class Scene:
     sigma: Float
     who: Int64 = field(repr=False)  # [T, C, D] the person, -1 none
 
-    def associate(self, people: int = 1, log: Path | None = None) -> Association:
-        actor = None if log is None else np.c_[log(self.time_s), np.ones(len(self.time_s))]
+    def associate(self, people: int | None = 1, *logs: Path, sigma_m: float = 0.5) -> Association:
+        heights, cameras = np.ones(len(self.time_s)), self.xy.shape[1]
+        actors = [np.c_[log(self.time_s), heights] for log in logs]
         return associate(
             self.time_s,
             self.xy,
@@ -48,9 +51,10 @@ class Scene:
             self.position,
             self.rotation,
             self.sigma,
-            actor=actor,
-            actor_sigma_m=0.5,
+            actors=np.stack(actors, axis=1) if actors else None,
+            actor_sigma_m=sigma_m,
             people=people,
+            scene=None if people else Surroundings(_level, np.tile([-1.0, -1.0, 1.0, 1.0], (cameras, 1))),
         )
 
     def chosen(self, result: Association, person: int = 0) -> Int64:
@@ -64,6 +68,10 @@ class Scene:
         xy = self.xy.copy()
         xy[times, camera][self.who[times, camera] == person] = np.nan
         return replace(self, xy=xy, who=np.where(np.isfinite(xy[..., 0, 0]), self.who, -1))
+
+
+def _level(points: Float) -> tuple[Float, Float]:
+    return np.zeros(len(points)), np.full(len(points), 0.1)
 
 
 def straight(start: tuple[float, float], velocity: tuple[float, float]) -> Path:
@@ -102,11 +110,14 @@ def film(
     missing: float = 0.0,
     outliers: float = 0.0,
     seed: int = 0,
+    shapes: dict[int, Shape] | None = None,
 ) -> Scene:
     """Film all people with a ring of cameras; pose errors are (m, deg) per axis, and included in sigma."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     joints = bodies(paths, time_s)
+    for person, shape in (shapes or {}).items():
+        joints[:, person] = shape(joints[:, person])
     times, people = joints.shape[:2]
 
     angle = 2 * np.pi * np.arange(cameras) / cameras + 0.3
@@ -205,7 +216,7 @@ def test_the_logged_actor_is_found_among_people_under_pose_noise(cameras: int) -
     right, wrong = [], []
     for seed in range(12):
         scene = film([ACTOR, CROSSING, ACROSS], cameras=cameras, white=MEDIUM, missing=0.1, seed=seed)
-        chosen = scene.chosen(scene.associate(log=ACTOR))
+        chosen = scene.chosen(scene.associate(1, ACTOR))
         right.append((chosen == 0).sum() / (scene.who == 0).any(-1).sum())
         wrong.append(((chosen >= 0) & (chosen != 0)).mean())
     assert np.mean(right) >= 0.97
@@ -215,16 +226,90 @@ def test_the_logged_actor_is_found_among_people_under_pose_noise(cameras: int) -
 def test_the_log_outvotes_who_is_seen_most() -> None:
     scene = film([ACTOR, CROSSING]).hide(0, camera=1).hide(0, camera=3)
     assert np.all(scene.chosen(scene.associate())[:, 0] == 1)
-    chosen = scene.chosen(scene.associate(log=ACTOR))
+    chosen = scene.chosen(scene.associate(1, ACTOR))
     assert np.all(chosen[:, [0, 2, 4]] == 0)
     assert np.all(chosen[:, [1, 3]] == -1)
 
 
 def test_a_log_that_is_near_nobody_is_reported() -> None:
     scene = film([ACTOR])
-    result = scene.associate(log=straight((80.0, 0.0), (0.0, 0.0)))
+    result = scene.associate(1, straight((80.0, 0.0), (0.0, 0.0)))
     assert result.views[0] == scene.who.size
     assert "nobody is near the logged actor (nearest 77.0 m, median 80.0 m)" in result.reasons[0]
+
+
+def test_several_logged_people_are_the_bodies_that_fit_all_logs_best() -> None:
+    """Let two people walk 1 m apart, both logged 0.8 m to one side: the second is nearer to both logs.
+
+    In any order of the logs each person is in their place; person by person, the first would take the body
+    between the logs.
+    """
+    beside = straight((-3.0, 1.0), (1.0, 0.0))
+    logs = [straight((-3.0, 0.8), (1.0, 0.0)), straight((-3.0, 1.8), (1.0, 0.0))]
+    scene = film([ACTOR, beside])
+    for order in ((0, 1), (1, 0)):
+        result = scene.associate(2, *(logs[k] for k in order), sigma_m=1.0)
+        for person, who in enumerate(order):
+            assert np.array_equal(scene.chosen(result, person), np.full_like(scene.who[..., 0], who))
+
+
+def test_nobody_stands_in_for_a_logged_person_whom_no_camera_sees() -> None:
+    scene = film([ACTOR, straight((2.0, 5.0), (0.0, 0.0))])
+    result = scene.associate(3, ACTOR, straight((40.0, 0.0), (0.0, 0.0)))
+    assert np.all(scene.chosen(result, 0) == 0)
+    assert np.all(result.choice[..., 1] == -1)
+    assert np.all(scene.chosen(result, 2) == 1)  # whom nobody logged
+    assert len(result.reasons) == 1
+
+
+def test_logged_people_who_leave_together_come_back_as_themselves() -> None:
+    """Hide two people for three seconds, in which they change sides: their logs tell them apart."""
+    paths = [straight((-3.0, 0.0), (1.0, 0.0)), straight((3.0, 0.6), (-1.0, 0.0))]
+    scene = film(paths)
+    for person in range(2):
+        for camera in range(5):
+            scene = scene.hide(person, camera, slice(25, 70))
+    result = scene.associate(2, *paths)
+    for person in range(2):
+        assert np.array_equal(scene.chosen(result, person) == person, (scene.who == person).any(-1))
+
+
+def test_as_many_people_are_found_as_there_are() -> None:
+    """Expect all who are seen by two cameras for a second, each once, whether or not they are logged."""
+    scene = film([ACTOR, CROSSING, ACROSS], missing=0.1, outliers=0.05)
+    for logs in ((), (ACTOR,), (ACTOR, CROSSING)):
+        result = scene.associate(None, *logs)
+        who = [scene.chosen(result, person) for person in range(result.choice.shape[2])]
+        assert sorted(int(np.bincount(own[own >= 0]).argmax()) for own in who) == [0, 1, 2]
+        assert not result.phantoms
+    assert film([ACTOR], cameras=2).associate(None).choice.shape[2] == 1
+
+
+def test_who_is_seen_by_one_camera_or_shortly_is_no_further_person() -> None:
+    scene = film([ACTOR, straight((1.0, 2.0), (0.0, 0.0)), straight((-1.0, 2.5), (0.0, 0.0))])
+    for camera in range(1, 5):
+        scene = scene.hide(1, camera)
+    for camera in range(5):
+        scene = scene.hide(2, camera, slice(10, None))  # 10 times at 15 Hz are shorter than a second
+    result = scene.associate(None)
+    assert result.choice.shape[2] == 1
+    assert np.all(scene.chosen(result) == 0)
+
+
+@pytest.mark.parametrize(
+    ("cause", "shape"),
+    [
+        ("ground", lambda joints: joints + np.array([0.0, 0.0, 1.0])),  # its middle is 1.9 m up
+        ("size", lambda joints: 0.35 * joints + 0.65 * joints.mean(axis=1, keepdims=True)),  # 0.6 m
+    ],
+)
+def test_phantoms_are_refused_and_counted(cause: str, shape: Shape) -> None:
+    """Bodies that all cameras agree on, but in a tree's crown, or of a small child's size, are nobody."""
+    scene = film([ACTOR, straight((1.0, 2.0), (0.0, 0.0)), ACROSS], shapes={1: shape})
+    result = scene.associate(None)
+    assert result.phantoms == {cause: 1}
+    who = [scene.chosen(result, person) for person in range(result.choice.shape[2])]
+    assert sorted(int(np.bincount(own[own >= 0]).argmax()) for own in who) == [0, 2]
 
 
 def test_a_bystander_is_not_taken_for_the_actor_where_the_actor_is_hidden() -> None:
@@ -245,7 +330,7 @@ def test_a_bystander_who_stood_beside_the_actor_is_refused_under_pose_noise() ->
     """Refuse a bystander at two metres, inside the gate of 3 sigma: both were once in one picture."""
     beside = straight((-3.0, 2.0), (1.0, 0.0))
     scene = film([ACTOR, beside], bias=MEDIUM, seed=4).hide(0, camera=2, times=slice(30, 90))
-    chosen = scene.chosen(scene.associate(log=ACTOR))
+    chosen = scene.chosen(scene.associate(1, ACTOR))
     assert np.all(chosen[:30, 2] == 0)
     assert np.all(chosen[30:, 2] == -1)
 

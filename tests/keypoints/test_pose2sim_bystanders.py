@@ -53,7 +53,8 @@ def test_the_person_of_interest_is_the_one_the_peer_associated() -> None:
                 xy[t, c, d] = cv2.undistortPoints(body[:, None, :2].copy(), matrix, distortion)[:, 0]
                 confidence[t, c, d] = body[:, 2]
 
-    result = associate(np.arange(FRAMES) / 60.0, xy, confidence, position, rotation, sigma)
+    seen = (np.arange(FRAMES) / 60.0, xy, confidence, position, rotation, sigma)
+    result = associate(*seen)
 
     agreed = named = 0
     for c, camera in enumerate(CAMERAS):
@@ -67,3 +68,6 @@ def test_the_person_of_interest_is_the_one_the_peer_associated() -> None:
     assert agreed >= 398
     assert result.views[0] == 400
     assert np.all(result.people == 2)  # one bystander stands in the view of two cameras
+    everybody = associate(*seen, people=None)  # and so is the second person, of these cameras alone
+    assert np.array_equal(everybody.choice[..., 0], result.choice[..., 0])
+    assert (everybody.choice[..., 1:] >= 0).sum(axis=0).T.tolist() == [[FRAMES, FRAMES, 0, 0]]
