@@ -211,20 +211,28 @@ def replan_compare_command(
 
 
 def _print(metrics: dict[str, Any]) -> None:
-    header = ["arm", "tilt deg", "max", "near obstacle", "occluded %", "clearance m", "separation m"]
-    header += ["MPJPE mm", "covered %", "violations"]
+    header = ["arm", "drones", "range m", "tilt deg", "max", "near obstacle", "hidden %", "blind s"]
+    header += ["path m", "energy kJ", "clearance m", "separation m", "actor m"]
+    header += ["PCK150 %", "MPJPE mm", "covered %", "violations"]
     rows: list[list[object]] = []
     for name, arm in metrics["arms"].items():
         tilt, error = arm["tilt_deg"], arm["reconstruction_error"]
         rows.append(
             [
                 name,
+                arm["drones"],
+                arm["range_m"]["mean"],
                 tilt["mean"],
                 tilt["max"],
                 tilt["near_obstacle"],
                 100 * arm["occluded_share"],
+                arm["blind_s"],
+                arm["path_m"],
+                arm["energy_kj"],
                 arm["min_clearance_m"],
                 arm["min_separation_m"],
+                arm["min_actor_distance_m"],
+                None if error["pck150"] is None else 100 * error["pck150"]["mean"],
                 _with_interval(error["mpjpe_mm"]),
                 None if error["coverage"] is None else 100 * error["coverage"]["mean"],
                 sum(arm["limit_violations"].values()),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,7 @@ from pipelines.planning.arm_flights import (
 )
 from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.comparison import ArmResult, compare
-from pipelines.planning.config import PlannerConfig, planner_config
+from pipelines.planning.config import ErrorModel, PlannerConfig, planner_config
 from pipelines.planning.loading import LoggedFlight, load_flight
 from pipelines.planning.scene import Scene, Settings, build_scene
 from pipelines.session.description import Description, read_description
@@ -53,13 +53,21 @@ from pipelines.session.tables import (
     read_table,
     write_table,
 )
-from pipelines.simulation.detector_errors import MODELLED, detect_keypoints, errors_of, view_of
+from pipelines.simulation.detector_errors import (
+    ANY_JOINT,
+    MEDIAN_PER_SIGMA,
+    MODELLED,
+    detect_keypoints,
+    errors_of,
+    read_errors,
+    view_of,
+)
 from pipelines.simulation.scenario import DetectorErrors
 
 if TYPE_CHECKING:
     import pandas as pd
 
-REPLAN_STAGE = Stage("replan", revision=3)
+REPLAN_STAGE = Stage("replan", revision=4)
 
 _HEIGHT_M = 1.75  # of the person, for their size in the modelled detector's pictures
 _SKELETON = "reconstruct/skeleton.parquet"
@@ -111,24 +119,26 @@ def replan(
     settings = settings or Settings()
     progress = progress or Silent()
     with locked(folder) as session:
-        description, reconstructed, inputs = _inputs(session)
-        _refuse_unknown(settings.arms or ())
-        run = session.begin(REPLAN_STAGE, settings=_flat(settings), inputs=inputs, force=force)
+        description, reconstructed, inputs = inputs_of(session)
+        refuse_unknown(settings.arms or ())
+        run = session.begin(REPLAN_STAGE, settings=settings_by_name(settings), inputs=inputs, force=force)
         if run.finished:
             metrics = read_json(folder / "replan" / "metrics.json")
             return Replanned(folder, run.record, metrics, skipped=True)
 
         flight = load_flight(folder, description, reconstructed, pose_noise=settings.pose_noise)
         arms = _arms(folder, settings.arms, flight)
-        errors = _detector_errors(session)
-        scene = build_scene(flight, load_maps(folder) if description.map else [], description, settings)
+        errors = detector_errors(session)
+        maps = load_maps(folder) if description.map else []
+        joints = flight.skeleton.joints if flight.skeleton else ()
+        scene = build_scene(flight, maps, description, settings, errors=error_model(errors, joints))
         for note in scene.notes:
             progress.note(note)
         progress.start("Replaying", len(arms))
         results, times = {}, {}
         for arm in arms:
-            made = run.chunk(arm, partial(_fly, scene, errors, arm))
-            results[arm] = _read_result(made)
+            made = run.chunk(arm, partial(fly_and_measure, scene, errors, arm))
+            results[arm] = read_result(made)
             times[arm] = read_json(made / "times.json")
             (run.folder / arm).mkdir()
             for table in made.glob("*.parquet"):
@@ -155,7 +165,7 @@ def replan(
 # --- what is compared ----------------------------------------------------------------------------------
 
 
-def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, dict[str, str]]:
+def inputs_of(session: WritableSession) -> tuple[Description, StageRecord | None, dict[str, str]]:
     """Load the inputs: all that was ingested, and the reconstruction if there is no truth or no actor.
 
     If the errors of the session's own detector were measured, the arms are scored with those.
@@ -169,28 +179,46 @@ def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, 
     reconstructed = session.intact_record("reconstruct") if needs_it else None
     if reconstructed is not None:
         inputs[_SKELETON] = reconstructed.outputs[_SKELETON]
-    errors = _detector_errors(session)
+    errors = detector_errors(session)
     if errors != DetectorErrors():
         inputs["errors of the detector"] = sha256_of(errors_of(errors.detector))
     return description, reconstructed, inputs
 
 
-def _detector_errors(session: WritableSession) -> DetectorErrors:
+def detector_errors(session: WritableSession) -> DetectorErrors:
     """Choose the errors of the detector that ran on the session's pictures, if measured; else the default."""
     detected = session.record("detect")
     name = None if detected is None else detected.settings["detector"]
     return DetectorErrors(detector=name) if name in MODELLED else DetectorErrors()
 
 
-def _flat(settings: Settings) -> dict[str, object]:
+def error_model(errors: DetectorErrors, joints: tuple[str, ...]) -> ErrorModel:
+    """Build the ray model's errors of a detector from its measured table; those of poses are the defaults.
+
+    Standard deviations are root mean squares over the joints; without joints, the table's row for any joint.
+    """
+    table = read_errors(errors_of(errors.detector))
+    tilts_deg = np.unique(np.concatenate([rows[:, 0] for rows in table.rows.values()]))
+    share, missed, _ = table.at(tilts_deg, joints or (ANY_JOINT,))
+    sigma_m = errors.scale * _HEIGHT_M * np.sqrt(np.mean(share**2, axis=1)) / MEDIAN_PER_SIGMA
+    return ErrorModel(
+        tilts_deg=tuple(tilts_deg.tolist()),
+        keypoint_sigma_m=tuple(sigma_m.tolist()),
+        placed_share=tuple((1.0 - missed.mean(axis=1)).tolist()),
+    )
+
+
+def settings_by_name(settings: Settings) -> dict[str, object]:
     """Flatten the settings to names and values, so that a change of each planner setting can be reported."""
     stated = asdict(settings)
     planner = stated.pop("planner")
+    del planner["errors"]  # of the session
     return stated | {f"planner.{name}": value for name, value in planner.items()}
 
 
-def _refuse_unknown(arms: tuple[str, ...]) -> None:
-    known = [*PLANNER_ARMS.names(), *LOGGED]
+def refuse_unknown(arms: Sequence[str], *, logged: bool = True) -> None:
+    """Refuse arms that do not exist; with `logged` those of the log exist, too."""
+    known = [*PLANNER_ARMS.names(), *(LOGGED if logged else ())]
     for arm in arms:
         if arm not in known:
             raise DataError(f"--arms {arm}", "no such planner arm", f"there are {', '.join(known)}")
@@ -217,7 +245,7 @@ def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> 
     return list(dict.fromkeys(asked))
 
 
-def _detect(
+def detect_by_model(
     pixels: Float,
     free: np.ndarray[Any, np.dtype[np.bool_]],
     camera: Float,
@@ -236,11 +264,11 @@ def _detect(
 # --- what is stored ------------------------------------------------------------------------------------
 
 
-def _fly(scene: Scene, errors: DetectorErrors, arm: str, folder: Path) -> None:
+def fly_and_measure(scene: Scene, errors: DetectorErrors, arm: str, folder: Path) -> None:
     """Fly one arm and measure from its cameras; write everything that the comparison needs to the folder."""
     flown = logged_arm(scene, arm) if arm in LOGGED else fly_arm(scene, PLANNER_ARMS.get(arm))
     joints = scene.flight.skeleton.joints if scene.flight.skeleton else ()
-    measured = measure_arm(scene, flown, partial(_detect, joints=joints, errors=errors))
+    measured = measure_arm(scene, flown, partial(detect_by_model, joints=joints, errors=errors))
     write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)
     np.save(folder / "known.npy", flown.known)
     facts: dict[str, object] = {
@@ -259,7 +287,8 @@ def _fly(scene: Scene, errors: DetectorErrors, arm: str, folder: Path) -> None:
     write_json(folder / "times.json", _percentiles({"central": flown.central_s, "local": flown.local_s}))
 
 
-def _read_result(folder: Path) -> ArmResult:
+def read_result(folder: Path) -> ArmResult:
+    """Read what `fly_and_measure` wrote."""
     facts = read_json(folder / "facts.json")
     table = read_table(folder / "trajectories.parquet", REPLAN)
     errors = folder / "error_m.npy"

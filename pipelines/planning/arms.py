@@ -150,7 +150,8 @@ class _Formation:
             costs = _look(field, actor.each(self._every), self._slots, self._offsets, config)
             cost = cost_map(costs, config)
             if self._predicts_error:  # the error does not depend on the zero of yaws
-                cost += config.w_error * error_map(costs, self._offsets, config)
+                # Its logarithm: a gain is worth the same, however large the errors of the session are.
+                cost += config.w_error * np.log(error_map(costs, self._offsets, config))
             sequence, _ = best_sequence(cost, self._lattice, commanded[0])
             through = _through(commanded, self._slots[sequence])
         else:  # the same in one call: calls between small parts took most of the time
@@ -181,7 +182,7 @@ class _Greedy:
             for slot in start
         ]
         self._offsets = [slot_offsets(each.states) for each in self._lattices]
-        self._information = [ray_information(offsets, config) for offsets in self._offsets]
+        self._information = [ray_information(offsets, config.errors) for offsets in self._offsets]
         self._config, self._rates = config, np.array(config.slot_rates)
 
     def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:

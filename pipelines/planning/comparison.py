@@ -23,6 +23,9 @@ REFERENCE = "fixed"
 """Arm that the others are compared with; the first arm where it is missing."""
 _ALIKE_DEG = 2.0  # smaller differences of tilt are not reported
 _ALIKE_PERCENT = 1.0  # of the joints, likewise
+_ALIKE_RANGE_M = 0.3  # arms whose mean ranges differ by more are not compared at equal range
+PCK_M = 0.15
+"""Largest error of a right joint in `pck150`."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,26 @@ def mpjpe_mm(error_m: Float32, counted: Bool) -> Float:
     return mean
 
 
+def pck(error_m: Float32, joint_frames: int) -> Float:
+    """Compute the share [K] of the joint-frames with a truth whose error is at most `PCK_M`, 0..1.
+
+    Joints that were not measured count as wrong.
+    """
+    share: Float = (error_m <= PCK_M).sum(axis=(1, 2)) / max(joint_frames, 1)
+    return share
+
+
+def capped_mm(error_m: Float32, joint_frames: int) -> Float:
+    """Compute the mean error [K] over all joint-frames with a truth, each at most 150 mm (`PCK_M`).
+
+    Joints that were not measured count as 150 mm off, so that missing joints cannot flatter.
+    """
+    error = np.where(np.isfinite(error_m), error_m, PCK_M).astype(np.float64)
+    gained = (PCK_M - np.minimum(error, PCK_M)).sum(axis=(1, 2))
+    capped: Float = 1e3 * (PCK_M - gained / max(joint_frames, 1))
+    return capped
+
+
 def coverage(error_m: Float32, joint_frames: int) -> Float:
     """Compute the share [K] of the joint-frames with a truth that were measured, 0..1."""
     share: Float = np.isfinite(error_m).sum(axis=(1, 2)) / max(joint_frames, 1)
@@ -115,6 +138,7 @@ def compare(scene: Scene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
         for name, result in results.items()
         if name != reference
     ]
+    best = _best(scene, results, arms, shared)
     settings, flight = scene.settings, scene.flight
     broken = [line for name, arm in arms.items() if (line := broken_limits(name, arm, scene.config))]
     return {
@@ -135,10 +159,16 @@ def compare(scene: Scene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
         "intervals": {"level": LEVEL, "errors_over": "trials", "flights_over_stretches_of_s": STRETCH_S},
         "arms": arms,
         "differences": differences,
-        "verdict": _verdict(arms, differences, broken),
+        "best": best,
+        "verdict": _verdict(arms, differences, broken, best),
         "notes": list(scene.notes),
-        "warnings": [*broken, *scene.warnings, *_warnings(results)],
+        "warnings": [*broken, *_unequal(arms), *scene.warnings, *_warnings(results)],
     }
+
+
+def measure_alone(scene: Scene, name: str, result: ArmResult) -> dict[str, Any]:
+    """Score one arm as in metrics.json; `mpjpe_mm` is that of all joint-frames that it measured."""
+    return _scores(scene, name, result, None if result.error_m is None else np.isfinite(result.error_m))
 
 
 def _scores(scene: Scene, name: str, result: ArmResult, shared: Bool | None) -> dict[str, Any]:
@@ -157,6 +187,7 @@ def _scores(scene: Scene, name: str, result: ArmResult, shared: Bool | None) -> 
             "mpjpe_mm": _json(common),
             "mpjpe_of_all_it_measured_mm": _json(own),
             "coverage": _json(covered),
+            "pck150": _json(_pck(scene, result)),
             "seen_share": result.seen_share,
             "joint_frames": result.joint_frames,
         },
@@ -175,6 +206,12 @@ def _errors(
     return own, common, mean_of_trials(coverage(error, result.joint_frames), seed)
 
 
+def _pck(scene: Scene, result: ArmResult) -> Estimate | None:
+    if result.error_m is None:
+        return None
+    return mean_of_trials(pck(result.error_m, result.joint_frames), scene.settings.seed)
+
+
 def _difference(scene: Scene, one: ArmResult, other: ArmResult, shared: Bool | None) -> dict[str, Any]:
     """Compute one minus the other, with intervals.
 
@@ -186,21 +223,45 @@ def _difference(scene: Scene, one: ArmResult, other: ArmResult, shared: Bool | N
     )
     always = np.ones(len(scene.t_ns), dtype=np.bool_)
     seed = scene.settings.seed
-    error = cover = None
+    error = cover = right = None
+    over_flights: dict[str, object] = {"mpjpe_mm": None, "pck150": None}
     if one.error_m is not None and other.error_m is not None and shared is not None:
         both = shared & np.isfinite(one.error_m) & np.isfinite(other.error_m)  # one may have measured none
         error = mean_of_trials(mpjpe_mm(one.error_m, both) - mpjpe_mm(other.error_m, both), seed)
         cover = mean_of_trials(
             coverage(one.error_m, one.joint_frames) - coverage(other.error_m, other.joint_frames), seed
         )
+        right = mean_of_trials(
+            pck(one.error_m, one.joint_frames) - pck(other.error_m, other.joint_frames), seed
+        )
+        over_flights = _over_flights(scene, one.error_m, other.error_m, both)
     return {
         "tilt_deg": _json(mean_over_time(tilt_deg, always, scene.t_ns, seed)),
         "tilt_near_obstacle_deg": _json(mean_over_time(tilt_deg, scene.near, scene.t_ns, seed)),
         "occluded_share": _json(mean_over_time(hidden, always, scene.t_ns, seed)),
         "mpjpe_mm": _json(error),
         "coverage": _json(cover),
+        "pck150": _json(right),
+        "interval_over_flights": over_flights,
         "simulated": True,
     }
+
+
+def _over_flights(scene: Scene, one: Float32, other: Float32, both: Bool) -> dict[str, object]:
+    """Compute the intervals of the differences over stretches of the flight, noise averaged over trials.
+
+    They answer another question than those over trials: what another flight of this kind could show.
+    """
+    t_ns = scene.t_ns[scene.pictures]
+    known = np.zeros(one.shape[1]) if scene.joints is None else np.isfinite(scene.joints[..., 0]).sum(axis=1)
+    right = ((one <= PCK_M).sum(axis=2, dtype=np.float64) - (other <= PCK_M).sum(axis=2)).mean(axis=0)
+    further = np.where(both, one - other, 0.0).sum(axis=2, dtype=np.float64).mean(axis=0)
+    series = {
+        "mpjpe_mm": (1e3 * further, both.sum(axis=2).mean(axis=0)),
+        "pck150": (right, known.astype(np.float64)),
+    }
+    found = intervals(series, t_ns, seed=scene.settings.seed)
+    return {name: None if ends is None else list(ends) for name, ends in found.items()}
 
 
 def _tilt_deg(scene: Scene, flown: ArmFlight) -> Float:
@@ -213,16 +274,121 @@ def _hidden(scene: Scene, flown: ArmFlight) -> Float:
     return np.where(seen, 0.0, 1.0)
 
 
+def _best(
+    scene: Scene,
+    results: Mapping[str, ArmResult],
+    arms: Mapping[str, Mapping[str, Any]],
+    shared: Bool | None,
+) -> dict[str, Any] | None:
+    """Name the best arm, the runner-up, and their difference; None if fewer than two measured anything.
+
+    Arms that violate a limit are left out, unless all do. The largest `pck150` over all joint-frames wins,
+    since missing joints cannot flatter it. Arms that the noise does not tell apart from the winner by it
+    are ranked by `mpjpe_mm` on common joint-frames. `alike` are those that neither figure tells apart from
+    the best; the runner-up is the best of the others, or of these if there are no others.
+    """
+    measured = [
+        name for name, arm in arms.items() if (arm["reconstruction_error"]["pck150"] or {}).get("mean")
+    ]
+    kept = [name for name in measured if not sum(arms[name]["limit_violations"].values())] or measured
+    if len(kept) < 2:
+        return None
+
+    def right(name: str) -> float:
+        return float(arms[name]["reconstruction_error"]["pck150"]["mean"])
+
+    def less(one: str, other: str) -> dict[str, Any]:
+        return _difference(scene, results[one], results[other], shared)
+
+    leader = max(kept, key=right)
+    close = [name for name in kept if name == leader or not _told_apart(less(leader, name)["pck150"])]
+    by_error = [name for name in close if arms[name]["mpjpe_mm"] is not None]
+    best = min(by_error, key=lambda name: float(arms[name]["mpjpe_mm"])) if by_error else leader
+    against = {name: less(best, name) for name in kept if name != best}
+    alike = [
+        name
+        for name in close
+        if name != best and not any(_told_apart(against[name][key]) for key in ("pck150", "mpjpe_mm"))
+    ]
+    others = [name for name in against if name not in alike] or list(against)
+    runner_up = max(others, key=right)
+    return {
+        "arm": best,
+        "alike": alike,
+        "runner_up": runner_up,
+        "left_out": [name for name in measured if name not in kept],
+        "difference": {"arm": best, "against": runner_up, **against[runner_up]},
+    }
+
+
+def _told_apart(found: Mapping[str, Any] | None) -> bool:
+    """Test if an interval over trials excludes zero; without an interval any difference counts."""
+    if found is None or not found["mean"]:
+        return False
+    ends = found["interval"]
+    return ends is None or not ends[0] <= 0.0 <= ends[1]
+
+
+def _about_best(best: Mapping[str, Any], arms: Mapping[str, Mapping[str, Any]]) -> str:
+    """Name the best arm with its difference to the runner-up and both intervals."""
+    name, other, difference = best["arm"], best["runner_up"], best["difference"]
+    share = 100 * arms[name]["reconstruction_error"]["pck150"]["mean"]
+    own = f"{share:.1f} % of all joints within {1e3 * PCK_M:.0f} mm"
+    words = [
+        f"{100 * difference['pck150']['mean']:+.1f} points of % against {other}"
+        f" ({_two_intervals(difference, 'pck150', 100.0)})"
+    ]
+    if difference["mpjpe_mm"] is not None:
+        words.append(
+            f"{difference['mpjpe_mm']['mean']:+.1f} mm where both measured"
+            f" ({_two_intervals(difference, 'mpjpe_mm', 1.0)})"
+        )
+    if best["alike"]:
+        first = f"best are {' and '.join([name, *best['alike']])}, which the noise does not tell apart: {own}"
+    else:
+        first = f"best is {name}: {own}"
+    left = best["left_out"]
+    dropped = f"; {' and '.join(left)} left out for broken limits" if left else ""
+    return f"{first}, {', '.join(words)}, simulated{dropped}"
+
+
+def _two_intervals(difference: Mapping[str, Any], key: str, scale: float) -> str:
+    """Format the interval over draws of noise and that over stretches of the flight."""
+    over = {"noise": difference[key]["interval"], "flight": difference["interval_over_flights"][key]}
+    parts = [
+        f"{name} [{scale * ends[0]:+.1f}, {scale * ends[1]:+.1f}]" for name, ends in over.items() if ends
+    ]
+    return ", ".join(parts) or "a single draw"
+
+
+def _unequal(arms: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """List what makes the comparison unequal: numbers of drones, and ranges, one line each."""
+    found = []
+    counts = {name: arm["drones"] for name, arm in arms.items()}
+    if len(set(counts.values())) > 1:
+        said = ", ".join(f"{name} {count}" for name, count in counts.items())
+        found.append(f"the arms have different numbers of drones ({said}): more views measure better")
+    ranges = {name: arm["range_m"]["mean"] for name, arm in arms.items()}
+    if max(ranges.values()) - min(ranges.values()) > _ALIKE_RANGE_M:
+        said = ", ".join(f"{name} {mean:.1f} m" for name, mean in ranges.items())
+        found.append(f"the arms film from different mean ranges ({said}): part of a difference may be that")
+    return found
+
+
 def _verdict(
-    arms: Mapping[str, Mapping[str, Any]], differences: Sequence[Mapping[str, Any]], broken: Sequence[str]
+    arms: Mapping[str, Mapping[str, Any]],
+    differences: Sequence[Mapping[str, Any]],
+    broken: Sequence[str],
+    best: Mapping[str, Any] | None,
 ) -> str:
-    """Name the violated limits, and then compare the arms."""
+    """Name the violated limits and the best arm, and then compare the arms."""
     if differences:
         wanted = next((each for each in differences if each["arm"] == "adaptive"), differences[0])
         conclusion = verdict(wanted["arm"], wanted["against"], arms, wanted)
     else:
         conclusion = f"{next(iter(arms))} flew alone: there is nothing to compare it with"
-    return ". ".join([*broken, conclusion])
+    named = [] if best is None else [_about_best(best, arms)]
+    return ". ".join([*broken, *named, conclusion, *_unequal(arms)])
 
 
 def _warnings(results: Mapping[str, ArmResult]) -> list[str]:

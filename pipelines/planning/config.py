@@ -14,10 +14,11 @@ Mode = Literal["plan-only", "closed-loop"]  # of a replay
 Frame = Literal["world", "heading"]
 _WORDS: dict[str, tuple[str, ...]] = {"yaw_frame": get_args(Frame)}
 _SIGNED = ("tilt_deg",)
+_NO_SETTING = "errors"
 _MAY_BE_ZERO = (
     *("w_obs", "w_occ", "w_turn", "w_error", "l_obs", "l_occ", "l_sep", "a_velocity", "a_acceleration"),
     *("speed_floor_mps", "sight_start_m", "k_integral", "actor_noise_m"),
-    *("position_sigma_m", "rotation_sigma_deg", "drone_radius_m", "actor_distance_m"),
+    *("drone_radius_m", "actor_distance_m"),
 )
 _MOST = {
     "yaws": 360,
@@ -27,6 +28,21 @@ _MOST = {
     "waypoints": 200,
     "iterations": 10_000,
 }
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Errors of cameras for the ray model: those of the poses, and of a detector by tilt.
+
+    A replay takes them from its session (`scene.build_scene`). The defaults are logs of usual drones, and
+    BlazePose as `simulation/data/blazepose_errors.csv` has it.
+    """
+
+    position_sigma_m: float = 0.3  # per axis
+    rotation_sigma_deg: float = 1.0  # per axis
+    tilts_deg: tuple[float, ...] = (-0.4, 14.1, 28.9, 43.9, 59.3)  # constant beyond the ends
+    keypoint_sigma_m: tuple[float, ...] = (0.0198, 0.0202, 0.0247, 0.0314, 0.0386)  # per axis, at the person
+    placed_share: tuple[float, ...] = (0.990, 0.988, 0.973, 0.954, 0.842)  # of joints that are found
 
 
 @dataclass(frozen=True)
@@ -57,7 +73,7 @@ class PlannerConfig:
     w_obs: float = 1.0
     w_occ: float = 1.0
     w_turn: float = 0.05  # per 45 deg of yaw, or 2 s of tilting or approaching
-    w_error: float = 1.0  # per metre of predicted error, or unit of log det of the information
+    w_error: float = 1.0  # per unit of the log of predicted error, or of log det of the information
 
     # Weights and distances of the local planner.
     l_obs: float = 50.0
@@ -100,14 +116,14 @@ class PlannerConfig:
     actor_noise_m: float = 0.0  # added to the log by a replay, drawn from its seed
 
     # The ray model of a camera's information.
-    pixel_sigma_rad: float = 0.003  # 3 px at f = 1000 px
-    position_sigma_m: float = 0.3
-    rotation_sigma_deg: float = 1.0
+    errors: ErrorModel = ErrorModel()  # no setting: taken from the session
     prior_sigma_m: float = 2.0  # prior of a joint without any camera
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
+            if field.name == _NO_SETTING:
+                continue
             if words := _WORDS.get(field.name):
                 if value not in words:
                     raise ValueError(f"{field.name}: {value!r} is none of {', '.join(words)}")
@@ -175,7 +191,7 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
         DataError: an unknown key, a value of another type, or one out of range; every problem of the
             first two kinds in one message.
     """
-    known = {field.name: field.default for field in fields(PlannerConfig)}
+    known = {field.name: field.default for field in fields(PlannerConfig) if field.name != _NO_SETTING}
     problems, taken = [], {}
     for key, value in values.items():
         if key not in known:

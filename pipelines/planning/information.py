@@ -3,27 +3,25 @@
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.planning.config import PlannerConfig
-
-# Share of joints that a detector places within 0.2 torso lengths, by tilt: BlazePose on people rendered from
-# 10 m at 720p, eight yaws by four phases of a step. Constant below and above.
-_TILT_RAD = np.radians([0.0, 15.0, 30.0, 45.0, 60.0])
-_PLACED_SHARE = np.array([0.96, 0.97, 0.91, 0.81, 0.61])
+from pipelines.planning.config import ErrorModel
 
 
-def ray_information(offset: Float, config: PlannerConfig) -> Float:
+def ray_information(offset: Float, errors: ErrorModel) -> Float:
     """Compute one camera's expected information on a point: I = p (1 - d d')/s^2, none along the ray d.
 
-    s^2 = (rho sigma_px/f)^2 + (rho sigma_rot)^2 + sigma_pos^2, rho the distance; p is the measured share of
-    joints that a detector places at that tilt. By geometry alone, steep views would be as good. Offsets
-    [..., 3] m go from the point to the camera and are not zero; the result is [..., 3, 3] 1/m^2.
+    s^2 = sigma_key(tilt)^2 + (rho sigma_rot)^2 + sigma_pos^2, rho the distance. sigma_key is the detector's
+    error in metres at the person and p the share of joints that it finds, both by tilt: by geometry alone,
+    steep views would be as good. A detector's errors in pixels are shares of the person's height in the
+    picture, so that distance and focal length cancel. Offsets [..., 3] m go from the point to the camera and
+    are not zero; the result is [..., 3, 3] 1/m^2.
     """
     square = np.sum(offset**2, axis=-1)[..., None, None]
-    turned = config.pixel_sigma_rad**2 + np.radians(config.rotation_sigma_deg) ** 2
     across = np.eye(3) - offset[..., :, None] * offset[..., None, :] / square
-    tilt = np.arcsin(np.abs(offset[..., 2]) / np.sqrt(square[..., 0, 0]))
-    placed = np.interp(tilt, _TILT_RAD, _PLACED_SHARE)[..., None, None]
-    information: Float = placed * across / (square * turned + config.position_sigma_m**2)
+    tilt_deg = np.degrees(np.arcsin(np.abs(offset[..., 2]) / np.sqrt(square[..., 0, 0])))
+    placed = np.interp(tilt_deg, errors.tilts_deg, errors.placed_share)[..., None, None]
+    keypoint = np.interp(tilt_deg, errors.tilts_deg, errors.keypoint_sigma_m)[..., None, None]
+    turned = np.radians(errors.rotation_sigma_deg) ** 2
+    information: Float = placed * across / (keypoint**2 + square * turned + errors.position_sigma_m**2)
     return information
 
 

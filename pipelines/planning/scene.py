@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.planning.config import Mode, PlannerConfig
+from pipelines.geometry.noise import sum_sigma
+from pipelines.geometry.poses import rates
+from pipelines.planning.config import ErrorModel, Mode, PlannerConfig
 from pipelines.planning.distance_field import (
     OCCUPIED,
     DistanceField,
@@ -31,6 +33,7 @@ MOST_DRONES = 8
 PICTURES_HZ = 25.0
 """Rate of the pictures: near enough to the 30 Hz for which the detector's errors are modelled."""
 _COST_MAP_HZ, _COST_MAP_YAWS = 2.0, 72
+_NOISE_LOOKS = 200  # moments from which the noise of a flight's poses is averaged
 _HIDDEN_HZ = 10.0  # rate of the moments of `hidden_shares`
 
 
@@ -131,9 +134,17 @@ class Scene:
 
 
 def build_scene(
-    flight: LoggedFlight, maps: Sequence[Occupancy], description: Description, settings: Settings
+    flight: LoggedFlight,
+    maps: Sequence[Occupancy],
+    description: Description,
+    settings: Settings,
+    *,
+    errors: ErrorModel | None = None,
 ) -> Scene:
-    """Prepare a comparison: distance fields, times, the first camera's start, and warnings."""
+    """Prepare a comparison: distance fields, times, the first camera's start, and warnings.
+
+    `errors` are those of the detector, by default as in `ErrorModel`; those of the poses are the flight's.
+    """
     notes = []
     unknown: Unknown = "occupied" if description.map and description.map.unknown == "occupied" else "free"
     fields = tuple(
@@ -145,6 +156,8 @@ def build_scene(
     t_ns = tracking_times(flight.actor_t_ns, settings.planner)
     actor, actor_source = flight.scored_actor(t_ns)
     flown = flown_poses(flight, description, t_ns)
+    errors = with_pose_errors(errors or ErrorModel(), flight, t_ns, *flown[:2])
+    settings = replace(settings, planner=replace(settings.planner, errors=errors))
     drones = settings.drones or min(max(len(flight.cameras), 2), MOST_DRONES)
     if settings.drones is None and drones != len(flight.cameras):
         notes.append(f"{drones} drones are replayed, the session has {len(flight.cameras)} cameras")
@@ -173,6 +186,28 @@ def build_scene(
         warnings=(),
     )
     return replace(scene, warnings=(*flight.warnings, *_doubts(scene)))
+
+
+def with_pose_errors(
+    errors: ErrorModel, flight: LoggedFlight, t_ns: Int64, position: Float, quaternion_xyzw: Float
+) -> ErrorModel:
+    """Take the errors of the poses from a flight: root mean squares over its cameras and times.
+
+    Args:
+        errors: those of the detector are kept.
+        flight: its cameras have noise models.
+        t_ns: [T].
+        position: [C, T, 3] m, of the cameras as flown.
+        quaternion_xyzw: [C, T, 4], the same.
+    """
+    rows = slice(None, None, max(len(t_ns) // _NOISE_LOOKS, 1))
+    elapsed_s = (t_ns[rows] - t_ns[0]) / 1e9
+    sigma = [
+        sum_sigma(camera.noise, elapsed_s, *rates(t_ns[rows], position[c, rows], quaternion_xyzw[c, rows]))
+        for c, camera in enumerate(flight.cameras)
+    ]
+    meters, radians = np.sqrt(np.mean(np.square(sigma), axis=(0, 1)))
+    return replace(errors, position_sigma_m=float(meters), rotation_sigma_deg=float(np.degrees(radians)))
 
 
 def _doubts(scene: Scene) -> list[str]:

@@ -16,6 +16,18 @@ NEAR_OBSTACLE_M = 15.0
 _MOTION_HZ = 10.0  # speed, acceleration and jerk are means over this period: plans change at 5 Hz
 _ROUNDING = 1.0 + 1e-6  # differences of positions; drones fly at their limits
 _LOOKS_PER_S = 5.0  # rate of the search for obstacles near the slots
+_FEWEST_VIEWS = 2  # that determine a point
+
+# The person of Hughes et al. 2024: a hexagonal prism with a lid.
+_SIDES = 6
+_APOTHEM_M, _PRISM_M = 0.484, 1.8  # from the axis to a side, and the height
+
+# Rotary-wing aircraft of Zeng, Xu & Zhang 2019 ("Energy Minimization for Wireless Communication with
+# Rotary-Wing UAV", IEEE Trans. Wireless Commun. 18(4), table I and eq. 12): 20 N.
+_BLADE_W, _INDUCED_W = 79.8563, 88.6279  # in hovering
+_TIP_MPS, _INDUCED_MPS = 120.0, 4.03  # speed of the rotor's tip; mean induced velocity in hovering
+_PARASITE_W_PER_MPS3 = 0.5 * 0.6 * 1.225 * 0.05 * 0.503  # drag ratio, air density, solidity, disc area
+_WEIGHT_N = 20.0
 
 
 def score(
@@ -42,6 +54,8 @@ def score(
         no obstacle at all, never near one). `limit_violations` counts episodes per drone (per pair for
         separation): in an obstacle (`collision`), within `drone_radius_m` of one (`clearance`), within
         `actor_distance_m` of the actor (`actor`), and beyond the other limits of the configuration.
+        `path_m` is the mean length of a drone's way, `energy_kj` the mean propulsion energy of a drone
+        (`propulsion_w`), `blind_s` the time in which fewer than two drones see the actor.
         `predicted_error_m` is sqrt(tr S) of the ray model over the times at which two free views or more
         determine it, `undetermined_share` the share of the others.
     """
@@ -72,6 +86,10 @@ def score(
         "range_m": _spread(slots[..., RANGE]),
         "yaw_separation_deg": _spread(np.degrees(np.abs(turned))) if pairs else None,
         "occluded_share": float(1.0 - seen.mean()),
+        "blind_s": float(np.trapezoid((seen.sum(axis=0) < _FEWEST_VIEWS).astype(np.float64), t_s)),
+        "path_m": float(np.linalg.norm(np.diff(position, axis=1), axis=-1).sum(axis=1).mean()),
+        "energy_kj": _energy_j(t_s, position) / 1e3,
+        "min_actor_distance_m": float(slots[..., RANGE].min()),
         "min_clearance_m": float(clearance.min()) if field.has_obstacles else None,
         "min_separation_m": float(apart.min()) if pairs else None,
         "max_speed_mps": float(motion["speed"].max()),
@@ -84,6 +102,84 @@ def score(
         },
         "undetermined_share": float(1.0 - determined.mean()),
     }
+
+
+def coverage(
+    position: Float, looks_rad: Float, people: Float, heading_rad: Float, *, fov_rad: float
+) -> Float:
+    """Compute how densely one camera sees the faces of people, up to the camera's constant.
+
+    Each face counts with c = |d look| (-d n) / |d|^4 where d is from the camera to the face's centre and n
+    its normal: pixels per area, times the cosine of the view (Hughes et al., "Multi-Robot Planning for
+    Filming Groups of Moving Actors Leveraging Submodularity and Pixel Density", CDC 2024). Faces that look
+    away have 0, and so have people whose axis is out of the level field of view. Nobody hides anybody.
+
+    Args:
+        position: [..., 3] metres, world; the camera.
+        looks_rad: [...] yaw of its optical axis from east; the axis is level.
+        people: [A, 3] metres, world; the centres of the prisms' sides.
+        heading_rad: [A] yaw from east.
+        fov_rad: level field of view.
+
+    Returns:
+        [..., A, 7] 1/m^2: six sides and the lid.
+    """
+    normal, centre = _faces(people, heading_rad)
+    look = np.stack([np.cos(looks_rad), np.sin(looks_rad), np.zeros_like(looks_rad)], axis=-1)
+    to_face = centre - position[..., None, None, :]
+    facing = np.maximum(-(to_face * normal).sum(axis=-1), 0.0)
+    along = np.abs((to_face * look[..., None, None, :]).sum(axis=-1))
+    offset = people - position[..., None, :]
+    aside = wrapped(np.arctan2(offset[..., 1], offset[..., 0]) - looks_rad[..., None])
+    inside = np.abs(aside) <= fov_rad / 2.0
+    found: Float = along * facing / (to_face**2).sum(axis=-1) ** 2 * inside[..., None]
+    return found
+
+
+def view_quality(covered: Float, weight: Float) -> Float:
+    """Sum what all cameras cover [..., A, 7] to the view quality [...] of people with `weight` [A].
+
+    The root of a face's density counts with the face's area and the person's weight: a second view of the
+    same face adds less than the first of another one (Hughes et al. 2024).
+    """
+    side_m = 2.0 * _APOTHEM_M * np.tan(np.pi / _SIDES)
+    area = np.full(_SIDES + 1, side_m * _PRISM_M)
+    area[-1] = 1.5 * np.sqrt(3.0) * side_m**2
+    quality: Float = (weight[:, None] * area * np.sqrt(covered)).sum(axis=(-2, -1))
+    return quality
+
+
+def _faces(people: Float, heading_rad: Float) -> tuple[Float, Float]:
+    """Return normals and centres [A, 7, 3] of the sides and the lid, whose centre is on the sides' level."""
+    yaw = heading_rad[:, None] + 2.0 * np.pi / _SIDES * np.arange(1, _SIDES + 1)
+    normal = np.zeros((len(people), _SIDES + 1, 3))
+    normal[:, :_SIDES, 0], normal[:, :_SIDES, 1] = np.cos(yaw), np.sin(yaw)
+    centre = people[:, None] + _APOTHEM_M * normal
+    normal[:, _SIDES, 2] = 1.0
+    return normal, centre
+
+
+def propulsion_w(level_mps: Float, climb_mps: Float) -> Float:
+    """Compute the propulsion power (W) of a small drone of 20 N in still air.
+
+    P = P0 (1 + 3 V^2/U^2) + Pi (sqrt(1 + V^4/(4 v0^4)) - V^2/(2 v0^2))^(1/2) + d rho s A V^3/2 at the level
+    speed V (Zeng, Xu & Zhang 2019), and the weight times the speed of climbing; descending saves nothing.
+    It compares arms: another drone needs another energy.
+    """
+    square = level_mps**2
+    blade = _BLADE_W * (1.0 + 3.0 * square / _TIP_MPS**2)
+    ratio = square / (2.0 * _INDUCED_MPS**2)
+    induced = _INDUCED_W * np.sqrt(np.sqrt(1.0 + ratio**2) - ratio)
+    power: Float = blade + induced + _PARASITE_W_PER_MPS3 * level_mps**3
+    return power + _WEIGHT_N * np.maximum(climb_mps, 0.0)
+
+
+def _energy_j(t_s: Float, position: Float) -> float:
+    """Compute the mean energy of a drone from the mean velocities between positions at 10 Hz."""
+    step_s = np.diff(_even(t_s))
+    velocity = np.diff(_at_even_times(t_s, position), axis=-1) / step_s
+    power = propulsion_w(np.linalg.norm(velocity[:, :2], axis=1), velocity[:, 2])
+    return float((power * step_s).sum(axis=-1).mean())
 
 
 def predicted_errors(position: Float, actor: Float, field: DistanceField, config: PlannerConfig) -> Float:
@@ -123,19 +219,28 @@ def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: Distanc
 
 def _information(offset: Float, seen: Bool, config: PlannerConfig) -> Float:
     """Sum the information [T, 3, 3] of all cameras that see the actor."""
-    total: Float = (ray_information(offset, config) * seen[..., None, None]).sum(axis=0)
+    total: Float = (ray_information(offset, config.errors) * seen[..., None, None]).sum(axis=0)
     return total
 
 
 def _motion(t_s: Float, position: Float) -> dict[str, Float]:
     """Compute magnitudes [N, ...] of the derivatives, from positions at 10 Hz."""
-    even = np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _MOTION_HZ)
-    value = np.array([[np.interp(even, t_s, axis) for axis in one.T] for one in position])
+    value = _at_even_times(t_s, position)
     motion = {}
     for name in ("speed", "acceleration", "jerk"):
         value = np.diff(value, axis=-1) * _MOTION_HZ
         motion[name] = np.linalg.norm(value, axis=1)
     return motion
+
+
+def _even(t_s: Float) -> Float:
+    return np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _MOTION_HZ)
+
+
+def _at_even_times(t_s: Float, position: Float) -> Float:
+    """Interpolate positions [N, T, 3] at 10 Hz, [N, 3, ...]."""
+    even = _even(t_s)
+    return np.array([[np.interp(even, t_s, axis) for axis in one.T] for one in position])
 
 
 def _spread(values: Float) -> dict[str, float]:

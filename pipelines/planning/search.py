@@ -315,7 +315,7 @@ def error_map(costs: SlotCosts, offsets: Float, config: PlannerConfig) -> Float:
 
     A weak prior limits the error where too few views are free.
     """
-    information = ray_information(offsets, config)
+    information = ray_information(offsets, config.errors)
     free = (costs.occluded == 0.0).astype(np.float64)
     total = np.einsum("tsn,snij->tsij", free, information) + np.eye(3) / config.prior_sigma_m**2
     return predicted_error(total)

@@ -13,6 +13,7 @@ from pipelines.planning.comparison import (
     mean_of_trials,
     mean_over_time,
     mpjpe_mm,
+    pck,
     verdict,
 )
 from pipelines.planning.config import PlannerConfig
@@ -83,6 +84,10 @@ def test_errors_on_common_joint_frames() -> None:
     assert mpjpe_mm(one, shared) == pytest.approx([100, 200])
     assert mpjpe_mm(two, shared) == pytest.approx([200, 300])
     assert mpjpe_mm(blind, np.isfinite(blind)).size == 0
+    # Of the right joints, those of all joint-frames count: what is missing is wrong.
+    assert pck(one, 2) == pytest.approx([0.5, 0.0])
+    assert pck(blind, 2) == pytest.approx([0.0, 0.0])
+    assert pck(np.full_like(one, 0.15), 4) == pytest.approx([0.5, 0.5])
     assert coverage(two, 2) == pytest.approx([0.5, 1.0])
     assert coverage(blind, 0) == pytest.approx([0.0, 0.0])
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.planning.config import PlannerConfig
+from pipelines.planning.config import ErrorModel, PlannerConfig
 from pipelines.planning.distance_field import distance_field, occupied_share, open_space
 from pipelines.planning.formation import formation_slots, slot_offsets
 from pipelines.planning.information import log_determinant, predicted_error, ray_information
@@ -68,19 +68,23 @@ def test_hidden_views_cost_information() -> None:
 
 
 def test_error_of_two_cameras_as_in_closed_form() -> None:
-    """Tr S = s^2 (1/2 + 2/sin^2 gamma) for equal cameras whose rays cross at gamma; 96 % seen when level."""
-    config = replace(CONFIG, rotation_sigma_deg=0.8)
+    """Tr S = s^2 (1/2 + 2/sin^2 gamma) for equal cameras whose rays cross at gamma."""
+    errors = ErrorModel(rotation_sigma_deg=0.8)
     offset = np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
     for gamma in np.radians([30.0, 60.0, 90.0, 150.0]):
         offset[1] = 10 * np.array([np.cos(gamma), np.sin(gamma), 0.0])
-        s2 = (10 * 0.003) ** 2 + (10 * np.radians(0.8)) ** 2 + config.position_sigma_m**2
-        error = predicted_error(ray_information(offset, config).sum(axis=0))
-        assert error**2 == pytest.approx(s2 / 0.96 * (0.5 + 2 / np.sin(gamma) ** 2), rel=1e-9)
+        keypoint_m, placed = (
+            np.interp(0.0, errors.tilts_deg, values)
+            for values in (errors.keypoint_sigma_m, errors.placed_share)
+        )
+        s2 = keypoint_m**2 + (10 * np.radians(0.8)) ** 2 + errors.position_sigma_m**2
+        error = predicted_error(ray_information(offset, errors).sum(axis=0))
+        assert error**2 == pytest.approx(s2 / placed * (0.5 + 2 / np.sin(gamma) ** 2), rel=1e-9)
 
 
 def test_one_camera_or_two_face_to_face_determine_nothing() -> None:
     offset = np.array([[10.0, 1.0, 2.0], [-10.0, -1.0, -2.0]])
-    information = ray_information(offset, CONFIG)
+    information = ray_information(offset, CONFIG.errors)
     assert np.isinf(predicted_error(information)).all()
     assert np.isinf(predicted_error(information.sum(axis=0)))
     assert np.isinf(predicted_error(np.zeros((3, 3))))
@@ -89,15 +93,16 @@ def test_one_camera_or_two_face_to_face_determine_nothing() -> None:
 @given(st.integers(0, 10_000))
 def test_closed_forms_equal_linear_algebra(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    information = ray_information(rng.uniform(2, 12, (3, 3)), CONFIG).sum(axis=0) + np.eye(3)
+    information = ray_information(rng.uniform(2, 12, (3, 3)), CONFIG.errors).sum(axis=0) + np.eye(3)
     assert predicted_error(information) ** 2 == pytest.approx(np.trace(np.linalg.inv(information)))
     assert log_determinant(information) == pytest.approx(np.linalg.slogdet(information)[1])
 
 
 def test_steeper_views_are_worth_less() -> None:
+    errors = ErrorModel(0.0, 0.0, (15, 30, 45, 60), (0.02, 0.02, 0.04, 0.04), (1.0, 0.9, 0.8, 0.6))
     tilts = np.radians([15.0, 30.0, 45.0, 60.0, 80.0])
     offsets = slot_offsets(
         formation_slots(np.zeros(1), 1, tilt_rad=0.0, range_m=10.0) + np.outer(tilts, [0, 1, 0])[:, None]
     )
-    worth = np.trace(ray_information(offsets[:, 0], CONFIG), axis1=-2, axis2=-1)
-    assert worth / worth[0] == pytest.approx(np.array([0.97, 0.91, 0.81, 0.61, 0.61]) / 0.97)
+    worth = np.trace(ray_information(offsets[:, 0], errors), axis1=-2, axis2=-1)
+    assert worth / worth[0] == pytest.approx(np.array([1.0, 0.9, 0.2, 0.15, 0.15]))
