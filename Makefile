@@ -70,9 +70,10 @@ results: setup
 	$(BIN)/mocap models fetch blazepose
 	$(BIN)/python -m benchmarks.results
 
-# Damaged files into every reader, and every stage killed at fifty moments, for some minutes each.
+# Damaged files and crafted ones into every reader, and every stage killed at fifty moments, for some minutes each.
 fuzz: setup
 	$(BIN)/python -m tests.fuzz --inputs 2000
+	$(BIN)/python -m tests.fuzz --crafted
 	$(BIN)/python -m tests.kills --kills 50
 
 # The wheel in an empty environment.

@@ -9,7 +9,7 @@ import click
 
 from mocap_cli.options import (
     Shown,
-    any_path,
+    any_place,
     every_option,
     force_option,
     grouped,
@@ -62,7 +62,7 @@ _settings_options = grouped(
 @click.option(
     "-o",
     "--output",
-    type=any_path,
+    type=any_place,
     metavar="FOLDER",
     help="Where sessions and summary go [default: sessions beside their flights, the summary in ./batch].",
 )
@@ -102,6 +102,7 @@ def batch_command(
     if workers is not None and scheduler is not None:
         raise click.UsageError("--workers are those of this machine: leave them out with --scheduler.")
     from pipelines.batch import batch
+    from pipelines.session.stores import url_of
 
     with watching(shown.level) as progress:
         result = batch(
@@ -132,8 +133,8 @@ def batch_command(
         done = len(result.rows) - len(failures)
         if not shown.quiet:
             say(f"{done} of {len(result.rows)} flights done, {result.unchanged} of them unchanged")
-        say(f"written: {result.table}")
-        say(f"written: {result.page}")
+        for written in (result.table, result.page):
+            say(f"written: {url_of(written) or written}")
     if failures:
         say(f"mocap: {len(failures)} of {len(result.rows)} flights failed", err=True)
         context.exit(1)

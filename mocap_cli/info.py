@@ -11,6 +11,7 @@ from mocap_cli.several import each
 from mocap_cli.terminal import one_line, say
 
 _LONGEST_LIST = 12
+_LARGE = 1e6
 
 
 @click.command("info", short_help="Print the content of a file or session.")
@@ -49,7 +50,8 @@ def _text(value: object) -> str:
     if value is None or value in ([], {}):
         return "-"
     if isinstance(value, float):
-        return f"{value:.6g}"
+        # Times of day need their milliseconds: the page on drones says to take them over into flight.yaml.
+        return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) >= _LARGE else f"{value:.6g}"
     if isinstance(value, list | tuple):
         shown = ", ".join(_text(item) for item in value[:_LONGEST_LIST])
         return f"{shown}, ... ({len(value)})" if len(value) > _LONGEST_LIST else shown

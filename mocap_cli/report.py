@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,11 +11,12 @@ import click
 from mocap_cli.options import (
     Shown,
     any_path,
+    any_place,
     force_option,
     output_options,
     overwrite_option,
 )
-from mocap_cli.several import end, expanded, tell
+from mocap_cli.several import end, expanded, session_here, tell
 from mocap_cli.terminal import print_json, say, say_warnings, watching
 from pipelines.session.errors import MocapError
 
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @click.command("report", short_help="Write a page about each session, and one that compares them.")
-@click.argument("sessions", nargs=-1, required=True, type=any_path, metavar="SESSION...")
+@click.argument("sessions", nargs=-1, required=True, type=any_place, metavar="SESSION...")
 @click.option(
     "-o",
     "--output",
@@ -78,7 +80,9 @@ def report_command(
     compared = drawn = None
     results = []
     failed: dict[str, str] = {}
-    with watching(shown.level) as progress:
+    with ExitStack() as stack:
+        ones = [stack.enter_context(session_here(session)) for session in ones]
+        progress = stack.enter_context(watching(shown.level))
         progress.start("Writing pages", len(ones) + (len(ones) > 1) + (figures is not None))
         for session in ones:
             try:

@@ -6,13 +6,14 @@ this flight where the stages stopped. Sessions are the same as those of single r
 
 import csv
 import io
+import json
 import logging
 import os
 import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -31,7 +32,8 @@ from pipelines.session.errors import BusyError, DataError, MocapError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.registries import need
 from pipelines.session.stages import names_of
-from pipelines.session.storage import as_data_error, read_json, write_json, write_whole
+from pipelines.session.storage import as_data_error, read_json, write_whole
+from pipelines.session.stores import as_urls, fetched, get, put, staged, url_of
 
 STAGES = ("ingest", "reconstruct", "replan-compare", "report")
 
@@ -77,6 +79,7 @@ class Outcome:
     seconds: dict[str, dict[str, float]] = field(default_factory=dict)  # of every stage: wall and cpu
     peak_memory_mb: float | None = None  # of the worker, up to the end of this flight
     worker: int | None = None  # its process id
+    version: str | None = None  # URL of the session's files, if it was published in an object store
 
 
 @dataclass(frozen=True)
@@ -143,7 +146,25 @@ def batch(
 
 
 def run_flight(job: Job) -> Outcome:
-    """Run all stages of one flight; errors are part of the outcome."""
+    """Run all stages of one flight; errors are part of the outcome.
+
+    A session in an object store is published after each stage, so that another worker continues from there.
+    """
+    with ExitStack() as stack:
+        try:
+            if flight := url_of(job.flight):
+                job = replace(job, flight=fetched(flight, fresh=True))
+            if (place := url_of(job.session)) is None:
+                return _run_stages(job, lambda: None)
+            copy = _patiently(lambda: stack.enter_context(staged(place, create=True)))
+        except MocapError as error:
+            return Outcome(failed_stage=job.settings.stages[0], error=" ".join(str(error).split()))
+        outcome = _run_stages(replace(job, session=copy.folder), copy.publish)
+        return replace(outcome, version=copy.version)
+
+
+def _run_stages(job: Job, publish: Callable[[], object]) -> Outcome:
+    """Run all stages of one flight, and publish after each."""
     failed: dict[str, str] = {}  # the first error, by its stage
     finished: list[str] = []
     seconds: dict[str, dict[str, float]] = {}
@@ -154,6 +175,7 @@ def run_flight(job: Job) -> Outcome:
         wall_s, cpu_s = time.perf_counter(), time.process_time()
         try:
             unchanged &= _patiently(partial(_run, stage, job))
+            publish()
             finished.append(stage)
         except MocapError as error:
             failed = failed or {stage: str(error)}
@@ -308,6 +330,8 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
 
 
 def _absolute(path: Path) -> Path:
+    if url_of(path):
+        return path
     return Path(os.path.abspath(path))  # noqa: PTH100  # links stay: media are named relative to the session
 
 
@@ -322,10 +346,15 @@ def _refuse_foreign(folder: Path, overwrite: bool) -> None:
     """Refuse to replace a table that is not the summary of a batch."""
     table = folder / _TABLE
     try:
-        if overwrite or not table.exists():
+        if overwrite:
             return
-        with table.open(encoding="utf-8", errors="replace") as file:
-            first = file.readline()
+        if url := url_of(table):
+            first = (get(url) or ",".join(COLUMNS).encode()).decode("utf-8", "replace")
+        elif not table.exists():
+            return
+        else:
+            with table.open(encoding="utf-8", errors="replace") as file:
+                first = file.readline()
     except OSError as error:
         raise as_data_error(error, table) from error
     if not first.startswith(",".join(COLUMNS[:4])):
@@ -337,6 +366,9 @@ def _refuse_foreign(folder: Path, overwrite: bool) -> None:
 def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:
     """Make a row of the summary, with paths relative to the summary's folder."""
     page = job.session / "report" / "index.html"
+    report = _from(folder, page) if page.is_file() else None
+    if outcome.version is not None:
+        report = f"{outcome.version}/report/index.html"
     return FlightRow(
         flight=_from(folder, job.flight),
         name=outcome.name,
@@ -344,16 +376,18 @@ def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:
         error=None if outcome.error is None else _as_here(outcome.error),
         figures=outcome.figures,
         warnings=outcome.warnings,
-        report=_from(folder, page) if page.is_file() else None,
+        report=report,
     )
 
 
 def _as_here(line: str) -> str:
     """Make the paths in a line relative, as in the messages of a single run."""
-    return line.replace(f"{Path.cwd()}{os.sep}", "")
+    return as_urls(line).replace(f"{Path.cwd()}{os.sep}", "")
 
 
 def _from(folder: Path, path: Path) -> str:
+    if url_of(folder) or url_of(path):
+        return url_of(path) or path.as_posix()
     return Path(os.path.relpath(path, folder)).as_posix()
 
 
@@ -365,14 +399,19 @@ def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome])
     for row in rows:
         cells = [*row.cells(), *(row.figures.get(arm) for arm in arms), len(row.warnings), row.report]
         writer.writerow(map(cell_text, cells))
+    times = [
+        {"flight": row.flight, **{k: asdict(outcome)[k] for k in ("seconds", "peak_memory_mb", "worker")}}
+        for row, outcome in zip(rows, outcomes, strict=True)
+    ]
+    document = json.dumps({"schema": 1, "flights": times}, indent=2, ensure_ascii=False)
+    files = {_TABLE: text.getvalue(), _PAGE: render_flights(rows), _TIMES: f"{document}\n"}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / _TABLE, text.getvalue().encode("utf-8", "replace"))
-        write_whole(folder / _PAGE, render_flights(rows).encode("utf-8", "replace"))
-        times = [
-            {"flight": row.flight, **{k: asdict(outcome)[k] for k in ("seconds", "peak_memory_mb", "worker")}}
-            for row, outcome in zip(rows, outcomes, strict=True)
-        ]
-        write_json(folder / _TIMES, {"schema": 1, "flights": times})
+        for name, content in files.items():
+            encoded = content.encode("utf-8", "replace")
+            if url := url_of(folder / name):
+                put(url, encoded)
+                continue
+            folder.mkdir(parents=True, exist_ok=True)
+            write_whole(folder / name, encoded)
     except OSError as error:
         raise as_data_error(error, folder) from error

@@ -20,7 +20,7 @@ from pipelines.reconstruction.loading import load_cameras
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt, read_description
 from pipelines.session.errors import DataError
-from pipelines.session.people import logged_actor
+from pipelines.session.people import logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import WritableSession, locked
@@ -96,8 +96,8 @@ def _checked(
         cameras, _ = load_cameras(
             folder, description, detected, min_confidence=_CONFIDENT, pose_noise=pose_noise
         )
-        actor = logged_actor(folder, description)
-        found, association, _ = find_people(cameras, description.pose_interpolation, actor)
+        actors = logged_people(folder, description)
+        found, association, _ = find_people(cameras, description.pose_interpolation, actors)
         doubts = doubts_of(
             folder,
             description,

@@ -17,7 +17,7 @@ from pipelines.reporting.content import estimated_clocks
 from pipelines.reporting.frame_drawing import caption_of, draw_frame
 from pipelines.reporting.motion import Motion, motion_from_skeleton
 from pipelines.reporting.overlays import FilmedCamera, read_filmed, refined_poses, status_at, views_of
-from pipelines.session.description import Description, read_description
+from pipelines.session.description import Description, Doubt, read_description, said_doubts
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
@@ -214,8 +214,17 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         angles=lambda: (
             None if record is None else read_table(folder / "reconstruct" / "angles.parquet", ANGLES)
         ),
+        doubts=lambda: said_doubts(_doubts(folder, description, record)),
         zero_ns=description.start_ns,
     )
+
+
+def _doubts(folder: Path, description: Description, record: StageRecord | None) -> list[Doubt]:
+    """Return the doubts of the reconstruction, which repeats those of ingest; those alone without one."""
+    if record is None:
+        return description.doubts
+    stored = read_json(folder / "reconstruct" / "metrics.json").get("doubts", [])
+    return [Doubt.model_validate(doubt) for doubt in stored]
 
 
 Stills = Callable[[str], Iterable[tuple[int, Picture]]]

@@ -24,6 +24,7 @@ from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, locked, open_session
 from pipelines.session.storage import read_json, write_json
+from pipelines.session.stores import is_there
 from pipelines.session.tables import FRAMES, SKELETON, read_table, rows_between
 from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
 
@@ -147,7 +148,7 @@ def _still_there(
     there, gone = [], []
     for name in cameras:
         media = description.cameras[name].media
-        missing = [path for path in media.paths if not (folder / path).exists()] if media else []
+        missing = [path for path in media.paths if not is_there(folder, path)] if media else []
         if missing:
             gone.append((name, folder / missing[0]))
         else:

@@ -65,6 +65,7 @@ from pipelines.reconstruction.results import (
     camera_poses_table,
     gait_of,
     method_used,
+    of_people,
     skeleton_table,
 )
 from pipelines.reconstruction.smoothing import smoother
@@ -88,7 +89,7 @@ from pipelines.session.description import (
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.memory import Waiting, return_freed_arrays
-from pipelines.session.people import LoggedActor, logged_actor, true_joints_at
+from pipelines.session.people import LoggedActor, logged_people, true_joints_at
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
 from pipelines.session.stage_records import Stage, StageRecord
@@ -111,7 +112,7 @@ class Settings:
 
     method: Method | Literal["refined", "auto"] = "auto"
     rate_hz: float | None = None
-    people: int = 1
+    people: int | Literal["auto"] | None = None  # None: `auto` if several were logged by name, else 1
     min_confidence: float = 0.3
     pixel_sigma: float = 3.0
     pose_noise: str | None = None
@@ -178,6 +179,7 @@ def reconstruct(
         if ingested is None:
             raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
         description = read_description(folder)
+        settings = replace(settings, people=settings.people or ("auto" if description.actors else 1))
         following, left_out = _following(session, description, settings, force)
         detected = _detected(session, settings, workers, force, following, progress)
         background = None
@@ -209,13 +211,13 @@ def reconstruct(
         cameras = waiting.put(cameras)
         progress.advance()
         followed = _followed(folder, cameras, left_out) if background or left_out else {}
-        actor = logged_actor(folder, description)
+        actors = logged_people(folder, description)
         flight = _Flight(
             description,
             followed,
             _stills(folder, cameras) if settings.method == "auto" else {},
-            actor,
-            ground_of(folder, description, actor),
+            actors,
+            ground_of(folder, description, actors[0] if actors else None),
             waiting.put(load_truth(folder, description, cameras[0].detections.joints)),
             waiting,
         )
@@ -284,7 +286,7 @@ def _detected(
     detected = detect(
         session,
         detector=settings.detector,
-        people=settings.people,
+        people=settings.people if isinstance(settings.people, int) else 2,
         every=settings.every,
         start_s=settings.start_s,
         end_s=settings.end_s,
@@ -391,7 +393,7 @@ class _Flight:
     description: Description
     followed: Mapping[str, Followed | str]  # the backgrounds of the cameras that are refined by them
     stills: Mapping[str, Stills]  # some pictures of cameras that are bound to each other by the ground
-    actor: LoggedActor | None
+    actors: list[LoggedActor]
     ground: Ground | None
     truth: JointMotion | None
     waiting: Waiting  # for large arrays of long flights
@@ -465,16 +467,18 @@ def _attempt(
     result, finished = finish(
         observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)
     )
+    truth = None if flight.truth is None else true_joints_at(flight.truth, observations.t_ns)
     metrics = assess(
         observations,
         views,
         result,
         cameras=[camera.name for camera in cameras],
         method=settings.method,
-        truth=None if flight.truth is None else true_joints_at(flight.truth, observations.t_ns),
+        truth=truth,
         solve=solve,
     )
-    people = {"people": _people_seen(cameras, seen.association)}
+    people = {"people": _people_seen(description, cameras, seen.association)}
+    metrics |= of_people(people["people"]["names"], observations, result, truth)
     readout = _readout(cameras, seen)
     parts = background | (refined.metrics if refined else {}) | _clock_metrics(cameras, clocks, refined)
     known = source_of_pose_noise(description, logged, settings.pose_noise)
@@ -579,8 +583,8 @@ def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _See
     found, association, sigma = find_people(
         cameras,
         between,
-        flight.actor,
-        people=settings.people,
+        flight.actors,
+        people=settings.people if isinstance(settings.people, int) else None,
         pixel_sigma=pixel_sigma,
         scene=Scene(flight.ground, np.array([camera.field for camera in cameras])),
     )
@@ -597,13 +601,13 @@ def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _See
 def find_people(
     cameras: list[Camera],
     between: Interpolation,
-    actor: LoggedActor | None,
+    actors: Sequence[LoggedActor],
     *,
-    people: int = Settings.people,
+    people: int | None = 1,
     pixel_sigma: float = Settings.pixel_sigma,
     scene: Scene | None = None,
 ) -> tuple[Candidates, Association, Float]:
-    """Collect all detections at common times, and associate them with people; person 0 is the actor.
+    """Collect all detections at common times, and associate them with people; those logged come first.
 
     With a scene, things that are no people by the ground and by the other cameras are left out.
 
@@ -618,7 +622,7 @@ def find_people(
         found.position,
         found.rotation,
         sigma,
-        actor=None if actor is None else actor.hips_at(found.t_ns),
+        actors=np.stack([actor.hips_at(found.t_ns) for actor in actors], axis=1) if actors else None,
         people=people,
         scene=scene,
     )
@@ -637,11 +641,15 @@ def chosen_detections(cameras: Sequence[Camera], found: Candidates, association:
     return chosen
 
 
-def _people_seen(cameras: Sequence[Camera], association: Association) -> dict[str, Any]:
+def _people_seen(
+    description: Description, cameras: Sequence[Camera], association: Association
+) -> dict[str, Any]:
     """Count people seen at once, times with more people than requested, and unused detections."""
     asked = association.choice.shape[2]
     return {
         "asked": asked,
+        "phantoms": association.phantoms,
+        "names": description.names_of_people(asked),
         "seen_at_once": int(association.people.max(initial=0)),
         "times": len(association.people),
         "times_with_more": int((association.people > asked).sum()),
@@ -657,7 +665,23 @@ def _people_seen(cameras: Sequence[Camera], association: Association) -> dict[st
 
 def _people_warnings(people: Mapping[str, Any]) -> list[str]:
     """Write warnings on things that are no people, unused detections, and more people than requested."""
-    return [*_no_people_warnings(people["no_people"]), *_unused_warnings(people)]
+    return [
+        *_no_people_warnings(people["no_people"]),
+        *_phantom_warnings(people["phantoms"]),
+        *_unused_warnings(people),
+    ]
+
+
+def _phantom_warnings(phantoms: Mapping[str, int]) -> list[str]:
+    """Write how many bodies that two cameras see were taken for nobody, by cause."""
+    words = {
+        "ground": "not on the ground",
+        "size": "not of a person's size",
+        "misfit": "seen at different places by different cameras",
+        "same": "a second image of a person",
+    }
+    causes = ", ".join(f"{count} {words[cause]}" for cause, count in phantoms.items())
+    return [f"bodies that are no people, by --persons auto: {causes}"] if causes else []
 
 
 def _no_people_warnings(no_people: Mapping[str, Mapping[str, int]]) -> list[str]:

@@ -27,6 +27,7 @@ from pipelines.session.records import Occupancy
 from pipelines.session.stage_records import Stage, StageRecord, outdated, versions_of
 from pipelines.session.stages import Session, locked, open_session, session_name
 from pipelines.session.storage import as_data_error, hash_of, read_json, sha256_of, write_whole
+from pipelines.session.stores import is_there
 from pipelines.session.tables import (
     ACTOR,
     ANGLES,
@@ -258,7 +259,7 @@ def _refuse_changed_pictures(folder: Path, description: Description) -> None:
 def _pictures_there(folder: Path, description: Description) -> list[str]:
     """List the cameras whose pictures are still where they were at ingest."""
     media = {name: entry.media for name, entry in description.cameras.items() if entry.media}
-    return [name for name, entry in media.items() if all((folder / path).exists() for path in entry.paths)]
+    return [name for name, entry in media.items() if all(is_there(folder, path) for path in entry.paths)]
 
 
 def _open_pictures(

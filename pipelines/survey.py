@@ -173,7 +173,7 @@ def _of_manifest(path: Path) -> dict[str, Any]:
     flight = read_flight(path)
     stated = flight.model_dump(mode="json", exclude_defaults=True)
     facts = {"name": flight.name, "clock_reference": flight.reference_camera, "cameras": stated["cameras"]}
-    return facts | {part: stated.get(part) for part in ("actor", "map", "truth", "plan")}
+    return facts | {part: stated.get(part) for part in ("actor", "actors", "map", "truth", "plan")}
 
 
 def _of_scenario(path: Path) -> dict[str, Any]:

@@ -70,11 +70,15 @@ class ArmRow:
     name: str
     simulated: bool
     tilt_deg: tuple[str, str, str]  # mean, largest, mean near an obstacle
-    hidden: str
+    drones: str
+    hidden: tuple[str, str]  # share of the time, and seconds in which fewer than two drones see
     range_m: str
+    path_m: str
+    energy_kj: str
     clearance_m: str
     separation_m: str
     predicted_cm: str
+    right: tuple[str, str]  # % of all joint-frames within 150 mm, and its interval
     error: tuple[str, str]  # mm, and its interval
     coverage: tuple[str, str]
     violations: str
@@ -87,6 +91,7 @@ class DifferenceRow:
     names: tuple[str, str]
     tilt_deg: tuple[str, str]
     hidden: tuple[str, str]
+    right: tuple[str, str]
     error: tuple[str, str]
     coverage: tuple[str, str]
 
@@ -273,11 +278,18 @@ def _row(name: str, stated: Mapping[str, object]) -> ArmRow:
             fixed(number(tilt, "max")),
             fixed(number(tilt, "near_obstacle")),
         ),
-        hidden=percent(number(stated, "occluded_share")),
+        drones=fixed(number(stated, "drones"), 0),
+        hidden=(
+            percent(number(stated, "occluded_share")),
+            "" if (blind_s := number(stated, "blind_s")) is None else f"{fixed(blind_s)} s blind",
+        ),
         range_m=ABSENT if least is None else f"{fixed(least)} to {fixed(most)}",
+        path_m=fixed(number(stated, "path_m"), 0),
+        energy_kj=fixed(number(stated, "energy_kj")),
         clearance_m=fixed(number(stated, "min_clearance_m")),
         separation_m=fixed(number(stated, "min_separation_m")),
         predicted_cm=fixed(None if predicted_m is None else 100 * predicted_m),
+        right=_estimate(section(errors, "pck150"), 100),
         error=_estimate(section(errors, "mpjpe_mm")),
         coverage=_estimate(section(errors, "coverage"), 100),
         violations=", ".join(broken) or "none",
@@ -290,6 +302,7 @@ def _difference(found: object) -> DifferenceRow:
         names=(text(stated, "arm"), text(stated, "against")),
         tilt_deg=_estimate(section(stated, "tilt_deg"), digits=2, signed=True),
         hidden=_estimate(section(stated, "occluded_share"), 100, digits=2, signed=True),
+        right=_estimate(section(stated, "pck150"), 100, digits=2, signed=True),
         error=_estimate(section(stated, "mpjpe_mm"), digits=2, signed=True),
         coverage=_estimate(section(stated, "coverage"), 100, digits=2, signed=True),
     )

@@ -11,20 +11,47 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import conjugate, multiply, quaternion_from_rotation_vector, rotate
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import read_flight
 from tests.commands.runner import mocap, refused, succeeds
-from tests.synthetic.flights import SyntheticFlight, write_flight
+from tests.synthetic.flights import SyntheticFlight, bystander_at, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log
+from tests.synthetic.walk import COCO17
 
 
 def write_actor(flight: SyntheticFlight, folder: Path) -> None:
     """Write a log of the actor's hip, as from a tracker on board."""
-    hip = flight.position[:, [flight.joints.index(f"{side}_hip") for side in ("left", "right")]].mean(axis=1)
-    entries = [
+    write_log(
+        folder, "actor", "ros2-mcap", _logged("/actor", flight.t_ns, hips(flight.joints, flight.position))
+    )
+    flight.settings["actor"] = {"log": "actor", "topic": "/actor"}
+    flight.save()
+
+
+def write_actors(flight: SyntheticFlight, folder: Path) -> None:
+    """Write a log of the bystander's and the actor's hips; the bystander, abe, is the first."""
+    passing = hips(COCO17, bystander_at(flight.t_ns))
+    entries = _logged("/abe", flight.t_ns, passing)
+    entries += _logged("/zoe", flight.t_ns, hips(flight.joints, flight.position))
+    write_log(folder, "people", "ros2-mcap", entries)
+    flight.settings["actors"] = {name: {"log": "people", "topic": f"/{name}"} for name in ("abe", "zoe")}
+    flight.save()
+
+
+def hips(joints: tuple[str, ...], position: Float) -> Float:
+    """Return the middle of the hips [T, 3]."""
+    middle: Float = position[:, [joints.index(f"{side}_hip") for side in ("left", "right")]].mean(axis=1)
+    return middle
+
+
+def _logged(topic: str, t_ns: Int64, position: Float) -> list[Entry]:
+    return [
         Entry(
-            "/actor",
+            topic,
             "geometry_msgs/msg/PoseStamped",
             int(stamp_ns),
             {
@@ -32,11 +59,8 @@ def write_actor(flight: SyntheticFlight, folder: Path) -> None:
                 "pose": {"position": dict(zip("xyz", at.tolist(), strict=True)), "orientation": {"w": 1.0}},
             },
         )
-        for stamp_ns, at in zip(flight.t_ns, hip, strict=True)
+        for stamp_ns, at in zip(t_ns, position, strict=True)
     ]
-    write_log(folder, "actor", "ros2-mcap", entries)
-    flight.settings["actor"] = {"log": "actor", "topic": "/actor"}
-    flight.save()
 
 
 def test_the_logged_actor_decides_who_it_is(tmp_path: Path) -> None:
@@ -48,6 +72,36 @@ def test_the_logged_actor_decides_who_it_is(tmp_path: Path) -> None:
     assert list(actor["t_ns"]) == list(flight.t_ns)
     result = json.loads(succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust", "--json"))
     assert result["mpjpe_mm"] < 0.5
+
+
+def test_several_logged_people_are_reconstructed_under_their_names(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=3, bystander=True, clean=True)
+    write_actors(flight, tmp_path)
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest)
+    succeeds("reconstruct", session, "--method", "robust")
+    metrics = json.loads((session / "reconstruct" / "metrics.json").read_text())
+    assert metrics["people"]["names"] == ["abe", "zoe"]
+    assert list(metrics["by_person"]) == ["abe", "zoe"]
+    assert metrics["by_person"]["zoe"]["coverage"] == 1
+    assert metrics["tracking"]["switches"] == 0
+    assert metrics["tracking"]["misses"] == 0
+    skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
+    for person, truth in enumerate((bystander_at(flight.t_ns), flight.position)):
+        rows = skeleton[(skeleton["person"] == person) & (skeleton["joint"] == "nose")]
+        found = rows[["x", "y", "z"]].to_numpy()
+        there = np.isfinite(found[:, 0])
+        assert there.mean() > 0.9
+        np.testing.assert_allclose(found[there], truth[there, flight.joints.index("nose")], atol=1e-3)
+
+
+@pytest.mark.parametrize("names", [["person1"], ["a/b"], ["ben", "Ben"]])
+def test_names_of_people_that_cannot_be_in_file_names_are_refused(tmp_path: Path, names: list[str]) -> None:
+    flight = write_flight(tmp_path, cameras=2, clean=True, seconds=0.2)
+    flight.settings["actors"] = {name: {"log": "people", "topic": "/abe"} for name in names}
+    flight.save()
+    with pytest.raises(DataError):
+        read_flight(flight.manifest)
 
 
 @pytest.mark.parametrize("relative_to", ["world", "heading"])

@@ -26,6 +26,7 @@ from tests.synthetic.drone_logs import (
     DroneTruth,
     drone_of,
     px4_entries,
+    tlog_pictures,
     ulog_rows,
     write_dataflash,
     write_record,
@@ -422,10 +423,17 @@ def _any_driver(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"log": f"{name}.bag", "topic": "/fix", "attitude": "/imu"}
 
 
-def test_frames_at_the_triggers_of_an_autopilot(tmp_path: Path) -> None:
-    flight = with_poses(tmp_path, _ulog, ON_GIMBAL)
-    for name in flight.cameras:
-        flight.settings["cameras"][name]["frame_times"] = {"ulog": f"{name}.ulg"}
+def _tlog_with_pictures(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    path = folder / _tlog(folder, name, truth)["tlog"]
+    path.write_bytes(path.read_bytes() + tlog_pictures(truth))
+    return {"tlog": path.name}
+
+
+@pytest.mark.parametrize("write", [_ulog, _tlog_with_pictures])
+def test_frames_at_the_triggers_of_an_autopilot(tmp_path: Path, write: Any) -> None:
+    flight = with_poses(tmp_path, write, ON_GIMBAL)
+    for camera in flight.settings["cameras"].values():
+        camera["frame_times"] = dict(camera["pose"])
     flight.save()
     ingest(flight.manifest)
     for name in flight.cameras:

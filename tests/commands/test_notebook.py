@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import os
 import re
 import runpy
@@ -17,6 +19,18 @@ PAGE = Path(__file__).parents[2] / "docs" / "notebook.md"
 def test_the_page_of_functions_is_that_of_the_docstrings() -> None:
     made = runpy.run_path(str(PAGE.with_name("api.py")))["page"]()
     assert made == PAGE.with_name("api.md").read_text(encoding="utf-8"), "run `python docs/api.py --write`"
+
+
+def test_the_executed_notebook_has_the_lines_of_the_page() -> None:
+    made = json.loads(PAGE.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    cells = [cell for cell in made["cells"] if cell["cell_type"] == "code"]
+    expected = runpy.run_path(str(PAGE.with_suffix(".py")))["cells_of"](PAGE.read_text(encoding="utf-8"))
+    assert ["".join(cell["source"]) for cell in cells] == expected, "run `python docs/notebook.py --write`"
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell["outputs"]]
+    assert {output["output_type"] for output in outputs} == {"display_data", "stream"}
+    (figure,) = (output["data"]["image/png"] for output in outputs if "data" in output)
+    assert base64.b64decode(figure).startswith(b"\x89PNG")
 
 
 def test_the_lines_of_the_notebook_run(tmp_path: Path) -> None:

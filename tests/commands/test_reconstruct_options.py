@@ -96,6 +96,8 @@ def test_people_beyond_those_asked_for_are_counted_and_said(tmp_path: Path) -> N
     }
     assert run(session)["people"] == {
         "asked": 1,
+        "phantoms": {},
+        "names": ["person0"],
         "seen_at_once": 2,
         "times": times,
         "times_with_more": times,

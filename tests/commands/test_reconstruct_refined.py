@@ -117,8 +117,12 @@ def test_refined_finds_the_clock_of_a_moving_camera(offset_s: float, tmp_path: P
 
 
 def a_second_late(folder: Path) -> SyntheticFlight:
-    """Write a flight with a wrong clock that is stated as known; no pose errors explain its keypoints."""
-    flight = write_flight(folder, cameras=3, seconds=2.5, pose_noise={})
+    """Write a flight with a wrong clock that is stated as known; no pose errors explain its keypoints.
+
+    The three other cameras determine the noise of the keypoints. With two others, lasting errors of keypoints
+    explain the wrong clock as well.
+    """
+    flight = write_flight(folder, cameras=4, seconds=2.5, pose_noise={})
     flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 1.0, "sigma_s": 0}
     return flight
 

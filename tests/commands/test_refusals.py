@@ -46,13 +46,6 @@ def test_unknown_key_names_the_nearest(flight: SyntheticFlight) -> None:
     assert re.search(r"cameras\.drone2\.keypoint: [^;]*'keypoints'\?; wrold: [^;]*'world'\?$", line)
 
 
-def test_parts_whose_readers_come_later_are_refused(flight: SyntheticFlight) -> None:
-    flight.settings["actors"] = {"anna": {"log": "d1", "topic": "/actor"}}
-    flight.save()
-    line = refused("ingest", flight.manifest)
-    assert line.startswith(f"mocap: {flight.manifest}: actors: ")
-
-
 @pytest.mark.parametrize("change", [{"map": "site.bt"}, {"truth": "true.csv"}])
 def test_file_that_is_not_there(flight: SyntheticFlight, change: dict[str, object]) -> None:
     flight.settings.update(change)

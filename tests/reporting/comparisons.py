@@ -100,8 +100,12 @@ def _estimate(mean: float, low: float, high: float) -> dict[str, object]:
 def make_scores(arm: str) -> dict[str, object]:
     return {
         "tilt_deg": {"mean": 17.25, "max": 23.5, "near_obstacle": None},
+        "drones": len(DRONES),
         "range_m": {"mean": 10.0, "min": 9.25, "max": 10.75},
         "occluded_share": 0.125,
+        "blind_s": 1.25,
+        "path_m": 87.5,
+        "energy_kj": 12.75,
         "min_clearance_m": -0.25,
         "min_separation_m": 14.125,
         "limit_violations": {"speed": 0, "collision": 3, "separation": 0},
@@ -110,6 +114,7 @@ def make_scores(arm: str) -> dict[str, object]:
         "simulated": arm != "flown",
         "reconstruction_error": {
             "simulated": True,
+            "pck150": _estimate(0.75, 0.6875, 0.8125),
             "mpjpe_mm": _estimate(61.0, 58.5, 63.5),
             "coverage": _estimate(0.875, 0.8125, 0.9375),
         },
@@ -135,6 +140,7 @@ def make_comparison(*arms: str, verdict: str = "adaptive is better") -> ReplanCo
                 "against": arms[1],
                 "tilt_deg": _estimate(-5.0, -5.5, -4.5),
                 "occluded_share": _estimate(-0.0625, -0.125, 0.0),
+                "pck150": _estimate(0.0625, 0.03125, 0.09375),
                 "mpjpe_mm": _estimate(1.5, 1.25, 1.75),
                 "coverage": None,
             }

@@ -292,7 +292,7 @@ def test_a_comparison_of_planners_is_a_section(page: str, compared: str) -> None
     assert str(make_comparison().metrics["verdict"])[1:] in after.text  # it begins with a capital there
     (adaptive,) = [row for row in after.cells if len(row) > 8 and "adaptive" in row[0]]
     scores = plain(" ".join(adaptive))
-    assert "17.2 23.5 – 12.5 % 9.2 to 10.8" in scores
+    assert "17.2 23.5 – 2 12.5 % 1.2 s blind 9.2 to 10.8 88 12.8" in scores
     assert "61.0 58.5 to 63.5 87.5 81.2 to 93.8 collision 3" in scores
     less = one([plain(" ".join(row)) for row in after.cells], "adaptive less fixed")
     assert numbers(less)[:3] == [-5.0, -5.5, -4.5]

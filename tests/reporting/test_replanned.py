@@ -77,7 +77,9 @@ def test_a_yaw_beyond_half_a_turn_does_not_jump() -> None:
 def test_the_table_says_what_the_metrics_say(compared: Replan) -> None:
     row = compared.rows[0]
     assert row.tilt_deg == ("17.2", "23.5", "–")
-    assert row.hidden.replace("\u202f", " ") == "12.5 %"
+    assert [part.replace("\u202f", " ") for part in row.hidden] == ["12.5 %", "1.2 s blind"]
+    assert (row.drones, row.path_m, row.energy_kj) == ("2", "88", "12.8")
+    assert row.right == ("75.0", "68.8 to 81.2")
     assert row.range_m == "9.2 to 10.8"
     assert (row.clearance_m, row.separation_m, row.predicted_cm) == ("−0.2", "14.1", "31.2")
     assert row.error == ("61.0", "58.5 to 63.5")
@@ -88,6 +90,7 @@ def test_the_table_says_what_the_metrics_say(compared: Replan) -> None:
     difference = compared.differences[0]
     assert difference.names == ("adaptive", "fixed")
     assert difference.tilt_deg == ("−5.00", "−5.50 to −4.50")
+    assert difference.right == ("+6.25", "3.12 to 9.38")
     assert difference.error == ("+1.50", "1.25 to 1.75")
     assert difference.coverage == ("–", "")
 
@@ -96,7 +99,7 @@ def test_metrics_that_say_nothing_leave_dashes() -> None:
     content = make_comparison()
     bare = summarise_replan(replace(content, metrics={"arms": {"adaptive": {}}}), START_NS, 2)
     assert bare.rows[0].error == ("–", "")
-    assert bare.rows[0].hidden == "–"
+    assert bare.rows[0].hidden == ("–", "")
     assert bare.level == "–"
     assert "truth" not in bare.setting
     logged: dict[str, object] = {"arms": {name: {"simulated": False} for name in ("flown", "planned")}}
