@@ -1,17 +1,20 @@
 """Mistakes in a flight's description: are they doubted, named, and does the remedy mend them?
 
     python -m benchmarks.mistakes [--folder FOLDER] [--kept] [FLIGHT ...]
+    python -m benchmarks.mistakes --bound 10    # what the standard deviations of remedies make of the error
     python -m benchmarks.mistakes --right 40    # random right flights: none should be doubted
     python -m benchmarks.mistakes --acrobats 40    # the same of people who lie or turn cartwheels
     python -m benchmarks.mistakes --corpus tuning|kept [--draws 1] [--mistake none] [FLIGHT ...]  # film
     python -m benchmarks.mistakes --time    # of the doubts in `reconstruct`, and of `check` on ten minutes
+    python -m benchmarks.mistakes --headings 60    # when a heading 8 deg off shows in the rays
     python -m benchmarks.mistakes --late    # why clocks that are all late are not told without film
 
 Right flights (simulated, modelled keypoints) are described anew with one mistake each. A mistake counts if
 the error of the skeleton grows by more than 20 %, or nothing can be reconstructed. `named`: the first doubt
 has the right code. `mended`: the lines of its remedy, put into the manifest, bring the error back to within
 10 % of the right one. The flights of `KEPT_ASIDE` are measured with --kept only; no constant was tuned on
-them.
+them. With --bound, a remedy that mends less is compared with its standard deviations: the right flight is
+reconstructed so many times, each time with errors drawn from them in the poses that the remedy changes.
 
 With --corpus, the flights are those of `benchmarks.corpus`: rendered pictures, keypoints of the real
 detector, backgrounds, and logs drawn anew. They are checked as they are, with and without a stated model of
@@ -28,6 +31,7 @@ import tempfile
 from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from time import perf_counter, process_time
@@ -56,7 +60,7 @@ from pipelines.geometry.poses import (
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.reconstruction.doubts.diagnosis import Diagnosis, doubts_of
-from pipelines.reconstruction.doubts.faults import fit
+from pipelines.reconstruction.doubts.faults import Fault, fit
 from pipelines.reconstruction.doubts.hypotheses import Trial
 from pipelines.reconstruction.doubts.scene import Sampled, Scene, scene_of
 from pipelines.reconstruction.doubts.score import base_of, score
@@ -831,6 +835,41 @@ def print_times(folder: Path) -> None:
 _LATE_S = 0.5
 
 
+def sampled_of(manifest: Path) -> Sampled:
+    """Return what `check` diagnoses of a flight."""
+    seen: list[Sampled] = []
+
+    def kept(sampled: Sampled | None, *_: object) -> Diagnosis:
+        seen.extend([] if sampled is None else [sampled])
+        return Diagnosis([], float("nan"), 0)
+
+    with patch("pipelines.reconstruction.doubts.diagnosis.diagnose", kept):
+        check(manifest)
+    return seen[0]
+
+
+def print_headings(folder: Path, right: int) -> None:
+    """Print by how much a turned heading lowers the chi^2: of headings 8 deg off, and of right flights."""
+
+    def gain(manifest: Path) -> tuple[float, float]:
+        sampled = sampled_of(manifest)
+        scene = scene_of(sampled)
+        stated = fit(sampled, scene, "none", 0).cost
+        turns = [fit(sampled, scene, "heading", index).cost for index in range(len(sampled.cameras))]
+        return stated, stated - min(turns)
+
+    print("| flight | heading of drone1 off by | chi^2 | less with a heading turned |")
+    print("| --- | --- | --- | --- |")
+    for flight, degrees in product([*FLIGHTS, *KEPT_ASIDE], (8, -8)):
+        manifest = mistaken(Described(flight, folder / flight.name), of_poses(heading(degrees), "drone1"))
+        stated, less = gain(manifest)
+        print(f"| {flight.name} | {degrees} deg | {stated:.1f} | {less:.1f} |", flush=True)
+    drawn = [right_flight(seed) for seed in range(100, 100 + right)]
+    gains = [gain(mistaken(Described(each, folder / each.name), None))[1] for each in drawn]
+    middle, high = np.percentile(gains, [50, 95])
+    print(f"{right} right flights: {middle:.1f} less (median), 95 % at most {high:.1f}, all {max(gains):.1f}")
+
+
 def print_late(folder: Path) -> None:
     """Print how well flights whose clocks are all late fit: as stated, at the right times, and at best."""
 
@@ -842,25 +881,17 @@ def print_late(folder: Path) -> None:
     print("| flight | chi^2 a picture, as stated | right | best | at s | score as stated | right |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for flight in FLIGHTS:
-        manifest = mistaken(Described(flight, folder / flight.name), of_cameras(clock(_LATE_S)))
-        seen: list[Sampled] = []
-
-        def kept(sampled: Sampled | None, *_: object, seen: list[Sampled] = seen) -> Diagnosis:
-            seen.extend([] if sampled is None else [sampled])
-            return Diagnosis([], float("nan"), 0)
-
-        with patch("pipelines.reconstruction.doubts.diagnosis.diagnose", kept):
-            check(manifest)
-        described = scene_of(seen[0])
-        base, stated = base_of(seen[0], described)
-        trial = Trial(seen[0], described, base)
+        sampled = sampled_of(mistaken(Described(flight, folder / flight.name), of_cameras(clock(_LATE_S))))
+        described = scene_of(sampled)
+        base, stated = base_of(sampled, described)
+        trial = Trial(sampled, described, base)
         late_s = np.linspace(-1, 1, 21)
         scenes = [trial.late(float(late), trial.every) for late in late_s]
-        costs = [misfit(seen[0], scene) for scene in scenes]
+        costs = [misfit(sampled, scene) for scene in scenes]
         right = int(np.argmin(np.abs(late_s + _LATE_S)))
         best = int(np.argmin(costs))
         chi2 = f"{costs[late_s.size // 2]:.2f} | {costs[right]:.2f} | {costs[best]:.2f} | {late_s[best]:+.1f}"
-        total = score(seen[0], scenes[right], base).total
+        total = score(sampled, scenes[right], base).total
         print(f"| {flight.name} | {chi2} | {stated.total:.1f} | {total:.1f} |", flush=True)
 
 
@@ -935,12 +966,16 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "mocap_mistakes")
     parser.add_argument("--kept", action="store_true", help="The flights that were kept aside.")
     parser.add_argument("--mistake", action="append", default=[], help="Only these; repeat it for several.")
+    parser.add_argument("--bound", type=int, default=0, metavar="N", help="Draws of a remedy's sigmas.")
     parser.add_argument("--right", type=int, metavar="N", help="Check random right flights instead.")
     parser.add_argument(
         "--acrobats", type=int, metavar="N", help="The same of people who lie or turn wheels."
     )
     parser.add_argument("--time", action="store_true", help="Measure what the doubts cost.")
     parser.add_argument("--late", action="store_true", help="Look at flights whose clocks are all late.")
+    parser.add_argument(
+        "--headings", type=int, metavar="N", help="Turn headings, and those of N right flights."
+    )
     parser.add_argument("--corpus", choices=HALVES, help="Check the flights of the corpus instead.")
     parser.add_argument("--draws", type=int, default=1, help="Draws of the corpus's pose errors.")
     parser.add_argument("flights", nargs="*")
@@ -957,6 +992,9 @@ def main() -> None:
         return
     if options.late:
         print_late(options.folder)
+        return
+    if options.headings:
+        print_headings(options.folder, options.headings)
         return
     if options.corpus:
         doubted_corpus(
@@ -978,7 +1016,7 @@ def main() -> None:
             row(flight.name, "drone1 left out", alone, "", "", "")
         for mistake in MISTAKES:
             if mistake.fits(flight) and (not options.mistake or mistake.name in options.mistake):
-                tally = tried(described, mistake, right or float("nan"))
+                tally = tried(described, mistake, right or float("nan"), options.bound)
                 if tally is not None:
                     tallies[flight.drones].append(tally)
                     by_mistake.setdefault(mistake.name, []).append(tally)
@@ -994,8 +1032,13 @@ def main() -> None:
             print(f"| {mistake.name} | {named} of {len(made)} | {mended} |")
 
 
-def tried(described: Described, mistake: Mistake, right: float) -> tuple[bool, bool, bool] | None:
-    """Make a mistake; return whether it was doubted, named and mended, None if it costs no more than 20 %."""
+def tried(
+    described: Described, mistake: Mistake, right: float, draws: int = 0
+) -> tuple[bool, bool, bool] | None:
+    """Make a mistake; return if it was doubted, named and mended, None if it costs no more than 20 %.
+
+    Of a remedy that does not mend, so many draws show what errors its standard deviations allow.
+    """
     compared = "mpjpe_mm"
     if mistake.loses_place(described.flight):
         compared = "root_mpjpe_mm"
@@ -1013,8 +1056,64 @@ def tried(described: Described, mistake: Mistake, right: float) -> tuple[bool, b
     counts = error is None or error > 1.2 * right
     verdict = ("yes" if named else "NO") if counts else f"({'yes' if named else 'no'})"
     mending = f"{after or 0:.0f}" + (f", root-relative; right: {right:.0f}" if compared != "mpjpe_mm" else "")
+    if draws and first is not None and after and not mended:
+        mending += f"; {_bound(described, mistake, first, draws)}"
     row(described.flight.name, mistake.name, error, said, verdict, mending if after else why)
     return (first is not None, named, mended) if counts else None
+
+
+def _bound(described: Described, mistake: Mistake, doubt: dict[str, Any], draws: int) -> str:
+    """Return the errors of the right flight whose poses have those that a remedy's sigmas allow.
+
+    Own origins err together: their shifts are drawn from the covariance of the fit.
+    """
+    shift_m, turn_deg = (doubt["evidence"].get(key, 0.0) for key in ("shift_sigma_m", "turn_sigma_deg"))
+    if not shift_m and not turn_deg:
+        return "no sigma"
+    names = [name for name in described.names if f"cameras.{name}." in doubt["remedy"]]
+    covariance = _covariance_of_origins(described, mistake) if mistake.name == "own origins" else None
+    draw = np.random.default_rng(0)
+    compared = "root_mpjpe_mm" if mistake.loses_place(described.flight) else "mpjpe_mm"
+    errors: list[float] = []
+    for _ in range(draws):
+        if covariance is None:
+            shifts = {name: draw.normal(0, shift_m / np.sqrt(3), 3) for name in names}
+        else:
+            drawn = draw.multivariate_normal(np.zeros(len(covariance)), covariance).reshape(-1, 6)
+            shifts = {name: drawn[described.names.index(name), :3] for name in names}
+        changes = [moved(shifts[name], name) for name in names if shift_m]
+        turn = draw.normal(0, turn_deg)  # tilts of several cameras have one
+        for name in names if turn_deg else ():
+            if doubt["code"] == "mount":
+                changes.append(of_mounts(turned("x", turn), name))
+            elif doubt["code"] == "pose":
+                changes.append(of_poses(heading(turn), name))
+            else:
+                changes.append(of_poses(partial(compose, (np.zeros(3), turned("z", turn))), name))
+        with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):
+            found = measured(mistaken(described, partial(_each_of, changes)), compared)[0]
+        errors.append(float("nan") if found is None else found)
+    low, middle, high = np.nanpercentile(errors, [5, 50, 95])
+    stated = " and ".join([f"{shift_m:g} m"] * bool(shift_m) + [f"{turn_deg:g} deg"] * bool(turn_deg))
+    return f"sigma {stated}: {middle:.0f} ({low:.0f} to {high:.0f})"
+
+
+def _each_of(changes: list[Change], description: Mistaken) -> None:
+    for change in changes:
+        change(description)
+
+
+def _covariance_of_origins(described: Described, mistake: Mistake) -> Float:
+    """Return the covariance [6 C, 6 C] of all constant errors, shifts in m first, of fitted own origins."""
+    found: list[Fault] = []
+
+    def kept(*arguments: Any, **named: Any) -> Fault:
+        found.append(fit(*arguments, **named))
+        return found[-1]
+
+    with patch("pipelines.reconstruction.doubts.faults.fit", kept):
+        check(mistaken(described, mistake.change))
+    return next(each.covariance for each in found if each.name == "origins")
 
 
 def row(flight: str, mistake: str, error: float | None, said: str, named: str, after: str) -> None:

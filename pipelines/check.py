@@ -2,6 +2,7 @@
 
 A flight that was not ingested yet is read into a temporary session. Where no keypoints are known, the
 detector looks at a few seconds in the middle of the flight, in a temporary copy: a check changes no session.
+The backgrounds of these pictures are followed, too: only they tell that all cameras' clocks are alike wrong.
 """
 
 import shutil
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipelines.detect import DETECT, cameras_to_detect, detect
-from pipelines.follow import BACKGROUND
+from pipelines.follow import BACKGROUND, Following, cameras_to_follow
 from pipelines.ingest import ingest
 from pipelines.reconstruct import chosen_detections, find_people
 from pipelines.reconstruction.background_tracks import Followed, load_tracks
@@ -130,6 +131,11 @@ def _detected(
     first, last = max(each.first_t_ns for each in frames), min(each.last_t_ns for each in frames)
     middle_s = ((first + last) / 2 - description.start_ns) / 1e9
     start_s, end_s = max(0.0, middle_s - _LOOK_S / 2), middle_s + _LOOK_S / 2
+    following = None
+    moving = cameras_to_follow(description)
+    # Of imported keypoints, all pictures would have to be decoded.
+    if moving and all(description.cameras[name].keypoints is None for name in moving):
+        following = Following(session, every=_LOOK_EVERY, span_s=(start_s, end_s))
     record = detect(
         session,
         detector=detector,
@@ -138,5 +144,8 @@ def _detected(
         end_s=end_s,
         workers=workers,
         progress=progress,
+        following=following,
     )
+    if following is not None:
+        following.finish(workers=workers, progress=progress)
     return record, f"every third picture from {start_s:.1f} to {end_s:.1f} s"

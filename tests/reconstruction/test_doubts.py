@@ -34,6 +34,7 @@ from benchmarks.mistakes import (
     of_poses,
     own_origins,
     same_topic,
+    sampled_of,
     swapped,
     turned,
     with_keypoints,
@@ -41,7 +42,8 @@ from benchmarks.mistakes import (
     written,
 )
 from pipelines.geometry.poses import compose, invert
-from pipelines.reconstruction.doubts.diagnosis import CODES
+from pipelines.reconstruction.doubts.diagnosis import CODES, diagnose
+from pipelines.reconstruction.doubts.turning import Lateness
 from pipelines.session.description import read_description
 from tests.commands.runner import refused, succeeds
 
@@ -90,6 +92,30 @@ CASES: dict[str, tuple[str, Change]] = {
 def test_the_mistake_is_named_first(flight: Described, case: str) -> None:
     code, change = CASES[case]
     assert doubts_of(mistaken(flight, change))[0]["code"] == code
+
+
+@pytest.mark.parametrize(("late", "named"), [(["drone1"], 1), (["drone1", "drone2", "drone3"], 3)])
+def test_rays_say_whose_clock_it_is_that_backgrounds_tell(
+    flight: Described, late: list[str], named: int
+) -> None:
+    """Give the clock of all cameras and of one the same evidence of backgrounds, but for a little."""
+
+    def change(mistaken: Mistaken) -> None:
+        for name in late:
+            of_cameras(clock(0.3), name)(mistaken)
+
+    one, every = (Lateness(group, -0.3, 1.0, gain, 0.02) for group, gain in (((0,), 26.0), ((0, 1, 2), 28.0)))
+    first = diagnose(sampled_of(mistaken(flight, change)), [every, one]).doubts[0]
+    assert first.code == "clock"
+    assert first.cameras == ["drone1", "drone2", "drone3"][:named]
+
+
+def test_the_tilt_of_all_cameras_has_a_standard_deviation(flight: Described) -> None:
+    """Bound it: 0.3 deg of each of three cameras are 0.17, an actor logged to 0.3 m is 2 deg at 8 m."""
+    first = doubts_of(mistaken(flight, of_mounts(turned("x", 20))))[0]
+    assert first["code"] == "mount"
+    assert first["cameras"] == ["drone1", "drone2", "drone3"]
+    assert 0.2 < first["evidence"]["turn_sigma_deg"] < 2
 
 
 @pytest.mark.parametrize("case", ["videos", "rolled", "mirrored", "feet"])

@@ -56,7 +56,7 @@ class Turning:
 def found(cameras: list[Turning]) -> Lateness | None:
     team: list[Any] = list(cameras)
     turns = {index: turns_of(camera, camera.followed()) for index, camera in enumerate(team)}
-    return lateness(team, turns, BETWEEN, RATES)
+    return next(iter(lateness(team, turns, BETWEEN, RATES)), None)
 
 
 def late(seconds: float, phase: float, slower: float = 1.0) -> Turning:

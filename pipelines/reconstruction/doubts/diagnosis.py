@@ -24,6 +24,7 @@ from pipelines.reconstruction.doubts.faults import (
     fit,
     origins,
     picture_variance,
+    tilt_sigma_deg,
     undone,
     zoom,
 )
@@ -169,7 +170,7 @@ def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | No
     return min(chosen, prominent, key=lambda flight: score(flight, scene_of(flight)).total)
 
 
-def diagnose(flight: Sampled | None, late: Lateness | None = None) -> Diagnosis:
+def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> Diagnosis:
     """Find what is odd about a flight, and why; a flight whose cameras share no time is not doubted here.
 
     Args:
@@ -198,7 +199,7 @@ def diagnose(flight: Sampled | None, late: Lateness | None = None) -> Diagnosis:
     if not causes or np.isfinite(causes[0].cost):
         causes = _faults([*_without_number(trial, hypotheses), *hypotheses], stated.cost, described) or causes
     causes = causes or _below_zero(trial)
-    doubts = [_doubt(each, found, described) for each in causes]
+    doubts = [_doubt(_with_sigma(trial, each), found, described) for each in causes]
     if doubts or base.total >= DOUBTFUL:
         doubts += _oddities(found, described, flight, alone=not doubts)
     return Diagnosis(doubts, base.total, len(hypotheses))
@@ -333,9 +334,17 @@ def _faults(hypotheses: list[Hypothesis], stated: float, scene: Scene) -> list[H
     return list(alike.values())
 
 
-def _of_turns(trial: Trial, late: Lateness | None) -> list[Hypothesis]:
-    """State the times that the backgrounds tell, where they tell them surely."""
-    if late is None or late.gain < GAIN + _COST_OF_NUMBER:
+def _of_turns(trial: Trial, tried: Sequence[Lateness]) -> list[Hypothesis]:
+    """State the times that the backgrounds tell, where they tell them surely.
+
+    Where they tell some, the rays help to say whose these are: other times of one camera change how its rays
+    meet those of the others, times of all alike do not.
+    """
+    least = GAIN + _COST_OF_NUMBER
+    if not tried or tried[0].gain < least:
+        return []
+    late = max(tried, key=lambda each: each.gain + _gain_of_rays(trial, each))
+    if late.gain < least:
         return []
     if late.slower == 1 and not (np.isfinite(late.sigma_s) and abs(late.late_s) >= _LEAST_LATE_S):
         return []
@@ -352,6 +361,17 @@ def _of_turns(trial: Trial, late: Lateness | None) -> list[Hypothesis]:
     found |= {"clock_sigma_s": _rounded(late.sigma_s)} if late.slower == 1 else {}
     named = tuple(names[index] for index in late.cameras)
     return [Hypothesis(code, named, what, remedy, 0.0, None, sigmas=found)]
+
+
+def _gain_of_rays(trial: Trial, late: Lateness) -> float:
+    """Return by how much the clock of some cameras lowers the chi^2 of the rays; 0 of times of all."""
+    if len(late.cameras) == len(trial.names):
+        return 0.0
+    scene = trial.late(late.late_s, late.cameras)
+    seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
+    same = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
+    costs = [fit(trial.flight, each, "none", 0).cost for each in (same, scene)]
+    return costs[0] - costs[1] if np.isfinite(costs).all() else 0.0
 
 
 def _of_logs(trial: Trial) -> Iterator[Hypothesis]:
@@ -507,6 +527,15 @@ def _of_fault(trial: Trial, fault: Fault, penalty: float) -> Hypothesis:
         cost=fault.cost + _COST_OF_NUMBER * FREE[fault.name],
         sigmas=fault.sigmas,
     )
+
+
+def _with_sigma(trial: Trial, cause: Hypothesis) -> Hypothesis:
+    """Add how sure a tilt of several cameras is, which was searched by its score."""
+    if cause.code != "mount" or cause.penalty <= _DISCRETE or cause.sigmas or cause.scene is None:
+        return cause
+    group = [trial.names.index(name) for name in cause.cameras]
+    sigma_deg = tilt_sigma_deg(trial.flight, cause.scene, group)
+    return replace(cause, sigmas={"turn_sigma_deg": round(sigma_deg, 2)})
 
 
 def _doubt(cause: Hypothesis, described: Score, scene: Scene) -> Doubt:

@@ -8,6 +8,7 @@ all pictures, each as one observation, and the constant errors over their standa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,7 +65,7 @@ class Fault:
     scene: Scene  # without the fault; constant errors stay
     errors: Float  # [C, 6] of all poses, m and rad, besides it
     covariance: (
-        Float  # [n, n] of its numbers: what the constant errors leave of it; for `origins` of all errors
+        Float  # [n, n] of its numbers: what the constant errors leave of it; without a number, of all errors
     )
 
     @property
@@ -172,6 +173,30 @@ def origins(flight: Sampled, scene: Scene) -> tuple[Float, Float]:
     return shifts, sigma
 
 
+def tilt_sigma_deg(flight: Sampled, scene: Scene, group: Sequence[int]) -> float:
+    """Return the standard deviation of one tilt that cameras have in common, beside all constant errors.
+
+    With the normal matrix N of a fit without a fault, the inverse variances P of the constant errors, and the
+    direction u in which the tilt turns the cameras, its information is u^T (P - P N^-1 P) u.
+
+    Args:
+        flight: the flight.
+        scene: the scene with the tilts of the group undone.
+        group: the cameras.
+
+    Returns:
+        NaN where the rays tell nothing of it.
+    """
+    covariance = fit(flight, scene, "none", 0).covariance
+    if not covariance.any():
+        return float("nan")
+    direction = np.zeros((len(scene.focal_px), 6))
+    direction[group, 3:] = np.nanmean(scene.rotation[group][..., 0], axis=1)
+    pulled = direction.ravel() / _constant_sigma(scene).ravel() ** 2
+    information = float(direction.ravel() @ pulled - pulled @ covariance @ pulled)
+    return float(np.degrees(1 / np.sqrt(information))) if information > 0 else float("nan")
+
+
 def _moved(flight: Sampled) -> list[int]:
     """Return the cameras whose places are open where every log counts from a place of its own."""
     moving = [index for index, camera in enumerate(flight.cameras) if not camera.static]
@@ -272,7 +297,7 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
         right += slope * sized
     normal += 1e-9 * np.eye(len(normal))
     covariance = np.linalg.inv(normal)
-    kept = 0 if fault.name == "origins" else errors.size
+    kept = errors.size if FREE[fault.name] else 0
     return cost, strain, -covariance @ right, covariance[kept:, kept:]
 
 

@@ -129,8 +129,8 @@ def _vectors(rotation: Float) -> Float:
 
 def lateness(
     cameras: Sequence[Camera], turns: Mapping[int, Turns], between: Interpolation, factors: Sequence[float]
-) -> Lateness | None:
-    """Find the clock of all cameras or of one, or the frame rate of all, that the turns tell best.
+) -> list[Lateness]:
+    """Find the clocks of all cameras and of each, and the frame rates of all, by which the turns fit best.
 
     Args:
         cameras: of the flight.
@@ -139,11 +139,11 @@ def lateness(
         factors: between the times of pictures that are tried.
 
     Returns:
-        None if too little turns, or the logs turn otherwise at all times.
+        The largest gain first; none if too little turns, or the logs turn otherwise at all times.
     """
     known = {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
     if not known:
-        return None
+        return []
     grid = np.arange(-_LONGEST_S, _LONGEST_S + _STEP_S / 2, _STEP_S)
     by_clock = {i: _gains(cameras[i], found, between, [(s, 1.0) for s in grid]) for i, found in known.items()}
     by_rate = [_gains(cameras[i], found, between, [(0.0, f) for f in factors]) for i, found in known.items()]
@@ -154,7 +154,7 @@ def lateness(
         for factor, each in zip(factors, zip(*by_rate, strict=True), strict=True):
             gain, explained = _summed(each)
             tried.append(Lateness(everyone, 0.0, factor, gain, float("nan")) if explained else None)
-    return max((each for each in tried if each is not None), key=lambda each: each.gain, default=None)
+    return sorted((each for each in tried if each is not None), key=lambda each: -each.gain)
 
 
 def _gains(
