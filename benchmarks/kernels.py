@@ -2,7 +2,11 @@
 
 python -m benchmarks.kernels SESSION...            # reconstructs and replays with an empty cache
 python -m benchmarks.kernels SESSION... --write    # and makes the list from what was compiled
+
+Functions of ingest and detection, which a session does not run again, keep their entries while they exist.
 """
+
+from __future__ import annotations
 
 import argparse
 import json
@@ -11,8 +15,14 @@ import tempfile
 import threading
 import time
 from collections import defaultdict
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipelines.precompile import Signatures
 
 LIST = Path(__file__).resolve().parents[1] / "pipelines" / "data" / "kernels.json"
 
@@ -30,7 +40,20 @@ def main() -> None:
     print(f"{sum(seconds.values()):6.2f} s  of processor time for {len(seconds)} functions")
     if arguments.write:
         slowest_first = {name: signatures[name] for name in sorted(signatures, key=lambda n: -seconds[n])}
-        LIST.write_text(f"{json.dumps(slowest_first, indent=0)}\n", encoding="utf-8")
+        kept = not_reached(signatures)
+        print(f"{len(kept)} listed functions were not called and stay: {', '.join(kept) or 'none'}")
+        LIST.write_text(f"{json.dumps(slowest_first | kept, indent=0)}\n", encoding="utf-8")
+
+
+def not_reached(signatures: Mapping[str, object]) -> Signatures:
+    """Return the list's entries of functions that still exist and are not among those compiled."""
+    from pipelines.precompile import listed
+
+    def exists(name: str) -> bool:
+        module, _, function = name.partition(":")
+        return find_spec(module) is not None and hasattr(import_module(module), function)
+
+    return {name: kinds for name, kinds in listed().items() if name not in signatures and exists(name)}
 
 
 def compiled_by(sessions: list[Path]) -> tuple[dict[str, float], dict[str, list[list[object]]]]:
