@@ -60,6 +60,9 @@ _PIXEL_SIGMA = (
     1.0  # px, of a followed point: 0.15 are seen, but neighbouring pictures and points share their errors
 )
 _LOSS = 1.0  # standard deviations at which a sighting counts half
+# Losses that come before: with logged poses off by many pixels, every sighting looks wrong to a narrow one at first
+# (graduated non-convexity: Blake and Zisserman 1987; Yang et al. 2020).
+_WIDE = (30.0, 5.0)
 _FEWEST_SIGHTINGS = 3  # of a point
 _LONGEST_S, _LONGEST = 1.0, (12, 30)  # sightings of a point: time, and at least and at most these pictures
 _POINTS = 120  # in a picture: relative attitudes are known to 0.003 deg with them
@@ -419,7 +422,12 @@ class _Stretch:
     def solve_with_levels(self, prior: PosePrior) -> _Solved | None:
         """Solve, with levels of errors estimated if they are unknown; None without convergence."""
         state = _State(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), np.zeros(9))
-        settle_points(self.seen, self.points, self.position, self.rotation, _LOSS, _INVERSE_DEPTH, 8)
+        settle_points(self.seen, self.points, self.position, self.rotation, _WIDE[0], _INVERSE_DEPTH, 8)
+        for loss in _WIDE:
+            found = self._solve(state, prior, rounds=2, loss=loss)
+            if found is None:
+                return None
+            state = found[0]
         for _ in range(_LEVEL_ROUNDS if prior.estimated else 0):
             found = self._solve(state, prior, rounds=2)
             if found is None:
@@ -434,7 +442,9 @@ class _Stretch:
         errors = self._draws(factored, _DRAWS)[0]
         return _Solved(state.errors, self._covariance(factored), errors, _PIXEL_SIGMA * missed, prior)
 
-    def _solve(self, state: _State, prior: PosePrior, rounds: int) -> tuple[_State, _Factored, Float] | None:
+    def _solve(
+        self, state: _State, prior: PosePrior, rounds: int, loss: float = _LOSS
+    ) -> tuple[_State, _Factored, Float] | None:
         """Make Gauss-Newton steps; return the estimate, the last equations, and residuals [K] in sigmas."""
         turned = np.concatenate([np.tile(np.eye(3), (len(self.rows), 1, 1)), self.rotation], axis=2)
         ties = self._ties(prior)
@@ -448,7 +458,7 @@ class _Stretch:
             band, force, border = np.zeros((size, self._width())), np.zeros(size), np.zeros((size, 9))
             corner, pull = np.diag(steady), -steady * state.constant
             eliminate_points(
-                self.seen, self.points, at, turn, _LOSS, _INVERSE_DEPTH, self.place, band, force, missed, kept
+                self.seen, self.points, at, turn, loss, _INVERSE_DEPTH, self.place, band, force, missed, kept
             )
             add_ties(ties, turned, *_parts(state), band, force, border, corner, pull)
             if not factorise(band):
@@ -461,7 +471,7 @@ class _Stretch:
             step = both[:, 9] - both[:, :9] @ shift
             if not (np.isfinite(step).all() and (np.diagonal(covariance) > 0).all()):
                 return None
-            move_points(self.seen, self.points, at, turn, _LOSS, kept, self.place, step)
+            move_points(self.seen, self.points, at, turn, loss, kept, self.place, step)
             state = _State(
                 state.errors + step[self.place[:, None] + np.arange(6)],
                 state.knots + step[self.knot_place[:, None] + np.arange(6)],
