@@ -60,7 +60,7 @@ _PIXEL_SIGMA = (
     1.0  # px, of a followed point: 0.15 are seen, but neighbouring pictures and points share their errors
 )
 _LOSS = 1.0  # standard deviations at which a sighting counts half
-# Losses that come before: with logged poses off by many pixels, every sighting looks wrong to a narrow one at first
+# Losses that come before it: where logged poses are many pixels off, a narrow one rejects all sightings
 # (graduated non-convexity: Blake and Zisserman 1987; Yang et al. 2020).
 _WIDE = (30.0, 5.0)
 _FEWEST_SIGHTINGS = 3  # of a point

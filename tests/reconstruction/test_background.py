@@ -217,18 +217,20 @@ def test_levels_that_nobody_stated_are_estimated(pictures: int) -> None:
     assert found.prior.white[1] == pytest.approx(PRIOR.white[1], rel=0.1 + 3 * scatter)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_logs_that_are_off_by_many_pixels_are_adjusted_too(seed: int) -> None:
-    """Take the errors of a bad log, which nobody stated: 0.15 m and 0.8 deg (11 px), new in every pose.
+    """Take errors that nobody stated, new in every pose: 0.15 m and 0.8 deg (11 px), with 10 % wrong points.
 
-    What remains is as small as with a good log: the sightings decide.
+    With a narrow loss alone, neither of these two converges. Right ones leave the points' own 0.3 px.
     """
     rng = np.random.default_rng(seed)
-    position, rotation = flown(60, 12.0)
+    position, rotation = flown(60, 3.0)
     picture, point, xy = sighted(position, rotation, rng)
+    wrong = rng.random(len(xy)) < 0.1
+    xy[wrong] += rng.normal(0, 20 / FOCAL, (int(wrong.sum()), 2))
     error = rng.normal(0, 1, (60, 6)) * np.repeat([0.15, np.radians(0.8)], 3)
-    turned = rotation @ matrix_from_quaternion(quaternion_from_rotation_vector(error[:, 3:]))
-    found = adjusted(picture, point, xy, (position + error[:, :3], turned), PosePrior.of(None))
+    turned = matrix_from_quaternion(quaternion_from_rotation_vector(error[:, 3:]))
+    found = adjusted(picture, point, xy, (position + error[:, :3], rotation @ turned), PosePrior.of(None))
     assert found.refused is None
     assert found.reprojection_px < 0.6
     assert found.prior.white[1] == pytest.approx(np.radians(0.8), rel=0.1 + 3 / np.sqrt(360))

@@ -590,15 +590,16 @@ def _measured_prior(
     clock_sigma_s: Float,
 ) -> Iterator[_Prior]:
     """Yield the prior with measured pose errors; motion, bones and keypoint noise are learned beside them."""
-    _, _, disagreement_m, range_m = _first_guess(problem, start)
+    guess, _, disagreement_m, range_m = _first_guess(problem, start)
     unlearned = _unlearned(problem, start, tuple(prior), clock_sigma_s)
     state = initial_state(problem, unlearned, start)
     known, state = learn(problem, unlearned, state, poses=False, memory=True, rounds=_LEARNING_ROUNDS)
     levels = [known]
     if any(errors.assumed for errors in prior):
-        usual = _of_levels(known, dict(enumerate(USUAL_CONSTANT)))
-        found = _with_constant_levels(problem, known, state)
-        levels = [usual] if found is None else [found, usual]
+        usual = _usual_levels(guess)
+        found = _with_constant_levels(problem, known, state, usual)
+        as_usual = _of_levels(known, usual)
+        levels = [as_usual] if found is None else [found, as_usual]
     measured_m = float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     expected_m = _spread_of(len(prior)) * max(_FARTHEST * disagreement_m, _FARTHEST_STATED * measured_m)
     acceleration = shrunk(known.acceleration, problem.t_s, state.position)
@@ -607,7 +608,18 @@ def _measured_prior(
         yield _Prior(settled, learned=number < len(levels), warnings=(), expected_m=expected_m)
 
 
-def _with_constant_levels(problem: Problem, known: Knowledge, state: State) -> Knowledge | None:
+def _usual_levels(guess: PoseErrors) -> dict[int, float]:
+    """Return usual levels of constant errors by kind, or those guessed from the views if they are smaller.
+
+    What pictures hardly determine follows the detector's lasting errors, as far as the level allows.
+    """
+    guessed = (process.sigma0 for process in guess.processes)
+    return {kind: min(pair) for kind, pair in enumerate(zip(USUAL_CONSTANT, guessed, strict=False))}
+
+
+def _with_constant_levels(
+    problem: Problem, known: Knowledge, state: State, usual: Mapping[int, float]
+) -> Knowledge | None:
     """Estimate the level of assumed constant errors by MacKay's rule, pooled over the cameras.
 
     Differences between cameras show in the pictures, their common error does not. A few numbers say little of
@@ -631,7 +643,7 @@ def _with_constant_levels(problem: Problem, known: Knowledge, state: State) -> K
         level = {}
         for kind, parts in found.items():
             squares, determined = np.sum(parts, axis=0)
-            usual2 = USUAL_CONSTANT[kind] ** 2
+            usual2 = usual[kind] ** 2
             level[kind] = np.sqrt((squares + USUAL_COUNT * usual2) / (max(determined, 0.0) + USUAL_COUNT))
         if any(sigma > UNKNOWN_SIGMA[kind] for kind, sigma in level.items()):
             return None
