@@ -16,6 +16,8 @@ from pipelines.geometry.noise import (
     ROTATION,
     SHIFT_IN_CAMERA,
     SHIFT_IN_WORLD,
+    UNKNOWN_SIGMA,
+    USUAL_CONSTANT,
     Bias,
     Drift,
     NoiseModel,
@@ -375,6 +377,29 @@ def test_two_hovering_cameras_do_not_run_away_with_the_size() -> None:
     assert result.fallback is None
     assert result.levels["pixel_scale"] < 1.15 * 2.0 / STATED_PX  # of 2 px keypoints
     assert mean_mm(result.position, flight.truth) < mean_mm(flight.start, flight.truth)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_assumed_constant_errors_are_no_larger_than_the_views_disagree(exact: bool) -> None:
+    """Give hovering cameras assumed levels, and a detector with lasting errors of 3 px (20 mm at 10 m).
+
+    Of 17 joints with errors of their own, a camera's median error is 6 mm: exact logs need no larger level
+    than the least guess of 20 mm. Errors of the medium level exceed the usual 0.1 m, which stays the bound.
+    """
+    flight = formation(
+        150, 3, [] if exact else [BIAS], 1, still=True, pixel_px=3.0, memory=0.9, constant_px=3.0
+    )
+    lasting = (Process(SHIFT_IN_WORLD, UNKNOWN_SIGMA[0]), Process(ROTATION, UNKNOWN_SIGMA[1]))
+    assumed = [PoseErrors((0.01, 1e-3), lasting, assumed=True)] * 3
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, assumed, np.zeros(3), contested=False)
+    assert result.fallback is None
+    level_m, off_mm = result.levels["bias_position_world_m"], mean_mm(result.position, flight.truth)
+    if exact:
+        assert level_m <= 0.02
+        assert off_mm < mean_mm(flight.start, flight.truth) + 1e3 * level_m
+    else:
+        assert level_m == pytest.approx(USUAL_CONSTANT[0])
+        assert off_mm < 0.6 * mean_mm(flight.start, flight.truth)
 
 
 def test_a_place_that_nobody_saw_is_the_log_s() -> None:
