@@ -402,6 +402,24 @@ def test_assumed_constant_errors_are_no_larger_than_the_views_disagree(exact: bo
         assert off_mm < 0.6 * mean_mm(flight.start, flight.truth)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_constant_errors_that_nothing_determines_are_held_and_all_else_is_estimated(seed: int) -> None:
+    """Let two cameras hover with large white errors that nobody stated, before a detector whose errors last.
+
+    The scale is open, so the person stays where the log has it, with a covariance that contains the usual
+    constant errors of 0.1 m and 0.3 deg: two rays that are 0.1 m off give sqrt(4.5 / 2 / 3) of it per axis.
+    """
+    models: list[NoiseModel] = [White(position_m=0.15, rotation_deg=0.8)]
+    flight = formation(150, 2, models, seed, still=True, pixel_px=8.0, memory=0.99, constant_px=8.0)
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, None, np.zeros(2))
+    assert result.fallback is None
+    assert result.warnings == (PLACED_AS_LOGGED,)
+    assert mean_mm(result.position, flight.truth) < 0.6 * mean_mm(flight.start, flight.truth)
+    off = np.nanmedian(result.position - flight.start, axis=(0, 1))
+    np.testing.assert_allclose(off, 0, atol=0.02)  # its median is over what was filled in between, too
+    assert np.diagonal(result.covariance, axis1=2, axis2=3).min() > 4.5 / 2 / 3 * 0.1**2
+
+
 def test_a_place_that_nobody_saw_is_the_log_s() -> None:
     # Two cameras with drifting logs and no stated noise: the estimated levels put the person a metre off.
     models: list[NoiseModel] = [BIAS, Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)]

@@ -63,6 +63,7 @@ _SETTLING = 4  # rounds to test how well given levels explain the pictures
 _STATED = 10.0  # bonus on the log evidence of stated levels
 _STATED_DRIFT = 0.5  # bonus per picture if errors change over time: between knots they count as white
 _LEVEL_ROUNDS = 3
+_HELD = 0.1  # of the usual level: constant errors stay as logged where the pictures let the scene grow
 _UNDETERMINED = 0.3  # of the usual level: a constant error with a smaller one is known from the background
 _UNINFORMATIVE_MEMORY = 30.0
 """Memory of image points from which levels of slow pose errors cannot be estimated."""
@@ -227,6 +228,7 @@ class _Prior:
     learned: bool  # the levels of pose errors were not stated
     warnings: tuple[str, ...]
     expected_m: float  # largest allowed move of the skeleton
+    held_m: float = 0.0  # standard deviation per axis by constant errors that are held as logged
 
 
 def _refined(views: _Views, whole: _Views, guiding: Bool, prior: _Prior, *, measured: bool) -> Refined:
@@ -275,10 +277,11 @@ def _refined(views: _Views, whole: _Views, guiding: Bool, prior: _Prior, *, meas
     else:
         joints = state.position
     fallback = doubts or _too_far(joints, whole.start, prior.expected_m)
+    as_logged = as_logged or prior.held_m > 0
     shift = np.median(whole.start - joints, axis=(0, 1)) if as_logged else np.zeros(3)
     return Refined(
         position=joints + shift,
-        covariance=covariance,
+        covariance=covariance + prior.held_m**2 * np.eye(3),
         corrections=_corrections(*slow, shift),
         clock_offset_s=clock_s,
         clock_sigma_s=clock_left_s,
@@ -589,16 +592,20 @@ def _measured_prior(
     prior: Sequence[PoseErrors],
     clock_sigma_s: Float,
 ) -> Iterator[_Prior]:
-    """Yield the prior with measured pose errors; motion, bones and keypoint noise are learned beside them."""
+    """Yield the prior with measured pose errors; motion, bones and keypoint noise are learned beside them.
+
+    Constant errors that are only assumed have estimated levels, then usual ones. If a check refuses both,
+    they are held as logged: motion, bones and what changes in the poses are estimated all the same.
+    """
     guess, _, disagreement_m, range_m = _first_guess(problem, start)
     unlearned = _unlearned(problem, start, tuple(prior), clock_sigma_s)
     state = initial_state(problem, unlearned, start)
     known, state = learn(problem, unlearned, state, poses=False, memory=True, rounds=_LEARNING_ROUNDS)
     levels = [known]
+    guessed = {kind: process.sigma0 for kind, process in enumerate(guess.processes[:2])}
     if any(errors.assumed for errors in prior):
-        usual = _usual_levels(guess)
-        found = _with_constant_levels(problem, known, state, usual)
-        as_usual = _of_levels(known, usual)
+        found = _with_constant_levels(problem, known, state, guessed)
+        as_usual = _of_levels(known, _usual_levels(guessed))
         levels = [as_usual] if found is None else [found, as_usual]
     measured_m = float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     expected_m = _spread_of(len(prior)) * max(_FARTHEST * disagreement_m, _FARTHEST_STATED * measured_m)
@@ -606,24 +613,30 @@ def _measured_prior(
     for number, level in enumerate(levels, 1):
         settled = replace(level, acceleration=acceleration)
         yield _Prior(settled, learned=number < len(levels), warnings=(), expected_m=expected_m)
+    if any(errors.assumed for errors in prior):
+        levels_held = {kind: _HELD * sigma for kind, sigma in _usual_levels(guessed).items()}
+        held = _of_levels(replace(known, acceleration=acceleration), levels_held)
+        ray_m = _ray_sigma_m(PoseErrors(USUAL_CONSTANT, ()), range_m)
+        held_m = _spread_of(len(prior)) * ray_m / float(np.sqrt(3))
+        yield _Prior(held, learned=False, warnings=(), expected_m=expected_m, held_m=held_m)
 
 
-def _usual_levels(guess: PoseErrors) -> dict[int, float]:
+def _usual_levels(guessed: Mapping[int, float]) -> dict[int, float]:
     """Return usual levels of constant errors by kind, or those guessed from the views if they are smaller.
 
     What pictures hardly determine follows the detector's lasting errors, as far as the level allows.
     """
-    guessed = (process.sigma0 for process in guess.processes)
-    return {kind: min(pair) for kind, pair in enumerate(zip(USUAL_CONSTANT, guessed, strict=False))}
+    return {kind: min(USUAL_CONSTANT[kind], sigma) for kind, sigma in guessed.items()}
 
 
 def _with_constant_levels(
-    problem: Problem, known: Knowledge, state: State, usual: Mapping[int, float]
+    problem: Problem, known: Knowledge, state: State, guessed: Mapping[int, float]
 ) -> Knowledge | None:
     """Estimate the level of assumed constant errors by MacKay's rule, pooled over the cameras.
 
     Differences between cameras show in the pictures, their common error does not. A few numbers say little of
-    a level, so a level of usual size counts as `USUAL_COUNT` more of them.
+    a level, so a level of usual size counts as `USUAL_COUNT` more of them. No level exceeds the one `guessed`
+    of its kind, which the disagreement of the views gives.
 
     Returns None where the pictures do not determine the formation's scale, or the level exceeds what is
     possible: the scene would grow to fit the detector's errors.
@@ -640,14 +653,14 @@ def _with_constant_levels(
                 own = slice(column, column + 3)
                 determined = float(np.sum(1 - variance[own] / process.sigma0**2))
                 found.setdefault(kind, []).append((float(np.sum(state.shared[own] ** 2)), determined))
-        level = {}
+        level, usual = {}, _usual_levels(guessed)
         for kind, parts in found.items():
             squares, determined = np.sum(parts, axis=0)
             usual2 = usual[kind] ** 2
             level[kind] = np.sqrt((squares + USUAL_COUNT * usual2) / (max(determined, 0.0) + USUAL_COUNT))
         if any(sigma > UNKNOWN_SIGMA[kind] for kind, sigma in level.items()):
             return None
-        known = _of_levels(known, level)
+        known = _of_levels(known, {kind: min(sigma, guessed[kind]) for kind, sigma in level.items()})
     system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
     return None if _scale_unseen(system, state, at) else known
 
