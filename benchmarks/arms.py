@@ -151,7 +151,7 @@ def _print_weights(scenes: Mapping[str, Scene]) -> None:
 def _figures(scene: Scene, arm: str) -> str:
     """Format mean/max tilt (deg) and the share of the time without any view (%)."""
     flown = fly_arm(scene, PLANNER_ARMS.get(arm))
-    scores = score(scene.t_s, flown.position, scene.actor, scene.field, scene.config)
+    scores = score(scene.t_s, flown.position, scene.actor, scene.maps, scene.config)
     tilt = np.degrees(
         np.arctan2(
             flown.position[..., 2] - scene.actor[:, 2],

@@ -172,12 +172,18 @@ _film_options = grouped(
 @click.command("replan-compare", short_help="Fly other planners against the log, compare.")
 @each("session", "SESSION")
 @_settings_options
+@click.option(
+    "--name",
+    metavar="NAME",
+    help="Name under which the comparison is kept, SESSION/replan/NAME [default: by its settings].",
+)
 @_film_options
 @force_option
 @output_options
 def replan_compare_command(
     session: Path,
     settings: Settings,
+    name: str | None,
     filmed: tuple[film.Settings, Path | None] | None,
     force: bool,
     shown: Shown,
@@ -190,7 +196,7 @@ def replan_compare_command(
     from pipelines.replan import replan
 
     with watching(shown.level) as progress:
-        result = replan(session, settings, force=force, progress=progress)
+        result = replan(session, settings, name=name, force=force, progress=progress)
         figures = None
         if filmed is not None:
             from pipelines.film import film
@@ -206,7 +212,9 @@ def replan_compare_command(
         _print(result.metrics)
         if figures is not None:
             _print_filmed(figures)
-    say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'replan'}")
+    place = result.folder / "replan"
+    said = "unchanged" if result.skipped else "written"
+    say(f"{said}: {place} (kept as {place / result.metrics['name']})")
     return None
 
 

@@ -2,12 +2,13 @@
 
 Load the logged flight; replay every arm and simulate what its cameras measure of the actor's skeleton; score
 all arms in the same way and compare; store. metrics.json marks what was simulated; run.json has the planning
-times.
+times. The stage's folder holds the last comparison, and every one by its name in a folder of its own.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -40,7 +41,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
-from pipelines.session.stage_records import Stage, StageRecord
+from pipelines.session.stage_records import Stage, StageRecord, key_of, usable_record
 from pipelines.session.stages import WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import (
@@ -67,10 +68,11 @@ from pipelines.simulation.scenario import DetectorErrors
 if TYPE_CHECKING:
     import pandas as pd
 
-REPLAN_STAGE = Stage("replan", revision=4)
+REPLAN_STAGE = Stage("replan", revision=5)
 
 _HEIGHT_M = 1.75  # of the person, for their size in the modelled detector's pictures
 _SKELETON = "reconstruct/skeleton.parquet"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 @dataclass(frozen=True)
@@ -106,10 +108,14 @@ def replan(
     folder: Path,
     settings: Settings | None = None,
     *,
+    name: str | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Replanned:
     """Replay the planners on a session, and compare them; run again even if nothing changed with `force`.
+
+    `name` is that of the folder in which the comparison stays when another one is made: by default the first
+    digits of the stage's key. One of the same name is replaced.
 
     Raises:
         DataError: the session cannot be used (it has no positions of the actor, or a table was changed), or a
@@ -121,7 +127,9 @@ def replan(
     with locked(folder) as session:
         description, reconstructed, inputs = inputs_of(session)
         refuse_unknown(settings.arms or ())
-        run = session.begin(REPLAN_STAGE, settings=settings_by_name(settings), inputs=inputs, force=force)
+        stated = settings_by_name(settings)
+        name = _usable(name) or f"run-{key_of(REPLAN_STAGE, stated, inputs)[:8]}"
+        run = session.begin(REPLAN_STAGE, settings=stated | {"name": name}, inputs=inputs, force=force)
         if run.finished:
             metrics = read_json(folder / "replan" / "metrics.json")
             return Replanned(folder, run.record, metrics, skipped=True)
@@ -144,11 +152,16 @@ def replan(
             for table in made.glob("*.parquet"):
                 shutil.copyfile(table, run.folder / arm / table.name)
             progress.advance()
-        metrics = jsonable(compare(scene, results) | {"keypoints": f"modelled after {errors.detector}"})
+        keypoints = f"modelled after {errors.detector}"
+        metrics = jsonable({"name": name} | compare(scene, results) | {"keypoints": keypoints})
         write_table(run.folder / "actor.parquet", _actor_table(scene), ACTOR)
         write_table(run.folder / "cost_map.parquet", _cost_table(scene), COST_MAP)
         write_json(run.folder / "metrics.json", metrics)
+        kept, lost = _keep_by_name(
+            session, run.folder, name, {"settings": jsonable(stated), "inputs": inputs}
+        )
         counts = {
+            "kept": kept,
             "moments": len(scene.t_ns),
             "pictures": len(scene.t_ns[scene.pictures]),
             "joint_frames": {name: result.joint_frames for name, result in results.items()},
@@ -157,9 +170,54 @@ def replan(
         }
         record = run.publish(counts=counts, warnings=metrics["warnings"])
         _note_planning_times(folder, times)
-        for name, (before, now) in run.replaces.items():
-            progress.note(f"replaced the comparison made with {name} = {before} (now {now})")
+        for setting, (before, now) in run.replaces.items():
+            if setting != "name":
+                progress.note(f"the comparison before was made with {setting} = {before} (now {now})")
+        for other in lost:
+            progress.note(f"replan/{other} was changed by hand since: it is no longer kept")
     return Replanned(folder, record, metrics, skipped=False)
+
+
+def _usable(name: str | None) -> str | None:
+    """Refuse a name that cannot be a folder of its own among those of the arms."""
+    if name is None:
+        return None
+    if not _NAME.fullmatch(name):
+        raise DataError(f"--name {name!r}", "cannot be a folder", "take letters, digits, points, - and _")
+    if name in (*PLANNER_ARMS.names(), *LOGGED):
+        raise DataError(f"--name {name}", "is the name of an arm", "take another one")
+    return name
+
+
+def _keep_by_name(
+    session: WritableSession, folder: Path, name: str, made_of: Mapping[str, object]
+) -> tuple[list[str], list[str]]:
+    """Copy the comparison in `folder` into a folder of its name, and earlier ones from the stage before.
+
+    Returns:
+        Names of all that are kept, and of those that are not, because a file is not as it was written.
+    """
+    own = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    for path in own:
+        target = folder / name / path.relative_to(folder)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, target)
+    write_json(folder / name / "settings.json", made_of)
+    before = usable_record(session.folder / "replan" / "stage.json")
+    earlier: dict[str, dict[str, str]] = {}
+    for output, digest in ({} if before is None else before.outputs).items():
+        earlier.setdefault(output.split("/")[1], {})[output] = digest
+    kept, lost = [name], []
+    for other, files in earlier.items():
+        if other == name or f"replan/{other}/metrics.json" not in files:
+            continue
+        paths = {session.folder / output: digest for output, digest in files.items()}
+        if all(path.is_file() and sha256_of(path) == digest for path, digest in paths.items()):
+            shutil.copytree(session.folder / "replan" / other, folder / other)
+            kept.append(other)
+        else:
+            lost.append(other)
+    return sorted(kept), lost
 
 
 # --- what is compared ----------------------------------------------------------------------------------

@@ -18,13 +18,13 @@ from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import invert, look_at, matrix_from_quaternion, rates, transform
 from pipelines.geometry.triangulation import Views, locate
 from pipelines.planning.arms import Arm
-from pipelines.planning.distance_field import DistanceField, visible
+from pipelines.planning.distance_field import DistanceField, MapsInTurn, looked, visible
 from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.formation import TILT, YAW, slot_of
 from pipelines.planning.loading import planned_positions
 from pipelines.planning.replay import Start, replay
 from pipelines.planning.scene import Scene
-from pipelines.planning.scores import predicted_errors
+from pipelines.planning.scores import predicted_errors, seen_actor
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -136,7 +136,7 @@ def measure_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | No
     )
     return measure(
         paths,
-        scene.field,
+        scene.maps_at(paths.t_ns),
         detect,
         start_m=scene.config.sight_start_m,
         trials=scene.settings.trials,
@@ -150,8 +150,8 @@ def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
 
     count, times = flown.position.shape[:2]
     position, slots = _rows(flown.position), _rows(flown.slots)
-    error = predicted_errors(flown.position, scene.actor, scene.field, scene.config)
-    seen = visible(scene.field, flown.position, scene.actor, start_m=scene.config.sight_start_m)
+    error = predicted_errors(flown.position, scene.actor, scene.maps, scene.config)
+    seen = seen_actor(flown.position, scene.actor, scene.maps, scene.config)
     table = pd.DataFrame(
         {
             "t_ns": np.repeat(scene.t_ns, count),
@@ -273,9 +273,15 @@ class Measured:
 
 
 def measure(
-    paths: CameraPaths, field: DistanceField, detect: Detect, *, start_m: float, trials: int, seed: int
+    paths: CameraPaths,
+    maps: DistanceField | MapsInTurn,
+    detect: Detect,
+    *,
+    start_m: float,
+    trials: int,
+    seed: int,
 ) -> Measured:
-    """Measure a skeleton in several trials.
+    """Measure a skeleton in several trials; sight is tested in the map of each moment.
 
     The last `start_m` of a sight line, next to the joint, is left out: maps contain the person. Trial k of
     camera i has the same random numbers for any other path.
@@ -285,7 +291,11 @@ def measure(
     pixels = np.stack([_pixels(paths, i) for i in range(cameras)])
     known = np.isfinite(joints[..., 0])
     standing_in = np.where(known[..., None], joints, paths.middle[:, None])
-    free = visible(field, paths.position[:, :, None], standing_in, start_m=start_m)
+    free = looked(
+        maps,
+        lambda field, rows: visible(field, paths.position[:, rows, None], standing_in[rows], start_m=start_m),
+        axis=1,
+    )
     sigma = np.stack([_pose_sigma(paths, i) for i in range(cameras)], axis=1)
     error = np.full((trials, times, count), np.nan, dtype=np.float32)
     first = np.full(joints.shape, np.nan)

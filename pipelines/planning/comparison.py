@@ -5,7 +5,7 @@ stretches of the flight for figures that depend on the flight's course.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,9 @@ from pipelines.geometry.arrays import Bool, Float, Float32, Int64
 from pipelines.geometry.bootstrap import LEVEL, STRETCH_S, intervals
 from pipelines.planning.arm_flights import LOGGED, ArmFlight
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import visible
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.scene import Scene
-from pipelines.planning.scores import score
+from pipelines.planning.scores import score, seen_actor
 
 REFERENCE = "fixed"
 """Arm that the others are compared with; the first arm where it is missing."""
@@ -153,6 +152,7 @@ def compare(scene: Scene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
         "flown_poses": flight.poses_source,
         "pose_noise_from": flight.noise_source,
         "maps": len(scene.fields),
+        "zones": [asdict(zone) for zone in scene.config.zones],
         "near_obstacle_share": float(scene.near.mean()),
         "trials": settings.trials,
         "seed": settings.seed,
@@ -173,7 +173,7 @@ def measure_alone(scene: Scene, name: str, result: ArmResult) -> dict[str, Any]:
 
 def _scores(scene: Scene, name: str, result: ArmResult, shared: Bool | None) -> dict[str, Any]:
     flown = result.flight
-    found = score(scene.t_s, flown.position, scene.actor, scene.field, scene.config, near=scene.near)
+    found = score(scene.t_s, flown.position, scene.actor, scene.maps, scene.config, near=scene.near)
     own, common, covered = _errors(scene, result, shared)
     return {
         **found,
@@ -270,8 +270,7 @@ def _tilt_deg(scene: Scene, flown: ArmFlight) -> Float:
 
 
 def _hidden(scene: Scene, flown: ArmFlight) -> Float:
-    seen = visible(scene.field, flown.position, scene.actor, start_m=scene.config.sight_start_m)
-    return np.where(seen, 0.0, 1.0)
+    return np.where(seen_actor(flown.position, scene.actor, scene.maps, scene.config), 0.0, 1.0)
 
 
 def _best(
@@ -427,6 +426,7 @@ def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) ->
         "collision": "collides with an obstacle",
         "clearance": f"comes within {config.drone_radius_m:g} m of an obstacle",
         "actor": f"comes within {config.actor_distance_m:g} m of the actor",
+        "zone": "enters a no-fly zone",
         "separation": f"has two drones within {config.separation_m:g} m of each other",
         "speed": f"flies faster than {config.speed_mps:g} m/s",
         "acceleration": f"accelerates by more than {config.acceleration_mps2:g} m/s^2",

@@ -2,8 +2,8 @@
 
 import difflib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -15,6 +15,7 @@ Frame = Literal["world", "heading"]
 _WORDS: dict[str, tuple[str, ...]] = {"yaw_frame": get_args(Frame)}
 _SIGNED = ("tilt_deg",)
 _NO_SETTING = "errors"
+_LEAST_ZONE_M2 = 1e-6
 _MAY_BE_ZERO = (
     *("w_obs", "w_occ", "w_turn", "w_error", "l_obs", "l_occ", "l_sep", "a_velocity", "a_acceleration"),
     *("speed_floor_mps", "sight_start_m", "k_integral", "actor_noise_m"),
@@ -43,6 +44,16 @@ class ErrorModel:
     tilts_deg: tuple[float, ...] = (-0.4, 14.1, 28.9, 43.9, 59.3)  # constant beyond the ends
     keypoint_sigma_m: tuple[float, ...] = (0.0198, 0.0202, 0.0247, 0.0314, 0.0386)  # per axis, at the person
     placed_share: tuple[float, ...] = (0.990, 0.988, 0.973, 0.954, 0.842)  # of joints that are found
+
+
+@dataclass(frozen=True)
+class Zone:
+    """No-fly zone: an upright prism that drones must not enter. Nothing is hidden by it."""
+
+    polygon_m: tuple[tuple[float, ...], ...]  # corners (east, north) of the world, at least three
+    low_m: float | None = None  # None: open to below
+    high_m: float | None = None
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -109,6 +120,7 @@ class PlannerConfig:
     # Distances that every drone keeps.
     drone_radius_m: float = 0.5  # to obstacles
     actor_distance_m: float = 3.0  # to the actor's position
+    zones: tuple[Zone, ...] = ()  # where drones must not fly
 
     # The actor's estimate.
     actor_sigma_m: float = 0.2  # of the logged position, per axis
@@ -122,7 +134,7 @@ class PlannerConfig:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == _NO_SETTING:
+            if field.name in (_NO_SETTING, "zones"):  # zones are checked where they are read
                 continue
             if words := _WORDS.get(field.name):
                 if value not in words:
@@ -199,7 +211,7 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
             problems.append(f"unknown key {key!r}" + (f" (did you mean {near[0]!r}?)" if near else ""))
             continue
         try:
-            taken[key] = _like(known[key], value)
+            taken[key] = _zones(value) if key == "zones" else _like(known[key], value)
         except TypeError as error:
             problems.append(f"{key}: {error}")
     if problems:
@@ -208,6 +220,69 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
         return PlannerConfig(**taken)  # type: ignore[arg-type]  # checked one by one above
     except ValueError as error:
         raise DataError(source, str(error)) from None
+
+
+def _zones(value: object) -> tuple[Zone, ...]:
+    """Read no-fly zones: `polygon` with `heights`, or `box` with two opposite corners.
+
+    Raises:
+        TypeError: the message names the zone and what is wrong with it.
+    """
+    if not isinstance(value, list | tuple):
+        raise TypeError("must be a list of zones")
+    zones: list[Zone] = []
+    for k, stated in enumerate(value):
+        try:
+            zone = _zone(stated)
+        except TypeError as error:
+            raise TypeError(f"zone {k + 1}: {error}") from None
+        zones.append(zone if zone.name else replace(zone, name=f"zone {k + 1}"))
+    return tuple(zones)
+
+
+def _zone(stated: object) -> Zone:
+    if not isinstance(stated, Mapping) or ("polygon" in stated) == ("box" in stated):
+        raise TypeError("must have either `polygon` and `heights`, or `box`")
+    unknown = set(stated) - ({"name", "polygon", "heights"} if "polygon" in stated else {"name", "box"})
+    if unknown:
+        raise TypeError(f"unknown key {', '.join(sorted(map(repr, unknown)))}")
+    name = str(stated.get("name") or "")
+    if "box" in stated:
+        low, high = _points(stated["box"], "box", size=3, least=2)[:2]
+        (x0, x1), (y0, y1), (z0, z1) = (sorted(ends) for ends in zip(low, high, strict=True))
+        corners: tuple[tuple[float, ...], ...] = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+        heights: tuple[float | None, float | None] = (z0, z1)
+    else:
+        corners = tuple(_points(stated["polygon"], "polygon", size=2, least=3))
+        corners = corners[:-1] if corners[0] == corners[-1] else corners
+        ends = stated.get("heights", (None, None))
+        if not isinstance(ends, list | tuple) or len(ends) != 2:
+            raise TypeError("heights must be the lowest and the highest, null where it is open")
+        lowest, highest = (None if end is None else float(_number(end)) for end in ends)
+        heights = (lowest, highest)
+    low_m, high_m = heights
+    if low_m is not None and high_m is not None and low_m >= high_m:
+        raise TypeError(f"its lowest point {low_m:g} must be below its highest {high_m:g}")
+    if any(one == other for one, other in zip(corners, (*corners[1:], corners[0]), strict=True)):
+        raise TypeError("two corners that follow each other are the same")
+    if len(corners) < 3 or abs(_area_m2(corners)) < _LEAST_ZONE_M2:
+        raise TypeError("its corners enclose nothing")
+    return Zone(corners, low_m, high_m, name)
+
+
+def _points(value: object, key: str, *, size: int, least: int) -> list[tuple[float, ...]]:
+    fits = isinstance(value, list | tuple) and len(value) >= least
+    if not fits or any(not isinstance(one, list | tuple) or len(one) != size for one in value):  # type: ignore[attr-defined]
+        raise TypeError(f"{key} must be a list of {least} points or more, of {size} numbers each")
+    if key == "box" and len(value) != 2:  # type: ignore[arg-type]
+        raise TypeError("box must be two opposite corners, of 3 numbers each")
+    return [tuple(float(_number(part)) for part in one) for one in value]  # type: ignore[attr-defined]
+
+
+def _area_m2(corners: Sequence[tuple[float, ...]]) -> float:
+    """Compute the signed area of a polygon."""
+    after = (*corners[1:], corners[0])
+    return sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(corners, after, strict=True)) / 2.0
 
 
 def _like(default: object, value: object) -> object:

@@ -15,7 +15,7 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm
 from pipelines.planning.config import MOST_DRONES, Mode, PlannerConfig
-from pipelines.planning.distance_field import DistanceField, open_space
+from pipelines.planning.distance_field import DistanceField, open_space, zone_edges
 from pipelines.planning.forecast import ActorFilter, Forecast, YawZero
 from pipelines.planning.formation import (
     TILT,
@@ -229,7 +229,8 @@ def replay(
     maps = sorted(fields, key=lambda field: field.from_ns)
     replay_ns = tracking_times(t_ns, config)
     map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")
-    known = [open_space(), *maps]
+    zones = zone_edges(config.zones)
+    known = [field.barring(zones) for field in (open_space(), *maps)]
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
 
     pilot = Pilot(arm, config, start, clock=clock)

@@ -15,10 +15,13 @@ from pipelines.planning.distance_field import (
     OCCUPIED,
     DistanceField,
     Grid,
+    MapsInTurn,
     Unknown,
     distance_field,
-    open_space,
+    in_turn,
+    looked,
     visible,
+    zone_edges,
 )
 from pipelines.planning.forecast import first_heading
 from pipelines.planning.formation import YAW, formation_slots, slot_of, slot_offsets, yaw_set
@@ -82,9 +85,13 @@ class Scene:
         return seconds
 
     @property
-    def field(self) -> DistanceField:
-        """Distance field of the last map."""
-        return self.fields[-1] if self.fields else open_space()
+    def maps(self) -> MapsInTurn:
+        """Map of each moment."""
+        return self.maps_at(self.t_ns)
+
+    def maps_at(self, t_ns: Int64) -> MapsInTurn:
+        """Return the map of each of some moments [T], ascending."""
+        return in_turn(self.fields, t_ns)
 
     @property
     def names(self) -> list[str]:
@@ -101,7 +108,12 @@ class Scene:
     @cached_property
     def near(self) -> Bool:
         """True [T] while an obstacle is near a slot of the formation of the start: the same for all arms."""
-        return near_obstacle(self.t_s, self._first_slots(), self.actor, self.field)
+        slots = self._first_slots()
+        return looked(
+            self.maps,
+            lambda field, rows: near_obstacle(self.t_s[rows], slots[:, rows], self.actor[rows], field),
+            axis=0,
+        )
 
     @cached_property
     def joints(self) -> Float | None:
@@ -118,8 +130,8 @@ class Scene:
 
     def start_slots_inside(self) -> int:
         """Count the slots of the start that are within the drones' radius of an obstacle, or in it."""
-        known = [field for field in self.fields if field.from_ns <= self.t_ns[0]]
-        clearance_m = (known[-1] if known else open_space()).sample(self._first_slots()[:, 0])[0]
+        (_, first), *_ = self.maps_at(self.t_ns[:1])
+        clearance_m = first.barring(zone_edges(self.config.zones)).sample(self._first_slots()[:, 0])[0]
         return int((clearance_m < self.config.drone_radius_m).sum())
 
     def cost_map(self) -> tuple[Int64, Float, Float]:
@@ -129,8 +141,14 @@ class Scene:
         slots = formation_slots(
             yaws, self.drones, tilt_rad=self.config.tilt_rad, range_m=self.config.radius_m
         )
-        costs = costs_of_slots(self.field, self.actor[rows], slot_offsets(slots), self.config)
-        return self.t_ns[rows], yaws, cost_map(costs, self.config)
+        t_ns, actor, offsets = self.t_ns[rows], self.actor[rows], slot_offsets(slots)
+        zones = zone_edges(self.config.zones)
+
+        def cost(field: DistanceField, part: slice) -> Float:
+            costs = costs_of_slots(field.barring(zones), actor[part], offsets, self.config)
+            return cost_map(costs, self.config)
+
+        return t_ns, yaws, looked(self.maps_at(t_ns), cost, axis=0)
 
 
 def build_scene(
@@ -214,9 +232,12 @@ def _doubts(scene: Scene) -> list[str]:
     """List problems of the maps, the start and the skeleton, one line each."""
     doubts = []
     fields = scene.fields
-    if fields and not scene.field.has_obstacles:
+    if fields and not any(field.has_obstacles for field in fields):
         doubts.append("nothing in the map is occupied")
-    outside = float(1.0 - scene.field.covers(scene.actor).mean()) if fields else 0.0
+    covered = [
+        field.covers(scene.actor[rows]) for rows, field in scene.maps if any(field is one for one in fields)
+    ]
+    outside = float(1.0 - np.concatenate(covered).mean()) if covered else 0.0
     if outside > 0.0:
         doubts.append(
             f"the map does not cover {100 * outside:.0f} % of the actor's way: what lies outside is free"
@@ -228,7 +249,7 @@ def _doubts(scene: Scene) -> list[str]:
     if inside:
         doubts.append(
             f"{inside} of {scene.drones} drones start within {scene.config.drone_radius_m:g} m of an obstacle"
-            " and leave by the shortest way: choose another --yaw, --radius or --tilt"
+            " or a no-fly zone and leave by the shortest way: choose another --yaw, --radius or --tilt"
         )
     doubts += scene.config.out_of_reach()
     if scene.flight.skeleton is None:

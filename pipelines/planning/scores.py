@@ -6,7 +6,14 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import DistanceField, visible
+from pipelines.planning.distance_field import (
+    DistanceField,
+    MapsInTurn,
+    looked,
+    visible,
+    zone_distances,
+    zone_edges,
+)
 from pipelines.planning.formation import RANGE, TILT, YAW, slot_of, wrapped
 from pipelines.planning.information import predicted_error, ray_information
 
@@ -34,7 +41,7 @@ def score(
     t_s: Float,
     position: Float,
     actor: Float,
-    field: DistanceField,
+    maps: DistanceField | MapsInTurn,
     config: PlannerConfig,
     *,
     near: Bool | None = None,
@@ -45,24 +52,26 @@ def score(
         t_s: [T] seconds, ascending, at least four of them over half a second or more.
         position: [N, T, 3] metres, world, the cameras; finite.
         actor: [T, 3] metres, world; finite.
-        field: the distance field of the last map.
-        config: limits, `sight_start_m` and the ray model.
+        maps: the distance field, or the map of each moment.
+        config: limits, no-fly zones, `sight_start_m` and the ray model.
         near: [T] True while an obstacle is near (see `near_obstacle`); the same for all arms of a comparison.
 
     Returns:
         JSON-able: degrees and metres by name; None where there is nothing to count (no pair of drones,
         no obstacle at all, never near one). `limit_violations` counts episodes per drone (per pair for
         separation): in an obstacle (`collision`), within `drone_radius_m` of one (`clearance`), within
-        `actor_distance_m` of the actor (`actor`), and beyond the other limits of the configuration.
-        `path_m` is the mean length of a drone's way, `energy_kj` the mean propulsion energy of a drone
-        (`propulsion_w`), `blind_s` the time in which fewer than two drones see the actor.
+        `actor_distance_m` of the actor (`actor`), in a no-fly zone (`zone`), and beyond
+        the other limits of the configuration. `path_m` is the mean length of a drone's way, `energy_kj` the
+        mean propulsion energy of a drone (`propulsion_w`), `blind_s` the time in which fewer than two drones
+        see the actor.
         `predicted_error_m` is sqrt(tr S) of the ray model over the times at which two free views or more
         determine it, `undetermined_share` the share of the others.
     """
     slots = slot_of(position - actor)
     tilt_deg = np.degrees(slots[..., TILT])
-    seen = visible(field, position, actor, start_m=config.sight_start_m)
-    clearance = field.sample(position)[0]
+    seen = seen_actor(position, actor, maps, config)
+    clearance = looked(maps, lambda field, rows: field.sample(position[:, rows])[0], axis=1)
+    zone_m = zone_distances(zone_edges(config.zones), position)
     pairs = list(combinations(range(len(position)), 2))
     apart = np.array([np.linalg.norm(position[i] - position[j], axis=-1) for i, j in pairs])
     turned = np.array([wrapped(slots[j, :, YAW] - slots[i, :, YAW]) for i, j in pairs])
@@ -74,6 +83,7 @@ def score(
         "collision": _episodes(clearance <= 0.0),
         "clearance": _episodes(clearance < config.drone_radius_m),
         "actor": _episodes(slots[..., RANGE] < config.actor_distance_m),
+        "zone": _episodes(zone_m < 0.0),
         "separation": _episodes(apart < config.separation_m) if pairs else 0,
         **{name: _episodes(motion[name] > limit * _ROUNDING) for name, limit in limits.items()},
     }
@@ -90,7 +100,8 @@ def score(
         "path_m": float(np.linalg.norm(np.diff(position, axis=1), axis=-1).sum(axis=1).mean()),
         "energy_kj": _energy_j(t_s, position) / 1e3,
         "min_actor_distance_m": float(slots[..., RANGE].min()),
-        "min_clearance_m": float(clearance.min()) if field.has_obstacles else None,
+        "min_clearance_m": float(clearance.min()) if _has_obstacles(maps) else None,
+        "min_zone_distance_m": float(zone_m.min()) if config.zones else None,
         "min_separation_m": float(apart.min()) if pairs else None,
         "max_speed_mps": float(motion["speed"].max()),
         "max_acceleration_mps2": float(motion["acceleration"].max()),
@@ -182,9 +193,27 @@ def _energy_j(t_s: Float, position: Float) -> float:
     return float((power * step_s).sum(axis=-1).mean())
 
 
-def predicted_errors(position: Float, actor: Float, field: DistanceField, config: PlannerConfig) -> Float:
+def seen_actor(
+    position: Float, actor: Float, maps: DistanceField | MapsInTurn, config: PlannerConfig
+) -> Bool:
+    """Test [N, T] if cameras at [N, T, 3] see the actor [T, 3], by the map of each moment."""
+    return looked(
+        maps,
+        lambda field, rows: visible(field, position[:, rows], actor[rows], start_m=config.sight_start_m),
+        axis=1,
+    )
+
+
+def _has_obstacles(maps: DistanceField | MapsInTurn) -> bool:
+    fields = [maps] if isinstance(maps, DistanceField) else [field for _, field in maps]
+    return any(field.has_obstacles for field in fields)
+
+
+def predicted_errors(
+    position: Float, actor: Float, maps: DistanceField | MapsInTurn, config: PlannerConfig
+) -> Float:
     """Compute sqrt(tr S) [T] in metres of the free views, inf where they do not determine a point."""
-    seen = visible(field, position, actor, start_m=config.sight_start_m)
+    seen = seen_actor(position, actor, maps, config)
     return predicted_error(_information(position - actor, seen, config))
 
 

@@ -65,29 +65,31 @@ def draw_as_seen(replan: Replan) -> Plate | None:
         "The skeleton in the pictures of each arm's cameras, all enlarged alike"
         + (f" (the first {columns} cameras)" if skipped else "")
         + ", with its tilt over the actor and how many joints it sees. Each quarter of the flight is shown "
-        "at the moment when these cameras together see the fewest joints; of several such moments, at the "
-        "highest tilt. Open and dotted: hidden by an obstacle; joints outside the picture are left "
-        "out. Computed from map and field of view, without a detector's errors."
+        "at the moment when the arms differ most in the joints that they do not see; of several such "
+        "moments, in their largest tilts. Open and dotted: hidden by an obstacle; joints outside the picture "
+        "are left out. Computed from map and field of view, without a detector's errors."
     )
     numbers = {"": stacked([_numbers(arm, seen) for arm, seen in looks])}
     return Plate("arms-seen", title, caption, description, figure, numbers)
 
 
 def moments(looks: list[tuple[Arm, Seen]]) -> Float:
-    """Choose the moment of each equal part of the flight at which all cameras lose most joints.
+    """Choose the moment of each equal part of the flight at which the arms differ most.
 
-    Of several such moments, take the one with the largest tilt.
+    They differ by the joints that their drawn cameras lose; of several such moments, by their largest tilts;
+    then the moment with most lost joints is taken. A single arm is shown where it loses most.
     """
     t_s = looks[0][1].t_s
-    lost, tilt_deg = np.zeros(len(t_s)), np.zeros(len(t_s))
-    for arm, seen in looks:
+    lost, tilt_deg = np.zeros((len(looks), len(t_s))), np.zeros((len(looks), len(t_s)))
+    for a, (arm, seen) in enumerate(looks):
         missing = (seen.status[:_CAMERAS] != "") & (seen.status[:_CAMERAS] != "seen")
         flown_deg = np.nan_to_num(arm.tilt_deg[:_CAMERAS, _nearest(arm.t_s, seen.t_s)]).max(axis=0)
-        for k, at in enumerate(_nearest(t_s, seen.t_s)):
-            lost[at] += missing[:, k].sum()
-            tilt_deg[at] = max(tilt_deg[at], flown_deg[k])
+        at = _nearest(seen.t_s, t_s)
+        lost[a], tilt_deg[a] = missing.sum(axis=(0, 2))[at], flown_deg[at]
+    spread = np.ptp(tilt_deg, axis=0) if len(looks) > 1 else tilt_deg[0]
+    order = (lost.sum(axis=0), spread, np.ptp(lost, axis=0) if len(looks) > 1 else lost[0])
     parts = [part for part in np.array_split(np.arange(len(t_s)), MOMENTS) if len(part)]
-    return np.array([t_s[part[np.lexsort((tilt_deg[part], lost[part]))[-1]]] for part in parts])
+    return np.array([t_s[part[np.lexsort([each[part] for each in order])[-1]]] for part in parts])
 
 
 def _nearest(t_s: Float, wanted_s: Float) -> Int64:

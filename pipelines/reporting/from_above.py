@@ -32,7 +32,7 @@ from pipelines.reporting.plates import (
     stride_for,
     table,
 )
-from pipelines.reporting.replanned import Arm, Replan, bounds_of
+from pipelines.reporting.replanned import Arm, NoFlyZone, Replan, bounds_of
 from pipelines.reporting.summary import CameraRow
 from pipelines.reporting.terrain import LOWEST_M, Heights, heights
 from pipelines.reporting.wording import fixed, listing, plural, quantity, shortened
@@ -151,6 +151,7 @@ def _decimation(step: int, noun: str) -> str:
 KEYFRAMES = 6
 HEIGHT_LEVELS_M = (LOWEST_M, 1.0, 2.0, 4.0, 8.0, 16.0)
 _HIDDEN = STATUS_COLOURS["rejected"]
+_ZONE_HATCH = "////"
 
 
 def draw_from_above(replan: Replan) -> Plate:
@@ -173,6 +174,7 @@ def draw_from_above(replan: Replan) -> Plate:
                 axes.set_visible(False)
                 continue
             _draw_panel(axes, arms[k], ground, low, high)
+            _draw_zones(axes, replan.zones, origin)
             if k + columns >= len(arms):
                 axes.set_xlabel(axis_label("east", origin[0]))
                 axes.tick_params(labelbottom=True)
@@ -180,7 +182,7 @@ def draw_from_above(replan: Replan) -> Plate:
                 axes.set_ylabel(axis_label("north", origin[1]))
             quiet(axes)
         levels = [] if ground is None else [m for m in HEIGHT_LEVELS_M if ground.above_m.max() >= m]
-        _legend(figure, arms, levels)
+        _legend(figure, arms, levels, has_zones=bool(replan.zones))
         title = "The arms from above"
         description = " ".join(_describe(arm) for arm in arms)
     numbers = {"": stacked([_arm_numbers(arm) for arm in arms])}
@@ -238,6 +240,13 @@ def _draw_panel(axes: Axes, arm: Arm, ground: Heights | None, low: Float, high: 
     axes.set_title(shortened(arm.name), fontsize=8.2, color=CAMERAS[arm.colour], loc="left")
 
 
+def _draw_zones(axes: Axes, zones: tuple[NoFlyZone, ...], origin: Float) -> None:
+    """Hatch the no-fly zones; what lies outside of the panel is cut off."""
+    for zone in zones:
+        corners = np.concatenate([zone.polygon_m, zone.polygon_m[:1]]) - origin
+        axes.fill(*corners.T, facecolor="none", edgecolor=_HIDDEN, hatch=_ZONE_HATCH, linewidth=0.9, zorder=2)
+
+
 def _draw_arm(axes: Axes, arm: Arm, origin: Float) -> None:
     stride = stride_for(len(arm.t_s))
     actor, places = arm.actor[:, :2] - origin, arm.position[..., :2] - origin
@@ -277,7 +286,7 @@ def _draw_arm(axes: Axes, arm: Arm, origin: Float) -> None:
             )
 
 
-def _legend(figure: Figure, arms: tuple[Arm, ...], levels: list[float]) -> None:
+def _legend(figure: Figure, arms: tuple[Arm, ...], levels: list[float], *, has_zones: bool) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -289,6 +298,8 @@ def _legend(figure: Figure, arms: tuple[Arm, ...], levels: list[float]) -> None:
     ]
     if not all(arm.visible[:, keyframes(arm)].all() for arm in arms):
         entries.append(Line2D([], [], color=_HIDDEN, linestyle=LINE_STYLES[2], linewidth=1.0, label="hidden"))
+    if has_zones:
+        entries.append(Patch(facecolor="none", edgecolor=_HIDDEN, hatch=_ZONE_HATCH, label="no-fly zone"))
     entries += shade_keys([f"above {level:g} m" for level in levels])
     figure.legend(handles=entries, loc="outside upper left", ncols=min(len(entries), 10))
 
@@ -306,6 +317,9 @@ def _caption(replan: Replan, levels: list[float]) -> str:
             if levels
             else f" Nothing in the map rises {quantity(LOWEST_M, 'm')} above the ground."
         )
+    if replan.zones:
+        named = listing(zone.name for zone in replan.zones)
+        caption += f" Hatched: {plural(len(replan.zones), 'no-fly zone')} ({named})."
     step = stride_for(len(replan.arms[0].t_s))
     return caption + (f" One pose in {step} is drawn." if step > 1 else "")
 

@@ -97,6 +97,14 @@ class DifferenceRow:
 
 
 @dataclass(frozen=True)
+class NoFlyZone:
+    """No-fly zone as it is drawn from above."""
+
+    name: str
+    polygon_m: Float  # [K, 2] east, north
+
+
+@dataclass(frozen=True)
 class Replan:
     """A comparison of planners."""
 
@@ -109,6 +117,7 @@ class Replan:
     differences: tuple[DifferenceRow, ...]
     level: str  # of the intervals
     notes: tuple[str, ...]
+    zones: tuple[NoFlyZone, ...] = ()
 
 
 def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Replan:
@@ -133,6 +142,7 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
         differences=tuple(_difference(found) for found in items(metrics, "differences")),
         level=_level(number(section(metrics, "intervals"), "level")),
         notes=tuple(str(note) for note in items(metrics, "notes")),
+        zones=tuple(_zone(stated) for stated in items(metrics, "zones")),
     )
 
 
@@ -237,6 +247,11 @@ def _terrain(content: ReplanContent, arms: tuple[Arm, ...]) -> Terrain | None:
         return None
     low, high = bounds_of(arms)
     return terrain_around(content.map, low - _MARGIN_M, high + _MARGIN_M)
+
+
+def _zone(found: object) -> NoFlyZone:
+    stated = section({"found": found}, "found")
+    return NoFlyZone(text(stated, "name"), np.array(items(stated, "polygon_m"), dtype=np.float64))
 
 
 # --- tables --------------------------------------------------------------------------------------------

@@ -223,6 +223,33 @@ def test_unchanged_is_skipped_and_forced_is_the_same(calm: Path) -> None:
     assert content(calm) != before
 
 
+def test_every_comparison_stays_by_its_name(calm: Path) -> None:
+    once = ("--arms", "fixed", "--trials", "1")
+    first = compared(calm, *once, "--name", "near", "--radius", "8")
+    second = compared(calm, *once)
+    folder = calm / "replan"
+
+    def stored(place: Path) -> Any:
+        return json.loads((place / "metrics.json").read_text())
+
+    assert stored(folder) == stored(folder / second["name"]) == second
+    assert stored(folder / "near") == first
+    made_of = json.loads((folder / "near" / "settings.json").read_text())
+    assert made_of["settings"]["planner.radius_m"] == 8.0
+    track = pd.read_parquet(folder / "near" / "fixed" / "trajectories.parquet")
+    assert track["slot_range_m"].max() == pytest.approx(8.0)
+    assert stored(folder)["arms"]["fixed"]["range_m"]["mean"] > 9
+    (folder / "near" / "metrics.json").write_text("{}")  # what was changed since is not kept as if it were
+    again = compare(calm, *once, "--name", "near", "--radius", "12")
+    assert again.exit_code == 0
+    assert stored(folder / "near")["arms"]["fixed"]["range_m"]["mean"] > 11
+    assert {path.parent.name for path in folder.glob("*/metrics.json")} == {"near", second["name"]}
+    for wrong in ("fixed", "../near", ".hidden", "flown"):
+        refused = compare(calm, *once, "--name", wrong)
+        assert refused.exit_code == 1
+        assert wrong in refused.stderr
+
+
 def test_an_interrupted_comparison_flies_only_what_is_missing(
     calm: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.planning.config import PlannerConfig, planner_config
+from pipelines.planning.config import PlannerConfig, Zone, planner_config
 from pipelines.planning.formation import yaw_set
 from pipelines.planning.search import lattice
 from pipelines.session.errors import DataError
@@ -36,12 +36,29 @@ def test_what_is_not_mentioned_keeps_its_default() -> None:
         ({"soft_separation_m": 2.0}, "soft_separation_m"),
         ({"yaw_frame": "body"}, "yaw_frame: 'body' is none of world, heading"),
         ({"yaw_frame": 1}, "yaw_frame: 1 is none of world, heading"),
+        ({"zones": {"box": []}}, "zones: must be a list"),
+        ({"zones": [{"name": "roof"}]}, "zones: zone 1: must have either"),
+        ({"zones": [{"box": [[0, 0, 0], [5, 5, 0]]}]}, "zone 1: its lowest point 0 must be below"),
+        ({"zones": [{"box": [[0, 0, 0], [5, 5]]}]}, "zone 1: box must be"),
+        ({"zones": [{"polygon": [[0, 0], [5, 5]]}]}, "zone 1: polygon must be"),
+        ({"zones": [{"polygon": [[0, 0], [5, 5], [2, 2]]}]}, "zone 1: its corners enclose nothing"),
+        ({"zones": [{"polygon": [[0, 0], [5, 5], [0, "x"]]}]}, "zone 1: 'x' is no number"),
+        ({"zones": [{"polygon": [[0, 0], [5, 5], [0, 5]], "hight": 3}]}, "zone 1: unknown key 'hight'"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(values: dict[str, object], said: str) -> None:
     with pytest.raises(DataError, match=said) as error:
         planner_config(values, "weights.yaml")
     assert error.value.source == "weights.yaml"
+
+
+def test_zones_are_polygons_with_heights_or_boxes() -> None:
+    polygon = {"name": "roof", "polygon": [[0, 0], [4, 0], [0, 3], [0, 0]], "heights": [None, 9]}
+    zones = planner_config({"zones": [polygon, {"box": [[5, 5, 3], [1, 7, 0]]}]}).zones
+    assert zones == (
+        Zone(((0.0, 0.0), (4.0, 0.0), (0.0, 3.0)), None, 9.0, "roof"),  # a closed polygon is opened
+        Zone(((1.0, 5.0), (5.0, 5.0), (5.0, 7.0), (1.0, 7.0)), 0.0, 3.0, "zone 2"),
+    )
 
 
 def test_all_unknown_keys_are_in_one_message() -> None:

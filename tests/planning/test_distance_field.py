@@ -7,7 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.planning.distance_field import distance_field, open_space
+from pipelines.planning.config import Zone
+from pipelines.planning.distance_field import (
+    distance_field,
+    in_turn,
+    occupied_share,
+    open_space,
+    visible,
+    zone_distances,
+    zone_edges,
+)
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import wall
 
@@ -98,3 +107,62 @@ def test_what_a_map_covers() -> None:
     assert not field.covers(outside).any()
     assert field.has_obstacles
     assert not open_space().has_obstacles
+
+
+YARD = Zone(((0.0, 0.0), (6.0, 0.0), (6.0, 2.0), (2.0, 2.0), (2.0, 6.0), (0.0, 6.0)), -1.0, 3.0)  # an L
+MAST = Zone(((20.0, 0.0), (21.0, 0.0), (21.0, 1.0), (20.0, 1.0)))  # without a top
+
+
+def test_zones_are_as_far_as_their_nearest_point() -> None:
+    """Distances from outside equal those to a dense sample of the L; inside, to the nearest wall or lid."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-2, -2, -2], [8, 8, 4], (300, 3))
+    spaced = [np.linspace(*ends, 61) for ends in ((0, 6), (0, 6), (-1, 3))]
+    solid = np.stack(np.meshgrid(*spaced, indexing="ij"), axis=-1).reshape(-1, 3)
+    solid = solid[(solid[:, 0] <= 2) | (solid[:, 1] <= 2)]
+    found = zone_distances(zone_edges([YARD]), points)
+    outside = found > 0
+    sampled = np.array([np.linalg.norm(solid - point, axis=1).min() for point in points])
+    assert 50 < outside.sum() < 280
+    assert found[outside] == pytest.approx(sampled[outside], abs=0.1 * np.sqrt(3) / 2)
+    assert (sampled[~outside] < 0.1).all()
+    assert zone_distances(zone_edges([YARD]), np.array([1.0, 4.5, 0.5])) == pytest.approx(-1.0)
+    assert zone_distances(zone_edges([YARD]), np.array([1.0, 1.0, 2.8])) == pytest.approx(-0.2)
+    assert zone_distances(zone_edges([YARD, MAST]), np.array([22.0, 0.5, 900.0])) == pytest.approx(1.0)
+    assert zone_distances(zone_edges([]), np.zeros((2, 3))).min() == np.inf
+
+
+def test_zones_bar_drones_but_not_sight() -> None:
+    free = distance_field(slab())
+    zones = zone_edges([Zone(((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)), 2.0, 3.0)])
+    field = free.barring(zones)
+    points = np.random.default_rng(1).uniform([-1.9, -1.9, 1.6], [1.9, 1.9, 3.8], (200, 3))
+    barred, gradient = field.sample(points)
+    assert (barred == np.minimum(free.sample(points)[0], zone_distances(zones, points))).all()
+    assert (barred < 0).any()
+    step = 1e-5
+    for axis in range(3):
+        ahead, behind = points.copy(), points.copy()
+        ahead[:, axis] += step
+        behind[:, axis] -= step
+        slope = (field.sample(ahead)[0] - field.sample(behind)[0]) / (2 * step)
+        assert np.mean(np.abs(slope - gradient[:, axis]) < 1e-3) > 0.97  # but for edges between faces
+    camera, actor = np.array([1.8, 0.0, 2.5]), np.array([-1.8, 0.0, 2.5])  # right through the zone
+    assert visible(field, camera, actor, start_m=0.0)
+    assert occupied_share(field, camera, actor, start_m=0.0) == 0.0
+    assert field.barring(zone_edges([])).sample(points)[0] == pytest.approx(free.sample(points)[0])
+
+
+def test_each_map_holds_from_its_own_time_on() -> None:
+    t_ns = np.arange(10, dtype=np.int64)
+    first, second = (
+        distance_field(Occupancy(slab().probability, np.zeros(3), RES, from_ns=n)) for n in (3, 6)
+    )
+    assert [(rows, field) for rows, field in in_turn([first, second], t_ns)][1:] == [
+        (slice(3, 6), first),
+        (slice(6, 10), second),
+    ]
+    assert not in_turn([first, second], t_ns)[0][1].has_obstacles
+    assert [rows for rows, _ in in_turn([first, second], t_ns[4:])] == [slice(0, 2), slice(2, 6)]
+    assert [rows for rows, _ in in_turn([first, second], t_ns[:2])] == [slice(0, 2)]
+    assert [rows for rows, _ in in_turn([], t_ns)] == [slice(0, 10)]

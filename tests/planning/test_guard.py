@@ -12,8 +12,15 @@ from hypothesis import strategies as st
 from benchmarks.worlds import fly, world_of
 from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import ADAPTIVE, FIXED
-from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import DistanceField, distance_field, open_space
+from pipelines.planning.config import PlannerConfig, Zone
+from pipelines.planning.distance_field import (
+    DistanceField,
+    distance_field,
+    in_turn,
+    open_space,
+    zone_distances,
+    zone_edges,
+)
 from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.guard import Flown, Guard, least_clearance, nearest_free, wanted_clearance_m
 from pipelines.planning.replay import Start, replay
@@ -207,11 +214,51 @@ def test_a_map_that_comes_late_is_left_and_reported() -> None:
     late = distance_field(Occupancy(occupied, origin, side_m, from_ns=4_000_000_000))
     result = replay(FIXED, stamps, hips, [late], Start(1), config=CONFIG)
     assert result.safety[Flown.LEFT] > 0
-    figures = score(result.t_s, result.position, result.actor, late, CONFIG)
-    violations = figures["limit_violations"]
-    assert isinstance(violations, dict)
-    assert violations["collision"] == violations["clearance"] == 1
+    for maps in (late, in_turn([late], result.t_ns)):
+        figures = score(result.t_s, result.position, result.actor, maps, CONFIG)
+        violations = figures["limit_violations"]
+        assert isinstance(violations, dict)
+        assert violations["collision"] == violations["clearance"] == 1
+    inside = late.sample(result.position[0])[0] < 0
+    early = np.where(result.t_s < 4.0 - 1e-9, inside, False)
+    assert early.any()  # the last map alone would blame what happened before it came
+    assert figures["min_clearance_m"] == late.sample(result.position[:, result.t_s >= 4.0])[0].min()
     assert late.sample(result.position[0, -1])[0] >= CONFIG.drone_radius_m
+
+
+def test_no_drone_flies_into_a_zone() -> None:
+    """Without the zones both arms fly through them; with them they keep their radius, and see as before."""
+    stamps, hips = walker(25.0)
+    post = ((9.0, 4.0), (12.0, 4.0), (12.0, 12.0), (9.0, 12.0))
+    zones = (Zone(post, None, 12.0), Zone(((14.0, -9.0), (22.0, -9.0), (18.0, -4.0)), 0.0))
+    edges = zone_edges(zones)
+    for arm in (FIXED, ADAPTIVE):
+        open_way = replay(arm, stamps, hips, [], Start(2, np.pi / 4), config=CONFIG)
+        barred = replay(arm, stamps, hips, [], Start(2, np.pi / 4), config=replace(CONFIG, zones=zones))
+        figures = score(barred.t_s, barred.position, barred.actor, open_space(), replace(CONFIG, zones=zones))
+        assert zone_distances(edges, barred.position).min() >= CONFIG.drone_radius_m
+        assert sum(figures["limit_violations"].values()) == 0  # type: ignore[attr-defined]
+        assert figures["occluded_share"] == 0.0
+        assert figures["min_clearance_m"] is None
+        if arm is FIXED:
+            assert zone_distances(edges, open_way.position).min() < 0
+            unaware = score(
+                open_way.t_s, open_way.position, open_way.actor, open_space(), replace(CONFIG, zones=zones)
+            )
+            assert unaware["limit_violations"]["zone"] > 0  # type: ignore[index]
+
+
+def test_a_drone_that_starts_in_a_zone_leaves_it() -> None:
+    stamps, hips = walker(8.0, 0.01)
+    start = replay(FIXED, stamps, hips, [], Start(1), config=CONFIG).position[0, 0]
+    x, y, _ = start
+    around = Zone(((x - 3, y - 2), (x + 3, y - 2), (x + 3, y + 2), (x - 3, y + 2)))
+    result = replay(FIXED, stamps, hips, [], Start(1), config=replace(CONFIG, zones=(around,)))
+    distance = zone_distances(zone_edges([around]), result.position[0])
+    assert distance[0] == pytest.approx(-2.0)
+    assert result.safety[Flown.LEFT] > 0
+    assert distance[-1] >= CONFIG.drone_radius_m
+    assert (np.diff(np.nonzero(distance >= 0.0)[0]) == 1).all()  # once out it stays out
 
 
 def test_plans_that_are_flown_exactly_do_not_pass_through_walls_either() -> None:

@@ -115,6 +115,19 @@ def test_heights_of_the_map_are_shaded_as_far_as_they_go(plates: dict[str, Plate
     assert "map" not in bare.caption
 
 
+def test_no_fly_zones_are_hatched_and_named() -> None:
+    content = make_comparison()
+    zone = {"name": "school", "polygon_m": [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]], "low_m": None, "high_m": 9.0}
+    plate = draw_arms(
+        summarise_replan(replace(content, metrics=content.metrics | {"zones": [zone]}), START_NS, 2)
+    )
+    drawn, bare = plate["arms-top"], draw_arms(summarise_replan(content, START_NS, 2))["arms-top"]
+    assert "school" in drawn.caption
+    assert drawn.svg.count("<pattern") == bare.svg.count("<pattern") + 1
+    assert drawn.svg.count("url(#") >= bare.svg.count("url(#") + len(content.arms)
+    assert "no-fly" not in bare.svg + bare.caption
+
+
 def test_without_a_cost_map_the_yaw_stands_alone() -> None:
     plate = draw_arms(summarise_replan(replace(make_comparison(), cost_map=None), START_NS, 2))["arms-yaw"]
     assert "cost" not in plate.title + plate.caption + plate.svg

@@ -43,10 +43,24 @@ def compared() -> Replan:
     return summarise_replan(replace(content, seen={arm: make_seen(arm) for arm in content.arms}), START_NS, 2)
 
 
-def test_moments_are_the_worst_of_each_quarter(compared: Replan) -> None:
+def test_moments_are_those_at_which_the_arms_differ_most(compared: Replan) -> None:
     """Hidden at 2 and 3 s; where nothing is lost, the tilt of `fixed` and `flown` rises by 1 deg/s."""
     looks = [(arm, arm.seen) for arm in compared.arms if arm.seen is not None]
     assert moments(looks).tolist() == [2, 3, 8, 10]
+
+
+def test_a_loss_that_all_arms_share_is_no_difference(compared: Replan) -> None:
+    """All arms lose all joints at 7 and 9 s; one of them loses one joint at 6 and at 8 s."""
+    looks = []
+    for k, (arm, seen) in enumerate((arm, arm.seen) for arm in compared.arms):
+        assert seen is not None
+        status = np.full(seen.status.shape, "seen", dtype="<U7")
+        status[:, [7, 9]] = "hidden"
+        if k == 0:
+            status[0, [6, 8], 0] = "hidden"
+        looks.append((arm, replace(seen, status=status)))
+    assert moments(looks).tolist()[2:] == [8, 10]
+    assert moments(looks[:1]).tolist()[2:] == [7, 9]  # a single arm: where it loses most
 
 
 def test_the_figure_says_what_is_lost(compared: Replan) -> None:
