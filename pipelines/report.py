@@ -49,8 +49,8 @@ from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_p
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = Stage("report", revision=10)
-_FIGURES_REVISION = 4
+REPORT = Stage("report", revision=11)
+_FIGURES_REVISION = 5
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def _refuse_foreign(page: Path) -> None:
 
 
 def _finished_stages(session: Session) -> dict[str, StageRecord]:
-    names = ("ingest", "detect", "reconstruct", "replan")
+    names = ("ingest", "detect", "reconstruct", "replan", "sweep")
     records = {name: session.intact_record(name) for name in names}
     if records["ingest"] is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
@@ -317,6 +317,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         keypoints=keypoints,
         stages={name: asdict(record) for name, record in records.items()},
         replan=_load_replan(folder, records["replan"], maps) if "replan" in records else None,
+        sweep=read_json(folder / "sweep" / "metrics.json") if "sweep" in records else None,
         refined=_by_camera(folder, "reconstruct/cameras.parquet", records.get("reconstruct")),
         true_poses=_by_camera(folder, "truth_poses.parquet", records["ingest"]),
         hidden=_load_hidden(folder, description, records, maps),

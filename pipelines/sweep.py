@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,8 @@ from pipelines.replan import (
     refuse_unknown,
     settings_by_name,
 )
-from pipelines.reporting.plates import CAMERAS, GRID, MUTED, new_figure, page_style, settled
+from pipelines.reporting.arm_figures import draw_tradeoff
+from pipelines.reporting.plates import page_style, settled
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.progress import Progress, Silent
@@ -38,13 +39,9 @@ from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import locked
 from pipelines.session.storage import jsonable, read_json, write_json
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 SWEEP_STAGE = Stage("sweep", revision=1)
 MOST_CELLS = 500
 
-_MARKERS = "osD^vPX*"  # by number of drones
 _COLUMNS = (
     *("arm", "radius_m", "tilt_deg", "drones", "best", "tradeoff", "capped_mm", "low_mm", "high_mm"),
     *("mpjpe_mm", "pck150", "coverage", "range_m", "mean_tilt_deg", "hidden_share", "blind_s"),
@@ -143,7 +140,7 @@ def sweep(
         )
         write_json(run.folder / "metrics.json", metrics)
         (run.folder / "table.csv").write_text(_as_csv(rows), encoding="utf-8", newline="\n")
-        draw(run.folder, rows)
+        draw(run.folder, metrics)
         record = run.publish(counts={"replays": len(rows)}, warnings=metrics["warnings"])
     return Swept(folder, record, metrics, skipped=False)
 
@@ -254,57 +251,10 @@ def _as_csv(rows: Sequence[dict[str, Any]]) -> str:
 # --- the figure ----------------------------------------------------------------------------------------
 
 
-def draw(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
+def draw(folder: Path, metrics: Mapping[str, Any]) -> None:
     """Write the trade-off as `tradeoff.svg` and `tradeoff.png`; equal rows give equal bytes."""
     with page_style():
-        figure = _draw(rows)
+        figure = draw_tradeoff(metrics).figure
         with settled(figure):
             figure.savefig(folder / "tradeoff.svg", metadata={"Date": None, "Creator": None})
             figure.savefig(folder / "tradeoff.png", dpi=160, metadata={"Software": None})
-
-
-def _draw(rows: Sequence[dict[str, Any]]) -> Figure:
-    """Draw error against way: colours by range, markers by number of drones, tilts as text."""
-    figure = new_figure(4.2, 6.4)
-    axes = figure.subplots()
-    radii = sorted({row["radius_m"] for row in rows})
-    counts = sorted({row["drones"] for row in rows})
-    several_arms, several_tilts = (len({row[key] for row in rows}) > 1 for key in ("arm", "tilt_deg"))
-    for row in rows:
-        colour = CAMERAS[radii.index(row["radius_m"]) % len(CAMERAS)]
-        low, high = (row[end] if row[end] is not None else row["capped_mm"] for end in ("low_mm", "high_mm"))
-        axes.errorbar(
-            row["path_m"],
-            row["capped_mm"],
-            [[row["capped_mm"] - low], [high - row["capped_mm"]]],
-            color=colour,
-            marker=_MARKERS[counts.index(row["drones"]) % len(_MARKERS)],
-            markersize=5.0,
-            markerfacecolor=colour if row["tradeoff"] else "none",
-            elinewidth=0.8,
-        )
-        words = [row["arm"]] if several_arms else []
-        words += [f"{row['tilt_deg']:g}°"] if several_tilts else []
-        axes.annotate(
-            " ".join(words),
-            (row["path_m"], row["capped_mm"]),
-            xytext=(4, 2),
-            textcoords="offset points",
-            color=MUTED,
-            fontsize=6.4,
-        )
-    axes.set_xlabel("way of all drones, m")
-    axes.set_ylabel("error over all joints, at most 150 mm each, mm")
-    axes.grid(color=GRID)
-    for k, radius_m in enumerate(radii):
-        axes.plot([], [], "s", color=CAMERAS[k % len(CAMERAS)], label=f"{radius_m:g} m")
-    for k, count in enumerate(counts):
-        axes.plot([], [], _MARKERS[k % len(_MARKERS)], color=MUTED, fillstyle="none", label=f"{count} drones")
-    axes.plot([], [], "o", color=MUTED, label="trade-off (filled)")
-    figure.legend(loc="outside lower center", ncols=min(len(radii) + len(counts) + 1, 6))
-    figure.suptitle(
-        "Simulated. Filled: no other one is better or equal in error, way and range",
-        color=MUTED,
-        fontsize=8.0,
-    )
-    return figure

@@ -49,6 +49,7 @@ class SessionContent:
     keypoints: dict[str, pd.DataFrame]  # camera: tables.KEYPOINTS, of cameras that have any
     stages: dict[str, dict[str, object]]  # stage: its stage.json
     replan: ReplanContent | None = None
+    sweep: dict[str, Any] | None = None  # sweep/metrics.json
     refined: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where refined
     true_poses: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where known
     hidden: dict[str, float] = field(default_factory=dict)  # camera: share of moments, where a map is
