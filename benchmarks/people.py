@@ -199,7 +199,7 @@ def seen_by_two(scenario: Path, t_ns: Int64) -> Bool:
     flight = fly_scenario(plan, noise_models(str(scenario), plan.drones.pose_noise))
     seen: Float = np.zeros((len(t_ns), len(flight.people)))
     for drone in flight.drones:
-        frame = np.abs(drone.at_frames.t_ns[None] - t_ns[:, None]).argmin(axis=1)
+        frame = np.abs(drone.at_frames.t_ns[None] + plan.start_ns - t_ns[:, None]).argmin(axis=1)
         for q, person in enumerate(flight.people):
             seen[:, q] += (visible_joints(flight, drone, person)[1].mean(axis=1) >= 0.5)[frame]
     return np.asarray(seen >= 2)

@@ -216,6 +216,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         ),
         doubts=lambda: said_doubts(_doubts(folder, description, record)),
         zero_ns=description.start_ns,
+        people=() if motion is None else tuple(description.names_of_people(motion.position.shape[1])),
     )
 
 

@@ -133,6 +133,11 @@ class Recording:
     axes: str | None = None  # z-up or y-up, if the user chooses them
     zero_ns: int = 0  # the time that formats in seconds count from, if they have the choice; 0 is the epoch
     progress: Progress = field(default_factory=Silent)  # receives notes on held, moved and thinned samples
+    people: tuple[str, ...] = ()  # names of the people of `motion`, in order, as far as they have any
+
+    def name_of(self, person: int) -> str:
+        """Return a person's name; `person0` and so on without one."""
+        return self.people[person] if person < len(self.people) else f"person{person}"
 
     @property
     def tracks(self) -> dict[str, Trajectory]:

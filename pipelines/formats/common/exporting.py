@@ -31,7 +31,7 @@ def safe_file_name(name: str) -> str:
 def people_of(recording: Recording, folder: Path, suffix: str) -> tuple[JointMotion, dict[int, Path]]:
     """Return a recording's motion, and a file for each person with at least one known joint.
 
-    The file is `<name>.trc`, or `<name>_person<k>.trc` if there are several people (for the suffix `.trc`).
+    The file is `<name>.trc`, or `<name>_<person>.trc` if there are several people (for the suffix `.trc`).
 
     Raises:
         DataError: no joint of any person is known.
@@ -41,9 +41,22 @@ def people_of(recording: Recording, folder: Path, suffix: str) -> tuple[JointMot
         raise DataError(recording.name, "holds no joints to export", "run `mocap reconstruct` first")
     people = motion.position.shape[1]
     known = [person for person in range(people) if not np.isnan(motion.position[:, person]).all()]
-    which = {person: f"_person{person}" if people > 1 else "" for person in known}
     name = safe_file_name(recording.name)
-    return motion, {person: folder / f"{name}{which[person]}{suffix}" for person in known}
+    named = file_names_of_people(recording, people)
+    return motion, {
+        person: folder / f"{name}_{named[person]}{suffix}" if people > 1 else folder / f"{name}{suffix}"
+        for person in known
+    }
+
+
+def file_names_of_people(recording: Recording, people: int) -> list[str]:
+    """Return a part of a file name for each person: their name, and a number where two would be equal."""
+    names: list[str] = []
+    for person in range(people):
+        name = safe_file_name(recording.name_of(person))
+        taken = {one.casefold() for one in names}
+        names.append(name if name.casefold() not in taken else f"{name}_{person}")
+    return names
 
 
 def tracks_of(recording: Recording) -> dict[str, Trajectory]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.exporting import safe_file_name, tracks_of
+from pipelines.formats.common.exporting import file_names_of_people, safe_file_name, tracks_of
 from pipelines.formats.common.files import read_head, read_text
 from pipelines.formats.common.rows import (
     SECONDS,
@@ -21,7 +21,7 @@ from pipelines.formats.common.rows import (
 )
 from pipelines.formats.poses.pose_rows import clean_poses, describe_trajectory, find_poses, pose_column
 from pipelines.session.errors import DataError
-from pipelines.session.records import JointMotion, Recording, Trajectory
+from pipelines.session.records import Recording, Trajectory
 
 _COLUMNS: tuple[str, ...] = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _HEADING = re.compile(r"[^\s,;\[(]+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?")  # a name, perhaps with its unit
@@ -80,7 +80,7 @@ class TumExport:
     """Writer of one file for each camera and for each joint, in metres, z up, stamps with nine decimals.
 
     `<name>_<camera>.tum` is world_from_camera as logged, `<name>_<camera>_refined.tum` as corrected by the
-    reconstruction. `<name>_<joint>.tum` (with several people `<name>_person<k>_<joint>.tum`) is a joint with
+    reconstruction. `<name>_<joint>.tum` (with several people `<name>_<person>_<joint>.tum`) is a joint with
     the identity as rotation (0 0 0 1). A time at which a joint is missing has no row.
     """
 
@@ -94,7 +94,7 @@ class TumExport:
             DataError: there are no such cameras or joints.
         """
         paths: list[Path] = []
-        for what, trajectory in {**tracks_of(recording), **_joint_tracks(recording.motion)}.items():
+        for what, trajectory in {**tracks_of(recording), **_joint_tracks(recording)}.items():
             path = folder / f"{safe_file_name(recording.name)}_{safe_file_name(what)}.tum"
             while path in paths:  # different names may give the same safe file name
                 path = path.with_stem(f"{path.stem}_")
@@ -107,18 +107,20 @@ class TumExport:
         return sorted(paths)
 
 
-def _joint_tracks(motion: JointMotion | None) -> dict[str, Trajectory]:
+def _joint_tracks(recording: Recording) -> dict[str, Trajectory]:
     """Return each joint of each person as a trajectory of its known times, without rotation."""
     tracks: dict[str, Trajectory] = {}
+    motion = recording.motion
     if motion is None:
         return tracks
     people = motion.position.shape[1]
+    named = file_names_of_people(recording, people)
     for person in range(people):
         for k, joint in enumerate(motion.joints):
             position = motion.position[:, person, k]
             known = np.isfinite(position).all(axis=1)
             if known.any():
-                which = f"person{person}_{joint}" if people > 1 else joint
+                which = f"{named[person]}_{joint}" if people > 1 else joint
                 unturned = np.tile([0.0, 0.0, 0.0, 1.0], (int(known.sum()), 1))
                 tracks[which] = Trajectory(motion.t_ns[known], position[known], unturned)
     return tracks

@@ -61,7 +61,8 @@ class GlbExport:
         spheres = {side: asset.mesh(*_octahedron(_JOINT_M), side) for side in _MATERIALS}
         bars = {side: asset.mesh(*_bar(_BONE_M), side) for side in _MATERIALS}
         for person in range(motion.position.shape[1]):
-            _add_person(asset, motion, rows, person, spheres, bars)
+            label = f"{recording.name_of(person)} " if motion.position.shape[1] > 1 else ""
+            _add_person(asset, motion, rows, person, label, spheres, bars)
         for name, track in recording.tracks.items():
             if name in recording.lenses:
                 _add_camera(asset, name, track, recording.lenses[name], t_ns)
@@ -75,12 +76,12 @@ def _add_person(
     motion: JointMotion,
     rows: Int64,
     person: int,
+    label: str,
     spheres: dict[str, int],
     bars: dict[str, int],
 ) -> None:
     joints, position = with_derived(motion.joints, motion.position[rows, person])
     place = np.stack([position[..., 0], position[..., 2], -position[..., 1]], axis=-1)
-    label = f"person{person} " if motion.position.shape[1] > 1 else ""
     for j, name in enumerate(joints):
         known = np.isfinite(place[:, j, 0])
         if known.any():

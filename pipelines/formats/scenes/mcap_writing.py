@@ -80,7 +80,7 @@ class McapExport:
                 streams.append(_pictures(recording, name, topics[name], lens, (start_ns, end_ns)))
         streams.append(_frustums(recording.lenses, list(tracks), (start_ns, end_ns)))
         if motion is not None:
-            streams += [_skeleton(motion), _uncertainty(motion), _sigmas(motion)]
+            streams += [_skeleton(motion), _uncertainty(motion), _sigmas(recording, motion)]
             recording.progress.start("Writing mcap", len(motion.t_ns))
         streams.append(_angles(recording, (start_ns, end_ns)))
         path = folder / f"{safe_file_name(recording.name)}.mcap"
@@ -174,16 +174,21 @@ def _uncertainty(motion: JointMotion) -> Iterator[Entry]:
 # --- series: JointState, which Foxglove, PlotJuggler and rqt plot by the names in it ---------------------
 
 
-def _series(
-    t_ns: int, topic: str, names: Sequence[str], people: Sequence[int], values: Sequence[float]
-) -> Entry:
-    """Return one message; the names of other people than the first begin with their number."""
-    labels = [f"{person}/{name}" if person else name for name, person in zip(names, people, strict=True)]
-    fields = {"header": {"stamp": t_ns, "frame_id": ""}, "name": labels, "position": list(values)}
+def _labels(recording: Recording, names: Sequence[str], people: Sequence[int]) -> list[str]:
+    """Label series: those of other people than the first begin with the person's name."""
+    return [
+        f"{recording.name_of(person)}/{name}" if person else name
+        for name, person in zip(names, people, strict=True)
+    ]
+
+
+def _series(t_ns: int, topic: str, labels: Sequence[str], values: Sequence[float]) -> Entry:
+    """Return one message."""
+    fields = {"header": {"stamp": t_ns, "frame_id": ""}, "name": list(labels), "position": list(values)}
     return t_ns, topic, "sensor_msgs/msg/JointState", fields
 
 
-def _sigmas(motion: JointMotion) -> Iterator[Entry]:
+def _sigmas(recording: Recording, motion: JointMotion) -> Iterator[Entry]:
     """Yield the standard deviation of each joint that has one: the root mean square of its three axes'."""
     if motion.covariance is None:
         return
@@ -191,7 +196,8 @@ def _sigmas(motion: JointMotion) -> Iterator[Entry]:
         sigma = np.sqrt(covariance[..., [0, 3, 5]].mean(axis=-1))  # xx, yy, zz
         person, joint = np.nonzero(np.isfinite(sigma) & np.isfinite(at).all(axis=-1))
         names = [motion.joints[k] for k in joint.tolist()]
-        yield _series(t_ns, "/sigma", names, person.tolist(), sigma[person, joint].tolist())
+        labels = _labels(recording, names, person.tolist())
+        yield _series(t_ns, "/sigma", labels, sigma[person, joint].tolist())
 
 
 def _angles(recording: Recording, span_ns: tuple[int, int]) -> Iterator[Entry]:
@@ -202,8 +208,9 @@ def _angles(recording: Recording, span_ns: tuple[int, int]) -> Iterator[Entry]:
     known = table[np.isfinite(table["value_deg"]) & table["t_ns"].between(*span_ns)]
     for t_ns, rows in known.groupby("t_ns", sort=True):
         names, people = rows["angle"].tolist(), rows["person"].tolist()
+        labels = _labels(recording, names, people)
         for topic, column in (("/angles", "value_deg"), ("/angles/sigma", "sigma_deg")):
-            yield _series(int(t_ns), topic, names, people, np.radians(rows[column].to_numpy()).tolist())
+            yield _series(int(t_ns), topic, labels, np.radians(rows[column].to_numpy()).tolist())
 
 
 def _doubts(recording: Recording, start_ns: int) -> Iterator[Entry]:

@@ -2,26 +2,34 @@
 
     world                             z up, metres
     world/map                         surface voxels of the map
-    world/person<k>/skeleton          joints with their bones, at every time of the skeleton
-    world/person<k>/uncertainty       95 % ellipsoids
+    world/<person>/skeleton            joints with their bones, at every time of the skeleton
+    world/<person>/uncertainty         95 % ellipsoids
     world/cameras/<camera>            its pose (the refined one if there is one), over time
     world/cameras/<camera>/image      pinhole, and pictures with the skeleton drawn into them (JPEG, 960 px)
     world/paths/<camera>              its path
-    angles/person<k>/<angle>          series in degrees; in `<angle>/sigma` its standard deviation
+    angles/<person>/<angle>            series in degrees; in `<angle>/sigma` its standard deviation
     doubts                            what contradicts itself in the flight, as warnings at the beginning
-    sigma/person<k>/<joint>           series of a joint's standard deviation per axis, m
+    sigma/<person>/<joint>             series of a joint's standard deviation per axis, m
 
 The timeline `time` is the session's own: a date, or seconds if the flight has no date. Missing joints
 are left out. The viewer's pinhole has no distortion, but the pictures keep the lens's distortion.
 Recordings of the same session differ in their bytes (rerun numbers its chunks at random).
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, shown_surface, thinned
+from pipelines.formats.common.exporting import (
+    as_jpeg,
+    ellipsoids_95,
+    file_names_of_people,
+    safe_file_name,
+    shown_surface,
+    thinned,
+)
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.session.errors import DataError
@@ -61,8 +69,9 @@ class RerunExport:
             _log_map(rr, stream, recording)
             recording.progress.advance()
             if motion is not None:
-                _log_people(rr, stream, motion)
-                _log_sigmas(rr, stream, motion)
+                named = file_names_of_people(recording, motion.position.shape[1])
+                _log_people(rr, stream, motion, named)
+                _log_sigmas(rr, stream, motion, named)
             _log_angles(rr, stream, recording)
             times = [track.t_ns for track in tracks.values()] + ([motion.t_ns] if motion is not None else [])
             _log_doubts(rr, stream, recording, min(int(t_ns[0]) for t_ns in times if len(t_ns)))
@@ -83,7 +92,7 @@ def _times(rr: Any, t_ns: Int64) -> Any:
     return rr.TimeColumn("time", timestamp=t_ns.astype("datetime64[ns]"))
 
 
-def _log_people(rr: Any, stream: Any, motion: JointMotion) -> None:
+def _log_people(rr: Any, stream: Any, motion: JointMotion, named: Sequence[str]) -> None:
     joints, position = with_derived(motion.joints, motion.position)
     described = rr.ClassDescription(
         info=rr.AnnotationInfo(id=1, label="person"),
@@ -98,7 +107,7 @@ def _log_people(rr: Any, stream: Any, motion: JointMotion) -> None:
         known = np.isfinite(body).all(axis=-1)
         total = int(known.sum())
         stream.send_columns(
-            f"world/person{person}/skeleton",
+            f"world/{named[person]}/skeleton",
             [_times(rr, motion.t_ns)],
             rr.Points3D.columns(
                 positions=body[known],
@@ -113,7 +122,7 @@ def _log_people(rr: Any, stream: Any, motion: JointMotion) -> None:
         stated = np.isfinite(half).all(axis=-1) & np.isfinite(motion.position[:, person]).all(axis=-1)
         colours = np.array([(*_colour(name), 80) for name in motion.joints], np.uint8)
         stream.send_columns(
-            f"world/person{person}/uncertainty",
+            f"world/{named[person]}/uncertainty",
             [_times(rr, motion.t_ns)],
             rr.Ellipsoids3D.columns(
                 half_sizes=half[stated],
@@ -124,7 +133,7 @@ def _log_people(rr: Any, stream: Any, motion: JointMotion) -> None:
         )
 
 
-def _log_sigmas(rr: Any, stream: Any, motion: JointMotion) -> None:
+def _log_sigmas(rr: Any, stream: Any, motion: JointMotion, named: Sequence[str]) -> None:
     """Log the standard deviation of each joint where it is there: root mean square of its axes'."""
     if motion.covariance is None:
         return
@@ -132,17 +141,19 @@ def _log_sigmas(rr: Any, stream: Any, motion: JointMotion) -> None:
     sigma[~np.isfinite(motion.position).all(axis=-1)] = np.nan
     for person in range(sigma.shape[1]):
         for joint, name in enumerate(motion.joints):
-            _log_series(rr, stream, f"sigma/person{person}/{name}", motion.t_ns, sigma[:, person, joint])
+            _log_series(rr, stream, f"sigma/{named[person]}/{name}", motion.t_ns, sigma[:, person, joint])
 
 
 def _log_angles(rr: Any, stream: Any, recording: Recording) -> None:
     table = recording.angles()
     if table is None:
         return
-    for (person, name), rows in table.groupby(["person", "angle"], sort=True):
+    named = file_names_of_people(recording, int(table["person"].max()) + 1 if len(table) else 0)
+    for (number, name), rows in table.groupby(["person", "angle"], sort=True):
+        person = named[int(str(number))]
         for entity, column in ((name, "value_deg"), (f"{name}/sigma", "sigma_deg")):
             values = rows[column].to_numpy()
-            _log_series(rr, stream, f"angles/person{person}/{entity}", rows["t_ns"].to_numpy(), values)
+            _log_series(rr, stream, f"angles/{person}/{entity}", rows["t_ns"].to_numpy(), values)
 
 
 def _log_doubts(rr: Any, stream: Any, recording: Recording, start_ns: int) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.formats.common.exporting import safe_file_name
+from pipelines.formats.common.exporting import file_names_of_people, safe_file_name
 from pipelines.formats.common.rows import format_seconds
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.joint_angles import ANGLES
@@ -26,7 +26,7 @@ _DECIMALS = 6  # of a degree or a metre
 
 
 class AnglesExport:
-    """Writer of `<name>_angles.csv` (the session's table) and `<name>_angles.sto` (`_person<k>` of several).
+    """Writer of `<name>_angles.csv` (the session's table) and `<name>_angles.sto` (`_<person>` of several).
 
     A STO has the angles in degrees and after them their standard deviations (`<angle>_sigma`), NaN where an
     angle is not known. Its seconds count from `recording.zero_ns`; the CSV keeps `t_ns`.
@@ -54,8 +54,9 @@ class AnglesExport:
         table.to_csv(paths[0], index=False, lineterminator="\n")
         t_ns, value, sigma = _dense(table)
         known = np.flatnonzero(np.isfinite(value).any(axis=(0, 2))).tolist()
+        named = file_names_of_people(recording, value.shape[1])
         for person in known:
-            which = f"_person{person}" if value.shape[1] > 1 else ""
+            which = f"_{named[person]}" if value.shape[1] > 1 else ""
             paths.append(folder / f"{name}_angles{which}.sto")
             write_sto(paths[-1], t_ns - recording.zero_ns, value[:, person], sigma[:, person])
         return sorted(paths)

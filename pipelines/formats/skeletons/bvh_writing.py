@@ -52,7 +52,7 @@ _MUST = ("left_hip", "right_hip", "neck")
 
 
 class BvhExport:
-    """Writer of `<name>.bvh`, or `<name>_person<k>.bvh` for each of several people; default cm and y up.
+    """Writer of `<name>.bvh`, or `<name>_<person>.bvh` for each of several people; default cm and y up.
 
     The module documents the fit of the rig and the handling of missing joints.
     """

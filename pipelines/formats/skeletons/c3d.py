@@ -267,7 +267,7 @@ def _number(contents: Any, group: str, name: str) -> float | None:
 
 
 class C3dExport:
-    """Writer of `<name>.c3d`, or `<name>_person<k>.c3d` for each of several people, at a constant rate."""
+    """Writer of `<name>.c3d`, or `<name>_<person>.c3d` for each of several people, at a constant rate."""
 
     name = "c3d"
     title = "C3D points with their uncertainty as residual; float32 (extra c3d)"

@@ -148,7 +148,7 @@ class Kinematics:
 
 
 class OpenSimExport:
-    """Writer of `<name>.osim`, `<name>_ik.mot` and `<name>_ik_marker_errors.sto` (`_person<k>` of several).
+    """Writer of `<name>.osim`, `<name>_ik.mot` and `<name>_ik_marker_errors.sto` (`_<person>` of several).
 
     Each body of the model is scaled by the median lengths of the person's bones, both sides alike. Mass and
     its distribution stay the model's: nothing measures them. A marker weighs at every time as in Pose2Sim's

@@ -129,7 +129,7 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
 
 
 class TrcExport:
-    """Writer of `<name>.trc`, or `<name>_person<k>.trc` for each of several people; default metres and y up.
+    """Writer of `<name>.trc`, or `<name>_<person>.trc` for each of several people; default metres and y up.
 
     OpenSim's (x, y, z) is our world's (y, z, x). The header states the unit; no TRC states its axes. Times
     are seconds since `recording.zero_ns`, with nine decimals: by default since the flight's first picture,

@@ -105,7 +105,10 @@ def test_sigmas_and_angles_are_series_by_name(tmp_path: Path) -> None:
     (path,) = WRITER.write(replace(made, angles=angles_of_two), tmp_path)
     (first, both), (second, one) = messages(path, "/angles")
     assert [first, second] == made.motion.t_ns[:2].tolist()
-    assert (both.name, one.name) == (["left_knee_flexion", "1/left_knee_flexion"], ["left_knee_flexion"])
+    assert (both.name, one.name) == (
+        ["left_knee_flexion", "person1/left_knee_flexion"],
+        ["left_knee_flexion"],
+    )
     np.testing.assert_allclose(both.position, [np.pi, np.pi / 2], rtol=1e-15)
     sigmas = [message.position for _, message in messages(path, "/angles/sigma")]
     np.testing.assert_allclose(np.concatenate(sigmas), [np.pi / 10, np.pi / 20, np.nan], rtol=1e-15)

@@ -141,6 +141,18 @@ def test_writing_and_reading_gives_the_same(
     np.testing.assert_allclose(back.position, motion.position, rtol=0, atol=0.5001e-7)
 
 
+def test_people_with_names_get_files_of_their_names(tmp_path: Path) -> None:
+    motion = JointMotion(np.array([0, 33_333_333]), ("nose",), np.ones((2, 4, 1, 3)))
+    recording = Recording("x", motion, {}, people=("anna", "Jürgen B.", "ANNA"))
+
+    paths = WRITER.write(recording, tmp_path)
+
+    # Two that differ in case alone would be one file on some systems; the fourth was not named.
+    assert sorted(path.name for path in paths) == sorted(
+        ["x_anna.trc", "x_Jürgen_B.trc", "x_ANNA_2.trc", "x_person3.trc"]
+    )
+
+
 def test_export_is_what_opensim_expects(tmp_path: Path) -> None:
     position = np.full((4, 2, 2, 3), np.nan)
     position[:, 0, 0] = [1.0, 2.0, 3.0]
