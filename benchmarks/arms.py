@@ -1,10 +1,11 @@
-"""Planner arms past a mound, a wall and trees: `python -m benchmarks.arms [--weights | --seeds N]`.
+"""Planner arms past a mound, a wall and trees: `python -m benchmarks.arms [--weights | --seeds N | --ahead]`.
 
 Each scenario of sample_data/planning is simulated without video, ingested, and flown again by the fixed and
 the adaptive formation with the weights of its planner.yaml, as `mocap replan-compare` does. All simulated.
 `--weights` flies them with other weights and resolutions too, and prints the figures of each.
 `--seeds` flies them, and the sample flight, many times with different noise of the actor's log, detector and
-poses, and pairs the arms seed by seed.
+poses, and pairs the arms seed by seed. `--ahead` starts the sample flight where the adaptive formation must
+turn past the actor's face, with its forecast and with the actor's way known.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ ARMS = ("adaptive", "fixed")
 ACTOR_NOISE_M = 0.2
 """Standard deviation of the actor's log per axis and measurement, as given to the planners."""
 
+AHEAD_DEG = (-20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0)
+"""Yaws of the first camera at the start from which the sample's formation turns past the actor's face."""
 VARIANTS: tuple[Mapping[str, float], ...] = (
     {},
     {"yaws": 8, "knot_s": 2, "horizon_knots": 5},
@@ -55,13 +58,15 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=20, help="draws of noise (default 20)")
     parser.add_argument("--weights", action="store_true", help="other weights instead (minutes)")
     parser.add_argument("--seeds", type=int, help="flights with noise of their own instead (minutes)")
+    parser.add_argument("--ahead", action="store_true", help="starts ahead of the actor instead")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
+        if arguments.ahead:
+            _print_ahead(_sample(Path(temporary)))
+            return
         sessions = {name: _session(name, Path(temporary)) for name in NAMES}
         if arguments.seeds:
-            sample = Path(temporary) / "sample.session"
-            ingest(SCENARIOS.parent / "mound_walk" / "flight.yaml", session=sample)
-            _print_seeds({"sample": sample, **sessions}, arguments.seeds)
+            _print_seeds({"sample": _sample(Path(temporary)), **sessions}, arguments.seeds)
         elif arguments.weights:
             _print_weights({name: _scene(session) for name, session in sessions.items()})
         else:
@@ -73,6 +78,24 @@ def _session(name: str, folder: Path) -> Path:
     simulate(SCENARIOS / f"{name}.yaml", folder / name, video=False)
     ingest(folder / name / "flight.yaml", session=session)
     return session
+
+
+def _sample(folder: Path) -> Path:
+    session = folder / "sample.session"
+    ingest(SCENARIOS.parent / "mound_walk" / "flight.yaml", session=session)
+    return session
+
+
+def _print_ahead(session: Path) -> None:
+    """Print tilt and hidden time of `adaptive` by the yaw of the start, with its forecast and foresight."""
+    scene = _scene(session)
+    rows = []
+    for yaw_deg in AHEAD_DEG:
+        started = replace(scene, yaw_rad=float(np.radians(yaw_deg)))
+        rows.append(
+            [f"{yaw_deg:g}", *(_figures(started, "adaptive", foresight=known) for known in (False, True))]
+        )
+    print("\n".join(markdown_table(["--yaw", "forecast", "way known"], rows)))
 
 
 def _print_comparisons(sessions: Mapping[str, Path], trials: int) -> None:
@@ -148,9 +171,9 @@ def _print_weights(scenes: Mapping[str, Scene]) -> None:
         print(f"| {said} | {' | '.join(cells)} |", flush=True)
 
 
-def _figures(scene: Scene, arm: str) -> str:
+def _figures(scene: Scene, arm: str, *, foresight: bool = False) -> str:
     """Format mean/max tilt (deg) and the share of the time without any view (%)."""
-    flown = fly_arm(scene, PLANNER_ARMS.get(arm))
+    flown = fly_arm(scene, PLANNER_ARMS.get(arm), foresight=foresight)
     scores = score(scene.t_s, flown.position, scene.actor, scene.maps, scene.config)
     tilt = np.degrees(
         np.arctan2(

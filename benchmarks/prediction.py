@@ -1,5 +1,8 @@
 """Predicted against measured errors of arms in random worlds: `python -m benchmarks.prediction [--first N]`.
 
+`--bound` also flies arms that know the whole way of the actor, with the same limits, and compares each arm
+with the least error of these in every world.
+
 Every arm flies through worlds of `benchmarks.worlds`. One posture of a walk, carried along by the actor, is
 measured by triangulation with modelled keypoints and white pose noise (0.02 m, 0.2 deg), 32 draws. The
 ray model predicts the error from the same noise and the detector's table. Correlations are over flights, and
@@ -9,7 +12,7 @@ within flights over seconds. All simulated. Worlds from 1000 on were tuned on, t
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -41,6 +44,15 @@ ARMS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "greedy": ("greedy", {}),
 }
 """Arms by their names in the tables, with changes of the settings: those of equal range beside each other."""
+FINE: Mapping[str, Any] = {"lattice_yaws": 32, "lattice_knots": 1, "tilts_deg": (10.0, 15.0, 20.0)}
+NEAREST_M = 8.0  # of all arms, but for those that stay at 10 m
+KNOWING: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "adaptive, 8 m, way known": ("adaptive", {"radius_m": NEAREST_M}),
+    "adaptive, 8 m, 10 deg, way known": ("adaptive", {"radius_m": NEAREST_M, "tilt_deg": 10.0}),
+    "covariance, fine, way known": ("covariance", {**FINE, "ranges_m": (8.0, 9.0, 10.0, 11.0, 12.0)}),
+    "greedy, way known": ("greedy", {}),
+}
+"""Arms that know the whole way: yaw alone, and yaw, tilt, range and spacing together."""
 NOISE = White(position_m=0.02, rotation_deg=0.2)
 TRIALS = 32
 EVERY = 2  # tracking steps from picture to picture
@@ -61,8 +73,8 @@ class Flight:
     range_m: float
 
 
-def fly(seed: int) -> list[Flight]:
-    """Fly all arms through one world and measure."""
+def fly(seed: int, *, bound: bool = False) -> list[Flight]:
+    """Fly all arms through one world and measure; with `bound` those that know the whole way, too."""
     world = world_of(seed)
     field = world.field()
     walking = walk(1.0, 2.0, seed=0)
@@ -73,7 +85,7 @@ def fly(seed: int) -> list[Flight]:
         rotation_sigma_deg=NOISE.rotation_deg,
     )
     found = []
-    for arm, (name, changes) in ARMS.items():
+    for arm, (name, changes) in ({**ARMS, **KNOWING} if bound else ARMS).items():
         config = replace(PlannerConfig(), errors=errors, **changes)
         done = replay(
             PLANNER_ARMS.get(name),
@@ -82,6 +94,7 @@ def fly(seed: int) -> list[Flight]:
             [field],
             Start(world.drones, world.yaw_rad),
             config=config,
+            foresight=arm in KNOWING,
         )
         rows = slice(None, None, EVERY)
         joints = done.actor[rows, None] + posture
@@ -147,18 +160,24 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1000, help="seed of the first world (default 1000)")
     parser.add_argument("--count", type=int, default=20, help="worlds (default 20)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--bound", action="store_true", help="compare with flights that know the whole way")
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.count)
     with ProcessPoolExecutor(arguments.workers) as pool:
-        flights = [flight for of in pool.map(fly, seeds) for flight in of]
+        flights = [flight for of in pool.map(partial(fly, bound=arguments.bound), seeds) for flight in of]
     _print_arms(flights)
+    if arguments.bound:
+        _print_bound(flights)
+        flights = [flight for flight in flights if flight.arm not in KNOWING]
     _print_correlations(flights)
 
 
 def _print_arms(flights: Iterable[Flight]) -> None:
     rows = []
-    for arm in ARMS:
+    for arm in (*ARMS, *KNOWING):
         own = [flight for flight in flights if flight.arm == arm]
+        if not own:
+            continue
         rows.append(
             [
                 arm,
@@ -170,6 +189,22 @@ def _print_arms(flights: Iterable[Flight]) -> None:
             ]
         )
     header = ["arm", "range m", "measured mm", "predicted mm", "hidden %", "PCK150 %"]
+    print("\n".join(markdown_table(header, rows)))
+
+
+def _print_bound(flights: Sequence[Flight]) -> None:
+    """Print each arm's error over the least of those that know the way, world by world, and what it hides."""
+    rows = []
+    for arm in ARMS:
+        ratios, hidden = [], []
+        for flight in flights:
+            if flight.arm == arm:
+                knowing = [one for one in flights if one.seed == flight.seed and one.arm in KNOWING]
+                least = min(knowing, key=lambda one: float(np.nanmean(one.measured)))
+                ratios.append(np.nanmean(flight.measured) / np.nanmean(least.measured))
+                hidden.append(flight.hidden - least.hidden)
+        rows.append([arm, f"{np.mean(ratios):.3f}", f"{np.max(ratios):.3f}", f"{100 * np.mean(hidden):+.2f}"])
+    header = ["arm", "error over the bound's, mean", "largest", "hidden, points of % more"]
     print("\n".join(markdown_table(header, rows)))
 
 

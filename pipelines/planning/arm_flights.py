@@ -91,8 +91,8 @@ def _estimates(scene: Scene) -> Float:
     return found
 
 
-def fly_arm(scene: Scene, arm: Arm) -> ArmFlight:
-    """Fly a scene again."""
+def fly_arm(scene: Scene, arm: Arm, *, foresight: bool = False) -> ArmFlight:
+    """Fly a scene again; with `foresight` the arm knows the actor's whole way, which bounds its forecast."""
     done = replay(
         arm,
         scene.flight.actor_t_ns,
@@ -102,6 +102,7 @@ def fly_arm(scene: Scene, arm: Arm) -> ArmFlight:
         config=scene.config,
         mode=scene.settings.mode,
         seed=scene.settings.seed,
+        foresight=foresight,
     )
     return ArmFlight(
         names=tuple(scene.names),

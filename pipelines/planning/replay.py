@@ -1,6 +1,7 @@
 """Replay of an arm: its planner in flight (`Pilot`), offline, against the logged actor and the maps.
 
-Equal arguments give equal replays, but for the measured times. No measurement or map is used before its time.
+Equal arguments give equal replays, but for the measured times. No measurement or map is used before its time,
+unless `foresight` asks for a bound.
 """
 
 from collections import Counter
@@ -16,7 +17,7 @@ from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm
 from pipelines.planning.config import MOST_DRONES, Mode, PlannerConfig
 from pipelines.planning.distance_field import DistanceField, open_space, zone_edges
-from pipelines.planning.forecast import ActorFilter, Forecast, YawZero
+from pipelines.planning.forecast import ActorFilter, Forecast, Foresight, YawZero
 from pipelines.planning.formation import (
     TILT,
     YAW,
@@ -92,7 +93,13 @@ class Pilot:
     """
 
     def __init__(
-        self, arm: Arm, config: PlannerConfig, start: Start, *, clock: Callable[[], float] = perf_counter
+        self,
+        arm: Arm,
+        config: PlannerConfig,
+        start: Start,
+        *,
+        actor: ActorFilter | None = None,
+        clock: Callable[[], float] = perf_counter,
     ) -> None:
         if not 1 <= start.drones <= MOST_DRONES:
             raise ValueError(f"{start.drones} drones: 1 to {MOST_DRONES} can be planned for")
@@ -101,7 +108,7 @@ class Pilot:
         yaw_rad = start.yaw_rad - float(self._zero.at(np.zeros(1))[0])
         self._formation_planner = arm.start(config, drones=start.drones, yaw_rad=yaw_rad)
         self._local_planner = LocalPlanner(config)
-        self._filter = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
+        self._filter = actor or ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
         slots = formation_slots(
             np.array([yaw_rad]), start.drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
         )
@@ -198,6 +205,7 @@ def replay(
     config: PlannerConfig,
     mode: Mode = "closed-loop",
     seed: int = 0,
+    foresight: bool = False,
     clock: Callable[[], float] = perf_counter,
 ) -> Replay:
     """Fly an arm against a log.
@@ -214,6 +222,7 @@ def replay(
         config: weights and rates, the same for all arms of a comparison.
         mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones exactly
             on their local plans.
+        foresight: forecasts are the log itself (`forecast.Foresight`); such a flight uses later measurements.
         clock: seconds, to measure planning times.
 
     Raises:
@@ -233,7 +242,8 @@ def replay(
     known = [field.barring(zones) for field in (open_space(), *maps)]
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
 
-    pilot = Pilot(arm, config, start, clock=clock)
+    foreseen = Foresight(log_s, measured) if foresight else None
+    pilot = Pilot(arm, config, start, actor=foreseen, clock=clock)
     pilot.measure(0.0, noisy[0])
     first_slots, first_estimate = pilot.wanted(0.0)
     guard = pilot.guard = Guard(

@@ -301,7 +301,7 @@ def _legend(figure: Figure, arms: tuple[Arm, ...], levels: list[float], *, has_z
     if has_zones:
         entries.append(Patch(facecolor="none", edgecolor=_HIDDEN, hatch=_ZONE_HATCH, label="no-fly zone"))
     entries += shade_keys([f"above {level:g} m" for level in levels])
-    figure.legend(handles=entries, loc="outside upper left", ncols=min(len(entries), 10))
+    figure.legend(handles=entries, loc="outside upper left", ncols=len(entries) if len(entries) <= 8 else 6)
 
 
 def _caption(replan: Replan, levels: list[float]) -> str:
