@@ -223,7 +223,9 @@ def _print(metrics: dict[str, Any]) -> None:
     header += ["path m", "energy kJ", "clearance m", "separation m", "actor m"]
     header += ["PCK150 %", "MPJPE mm", "covered %", "violations"]
     rows: list[list[object]] = []
-    for name, arm in metrics["arms"].items():
+    near_first = [name for group in metrics["equal_ranges"] for name in group["arms"]]
+    for name in near_first:  # arms of equal range stand beside each other
+        arm = metrics["arms"][name]
         tilt, error = arm["tilt_deg"], arm["reconstruction_error"]
         rows.append(
             [
@@ -248,6 +250,10 @@ def _print(metrics: dict[str, Any]) -> None:
         )
     print_table(header, rows)
     say(metrics["verdict"])
+    for group in metrics["equal_ranges"]:
+        if len(metrics["equal_ranges"]) > 1 and group["best"] is not None:
+            arms = ", ".join(group["arms"])
+            say(f"of equal range ({arms}): best is {group['best']['arm']}")
 
 
 def _with_interval(estimate: dict[str, Any] | None) -> str | None:

@@ -138,6 +138,7 @@ def compare(scene: Scene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
         if name != reference
     ]
     best = _best(scene, results, arms, shared)
+    alike = equal_ranges({name: arm["range_m"]["mean"] for name, arm in arms.items()})
     settings, flight = scene.settings, scene.flight
     broken = [line for name, arm in arms.items() if (line := broken_limits(name, arm, scene.config))]
     return {
@@ -160,6 +161,15 @@ def compare(scene: Scene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
         "arms": arms,
         "differences": differences,
         "best": best,
+        "equal_ranges": [
+            {
+                "arms": names,
+                "best": _best(scene, {name: results[name] for name in names}, arms, shared)
+                if len(alike) > 1
+                else best,
+            }
+            for names in alike
+        ],
         "verdict": _verdict(arms, differences, broken, best),
         "notes": list(scene.notes),
         "warnings": [*broken, *_unequal(arms), *scene.warnings, *_warnings(results)],
@@ -287,7 +297,9 @@ def _best(
     the best; the runner-up is the best of the others, or of these if there are no others.
     """
     measured = [
-        name for name, arm in arms.items() if (arm["reconstruction_error"]["pck150"] or {}).get("mean")
+        name
+        for name, arm in arms.items()
+        if name in results and (arm["reconstruction_error"]["pck150"] or {}).get("mean")
     ]
     kept = [name for name in measured if not sum(arms[name]["limit_violations"].values())] or measured
     if len(kept) < 2:
@@ -358,6 +370,20 @@ def _two_intervals(difference: Mapping[str, Any], key: str, scale: float) -> str
         f"{name} [{scale * ends[0]:+.1f}, {scale * ends[1]:+.1f}]" for name, ends in over.items() if ends
     ]
     return ", ".join(parts) or "a single draw"
+
+
+def equal_ranges(range_m: Mapping[str, float]) -> list[list[str]]:
+    """Group arms by their mean ranges, the nearest first: within a group they differ by at most 0.3 m.
+
+    Arms of one group can be compared without the gain of a nearer view.
+    """
+    groups: list[list[str]] = []
+    for name in sorted(range_m, key=lambda name: range_m[name]):
+        if groups and range_m[name] - range_m[groups[-1][0]] <= _ALIKE_RANGE_M:
+            groups[-1].append(name)
+        else:
+            groups.append([name])
+    return groups
 
 
 def _unequal(arms: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -138,7 +138,7 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
         terrain=_terrain(content, arms),
         verdict=text(metrics, "verdict"),
         setting=_setting(metrics),
-        rows=tuple(_row(name, section(stated, name)) for name in stated),
+        rows=tuple(_row(name, section(stated, name)) for name in _by_range(metrics, stated)),
         differences=tuple(_difference(found) for found in items(metrics, "differences")),
         level=_level(number(section(metrics, "intervals"), "level")),
         notes=tuple(str(note) for note in items(metrics, "notes")),
@@ -273,6 +273,13 @@ def _setting(metrics: Mapping[str, object]) -> str:
         + ("the true skeleton." if skeleton == "truth" else f"the skeleton of {skeleton}."),
     ]
     return " ".join(sentences)
+
+
+def _by_range(metrics: Mapping[str, object], stated: Mapping[str, object]) -> list[str]:
+    """List the arms from near to far, those of equal range beside each other; as stored by older versions."""
+    groups = items(metrics, "equal_ranges")
+    named = [str(name) for group in groups for name in items(section({"group": group}, "group"), "arms")]
+    return named if set(named) == set(stated) else list(stated)
 
 
 def _level(level: float | None) -> str:

@@ -10,6 +10,7 @@ from pipelines.planning.comparison import (
     broken_limits,
     common_frames,
     coverage,
+    equal_ranges,
     mean_of_trials,
     mean_over_time,
     mpjpe_mm,
@@ -90,6 +91,15 @@ def test_errors_on_common_joint_frames() -> None:
     assert pck(np.full_like(one, 0.15), 4) == pytest.approx([0.5, 0.5])
     assert coverage(two, 2) == pytest.approx([0.5, 1.0])
     assert coverage(blind, 0) == pytest.approx([0.0, 0.0])
+
+
+def test_arms_of_equal_range_are_grouped_from_near_to_far() -> None:
+    assert equal_ranges({"a": 10.0, "b": 8.0, "c": 9.75, "d": 8.25, "e": 10.25}) == [
+        ["b", "d"],
+        ["c", "a"],  # e is 0.5 m from c, although it is near a
+        ["e"],
+    ]
+    assert equal_ranges({}) == []
 
 
 def arm(tilt_deg: float, covered: float | None = 1.0) -> dict[str, object]:
