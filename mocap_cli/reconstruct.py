@@ -163,13 +163,47 @@ _settings_options = grouped(
 )
 
 
-@click.command("reconstruct", short_help="Detect, triangulate, measure the errors.")
+class _Reconstruct(click.Command):
+    """Command whose `--overlay` needs no value, also right before a session."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments, with `skeleton` after a bare --overlay."""
+        end = args.index("--") if "--" in args else len(args)
+        for k in range(end - 1, -1, -1):
+            if args[k] == "--overlay" and (k + 1 == end or not args[k + 1].startswith("angle:")):
+                args = [*args[:k], "--overlay=skeleton", *args[k + 1 :]]
+        return super().parse_args(ctx, args)
+
+
+class Shows(click.ParamType[str]):
+    """Content of an overlay: `skeleton`, or `angle:` and an angle."""
+
+    name = "overlay"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the full name of an angle, or an empty text for the skeleton; or raise a usage error."""
+        from pipelines.geometry.joint_angles import ANGLES, angle_named
+
+        if value in ("", "skeleton"):
+            return ""
+        kind, _, name = str(value).partition(":")
+        try:
+            return angle_named(name if kind == "angle" else "")
+        except KeyError:
+            self.fail(f"{value!r} is not angle: and one of {', '.join(ANGLES)}.", param, ctx)
+
+
+@click.command("reconstruct", cls=_Reconstruct, short_help="Detect, triangulate, measure the errors.")
 @each("session", "SESSION")
 @_settings_options
 @click.option(
     "--overlay",
-    is_flag=True,
-    help="Draw the skeleton over every picture: SESSION/overlay/CAMERA.mp4.",
+    "overlays",
+    type=Shows(),
+    multiple=True,
+    metavar="[angle:NAME]",
+    help="Draw the skeleton over every picture: SESSION/overlay/CAMERA.mp4. angle:left_knee writes that joint"
+    " angle beside it, with its standard deviation; repeat it for several.",
 )
 @click.option(
     "--workers",
@@ -184,7 +218,7 @@ _settings_options = grouped(
 def reconstruct_command(
     session: Path,
     settings: Settings,
-    overlay: bool,
+    overlays: tuple[str, ...],
     strict: bool,
     workers: int,
     force: bool,
@@ -194,13 +228,18 @@ def reconstruct_command(
     from pipelines.overlay import refuse_overlays, write_overlays
     from pipelines.reconstruct import reconstruct
 
-    if overlay:
+    if overlays:
         refuse_overlays(session, force=force)
     with watching(shown.level) as progress:
         result = reconstruct(
             session, settings, strict=strict, workers=workers, force=force, progress=progress
         )
-        videos = write_overlays(session, workers=workers, force=force, progress=progress) if overlay else []
+        angles = list(dict.fromkeys(filter(None, overlays)))
+        videos = (
+            write_overlays(session, angles=angles, workers=workers, force=force, progress=progress)
+            if overlays
+            else []
+        )
     say_warnings(result.record.warnings, shown.quiet)
     if shown.as_json:
         return result.metrics

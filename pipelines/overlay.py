@@ -5,19 +5,23 @@ block; join the blocks to one video for each camera, with the stamps of its pict
 the videos. They are removed when the skeleton that they show is replaced.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.geometry.arrays import Int64, Picture
-from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
+from pipelines.geometry.joint_angles import joint_of_angle
+from pipelines.reporting.frame_drawing import Label, blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton
-from pipelines.reporting.overlays import FilmedCamera, read_filmed, status_at, views_of
+from pipelines.reporting.overlays import FilmedCamera, angles_at, read_filmed, status_at, views_of
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
@@ -25,8 +29,11 @@ from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, locked, open_session
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.stores import is_there
-from pipelines.session.tables import FRAMES, SKELETON, read_table, rows_between
+from pipelines.session.tables import ANGLES, FRAMES, SKELETON, read_table, rows_between
 from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 OVERLAY = Stage("overlay", revision=5)
 
@@ -40,6 +47,7 @@ def write_overlays(
     cameras: Sequence[str] | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
+    angles: Sequence[str] = (),
     workers: int = 1,
     force: bool = False,
     progress: Progress | None = None,
@@ -53,6 +61,8 @@ def write_overlays(
         cameras: names of cameras; by default all that have pictures.
         start_s: use only pictures at or after this time, in seconds since the flight's first frame.
         end_s: use only pictures before this time.
+        angles: names of `geometry.joint_angles.ANGLES`, written beside their joints with their standard
+            deviations.
         workers: the number of blocks in parallel; the pictures do not depend on it.
         force: run it again even if nothing changed, and replace a folder that is no overlay.
 
@@ -78,7 +88,7 @@ def write_overlays(
         refuse_changed_pictures(folder, description, wanted)
 
         def begin(names: Sequence[str]) -> Run:
-            settings = {"cameras": list(names), "start_s": start_s, "end_s": end_s}
+            settings = {"cameras": list(names), "start_s": start_s, "end_s": end_s, "angles": list(angles)}
             inputs = {"reconstruct": record.key}  # which covers all tables that it was made of
             inputs |= {f"pictures of {name}": description.recorded[f"pictures of {name}"] for name in names}
             return session.begin(OVERLAY, settings=settings, inputs=inputs, force=force)
@@ -92,7 +102,9 @@ def write_overlays(
         films = _films(folder, description, record, wanted, (start_s, end_s), progress)
         motion = motion_from_skeleton(read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON))
         method = record.settings["method"]
-        counts = _draw(folder, films, _Show(description, motion, method), run, workers, progress)
+        table = read_table(folder / "reconstruct" / "angles.parquet", ANGLES) if angles else None
+        show = _Show(description, motion, method, tuple(angles), table)
+        counts = _draw(folder, films, show, run, workers, progress)
         return _videos(folder, run.publish(counts={"method": method, "cameras": counts}))
 
 
@@ -223,6 +235,15 @@ def _picture_size(
     return camera.intrinsics.width, camera.intrinsics.height
 
 
+def _angle_text(name: str, value_deg: float, sigma_deg: float) -> str:
+    """Write an angle in ASCII, which is all that OpenCV's letters have."""
+    words = name.replace("_", " ")
+    if not np.isfinite(value_deg):
+        return f"{words}: undetermined"
+    spread = f" +/- {sigma_deg:.0f}" if np.isfinite(sigma_deg) else ""
+    return f"{words} {value_deg:.0f}{spread} deg"
+
+
 # --- drawing -------------------------------------------------------------------------------------------
 
 
@@ -233,6 +254,25 @@ class _Show:
     description: Description
     motion: Motion
     method: str
+    angles: tuple[str, ...] = ()
+    table: pd.DataFrame | None = None  # tables.ANGLES; None without angles
+
+    def labels_at(self, t_ns: Int64) -> list[list[Label]]:
+        """Write every angle of every person at [N] times."""
+        values = (
+            []
+            if self.table is None
+            else [angles_at(self.motion, self.table, name, t_ns) for name in self.angles]
+        )
+        people = range(self.motion.position.shape[1])
+        return [
+            [
+                (person, joint_of_angle(name), _angle_text(name, *value[k, person].tolist()))
+                for name, value in zip(self.angles, values, strict=False)
+                for person in people
+            ]
+            for k in range(len(t_ns))
+        ]
 
 
 def _draw(
@@ -277,6 +317,7 @@ def _draw_block(
     at = np.array(film.rows[block.start : block.stop])
     status = status_at(show.motion, film.camera.frame_t_ns[at])
     views = views_of(film.camera, at, show.motion, status, show.description.start_ns)
+    labels = show.labels_at(film.camera.frame_t_ns[at])
     width, height = film.size
     counts = {
         "frames": len(views),
@@ -286,14 +327,15 @@ def _draw_block(
 
     def pictures() -> Iterator[Picture]:
         with open_pictures(folder, show.description, film.camera.name) as source:
-            for view, of_joints in zip(views, status, strict=True):
+            for view, of_joints, own in zip(views, status, labels, strict=True):
                 halt.check()
                 picture = source.read(view.frame)
                 if picture is None:
                     counts["undecoded"] += 1
                     picture = blank_frame(width, height, f"frame {view.frame} cannot be decoded")
                 picture = _of_size(picture, width, height)
-                yield padded_to_even(draw_frame(picture, view, caption_of(view, of_joints, show.method)))
+                caption = caption_of(view, of_joints, show.method)
+                yield padded_to_even(draw_frame(picture, view, caption, own))
                 progress.advance()
 
     write_h264(

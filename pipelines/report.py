@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 REPORT = Stage("report", revision=11)
-_FIGURES_REVISION = 5
+REPORT = Stage("report", revision=12)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,11 @@ _SHIFT = 4  # OpenCV takes coordinates in sixteenths of a pixel
 _FURTHEST_PX = 1e6  # of a point just before the camera's plane; OpenCV counts in 32 bits
 
 
-def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
+Label = tuple[int, str, str]
+"""Person, joint (K of a view), and what is written beside it."""
+
+
+def draw_frame(picture: Picture, view: View, caption: Sequence[str], labels: Sequence[Label] = ()) -> Picture:
     """Draw a view's skeleton and keypoints, and lines of text at the upper left, on a copy of a picture.
 
     Bones and joints are coloured by the side of the body; NaN is not drawn. Thin ellipses are the 95 %
@@ -47,6 +51,7 @@ def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
             scale.
         view: the view to draw; its own picture is not used.
         caption: lines of ASCII, or none; left out where the picture is too small to read them.
+        labels: in ASCII, each written beside its joint; left out alike, and where the joint is not there.
     """
     drawn = picture.copy()
     height, width = drawn.shape[:2]
@@ -66,6 +71,7 @@ def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
     _rings(drawn, found[~view.rejected & ~view.unmeasured], 2.5 * bone, max(1, round(0.7 * bone)), FOUND)
     _crosses(drawn, found[view.rejected], 2.5 * bone, bone, REJECTED)
     _crosses(drawn, found[view.unmeasured], 2.5 * bone, bone, UNMEASURED)
+    _label(drawn, view.joints, reprojected, labels)
     if caption:
         _write(drawn, caption, top=True)
     return drawn
@@ -231,6 +237,42 @@ def _write(picture: Picture, lines: Sequence[str], *, top: bool) -> None:
     for k, line in enumerate(lines):
         at = (left + step // 2, upper + (k + 1) * step)
         cv2.putText(picture, line, at, font, scale, _PAPER, _pen(scale), cv2.LINE_AA)
+
+
+def _label(picture: Picture, joints: tuple[str, ...], people: Float, labels: Sequence[Label]) -> None:
+    """Write labels beside their joints [P, K, 2], on the outer side; none covers another."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    scale = float(np.hypot(width, height)) * _TEXT
+    step = round(36 * scale)
+    taken: list[tuple[int, int, int]] = []
+    for person, joint, text in labels:
+        point = people[person, joints.index(joint)] if joint in joints else np.full(2, np.nan)
+        if (
+            scale < _LEAST_TEXT
+            or not _drawable(point)
+            or (point < 0).any()
+            or (point >= [width, height]).any()
+        ):
+            continue
+        long = int(cv2.getTextSize(text, font, scale, _pen(scale))[0][0]) + step // 2
+        body = people[person][_drawable(people[person])]
+        beside = step if point[0] >= np.median(body[:, 0]) else -step - long
+        left = int(np.clip(round(float(point[0])) + beside, 0, max(width - long, 0)))
+        upper = int(np.clip(round(float(point[1])) - step // 2, 0, height - step))
+        while any(abs(upper - y) < step and left < x + wide and x < left + long for x, y, wide in taken):
+            upper += step
+        if upper + step > height:
+            continue
+        taken.append((left, upper, long))
+        part = picture[upper : upper + step, left : left + long]
+        part[:] = part // 3
+        edge = np.array([left if left > point[0] else left + long, upper + step // 2], dtype=np.float64)
+        _line(picture, point, edge, 1, _PAPER)
+        at = (left + step // 4, upper + round(0.72 * step))
+        cv2.putText(picture, text, at, font, scale, _PAPER, _pen(scale), cv2.LINE_AA)
 
 
 def _pen(scale: float) -> int:

@@ -297,6 +297,28 @@ def status_at(motion: Motion, t_ns: Int64) -> NDArray[np.int8]:
     return np.where(known[:, None, None], motion.status[_nearest_row(motion, t_ns)], np.int8(-1))
 
 
+def angles_at(motion: Motion, angles: pd.DataFrame, name: str, t_ns: Int64) -> Float:
+    """Interpolate a joint angle and its standard deviation to [N] times, as the skeleton is; [N, P, 2] deg.
+
+    NaN where a neighbour in time is not determined. Values lie within 180 deg of 0.
+
+    Args:
+        angles: tables.ANGLES.
+        name: of `geometry.joint_angles.ANGLES`.
+    """
+    own = angles[angles["angle"] == name]
+    times, persons = (np.unique(angles[column]) for column in ("t_ns", "person"))
+    values = np.full((len(times), len(persons), 2), np.nan)
+    cell = (np.searchsorted(times, own["t_ns"]), np.searchsorted(persons, own["person"]))
+    values[cell] = own[["value_deg", "sigma_deg"]]
+    turned = np.radians(values[..., 0])
+    parts = np.stack([np.cos(turned), np.sin(turned), values[..., 1]], axis=-1)
+    along, across, sigma = np.moveaxis(
+        interpolate_points(times, parts, t_ns, max_gap_ns=_longest_step_ns(motion)), -1, 0
+    )
+    return np.stack([np.degrees(np.arctan2(across, along)), sigma], axis=-1)
+
+
 def _nearest_row(motion: Motion, t_ns: Int64) -> Int64:
     """Find the skeleton's time nearest to each of [N] times; of two the earlier."""
     after = np.clip(np.searchsorted(motion.t_ns, t_ns), min(1, len(motion.t_ns) - 1), len(motion.t_ns) - 1)

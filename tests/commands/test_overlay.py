@@ -9,12 +9,14 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
 import pipelines.overlay
+from mocap_cli.reconstruct import reconstruct_command
 from pipelines.formats.videos.video import VideoReader, index_video
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.poses import conjugate, rotate
@@ -329,6 +331,37 @@ def test_the_command_refuses_before_it_reconstructs(session: Path, tmp_path: Pat
         refused("reconstruct", session, "--method", "robust", "--overlay"),
     )
     assert not (session / "reconstruct").exists()
+
+
+def test_an_angle_is_written_beside_its_joint(filmed: tuple[SyntheticFlight, Path], session: Path) -> None:
+    flight, _ = filmed
+    bare = decoded(write_overlays(session, cameras=["drone1"])[0])
+    shown = decoded(write_overlays(session, cameras=["drone1"], angles=["left_knee_flexion"])[0])
+    knee = flight.joints.index("left_knee")
+    for before, after, pixels in zip(bare, shown, true_pixels(flight, "drone1"), strict=True):
+        rows, columns = np.nonzero(np.abs(before.astype(int) - after).max(axis=-1) > 60)
+        assert len(rows) > 500
+        assert abs(np.median(rows) - pixels[knee, 1]) < 15
+        assert abs(np.median(columns) - pixels[knee, 0]) < 400
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        (["--overlay", "SESSION"], ("",)),
+        (["--overlay", "angle:left_knee", "SESSION", "--overlay"], ("left_knee_flexion", "")),
+        (["SESSION", "--overlay=angle:right_shoulder"], ("right_shoulder_elevation",)),
+        (["--", "SESSION"], ()),
+    ],
+)
+def test_an_overlay_needs_no_value(tmp_path: Path, given: list[str], meant: tuple[str, ...]) -> None:
+    arguments = [word.replace("SESSION", str(tmp_path)) for word in given]
+    assert reconstruct_command.make_context("reconstruct", arguments).params["overlays"] == meant
+
+
+def test_an_angle_that_is_none_is_a_usage_error(tmp_path: Path) -> None:
+    with pytest.raises(click.BadParameter, match="left_knee_flexion"):
+        reconstruct_command.make_context("reconstruct", [str(tmp_path), "--overlay", "angle:left_nose"])
 
 
 def test_somebody_elses_folder_is_not_replaced(session: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -312,3 +313,45 @@ def test_a_click_on_a_curve_and_its_arrow_keys_choose_the_moment(opened: Browser
 def test_a_narrow_window_scrolls_inside_tables_and_curves_alone(opened: Browser) -> None:
     opened.show_as(width=390, height=800)
     assert opened.evaluate("document.documentElement.scrollWidth <= 390")
+
+
+def test_seen_from_a_drone_the_actor_is_in_the_middle_of_its_picture(opened: Browser) -> None:
+    opened.send(
+        "Emulation.setDeviceMetricsOverride", width=1200, height=900, deviceScaleFactor=3, mobile=False
+    )  # lines of a few pixels have some of exactly their colour
+    _go_to(opened, 5.0)
+    assert opened.evaluate(_DRAWN)
+    width, height = opened.evaluate(
+        "(() => { const e = document.getElementById('viewer-flight'); return [e.width, e.height]; })()"
+    )
+
+    def see_from(camera: str) -> None:
+        opened.evaluate(
+            f"(() => {{ const e = document.getElementById('viewer-from'); e.value = '{camera}';"
+            "e.dispatchEvent(new Event('change')); })()"
+        )
+
+    outside = _limbs(opened, "flight")
+    see_from("1")
+    count, x, y = _limbs(opened, "flight")
+    # The drone looks 7 cm above the hips from 10 m: the left side has its middle at most 0.3 m from there,
+    # 1/24 of what the picture's 1920 px show across at 1400 px focal length.
+    assert count > 10
+    assert abs(x - width / 2) < width / 24
+    assert abs(y - height / 2) < width / 24
+    see_from("")
+    assert _limbs(opened, "flight") == outside
+    see_from("0")
+    opened.evaluate("document.getElementById('viewer-flight').focus()")
+    opened.press("ArrowLeft")  # turning leaves the camera
+    assert opened.evaluate("document.getElementById('viewer-from').value") == ""
+
+
+def test_a_table_is_saved_with_its_numbers(opened: Browser) -> None:
+    opened.evaluate("URL.createObjectURL = (blob) => { window.saved = blob; return '#t=1'; }")
+    opened.click("[aria-labelledby=joints-caption] + .downloads button")
+    text = str(opened.evaluate("window.saved.text()"))
+    head, *rows = csv.reader(text.splitlines())
+    assert len(rows) == 17
+    assert head[1] == "Measured, share"
+    assert {row[0]: row[1].replace("\u202f", "").replace(" ", "") for row in rows}["left wrist"] == "45.0%"

@@ -16,6 +16,7 @@ from pipelines.reporting.motion import motion_from_skeleton
 from pipelines.reporting.overlays import (
     MOMENTS,
     View,
+    angles_at,
     choose_moments,
     collect_moments,
     match_people,
@@ -237,3 +238,16 @@ def test_spread_is_what_samples_of_a_joint_show() -> None:
     largest = float(np.linalg.norm(spread))
     np.testing.assert_allclose(spread, np.cov(pixels.T), rtol=0, atol=0.03 * largest)
     assert np.isnan(seen_spread(joint, np.full(6, np.nan), turn, lens)).all()
+
+
+def test_angles_are_interpolated_the_short_way_round_and_never_across_a_gap() -> None:
+    skeleton = make_skeleton(frames=5)
+    motion = motion_from_skeleton(skeleton)
+    values, sigmas = [170.0, -170.0, 20.0, np.nan, 30.0], [1.0, 3.0, 3.0, np.nan, 2.0]
+    angles = pd.DataFrame(
+        {"t_ns": motion.t_ns, "person": 0, "angle": "left_knee_flexion", "value_deg": values}
+    ).assign(sigma_deg=sigmas, status="ok")
+    at = motion.t_ns[[0, 0, 2, 2, 4]] + np.array([0, 16_666_667, 0, 16_666_667, 0])
+    found = angles_at(motion, angles, "left_knee_flexion", at)[:, 0]
+    assert np.abs(found[:, 0]) == pytest.approx([170.0, 180.0, 20.0, np.nan, 30.0], abs=1e-4, nan_ok=True)
+    assert found[:, 1] == pytest.approx([1.0, 2.0, 3.0, np.nan, 2.0], abs=1e-4, nan_ok=True)

@@ -196,6 +196,8 @@
   }
 
   function looking(view, at) {
+    const through = view.whole ? throughCamera(view, at) : null;
+    if (through) return through;
     const { canvas, distance } = view;
     const target = view.whole || !people ? centre : steadyAt(person(), at);
     const axes = eyeAxes(angles);
@@ -210,6 +212,28 @@
     const flat = (q) => [width / 2 + (focal * q[0]) / q[2], height / 2 - (focal * q[1]) / q[2]];
     return { target, axes, width, height, focal, near, inside, flat, distance, context: view.context };
   }
+
+  /** The flight as the chosen camera sees it, by its pinhole alone; null without a choice, or without its pose. */
+  function throughCamera(view, at) {
+    const [camera, c] = shownCameras().find((each) => String(each[1]) === (element("from")?.value ?? "")) ?? [];
+    const eye = camera && cameraPosition(camera, at);
+    if (!eye) return null;
+    const rotation = cameraRotation(camera, at);
+    const axes = [[1, 0, 0], [0, -1, 0], [0, 0, 1]].map((axis) => rotate(rotation, axis));
+    const [left, right, top, bottom] = edgesOf(camera);
+    const [width, height] = [view.canvas.clientWidth, view.canvas.clientHeight];
+    const focal = 0.94 * Math.min(width / (right - left), height / (bottom - top));
+    const inside = (p) => axes.map((axis) => dot(p.map((value, k) => value - eye[k]), axis));
+    const place = (x, y) => [width / 2 + focal * (x - (left + right) / 2), height / 2 + focal * (y - (top + bottom) / 2)];
+    const target = people ? steadyAt(person(), at) : onGround(eye);
+    const distance = Math.max(Math.hypot(...target.map((value, k) => value - eye[k])), 0.5);
+    const frame = [...place(left, top), focal * (right - left), focal * (bottom - top)];
+    const flat = (q) => place(q[0] / q[2], -q[1] / q[2]);
+    return { target, axes, width, height, focal, near: 0.05, inside, flat, distance, context: view.context, own: c, frame };
+  }
+
+  /** Left, right, upper and lower edge of a camera's picture, 1 m in front of it; those of a fisheye lens cut off. */
+  const edgesOf = (camera) => camera.corners.map((edge) => Math.min(Math.max(edge, -1.2), 1.2));
 
   /** A straight line in space, cut off in front of the eye. */
   function line(eye, a, b) {
@@ -329,6 +353,12 @@
     return cameras.map((camera, c) => [camera, c]).filter(([camera]) => String(camera.arm ?? "") === arm);
   }
 
+  /** Offer the cameras that are shown as places to look from. */
+  function offerCameras() {
+    const options = shownCameras().map(([camera, c]) => new Option(camera.name, c));
+    element("from").replaceChildren(new Option("outside", ""), ...options);
+  }
+
   const cubes = surface
     ? Array.from({ length: surface.points.length / 3 }, (_, row) => triple(surface.points, row))
     : [];
@@ -355,7 +385,7 @@
     const position = cameraPosition(camera, at);
     if (!position) return [];
     const rotation = cameraRotation(camera, at);
-    const [left, right, top, bottom] = camera.corners.map((edge) => Math.min(Math.max(edge, -1.2), 1.2));
+    const [left, right, top, bottom] = edgesOf(camera);
     const corner = (x, y) => add(position, rotate(rotation, [x * frustumDepth, y * frustumDepth, frustumDepth]));
     const corners = [corner(left, top), corner(right, top), corner(right, bottom), corner(left, bottom)];
     const apex = eye.inside(position);
@@ -490,9 +520,13 @@
         parts.push(...boneParts(eye, jointsAt(body.truth, p, at), style));
       }
     }
-    shownCameras().forEach(([camera, c]) => parts.push(...cameraParts(eye, camera, c, at)));
+    shownCameras().forEach(([camera, c]) => c === eye.own || parts.push(...cameraParts(eye, camera, c, at)));
     parts.sort((a, b) => b.depth - a.depth);
     for (const part of [...around, ...parts]) part.draw();
+    if (eye.frame) {
+      Object.assign(context, { strokeStyle: colours.cameras[eye.own], lineWidth: 1.2 });
+      context.strokeRect(...eye.frame);
+    }
     drawCompass(eye, step);
   }
 
@@ -504,6 +538,9 @@
   const seconds = (t) => `${minus(t.toFixed(2))}\u202fs`;
 
   function said(at) {
+    const chosen = element("from").selectedOptions[0];
+    const from = chosen?.value && cameras[Number(chosen.value)];
+    if (from && !cameraPosition(from, at)) return `${from.name} has no pose at this time`;
     if (!people) return "";
     const joints = jointsAt(body.joint, person(), at);
     const measured = joints.slice(0, jointCount).filter((joint) => joint).length;
@@ -579,6 +616,33 @@
     showNearestPictures(t);
   }
 
+  function save(name, type, text) {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([text], { type }));
+    link.download = name;
+    link.click();
+    URL.revokeObjectURL(link.href);
+  }
+
+  /** Offer every table of the page but the folded ones as CSV: numbers as they are shown, with a plain minus. */
+  for (const region of document.querySelectorAll(".table[aria-labelledby]")) {
+    const button = document.createElement("button");
+    Object.assign(button, { type: "button", textContent: "Table (CSV)" });
+    button.addEventListener("click", () => {
+      const cell = (each) => {
+        const words = Array.from(each.childNodes, (node) => node.textContent.replace(/\s+/g, " ").trim()).filter(Boolean);
+        const text = words.join(", ").replace(/\u2212(?=\d)/g, "-");
+        return `"${(/^[=+@\t]|^-(?!\d)/.test(text) ? `'${text}` : text).replace(/"/g, '""')}"`;
+      };
+      const rows = Array.from(region.querySelectorAll("tr"), (row) => Array.from(row.cells, cell).join(","));
+      save(`${region.getAttribute("aria-labelledby").replace(/-caption$/, "")}.csv`, "text/csv", `${rows.join("\n")}\n`);
+    });
+    const downloads = document.createElement("div");
+    downloads.className = "downloads";
+    downloads.append(button);
+    region.after(downloads);
+  }
+
   /** Save a drawing with the colours of the page: outside of it, its variables have no values. */
   for (const button of document.querySelectorAll("button[data-save]")) {
     button.hidden = false;
@@ -588,11 +652,7 @@
       svg.setAttribute("xmlns", "http://www.w3.org/2000/svg");
       const style = getComputedStyle(document.documentElement);
       const text = svg.outerHTML.replace(/var\((--[\w-]+)\)/g, (_, name) => style.getPropertyValue(name).trim());
-      const link = document.createElement("a");
-      link.href = URL.createObjectURL(new Blob([text], { type: "image/svg+xml" }));
-      link.download = button.dataset.save;
-      link.click();
-      URL.revokeObjectURL(link.href);
+      save(button.dataset.save, "image/svg+xml", text);
     });
   }
 
@@ -690,24 +750,33 @@
 
   // --- hands ---------------------------------------------------------------------------------------------
 
-  function turn(azimuth, elevation) {
+  /** Leave the camera that the flight is seen from. */
+  function letGo() {
+    if (element("from")) element("from").value = "";
+  }
+
+  function turn(view, azimuth, elevation) {
+    if (view.whole) letGo();
     angles.azimuth += azimuth;
     angles.elevation = Math.min(Math.max(angles.elevation + elevation, -0.3), Math.PI / 2);
     showSoon();
   }
 
   function zoom(view, factor) {
+    if (view.whole) letGo();
     view.distance = Math.min(Math.max(view.distance * factor, 0.15 * fit(view)), 40 * radius);
     showSoon();
   }
 
   function reset() {
+    letGo();
     Object.assign(angles, START);
     for (const view of views) view.distance = fit(view);
     showSoon();
   }
 
   function fromAbove() {
+    letGo();
     Object.assign(angles, { azimuth: -Math.PI / 2, elevation: Math.PI / 2 });
     showSoon();
   }
@@ -734,9 +803,9 @@
       if (was) {
         const is = spread();
         zoom(view, was.size / Math.max(is.size, 1));
-        turn(0, (is.y - was.y) * 0.008);
+        turn(view, 0, (is.y - was.y) * 0.008);
       } else if (fingers.size === 1) {
-        turn((before.x - now.x) * 0.008, (now.y - before.y) * 0.008);
+        turn(view, (before.x - now.x) * 0.008, (now.y - before.y) * 0.008);
       }
     });
     for (const end of ["pointerup", "pointercancel"]) {
@@ -749,8 +818,8 @@
       zoom(view, Math.exp(0.0015 * Math.max(-300, Math.min(300, event.deltaY * (event.deltaMode ? 30 : 1)))));
     }, { passive: false });
     const keys = {
-      ArrowLeft: () => turn(-0.1, 0), ArrowRight: () => turn(0.1, 0),
-      ArrowUp: () => turn(0, 0.1), ArrowDown: () => turn(0, -0.1),
+      ArrowLeft: () => turn(view, -0.1, 0), ArrowRight: () => turn(view, 0.1, 0),
+      ArrowUp: () => turn(view, 0, 0.1), ArrowDown: () => turn(view, 0, -0.1),
       "+": () => zoom(view, 1 / 1.15), "=": () => zoom(view, 1 / 1.15), "-": () => zoom(view, 1.15),
       " ": () => play(!clock.playing), ",": () => step(-1), ".": () => step(1), "0": reset,
     };
@@ -785,13 +854,14 @@
   element("play").addEventListener("click", () => play(!clock.playing));
   element("reset").addEventListener("click", reset);
   element("above").addEventListener("click", fromAbove);
-  for (const name of ["truth", "ellipsoids", "paths", "person", "arm", "surface"]) element(name)?.addEventListener("change", showSoon);
+  for (const name of ["truth", "ellipsoids", "paths", "person", "arm", "surface", "from"]) element(name)?.addEventListener("change", showSoon);
   addEventListener("hashchange", () => goTo(location.hash));
   document.addEventListener("click", (event) => {
     const link = event.target.closest?.('a[href^="#t="]');
     // The address does not change by a second click on the same moment.
     if (link && link.hash === location.hash) goTo(link.hash);
   });
+  element("arm")?.addEventListener("change", offerCameras);
   views.forEach(grab);
   const recolour = () => {
     readColours();
@@ -802,6 +872,7 @@
   addEventListener("afterprint", recolour);
 
   stage.hidden = false;
+  offerCameras();
   readColours();
   reset();
   clock.t = time[body ? body.start : 0];
