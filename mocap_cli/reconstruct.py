@@ -182,15 +182,15 @@ class Shows(click.ParamType[str]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Return the full name of an angle, or an empty text for the skeleton; or raise a usage error."""
-        from pipelines.geometry.joint_angles import ANGLES, angle_named
+        from pipelines.overlay import angle_named
 
         if value in ("", "skeleton"):
             return ""
         kind, _, name = str(value).partition(":")
         try:
-            return angle_named(name if kind == "angle" else "")
-        except KeyError:
-            self.fail(f"{value!r} is not angle: and one of {', '.join(ANGLES)}.", param, ctx)
+            return angle_named(name if kind == "angle" else str(value))
+        except ValueError as error:
+            self.fail(f"{error}.", param, ctx)
 
 
 @click.command("reconstruct", cls=_Reconstruct, short_help="Detect, triangulate, measure the errors.")

@@ -18,7 +18,7 @@ import numpy as np
 
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.geometry.arrays import Int64, Picture
-from pipelines.geometry.joint_angles import joint_of_angle
+from pipelines.geometry.joint_angles import ANGLES
 from pipelines.reporting.frame_drawing import Label, blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton
 from pipelines.reporting.overlays import FilmedCamera, angles_at, read_filmed, status_at, views_of
@@ -29,7 +29,8 @@ from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, locked, open_session
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.stores import is_there
-from pipelines.session.tables import ANGLES, FRAMES, SKELETON, read_table, rows_between
+from pipelines.session.tables import ANGLES as ANGLES_TABLE
+from pipelines.session.tables import FRAMES, SKELETON, read_table, rows_between
 from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:
@@ -102,10 +103,23 @@ def write_overlays(
         films = _films(folder, description, record, wanted, (start_s, end_s), progress)
         motion = motion_from_skeleton(read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON))
         method = record.settings["method"]
-        table = read_table(folder / "reconstruct" / "angles.parquet", ANGLES) if angles else None
+        table = read_table(folder / "reconstruct" / "angles.parquet", ANGLES_TABLE) if angles else None
         show = _Show(description, motion, method, tuple(angles), table)
         counts = _draw(folder, films, show, run, workers, progress)
         return _videos(folder, run.publish(counts={"method": method, "cameras": counts}))
+
+
+def angle_named(words: str) -> str:
+    """Return the angle of `ANGLES` by its name, or the main one of a joint: left_knee is left_knee_flexion.
+
+    Raises:
+        ValueError: there is no such angle.
+    """
+    main = ("", "_flexion", "_dorsiflexion", "_elevation", "_pronation")
+    name = next((words + end for end in main if words + end in ANGLES), None)
+    if name is None:
+        raise ValueError(f"{words!r} is none of {', '.join(ANGLES)}")
+    return name
 
 
 def refuse_overlays(folder: Path, *, force: bool = False) -> None:
@@ -235,6 +249,12 @@ def _picture_size(
     return camera.intrinsics.width, camera.intrinsics.height
 
 
+def _joint_of(name: str) -> str:
+    """Return the joint beside which an angle of `ANGLES` is written; of the trunk it is `hip`."""
+    joint = name.rpartition("_")[0]
+    return {"trunk": "hip", "left_forearm": "left_wrist", "right_forearm": "right_wrist"}.get(joint, joint)
+
+
 def _angle_text(name: str, value_deg: float, sigma_deg: float) -> str:
     """Write an angle in ASCII, which is all that OpenCV's letters have."""
     words = name.replace("_", " ")
@@ -267,7 +287,7 @@ class _Show:
         people = range(self.motion.position.shape[1])
         return [
             [
-                (person, joint_of_angle(name), _angle_text(name, *value[k, person].tolist()))
+                (person, _joint_of(name), _angle_text(name, *value[k, person].tolist()))
                 for name, value in zip(self.angles, values, strict=False)
                 for person in people
             ]

@@ -54,25 +54,6 @@ ANGLES: dict[str, str] = {
 """Every angle and what its positive sign means."""
 
 
-def angle_named(words: str) -> str:
-    """Return the angle of `ANGLES` by its name, or the main one of a joint: left_knee is left_knee_flexion.
-
-    Raises:
-        KeyError: there is no such angle.
-    """
-    main = ("", "_flexion", "_dorsiflexion", "_elevation", "_pronation")
-    name = next((words + end for end in main if words + end in ANGLES), None)
-    if name is None:
-        raise KeyError(words)
-    return name
-
-
-def joint_of_angle(name: str) -> str:
-    """Return the joint beside which an angle of `ANGLES` is written; of the trunk it is `hip`."""
-    joint = name.rpartition("_")[0]
-    return {"trunk": "hip", "left_forearm": "left_wrist", "right_forearm": "right_wrist"}.get(joint, joint)
-
-
 UNDETERMINED = "undetermined"
 """Status of an angle that its joints do not determine in this pose."""
 ABSENT = "no_such_joint"

@@ -7,7 +7,7 @@ the captions say so.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.from_above import draw_paths
-from pipelines.reporting.motion import Motion, side_of
+from pipelines.reporting.motion import Motion, side_of, standing_heights
 from pipelines.reporting.plates import (
     CAMERAS,
     LINE_STYLES,
@@ -447,7 +447,7 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
     """
     chosen = _fullest_times(motion)
     joints, position = with_derived(motion.joints, motion.measured_position[chosen, 0])
-    ground = _feet_m(motion, chosen)
+    ground = standing_heights(motion)[chosen, 0]
     above = position[..., 2] - ground[:, None]
     top = float(np.clip(np.nanmax(above) + 0.1, 1.0, _TALLEST_M))
     bottom = float(np.clip(np.nanmin(above), -_DEEPEST_M, 0.0)) - 0.05
@@ -487,18 +487,6 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
         above_ground_m=places[:, 1],
     )
     return Plate("body", title, caption, description, figure, {"": numbers})
-
-
-def _feet_m(motion: Motion, rows: Sequence[int]) -> Float:
-    """Return the height [N] on which the first person stands at rows of the motion.
-
-    It is the median over two seconds of the lowest joint, so that no single joint lifts a body.
-    """
-    height = motion.measured_position[:, 0, :, 2]
-    known = np.isfinite(height).any(axis=1)
-    lowest = np.where(np.isfinite(height), height, np.inf).min(axis=1)
-    near = [known & (np.abs(motion.t_ns - motion.t_ns[row]) <= 1_000_000_000) for row in rows]
-    return np.array([np.median(lowest[each]) if each.any() else 0.0 for each in near])
 
 
 def _fullest_times(motion: Motion) -> list[int]:

@@ -168,3 +168,18 @@ def watched_bones(motion: Motion) -> list[Bone]:
             spread = (p84 - p16) / 2 / median if median > 0 else 0.0
             bones.append(Bone(name, side, median, low, high, spread))
     return bones
+
+
+def standing_heights(motion: Motion) -> Float:
+    """Return the height [T, P] on which each person stands, m.
+
+    It is the median over two seconds of the lowest measured joint, so that no single joint lifts a body.
+    Where nothing was measured, it is that of the last time before, else of the first after, else 0.
+    """
+    import pandas as pd
+
+    height = motion.measured_position[..., 2]
+    lowest = np.where(np.isfinite(height), height, np.inf).min(axis=-1)
+    table = pd.DataFrame(np.where(np.isinf(lowest), np.nan, lowest), index=pd.to_datetime(motion.t_ns))
+    near = table.rolling("2s", center=True, closed="both", min_periods=1).median()
+    return near.ffill().bfill().fillna(0.0).to_numpy(np.float64)

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.reporting.content import FULL_SCALE, Strip
-from pipelines.reporting.motion import Motion, full_covariance, middles, side_of
+from pipelines.reporting.motion import Motion, full_covariance, middles, side_of, standing_heights
 from pipelines.reporting.replanned import Arm, Replan
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.terrain import Surface, surface
@@ -79,7 +79,7 @@ def make_scene(
     paths = [camera.position for camera in placed]
     low, high = _bounds(np.concatenate(paths + ([body.middle[kept].reshape(-1, 3)] if body else [])))
     origin = np.round((low + high) / 2)
-    ground = body.ground_m if body is not None else float(low[2])
+    ground = float(np.median(body.feet_m)) if body is not None else float(low[2])
     data: dict[str, object] = {
         "t": _packed(np.round((t_ns - summary.origin_ns) / 1e5), np.int32),
         "low": _rounded(low - origin),
@@ -146,7 +146,7 @@ class _Body:
     joint: Float  # [T, P, J, 3] m from the middle
     truth: Float | None  # [T, P, J, 3] m from the middle
     root: Float | None  # [T, P, J, 6] m, lower triangle of the covariance's Cholesky factor, row by row
-    ground_m: float
+    feet_m: Float  # [T, P] height on which each person stands
 
     @classmethod
     def of(cls, motion: Motion, truth: Float | None) -> _Body:
@@ -155,14 +155,13 @@ class _Body:
         if truth is not None:
             middle = np.where(np.isnan(middle), middles(truth), middle)
             truth = truth - middle[:, :, None]
-        lowest = _lowest(position)
         return cls(
             joints=motion.joints,
             middle=middle,
             joint=position - middle[:, :, None],
             truth=truth if truth is not None and np.isfinite(truth).any() else None,
             root=_square_root(np.where(motion.measured[..., None], motion.covariance, np.nan)),
-            ground_m=float(np.median(lowest[np.isfinite(lowest)])),
+            feet_m=standing_heights(motion),
         )
 
     @property
@@ -187,6 +186,7 @@ class _Body:
             "bones": [[place[a], place[b], _SIDES.index(side_of(a, b))] for a, b in bones_of(known)],
             # The first time with nearly the most joints: the page opens with it, and prints it.
             "start": int(np.argmax(counts >= 0.9 * counts.max())),
+            "feet": _packed(1000 * (self.feet_m[kept] - origin[2]), np.int32),
             "middle": _packed(1000 * (self.middle[kept] - origin), np.int32),
             "joint": _packed(1000 * self.joint[kept], np.int16),
             "truth": None if self.truth is None else _packed(1000 * self.truth[kept], np.int16),
@@ -207,13 +207,6 @@ class _Body:
             for count, noun in far
             if count
         ]
-
-
-def _lowest(position: Float) -> Float:
-    """Return the height of the lowest joint [T, P]; NaN where there is none."""
-    height = position[..., 2]
-    lowest = np.where(np.isnan(height), np.inf, height).min(axis=-1)
-    return np.where(np.isinf(lowest), np.nan, lowest)
 
 
 def _square_root(covariance: Float) -> Float | None:
@@ -294,7 +287,7 @@ def _bytes_per_time(body: _Body | None, cameras: int) -> int:
     if body is None:
         return cameras * per_camera
     channels = 3 + 3 * (body.truth is not None) + 6 * (body.root is not None)
-    return cameras * per_camera + body.people * (3 * 4 + len(body.joints) * channels * 2)
+    return cameras * per_camera + body.people * (4 * 4 + len(body.joints) * channels * 2)
 
 
 def _bounds(points: Float) -> tuple[Float, Float]:

@@ -69,7 +69,7 @@ def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_pa
     with AnyReader([log]) as reader:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
     # 0.4 s of video at 5 pictures per second.
-    assert counts["/drone1/image/compressed"] == counts["/drone1/camera_info"] == 2
+    assert counts["/drone1/image/video"] == counts["/drone1/camera_info"] == 2
 
 
 def test_pictures_lie_where_the_skeleton_does(filmed: Path) -> None:
@@ -169,7 +169,7 @@ def test_pictures_that_are_gone_cost_pictures_only(filmed: Path, tmp_path: Path)
     with AnyReader(result.written) as reader:
         topics = {connection.topic for connection in reader.connections}
     assert {"/skeleton", "/drone1/camera_info"} <= topics
-    assert "/drone1/image/compressed" not in topics
+    assert "/drone1/image/video" not in topics
 
 
 def test_c3d_is_truth(tmp_path: Path) -> None:

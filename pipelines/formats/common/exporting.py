@@ -7,14 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bytes, Float, Int64
-from pipelines.geometry.cameras import Intrinsics, rescaled
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Occupancy, Recording, Trajectory
-
-_WIDEST_PX = 960
-_QUALITY = 85
 
 CHI2_95 = 7.815
 """95 % of a Gaussian in three dimensions lie within {x : x' S^-1 x = 7.815} (chi-square)."""
@@ -89,24 +85,6 @@ def write_tables(
     if not paths:
         raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
     return sorted(paths)
-
-
-def as_jpeg(camera: str, picture: Bytes, lens: Intrinsics) -> tuple[Intrinsics, bytes]:
-    """Shrink a BGR picture [height, width, 3] to at most 960 px in width; return its intrinsics and JPEG.
-
-    Raises:
-        DataError: the picture cannot be encoded.
-    """
-    import cv2
-
-    height, width = picture.shape[:2]
-    if width > _WIDEST_PX:
-        size = (_WIDEST_PX, round(height * _WIDEST_PX / width))
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    done, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    if not done:
-        raise DataError(camera, "has a picture that cannot be encoded as JPEG", "add --pictures-hz 0")
-    return rescaled(lens, picture.shape[1], picture.shape[0]), jpeg.tobytes()
 
 
 def ellipsoids_95(covariance: Float) -> tuple[Float, Float]:

@@ -10,11 +10,18 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 _CHUNK_BYTES = 1 << 20
 _STAMPS = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
+_COMPRESSED_VIDEO = """\
+builtin_interfaces/Time timestamp
+string frame_id
+uint8[] data
+string format
+"""
+"""Foxglove's schema (foxglove_msgs/CompressedVideo), which ROS 2 itself does not have."""
 _BYTES = {"bool": "bool", "byte": "uint8", "char": "uint8", "octet": "uint8"}
 
 
@@ -28,6 +35,7 @@ class Ros2Recording:
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")
         self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._store.register(get_types_from_msg(_COMPRESSED_VIDEO, "foxglove_msgs/msg/CompressedVideo"))
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library="mocap")
         self._schemas: dict[str, int] = {}

@@ -11,7 +11,7 @@
 | /frustums | visualization_msgs/MarkerArray | the cameras' views, in their own frames, every second |
 | /CAMERA/path | nav_msgs/Path | the camera's path, at most 10 poses a second, written once |
 | /CAMERA/camera_info | sensor_msgs/CameraInfo | with every picture, else every second |
-| /CAMERA/image/compressed | sensor_msgs/CompressedImage | JPEG, at most 960 px wide |
+| /CAMERA/image/video | foxglove_msgs/CompressedVideo | H.264, at most 960 px wide |
 | /map | sensor_msgs/PointCloud2 | the middles of the map's surface voxels |
 
 World axes as in the session (z up), cameras with x right, y down, z forward; metres. Poses are the refined
@@ -28,10 +28,11 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.calibrations.ros_camera_info import ros_distortion
-from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, shown_surface, thinned
+from pipelines.formats.common.exporting import ellipsoids_95, safe_file_name, shown_surface, thinned
 from pipelines.formats.logs.ros2_writing import Ros2Recording
+from pipelines.formats.videos.video_writing import H264Stream
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.cameras import Intrinsics, rescaled
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.skeletons import bones_of, with_derived
@@ -290,13 +291,13 @@ def _pictures(
 ) -> Iterator[Entry]:
     """Yield pictures with their CameraInfo; without pictures the CameraInfo alone, every second."""
     is_empty = True
+    stream = H264Stream()
     for t_ns, picture in recording.pictures(name):
         if span_ns[0] <= t_ns <= span_ns[1]:
-            smaller, jpeg = as_jpeg(name, picture, lens)
-            header = {"stamp": t_ns, "frame_id": name}
-            yield _info(t_ns, name, topic, smaller)
-            image = {"header": header, "format": "jpeg", "data": jpeg}
-            yield t_ns, f"{topic}/image/compressed", "sensor_msgs/msg/CompressedImage", image
+            unit, _ = stream.encode(picture)
+            yield _info(t_ns, name, topic, rescaled(lens, *stream.size))
+            video = {"timestamp": t_ns, "frame_id": name, "format": "h264", "data": unit}
+            yield t_ns, f"{topic}/image/video", "foxglove_msgs/msg/CompressedVideo", video
             is_empty = False
     if is_empty:
         for t_ns in _seconds(span_ns):

@@ -5,7 +5,7 @@
     world/<person>/skeleton            joints with their bones, at every time of the skeleton
     world/<person>/uncertainty         95 % ellipsoids
     world/cameras/<camera>            its pose (the refined one if there is one), over time
-    world/cameras/<camera>/image      pinhole, and pictures with the skeleton drawn into them (JPEG, 960 px)
+    world/cameras/<camera>/image      pinhole, and pictures with the skeleton drawn into them (H.264, 960 px)
     world/paths/<camera>              its path
     angles/<person>/<angle>            series in degrees; in `<angle>/sigma` its standard deviation
     doubts                            what contradicts itself in the flight, as warnings at the beginning
@@ -23,15 +23,15 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.exporting import (
-    as_jpeg,
     ellipsoids_95,
     file_names_of_people,
     safe_file_name,
     shown_surface,
     thinned,
 )
+from pipelines.formats.videos.video_writing import H264Stream
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.cameras import Intrinsics, camera_matrix
+from pipelines.geometry.cameras import Intrinsics, camera_matrix, rescaled
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import need
@@ -183,14 +183,17 @@ def _log_track(rr: Any, stream: Any, name: str, track: Trajectory) -> None:
 
 def _log_pictures(rr: Any, stream: Any, recording: Recording, name: str, lens: Intrinsics) -> None:
     entity = f"world/cameras/{rr.escape_entity_path_part(name)}/image"
-    shown = lens
+    film = H264Stream()
     for t_ns, picture in recording.overlays(name):
-        shown, jpeg = as_jpeg(name, picture, lens)
+        if film.size == (0, 0):
+            stream.log(entity, rr.VideoStream(codec=rr.VideoCodec.H264), static=True)
+        unit, is_key = film.encode(picture)
         stream.send_columns(
             entity,
             [_times(rr, np.array([t_ns], np.int64))],
-            rr.EncodedImage.columns(blob=[jpeg], media_type=["image/jpeg"]),
+            rr.VideoStream.columns(sample=[unit], is_keyframe=[is_key]),
         )
+    shown = rescaled(lens, *film.size) if film.size[0] else lens
     stream.log(
         entity,
         rr.Pinhole(

@@ -12,11 +12,13 @@ import numpy as np
 from pipelines.geometry.arrays import Int64, Picture
 
 if TYPE_CHECKING:
-    from av import Packet, VideoStream
+    from av import Packet, VideoCodecContext, VideoStream
 
 TICK_S = Fraction(1, 90_000)
 """Unit of the stamps, as in MPEG; a stamp is off by up to 5.6 microseconds."""
 
+# Of pictures in a log, often two a second: a viewer decodes from a key frame on.
+_WIDEST_PX, _SEEK_EVERY = 960, 10
 # The edit list that shifts a part to its start counts in the movie's own unit, by default 1 ms.
 _KEY_EVERY = 60  # frames from one key frame to the next; a seek goes to a key frame
 _OPTIONS = {"movflags": "faststart", "movie_timescale": str(TICK_S.denominator)}
@@ -59,6 +61,51 @@ def write_h264(
             frame.pts, frame.time_base = pts, TICK_S
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
+
+
+class H264Stream:
+    """Encoder of the pictures of one camera for logs: one access unit of H.264 (Annex B) for each picture.
+
+    There are no B frames, and every key frame carries its parameter sets, as foxglove.CompressedVideo and
+    Rerun's VideoStream want it. All pictures have the size of the first, at most 960 px wide, made even. One
+    thread: the same pictures give the same bytes.
+    """
+
+    def __init__(self) -> None:
+        self._codec: VideoCodecContext | None = None
+        self._count = 0
+
+    def encode(self, picture: Picture) -> tuple[bytes, bool]:
+        """Encode a picture [height, width, 3] BGR; return its access unit, and if it is a key frame."""
+        import av
+        import cv2
+
+        if self._codec is None:
+            self._codec = _open_stream(picture.shape[1], picture.shape[0])
+        size = (self._codec.width, self._codec.height)
+        if (picture.shape[1], picture.shape[0]) != size:
+            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
+        frame.pts, self._count = self._count, self._count + 1
+        packets = self._codec.encode(frame)
+        return b"".join(bytes(packet) for packet in packets), any(packet.is_keyframe for packet in packets)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the video, px; (0, 0) before its first picture."""
+        return (0, 0) if self._codec is None else (self._codec.width, self._codec.height)
+
+
+def _open_stream(width: int, height: int) -> VideoCodecContext:
+    """Open an encoder that gives each picture at once, for pictures of a size."""
+    from av import VideoCodecContext
+
+    shrunk = min(_WIDEST_PX / width, 1.0)
+    codec = VideoCodecContext.create("libx264", "w")
+    codec.width, codec.height = (max(2 * round(shrunk * side / 2), 2) for side in (width, height))
+    codec.pix_fmt, codec.time_base, codec.thread_count = "yuv420p", TICK_S, 1
+    codec.options = {"crf": "23", "preset": "fast", "tune": "zerolatency", "g": str(_SEEK_EVERY), "bf": "0"}
+    return codec
 
 
 def join_videos(path: Path, parts: Sequence[Path]) -> None:

@@ -19,6 +19,7 @@
   }));
   const body = scene.body && {
     ...scene.body,
+    feet: numbers(scene.body.feet, Int32Array),
     middle: numbers(scene.body.middle, Int32Array),
     joint: numbers(scene.body.joint, Int16Array),
     truth: scene.body.truth && numbers(scene.body.truth, Int16Array),
@@ -200,6 +201,7 @@
     if (through) return through;
     const { canvas, distance } = view;
     const target = view.whole || !people ? centre : steadyAt(person(), at);
+    const ground = groundAt(at);
     const axes = eyeAxes(angles);
     const eye = target.map((value, k) => value - distance * axes[2][k]);
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -210,7 +212,7 @@
       return axes.map((axis) => dot(q, axis));
     };
     const flat = (q) => [width / 2 + (focal * q[0]) / q[2], height / 2 - (focal * q[1]) / q[2]];
-    return { target, axes, width, height, focal, near, inside, flat, distance, context: view.context };
+    return { target, ground, axes, width, height, focal, near, inside, flat, distance, context: view.context };
   }
 
   /** The flight as the chosen camera sees it, by its pinhole alone; null without a choice, or without its pose. */
@@ -229,7 +231,8 @@
     const distance = Math.max(Math.hypot(...target.map((value, k) => value - eye[k])), 0.5);
     const frame = [...place(left, top), focal * (right - left), focal * (bottom - top)];
     const flat = (q) => place(q[0] / q[2], -q[1] / q[2]);
-    return { target, axes, width, height, focal, near: 0.05, inside, flat, distance, context: view.context, own: c, frame };
+    const ground = groundAt(at);
+    return { target, ground, axes, width, height, focal, near: 0.05, inside, flat, distance, context: view.context, own: c, frame };
   }
 
   /** Left, right, upper and lower edge of a camera's picture, 1 m in front of it; those of a fisheye lens cut off. */
@@ -297,7 +300,7 @@
   function drawGround(eye) {
     const step = spacing(eye.distance);
     const snapped = [0, 1].map((axis) => Math.round(eye.target[axis] / step) * step);
-    const at = (i, j) => [snapped[0] + i * step, snapped[1] + j * step, scene.ground];
+    const at = (i, j) => [snapped[0] + i * step, snapped[1] + j * step, eye.ground];
     for (let level = 0; level < LEVELS; level++) {
       const style = { strokeStyle: colours.grid, lineWidth: 1, globalAlpha: 1 - level / LEVELS };
       stroke(eye, style, () => {
@@ -326,11 +329,17 @@
     }
   }
 
-  const onGround = (point) => [point[0], point[1], scene.ground];
+  const onGround = (point, height = scene.ground) => [point[0], point[1], height];
+
+  /** The height on which a person stands at a stored time. */
+  const feetOf = (p, k) => body.feet[k * people + p] / 1e3;
+
+  /** The height of the ground that is drawn: the one on which the chosen person stands. */
+  const groundAt = (at) => (people ? mix([feetOf(person(), at.low)], [feetOf(person(), at.high)], at.fraction)[0] : scene.ground);
 
   function drawPaths(eye, at, t) {
     for (let p = 0; p < people; p++) {
-      const pointAt = (k) => (known(body.middle, k * people + p) ? onGround(steady[p][k]) : null);
+      const pointAt = (k) => (known(body.middle, k * people + p) ? onGround(steady[p][k], feetOf(p, k)) : null);
       stroke(eye, { strokeStyle: colours.ink, lineWidth: 1, globalAlpha: 0.3 }, () => path(eye, Infinity, pointAt));
       stroke(eye, { strokeStyle: colours.ink, lineWidth: 1.8, globalAlpha: 0.8 }, () => path(eye, t, pointAt));
     }
@@ -341,9 +350,9 @@
       const position = cameraPosition(camera, at);
       if (!position) return;
       stroke(eye, { strokeStyle: colours.cameras[c], lineWidth: 1, globalAlpha: 0.5, dash: [2, 3] }, () =>
-        line(eye, position, onGround(position)),
+        line(eye, position, onGround(position, eye.ground)),
       );
-      dotAt(eye, onGround(position), 1.8, colours.cameras[c]);
+      dotAt(eye, onGround(position, eye.ground), 1.8, colours.cameras[c]);
     });
   }
 
@@ -410,9 +419,11 @@
 
   const depthOf = (eye, a, b) => (eye.inside(a)[2] + eye.inside(b)[2]) / 2;
 
-  function drawShadow(eye, joints) {
+  function drawShadow(eye, joints, p, at) {
+    const height = mix([feetOf(p, at.low)], [feetOf(p, at.high)], at.fraction)[0];
+    const under = (joint) => onGround(joint, height);
     stroke(eye, { strokeStyle: colours.muted, lineWidth: 2, globalAlpha: 0.28 }, () => {
-      for (const [a, b] of body.bones) if (joints[a] && joints[b]) line(eye, onGround(joints[a]), onGround(joints[b]));
+      for (const [a, b] of body.bones) if (joints[a] && joints[b]) line(eye, under(joints[a]), under(joints[b]));
     });
   }
 
@@ -510,7 +521,7 @@
     const width = Math.min(Math.max((0.04 * eye.focal) / eye.distance, 1.6), 5);
     for (let p = 0; p < people; p++) {
       const joints = jointsAt(body.joint, p, at);
-      drawShadow(eye, joints);
+      drawShadow(eye, joints, p, at);
       parts.push(...boneParts(eye, joints, (side) => ({ strokeStyle: colours.sides[side], lineWidth: width })));
       parts.push(...jointParts(eye, joints, 0.75 * width + 0.4));
       if (body.root && shown("ellipsoids")) around.push(...ellipsoidParts(eye, joints, p, at));

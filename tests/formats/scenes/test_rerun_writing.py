@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -96,11 +97,17 @@ def test_cameras_move_and_show_their_pictures(chunks: dict[str, list[Any]]) -> N
     moved = np.array([row[0] for row in column(chunks, entity, "Transform3D:translation")])
     np.testing.assert_allclose(moved, flown().position, rtol=FLOAT32, atol=1e-7)
     images = f"{entity}/image"
-    assert len(column(chunks, images, "EncodedImage:blob")) == 4
+    units = column(chunks, images, "VideoStream:sample")
+    keys = column(chunks, images, "VideoStream:is_keyframe")
+    assert [bool(key) for (key,) in keys] == [True, False, False, False]
+    decoder = av.VideoCodecContext.create("h264", "r")
+    packets = [av.Packet(np.asarray(unit, np.uint8).tobytes()) for (unit,) in units]
+    shown = [frame for packet in [*packets, None] for frame in decoder.decode(packet)]
+    assert [(frame.width, frame.height) for frame in shown] == [(960, 540)] * 4
     times = [
         int(stamp)
         for batch in chunks[images]
-        if "EncodedImage:blob" in batch.schema.names
+        if "VideoStream:sample" in batch.schema.names
         for stamp in np.asarray(batch.column("time").to_numpy(zero_copy_only=False)).astype(np.int64)
     ]
     assert times == stamps(60)[::15].tolist()
