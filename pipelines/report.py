@@ -49,8 +49,8 @@ from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_p
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = Stage("report", revision=11)
 REPORT = Stage("report", revision=12)
+_FIGURES_REVISION = 6
 
 
 @dataclass(frozen=True)
