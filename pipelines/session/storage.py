@@ -1,5 +1,6 @@
 """Files that survive a kill, reproducible JSON, and hashes of files that were read or written."""
 
+import codecs
 import errno
 import hashlib
 import json
@@ -17,6 +18,8 @@ import numpy as np
 from pipelines.session.errors import DataError
 
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+_UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # spreadsheets and some editors write them
 
 _REMEDIES = {
     errno.ENOENT: "check the path; those in a flight.yaml are relative to it",
@@ -82,6 +85,24 @@ def refuse_special(path: Path) -> None:
         raise DataError(
             path, "is a pipe, a socket or a device", "write what comes out of it to a file, and name that"
         )
+
+
+def text_encoding(content: bytes) -> str:
+    """Return the encoding of a text by its first bytes: UTF-16 if they are its mark, else UTF-8."""
+    return "utf-16" if content.startswith(_UTF16_MARKS) else "utf-8-sig"
+
+
+def plain_text(content: bytes, errors: str = "replace") -> str:
+    r"""Decode UTF-8, or UTF-16 that begins with its mark, without the mark and with lines ending in "\n".
+
+    Args:
+        content: a file, or its beginning.
+        errors: `replace`, so that bytes which are no text become a sign that no number contains, or `strict`.
+
+    Raises:
+        UnicodeDecodeError: with `strict`, bytes that are no such text.
+    """
+    return content.decode(text_encoding(content), errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
 def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sha256()) -> str:

@@ -10,6 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pipelines.session.storage import plain_text
+
 _HEAD_BYTES = 64 * 1024
 _LARGEST_PARSED = 8 << 20  # bytes; larger text is described by its first line
 _SHOWN = 8  # names of keys, columns or endings in a message
@@ -66,6 +68,9 @@ _UNREAD = (
      "name the .amc that it belongs to"),
     (re.compile(rb"(?:\xef\xbb\xbf)?\[Script Info\]"), "subtitles as ASS, which Autel's drones write",
      "write their positions as a CSV of poses"),
+    (re.compile(rb"(?s).{,400}<kml\b|.{,400}<TrainingCenterDatabase\b|.{8}\.FIT"),
+     "a track of a watch or a map program (KML, TCX or FIT)", "export it as GPX"),
+    (re.compile(rb"\$G[A-Z]{4},"), "a receiver's log (NMEA)", "convert it to GPX (GPSBabel does)"),
     (re.compile(rb"# Camera list|# Image list|# 3D point list"), "one file of a COLMAP model",
      "name the folder that holds it"),
     (re.compile(rb"(?s).{,200}rosbag2_bagfile_information:"), "the metadata of a ROS 2 bag",
@@ -105,8 +110,6 @@ def _of_folder(path: Path) -> Likeness:
 
 def _of_bytes(path: Path, head: bytes) -> Likeness | None:
     """Describe a file by its first bytes and its name; None if it may be text."""
-    if head[:2] in {b"\xff\xfe", b"\xfe\xff"}:
-        return Likeness("is text in UTF-16", "save it as UTF-8")
     if (
         len(head) >= 16
         and not any(head[1:64:2])
@@ -128,7 +131,10 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
             return Likeness(f"begins as {kind} but is none that can be read", _COPY)
     if path.suffix.lower() in {".tlog", ".laz", ".las"}:
         return Likeness(f"is called {path.suffix} but holds nothing of that kind", _COPY)
-    if b"\0" in head or _undecodable(head):
+    is_utf16 = head.startswith((b"\xff\xfe", b"\xfe\xff"))
+    if (b"\0" in head or _undecodable(head)) and not is_utf16:
+        if not any(c < 32 and c not in b"\t\n\f\r" for c in head):
+            return Likeness("is text, but not UTF-8", "save it as UTF-8")
         return Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
     return None
 
@@ -142,7 +148,7 @@ def _undecodable(head: bytes) -> bool:
 
 
 def _of_text(path: Path, head: bytes, size: int) -> Likeness:
-    text = head.decode("utf-8-sig", "replace")
+    text = plain_text(head)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if not lines:
         return Likeness("holds blank lines only", "")
@@ -161,9 +167,10 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
         if len(cells) > 2 and len(lines) > 1 and lines[1].count(mark) > len(cells) // 2:
             named = sum(bool(re.match(r"[A-Za-z_]", cell)) for cell in cells) > len(cells) / 2
             columns = f"the columns {_listed(cells)}" if named else f"{len(cells)} columns without names"
-            if {"latitude", "longitude"} <= {cell.lower() for cell in cells}:
+            if {"latitude", "longitude"} <= (names := {cell.lower() for cell in cells}):
                 problem = f"is a table of places on Earth whose writer is not known, with {columns}"
-                return Likeness(problem, "poses need attitudes, too: give the drone's own log")
+                lacks = "a writer that is known" if any("yaw" in name for name in names) else "attitudes, too"
+                return Likeness(problem, f"poses need {lacks}: give the drone's own log")
             remedy = "poses need a time, x, y, z, qx, qy, qz, qw; joints person, joint, x, y, z"
             return Likeness(f"is a table with {columns}", f"{remedy}, by name in the first line")
     return Likeness(f"is text that begins with {lines[0][:_WIDEST]!r}")
@@ -183,7 +190,7 @@ def _of_json(path: Path) -> Likeness:
 
 def _of_toml(path: Path) -> Likeness:
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        content = tomllib.loads(plain_text(path.read_bytes(), errors="strict"))
     except (OSError, ValueError, RecursionError) as error:
         return Likeness(f"is no valid TOML ({str(error)[:100]})", "write it again")
     return Likeness(
@@ -197,7 +204,7 @@ def _of_yaml(path: Path) -> Likeness:
 
     content: object = None
     with suppress(YAMLError, OSError, ValueError, RecursionError):
-        text = path.read_text(encoding="utf-8-sig")
+        text = plain_text(path.read_bytes(), errors="strict")
         content = YAML(typ="safe", pure=True).load(re.sub(r"\A%YAML:", "#", text))
     if not isinstance(content, dict):
         return Likeness("is YAML without names at its top")

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
 from pipelines.session.errors import DataError
-from pipelines.session.storage import refuse_special
+from pipelines.session.storage import plain_text, refuse_special
 
 _LARGEST_FILE = 1_000_000  # bytes; a real one has a few thousand
 _LATEST_NS = 2**62  # differences of two such times fit int64
@@ -96,7 +96,7 @@ def _read_yaml(path: Path, noun: str) -> object:
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise DataError(path, f"is larger than {_LARGEST_FILE} bytes", f"this is no {noun}")
-        text = path.read_text(encoding="utf-8-sig")
+        text = plain_text(path.read_bytes(), errors="strict")
     except OSError as error:
         raise DataError(path, f"cannot be read ({error.strerror})", f"give the path of a {noun}") from None
     except UnicodeDecodeError:

@@ -684,9 +684,14 @@ class FlightPoses:
 def _reader(kind: str, path: Path) -> Format:
     """Return the format of a drone's own log; DJI's comes as subtitles, flight record, pictures or video."""
     several = ("dji_record", "dji_binary", "dji_video", "picture_tags") if kind == "dji" else ()
-    return next(
-        (found for name in several if (found := FORMATS.get(name)).recognises(path)), FORMATS.get(kind)
-    )
+    found = next((found for name in several if (found := FORMATS.get(name)).recognises(path)), None)
+    if several and found is None and path.exists() and path.suffix.lower() != ".srt":
+        raise DataError(
+            path,
+            "holds no subtitles, flight record (CSV), telemetry track (djmd) or tagged pictures of DJI's",
+            "`mocap info` says what it is",
+        )
+    return found or FORMATS.get(kind)
 
 
 def _first_place(track: PositionTrack) -> Place:

@@ -25,6 +25,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy, Trajectory
 from pipelines.session.registries import need
 
+_NEAREST_M = 10_000.0
 _NO_PLACE = "check the CRS: world.crs and map.crs are those of the numbers in the files"
 
 
@@ -61,6 +62,8 @@ class Projection:
         authority = crs.to_authority(min_confidence=100)
         self.name = ":".join(authority) if authority else crs.name
         self._step = 1.0 if crs.is_projected else 1e-5  # a unit north by which grid north is found
+        # A grid that a registry knows has its zero far from any flight.
+        self._nearest_m = _NEAREST_M if crs.is_projected and crs.area_of_use is not None else 0.0
         self._to_earth = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
 
     def first_place(self, source: Path | str, position: Float) -> Place:
@@ -111,6 +114,11 @@ class Projection:
 
     def _geodetic(self, source: Path | str, position: Float) -> Float:
         """Return latitude, longitude (deg) and height (m) of positions [N, 3]."""
+        from_zero = np.abs(position[:, :2]).max(axis=1, initial=0)
+        if len(position) and np.nanmax(from_zero, initial=0) < self._nearest_m:
+            x, y = position[0, :2].tolist()
+            problem = f"its x {x:.0f}, y {y:.0f} are metres of a local frame, not coordinates in {self.name}"
+            raise DataError(source, problem, _NO_PLACE)
         longitude, latitude = self._to_earth.transform(position[:, 0], position[:, 1])
         found = np.stack([latitude, longitude, position[:, 2]], axis=1)
         found[~np.isfinite(found).all(axis=1)] = np.nan  # pyproj says inf outside the CRS

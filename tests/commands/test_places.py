@@ -157,6 +157,13 @@ def test_a_crs_that_is_none_is_refused(tmp_path: Path, crs: str) -> None:
     assert "EPSG:32632" in said
 
 
+def test_local_metres_are_no_coordinates_of_a_registered_grid(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=1, seconds=0.2, clean=True)
+    flight.settings["world"]["crs"] = ZONE
+    flight.save()
+    assert ZONE in refused("ingest", flight.manifest)
+
+
 def test_another_zone_is_refused_by_the_distance(tmp_path: Path) -> None:
     flight = flown_in_utm(tmp_path)
     flight.settings["world"]["crs"] = "EPSG:32632"

@@ -21,7 +21,12 @@ SUBTITLE = "1\n00:00:00,000 --> 00:00:01,000\nHello\n"
     ("name", "content", "word"),
     [
         ("empty.csv", b"", "empty"),
-        ("a.srt", SUBTITLE.encode("utf-16"), "UTF-16"),
+        ("a.srt", SUBTITLE.encode("utf-16"), "subtitles"),
+        ("a.csv", "Höhe,Länge\n1,2\n".encode("cp1252"), "not UTF-8"),
+        ("a.kml", b'<?xml version="1.0"?>\n<kml xmlns="x">', "KML"),
+        ("a.fit", bytes([14, 16, 0, 0, 1, 0, 0, 0]) + b".FIT" + bytes(9), "FIT"),
+        ("a.nmea", b"$GPGGA,1,2,N,3,E,1\n", "NMEA"),
+        ("a.csv", b"Time,Latitude,Longitude,Yaw\n1,2,3,4\n", "writer is not known"),
         ("a.srt", SUBTITLE.encode("utf-16-le"), "UTF-16"),
         ("a.srt", SUBTITLE.encode(), "subtitles"),
         ("a.mcap", b"\x89MCAQ0\r\n" + bytes(100), "MCAP"),

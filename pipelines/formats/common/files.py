@@ -8,7 +8,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error, is_special, refuse_special
+from pipelines.session.storage import as_data_error, is_special, plain_text, refuse_special
 from pipelines.session.yaml_files import plain_yaml
 
 HEAD_BYTES = 64 * 1024
@@ -104,24 +104,24 @@ def leads_out(stated: str) -> bool:
 
 
 def read_text(path: Path) -> str:
-    r"""Read the whole file as UTF-8 without a byte order mark, lines ending in "\n".
+    r"""Read the whole file as UTF-8, or as UTF-16 that begins with its mark, lines ending in "\n".
 
     Raises:
         DataError: missing, unreadable, or not text.
     """
     refuse_special(path)
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return plain_text(path.read_bytes(), errors="strict")
     except OSError as error:
         raise DataError(
             path, f"cannot be read ({error.strerror})", "check the path and its permissions"
         ) from error
     except UnicodeDecodeError as error:
-        raise DataError(path, f"is not UTF-8 text (byte {error.start})", "save it as plain text") from error
+        raise DataError(path, f"is not UTF-8 text (byte {error.start})", "save it as UTF-8") from error
 
 
 def read_head(path: Path, suffixes: Collection[str] = ()) -> str:
     """Read the first lines of a text file, to recognise it; like `first_bytes`."""
     head = first_bytes(path, suffixes=suffixes)
-    text = head.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+    text = plain_text(head)
     return text if len(head) < HEAD_BYTES else text.rpartition("\n")[0]

@@ -7,6 +7,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from decimal import ROUND_HALF_UP, Decimal, InvalidOperation
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +26,8 @@ SECONDS, MILLISECONDS, MICROSECONDS, NANOSECONDS = 9, 6, 3, 0
 _UNITS = {"s": SECONDS, "sec": SECONDS, "ms": MILLISECONDS, "us": MICROSECONDS, "ns": NANOSECONDS}
 _STAMP_NAMES = {"t", "time", "timestamp", "stamp"}
 _LARGEST = 2**63 - 1
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 NORM_TOLERANCE = 0.1
 """Largest deviation of a quaternion from unit length: up to this rounding explains it, beyond not."""
@@ -59,7 +62,7 @@ def parse_table(
     """Read delimited rows of `columns` cells; blank lines and lines that begin with # are skipped.
 
     If the last line does not parse, its writing was probably interrupted: it is left out and counted in
-    `truncated`.
+    `truncated`. Where commas do not separate cells and the first row has no dot, commas are decimal.
 
     Args:
         body: its text below the header.
@@ -74,6 +77,8 @@ def parse_table(
     import pyarrow as pa
 
     body = re.sub(r"\n[ \t]*#[^\n]*", "\n", "\n" + body)[1:]
+    if delimiter in ";\t" and "." not in (body.strip() + "\n").partition("\n")[0]:
+        body = body.replace(",", ".")
     wanted = {**text, **numbers}
     for truncated in (0, 1):
         try:
@@ -158,6 +163,7 @@ def parse_stamps(
     MILLISECONDS, MICROSECONDS or NANOSECONDS. The result is 0 where the second array is False, because the
     text is no finite number that int64 nanoseconds can hold. If the file does not state its unit, stamps that
     would lie after the year 2262 are read in the unit in which they do not (EuRoC's `#timestamp`: ns).
+    Dates with times by ISO 8601 are read whatever the unit; without a zone they are UTC.
 
     Raises:
         DataError: most stamps are too large for the stated unit (after the year 2262), so the unit is wrong.
@@ -170,7 +176,11 @@ def parse_stamps(
     t_ns, readable = _parse_plain(column, unit)
     too_large: list[Decimal] = []
     for index in np.flatnonzero(~readable):
-        value = _decimal(column[int(index)].as_py())
+        cell = column[int(index)].as_py()
+        if (date_ns := _date_ns(cell)) is not None:
+            t_ns[index], readable[index] = date_ns, True
+            continue
+        value = _decimal(cell)
         if value is None:
             continue
         exact = value.scaleb(unit)
@@ -209,6 +219,19 @@ def _parse_plain(column: pa.ChunkedArray, unit: int) -> tuple[Int64, Bool]:
     magnitude = np.where(plain, units, 0) * 10**unit + (integers(one_more) + 5) // 10
     negative = np.asarray(pc.equal(sign, "-").to_numpy(), dtype=np.bool_)
     return np.where(plain, np.where(negative, -magnitude, magnitude), 0), plain
+
+
+def _date_ns(text: str) -> int | None:
+    """Parse a date with a time by ISO 8601, also with a blank for the T, as ns since the epoch, or None."""
+    match = _DATE.fullmatch(text)
+    if match is None:
+        return None
+    try:
+        elapsed = datetime.fromisoformat(match[1].replace(" ", "T") + (match[3] or "+00:00")) - _EPOCH
+    except ValueError:
+        return None
+    t_ns = elapsed // timedelta(seconds=1) * 10**9 + int((match[2] or "0").ljust(9, "0"))
+    return t_ns if abs(t_ns) <= _LARGEST else None
 
 
 def _decimal(text: str) -> Decimal | None:

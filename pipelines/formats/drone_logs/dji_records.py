@@ -28,7 +28,7 @@ from pipelines.formats.common.rows import describe_times
 from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, range_of, telemetry_of_rows
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error, refuse_special
+from pipelines.session.storage import as_data_error, refuse_special, text_encoding
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 _FIRST_YEAR, _LAST_YEAR = 1970, 2200  # of dates; others are damage
@@ -359,7 +359,9 @@ def _read(path: Path) -> _Record:
 
 def _rows(path: Path, heading: _Heading) -> Iterator[list[str]]:
     """Yield the rows below the heading that are not blank; one that is no CSV comes as an empty row."""
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+    with path.open("rb") as file:
+        encoding = text_encoding(file.read(2))
+    with path.open(encoding=encoding, errors="replace", newline="") as file:
         below = (line.replace("\0", "") for line in islice(file, heading.line + 1, None))
         rows = csv.reader(below, delimiter=heading.delimiter)
         while True:

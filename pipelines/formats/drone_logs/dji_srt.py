@@ -28,7 +28,7 @@ from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _BRACKETS = re.compile(r"\[([^\[\]\n]{1,300})\]")
-_PAIR = re.compile(rf"([A-Za-z_]+)\s*:\s*{_NUMBER}(?![\d/])")
+_PAIR = re.compile(r"([A-Za-z_]+)\s*:\s*([-+]?\d+(?:[.,]\d+)?)(?![\d/])")  # with a decimal dot or comma
 _GPS = re.compile(rf"GPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(M?)")
 _ANGLES = {
     part: re.compile(rf"\b{letter}\.PRY\s*\(\s*{_NUMBER}[^,\d]*,\s*{_NUMBER}[^,\d]*,\s*{_NUMBER}")
@@ -129,7 +129,7 @@ def _fields(text: str) -> dict[str, float]:
     for bracket in _BRACKETS.findall(text):
         for key, number in _PAIR.findall(bracket):
             name = key.lower()
-            fields[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number)
+            fields[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number.replace(",", "."))
     if "GPS" in text and (gps := _GPS.search(text)):
         first, second, third = (float(part) for part in gps.groups()[:3])
         if gps[4]:  # the M of a height: only this form begins with the latitude

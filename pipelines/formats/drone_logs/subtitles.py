@@ -9,14 +9,15 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
+from pipelines.session.storage import plain_text
 
 _TIMECODE = r"(\d+):([0-5]\d):([0-6]\d)[,.](\d{3})"  # a Matrice 300 ends its 60th second at :60
 _BLOCK = re.compile(rf"(?m)^{_TIMECODE} --> {_TIMECODE}[ \t]*$")
 _CLOCK = re.compile(
-    r"(\d{4})[-.](\d{1,2})[-.](\d{1,2}) +(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d{3}))?(?:,(\d{3}))?(?!\d)"
+    r"(\d{4})[-./](\d{1,2})[-./](\d{1,2}) +(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d{3}))?(?:,(\d{3}))?(?!\d)"
 )
 # Some Mavic 2 write no display times: a number, then the clock time on a line of its own.
-_UNTIMED = re.compile(r"(?m)^\d+[ \t]*\n(?=\d{4}[-.]\d{1,2}[-.]\d{1,2} +\d)")
+_UNTIMED = re.compile(r"(?m)^\d+[ \t]*\n(?=\d{4}[-./]\d{1,2}[-./]\d{1,2} +\d)")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _SLOW_NS = 500_000_000  # subtitles further apart than this come once a second, with whole seconds
 
@@ -66,10 +67,10 @@ def read_subtitles(path: Path) -> Subtitles:
         DataError: the file cannot be read, or holds no subtitles.
     """
     try:
-        text = path.read_bytes().decode("utf-8-sig", errors="replace")
+        text = plain_text(path.read_bytes())
     except OSError as error:
         raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    subtitles = parse_subtitles(text.replace("\r\n", "\n").replace("\r", "\n"))
+    subtitles = parse_subtitles(text)
     if not subtitles.texts:
         raise DataError(
             path, "holds no subtitles" if text.strip() else "is empty", "copy it from the drone again"

@@ -319,8 +319,8 @@ def _read(path: Path) -> _Packets:
                 if packet.stamp_us > _LARGEST_US:
                     found.dropped["absurd stamp"] = found.dropped.get("absurd stamp", 0) + 1
                     continue
-                found.first_us = found.first_us or packet.stamp_us
-                found.last_us = packet.stamp_us
+                found.first_us = min(found.first_us or packet.stamp_us, packet.stamp_us)
+                found.last_us = max(found.last_us, packet.stamp_us)
                 found.counts[packet.message] += 1
                 sender = packet.system, packet.component
                 if sender in last:

@@ -7,6 +7,7 @@ them. GPX has no accuracy.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
@@ -18,7 +19,7 @@ from xml.etree import ElementTree as ET
 from pipelines.formats.common.files import first_bytes
 from pipelines.session.errors import DataError
 from pipelines.session.records import Message, Topic
-from pipelines.session.storage import as_data_error
+from pipelines.session.storage import as_data_error, plain_text
 
 _TYPE = "sensor_msgs/msg/NavSatFix"
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -34,7 +35,8 @@ class GpxFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file's first element is gpx."""
-        return b"<gpx" in first_bytes(path, 4096, suffixes=self.suffixes)
+        head = plain_text(first_bytes(path, 4096, suffixes=self.suffixes))
+        return re.search(r"<(?:\w+:)?gpx\b", head) is not None
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe every track by its topic, points and times, and the losses."""

@@ -235,9 +235,11 @@ def _refuse_impossible_records(path: Path) -> None:
     head = first_bytes(path, 375)
     counts = [int.from_bytes(head[place : place + 4], "little") for place in (100, 243)]
     counts = counts if head[25:26] >= b"\x04" and len(head) >= 375 else counts[:1]
-    if len(head) < 227:
+    size = path.stat().st_size
+    if len(head) < 227 or not 227 <= int.from_bytes(head[96:100], "little") <= size:
+        # The points begin behind the header: before its end, or behind the file's, is damage.
         raise DataError(path, f"is cut off within its header ({len(head)} bytes)", _COPY)
-    if sum(counts) * _RECORD > path.stat().st_size:
+    if sum(counts) * _RECORD > size:
         raise DataError(
             path, f"has a header that states {sum(counts)} records, more than it has room for", _COPY
         )

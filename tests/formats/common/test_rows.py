@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from decimal import Decimal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from pipelines.formats.common.rows import (
     cell_name,
     format_seconds,
     parse_stamps,
+    parse_table,
     stamp_column,
 )
 from tests.formats.refusals import refuses
@@ -119,3 +121,34 @@ def test_cell_names() -> None:
     dotted = "pose.position.x"
     assert cell_name(dotted) == ("pose_position_x", "")
     assert cell_name("q_RS_w []") == ("q_rs_w", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2023-11-14 22:13:20", 1_700_000_000_000_000_000),
+        ("2023-11-14T22:13:20.123456789Z", 1_700_000_000_123_456_789),
+        ("2023-11-14T23:13:20,5+01:00", 1_700_000_000_500_000_000),
+        ("2023-11-14 16:43:20-0530", 1_700_000_000_000_000_000),
+    ],
+)
+def test_dates_are_stamps_in_any_unit(text: str, expected: int) -> None:
+    for unit in (SECONDS, NANOSECONDS):
+        t_ns, readable = parse_stamps("log", [text, "2023-13-14 22:13:20"], unit)
+        assert (t_ns.tolist(), readable.tolist()) == ([expected, 0], [True, False])
+
+
+@pytest.mark.parametrize(("body", "expected"), [("1,5;2,25\n-3;4e-1\n", 2.25), ("1.5;2,25\n1.5;2.5\n", None)])
+def test_commas_are_decimal_where_they_separate_nothing(body: str, expected: float | None) -> None:
+    def read() -> float:
+        columns = {"a": 0, "b": 1}
+        table = parse_table(
+            Path("a.csv"), body, delimiter=";", columns=2, text={}, numbers=columns, first_line=2
+        )
+        return float(table.numbers["b"][0])
+
+    if expected is None:  # dots and commas in one row: the commas may separate thousands
+        with refuses("a.csv", 2):
+            read()
+    else:
+        assert read() == expected

@@ -123,6 +123,14 @@ def test_airdata_is_placed_by_its_clock_and_its_gimbal_looks_where_it_says(tmp_p
     assert (first_ns - int(telemetry.position.t_ns[0]), last_ns - first_ns) == (2_000_000_000, 1_900_000_000)
 
 
+def test_a_record_saved_in_utf16_is_the_same(tmp_path: Path) -> None:
+    path = airdata(tmp_path / "a.csv")
+    expected = read(path).position.values
+    path.write_bytes(path.read_text().encode("utf-16"))
+    assert FORMAT.recognises(path)
+    np.testing.assert_array_equal(read(path).position.values, expected)
+
+
 def test_a_gimbal_that_is_zero_throughout_is_none(tmp_path: Path) -> None:
     assert read(airdata(tmp_path / "a.csv", gimbal=False)).gimbal is None
 

@@ -325,3 +325,16 @@ def test_angles_whose_refresh_does_not_keep_step_with_the_pictures_become_lines(
     behind = 20 * (t_ns / 1e9) - found
     # Each measurement is shown up to a picture late, and none follows the last one.
     assert np.ptp(behind[:-4]) < 20 / 29.97 + 1e-6
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_subtitles_of_other_programs(tmp_path: Path, encoding: str) -> None:
+    """Decimal commas and dates with slashes are the same numbers; an editor may have saved UTF-16."""
+    path = subtitles(tmp_path / "a.srt", "[latitude: 47,25] [longitude: -8,125] [rel_alt: 3,5 abs_alt: 400]")
+    expected_ns = read(path).position.t_ns.tolist()
+    assert "2024-05-01" in path.read_text()
+    path.write_bytes(path.read_text().replace("2024-05-01", "2024/05/01").encode(encoding))
+    assert FORMAT.recognises(path)
+    track = read(path).position
+    assert track.values.tolist() == [[47.25, -8.125, 3.5]]
+    assert track.t_ns.tolist() == expected_ns

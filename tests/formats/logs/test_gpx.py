@@ -43,6 +43,15 @@ def test_points_are_fixes_by_time(tmp_path: Path) -> None:
     assert (second.value.latitude, second.value.longitude, second.value.altitude) == (48.1, -11.5, 500.5)
 
 
+def test_a_prefix_of_the_schema_changes_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path, track(point(0)))
+    text = path.read_text().replace("xmlns=", "xmlns:g=").replace("<", "<g:").replace("<g:/", "</g:")
+    path.write_text(text.replace("<g:?", "<?"))
+    assert recognise(path, LogFormat, "log") is READER
+    with READER.open_log([path]) as log:
+        assert [topic.count for topic in log.topics] == [1]
+
+
 def test_several_tracks_are_several_topics(tmp_path: Path) -> None:
     path = write(tmp_path, track(point(0)), track(point(5), point(6)))
     with READER.open_log([path]) as log:

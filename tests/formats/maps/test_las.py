@@ -15,6 +15,7 @@ from pipelines.formats.maps import las
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat, need, recognise
+from tests.formats.refusals import refuses
 
 READER: MapFormat = las.FORMAT
 # Two voxels of 0.5 m beside each other and one above, in UTM 32 north.
@@ -107,3 +108,12 @@ def test_a_decompressor_that_ends_its_process_ends_no_other(
         else:
             with pytest.raises(DataError):
                 READER.read_map(path, resolution_m=0.5)
+
+
+@pytest.mark.parametrize("size", [240, 370])
+def test_a_header_that_is_cut_is_refused_and_not_empty(tmp_path: Path, size: int) -> None:
+    """The number of points stands behind byte 247 of a header of LAS 1.4."""
+    path = write(tmp_path / "cloud.las")
+    path.write_bytes(path.read_bytes()[:size])
+    with refuses(path, size):
+        READER.describe(path)

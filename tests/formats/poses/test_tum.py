@@ -196,7 +196,7 @@ def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:
     with refuses(tmp_path / "none.tum", "permissions"):
         READER.read_trajectory(tmp_path / "none.tum")
     path = tmp_path / "binary.tum"
-    path.write_bytes(b"\xff\xfe\x00\x01" * 100)
+    path.write_bytes(b"\x80\xfe\x00\x01" * 100)
     assert not READER.recognises(path)
     with pytest.raises(DataError, match="not UTF-8"):
         READER.read_trajectory(path)
