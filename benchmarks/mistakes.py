@@ -2,8 +2,8 @@
 
     python -m benchmarks.mistakes [--folder FOLDER] [--kept] [FLIGHT ...]
     python -m benchmarks.mistakes --bound 10    # what the standard deviations of remedies make of the error
+    python -m benchmarks.mistakes --less-usual  # other mistakes, on the flights tuned on
     python -m benchmarks.mistakes --right 40    # random right flights: none should be doubted
-    python -m benchmarks.mistakes --acrobats 40    # the same of people who lie or turn cartwheels
     python -m benchmarks.mistakes --corpus tuning|kept [--draws 1] [--mistake none] [FLIGHT ...]  # film
     python -m benchmarks.mistakes --time    # of the doubts in `reconstruct`, and of `check` on ten minutes
     python -m benchmarks.mistakes --headings 60    # when a heading 8 deg off shows in the rays
@@ -66,12 +66,14 @@ from pipelines.reconstruction.doubts.scene import Sampled, Scene, scene_of
 from pipelines.reconstruction.doubts.score import base_of, score
 from pipelines.session.description import Doubt
 from pipelines.session.errors import MocapError
+from pipelines.session.skeletons import SKELETONS
 from pipelines.session.stages import locked
 from pipelines.session.tables import POSES, read_table, trajectory_from
 from pipelines.simulate import simulate
 
 Pose = tuple[Float, Float]  # [N, 3], [N, 4]
 RATE_HZ = 30
+HEIGHT_PX = 720
 
 _SCENARIO = """\
 schema: 1
@@ -325,6 +327,7 @@ class Mistaken:
     manifest: dict[str, Any]
     poses: dict[str, tuple[Int64, Pose]]
     keypoints: Callable[[Float, int], Float] | None = None  # pixels [K, 3] of 17 joints and the width
+    only: str | None = None  # the camera whose keypoints change; None: all
 
     @property
     def names(self) -> list[str]:
@@ -339,6 +342,8 @@ class Mistaken:
             (folder / f"{name}.tum").write_text("\n".join(lines) + "\n", encoding="utf-8")
         if self.keypoints is not None:
             for name in self.names:
+                if self.only not in (None, name):
+                    continue
                 found = json.loads((folder / "made" / f"{name}_keypoints.json").read_text())
                 for person in found:
                     pixels = np.array(person["keypoints"]).reshape(-1, 3)
@@ -468,9 +473,9 @@ def own_origins(mistaken: Mistaken) -> None:
         mistaken.poses[name] = (stamps, (position - position[0] + [0, 0, position[0, 2]], quaternion))
 
 
-def with_keypoints(change: Callable[[Float, int], Float]) -> Change:
+def with_keypoints(change: Callable[[Float, int], Float], only: str | None = None) -> Change:
     def apply(mistaken: Mistaken) -> None:
-        mistaken.keypoints = change
+        mistaken.keypoints, mistaken.only = change, only
 
     return apply
 
@@ -480,6 +485,14 @@ COCO_SWAPPED = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
 
 def mirrored(pixels: Float, width: int) -> Float:
     return np.column_stack([width - 1 - pixels[:, 0], pixels[:, 1:]])
+
+
+def from_below(pixels: Float, _: int) -> Float:
+    return np.column_stack([pixels[:, 0], HEIGHT_PX - 1 - pixels[:, 1], pixels[:, 2]])
+
+
+def _both(pixels: Float, width: int) -> Float:
+    return mirrored(pixels, width)[COCO_SWAPPED]
 
 
 def as_ned(pose: Pose) -> Pose:
@@ -526,9 +539,6 @@ def _mistakes() -> list[Mistake]:
     def own(flight: Flight) -> bool:
         return not flight.carried
 
-    def both(pixels: Float, width: int) -> Float:
-        return mirrored(pixels, width)[COCO_SWAPPED]
-
     return [
         Mistake("videos swapped", ("videos_swapped",), swapped),
         Mistake("videos cycled", ("videos_swapped",), cycled, lambda flight: flight.drones > 2),
@@ -539,7 +549,7 @@ def _mistakes() -> list[Mistake]:
         Mistake("rolled by 90, one", ("mount",), of_mounts(turned("z", 90), one)),
         Mistake("tilt's sign, all", ("mount",), of_mounts(turned("x", 2 * DOWN_DEG))),
         Mistake("looks left, all", ("mount", "pose"), looks_left),
-        Mistake("pictures mirrored", ("mirrored",), with_keypoints(both)),
+        Mistake("pictures mirrored", ("mirrored",), with_keypoints(_both)),
         Mistake("x mirrored", ("mirrored",), with_keypoints(mirrored)),
         Mistake("names mirrored", ("mirrored",), with_keypoints(lambda pixels, _: pixels[COCO_SWAPPED])),
         Mistake("clock 0.3 s, one", ("clock",), of_cameras(clock(0.3), one)),
@@ -578,6 +588,87 @@ def heading(degrees: float) -> Callable[[Pose], Pose]:
 
 
 MISTAKES = _mistakes()
+
+
+def fixed_gimbal(pitch_deg: float, relative_to: str) -> Change:
+    """State the mount as fixed angles of a gimbal; right: -DOWN_DEG, relative to the body."""
+
+    def apply(mistaken: Mistaken) -> None:
+        for name in mistaken.names:
+            camera = mistaken.manifest["cameras"][name]
+            camera["mount"] = {"looks": "forward", "translation": LEVER}
+            camera["gimbal"] = {"fixed": {"yaw_deg": 0, "pitch_deg": pitch_deg}, "relative_to": relative_to}
+
+    return apply
+
+
+def renamed(pixels: Float, *parts: str) -> Float:
+    """Exchange left and right in the names of some joints of COCO."""
+    order = [
+        COCO_SWAPPED[index] if name.partition("_")[2] in parts else index
+        for index, name in enumerate(SKELETONS["coco17"].joints)
+    ]
+    return pixels[order]
+
+
+def _less_usual() -> list[Mistake]:
+    one = "drone1"
+
+    def carried(flight: Flight) -> bool:
+        return flight.carried
+
+    def x_and_y(pose: Pose) -> Pose:
+        return pose[0][:, [1, 0, 2]], pose[1]
+
+    def of_all(degrees: float) -> Change:
+        return of_poses(heading(degrees))
+
+    return [
+        Mistake("y from below", ("mirrored",), with_keypoints(from_below)),
+        Mistake("pictures mirrored, one", ("mirrored",), with_keypoints(_both, one)),
+        Mistake("x mirrored, one", ("mirrored",), with_keypoints(mirrored, one)),
+        Mistake(
+            "half-size keypoints, one",
+            ("keypoints_size",),
+            with_keypoints(lambda px, _: px * [0.5, 0.5, 1], one),
+        ),
+        Mistake(
+            "names: knees, ankles",
+            ("mirrored", "body"),
+            with_keypoints(lambda px, _: renamed(px, "knee", "ankle")),
+        ),
+        Mistake(
+            "names: elbows, wrists",
+            ("mirrored", "body"),
+            with_keypoints(lambda px, _: renamed(px, "elbow", "wrist")),
+        ),
+        Mistake(
+            "names: legs",
+            ("mirrored", "body"),
+            with_keypoints(lambda px, _: renamed(px, "hip", "knee", "ankle")),
+        ),
+        Mistake("gimbal: of world", ("gimbal",), fixed_gimbal(-DOWN_DEG, "world"), carried),
+        Mistake("gimbal: pitch's sign", ("gimbal", "mount"), fixed_gimbal(DOWN_DEG, "body"), carried),
+        Mistake("x and y exchanged", ("axes",), of_poses(x_and_y)),
+        Mistake("all headings 90 deg", ("pose", "axes", "mount"), of_all(90)),
+        Mistake("all headings -30 deg", ("pose",), of_all(-30)),
+        Mistake("feet, one", ("unit", "origin"), of_poses(lambda pose: (pose[0] / 0.3048, pose[1]), one)),
+        Mistake(
+            "w x y z, one",
+            ("convention", "pose"),
+            of_poses(lambda pose: (pose[0], np.roll(pose[1], 1, axis=-1)), one),
+        ),
+        Mistake(
+            "height 5 m off, all",
+            ("origin", "actor", "ground"),
+            of_poses(lambda pose: (pose[0] + [0, 0, 5], pose[1])),
+        ),
+        Mistake("clock -1.2 s, one", ("clock",), of_cameras(clock(-1.2), one)),
+        Mistake("60 for 30 Hz, all", ("frame_rate",), of_cameras(rate(60))),
+    ]
+
+
+LESS_USUAL = _less_usual()
 
 
 # --- measuring ---------------------------------------------------------------------------------------------
@@ -784,6 +875,11 @@ def acrobatic_flight(seed: int, folder: Path) -> Flight:
     return replace(right_flight(seed), name=f"acrobat{seed}", motion=f"{{bvh: {path}}}")
 
 
+def any_right_flight(seed: int, folder: Path) -> Flight:
+    """Draw a right flight: every third is of somebody who lies, lies down, or turns cartwheels."""
+    return acrobatic_flight(seed, folder) if seed % 3 == 0 else right_flight(seed)
+
+
 _LONG = Flight(
     "long3",
     3,
@@ -968,9 +1064,8 @@ def main() -> None:
     parser.add_argument("--mistake", action="append", default=[], help="Only these; repeat it for several.")
     parser.add_argument("--bound", type=int, default=0, metavar="N", help="Draws of a remedy's sigmas.")
     parser.add_argument("--right", type=int, metavar="N", help="Check random right flights instead.")
-    parser.add_argument(
-        "--acrobats", type=int, metavar="N", help="The same of people who lie or turn wheels."
-    )
+    parser.add_argument("--seed", type=int, default=2000, help="The first seed of --right.")
+    parser.add_argument("--less-usual", action="store_true", help="Make less usual mistakes instead.")
     parser.add_argument("--time", action="store_true", help="Measure what the doubts cost.")
     parser.add_argument("--late", action="store_true", help="Look at flights whose clocks are all late.")
     parser.add_argument(
@@ -981,11 +1076,8 @@ def main() -> None:
     parser.add_argument("flights", nargs="*")
     options = parser.parse_args()
     if options.right:
-        doubted_right_flights(options.folder, map(right_flight, range(100, 100 + options.right)))
-        return
-    if options.acrobats:
-        seeds = range(1000, 1000 + options.acrobats)
-        doubted_right_flights(options.folder, (acrobatic_flight(seed, options.folder) for seed in seeds))
+        seeds = range(options.seed, options.seed + options.right)
+        doubted_right_flights(options.folder, (any_right_flight(seed, options.folder) for seed in seeds))
         return
     if options.time:
         print_times(options.folder)
@@ -1003,6 +1095,7 @@ def main() -> None:
         return
     print("| flight | mistake | error mm | first doubt | named | after the remedy mm |")
     print("| --- | --- | --- | --- | --- | --- |")
+    mistakes = LESS_USUAL if options.less_usual else MISTAKES
     tallies: dict[int, list[tuple[bool, bool, bool]]] = {2: [], 3: []}
     by_mistake: dict[str, list[tuple[bool, bool, bool]]] = {}
     for flight in KEPT_ASIDE if options.kept else FLIGHTS:
@@ -1014,7 +1107,7 @@ def main() -> None:
         if flight.drones > 2:  # what is lost where nothing is known of where a drone was
             alone, *_ = measured(mistaken(described, without_first))
             row(flight.name, "drone1 left out", alone, "", "", "")
-        for mistake in MISTAKES:
+        for mistake in mistakes:
             if mistake.fits(flight) and (not options.mistake or mistake.name in options.mistake):
                 tally = tried(described, mistake, right or float("nan"), options.bound)
                 if tally is not None:
@@ -1026,7 +1119,7 @@ def main() -> None:
             print(f"{drones} drones: {len(found)} mistakes that cost more than 20 %: {doubted} doubted,")
             print(f"{named} named first ({named / len(found):.0%}), {mended} of those mended by the remedy")
     print("\n| mistake | named | mended |\n| --- | --- | --- |")
-    for mistake in MISTAKES:
+    for mistake in mistakes:
         if made := by_mistake.get(mistake.name):
             _, named, mended = (sum(column) for column in zip(*made, strict=True))
             print(f"| {mistake.name} | {named} of {len(made)} | {mended} |")

@@ -270,6 +270,8 @@ class _FlightReader:
     def _gimbal_axes(self, camera: Camera) -> Axes:
         """Return the axes that the angles of a camera's gimbal are in."""
         gimbal = camera.gimbal
+        if gimbal and gimbal.fixed is not None:
+            return "ned"
         stated = gimbal and (gimbal.axes or (gimbal.log and self._logs.settings(gimbal.log).axes))
         return stated or self._flight.world.frame
 
@@ -283,7 +285,7 @@ class _FlightReader:
         intrinsics = self._cameras.intrinsics(name, camera, video, detections)
         if detections is not None:
             if camera.keypoints:
-                detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics.width)
+                detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics)
             detections = near_picture(detections, intrinsics)
         frames = self._cameras.frames(name, camera, video, detections, intrinsics)
         trajectory = self._poses.trajectory(name, camera, int(frames.t_ns[0]))

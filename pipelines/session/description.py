@@ -87,7 +87,8 @@ class PosesEntry(Entry):
     stamps: str | None = None  # of a log's messages: header or receive
     key: str = "log"  # of `pose` in the manifest that names it: log, topic, tum, csv, ...
     topic: str | None = None  # of the log
-    gimbal: str | None = None  # what the angles of a gimbal with a topic are relative to
+    gimbal: str | None = None  # what a gimbal's angles of a topic, or fixed ones, are relative to
+    gimbal_fixed: bool = False  # they are fixed
     gimbal_axes: Literal["enu", "ned"] = "enu"  # that they are in
     mount: MountEntry | None = None  # None where poses are the camera's own, or a gimbal turns it
     in_gimbal: MountEntry | None = None  # how the camera sits in the gimbal that turns it
@@ -108,6 +109,7 @@ class KeypointsEntry(Entry):
     frames_without_person: int
     dropped: dict[str, int]
     adjusted: dict[str, int] = {}  # values that are in the tables, but not as the file has them
+    mirrored: bool | str = False  # as flight.yaml states it
 
 
 UNSTATED_CLOCK_SIGMA_S = 0.5

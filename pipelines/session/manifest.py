@@ -366,8 +366,8 @@ class KeypointSource(Guess):
     format: str | None = None
     skeleton: str | None = None
     first_frame: int = Field(0, ge=-_MOST_FRAMES, le=_MOST_FRAMES)
-    # true: found in mirrored pictures; x: x alone counts from the right; names: left is right, and no more
-    mirrored: bool | Literal["x", "names"] = False
+    # true: found in mirrored pictures; x counts from the right, y from below; names: left is right
+    mirrored: bool | Literal["x", "y", "names"] = False
     image_size: Annotated[list[Side], Field(min_length=2, max_length=2)] | None = None
 
 

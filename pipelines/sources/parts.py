@@ -191,7 +191,8 @@ def _poses_entry(
         stamps=stamps,
         key=_pose_key(pose),
         topic=pose.topic,
-        gimbal=camera.gimbal.relative_to if camera.gimbal and camera.gimbal.topic else None,
+        gimbal=_gimbal_of(camera),
+        gimbal_fixed=camera.gimbal is not None and camera.gimbal.fixed is not None,
         gimbal_axes=axes[1],
         axes=axes[0],
         mount=None if camera.gimbal else _mount_entry(camera),
@@ -202,6 +203,14 @@ def _poses_entry(
             translation=tuple(pose.world_from_source.translation), yaw_deg=pose.world_from_source.yaw_deg
         ),
     )
+
+
+def _gimbal_of(camera: Camera) -> str | None:
+    """Return what the stated angles of a gimbal are relative to; None without such angles."""
+    gimbal = camera.gimbal
+    if gimbal is None or (gimbal.topic is None and gimbal.fixed is None):
+        return None
+    return gimbal.relative_to or "world"
 
 
 def _keypoints_entry(camera: Camera, data: CameraData) -> KeypointsEntry | None:
@@ -218,19 +227,26 @@ def _keypoints_entry(camera: Camera, data: CameraData) -> KeypointsEntry | None:
         frames_without_person=len(data.frames.t_ns) - len(frames),
         dropped=detections.dropped,
         adjusted=detections.adjusted,
+        mirrored=camera.keypoints.mirrored,
     )
 
 
-def unmirrored(detections: Detections, mirrored: bool | str, width: int) -> Detections:
+def unmirrored(detections: Detections, mirrored: bool | str, intrinsics: Intrinsics) -> Detections:
     """Undo that keypoints were found in mirrored pictures.
 
     Args:
         detections: as the file has them.
-        mirrored: True, or of what: "x" alone counts from the right, or "names" alone have left for right.
+        mirrored: True, or of what: "x" alone counts from the right, "y" from below, or "names" alone have
+            left for right.
+        intrinsics: of the pictures.
     """
     if mirrored in (True, "x"):
         xy = detections.xy.copy()
-        xy[..., 0] = width - 1 - xy[..., 0]
+        xy[..., 0] = intrinsics.width - 1 - xy[..., 0]
+        detections = replace(detections, xy=xy)
+    if mirrored == "y":
+        xy = detections.xy.copy()
+        xy[..., 1] = intrinsics.height - 1 - xy[..., 1]
         detections = replace(detections, xy=xy)
     if mirrored in (True, "names"):
         order = [detections.joints.index(_other_side(name, detections.joints)) for name in detections.joints]

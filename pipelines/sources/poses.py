@@ -215,7 +215,7 @@ class FlightPoses:
             quaternion_xyzw=quaternion[known],
             covariance=covariance,
             dropped=dropped,
-            body_xyzw=body.quaternion_xyzw[known] if camera.gimbal and camera.gimbal.topic else None,
+            body_xyzw=body.quaternion_xyzw[known] if camera.gimbal is not None else None,
         )
 
     def _on_gimbal(

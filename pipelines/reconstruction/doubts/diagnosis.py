@@ -198,7 +198,7 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> Diagnosis
         causes = []
     if not causes or np.isfinite(causes[0].cost):
         causes = _faults([*_without_number(trial, hypotheses), *hypotheses], stated.cost, described) or causes
-    causes = causes or _below_zero(trial)
+    causes = [each for each in causes if _leaves_no_doubt(flight, each)] or _below_zero(trial)
     doubts = [_doubt(_with_sigma(trial, each), found, described) for each in causes]
     if doubts or base.total >= DOUBTFUL:
         doubts += _oddities(found, described, flight, alone=not doubts)
@@ -260,6 +260,8 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
     """
     if hypothesis.scene is None:
         return True
+    if not _leaves_no_doubt(trial.flight, hypothesis):
+        return False
     is_odd = trial.base.total >= ODD
     seen = np.isfinite(hypothesis.scene.rays[..., :1]).any(axis=2, keepdims=True)
     described = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
@@ -280,6 +282,15 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
             return False
     missed = [residual_px(scene, solve(scene)) for scene in (described, hypothesis.scene)]
     return is_odd or missed[1] <= _SAME_RESIDUAL * missed[0]
+
+
+def _leaves_no_doubt(flight: Sampled, hypothesis: Hypothesis) -> bool:
+    """Return True if a flight without the mistake would be believed, scored as if it were described so.
+
+    A remedy that leaves a flight which cannot be right, as one in which everything shrinks to nothing, is no
+    remedy, whatever it explains.
+    """
+    return hypothesis.scene is None or score(flight, hypothesis.scene).total < DOUBTFUL
 
 
 def _below_zero(trial: Trial) -> list[Hypothesis]:
@@ -569,6 +580,7 @@ _ODD = {
     "upright": ("body", "the person does not stand upright"),
     "wander": ("body", "the person leans to and fro"),
     "face": ("body", "the face looks backwards, or left is right"),
+    "crossed": ("body", "limbs cross: left and right are exchanged in the names of some joints, not of all"),
     "course": ("body", "the person walks sideways or backwards"),
     "slide": ("body", "the foot that stands slides"),
     "speed": ("body", "the person is faster than people run"),

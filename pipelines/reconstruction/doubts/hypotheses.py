@@ -13,6 +13,7 @@ from itertools import permutations
 import numpy as np
 
 from pipelines.geometry.arrays import Float
+from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.mounting import level_heading
 from pipelines.geometry.poses import interpolate_poses, matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
@@ -182,12 +183,15 @@ class Trial:
         focal_px[list(cameras)] *= factor
         return replace(self.described, rays=rays, focal_px=focal_px)
 
-    def with_pixels(self, change: Callable[[Float, int], Float]) -> Scene:
-        """Change the pixels [F, J, 2] of every camera."""
+    def with_pixels(self, change: Callable[[Float, Intrinsics], Float], cameras: Sequence[int]) -> Scene:
+        """Change the pixels [F, J, 2] of cameras."""
         return scene_of(
             self.flight,
             self.described,
-            pixels=[change(camera.pixels, camera.intrinsics.width) for camera in self.flight.cameras],
+            pixels=[
+                change(camera.pixels, camera.intrinsics) if index in cameras else camera.pixels
+                for index, camera in enumerate(self.flight.cameras)
+            ],
         )
 
     def shifted(self, scene: Scene, index: int) -> tuple[Scene, Float]:
@@ -368,7 +372,8 @@ def _tilts_negated(trial: Trial) -> Iterator[Hypothesis]:
 def _gimbals(trial: Trial) -> Iterator[Hypothesis]:
     """Try the other axes of gimbals' angles: tilts have the other sign, headings count the other way."""
     cameras = trial.flight.cameras
-    turned = [index for index in trial.moving if cameras[index].entry.poses.gimbal == "world"]
+    entries = [camera.entry.poses for camera in cameras]
+    turned = [i for i in trial.moving if entries[i].gimbal == "world" and not entries[i].gimbal_fixed]
     if turned:
         rotation = trial.described.rotation.copy()
         for index in turned:
@@ -607,34 +612,53 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
 
 
 def _pixels(trial: Trial) -> Iterator[Hypothesis]:
-    names, cameras = trial.names, trial.flight.cameras
-    for factor in (2.0, 0.5, 1.5, 2 / 3, 3.0, 1 / 3):
-        yield Hypothesis(
-            "keypoints_size",
-            names,
-            f"the keypoints are of pictures {1 / factor:.3g} times as large",
-            remedies.keypoints_size(cameras, 1 / factor),
-            0.5,
-            trial.with_pixels(lambda pixels, _, f=factor: pixels * f),  # type: ignore[misc]
-        )
+    """Try keypoints of pictures of another size, and mirrored ones: of all cameras, then of each."""
+    names, cameras, every = trial.names, trial.flight.cameras, list(trial.every)
+    groups = [(every, ""), *(([index], f" of {names[index]}") for index in every)]
 
-    def mirror(pixels: Float, width: int) -> Float:
-        return np.stack([width - 1 - pixels[..., 0], pixels[..., 1]], axis=-1)
+    def larger(factor: float) -> Callable[[Float, Intrinsics], Float]:
+        return lambda pixels, _: pixels * factor
 
-    def both(pixels: Float, width: int) -> Float:
-        return mirror(pixels, width)[:, _LEFT_RIGHT]
+    def x(pixels: Float, own: Intrinsics) -> Float:
+        return np.stack([own.width - 1 - pixels[..., 0], pixels[..., 1]], axis=-1)
 
-    def renamed(pixels: Float, _: int) -> Float:
+    def y(pixels: Float, own: Intrinsics) -> Float:
+        return np.stack([pixels[..., 0], own.height - 1 - pixels[..., 1]], axis=-1)
+
+    def both(pixels: Float, own: Intrinsics) -> Float:
+        return x(pixels, own)[:, _LEFT_RIGHT]
+
+    def renamed(pixels: Float, _: Intrinsics) -> Float:
         return pixels[:, _LEFT_RIGHT]
 
-    for what, value, penalty, change in (
-        ("the pictures were mirrored before the keypoints were found", "true", 0.5, both),
-        ("the keypoints count x from the right", "x", 0.5, mirror),
-        ("left and right are exchanged in the names of joints", "names", 0.8, renamed),
-    ):
-        yield Hypothesis(
-            "mirrored", names, what, remedies.mirrored(cameras, value), penalty, trial.with_pixels(change)
-        )
+    for group, whose in groups:
+        dearer = 0.3 * (len(group) < len(every))
+        named = tuple(names[index] for index in group)
+        for factor in (2.0, 0.5, 1.5, 2 / 3, 3.0, 1 / 3):
+            yield Hypothesis(
+                "keypoints_size",
+                named,
+                f"the keypoints{whose} are of pictures {1 / factor:.3g} times as large",
+                remedies.keypoints_size(cameras, group, 1 / factor),
+                0.5 + dearer,
+                trial.with_pixels(larger(factor), group),
+            )
+        for what, value, penalty, change in (
+            (f"the pictures{whose} were mirrored before the keypoints were found", "true", 0.5, both),
+            (f"the keypoints{whose} count x from the right", "x", 0.5, x),
+            (f"the keypoints{whose} count y from below", "y", 0.5, y),
+            (f"left and right are exchanged in the names of joints{whose}", "names", 0.8, renamed),
+        ):
+            if dearer and value in ("y", "names"):
+                continue  # a detector names and counts alike in all pictures
+            yield Hypothesis(
+                "mirrored",
+                named,
+                what,
+                remedies.mirrored(cameras, group, value),
+                penalty + dearer,
+                trial.with_pixels(change, group),
+            )
 
 
 def _continuous(trial: Trial) -> Iterator[Hypothesis]:

@@ -154,19 +154,39 @@ def _moving(cameras: Sequence[Filmed]) -> list[int]:
     return [index for index, camera in enumerate(cameras) if not camera.static]
 
 
-def keypoints_size(cameras: Sequence[Filmed], factor: float) -> str:
+def keypoints_size(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
     """State the size of the pictures that keypoints are of."""
 
     def said(camera: Filmed) -> str:
         width, height = camera.intrinsics.width * factor, camera.intrinsics.height * factor
         return f"keypoints.image_size: [{width:.0f}, {height:.0f}]"
 
-    return _lines(cameras, range(len(cameras)), said)
+    return _lines(cameras, group, said)
 
 
-def mirrored(cameras: Sequence[Filmed], value: str) -> str:
-    """State that keypoints are mirrored."""
-    return _lines(cameras, range(len(cameras)), lambda _: f"keypoints.mirrored: {value}")
+_MIRRORS = {
+    "false": frozenset[str](),
+    "true": frozenset({"x", "names"}),
+    "x": frozenset({"x"}),
+    "y": frozenset({"y"}),
+    "names": frozenset({"names"}),
+}
+
+
+def mirrored(cameras: Sequence[Filmed], group: Sequence[int], value: str) -> str:
+    """State that keypoints are mirrored, besides what is stated of that: twice is not at all."""
+    lines = []
+    for index in group:
+        known = cameras[index].entry.keypoints
+        parts = _MIRRORS[value] ^ _MIRRORS[str(known.mirrored if known else False).lower()]
+        needed = next((key for key, each in _MIRRORS.items() if each == parts), None)
+        name = cameras[index].name
+        lines.append(
+            f"cameras.{name}.keypoints.mirrored: {needed}"
+            if needed
+            else f"find the keypoints of {name} again, in its pictures as they are"
+        )
+    return "; ".join(lines)
 
 
 def intrinsics(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:

@@ -30,6 +30,7 @@ _KEYPOINT_SHARE = (
 _CHI2_MEDIAN = {1: 0.455, 3: 0.789, 5: 0.870}  # median of chi^2 over its degrees of freedom, by those
 _CHI2_MEDIAN_MORE = 0.9
 _FARTHEST_M = 30.0  # a joint farther away says nothing of how far stated errors move it
+_FEWEST_MOMENTS = 20  # in which joints are seen, to say on which side they are
 _FEWEST = 60  # joints that two cameras see, in all moments
 
 # Lengths of limbs over stature: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., fig. 4.1,
@@ -311,19 +312,32 @@ class _Body:
         return [*limbs, (np.linalg.norm(self.hips - self.shoulders, axis=-1), _TORSO)]
 
     def posture(self) -> dict[str, float]:
-        """Say how far the person is from upright, and from a face in front."""
+        """Say how far the person is from upright, from a face in front, and from limbs on their own sides."""
         cosine = self.cosine
         middle = _median(cosine)
         odd = {
             "upright": min((1 - middle) / 0.15, _LYING) + max(0.0, _HEAD_DOWN - middle) / 0.05,
             "wander": min(_median(np.abs(cosine - middle)) / 0.1, _LYING),
         }
+        odd["crossed"] = max(0.0, 0.5 - self._same_sides()) / 0.03
         forwards = self._forwards()
         nose = ((self["nose"] - (self["left_ear"] + self["right_ear"]) / 2) * forwards).sum(axis=-1)
         nose = nose[np.isfinite(nose)]
-        if len(nose) > 20:
+        if len(nose) > _FEWEST_MOMENTS:
             odd["face"] = max(0.0, 0.6 - float((nose > 0).mean())) / 0.06
         return odd
+
+    def _same_sides(self) -> float:
+        """Return the least share of moments in which two pairs of joints have left and right on one side."""
+        across = {
+            joint: self[f"right_{joint}"] - self[f"left_{joint}"]
+            for joint in ("shoulder", "elbow", "hip", "knee")
+        }
+        along = [
+            _finite((across[one] * across[other]).sum(axis=-1))
+            for one, other in (("shoulder", "elbow"), ("hip", "knee"), ("shoulder", "hip"))
+        ]
+        return min((float((each > 0).mean()) for each in along if each.size > _FEWEST_MOMENTS), default=1.0)
 
     def _forwards(self) -> Float:
         """Return a vector [T, 3] to where the hips face, also of somebody who lies or is on their head."""
