@@ -296,8 +296,18 @@ def beside_opensim(session: Path, peer: Path | None) -> list[str]:
             column = f"{coordinate}_{side[0]}"
             apart = own[f"{side}_{name}"].to_numpy()[row] - solved[column]
             pair = "" if both is None else f"{(solved[column] - both[column]).abs().median():.1f}"
-            rows.append([f"{side}_{name}", f"{apart.abs().median():.1f}", f"{apart.median():.1f}", pair])
-    header = ["angle", "ours from OpenSim's, median deg", "with its sign", "OpenSim's from the peer's"]
+            offset = apart.median()
+            left = (apart - offset).abs().median()
+            rows.append(
+                [f"{side}_{name}", f"{apart.abs().median():.1f}", f"{offset:.1f}", f"{left:.1f}", pair]
+            )
+    header = [
+        "angle",
+        "ours from OpenSim's, median deg",
+        "constant offset (median)",
+        "median without it",
+        "OpenSim's from the peer's",
+    ]
     return [
         f"{len(solved)} times; markers are {rms_mm:.1f} mm (RMS) off the model's.",
         "",
