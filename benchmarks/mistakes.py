@@ -4,6 +4,8 @@
     python -m benchmarks.mistakes --bound 10    # what the standard deviations of remedies make of the error
     python -m benchmarks.mistakes --less-usual  # other mistakes, on the flights tuned on
     python -m benchmarks.mistakes --right 40    # random right flights: none should be doubted
+    python -m benchmarks.mistakes --acrobats 40    # the same of people who lie or turn cartwheels
+    python -m benchmarks.mistakes --right 200 --any --seed 2000    # of both kinds
     python -m benchmarks.mistakes --corpus tuning|kept [--draws 1] [--mistake none] [FLIGHT ...]  # film
     python -m benchmarks.mistakes --time    # of the doubts in `reconstruct`, and of `check` on ten minutes
     python -m benchmarks.mistakes --headings 60    # when a heading 8 deg off shows in the rays
@@ -1064,7 +1066,11 @@ def main() -> None:
     parser.add_argument("--mistake", action="append", default=[], help="Only these; repeat it for several.")
     parser.add_argument("--bound", type=int, default=0, metavar="N", help="Draws of a remedy's sigmas.")
     parser.add_argument("--right", type=int, metavar="N", help="Check random right flights instead.")
-    parser.add_argument("--seed", type=int, default=2000, help="The first seed of --right.")
+    parser.add_argument("--seed", type=int, default=100, help="The first seed of --right.")
+    parser.add_argument("--any", action="store_true", help="Let every third of --right be an acrobat.")
+    parser.add_argument(
+        "--acrobats", type=int, metavar="N", help="The same of people who lie or turn wheels."
+    )
     parser.add_argument("--less-usual", action="store_true", help="Make less usual mistakes instead.")
     parser.add_argument("--time", action="store_true", help="Measure what the doubts cost.")
     parser.add_argument("--late", action="store_true", help="Look at flights whose clocks are all late.")
@@ -1076,8 +1082,12 @@ def main() -> None:
     parser.add_argument("flights", nargs="*")
     options = parser.parse_args()
     if options.right:
-        seeds = range(options.seed, options.seed + options.right)
-        doubted_right_flights(options.folder, (any_right_flight(seed, options.folder) for seed in seeds))
+        draw = partial(any_right_flight, folder=options.folder) if options.any else right_flight
+        doubted_right_flights(options.folder, map(draw, range(options.seed, options.seed + options.right)))
+        return
+    if options.acrobats:
+        seeds = range(1000, 1000 + options.acrobats)
+        doubted_right_flights(options.folder, (acrobatic_flight(seed, options.folder) for seed in seeds))
         return
     if options.time:
         print_times(options.folder)
