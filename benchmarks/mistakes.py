@@ -1082,7 +1082,9 @@ def main() -> None:
     parser.add_argument("flights", nargs="*")
     options = parser.parse_args()
     if options.right:
-        draw = partial(any_right_flight, folder=options.folder) if options.any else right_flight
+        draw: Callable[[int], Flight] = right_flight
+        if options.any:
+            draw = partial(any_right_flight, folder=options.folder)
         doubted_right_flights(options.folder, map(draw, range(options.seed, options.seed + options.right)))
         return
     if options.acrobats:
