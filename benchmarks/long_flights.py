@@ -5,12 +5,20 @@
 Simulated, modelled keypoints with a detector's lasting errors; noise stated, and nothing stated. There is no
 film and so no background: keypoints alone tell of the cameras. Odd seeds drift; half of the flights have
 three drones.
+
+    python -m benchmarks.long_flights --memory 2 5 10
+
+measures instead the most memory and the processor time that `mocap reconstruct` takes on the first of these
+flights, of so many minutes, each in a process of its own. `--given nothing` leaves its noise out.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -48,6 +56,29 @@ def scenario(seed: int, seconds: float) -> dict[str, object]:
     return document | {"seed": seed, "duration_s": seconds}
 
 
+def memory_row(seed: int, minutes: float, *, stated: bool) -> str:
+    """Fly, and reconstruct by the command; return a row: minutes, peak MB, processor seconds, method used."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        (place / "scenario.yaml").write_text(yaml.safe_dump(scenario(seed, 60 * minutes)))
+        simulate(place / "scenario.yaml", place / "made", video=False)
+        manifest = yaml.safe_load((place / "made" / "flight.yaml").read_text())
+        if not stated:
+            for camera in manifest["cameras"].values():
+                del camera["pose_noise"]
+        (place / "made" / "flown.yaml").write_text(yaml.safe_dump(manifest))
+        session = ingest(place / "made" / "flown.yaml", place / "flown.session").folder
+        process = subprocess.Popen(  # noqa: S603  # our own command, with folders made here
+            [Path(sys.executable).parent / "mocap", "reconstruct", session], stdout=subprocess.DEVNULL
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        if status:
+            raise SystemExit(f"mocap reconstruct ended with {os.waitstatus_to_exitcode(status)}")
+        used = json.loads((session / "reconstruct" / "metrics.json").read_text())["method_used"]
+        peak_mb, took_s = usage.ru_maxrss * 1024 / 1e6, usage.ru_utime + usage.ru_stime
+        return f"| {minutes:g} | {peak_mb:.0f} | {took_s:.0f} | {json.dumps(used)} |"
+
+
 def main() -> None:
     """Fly, reconstruct and print."""
     parser = argparse.ArgumentParser(
@@ -56,7 +87,14 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=300, help="seed of the first flight")
     parser.add_argument("--count", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=90.0)
+    parser.add_argument("--memory", type=float, nargs="+", metavar="MINUTES", help="measure memory instead")
+    parser.add_argument("--given", choices=("model", "nothing"), default="model", help="with --memory")
     arguments = parser.parse_args()
+    if arguments.memory:
+        stated = arguments.given == "model"
+        for minutes in arguments.memory:
+            print(memory_row(arguments.first, minutes, stated=stated), flush=True)
+        return
     rows = []
     for seed in range(arguments.first, arguments.first + arguments.count):
         with tempfile.TemporaryDirectory() as folder:

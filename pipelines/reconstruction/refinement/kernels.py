@@ -437,6 +437,7 @@ def assemble(
     joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
     factor, by_white = np.empty((WHITE, WHITE)), np.empty((n + NUMBERS + 1, WHITE))
     z = by_white[n + NUMBERS]  # the gradient is stored below the derivatives
+    by_both = np.empty((n, n))  # what the white errors take from each pair of coordinates
     most = 2 * (entries.column.size + 1)
     column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
     half = 0.0
@@ -461,6 +462,12 @@ def assemble(
                 half += np.log(factor[a, a])
             for line in range(len(by_white)):
                 forward(factor, by_white[line])
+            for p in range(n):
+                for q in range(p + 1):
+                    total = 0.0
+                    for a in range(WHITE):
+                        total += by_white[p, a] * by_white[q, a]
+                    by_both[p, q] = by_both[q, p] = total
         else:
             by_white[:] = 0.0
 
@@ -482,10 +489,7 @@ def assemble(
                 if eliminated:
                     for p in range(n):
                         for q in range(p + 1 if k == m else n):
-                            total = 0.0
-                            for a in range(WHITE):
-                                total += by_white[p, a] * by_white[q, a]
-                            front[k * n + p, m * n + q] -= both * total
+                            front[k * n + p, m * n + q] -= both * by_both[p, q]
             for p in range(n):
                 down = joint_gradient[p // 3, p % 3]
                 for a in range(WHITE):

@@ -46,6 +46,7 @@ from pipelines.reconstruction.refinement.system import AT_ONCE, System, misfit
 
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
 _LEARNING_ROUNDS, _FEWER_ROUNDS = 8, 3
+_ROUNDS_IN_CORRECTED = 4  # to learn motion and keypoint errors in poses that the guides have corrected
 _ROUNDS = 8
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a walking body, its limbs
 _BONE_SIGMA_M = 0.02
@@ -362,7 +363,7 @@ def _with_all_joints(
     stretches, start = views.stretches()
     unlearned = _unlearned(stretches, start, _white_only(system.problem, known), known.clock_sigma_s)
     first = initial_state(stretches, unlearned, start)
-    learned, first = learn(stretches, unlearned, first, poses=False, memory=True, rounds=_LEARNING_ROUNDS)
+    learned, first = learn(stretches, unlearned, first, poses=False, memory=True, rounds=_ROUNDS_IN_CORRECTED)
     acceleration = shrunk(learned.acceleration, stretches.t_s, first.position)
     of_all = replace(
         learned,
