@@ -22,6 +22,7 @@ from pipelines.reporting.plates import (
     MOST_BINS,
     MUTED,
     PAPER,
+    PEOPLE,
     SIDES,
     STATUS_COLOURS,
     TIME_LABEL,
@@ -73,7 +74,7 @@ def draw_all(
     motion = summary.motion
     plates = [_timeline(summary.cameras)]
     measured = motion is not None and bool(motion.measured.any())
-    plates.append(draw_paths(summary.cameras, poses, motion if measured else None))
+    plates.append(draw_paths(summary.cameras, poses, motion if measured else None, summary.people))
     if motion is not None:
         plates.append(draw_over_time(summary, motion))
         if residuals:
@@ -209,11 +210,20 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
     bins = time_bins(seconds)
     centres, shares = _status_shares(seconds, motion, bins)
     shown = {word: 100 * shares[STATUS.index(word)] for word in summary.statuses}
-    middle, low, high = percentiles(np.where(motion.measured, values, np.nan), seconds, bins)
+    values = np.where(motion.measured, values, np.nan)
+    middle, low, high = percentiles(values, seconds, bins)
+    people = [shortened(name) for name in summary.people] if len(summary.people) > 1 else []
+    each = {
+        f"median_{unit}_of_{name}": percentiles(values[:, [k]], seconds, bins)[0]
+        for k, name in enumerate(summary.people)
+        if people
+    }
     with page_style():
         figure = new_figure(3.5)
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
         _draw_errors(upper, centres, middle, low, high)
+        for k, own in enumerate(each.values()):
+            upper.plot(centres, own, color=PEOPLE[k % len(PEOPLE)], linewidth=0.9, label=people[k])
         upper.set_ylabel(f"{what} ({unit})")
         _draw_percentages(lower, bins, shown)
         lower.set_xlabel(TIME_LABEL)
@@ -230,11 +240,14 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
         f"Above: {what} of the measured joints, median and the range from the 10th to the 90th percentile. "
         "Below: the share of joints measured, and why the others were not."
     )
+    if people:
+        caption += " Thin lines are the medians of each person."
     if len(centres) < len(motion.t_ns):
         caption += f" Each point stands for {bins[1] - bins[0]:.2g} s."
     numbers = table(
         t_s=centres,
         **{f"median_{unit}": middle, f"p10_{unit}": low, f"p90_{unit}": high},
+        **each,
         **{f"{word}_percent": share for word, share in shown.items()},
     )
     return Plate("time", title, caption, description, figure, {"": numbers})

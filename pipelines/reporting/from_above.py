@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +17,7 @@ from pipelines.reporting.plates import (
     LINE_STYLES,
     MUTED,
     PAPER,
+    PEOPLE,
     STATUS_COLOURS,
     WIDTH_IN,
     Plate,
@@ -46,9 +47,15 @@ if TYPE_CHECKING:
 
 
 def draw_paths(
-    cameras: tuple[CameraRow, ...], poses: Mapping[str, pd.DataFrame], motion: Motion | None
+    cameras: tuple[CameraRow, ...],
+    poses: Mapping[str, pd.DataFrame],
+    motion: Motion | None,
+    names: Sequence[str],
 ) -> Plate:
-    """Draw the paths on the ground plane; without a motion those of the cameras alone."""
+    """Draw the paths on the ground plane; without a motion those of the cameras alone.
+
+    `names` are those of the people, and have a colour each where there are several.
+    """
     tracks = {camera.name: trajectory_from(poses[camera.name]) for camera in cameras if camera.name in poses}
     people = list(np.moveaxis(middles(motion.measured_position)[..., :2], 1, 0)) if motion is not None else []
     low, high = bounds([*people, *(track.position[:, :2] for track in tracks.values())])
@@ -60,6 +67,8 @@ def draw_paths(
         figure = new_figure(height_in)
         axes = figure.subplots()
         drawn = []
+        labels = ["actor"] if len(people) == 1 else [shortened(name) for name in names]
+        whom = "the actor" if len(people) == 1 else "people"
         for k, camera in enumerate(cameras):
             if camera.name in tracks:
                 style = (CAMERAS[k % len(CAMERAS)], LINE_STYLES[k // len(CAMERAS) % len(LINE_STYLES)])
@@ -67,9 +76,9 @@ def draw_paths(
                     axes, camera, tracks[camera.name], origin, style, float(extent.max())
                 )
                 drawn.append((camera.name, path + origin, stride))
-        for k, person in enumerate(people):
-            label = "actor" if len(people) == 1 else f"person {k}"
-            path, stride = _draw_person(axes, label, person - origin, LINE_STYLES[k % len(LINE_STYLES)])
+        for k, (label, person) in enumerate(zip(labels, people, strict=True)):
+            colour = INK if len(people) == 1 else PEOPLE[k % len(PEOPLE)]
+            path, stride = _draw_person(axes, label, person - origin, colour)
             drawn.append((label, path + origin, stride))
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.06)
@@ -79,12 +88,13 @@ def draw_paths(
         quiet(axes, "both")
         title = "Seen from above"
         paths = [f"{name} over {quantity(_way_m(t.position), 'm')}" for name, t in tracks.items()]
-        paths += [f"the actor over {quantity(_way_m(person), 'm')}" for person in people]
+        who = ["the actor"] if len(people) == 1 else labels
+        paths += [f"{name} over {quantity(_way_m(p), 'm')}" for name, p in zip(who, people, strict=True)]
         description = f"Paths on the ground plane: {listing(paths)}."
-    caption = "Paths of the cameras" + (" and of the actor (middle of the measured joints)" if people else "")
+    caption = "Paths of the cameras" + (f" and of {whom} (middle of the measured joints)" if people else "")
     caption += "; an open circle marks the start, short strokes the direction of view."
     caption += _decimation(max((stride for _, _, stride in drawn), default=1), "pose")
-    numbers = [table(who=who, east_m=path[:, 0], north_m=path[:, 1]) for who, path, _ in drawn]
+    numbers = [table(who=name, east_m=path[:, 0], north_m=path[:, 1]) for name, path, _ in drawn]
     return Plate("top", title, caption, description, figure, {"": stacked(numbers)})
 
 
@@ -119,13 +129,13 @@ def _draw_camera(
     return path, stride
 
 
-def _draw_person(axes: Axes, label: str, person: Float, line: object) -> tuple[Float, int]:
+def _draw_person(axes: Axes, label: str, person: Float, colour: str) -> tuple[Float, int]:
     """Draw a person's path [T, 2] and its start; return the drawn path, and the stride of its poses."""
     stride = stride_for(len(person))
     path = person[::stride]
-    axes.plot(*path.T, color=INK, linewidth=2.0, linestyle=line, label=label, zorder=4)
+    axes.plot(*path.T, color=colour, linewidth=2.0, label=label, zorder=4)
     start = path[np.isfinite(path[:, 0])][:1]
-    axes.plot(*start.T, "o", color=INK, markerfacecolor=PAPER, markersize=5, zorder=5)
+    axes.plot(*start.T, "o", color=colour, markerfacecolor=PAPER, markersize=5, zorder=5)
     return path, stride
 
 

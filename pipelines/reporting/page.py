@@ -18,7 +18,14 @@ from pipelines.reporting.panels import Video, draw_overlays, draw_panel, make_st
 from pipelines.reporting.plates import MOST_BINS, Plate
 from pipelines.reporting.replanned import Replan, summarise_replan
 from pipelines.reporting.studies import draw_studies, summarise_studies
-from pipelines.reporting.summary import Summary, errors_per_camera, measures, quality, summarise
+from pipelines.reporting.summary import (
+    Summary,
+    errors_by_person,
+    errors_per_camera,
+    measures,
+    quality,
+    summarise,
+)
 from pipelines.reporting.verdict import at_a_glance, give_verdict
 from pipelines.reporting.viewer import make_scene
 from pipelines.reporting.wording import environment
@@ -56,6 +63,8 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None, vi
             key_figures=_key_figures(summary),
             measures=measures(summary),
             errors_per_camera=errors_per_camera(summary),
+            errors_by_person=errors_by_person(summary),
+            tracking=section(summary.metrics, "tracking"),
             plates=plates,
             replan=replan,
             sweep=content.sweep,

@@ -35,6 +35,8 @@ SIDES = {"left": "#1f78b5", "right": "#c8561b", "": "#4a4f55"}
 """Colours of the sides of the body, by the words of `motion.side_of`."""
 CAMERAS = ("#00785a", "#7d4fb5", "#8f7a00", "#5d7d1c", "#00808f", "#8c5a3c")
 """Colours of cameras: none is near the blue and the orange of left and right."""
+PEOPLE = ("#b0267a", "#3f48b8", "#a36f00", "#2a7d33", "#a8322b", "#4f6272")
+"""Colours of people, where there are several."""
 LEVELS = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")
 """Colours of ordered values, from the least to the most: light to dark, on dark paper dark to light."""
 STATUS_COLOURS = {
@@ -53,6 +55,7 @@ PALETTE = {
     PAPER: "--paper",
     **{colour: f"--{side or 'middle'}" for side, colour in SIDES.items()},
     **{colour: f"--camera-{k}" for k, colour in enumerate(CAMERAS)},
+    **{colour: f"--person-{k}" for k, colour in enumerate(PEOPLE)},
     **{colour: f"--level-{k}" for k, colour in enumerate(LEVELS)},
     **{colour: f"--status-{word.replace('_', '-')}" for word, colour in STATUS_COLOURS.items()},
 }

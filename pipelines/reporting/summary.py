@@ -99,6 +99,12 @@ class Summary:
     metrics: dict[str, object] = field(default_factory=dict)
 
     @property
+    def people(self) -> tuple[str, ...]:
+        """Names of the reconstructed people; none without a motion."""
+        count = self.motion.position.shape[1] if self.motion is not None else 0
+        return tuple(self.description.names_of_people(count))
+
+    @property
     def total(self) -> int:
         """Number of joint-frames."""
         return sum(self.counts.values())
@@ -250,6 +256,31 @@ def measures(summary: Summary) -> list[Measure]:
         if key not in explained and number(summary.metrics, key) is not None
     ]
     return rows
+
+
+@dataclass(frozen=True)
+class PersonErrors:
+    """Row of the table of people; shares 0..1, None where unknown."""
+
+    name: str
+    coverage: float | None  # share of the times with any measured joint
+    reconstructed: float | None  # share of joint-frames
+    mpjpe_mm: float | None
+
+
+def errors_by_person(summary: Summary) -> list[PersonErrors]:
+    """Return the rows of the table of people; none if fewer than two were reconstructed."""
+    own = section(summary.metrics, "by_person")
+    return [
+        PersonErrors(
+            name=name,
+            coverage=number(section(own, name), "coverage"),
+            reconstructed=number(section(own, name), "reconstructed_share"),
+            mpjpe_mm=number(section(own, name), "mpjpe_mm"),
+        )
+        for name in own
+        if len(own) > 1
+    ]
 
 
 def errors_per_camera(summary: Summary) -> list[CameraErrors]:

@@ -41,7 +41,7 @@ class Scene:
     """Data of the viewer, and what the page says about it."""
 
     data: dict[str, object]  # JSON
-    people: int
+    people: tuple[str, ...]
     truth: bool
     ellipsoids: bool
     notes: tuple[str, ...]  # differences from the tables, in whole sentences
@@ -88,7 +88,7 @@ def make_scene(
         "cameras": [camera.packed(origin) for camera in placed],
     }
     if body is not None:
-        data["body"] = body.packed(kept, origin)
+        data["body"] = body.packed(kept, origin) | {"names": list(summary.people)}
     around = surface(replan.terrain) if replan is not None and replan.terrain is not None else None
     if around is not None and around.voxels:
         points = _packed(1000 * (around.points - origin), np.int32)
@@ -97,7 +97,7 @@ def make_scene(
         data["film"] = [_packed_strip(strip, summary.origin_ns) for strip in strips]
     return Scene(
         data=data,
-        people=body.people if body is not None else 0,
+        people=summary.people if body is not None else (),
         truth=body is not None and body.truth is not None,
         ellipsoids=body is not None and body.root is not None,
         notes=tuple(_notes(every, len(all_t_ns), body, around)),

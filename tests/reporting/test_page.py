@@ -199,12 +199,18 @@ def test_page_of_unknown_joints_and_two_people(content: SessionContent) -> None:
     first = make_skeleton(40)
     first["joint"] = first["joint"].map(markers)
     both = pd.concat([first, first.assign(person=1, x=first["x"] + 3)])
-    page = render_page(replace(content, skeleton=both, metrics={}, truth=None))
+    figures = {"coverage": 0.905, "reconstructed_share": 0.8, "mpjpe_mm": 43.21}
+    by_person = {"person0": figures, "person1": figures | {"mpjpe_mm": None}}
+    page = render_page(replace(content, skeleton=both, metrics={"by_person": by_person}, truth=None))
     outline = Outline(page)
     assert outline.count("figure") == 9  # no bone is known
+    assert "90.5" in outline.text
+    assert "43.2" in outline.text
+    assert page.count('class="swatch"') == 2
+    assert '<option value="1">person1</option>' in page
     assert '<select id="viewer-person">' in page
     assert "2 people" in outline.text
-    assert "person 1" in outline.text
+    assert page.count(">person1</text>") == 2  # the legends of the paths and of the errors over time
 
 
 HOSTILE = [

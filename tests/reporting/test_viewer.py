@@ -187,7 +187,7 @@ def test_two_people_keep_apart(content: SessionContent) -> None:
     first = make_skeleton(40)
     both = pd.concat([first, first.assign(person=1, x=first["x"] + 3)])
     scene = _scene(replace(content, skeleton=both, truth=None))
-    assert scene.people == 2
+    assert scene.people == ("person0", "person1")
     joints = _joints(scene)
     apart = joints[:, 1] - joints[:, 0]
     assert np.nanmax(np.abs(apart - [3.0, 0.0, 0.0])) < 2 * ROUNDING_M
@@ -195,7 +195,7 @@ def test_two_people_keep_apart(content: SessionContent) -> None:
 
 def test_cameras_alone_before_the_reconstruction(content: SessionContent) -> None:
     scene = _scene(replace(content, skeleton=None, truth=None))
-    assert scene.people == 0
+    assert scene.people == ()
     assert "body" not in scene.data
     t_s = _numbers(scene.data["t"], np.int32, 1)[:, 0] / 1e4
     assert t_s == pytest.approx(np.arange(FRAMES) / 30, abs=1e-4)

@@ -160,6 +160,7 @@
     colours = {
       paper: colour("paper"), ink: colour("ink"), muted: colour("muted"), grid: colour("grid"),
       sides: [colour("middle"), colour("left"), colour("right")],
+      people: Array.from({ length: people }, (_, p) => colour(people > 1 ? `person-${p % 6}` : "ink")),
       cameras: cameras.map((camera, k) => colour(`camera-${camera.colour ?? k % 6}`)),
       font: `11px ${style.getPropertyValue("--sans")}`,
     };
@@ -340,8 +341,8 @@
   function drawPaths(eye, at, t) {
     for (let p = 0; p < people; p++) {
       const pointAt = (k) => (known(body.middle, k * people + p) ? onGround(steady[p][k], feetOf(p, k)) : null);
-      stroke(eye, { strokeStyle: colours.ink, lineWidth: 1, globalAlpha: 0.3 }, () => path(eye, Infinity, pointAt));
-      stroke(eye, { strokeStyle: colours.ink, lineWidth: 1.8, globalAlpha: 0.8 }, () => path(eye, t, pointAt));
+      stroke(eye, { strokeStyle: colours.people[p], lineWidth: 1, globalAlpha: 0.3 }, () => path(eye, Infinity, pointAt));
+      stroke(eye, { strokeStyle: colours.people[p], lineWidth: 1.8, globalAlpha: 0.8 }, () => path(eye, t, pointAt));
     }
     shownCameras().forEach(([camera, c]) => {
       const pointAt = (k) => (known(camera.position, k) ? triple(camera.position, k) : null);
@@ -437,6 +438,17 @@
     return parts;
   }
 
+  /** A person's name above their highest joint. */
+  function nameParts(eye, joints, p) {
+    const top = joints.reduce((best, joint) => (joint && (!best || joint[2] > best[2]) ? joint : best), null);
+    if (!top) return [];
+    const above = [top[0], top[1], top[2] + 0.2];
+    const q = eye.inside(above);
+    if (q[2] < eye.near) return [];
+    const draw = () => label(eye, body.names[p], ...eye.flat(q), colours.people[p]);
+    return [{ depth: -1, draw }];
+  }
+
   function jointParts(eye, joints, size) {
     return joints.slice(0, jointCount).flatMap((joint, j) => {
       if (!joint) return [];
@@ -522,7 +534,10 @@
     for (let p = 0; p < people; p++) {
       const joints = jointsAt(body.joint, p, at);
       drawShadow(eye, joints, p, at);
-      parts.push(...boneParts(eye, joints, (side) => ({ strokeStyle: colours.sides[side], lineWidth: width })));
+      // Of several people the bones have the person's colour, and the joints that of their side.
+      const own = (side) => (people > 1 ? colours.people[p] : colours.sides[side]);
+      parts.push(...boneParts(eye, joints, (side) => ({ strokeStyle: own(side), lineWidth: width })));
+      if (people > 1) parts.push(...nameParts(eye, joints, p));
       parts.push(...jointParts(eye, joints, 0.75 * width + 0.4));
       if (body.root && shown("ellipsoids")) around.push(...ellipsoidParts(eye, joints, p, at));
       if (body.truth && shown("truth")) {
