@@ -67,7 +67,7 @@ def draw_paths(
         figure = new_figure(height_in)
         axes = figure.subplots()
         drawn = []
-        labels = ["actor"] if len(people) == 1 else [shortened(name) for name in names]
+        labels = ["actor"] if len(people) == 1 else [shortened(name) for name in names[: len(people)]]
         whom = "the actor" if len(people) == 1 else "people"
         for k, camera in enumerate(cameras):
             if camera.name in tracks:
