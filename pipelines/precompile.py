@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from enum import StrEnum
 from importlib import import_module
 from importlib.resources import files
 from itertools import cycle
@@ -31,11 +31,15 @@ def listed() -> Signatures:
     return signatures
 
 
-def precompile(workers: int, progress: Progress | None = None) -> int:
-    """Compile all functions of the list that are not in numba's cache yet, and return their number.
+def precompile(workers: int, progress: Progress | None = None) -> list[str]:
+    """Compile all functions of the list that are not in numba's cache yet.
 
     Args:
         workers: the number of processes; each compiles every so-manieth function, largest first.
+
+    Returns:
+        The functions of the list that do not exist, or not for the listed types. They are compiled at their
+        first use, like all that the list lacks.
     """
     progress = progress or Silent()
     names = list(listed())
@@ -50,32 +54,45 @@ def precompile(workers: int, progress: Progress | None = None) -> int:
         for share in shares
         if share
     ]
-    compiled = 0
+    outdated: list[str] = []
     for process in running:
         assert process.stdout is not None  # noqa: S101  # it is a pipe
         for line in process.stdout:
-            compiled += int(line)
+            name, _, outcome = line.rpartition(" ")
+            if outcome.strip() == Outcome.OUTDATED:
+                outdated.append(name)
             progress.advance()
         process.wait()
-    return compiled
+    return outdated
 
 
-def compile_function(name: str, signatures: Sequence[Sequence[object]]) -> bool:
-    """Compile a function for types of arguments; return False if all came from the cache, or it is not there.
+class Outcome(StrEnum):
+    """Result of compiling a function of the list."""
+
+    COMPILED = "compiled"
+    CACHED = "cached"
+    OUTDATED = "outdated"  # the list is older than the code
+
+
+def compile_function(name: str, signatures: Sequence[Sequence[object]]) -> Outcome:
+    """Compile a function for types of arguments, unless all comes from the cache.
 
     Args:
         name: `module:name`.
         signatures: types of the arguments, as in the list.
     """
+    from numba.core.errors import NumbaError
+
     from pipelines.geometry.compilation import dispatcher_of
 
     module, _, function = name.partition(":")
-    with suppress(ImportError, AttributeError, TypeError):  # a list older than the code
+    try:
         dispatcher = dispatcher_of(getattr(import_module(module), function))
         for signature in signatures:
             dispatcher.compile(tuple(type_of(each) for each in signature))
-        return bool(sum(dispatcher.stats.cache_misses.values()))
-    return False
+    except (ImportError, AttributeError, TypeError, NumbaError):
+        return Outcome.OUTDATED
+    return Outcome.COMPILED if sum(dispatcher.stats.cache_misses.values()) else Outcome.CACHED
 
 
 def type_of(text: object) -> Any:
@@ -105,9 +122,16 @@ def entry_of(kind: Any) -> object:
     return str(kind)
 
 
-if __name__ == "__main__":
-    if not sys.argv[1:]:
-        precompile(os.cpu_count() or 1)
+def main(names: Sequence[str]) -> None:
+    """Compile functions and print the outcome of each; without names all, and exit 1 if any is outdated."""
+    if not names:
+        outdated = precompile(os.cpu_count() or 1)
+        if outdated:
+            raise SystemExit(f"pipelines/data/kernels.json is older than the code of {', '.join(outdated)}")
     everything = listed()
-    for one in sys.argv[1:]:
-        print(int(compile_function(one, everything[one])), flush=True)  # noqa: T201  # read by precompile
+    for name in names:
+        print(name, compile_function(name, everything[name]), flush=True)  # noqa: T201  # read by precompile
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

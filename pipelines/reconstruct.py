@@ -32,9 +32,11 @@ from pipelines.reconstruction.background import refine_cameras
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.doubts.scene import Ground as GroundOfMap
+from pipelines.reconstruction.doubts.turning import common_offset
 from pipelines.reconstruction.finishing import finish
 from pipelines.reconstruction.ground import bind_positions
 from pipelines.reconstruction.loading import (
+    is_time_unknown,
     load_cameras,
     load_clock_sigma,
     load_pose_errors,
@@ -419,16 +421,9 @@ def _attempt(
     flight: _Flight, cameras: list[Camera], settings: Settings, workers: int, progress: Progress
 ) -> _Attempt:
     description, refines = flight.description, settings.method in ("refined", "auto")
-    clocks: FoundClocks | None = None
-    clock_sigma_s, stated = load_clock_sigma(description, cameras)
-    if settings.method == "refined":  # it finds the clocks of which the manifest says that they are off
-        clock_sigma_s = np.where(stated, clock_sigma_s, 0.0)
-    elif clock_sigma_s.any():
-        seen, views, result, _ = _triangulated(flight, cameras, settings, workers)
-        clocks = find_clocks(
-            _robust_flight(flight, cameras, seen, views, result, clock_sigma_s, settings, workers), stated
-        )
-        cameras, clock_sigma_s = shifted(cameras, clocks.offset_s), clocks.prior_s
+    clocks, clock_sigma_s = _find_clocks(flight, cameras, settings, workers)
+    if clocks is not None:
+        cameras = shifted(cameras, clocks.offset_s)
     logged = cameras
     background: dict[str, Any] = {"background": None}
     warnings: list[str] = []
@@ -508,6 +503,32 @@ def _attempt(
     )
 
 
+def _find_clocks(
+    flight: _Flight, cameras: list[Camera], settings: Settings, workers: int
+) -> tuple[FoundClocks | None, Float]:
+    """Find unknown clocks, those of cameras relative to each other first; return the priors [C] s for later.
+
+    Rays of people tell how far clocks are apart. An offset that all share changes next to nothing about
+    rays, but backgrounds tell it where nobody stated any start.
+    """
+    description, clocks = flight.description, None
+    prior_s, stated = load_clock_sigma(description, cameras)
+    if settings.method == "refined":  # it finds the clocks of which the manifest says that they are off
+        return None, np.where(stated, prior_s, 0.0)
+    if prior_s.any():
+        seen, views, result, _ = _triangulated(flight, cameras, settings, workers)
+        robust = _robust_flight(flight, cameras, seen, views, result, prior_s, settings, workers)
+        clocks = find_clocks(robust, stated)
+        cameras, prior_s = shifted(cameras, clocks.offset_s), clocks.prior_s
+    if settings.method == "auto" and is_time_unknown(description, cameras):
+        late = common_offset(cameras, flight.followed, description.pose_interpolation)
+        if late is not None:
+            zero = np.zeros(len(cameras))
+            clocks = clocks or FoundClocks(zero, zero, zero)
+            clocks = replace(clocks, offset_s=clocks.offset_s + late.late_s, common_sigma_s=late.sigma_s)
+    return clocks, prior_s
+
+
 def _triangulated(
     flight: _Flight, cameras: list[Camera], settings: Settings, workers: int
 ) -> tuple[_Seen, Views, Triangulation, Callable[[Views], Triangulation]]:
@@ -562,6 +583,7 @@ def _clock_metrics(
         later = refined.metrics["clock_offsets_s"]
         offset_s = {name: offset + later[name] for name, offset in offset_s.items()}
         sigma_s = refined.metrics["clock_offset_sigmas_s"]
+    sigma_s = {name: float(np.hypot(sigma, clocks.common_sigma_s)) for name, sigma in sigma_s.items()}
     return {"clock_offsets_s": offset_s, "clock_offset_sigmas_s": sigma_s}
 
 

@@ -231,6 +231,12 @@ def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> tup
     return sigma_s, np.array([clock.sigma_s > 0 or clock.start == "stated" for clock in clocks])
 
 
+def is_time_unknown(description: Description, cameras: Sequence[Camera]) -> bool:
+    """Test if the start of every camera's pictures was assumed or is not stated: all may be late alike."""
+    clocks = [description.cameras[camera.name].clock for camera in cameras]
+    return all(clock.prior_sigma_s > 0 and clock.sigma_s == 0 and clock.start != "stated" for clock in clocks)
+
+
 def load_truth(folder: Path, description: Description, joints: tuple[str, ...]) -> JointMotion | None:
     """Load the true joints, NaN for joints without truth; None if the session has no truth."""
     if not description.has_true_joints:

@@ -128,6 +128,7 @@ class FoundClocks:
     offset_s: Float  # [C] to add to the pictures' times
     sigma_s: Float  # [C] posterior standard deviation; the prior's where only the search found it, 0 if held
     prior_s: Float  # [C] prior standard deviation for later estimates; 0 for clocks that are held
+    common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
 
 
 def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.geometry.compilation import LOGGER, _Announcement, cached, dispatcher_of
-from pipelines.precompile import compile_function, entry_of, listed, type_of
+from pipelines.precompile import Outcome, compile_function, entry_of, listed, type_of
 
 SOURCE = """
 from pipelines.geometry.compilation import cached, helper
@@ -151,10 +151,18 @@ def test_what_was_compiled_ahead_is_found_in_the_cache(
     load_quarter: Callable[[], Callable[[float], float]],
 ) -> None:
     load_quarter()
-    assert compile_function("quarters:quarter", [["float64"]])
+    assert compile_function("quarters:quarter", [["float64"]]) is Outcome.COMPILED
     load_quarter()
-    assert not compile_function("quarters:quarter", [["float64"]])
-    assert not compile_function("quarters:gone", [["float64"]])  # a list older than the code
+    assert compile_function("quarters:quarter", [["float64"]]) is Outcome.CACHED
+
+
+@pytest.mark.parametrize("entry", ["float64 1A", "float64"])
+def test_a_list_older_than_the_code_is_named_without_a_traceback(
+    load_quarter: Callable[[], Callable[[float], float]], entry: str
+) -> None:
+    load_quarter()
+    name = "quarters:quarter" if entry != "float64" else "quarters:gone"
+    assert compile_function(name, [[entry, entry]]) is Outcome.OUTDATED
 
 
 @pytest.mark.parametrize("name", sorted(listed()))

@@ -42,7 +42,13 @@ from pipelines.reconstruction.doubts.hypotheses import (
 )
 from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
 from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, score, solve
-from pipelines.reconstruction.doubts.turning import Lateness, lateness, turns_of
+from pipelines.reconstruction.doubts.turning import (
+    LEAST_GAIN,
+    Lateness,
+    is_sure_clock,
+    lateness,
+    turns_of,
+)
 from pipelines.session.description import Description, Doubt
 from pipelines.session.log_doubts import doubts_of_logs
 from pipelines.session.maps import each_map
@@ -94,7 +100,6 @@ GAIN = 14.0
 DOUBTFUL = 6.0
 """Score of a description above which it is doubted although no mistake explains it."""
 
-_LEAST_LATE_S = 0.2  # of clocks by backgrounds: errors of attitudes that wander pass for less
 _HOVERING_M = 0.5  # apart: too little to tell own origins from positions in a smaller unit
 _BELOW_M = 1.0  # below zero, of drones
 _ALIKE = 1.0  # hypotheses whose scores are this close are stated together
@@ -351,13 +356,12 @@ def _of_turns(trial: Trial, tried: Sequence[Lateness]) -> list[Hypothesis]:
     Where they tell some, the rays help to say whose these are: other times of one camera change how its rays
     meet those of the others, times of all alike do not.
     """
-    least = GAIN + _COST_OF_NUMBER
-    if not tried or tried[0].gain < least:
+    if not tried or tried[0].gain < LEAST_GAIN:
         return []
     late = max(tried, key=lambda each: each.gain + _gain_of_rays(trial, each))
-    if late.gain < least:
+    if late.gain < LEAST_GAIN:
         return []
-    if late.slower == 1 and not (np.isfinite(late.sigma_s) and abs(late.late_s) >= _LEAST_LATE_S):
+    if late.slower == 1 and not is_sure_clock(late):
         return []
     names, cameras = trial.names, trial.flight.cameras
     whose = "all cameras" if len(late.cameras) == len(names) else names[late.cameras[0]]

@@ -7,7 +7,7 @@ error along. The background does not move, so it tells when each camera turned b
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,13 @@ _STEPS = 3
 _BASELINE_M = 1e-3  # below it, a camera only turned
 _HUBER = 1.5
 _LONGEST_S, _STEP_S = 1.0, 0.1  # of clocks that are tried
+_FINE_STEP_S, _FINE_STEPS = 0.02, 4  # around the best of them
+
+LEAST_GAIN = 16.0
+"""Chi^2 that other times of pictures must gain to be believed."""
+
+LEAST_LATE_S = 0.2
+"""Smallest clock offset that backgrounds tell: errors of attitudes that wander pass for less."""
 _USUAL_SHARE = 0.9  # of turns; the others are outliers
 _UNEXPLAINED = 0.5  # most of the turning that the logs may leave unexplained, to say anything
 
@@ -157,6 +164,45 @@ def lateness(
     return sorted((each for each in tried if each is not None), key=lambda each: -each.gain)
 
 
+def common_offset(
+    cameras: Sequence[Camera], followed: Mapping[str, object], between: Interpolation
+) -> Lateness | None:
+    """Find by how much the pictures of all cameras alike are late, if the backgrounds tell it surely.
+
+    Args:
+        cameras: of the flight.
+        followed: backgrounds of cameras by name; what is none is ignored. Two cameras that are not late alike
+            are told apart by rays, before this.
+        between: how poses are interpolated.
+
+    Returns:
+        None if too little turns, if the logs turn otherwise at all times, or if the offset is too small.
+    """
+    turns = {
+        index: found
+        for index, camera in enumerate(cameras)
+        if isinstance(tracks := followed.get(camera.name), Followed)
+        and len((found := turns_of(camera, tracks)).before) >= _FEWEST_TURNS
+    }
+    if not turns:
+        return None
+
+    def best_of(grid: Float) -> Lateness | None:
+        curves = [_gains(cameras[i], each, between, [(s, 1.0) for s in grid]) for i, each in turns.items()]
+        return _best_clock(tuple(range(len(cameras))), grid, curves)
+
+    late = best_of(np.arange(-_LONGEST_S, _LONGEST_S + _STEP_S / 2, _STEP_S))
+    if late is None or not is_sure_clock(late):
+        return None
+    fine = best_of(late.late_s + _FINE_STEP_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1, dtype=np.float64))
+    return late if fine is None else replace(late, late_s=fine.late_s)
+
+
+def is_sure_clock(late: Lateness) -> bool:
+    """Test if backgrounds tell a clock offset surely, and if it is larger than what attitude errors cause."""
+    return late.gain >= LEAST_GAIN and bool(np.isfinite(late.sigma_s)) and abs(late.late_s) >= LEAST_LATE_S
+
+
 def _gains(
     camera: Camera, turns: Turns, between: Interpolation, times: Sequence[tuple[float, float]]
 ) -> list[tuple[float, float, float]]:
@@ -234,6 +280,7 @@ def _best_clock(
         below, at, above = gains[best - 1 : best + 2]
         bend = float(2 * at - below - above)
         if bend > 0:
-            late_s += _STEP_S * float(above - below) / (2 * bend)
-            sigma_s = _STEP_S * float(np.sqrt(2 / bend))
+            step_s = float(grid[1] - grid[0])
+            late_s += step_s * float(above - below) / (2 * bend)
+            sigma_s = step_s * float(np.sqrt(2 / bend))
     return Lateness(group, late_s, 1.0, float(gains[best]), sigma_s)
