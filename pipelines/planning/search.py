@@ -29,8 +29,6 @@ from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import YAW, slot_offsets, turned, wrapped
 from pipelines.planning.information import predicted_error, ray_information
 
-GROUND_UP = 0.9
-"""Upward part of a distance's gradient from which level ground lies below a slot: slopes up to 25 deg."""
 _REACHED_S = 1e-9  # a cell exactly as far as the rates allow is a neighbour
 
 
@@ -110,9 +108,8 @@ def _look_at_slots(
                 x, y, z = offsets[s, i]
                 is_occupied, leap = look(sight, ax + x * per_m, ay + y * per_m, az + z * per_m)
                 if has_zones or is_occupied or leap < clear:
-                    distance, _, _, up = barred(grid, actor[t, 0] + x, actor[t, 1] + y, actor[t, 2] + z)
-                    if not (distance > 0.0 and up >= GROUND_UP):
-                        obstacle[t, s, i] = min(max(1.0 - distance / eps_obs_m, 0.0), 1.0)
+                    distance = barred(grid, actor[t, 0] + x, actor[t, 1] + y, actor[t, 2] + z)[0]
+                    obstacle[t, s, i] = min(max(1.0 - distance / eps_obs_m, 0.0), 1.0)
                 first = max(int((free_m - start_m) * rule[9] - 0.5), 0)
                 end = count if is_occupied else count - leap
                 if first < end:
@@ -291,9 +288,7 @@ def costs_of_slots(field: DistanceField, actor: Float, offsets: Float, config: P
     """Compute the costs of every slot, offsets [S, n, 3] m from the actor's forecast [T, 3] m, world.
 
     The integrand of the obstacle cost that Ho et al. print ignores its variable; here it is one minus the
-    signed distance over the local planner's `eps_obs_m`, so that both planners keep the same distance. Level
-    ground below a slot costs nothing (`GROUND_UP`): it would be a price of low tilts, not of obstacles.
-    Drones still keep away from it, by local planner and guard.
+    signed distance over the local planner's `eps_obs_m`, so that both planners keep the same distance.
     """
     actor = np.ascontiguousarray(actor)
     eps_m, start_m = config.eps_obs_m, config.sight_start_m

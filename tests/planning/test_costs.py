@@ -9,14 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.geometry.arrays import Float
 from pipelines.planning.config import ErrorModel, PlannerConfig
-from pipelines.planning.distance_field import DistanceField, distance_field, occupied_share, open_space
+from pipelines.planning.distance_field import distance_field, occupied_share, open_space
 from pipelines.planning.formation import formation_slots, slot_offsets
 from pipelines.planning.information import log_determinant, predicted_error, ray_information
-from pipelines.planning.search import GROUND_UP, cost_map, costs_of_slots, error_map
+from pipelines.planning.search import cost_map, costs_of_slots, error_map
 from pipelines.session.records import Occupancy
-from tests.planning.worlds import bare_ground, wall
+from tests.planning.worlds import wall
 
 CONFIG = PlannerConfig(w_obs=2.0, w_occ=3.0)
 
@@ -30,7 +29,8 @@ def test_obstacles_count_by_distance_and_sight_by_share() -> None:
     offsets = slot_offsets(formation_slots(yaws, 3, tilt_rad=0.26, range_m=10.0))
     costs = costs_of_slots(field, actor, offsets, CONFIG)
     cameras = actor[:, None, None] + offsets
-    assert costs.obstacle == pytest.approx(price(field, cameras, CONFIG.eps_obs_m), abs=1e-12)
+    distance, _ = field.sample(cameras)
+    assert costs.obstacle == pytest.approx(np.clip(1 - distance / CONFIG.eps_obs_m, 0, 1), abs=1e-12)
     share = occupied_share(field, cameras, actor[:, None, None], start_m=CONFIG.sight_start_m)
     assert np.array_equal(costs.occluded, share)
     assert costs.occluded.max() > 0.1
@@ -50,26 +50,10 @@ def test_what_the_ends_of_a_line_tell_changes_no_cost(seed: int, share: float, e
     offsets = slot_offsets(formation_slots(rng.uniform(-3, 3, 7), 3, tilt_rad=0.2, range_m=6.0))
     costs = costs_of_slots(field, actor, offsets, config)
     cameras = actor[:, None, None] + offsets
-    assert costs.obstacle == pytest.approx(price(field, cameras, eps_m), abs=1e-12)
+    distance, _ = field.sample(cameras)
+    assert costs.obstacle == pytest.approx(np.clip(1 - distance / eps_m, 0, 1), abs=1e-12)
     expected = occupied_share(field, cameras, actor[:, None, None], start_m=config.sight_start_m)
     assert np.array_equal(costs.occluded, expected)
-
-
-def price(field: DistanceField, cameras: Float, eps_m: float) -> Float:
-    """Compute the cost of slots: one minus the distance over eps, none where level ground is below."""
-    distance, gradient = field.sample(cameras)
-    above_ground = (distance > 0) & (gradient[..., 2] >= GROUND_UP)
-    return np.where(above_ground, 0.0, np.clip(1 - distance / eps_m, 0, 1))
-
-
-def test_the_ground_below_a_slot_costs_nothing_and_a_wall_as_near_does() -> None:
-    """A slot 1.5 m above bare ground is free; below the ground, or 1.5 m beside a wall, it is not."""
-    low = np.array([[[10.0, 0.0, 0.5]]])
-    actor = np.array([[0.0, 0.0, 1.5]])
-    assert costs_of_slots(bare_ground(), actor, low, CONFIG).obstacle == 0.0  # 2 m up, the ground is at 0.5 m
-    assert costs_of_slots(bare_ground(), actor, low - [0, 0, 2.2], CONFIG).obstacle == 1.0
-    beside = np.array([[[10.0, 5.0, 0.5]]])  # the wall begins at y = 6.5
-    assert costs_of_slots(wall(), actor, beside, CONFIG).obstacle == pytest.approx(0.5, abs=0.02)
 
 
 def test_hidden_views_cost_information() -> None:
