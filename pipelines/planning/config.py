@@ -215,7 +215,9 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
         except TypeError as error:
             problems.append(f"{key}: {error}")
     if problems:
-        raise DataError(source, "; ".join(problems), f"there are {', '.join(known)}")
+        unknown = not set(values) <= set(known)
+        remedy = f"there are {', '.join(known)}" if unknown else "correct it (docs/planner.md)"
+        raise DataError(source, "; ".join(problems), remedy)
     try:
         return PlannerConfig(**taken)  # type: ignore[arg-type]  # checked one by one above
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Export to mcap: one log of ROS 2 messages, for Foxglove and RViz.
+"""Export to mcap: one log of ROS 2 messages, for Foxglove, and but for its videos for RViz.
 
 | topic | type | |
 | --- | --- | --- |

@@ -33,14 +33,12 @@ _BASELINE_M = 1e-3  # below it, a camera only turned
 _HUBER = 1.5
 _LONGEST_S, _STEP_S = 1.0, 0.1  # of clocks that are tried
 _FINE_STEP_S, _FINE_STEPS = 0.02, 4  # around the best of them
+_LEAST_LATE_S = 0.2  # of clocks: errors of attitudes that wander pass for less
+_USUAL_SHARE = 0.9  # of turns; the others are outliers
+_UNEXPLAINED = 0.5  # most of the turning that the logs may leave unexplained, to say anything
 
 LEAST_GAIN = 16.0
 """Chi^2 that other times of pictures must gain to be believed."""
-
-LEAST_LATE_S = 0.2
-"""Smallest clock offset that backgrounds tell: errors of attitudes that wander pass for less."""
-_USUAL_SHARE = 0.9  # of turns; the others are outliers
-_UNEXPLAINED = 0.5  # most of the turning that the logs may leave unexplained, to say anything
 
 
 class Turns(NamedTuple):
@@ -200,7 +198,7 @@ def common_offset(
 
 def is_sure_clock(late: Lateness) -> bool:
     """Test if backgrounds tell a clock offset surely, and if it is larger than what attitude errors cause."""
-    return late.gain >= LEAST_GAIN and bool(np.isfinite(late.sigma_s)) and abs(late.late_s) >= LEAST_LATE_S
+    return late.gain >= LEAST_GAIN and bool(np.isfinite(late.sigma_s)) and abs(late.late_s) >= _LEAST_LATE_S
 
 
 def _gains(
