@@ -62,9 +62,17 @@ class Projection:
         authority = crs.to_authority(min_confidence=100)
         self.name = ":".join(authority) if authority else crs.name
         self._step = 1.0 if crs.is_projected else 1e-5  # a unit north by which grid north is found
-        # A grid that a registry knows has its zero far from any flight.
-        self._nearest_m = _NEAREST_M if crs.is_projected and crs.area_of_use is not None else 0.0
         self._to_earth = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+        # No flight is near the zero of a grid whose zero lies outside of the area that it is for, as in UTM.
+        # Japan, Portugal and Norway have it in the middle of their grids.
+        is_far = crs.is_projected and crs.area_of_use is not None and not self._has_zero_in(crs.area_of_use)
+        self._nearest_m = _NEAREST_M if is_far else 0.0
+
+    def _has_zero_in(self, area: Any) -> bool:
+        """Test if x 0, y 0 lies in pyproj's area of use."""
+        longitude, latitude = self._to_earth.transform(0.0, 0.0)
+        in_longitude = area.west <= longitude <= area.east or area.west > area.east
+        return bool(in_longitude and area.south <= latitude <= area.north)
 
     def first_place(self, source: Path | str, position: Float) -> Place:
         """Return the place on Earth of the first position [N, 3].
@@ -114,9 +122,9 @@ class Projection:
 
     def _geodetic(self, source: Path | str, position: Float) -> Float:
         """Return latitude, longitude (deg) and height (m) of positions [N, 3]."""
-        from_zero = np.abs(position[:, :2]).max(axis=1, initial=0)
-        if len(position) and np.nanmax(from_zero, initial=0) < self._nearest_m:
-            x, y = position[0, :2].tolist()
+        known = position[np.isfinite(position[:, :2]).all(axis=1), :2]
+        if len(known) and np.abs(known).max() < self._nearest_m:
+            x, y = known[0].tolist()
             problem = f"its x {x:.0f}, y {y:.0f} are metres of a local frame, not coordinates in {self.name}"
             raise DataError(source, problem, _NO_PLACE)
         longitude, latitude = self._to_earth.transform(position[:, 0], position[:, 1])

@@ -164,6 +164,16 @@ def test_local_metres_are_no_coordinates_of_a_registered_grid(tmp_path: Path) ->
     assert ZONE in refused("ingest", flight.manifest)
 
 
+@pytest.mark.parametrize(
+    ("crs", "latitude_deg", "longitude_deg"), [("EPSG:6677", 36.0, 139 + 5 / 6), ("EPSG:27391", 58.0, 6.052)]
+)
+def test_a_grid_whose_zero_is_in_its_country_is_flown_there(
+    crs: str, latitude_deg: float, longitude_deg: float
+) -> None:
+    place = Projection(crs, "world.crs").first_place("poses", np.array([[0.0, 0.0, 30.0]]))
+    assert (place.latitude_deg, place.longitude_deg) == pytest.approx((latitude_deg, longitude_deg), abs=2e-3)
+
+
 def test_another_zone_is_refused_by_the_distance(tmp_path: Path) -> None:
     flight = flown_in_utm(tmp_path)
     flight.settings["world"]["crs"] = "EPSG:32632"
