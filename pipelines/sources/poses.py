@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.common.files import read_head
+from pipelines.formats.drone_logs.subtitles import parse_subtitles
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
 from pipelines.formats.logs.presets import FIXES, px4_names, read_pair, read_positions, read_preset
 from pipelines.formats.logs.px4_topics import read_px4
@@ -685,7 +687,8 @@ def _reader(kind: str, path: Path) -> Format:
     """Return the format of a drone's own log; DJI's comes as subtitles, flight record, pictures or video."""
     several = ("dji_record", "dji_binary", "dji_video", "picture_tags") if kind == "dji" else ()
     found = next((found for name in several if (found := FORMATS.get(name)).recognises(path)), None)
-    if several and found is None and path.exists() and path.suffix.lower() != ".srt":
+    is_other = several and found is None and path.exists() and path.suffix.lower() != ".srt"
+    if is_other and not parse_subtitles(read_head(path)).texts:
         raise DataError(
             path,
             "holds no subtitles, flight record (CSV), telemetry track (djmd) or tagged pictures of DJI's",
