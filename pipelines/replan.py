@@ -73,6 +73,7 @@ REPLAN_STAGE = Stage("replan", revision=5)
 _HEIGHT_M = 1.75  # of the person, for their size in the modelled detector's pictures
 _SKELETON = "reconstruct/skeleton.parquet"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_ENDINGS = (".json", ".parquet")  # of the tables beside the folders of comparisons
 
 
 @dataclass(frozen=True)
@@ -179,12 +180,16 @@ def replan(
 
 
 def _usable(name: str | None) -> str | None:
-    """Refuse a name that cannot be a folder of its own among those of the arms."""
+    """Refuse a name that cannot be a folder of its own among the tables and those of the arms."""
     if name is None:
         return None
-    if not _NAME.fullmatch(name):
-        raise DataError(f"--name {name!r}", "cannot be a folder", "take letters, digits, points, - and _")
-    if name in (*PLANNER_ARMS.names(), *LOGGED):
+    if not _NAME.fullmatch(name) or name.casefold().endswith(_ENDINGS):
+        raise DataError(
+            f"--name {name!r}",
+            "cannot be a folder",
+            "take letters, digits, points, - and _, without an ending",
+        )
+    if name.casefold() in {arm.casefold() for arm in (*PLANNER_ARMS.names(), *LOGGED)}:
         raise DataError(f"--name {name}", "is the name of an arm", "take another one")
     return name
 

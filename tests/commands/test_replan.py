@@ -244,7 +244,7 @@ def test_every_comparison_stays_by_its_name(calm: Path) -> None:
     assert again.exit_code == 0
     assert stored(folder / "near")["arms"]["fixed"]["range_m"]["mean"] > 11
     assert {path.parent.name for path in folder.glob("*/metrics.json")} == {"near", second["name"]}
-    for wrong in ("fixed", "../near", ".hidden", "flown"):
+    for wrong in ("fixed", "Fixed", "../near", ".hidden", "flown", "metrics.json", "actor.parquet"):
         refused = compare(calm, *once, "--name", wrong)
         assert refused.exit_code == 1
         assert wrong in refused.stderr
