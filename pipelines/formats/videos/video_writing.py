@@ -19,6 +19,7 @@ TICK_S = Fraction(1, 90_000)
 
 # Of pictures in a log, often two a second: a viewer decodes from a key frame on.
 _WIDEST_PX, _SEEK_EVERY = 960, 10
+_STATED_HZ = 60  # of such a stream, whose pictures come more seldom: the level of H.264 follows from it
 # The edit list that shifts a part to its start counts in the movie's own unit, by default 1 ms.
 _KEY_EVERY = 60  # frames from one key frame to the next; a seek goes to a key frame
 _OPTIONS = {"movflags": "faststart", "movie_timescale": str(TICK_S.denominator)}
@@ -103,7 +104,8 @@ def _open_stream(width: int, height: int) -> VideoCodecContext:
     shrunk = min(_WIDEST_PX / width, 1.0)
     codec = VideoCodecContext.create("libx264", "w")
     codec.width, codec.height = (max(2 * round(shrunk * side / 2), 2) for side in (width, height))
-    codec.pix_fmt, codec.time_base, codec.thread_count = "yuv420p", TICK_S, 1
+    codec.pix_fmt, codec.thread_count = "yuv420p", 1
+    codec.framerate, codec.time_base = Fraction(_STATED_HZ), Fraction(1, _STATED_HZ)
     codec.options = {"crf": "23", "preset": "fast", "tune": "zerolatency", "g": str(_SEEK_EVERY), "bf": "0"}
     return codec
 
