@@ -174,7 +174,8 @@ def standing_heights(motion: Motion) -> Float:
     """Return the height [T, P] on which each person stands, m.
 
     It is the median over two seconds of the lowest measured joint, so that no single joint lifts a body.
-    Where nothing was measured, it is that of the last time before, else of the first after, else 0.
+    Where nothing was measured, it is that of the last time before, else of the first after. Whoever was never
+    measured stands as high as the others do in the median; without anybody it is 0.
     """
     import pandas as pd
 
@@ -182,4 +183,6 @@ def standing_heights(motion: Motion) -> Float:
     lowest = np.where(np.isfinite(height), height, np.inf).min(axis=-1)
     table = pd.DataFrame(np.where(np.isinf(lowest), np.nan, lowest), index=pd.to_datetime(motion.t_ns))
     near = table.rolling("2s", center=True, closed="both", min_periods=1).median()
-    return near.ffill().bfill().fillna(0.0).to_numpy(np.float64)
+    heights = near.ffill().bfill().to_numpy(np.float64)
+    known = heights[np.isfinite(heights)]
+    return np.where(np.isfinite(heights), heights, np.median(known) if len(known) else 0.0)

@@ -111,3 +111,20 @@ def test_a_person_stands_where_the_lowest_joint_is_for_two_seconds() -> None:
     # Ankles are 8 cm high at all times. One time of 61 moves the median by a step of 3.3 mm at most.
     assert feet[inner] == pytest.approx(0.08 + OFFSET_M[2] + slope[inner], abs=0.0034)
     assert np.isfinite(feet).all()
+
+
+def test_a_person_who_was_never_measured_stands_where_the_others_do() -> None:
+    motion = motion_from_skeleton(make_skeleton(30))
+    height_m = 100.0  # of the flight above the world's zero
+    both = replace(
+        motion,
+        position=np.concatenate(
+            [motion.position + np.array([0, 0, height_m]), np.full_like(motion.position, np.nan)], axis=1
+        ),
+        status=np.concatenate(
+            [motion.status, np.full_like(motion.status, STATUS.index("few_views"))], axis=1
+        ),
+    )
+    first, second = standing_heights(both).T
+    assert np.median(first) > height_m
+    assert second == pytest.approx(np.median(first))
