@@ -152,3 +152,16 @@ def test_commas_are_decimal_where_they_separate_nothing(body: str, expected: flo
             read()
     else:
         assert read() == expected
+
+
+def test_a_comma_in_a_name_is_not_decimal() -> None:
+    table = parse_table(
+        Path("a.csv"),
+        "Doe, Jane;1,5\n",
+        delimiter=";",
+        columns=2,
+        text={"n": 0},
+        numbers={"x": 1},
+        first_line=2,
+    )
+    assert (table.text["n"].to_pylist(), table.numbers["x"].tolist()) == (["Doe, Jane"], [1.5])
