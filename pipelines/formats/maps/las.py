@@ -236,9 +236,11 @@ def _refuse_impossible_records(path: Path) -> None:
     counts = [int.from_bytes(head[place : place + 4], "little") for place in (100, 243)]
     counts = counts if head[25:26] >= b"\x04" and len(head) >= 375 else counts[:1]
     size = path.stat().st_size
-    if len(head) < 227 or not 227 <= int.from_bytes(head[96:100], "little") <= size:
-        # The points begin behind the header: before its end, or behind the file's, is damage.
-        raise DataError(path, f"is cut off within its header ({len(head)} bytes)", _COPY)
+    first_point = int.from_bytes(head[96:100], "little")
+    if len(head) < 227 or first_point > size:
+        raise DataError(path, f"is cut off within its header ({size} bytes)", _COPY)
+    if first_point < 227:
+        raise DataError(path, f"has points from byte {first_point} on, within its header", _COPY)
     if sum(counts) * _RECORD > size:
         raise DataError(
             path, f"has a header that states {sum(counts)} records, more than it has room for", _COPY
