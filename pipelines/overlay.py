@@ -261,7 +261,7 @@ def _angle_text(name: str, value_deg: float, sigma_deg: float) -> str:
     if not np.isfinite(value_deg):
         return f"{words}: undetermined"
     spread = f" +/- {sigma_deg:.0f}" if np.isfinite(sigma_deg) else ""
-    return f"{words} {value_deg:.0f}{spread} deg"
+    return f"{words} {round(value_deg)}{spread} deg"  # round: no minus before 0
 
 
 # --- drawing -------------------------------------------------------------------------------------------

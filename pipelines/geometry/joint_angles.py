@@ -53,7 +53,6 @@ ANGLES: dict[str, str] = {
 }
 """Every angle and what its positive sign means."""
 
-
 UNDETERMINED = "undetermined"
 """Status of an angle that its joints do not determine in this pose."""
 ABSENT = "no_such_joint"
