@@ -117,3 +117,12 @@ def test_a_header_that_is_cut_is_refused_and_not_empty(tmp_path: Path, size: int
     path.write_bytes(path.read_bytes()[:size])
     with refuses(path, size):
         READER.describe(path)
+
+
+def test_points_within_the_header_are_damage_and_no_cut(tmp_path: Path) -> None:
+    path = write(tmp_path / "cloud.las")
+    content = bytearray(path.read_bytes())
+    content[96:100] = (17).to_bytes(4, "little")
+    path.write_bytes(content)
+    with refuses(path, 17):
+        READER.describe(path)
