@@ -50,8 +50,9 @@ def file_names_of_people(recording: Recording, people: int) -> list[str]:
     names: list[str] = []
     for person in range(people):
         name = safe_file_name(recording.name_of(person))
-        taken = {one.casefold() for one in names}
-        names.append(name if name.casefold() not in taken else f"{name}_{person}")
+        while name.casefold() in {one.casefold() for one in names}:
+            name = f"{name}_{person}"
+        names.append(name)
     return names
 
 

@@ -142,15 +142,17 @@ def test_writing_and_reading_gives_the_same(
 
 
 def test_people_with_names_get_files_of_their_names(tmp_path: Path) -> None:
-    motion = JointMotion(np.array([0, 33_333_333]), ("nose",), np.ones((2, 4, 1, 3)))
-    recording = Recording("x", motion, {}, people=("anna", "Jürgen B.", "ANNA"))
+    motion = JointMotion(np.array([0, 33_333_333]), ("nose",), np.ones((2, 5, 1, 3)))
+    recording = Recording("x", motion, {}, people=("anna", "Jürgen B.", "ANNA", "anna_4", "Anna"))
 
     paths = WRITER.write(recording, tmp_path)
 
-    # Two that differ in case alone would be one file on some systems; the fourth was not named.
+    # Names that differ in case alone would be one file on some systems.
     assert sorted(path.name for path in paths) == sorted(
-        ["x_anna.trc", "x_Jürgen_B.trc", "x_ANNA_2.trc", "x_person3.trc"]
+        ["x_anna.trc", "x_Jürgen_B.trc", "x_ANNA_2.trc", "x_anna_4.trc", "x_Anna_4_4.trc"]
     )
+    unnamed = WRITER.write(replace(recording, people=("anna",)), tmp_path)
+    assert {path.name for path in unnamed} == {"x_anna.trc", *(f"x_person{k}.trc" for k in range(1, 5))}
 
 
 def test_export_is_what_opensim_expects(tmp_path: Path) -> None:
