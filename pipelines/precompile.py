@@ -35,7 +35,7 @@ def precompile(workers: int, progress: Progress | None = None) -> list[str]:
     """Compile all functions of the list that are not in numba's cache yet.
 
     Args:
-        workers: the number of processes; each compiles every so-manieth function, largest first.
+        workers: the number of processes; functions are dealt out to them, largest first.
 
     Returns:
         The functions of the list that do not exist, or not for the listed types. They are compiled at their

@@ -506,10 +506,10 @@ def _attempt(
 def _find_clocks(
     flight: _Flight, cameras: list[Camera], settings: Settings, workers: int
 ) -> tuple[FoundClocks | None, Float]:
-    """Find unknown clocks, those of cameras relative to each other first; return the priors [C] s for later.
+    """Estimate unknown clock offsets; return also their prior standard deviations [C], s, for later steps.
 
-    Rays of people tell how far clocks are apart. An offset that all share changes next to nothing about
-    rays, but backgrounds tell it where nobody stated any start.
+    Offsets between cameras are estimated from the rays of people. An offset that all cameras share hardly
+    changes these rays. It is estimated from the turning of the backgrounds, if no camera's start is stated.
     """
     description, clocks = flight.description, None
     prior_s, stated = load_clock_sigma(description, cameras)

@@ -232,7 +232,7 @@ def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> tup
 
 
 def is_time_unknown(description: Description, cameras: Sequence[Camera]) -> bool:
-    """Test if the start of every camera's pictures was assumed or is not stated: all may be late alike."""
+    """Test if no camera's start is stated (assumed, or absent): all may have the same clock offset."""
     clocks = [description.cameras[camera.name].clock for camera in cameras]
     return all(clock.prior_sigma_s > 0 and clock.sigma_s == 0 and clock.start != "stated" for clock in clocks)
 

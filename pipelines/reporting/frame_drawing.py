@@ -51,7 +51,8 @@ def draw_frame(picture: Picture, view: View, caption: Sequence[str], labels: Seq
             scale.
         view: the view to draw; its own picture is not used.
         caption: lines of ASCII, or none; left out where the picture is too small to read them.
-        labels: in ASCII, each written beside its joint; left out alike, and where the joint is not there.
+        labels: in ASCII, each written beside its joint. A label is left out in small pictures, without its
+            joint, and where no room is left below the others.
     """
     drawn = picture.copy()
     height, width = drawn.shape[:2]

@@ -290,10 +290,10 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
 
 
 def _leaves_no_doubt(flight: Sampled, hypothesis: Hypothesis) -> bool:
-    """Return True if a flight without the mistake would be believed, scored as if it were described so.
+    """Test if the flight without the mistake scores below the limit of a doubt.
 
-    A remedy that leaves a flight which cannot be right, as one in which everything shrinks to nothing, is no
-    remedy, whatever it explains.
+    A remedy may explain the rays and still leave a flight that cannot be right, for example one in which all
+    sizes shrink to zero. Such a remedy is not given.
     """
     return hypothesis.scene is None or score(flight, hypothesis.scene).total < DOUBTFUL
 

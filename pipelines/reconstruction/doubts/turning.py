@@ -38,7 +38,7 @@ _USUAL_SHARE = 0.9  # of turns; the others are outliers
 _UNEXPLAINED = 0.5  # most of the turning that the logs may leave unexplained, to say anything
 
 LEAST_GAIN = 16.0
-"""Chi^2 that other times of pictures must gain to be believed."""
+"""Least gain of chi^2 with which other times of pictures are accepted."""
 
 
 class Turns(NamedTuple):
@@ -165,16 +165,16 @@ def lateness(
 def common_offset(
     cameras: Sequence[Camera], followed: Mapping[str, object], between: Interpolation
 ) -> Lateness | None:
-    """Find by how much the pictures of all cameras alike are late, if the backgrounds tell it surely.
+    """Estimate the clock offset that all cameras share, from the turning of their backgrounds.
 
     Args:
-        cameras: of the flight.
-        followed: backgrounds of cameras by name; what is none is ignored. Two cameras that are not late alike
-            are told apart by rays, before this.
-        between: how poses are interpolated.
+        cameras: of the flight, after the offsets between them were corrected.
+        followed: tracks of the backgrounds by camera; values of other types are ignored.
+        between: interpolation of the poses.
 
     Returns:
-        None if too little turns, if the logs turn otherwise at all times, or if the offset is too small.
+        None if the cameras turn too little, if the logs turn differently at every offset, or if the estimate
+        is not significant (`is_sure_clock`).
     """
     turns = {
         index: found
@@ -197,7 +197,7 @@ def common_offset(
 
 
 def is_sure_clock(late: Lateness) -> bool:
-    """Test if backgrounds tell a clock offset surely, and if it is larger than what attitude errors cause."""
+    """Test if a clock offset is significant, and larger than the apparent offsets of attitude errors."""
     return late.gain >= LEAST_GAIN and bool(np.isfinite(late.sigma_s)) and abs(late.late_s) >= _LEAST_LATE_S
 
 
