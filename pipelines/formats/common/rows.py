@@ -62,8 +62,8 @@ def parse_table(
     """Read delimited rows of `columns` cells; blank lines and lines that begin with # are skipped.
 
     If the last line does not parse, its writing was probably interrupted: it is left out and counted in
-    `truncated`. Where commas do not separate cells and the first row has no dot, commas before digits are
-    decimal.
+    `truncated`. Where commas do not separate cells and the first row has no dot but in a date, commas before
+    digits are decimal.
 
     Args:
         body: its text below the header.
@@ -78,7 +78,7 @@ def parse_table(
     import pyarrow as pa
 
     body = re.sub(r"\n[ \t]*#[^\n]*", "\n", "\n" + body)[1:]
-    if delimiter in ";\t" and "." not in (body.strip() + "\n").partition("\n")[0]:
+    if delimiter in ";\t" and "." not in _DATE.sub("", (body.strip() + "\n").partition("\n")[0]):
         body = re.sub(r",(?=\d)", ".", body)
     wanted = {**text, **numbers}
     for truncated in (0, 1):

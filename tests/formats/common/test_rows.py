@@ -154,14 +154,15 @@ def test_commas_are_decimal_where_they_separate_nothing(body: str, expected: flo
         assert read() == expected
 
 
-def test_a_comma_in_a_name_is_not_decimal() -> None:
+@pytest.mark.parametrize("text", ["Doe, Jane", "2023-11-14 22:13:20.500000"])
+def test_beside_decimal_commas_names_and_dates_are_kept(text: str) -> None:
     table = parse_table(
         Path("a.csv"),
-        "Doe, Jane;1,5\n",
+        f"{text};1,5\n",
         delimiter=";",
         columns=2,
         text={"n": 0},
         numbers={"x": 1},
         first_line=2,
     )
-    assert (table.text["n"].to_pylist(), table.numbers["x"].tolist()) == (["Doe, Jane"], [1.5])
+    assert (table.text["n"].to_pylist(), table.numbers["x"].tolist()) == ([text], [1.5])
