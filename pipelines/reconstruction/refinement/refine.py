@@ -183,7 +183,7 @@ def refine(
 
 @dataclass(frozen=True)
 class _Views:
-    """What a problem is built of."""
+    """Constants from which a problem is built."""
 
     t_s: Float  # [T]
     sightings: tuple[Sighting, ...]
