@@ -127,7 +127,7 @@ def settled(figure: Figure, scale: float = 1.0) -> Iterator[None]:
         axes.set_in_layout(True)
     figure.set_layout_engine("constrained")
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")
+    figure.set_layout_engine(None)  # not "none", a placeholder for which every savefig draws twice
     for axes in figure.axes:
         left, bottom, width, height = (round(float(edge), 5) for edge in axes.get_position(True).bounds)
         axes.set_position((left, bottom, width, height))
