@@ -279,16 +279,15 @@ class _Show:
 
     def labels_at(self, t_ns: Int64) -> list[list[Label]]:
         """Write every angle of every person at [N] times."""
-        values = (
-            []
-            if self.table is None
-            else [angles_at(self.motion, self.table, name, t_ns) for name in self.angles]
-        )
+        table = self.table
+        if table is None:
+            return [[] for _ in t_ns]
+        values = [angles_at(self.motion, table, name, t_ns) for name in self.angles]
         people = range(self.motion.position.shape[1])
         return [
             [
                 (person, _joint_of(name), _angle_text(name, *value[k, person].tolist()))
-                for name, value in zip(self.angles, values, strict=False)
+                for name, value in zip(self.angles, values, strict=True)
                 for person in people
             ]
             for k in range(len(t_ns))

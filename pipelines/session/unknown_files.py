@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipelines.session.storage import plain_text
+from pipelines.session.storage import plain_text, text_encoding
 
 _HEAD_BYTES = 64 * 1024
 _LARGEST_PARSED = 8 << 20  # bytes; larger text is described by its first line
@@ -131,8 +131,7 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
             return Likeness(f"begins as {kind} but is none that can be read", _COPY)
     if path.suffix.lower() in {".tlog", ".laz", ".las"}:
         return Likeness(f"is called {path.suffix} but holds nothing of that kind", _COPY)
-    is_utf16 = head.startswith((b"\xff\xfe", b"\xfe\xff"))
-    if (b"\0" in head or _undecodable(head)) and not is_utf16:
+    if (b"\0" in head or _undecodable(head)) and text_encoding(head) != "utf-16":
         if not any(c < 32 and c not in b"\t\n\f\r" for c in head):
             return Likeness("is text, but not UTF-8", "save it as UTF-8")
         return Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
