@@ -125,11 +125,12 @@ def replan(
     """
     settings = settings or Settings()
     progress = progress or Silent()
+    refuse_unknown(settings.arms or ())
+    _refuse_name(name)
     with locked(folder) as session:
         description, reconstructed, inputs = inputs_of(session)
-        refuse_unknown(settings.arms or ())
         stated = settings_by_name(settings)
-        name = _usable(name) or f"run-{key_of(REPLAN_STAGE, stated, inputs)[:8]}"
+        name = name or f"run-{key_of(REPLAN_STAGE, stated, inputs)[:8]}"
         run = session.begin(REPLAN_STAGE, settings=stated | {"name": name}, inputs=inputs, force=force)
         if run.finished:
             metrics = read_json(folder / "replan" / "metrics.json")
@@ -179,10 +180,10 @@ def replan(
     return Replanned(folder, record, metrics, skipped=False)
 
 
-def _usable(name: str | None) -> str | None:
+def _refuse_name(name: str | None) -> None:
     """Refuse a name that cannot be a folder of its own among the tables and those of the arms."""
     if name is None:
-        return None
+        return
     if not _NAME.fullmatch(name) or name.casefold().endswith(_ENDINGS):
         raise DataError(
             f"--name {name!r}",
@@ -191,7 +192,6 @@ def _usable(name: str | None) -> str | None:
         )
     if name.casefold() in {arm.casefold() for arm in (*PLANNER_ARMS.names(), *LOGGED)}:
         raise DataError(f"--name {name}", "is the name of an arm", "take another one")
-    return name
 
 
 def _keep_by_name(

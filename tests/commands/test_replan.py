@@ -244,10 +244,16 @@ def test_every_comparison_stays_by_its_name(calm: Path) -> None:
     assert again.exit_code == 0
     assert stored(folder / "near")["arms"]["fixed"]["range_m"]["mean"] > 11
     assert {path.parent.name for path in folder.glob("*/metrics.json")} == {"near", second["name"]}
-    for wrong in ("fixed", "Fixed", "../near", ".hidden", "flown", "metrics.json", "actor.parquet"):
-        refused = compare(calm, *once, "--name", wrong)
-        assert refused.exit_code == 1
-        assert wrong in refused.stderr
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["fixed", "Fixed", "flown", "../near", ".hidden", "", "metrics.json", "actor.parquet", "Stage.JSON"],
+)
+def test_a_name_that_can_be_no_folder_of_a_comparison_is_refused(tmp_path: Path, name: str) -> None:
+    refused = compare(tmp_path / "any.session", "--name", name)
+    assert (refused.exit_code, refused.stdout) == (1, "")
+    assert f"--name {name}" in refused.stderr.replace("'", "")
 
 
 def test_an_interrupted_comparison_flies_only_what_is_missing(

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from pipelines.reporting.arm_figures import draw_arms, draw_tradeoff, hidden_spans
-from pipelines.reporting.from_above import KEYFRAMES
+from pipelines.reporting.from_above import KEYFRAMES, draw_from_above
 from pipelines.reporting.plates import Plate
 from pipelines.reporting.replanned import Replan, summarise_replan
 
@@ -138,10 +138,10 @@ def test_the_trade_off_fills_what_nothing_beats() -> None:
 def test_no_fly_zones_are_hatched_and_named() -> None:
     content = make_comparison()
     zone = {"name": "school", "polygon_m": [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]], "low_m": None, "high_m": 9.0}
-    plate = draw_arms(
-        summarise_replan(replace(content, metrics=content.metrics | {"zones": [zone]}), START_NS, 2)
+    drawn, bare = (
+        draw_from_above(summarise_replan(replace(content, metrics=content.metrics | zones), START_NS, 2))
+        for zones in ({"zones": [zone]}, {})
     )
-    drawn, bare = plate["arms-top"], draw_arms(summarise_replan(content, START_NS, 2))["arms-top"]
     assert "school" in drawn.caption
     assert drawn.svg.count("<pattern") == bare.svg.count("<pattern") + 1
     assert drawn.svg.count("url(#") >= bare.svg.count("url(#") + len(content.arms)
