@@ -1,5 +1,7 @@
 """KITTI odometry: twelve numbers a line, world_from_camera as 3 x 4 by rows; the times are in another file.
 
+Writers of 4 x 4 matrices add 0 0 0 1: sixteen numbers a line are read, too.
+
 KITTI's world is the first camera's: x right, y down, z forward. It is turned to x right, y forward, z up.
 The times are seconds, one a line, in a file beside the poses (`times.txt`, or `NAME_times.txt` for
 `NAME.txt`), or where the data set has them: `sequences/NAME/times.txt` for `poses/NAME.txt`.
@@ -17,7 +19,7 @@ from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.records import Trajectory
 
-_NUMBERS = 12
+_LAST_ROW = (0.0, 0.0, 0.0, 1.0)  # of a 4 x 4 matrix
 _WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # from x right, y down, z forward
 _ORTHOGONAL = 1e-2  # largest deviation of R R' from the identity that rounding of the numbers explains
 
@@ -30,13 +32,15 @@ class KittiFormat:
     suffixes: tuple[str, ...] = (".txt", ".kitti")
 
     def recognises(self, path: Path) -> bool:
-        """Return True if the first line is twelve numbers whose left part is a rotation."""
+        """Return True if the first line is twelve or sixteen numbers whose upper left part is a rotation."""
         line = read_head(path, self.suffixes).lstrip().split("\n", 1)[0]
         try:
-            rows = np.array([float(cell) for cell in line.split()]).reshape(3, 4)
+            numbers = [float(cell) for cell in line.split()]
         except ValueError:
             return False
-        return bool(_is_rotation(rows[None, :, :3])[0])
+        if len(numbers) == 16 and tuple(numbers[12:]) == _LAST_ROW:
+            numbers = numbers[:12]
+        return len(numbers) == 12 and bool(_is_rotation(np.array(numbers).reshape(1, 3, 4)[:, :, :3])[0])
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, times, gaps, bounding box and losses."""
@@ -46,19 +50,21 @@ class KittiFormat:
         """Read every pose, and its time from the file of times.
 
         Raises:
-            DataError: no file of times, another number of times than poses, a line without twelve numbers,
-                or no usable row.
+            DataError: no file of times, another number of times than poses, a line with another number of
+                columns than the first, or no usable row.
         """
+        text = " ".join(read_text(path).split(" ")).strip()
+        columns = 16 if len(text.split("\n", 1)[0].split()) == 16 else 12
         table = parse_table(
             path,
-            " ".join(read_text(path).split(" ")).strip(),
+            text,
             delimiter=" ",
-            columns=_NUMBERS,
+            columns=columns,
             text={},
-            numbers={str(column): column for column in range(_NUMBERS)},
+            numbers={str(column): column for column in range(12)},
             first_line=1,
         )
-        rows = table.stack([str(column) for column in range(_NUMBERS)]).reshape(-1, 3, 4)
+        rows = table.stack([str(column) for column in range(12)]).reshape(-1, 3, 4)
         times = _times_of(path)
         t_ns, readable = parse_stamps(times, read_text(times).split())
         if len(t_ns) < len(rows):

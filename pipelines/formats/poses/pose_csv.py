@@ -21,10 +21,11 @@ from pipelines.session.records import Trajectory
 class PoseCsvFormat:
     """Reader of CSV with a header, separated by commas, semicolons or tabs; the order of columns is free.
 
-    Needed: t_ns, or t, time, timestamp, stamp in seconds or with a unit (`time_ms`, `timestamp [ns]`);
+    Needed: t_ns, or t, time, timestamp, stamp in seconds or with a unit (`time_ms`, `timestamp [ns]`), or sec
+    and nanosec;
     x y z (also tx, p_x, pos_x, position_x); qx qy qz qw (also q_x, orientation_x, q_RS_x).
     Optional: the covariance c00..c55, upper triangle, position in world and rotation vector in body.
-    Other columns are ignored.
+    Other columns are ignored. `rostopic echo -p` writes such a table; the stamps of its headers are taken.
     """
 
     name = "csv"

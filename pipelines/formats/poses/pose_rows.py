@@ -18,8 +18,12 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Trajectory
 
 POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
-_POSITION_PREFIX = r"t|p_|pos_|position_|p_rs_r_|translation_|pose_position_|pose_pose_position_"
-_QUATERNION_PREFIX = r"q|q_|quat_|quaternion_|orientation_|q_rs_|pose_orientation_|pose_pose_orientation_"
+_POSITION_PREFIX = (
+    r"t|p_|pos_|position_|p_rs_r_|(?:transform_)?translation_|pose_position_|pose_pose_position_"
+)
+_QUATERNION_PREFIX = (
+    r"q|q_|quat_|quaternion_|orientation_|q_rs_|transform_rotation_|pose_orientation_|pose_pose_orientation_"
+)
 
 FARTHEST_M = 1e9
 """Largest coordinate: beyond the Moon, so no pose of a flight; squares of much larger ones overflow."""

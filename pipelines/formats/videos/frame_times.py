@@ -51,7 +51,10 @@ class FrameTimesFormat:
             subtitles = parse_subtitles(head)
             return bool(subtitles.has_clock.any()) and not subtitles.are_slow
         found = _find_heading(head)
-        return found is not None and found[0].columns == (1 if found[1] is None else 2)
+        if found is None:
+            return False
+        heading, column = found
+        return heading.columns == 1 + (column is not None) + (heading.nanoseconds is not None)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, frame numbers, times, gaps, and losses."""

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 
 from pipelines.formats.poses import pose_csv, tum
+from pipelines.formats.videos import frame_times
 from pipelines.session.records import Trajectory
 from pipelines.session.registries import TrajectoryFormat
 from pipelines.session.tables import COVARIANCE_COLUMNS
@@ -88,6 +89,46 @@ def test_spellings(tmp_path: Path, header: str) -> None:
     assert poses.t_ns.tolist() == [1_500_000_000]
     assert poses.position.tolist() == [[1, 2, 3]]
     assert poses.quaternion_xyzw.tolist() == [[0, 0, 0, 1]]
+
+
+FIELDS = "field.{0}position.x,field.{0}position.y,field.{0}position.z,field.{0}orientation.x,"
+FIELDS += "field.{0}orientation.y,field.{0}orientation.z,field.{0}orientation.w"
+
+
+@pytest.mark.parametrize(
+    ("heading", "row", "t_ns"),
+    [
+        (
+            "%time,field.header.seq,field.header.stamp,field.header.frame_id," + FIELDS.format("pose."),
+            "1700000000500000000,7,1700000000123456789,map",
+            1700000000123456789,
+        ),
+        (
+            "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.child_frame_id,"
+            + FIELDS.format("pose.pose."),
+            "5500000000,7,5123456789,odom,base",  # simulation time
+            5123456789,
+        ),
+        ("%time," + FIELDS.format(""), "5500000000", 5500000000),
+        ("sec,nanosec,x,y,z,qx,qy,qz,qw", "1700000000,5", 1700000000000000005),
+        ("header.stamp.secs,header.stamp.nsecs,x,y,z,qx,qy,qz,qw", "12,500000000.0", 12_500_000_000),
+    ],
+)
+def test_tables_of_ros_tools(tmp_path: Path, heading: str, row: str, t_ns: int) -> None:
+    path = write(tmp_path, f"{heading}\n{row},1,2,3,0,0,0,1\n")
+    assert READER.recognises(path)
+    assert not frame_times.FORMAT.recognises(path)
+    poses = READER.read_trajectory(path)
+    assert poses.t_ns.tolist() == [t_ns]
+    assert poses.position.tolist() == [[1, 2, 3]]
+    assert poses.quaternion_xyzw.tolist() == [[0, 0, 0, 1]]
+
+
+def test_seconds_without_their_nanoseconds_are_dropped_and_counted(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{part},1,2,3,0,0,0,1\n" for k, part in enumerate(["0", "", "-5", "2.5", "7"]))
+    poses = READER.read_trajectory(write(tmp_path, f"sec,nanosec,x,y,z,qx,qy,qz,qw\n{rows}"))
+    assert poses.t_ns.tolist() == [0, 4_000_000_007]
+    assert poses.dropped == {"not finite": 3}
 
 
 def test_blank_cells_are_not_finite_and_counted(tmp_path: Path) -> None:
