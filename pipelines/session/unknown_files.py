@@ -110,11 +110,7 @@ def _of_folder(path: Path) -> Likeness:
 
 def _of_bytes(path: Path, head: bytes) -> Likeness | None:
     """Describe a file by its first bytes and its name; None if it may be text."""
-    if (
-        len(head) >= 16
-        and not any(head[1:64:2])
-        and all(32 <= c < 127 or c in b"\r\n\t" for c in head[:64:2])
-    ):
+    if len(head) >= 16 and (_is_wide(head[:64:2], head[1:64:2]) or _is_wide(head[1:64:2], head[:64:2])):
         return Likeness("is text in UTF-16 without a byte order mark", "save it as UTF-8")
     for kind, magic, endings in _BEGINNINGS:
         if path.suffix.lower() in endings and not head.startswith(magic):
@@ -136,6 +132,11 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
             return Likeness("is text, but not UTF-8", "save it as UTF-8")
         return Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
     return None
+
+
+def _is_wide(low: bytes, high: bytes) -> bool:
+    """Test if characters of two bytes are those of English text, by their lower and higher bytes."""
+    return not any(high) and all(32 <= byte < 127 or byte in b"\r\n\t" for byte in low)
 
 
 def _undecodable(head: bytes) -> bool:
@@ -160,7 +161,8 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
         if ending in {".yaml", ".yml"}:
             return _of_yaml(path)
     if ending == ".srt":
-        return Likeness("holds subtitles without the positions and times of a drone", "")
+        remedy = "turn on subtitles (captions) on the drone, or name its flight record or its video"
+        return Likeness("holds subtitles without the positions and times of a drone", remedy)
     for mark in ",;\t":
         cells = [cell.strip(' "#') for cell in lines[0].split(mark)]
         if len(cells) > 2 and len(lines) > 1 and lines[1].count(mark) > len(cells) // 2:
@@ -193,7 +195,8 @@ def _of_toml(path: Path) -> Likeness:
     except (OSError, ValueError, RecursionError) as error:
         return Likeness(f"is no valid TOML ({str(error)[:100]})", "write it again")
     return Likeness(
-        f"is TOML with {_keys(content)}", "a calibration has a table for each camera, with `matrix`"
+        f"is TOML with {_keys(content)}",
+        "a calibration has a table for each camera, with `matrix`, `distortions` and `size`",
     )
 
 

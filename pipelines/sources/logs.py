@@ -20,6 +20,7 @@ from pipelines.formats.logs.pictures import (
     picture_stamps,
     read_triggers,
 )
+from pipelines.formats.logs.presets import FIXES, pairs_of
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.formats.logs.trajectories import (
     Gathered,
@@ -95,8 +96,13 @@ class FlightLog:
                 return topic
             type_ = self.type_of(topic)
             problem = f"topic {topic} holds {type_}, no {noun}" if type_ else f"has no topic {topic}"
-            of_px4 = (type_ or "").startswith("px4_msgs/") and noun == _NOUNS["poses"]
-            remedy = "write preset: px4 instead of the topic" if of_px4 else f"topics with {noun}: {listed}"
+            remedy = f"topics with {noun}: {listed}"
+            if (type_ or "").startswith("px4_msgs/") and noun == _NOUNS["poses"]:
+                remedy = "write preset: px4 instead of the topic"
+            elif type_ in FIXES and noun == _NOUNS["poses"]:
+                turned = next((b for a, b in pairs_of(self.recording.topics) if a == topic), "TOPIC")
+                problem += ", but positions alone"
+                remedy = f"name the attitudes beside it, attitude: {turned}; {remedy}"
             raise DataError(self.source, problem, remedy)
         if len(there) != 1:
             problem = f"has {len(there)} topics with {noun} ({listed})"

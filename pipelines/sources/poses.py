@@ -280,7 +280,7 @@ class FlightPoses:
         origin = self.origin()
         if self._projection is not None and origin is not None:
             trajectory = self._projection.trajectory(source, trajectory, origin.place)
-        self.refuse_projected(source, trajectory.position)
+        self.refuse_projected(source, trajectory.position, self._projection)
         return trajectory
 
     def joints(self, source: Path, position: Float) -> Float:
@@ -288,7 +288,7 @@ class FlightPoses:
         origin = self.origin()
         if self._projection is not None and origin is not None:
             position = self._projection.points(source, position, origin.place)
-        self.refuse_projected(source, position.reshape(-1, 3))
+        self.refuse_projected(source, position.reshape(-1, 3), self._projection)
         return position
 
     def map(self, source: Path, grid: Occupancy, crs: str | None) -> Occupancy:
@@ -320,7 +320,7 @@ class FlightPoses:
                     f"{source}: the scale of {projection.name} is not applied to voxels, {error_m:.2g} m at"
                     " its corners: crop it"
                 )
-        self.refuse_projected(source, grid.origin[None])
+        self.refuse_projected(source, grid.origin[None], projection)
         return grid
 
     def _own_crs(self, source: Path, grid: Occupancy) -> Projection | None:
@@ -350,10 +350,12 @@ class FlightPoses:
                 )
             )
 
-    def refuse_projected(self, source: Path | str, position: Float) -> None:
-        """Refuse positions [N, 3] in projected coordinates if the world has an origin on Earth."""
+    def refuse_projected(
+        self, source: Path | str, position: Float, projection: Projection | None = None
+    ) -> None:
+        """Refuse positions [N, 3] far from the world's origin on Earth; `projection` placed them already."""
         if (origin := self.origin()) is not None:
-            refuse_projected(source, position, origin.place)
+            refuse_projected(source, position, origin.place, projection.name if projection else "")
 
     # --- people, commands, truth -----------------------------------------------------------------------
 

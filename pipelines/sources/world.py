@@ -102,11 +102,14 @@ def in_world(trajectory: Trajectory, place: WorldFromLog) -> Trajectory:
     )
 
 
-def refuse_projected(source: Path | str, position: Float, origin: Place) -> None:
+def refuse_projected(source: Path | str, position: Float, origin: Place, crs: str = "") -> None:
     """Refuse coordinates of a map projection, such as UTM, in a world whose origin on Earth is known.
 
     Args:
+        source: for the message.
         position: [N, 3] m in the world; rows of NaN are ignored.
+        origin: the world's.
+        crs: name of the CRS that placed them in the world, if one did.
 
     Raises:
         DataError: the median position is more than 100 km from the origin.
@@ -117,11 +120,14 @@ def refuse_projected(source: Path | str, position: Float, origin: Place) -> None
     x_m, y_m = np.median(across, axis=0).tolist()
     away_m = float(np.hypot(x_m, y_m))
     if away_m > _FARTHEST_M:
+        place = f"latitude {origin.latitude_deg:.6f}, longitude {origin.longitude_deg:.6f}"
+        away = f"{away_m / 1000:.0f} km from the world's origin ({place})"
+        if crs:
+            problem = f"lies {away} by its CRS, {crs}"
+            raise DataError(source, problem, "give the files of one place, or correct world.crs or map.crs")
         raise DataError(
             source,
-            f"lies about x {x_m:.0f} m, y {y_m:.0f} m (UTM or another map projection), {away_m / 1000:.0f} km"
-            f" from the world's origin (latitude {origin.latitude_deg:.6f}, longitude"
-            f" {origin.longitude_deg:.6f})",
+            f"lies about x {x_m:.0f} m, y {y_m:.0f} m (UTM or another map projection), {away}",
             "state the CRS, world: {crs: EPSG:32632} or map: {crs: ...}; or give metres from that origin",
         )
 

@@ -241,3 +241,16 @@ def test_the_crs_in_a_cloud_places_it_unless_another_is_stated(
     else:
         assert [doubt.code for doubt in doubts] == ["origin"]
         assert doubts[0].evidence["apart_m"] == pytest.approx(apart_m, rel=0.5)
+
+
+def test_a_cloud_of_another_place_is_refused_by_its_own_crs(tmp_path: Path) -> None:
+    pyproj = pytest.importorskip("pyproj")
+    flight = flown_in_utm(tmp_path)
+    write_las(
+        tmp_path / "site.laz", np.array([[500000.0, 5300000.0, 400.0]]), crs=pyproj.CRS.from_epsg(25832)
+    )
+    flight.settings["map"] = "site.laz"
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "EPSG:25832" in line
+    assert "site.laz" in line

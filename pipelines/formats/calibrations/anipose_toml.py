@@ -39,9 +39,9 @@ class AniposeToml:
     suffixes: tuple[str, ...] = (".toml",)
 
     def recognises(self, path: Path) -> bool:
-        """Return True if a TOML file has the keys `matrix` and `distortions`."""
+        """Return True if a TOML file has the keys `matrix`, and `distortions` or `size`."""
         head = read_head(path, self.suffixes)
-        return all(re.search(rf"(?m)^\s*{key}\s*=", head) for key in ("matrix", "distortions"))
+        return all(re.search(rf"(?m)^\s*(?:{key})\s*=", head) for key in ("matrix", "distortions|size"))
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe every camera, and name the tables that look like cameras but are left out."""
@@ -120,7 +120,8 @@ def _numbers(path: Path, camera: str, table: dict[str, object], key: str) -> Flo
     except (TypeError, ValueError, OverflowError):
         values = np.array(np.nan)
     if not np.isfinite(values).all():
-        raise DataError(path, f"camera {camera}: {key} is missing or not made of numbers")
+        problem = f"camera {camera}: {key} is missing or not made of numbers"
+        raise DataError(path, problem, f"state {key} as a list of numbers")
     return values
 
 

@@ -59,6 +59,7 @@ _CLOCK = re.compile(
 _DAY_OF_NAME = re.compile(r"(\d{4})[-_](\d{2})[-_](\d{2})")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _PREFIX = struct.Struct("<QHB")  # of a binary record: where its details lie, their length, and the version
+_BINARY_NAME = re.compile(r"DJIFlightRecord_|FLY\d{3}\.dat$", re.IGNORECASE)
 _NEWEST_BINARY = 30  # 14 in 2025
 
 
@@ -129,11 +130,14 @@ class DjiBinaryFormat:
     suffixes: tuple[str, ...] = (".txt", ".dat")
 
     def recognises(self, path: Path) -> bool:
-        """Return True for the app's record by its prefix, and for the drone's by its signatures.
+        """Return True for the app's record by its prefix, the drone's by signatures, or either by its name.
 
-        The prefix is described in lvauvillier/dji-log-parser, the signatures in DatCon.
+        The prefix is described in lvauvillier/dji-log-parser, the signatures in DatCon. A name counts for
+        binary content alone.
         """
         head = first_bytes(path, 256, suffixes=self.suffixes)
+        if _BINARY_NAME.match(path.name) and any(byte < 9 for byte in head):
+            return True
         if path.suffix.lower() == ".dat":
             return head[16:21] == b"BUILD" or head[242:252] == b"DJI_LOG_V3" or head.startswith(b"LOGH")
         if len(head) < 100:

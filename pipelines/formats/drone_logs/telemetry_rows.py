@@ -21,6 +21,7 @@ from pipelines.geometry.poses import (
 from pipelines.session.errors import DataError
 from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry, TelemetryChoice
 
+_UNEVEN_S = 0.5  # scatter of GPS times beyond what late messages explain
 _HELD_NS = 1_000_000_000  # receivers on drones report at least once a second
 _LEAST_REFRESHES = 4  # intervals between changes that are needed to judge their regularity
 
@@ -216,6 +217,11 @@ def on_gps_time(
         notes.append(f"its stamps count from boot, as asked ({describe_fit(fit)})")
         return None
     notes.append(f"its stamps are turned to UTC: {describe_fit(fit)}")
+    if fit.residual_s > _UNEVEN_S:
+        notes.append(
+            f"its clock does not keep step with GPS time: times may be {fit.residual_s:.1f} s off, and its"
+            " rates wrong; do not rely on its poses in motion"
+        )
     return fit
 
 

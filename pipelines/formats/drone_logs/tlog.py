@@ -67,7 +67,7 @@ class TlogFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if it begins with three packets behind plausible times."""
-        head = first_bytes(path, 1024, suffixes=self.suffixes)
+        head = first_bytes(path, 1024)
         place = 0
         for _ in range(3):
             stamp_us = int.from_bytes(head[place : place + _STAMP], "big")
@@ -111,11 +111,13 @@ class TlogFormat:
                 notes.append("holds no GPS time: its stamps are turned to the ground station's clock")
         else:
             fit = on_gps_time(path, fit, choice.time, notes)
-        topics = _topics(log, system)
+        messages = _topics(log, system)
+        topics = [topic for topic, _ in messages]
         kinds = {"vehicle_global_position": "global", "vehicle_local_position": "local"}
         there = next((kind for name, kind in kinds.items() if any(t.name == name for t in topics)), None)
         asked = replace(choice, instance=None, position=choice.position or there)  # type: ignore[arg-type]
         found = telemetry_of(path, topics, asked, fit, notes)
+        found = _by_messages(found, {topic.name: name for topic, name in messages})
         found = replace(found, dropped=dict(Counter(found.dropped) + Counter(log.dropped)))
         return replace(found, clock="the ground station's clock", fit=None) if station else found
 
@@ -183,43 +185,44 @@ def _vehicle(path: Path, log: _Packets, stated: int | None, messages: frozenset[
 # --- content of a log ----------------------------------------------------------------------------------
 
 
-def _topics(log: _Packets, system: int) -> list[Topic]:
-    """Make PX4's topics of the messages of one vehicle."""
-    topics: list[Topic] = []
+def _topics(log: _Packets, system: int) -> list[tuple[Topic, str]]:
+    """Make PX4's topics of the messages of one vehicle; each with the name of its message."""
+    topics: list[tuple[Topic, str]] = []
 
-    def add(name: str, columns: Columns) -> None:
+    def add(name: str, message: int, columns: Columns) -> None:
         if len(columns["timestamp"]):
-            topics.append(Topic(name, 0, columns))
+            topics.append((Topic(name, 0, columns), log.dialect.mavlink_map[message].msgname))
 
     place = log.columns(system, _GLOBAL_POSITION)
     scaled = {"lat": place["lat"] * 1e-7, "lon": place["lon"] * 1e-7, "alt": place["alt"] * 1e-3}
     if place["lat"].any() or place["lon"].any():
-        add("vehicle_global_position", {"timestamp": _boot_us(place), **scaled})
+        add("vehicle_global_position", _GLOBAL_POSITION, {"timestamp": _boot_us(place), **scaled})
     local, origin = log.columns(system, _LOCAL_POSITION), log.columns(system, _ORIGIN)
     columns = {"timestamp": _boot_us(local), **{axis: local[axis] for axis in "xyz"}}
     if len(origin["latitude"]):
         names = (("ref_lat", "latitude", 1e-7), ("ref_lon", "longitude", 1e-7), ("ref_alt", "altitude", 1e-3))
         columns |= {ref: np.full(len(local["x"]), origin[name][-1] * unit) for ref, name, unit in names}
-    add("vehicle_local_position", columns | {"xy_global": np.full(len(local["x"]), len(origin["latitude"]))})
+    columns["xy_global"] = np.full(len(local["x"]), len(origin["latitude"]))
+    add("vehicle_local_position", _LOCAL_POSITION, columns)
     gps = log.columns(system, _GPS_RAW_INT)
     since_boot = gps["time_usec"] < _UNIX_US
     fit = log.gps_time(system)
     ahead_us = 0 if fit is None else fit.offset_ns // 1000
     stamps = np.where(since_boot, gps["time_usec"], gps["time_usec"] - ahead_us)
     fixes = {name: gps[name] for name in ("lat", "lon", "alt", "fix_type")}
-    add("vehicle_gps_position", {**fixes, "timestamp": stamps.astype(np.int64)})
-    turned = log.columns(system, _ATTITUDE_QUATERNION)
+    add("vehicle_gps_position", _GPS_RAW_INT, {**fixes, "timestamp": stamps.astype(np.int64)})
+    turned, attitude = log.columns(system, _ATTITUDE_QUATERNION), _ATTITUDE_QUATERNION
     if len(turned["q1"]):
         body = np.stack([turned[f"q{k}"] for k in range(1, 5)], axis=1)
     else:
-        turned = log.columns(system, _ATTITUDE)
+        turned, attitude = log.columns(system, _ATTITUDE), _ATTITUDE
         body = _wxyz(np.stack([turned[name] for name in ("yaw", "pitch", "roll")], axis=1))
-    add("vehicle_attitude", {"timestamp": _boot_us(turned), **_quaternion(body)})
+    add("vehicle_attitude", attitude, {"timestamp": _boot_us(turned), **_quaternion(body)})
     device = log.columns(system, _GIMBAL_DEVICE)
     if len(device["flags"]):
         gimbal = np.stack([device[f"q[{k}]"] for k in range(4)], axis=1)
         columns = {"timestamp": _boot_us(device), "device_flags": device["flags"], **_quaternion(gimbal)}
-        add("gimbal_device_attitude_status", columns)
+        add("gimbal_device_attitude_status", _GIMBAL_DEVICE, columns)
         return topics
     mount = log.columns(system, _MOUNT_ORIENTATION)  # degrees; yaw_absolute is NaN where it is not known
     from_north = np.isfinite(mount["yaw_absolute"])
@@ -227,8 +230,21 @@ def _topics(log: _Packets, system: int) -> list[Topic]:
     gimbal = _wxyz(np.radians(np.stack([yaw, mount["pitch"], mount["roll"]], axis=1)))
     flags = np.where(from_north, _YAW_IN_EARTH, _YAW_IN_VEHICLE)
     columns = {"timestamp": _boot_us(mount), "device_flags": flags, **_quaternion(gimbal)}
-    add("gimbal_device_attitude_status", columns)
+    add("gimbal_device_attitude_status", _MOUNT_ORIENTATION, columns)
     return topics
+
+
+def _by_messages(found: Telemetry, names: Mapping[str, str]) -> Telemetry:
+    """Name the tracks and notes by MAVLink's messages instead of PX4's topics."""
+
+    def named(text: str) -> str:
+        for topic, message in names.items():
+            text = text.replace(f"{topic} (instance 0)", message).replace(topic, message)
+        return text
+
+    tracks = {part: getattr(found, part) for part in ("position", "body", "gimbal")}
+    renamed = {part: replace(track, name=named(track.name)) for part, track in tracks.items() if track}
+    return replace(found, notes=tuple(map(named, found.notes)), **renamed)
 
 
 def _boot_us(columns: Columns) -> Int64:

@@ -62,6 +62,7 @@ FIXES = (
 )
 """Types of positions on Earth."""
 
+_MOST_NAMED = 8  # topics in a message
 _NO_FIX = -1  # status.status of NavSatFix and GPSFix
 _TURNED = ("sensor_msgs/msg/Imu", "geometry_msgs/msg/QuaternionStamped")
 _VERSION = re.compile(r"_v\d+")  # PX4 appends it to the names of topics whose messages changed
@@ -366,7 +367,10 @@ def _prefix(source: str, preset: Preset, namespace: str | None, names: Sequence[
         bases = "/".join(driver.names)
         if not others:
             problem = f"has no topics of {preset} ({bases}/...)"
-            raise DataError(source, problem, "name the topic of the poses instead")
+            listed = ", ".join(names[:_MOST_NAMED]) + (", ..." if len(names) > _MOST_NAMED else "")
+            raise DataError(
+                source, problem, f"name the topic of the poses instead; there is {listed or 'none'}"
+            )
         positions = ", ".join(part for parts in driver.positions.values() for part in parts)
         raise DataError(
             source,

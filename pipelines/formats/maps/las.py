@@ -28,7 +28,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size
 from pipelines.session.records import Occupancy
-from pipelines.session.registries import need
+from pipelines.session.registries import install_command, need
 
 _CHUNK = 1_000_000  # points
 _NOISE = (7, 18)  # low and high noise of ASPRS
@@ -146,12 +146,15 @@ class _Cloud:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Cloud]:
-    need("laspy", "las")
+    laspy = need("laspy", "las")
     _refuse_impossible_records(path)
     if first_bytes(path, 105)[104] & 0xC0 != 0x80:  # the bit of LAZ
         with _opened_here(path) as cloud:
             yield cloud
         return
+    if not laspy.LazBackend.detect_available():
+        remedy = f"run `{install_command('las')}`"
+        raise DataError(path, "is compressed (LAZ), and lazrs is not installed", remedy)
     pipe, silent = subprocess.PIPE, subprocess.DEVNULL
     with subprocess.Popen(_decoder(path), stdin=silent, stdout=pipe, stderr=silent) as process:  # noqa: S603
         assert process.stdout is not None  # noqa: S101

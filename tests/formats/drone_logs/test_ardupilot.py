@@ -234,6 +234,9 @@ def test_the_old_estimator_is_read_if_it_is_asked_for() -> None:
     assert len(track.t_ns) == len(rows)
     np.testing.assert_allclose(track.values, [rows[t // 10**6] for t in track.t_ns.tolist()], rtol=1e-6)
     assert read(path, time="boot").position.name == "GPS"
+    # Its clock loses 9 % on GPS time: 181 s are 198 s by the fixes.
+    uneven = [note for note in read(path).notes if "does not keep step with GPS time" in note]
+    assert len(uneven) == 1
 
 
 def test_pictures_of_2014_have_gps_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

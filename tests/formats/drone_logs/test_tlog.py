@@ -64,6 +64,8 @@ def test_a_real_log_has_the_messages_that_pymavlink_finds() -> None:
     np.testing.assert_allclose(np.arcsin(ahead[:, 2]), pitch, atol=1e-9)
     np.testing.assert_allclose(ahead[:, 0], np.sin(yaw) * np.cos(pitch), atol=1e-9)
     # UTC is that of SYSTEM_TIME: 1533737145.465 at 608.582 s since boot.
+    assert (track.name, body.name) == ("GLOBAL_POSITION_INT", "ATTITUDE")
+    assert not any("vehicle_" in note for note in read(path).notes)
     late_s = (read(path).position.t_ns[0] - track.t_ns[0]) / 1e9
     assert late_s == pytest.approx(1533737145.465009 - 608.582, abs=2e-3)
 

@@ -126,3 +126,11 @@ def test_points_within_the_header_are_damage_and_no_cut(tmp_path: Path) -> None:
     path.write_bytes(content)
     with refuses(path, 17):
         READER.describe(path)
+
+
+def test_without_a_decompressor_the_refusal_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, compressed = (write(tmp_path / f"a{suffix}") for suffix in (".las", ".laz"))
+    monkeypatch.setattr(need("laspy", "las").LazBackend, "detect_available", staticmethod(lambda: ()))
+    with refuses(compressed, "lazrs", "pip install"):
+        READER.read_map(compressed)
+    assert READER.read_map(plain, resolution_m=0.5).resolution_m == 0.5
