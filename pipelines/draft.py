@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -27,14 +28,18 @@ from pipelines.drafting.found import (
     Span,
     Thing,
     TopicFound,
+    TopicKind,
     Video,
+    VideoStart,
     kind_of_format,
+    with_remedy,
 )
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import NO_DATE_NS, Alike, match
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.subtitles import read_subtitles
+from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
 from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
 from pipelines.formats.videos.frame_times import read_frame_times
@@ -80,6 +85,12 @@ _KEYS: dict[str, OwnLog] = {
     "parrot": "parrot",
 }
 """The key in a manifest for each format of a drone's own log."""
+
+_OTHER_KINDS: dict[str, TopicKind] = {
+    **dict.fromkeys(MAP_TYPES, "maps"),
+    **dict.fromkeys(FIXES, "fixes"),
+}
+"""Kinds of topics whose messages are no samples, by type."""
 
 _WATCHED_NS = 60_000_000_000  # of a video, to compare its motion with logs
 _NOMINAL_FOCAL = 0.8  # of a picture's width: an angle of view of 64 degrees
@@ -132,7 +143,7 @@ def draft(
         path, reason = home, f"holds nothing that can be used ({len(left_out)} files)"
         if len(left_out) == 1:
             [(path, reason)] = left_out.items()
-        raise DataError(path, reason, EXPECTED)
+        raise DataError(path, reason, "" if "; " in reason else EXPECTED)
 
     flight = match(findings, _Comparison())
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
@@ -187,7 +198,7 @@ def _read_all(things: Sequence[Thing], home: Path, progress: Progress) -> tuple[
     for path, formats in things:
         known, problem = _read(path, formats, home)
         found += known
-        if not known:
+        if problem:
             unread[path] = problem
         progress.advance()
     return Findings(found), unread
@@ -196,10 +207,11 @@ def _read_all(things: Sequence[Thing], home: Path, progress: Progress) -> tuple[
 def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found], str]:
     """Read a thing as every kind that it can be; of several formats of a kind, the first that works is used.
 
-    Return also the reason if it is of no kind.
+    Return also the reason if it is of no kind, or if one of its kinds cannot be read.
     """
     found: dict[type[Found], Found] = {}
-    problems: list[str] = []
+    kinds: set[type | None] = set()  # of formats that read it
+    problems: list[tuple[Format, DataError]] = []
     *folders, name = path.relative_to(home).parts or (path.name,)
     place = (*folders, name if path.is_dir() else Path(name).stem)
     for format_ in formats:
@@ -208,11 +220,23 @@ def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found
         try:
             thing = _described(head, format_, ambiguous)
         except DataError as error:
-            problems.append(f"{error.problem}, left out")
+            problems.append((format_, error))
             continue
         if thing is not None:
             found.setdefault(type(thing), thing)
-    return list(found.values()), problems[0] if problems else "of no use here, left out"
+            kinds.add(kind_of_format(format_))
+    problem = "" if found else "of no use here, left out"
+    for format_, cause in problems:
+        # A missing library names itself.
+        own = str(cause.source).startswith(str(path))
+        what = cause.problem if own else f"{cause.source} {cause.problem}"
+        if not found:
+            problem = with_remedy(f"{what}, left out", cause.remedy)
+            break
+        if kind_of_format(format_) not in kinds:
+            problem = with_remedy(f"{format_.title} left out: {what}", cause.remedy)
+            break
+    return list(found.values()), problem
 
 
 def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
@@ -330,11 +354,18 @@ def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
     key = _KEYS.get(head.format)
     if key is None:
         return None
-    start_ns = None
+    start = None
     films = recordings_of(head.path) if head.format == "dji_record" else []
     if head.path.suffix.lower() == ".srt":
         subtitles = read_subtitles(head.path)
         start_ns = subtitles.start_ns() if subtitles.are_slow else None
+        if start_ns is not None:
+            start = VideoStart(start_ns, "by the subtitles' clock, local time taken as UTC", sigma_s=1)
+    elif telemetry.video_began is not None:
+        began_ns, sigma_s = telemetry.video_began
+        made = telemetry.clock == "the video's time of creation"
+        source = f"by the {'time of creation in its metadata' if made else 'telemetry in it'}"
+        start = VideoStart(began_ns, source, sigma_s)
     return DroneLog(
         head.path,
         head.place,
@@ -348,7 +379,7 @@ def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
         body=telemetry.body is not None,
         gimbal=telemetry.gimbal is not None,
         height=track.height,
-        video_start_ns=start_ns,
+        video_start=start,
         films=tuple(Span(*film) for film in films),
     )
 
@@ -361,7 +392,7 @@ def _recording(head: Found, format_: LogFormat) -> Recording:
     with format_.open_log([head.path]) as log:
         topics: dict[str, TopicFound] = {}
         for topic in log.topics:
-            kind = kind_of(topic)
+            kind = kind_of(topic) or _OTHER_KINDS.get(topic.type)
             if kind and topic.name not in topics:
                 span = Span(topic.first_ns or 0, topic.last_ns or 0)
                 lead_ns = _lead_ns(log, topic.name) if topic.count else None
@@ -375,6 +406,10 @@ def _recording(head: Found, format_: LogFormat) -> Recording:
                 first = next(_pose_samples(log, name, 1, head.path), None)
                 if first:
                     topics[name] = replace(known, target=first.target, source=first.source)
+            elif known.kind == "maps":
+                message = next(iter(log.messages([name])), None)
+                with suppress(DataError):
+                    topics[name] = replace(known, target=frame_of(message, name) if message else "")
             elif known.kind == "transforms":
                 still = name.rstrip("/").endswith("tf_static")
                 for sample in _pose_samples(log, name, _TRANSFORMS_ASKED, head.path):

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 from pipelines.drafting.labels import OPTICAL, Label, Place, is_called, label_of, label_of_place
 from pipelines.session.errors import DataError
@@ -32,7 +32,7 @@ from pipelines.session.unknown_files import describe_unknown
 
 F = TypeVar("F", bound="Found")
 
-TopicKind = Literal["poses", "transforms", "angles", "intrinsics", "pictures"]
+TopicKind = Literal["poses", "transforms", "angles", "intrinsics", "pictures", "maps", "fixes"]
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,10 @@ class Map(Found):
 
 @dataclass(frozen=True)
 class TopicFound:
-    """A topic that a manifest can name; `target` and `source` are the frames of its first pose."""
+    """A topic that a manifest can name; `target` and `source` are the frames of its first pose.
+
+    The `target` of maps is the frame in which they lie.
+    """
 
     name: str
     type: str
@@ -131,6 +134,14 @@ class TopicFound:
     target: str = ""
     source: str = ""
     lead_ns: int | None = None  # by which header stamps are ahead of those of receipt; None without
+
+
+class VideoStart(NamedTuple):
+    """Start of a video, as a drone's own log has it."""
+
+    start_ns: int
+    source: str  # for the user
+    sigma_s: float = 0.0  # 0: as exactly as its poses
 
 
 @dataclass(frozen=True)
@@ -145,7 +156,7 @@ class DroneLog(Found):
     body: bool
     gimbal: bool
     height: Height = "unknown"  # zero level of its heights; "stated" if it has no heights
-    video_start_ns: int | None = None  # of the video beside it, if its own times are too coarse for frames
+    video_start: VideoStart | None = None  # of the video beside it, or of the one that holds it
     films: tuple[Span, ...] = ()  # when it says that the camera recorded videos
 
 
@@ -346,7 +357,13 @@ def _why_left_out(path: Path) -> str:
             pass
         else:
             return "is a flight manifest already (run `mocap ingest` on it), left out"
-    return f"{describe_unknown(path).problem}, left out"
+    likeness = describe_unknown(path)
+    return with_remedy(f"{likeness.problem}, left out", likeness.remedy)
+
+
+def with_remedy(problem: str, remedy: str) -> str:
+    """Return a problem with what the user can do about it, if that is known."""
+    return f"{problem}; {remedy}" if remedy else problem
 
 
 def joined(recordings: Sequence[Recording]) -> list[Recording]:
@@ -374,7 +391,8 @@ def with_stamps(recordings: Sequence[Recording]) -> list[Recording]:
     apart = False
     longest_ns = _LEAST_APART_NS
     for recording in recordings:
-        moving = [t for t in recording.topics if t.kind != "intrinsics" and not t.name.endswith("static")]
+        still = {"intrinsics", "maps"}  # published once, perhaps long before
+        moving = [t for t in recording.topics if t.kind not in still and not t.name.endswith("static")]
         every: list[TopicFound | Driver] = [*moving, *recording.drivers]
         parts = [part for part in every if part.count]
         if not parts:

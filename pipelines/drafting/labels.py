@@ -160,7 +160,9 @@ COMMANDED = frozenset(
     {"setpoint", "setpoints", "cmd", "command", "commanded", "desired", "goal", "reference", "target"}
     | {"plan", "planned", "planner", "waypoint", "waypoints"}
 )
-ACTOR = frozenset({"actor", "person", "people", "human", "subject", "pedestrian"})
+ACTOR = frozenset(
+    {"actor", "person", "people", "human", "subject", "pedestrian", "runner", "athlete", "watch"}
+)
 NO_PICTURES = frozenset({"depth", "disparity", "infra", "mask", "segmentation", "confidence"})
 OPTICAL = frozenset({"camera", "cam", "optical", "lens"})
 _NED = frozenset({"ned", "px4", "fmu"})

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from ruamel.yaml import YAML
 from ruamel.yaml.representer import RoundTripRepresenter
@@ -27,9 +27,10 @@ from pipelines.drafting.found import (
     Recording,
     Span,
     Video,
+    VideoStart,
 )
 from pipelines.drafting.matching import CameraDraft, Candidate, Draft
-from pipelines.session.manifest import SCHEMA
+from pipelines.session.manifest import SCHEMA, OwnLog
 
 # Texts that every reader of YAML, old or new, reads as text without quotes.
 _PLAIN = re.compile(r"(?:\.\.?/)*[A-Za-z_/][A-Za-z0-9_./-]*(?: [A-Za-z0-9_./-]+)*")
@@ -173,10 +174,12 @@ class CameraText:
             return self._said("frame_times", choice.all, describe(choice.taken))
         if self._camera.videos and self._film is None:
             return []  # the log's own stamps
-        if self._coarse_start is not None:
-            coarse, source = self._coarse_start
-            self._assume("frame_times", f"start {source}, to a second")
-            return [self._entry("frame_times", {"start": coarse}, f"assumed: {source}")]
+        if (known := self._known_start) is not None:
+            settings = {"start": (Decimal(known.start_ns) / 10**9).normalize()}
+            if not known.sigma_s:
+                return [self._entry("frame_times", settings, known.source)]
+            self._assume("frame_times", f"start {known.source}, to {known.sigma_s:g} s")
+            return [self._entry("frame_times", settings, f"assumed: {known.source}")]
         start, reason = self._start()
         if self._film:
             if start is None:
@@ -195,26 +198,41 @@ class CameraText:
         return [self._entry("frame_times", {"start": start, **fps}, remark)]
 
     @property
-    def _coarse_start(self) -> tuple[Decimal, str] | None:
-        """The video's start in seconds with its source, by a drone's log that knows it to a second.
+    def _known_start(self) -> VideoStart | None:
+        """The video's start by the log of its poses, or by its own metadata if the log covers it then.
 
-        That are subtitles with whole seconds, or a flight record with one video of about this length.
+        A log inside the video knows it exactly, and motion that a log explains determines it well. Subtitles
+        with whole seconds know it to a second, and so does a record of one video of about this length.
         """
-        found = self._camera.poses.taken.found if self._camera.poses else None
-        if not isinstance(found, DroneLog) or not self._film:
+        film, poses = self._film, self._camera.poses
+        if film is None or poses is None:
             return None
-        if self._camera.poses and self._camera.poses.start_ns is not None:
-            return (
-                Decimal(self._camera.poses.start_ns) / 10**9
-            ).normalize(), "when its pictures move as its poses"
-        start_ns, source = found.video_start_ns, "by the subtitles' clock, local time taken as UTC"
-        if start_ns is None:
-            length_ns = self._film.length_ns
-            alike = [f for f in found.films if abs(f.last_ns - f.first_ns - length_ns) < _LENGTHS_DIFFER_NS]
-            if len(alike) != 1:
-                return None
-            start_ns, source = alike[0].first_ns, "when the flight record says that a video began"
-        return (Decimal(start_ns) / 10**9).normalize(), source
+        found = poses.taken.found
+        if poses.start_ns is not None:
+            return VideoStart(poses.start_ns, "when its pictures move as its poses", sigma_s=0.2)
+        if isinstance(found, DroneLog):
+            if found.video_start is not None and (
+                found.path == film.path or found.path.suffix.lower() == ".srt"
+            ):
+                return found.video_start
+            alike = [
+                f for f in found.films if abs(f.last_ns - f.first_ns - film.length_ns) < _LENGTHS_DIFFER_NS
+            ]
+            if len(alike) == 1:
+                return VideoStart(
+                    alike[0].first_ns, "when the flight record says that a video began", sigma_s=1
+                )
+        if film.made_ns is None or poses.taken.span is None:
+            return None
+        made = Span(film.made_ns, film.made_ns + film.length_ns)
+        if film.path.is_dir() and found.path == film.path:
+            return VideoStart(film.made_ns, "by the EXIF of its pictures")
+        covered = poses.taken.span.overlap_ns(made) >= film.length_ns
+        return (
+            VideoStart(film.made_ns, "by the time of creation in its metadata", sigma_s=1)
+            if covered
+            else None
+        )
 
     def _start(self) -> tuple[Decimal | None, str]:
         """Assume the first frame's time in seconds: the start of poses and truth; None for 0."""
@@ -239,9 +257,10 @@ class CameraText:
     def _clock(self) -> list[str]:
         if self._camera.videos and self._film is None:
             return []
-        if self._coarse_start is not None:
-            settings = {"offset_s": 0, "sigma_s": 1}
-            return [entry("clock", settings, "the start is known to a second")]
+        known = None if self._camera.frame_times else self._known_start
+        if known is not None and known.sigma_s:
+            settings = {"offset_s": 0, "sigma_s": known.sigma_s}
+            return [entry("clock", settings, f"the start is known to {known.sigma_s:g} s")]
         return ["# clock: {offset_s: 0, sigma_s: 0.2}  # if its clock is off against the poses', or unsure"]
 
     # --- poses -----------------------------------------------------------------------------------------
@@ -254,7 +273,7 @@ class CameraText:
             return [
                 f"# pose: {{tum: {self._camera.name}.tum}}  # missing: nothing of that name has poses{loose}",
                 "#   or {csv: FILE}, {static: CALIBRATION}, {log: LOG, topic: TOPIC}, {log, parent, child},",
-                "#   {dji: FILE}, {ulog: FILE}, {ardupilot: FILE}, {tlog: FILE}, {log, preset: mavros}",
+                f"#   {{log, preset: mavros}}, or a drone's own log: {', '.join(get_args(OwnLog))}",
             ]
         taken = choice.taken
         remarks = [describe(taken)]
@@ -593,9 +612,16 @@ def _actor(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> l
 
 
 def _map(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
-    """Write the maps: the first one, and the others as comments."""
+    """Write the maps: the first file, else a topic that lies where the poses do; the others as comments."""
+    placed = [c for c in draft.logged_maps if c.placed]
     lines = [entry("map", relative(found.path), found.title) for found in draft.maps]
-    return ["", *lines[:1], *(f"# or {line}" for line in lines[1:])] if lines else []
+    lines += [entry("map", c.settings, describe(c)) for c in placed]
+    others = [
+        entry("map", c.settings, f"{describe(c)}; in another frame than the poses: needs transforms")
+        for c in draft.logged_maps[len(placed) :]
+    ]
+    comments = [f"# or {line}" for line in [*lines[1:], *others][:_MOST_OTHERS]]
+    return ["", *lines[:1], *comments] if lines or comments else []
 
 
 def _truth(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
@@ -609,11 +635,11 @@ def _truth(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
         if meets and "joints" not in known:
             known["joints"] = relative(joints.path)
             continue
-        why = "" if meets else ", when there are no poses"
+        why = "" if meets else ", when there are no poses: add offset_s to its times"
+        shown = relative(joints.path) if meets else {"path": relative(joints.path), "offset_s": 0}
         lines.append(
             commented(
-                f"# or truth: {{joints: {flow(relative(joints.path))}}}",
-                f"{joints.title}, {spanned(joints.span)}{why}",
+                f"# or truth: {{joints: {flow(shown)}}}", f"{joints.title}, {spanned(joints.span)}{why}"
             )
         )
     poses = {c.name: next(iter(c.true_poses.taken.settings.values())) for c in draft.cameras if c.true_poses}
@@ -632,13 +658,15 @@ def _unused(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
     lines = ["", "# Recognised, but not used:"]
     for found in draft.unused:
         hint = "; if known to be true: truth: {joints: FILE}" if isinstance(found, Joints) else ""
-        if isinstance(found, Recording) and found.format == "gpx":
-            hint = "; if the person carried it: actor: {log: FILE, topic: /track}"
+        if isinstance(found, Recording) and (fixes := [t.name for t in found.topics if t.kind == "fixes"]):
+            hint = f" with positions alone; if the person carried it: actor: {{log: FILE, topic: {fixes[0]}}}"
         lines.append(f"#   {flow(relative(found.path))}  ({one_line(found.title)}{hint or _held(found)})")
     return lines
 
 
 def _held(found: Found) -> str:
     """List the topics of an unused log, which the user could still name."""
-    topics = [topic.name for topic in found.topics if topic.count] if isinstance(found, Recording) else []
-    return f" with {one_line(', '.join(topics[:_NAMES_LISTED]))}" if topics else ""
+    if not isinstance(found, Recording):
+        return ""
+    topics = [topic.name for topic in found.topics if topic.count]
+    return f" with {one_line(', '.join(topics[:_NAMES_LISTED]))}" if topics else " without poses or pictures"

@@ -62,6 +62,8 @@ from pipelines.session.manifest import PoseSource
 
 _POSE_TYPES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "PoseInFrame", "TransformStamped")
 """Types of pose messages, the preferred first: odometry states its uncertainty. All others come last."""
+_MAP_TYPES = ("Octomap", "GridMap", "OccupancyGrid")
+"""Types of whole maps, the preferred first; clouds of points are a sensor's, seldom in the frame of poses."""
 _GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "ptz", "camera", "cam"})
 NO_DATE_NS = 10**17  # stamps below it count from boot
 _MANY_CAMERAS = 200  # of one calibration file: more are the pictures of one moving camera
@@ -81,6 +83,7 @@ class Candidate:
     by_gps: bool = False  # poses whose position is that of a satellite receiver
     unturned: bool = False  # positions only, without attitudes of drone or gimbal
     is_true: bool = False  # its name says that it is ground truth
+    placed: bool = False  # maps in the frame of poses
     ned_hint: str = ""  # a name that sounds like north-east-down
 
     def affinity(self, label: Label) -> int:
@@ -285,6 +288,7 @@ class Draft:
     true_joints: list[Joints]  # the first is taken
     actors: list[Candidate]  # the first is taken
     maps: list[Found]  # the first is taken
+    logged_maps: list[Candidate]  # topics; the first is taken if there is no file and it lies where poses do
     unused: list[Found]
 
 
@@ -329,7 +333,11 @@ def match(findings: Findings, compare: Compare | None = None) -> Draft:
 
     _pair_drones(cameras, moving, compare)
     actors = [c for c in pose_topics if is_called(_topic_of(c), ACTOR)]
-    mentioned = [*(c for camera in cameras for c in camera.mentioned()), *actors]
+    if any(camera.poses and camera.poses.taken.by_gps for camera in cameras):
+        names = ((c, f"{_topic_of(c)} {c.found.place[-1]}") for c in _topics(logs, "fixes"))
+        actors += [fixes for fixes, name in names if is_called(name, ACTOR)]
+    logged_maps = _logged_maps(logs, cameras)
+    mentioned = [*(c for camera in cameras for c in camera.mentioned()), *actors, *logged_maps]
     used = {candidate.found.path for candidate in mentioned}
     used |= {thing.path for thing in (*true_joints, *findings.of(Map))}
     return Draft(
@@ -338,6 +346,7 @@ def match(findings: Findings, compare: Compare | None = None) -> Draft:
         true_joints=true_joints,
         actors=actors,
         maps=findings.of(Map),
+        logged_maps=logged_maps,
         unused=[
             found
             for found in findings.all()
@@ -345,6 +354,23 @@ def match(findings: Findings, compare: Compare | None = None) -> Draft:
         ]
         + [log for log in logs.values() if log.path not in used],
     )
+
+
+def _logged_maps(logs: Mapping[str, Recording], cameras: Sequence[CameraDraft]) -> list[Candidate]:
+    """List the topics of maps, those first that lie in the frame of a camera's poses in the same log."""
+    poses = [camera.poses.taken for camera in cameras if camera.poses]
+    frames = {
+        (c.settings.get("log"), c.settings.get("parent") or (c.topic.target if c.topic else None))
+        for c in poses
+    }
+    found = []
+    for candidate in _topics(logs, "maps"):
+        type_ = candidate.topic.type.rpartition("/")[2] if candidate.topic else ""
+        frame = candidate.topic.target if candidate.topic else ""
+        there = type_ in _MAP_TYPES and (candidate.settings["log"], frame) in frames
+        likelihood = _MAP_TYPES.index(type_) if type_ in _MAP_TYPES else len(_MAP_TYPES)
+        found.append(replace(candidate, rank=(int(not there), likelihood, *candidate.rank), placed=there))
+    return sorted(found, key=lambda candidate: candidate.rank)
 
 
 def _video(camera: CameraDraft) -> dict[str, object]:
@@ -507,8 +533,12 @@ class _Chooser:
         """
         least = UNNAMED if self._lone or shared else NUMBER
         rivals = [candidate for candidate in candidates if self._likeness(candidate) >= least]
-        if not rivals and len(candidates) == 1 and (self._lone or shared):
-            rivals = list(candidates)
+        # The only candidate is taken, and for a lone camera the likeliest topic of the only log.
+        logs = {id(c.found) for c in candidates if isinstance(c.found, Recording)}
+        one_log = self._lone and len(logs) == 1 and all(isinstance(c.found, Recording) for c in candidates)
+        if not rivals and (one_log or (len(candidates) == 1 and (self._lone or shared))):
+            own = self._camera.label
+            rivals = [c for c in candidates if not any(_are_two(own, label) for label in c.labels)]
         if not rivals:
             return None
         # A candidate with the camera's name excludes those without. How exactly the name matches matters less

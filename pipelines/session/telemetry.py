@@ -59,6 +59,8 @@ class Telemetry:
     fit: ClockFit | None = None  # of the log's own clock to GPS time, if it was used
     notes: tuple[str, ...] = ()  # choices that the reader made, and doubts
     dropped: dict[str, int] = field(default_factory=dict)
+    video_began: tuple[int, float] | None = None
+    """Start of the video that holds the log, ns, by the clock of its times, with standard deviation, s."""
 
 
 @dataclass(frozen=True)

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 
 from pipelines.draft import Drafted, draft
 from pipelines.ingest import ingest
+from tests.commands.runner import refused, succeeds
 from tests.real_data import real_data
-from tests.synthetic.drone_logs import drone_of, px4_entries
+from tests.synthetic.drone_logs import drone_of, px4_entries, ulog_rows, write_ulog
 from tests.synthetic.flights import LENS, START_NS, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap
-from tests.synthetic.videos import even_ticks, write_video
+from tests.synthetic.map_logs import grid_entry
+from tests.synthetic.video_tracks import write_djmd, write_gopro, write_klv, write_parrot
+from tests.synthetic.videos import SIZE, even_ticks, write_video
 
 FRAMES = 30
 UPTIME_NS = 900_000_000_000  # a stamp of simulation time
@@ -159,3 +164,98 @@ def test_a_flight_record_says_when_the_video_of_its_length_began(tmp_path: Path)
     assert camera["frame_times"]["start"] == pytest.approx(1_714_557_610, abs=0.1)
     assert camera["frame_times"]["assumed"] is True
     assert camera["clock"]["sigma_s"] == 1
+
+
+def write_lens(folder: Path) -> None:
+    """Write a calibration of the small videos."""
+    matrix = [[300.0, 0.0, SIZE[0] / 2], [0.0, 300.0, SIZE[1] / 2], [0.0, 0.0, 1.0]]
+    text = f"[cam_0]\nsize = {list(SIZE)}\nmatrix = {matrix}\ndistortions = [0, 0, 0, 0, 0]\n"
+    (folder / "lenses.toml").write_text(text, encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "key", "sigma_s"),
+    [
+        ("DJI_1.MP4", write_djmd, "dji", 1),  # its clock is the time of creation
+        ("GOPR1.MP4", write_gopro, "gopro", 0.2),  # a packet of a second has but its own time
+        ("a1.ts", write_klv, "klv", 0),
+        ("P1.MP4", partial(write_parrot, version=4), "parrot", 0),
+    ],
+)
+def test_a_video_begins_when_the_telemetry_in_it_says(
+    tmp_path: Path, name: str, write: Any, key: str, sigma_s: float
+) -> None:
+    truth = drone_of(write_flight(tmp_path / "x", cameras=1, seconds=1.1, clean=True), 0)
+    shutil.rmtree(tmp_path / "x")
+    write(tmp_path / name, truth, pictures=33)
+    write_lens(tmp_path)
+    result, stated = drafted(tmp_path)
+    (camera,) = stated["cameras"].values()
+    assert camera["pose"][key] == name
+    assert float(camera["frame_times"]["start"]) == pytest.approx(START_NS / 1e9, abs=1e-6)
+    assert camera["frame_times"].get("assumed", False) is bool(sigma_s)
+    assert camera.get("clock", {}).get("sigma_s", 0) == sigma_s
+    if key == "gopro":
+        assert len(result.missing) == 1
+        assert "gimbal: {fixed:" in refused("ingest", result.path)
+        text = result.path.read_text(encoding="utf-8").replace("# gimbal: {fixed", "gimbal: {fixed")
+        result.path.write_text(text, encoding="utf-8")
+    assert frames_with_poses(result.path) == 33
+
+
+def test_telemetry_that_cannot_be_read_is_named_beside_its_video(tmp_path: Path) -> None:
+    truth = drone_of(write_flight(tmp_path / "x", cameras=1, seconds=0.2, clean=True), 0)
+    shutil.rmtree(tmp_path / "x")
+    path = write_djmd(tmp_path / "DJI_1.MP4", truth, "dvtm_wm999.proto", pictures=6)
+    result, _ = drafted(tmp_path)
+    assert "dvtm_wm999" in result.left_out[path]
+    assert "name the .SRT" in result.left_out[path]
+    assert len(result.missing) == 2  # poses, intrinsics
+
+
+def test_a_map_in_the_frame_of_the_poses_is_drafted(tmp_path: Path) -> None:
+    entries = [*poses("/drone1/pose", 0), grid_entry(np.full((4, 4), 100, np.int8), START_NS)]
+    write_mcap(tmp_path / "flight.mcap", sorted(entries, key=lambda entry: entry.stamp_ns))
+    write_pictures(tmp_path, "drone1")
+    result, stated = drafted(tmp_path)
+    assert stated["map"] == {"log": "flight", "topic": "/map"}
+    succeeds("ingest", result.path)
+    assert (tmp_path / "flight.session" / "map").is_dir()
+
+
+def test_a_watch_beside_a_drone_on_earth_is_the_actor(tmp_path: Path) -> None:
+    truth = drone_of(write_flight(tmp_path / "x", cameras=1, seconds=1.0, clean=True), 0)
+    shutil.rmtree(tmp_path / "x")
+    write_ulog(tmp_path / "drone1.ulg", ulog_rows(truth))
+    fixes = [
+        Entry("/fix", "sensor_msgs/msg/NavSatFix", t, {
+            "header": header(t, "gps"), "latitude": 40.4433, "longitude": -79.9436, "altitude": 280.0})
+        for t in range(START_NS, START_NS + 10**9, 10**8)
+    ]  # fmt: skip
+    for name in ("watch", "mast"):
+        write_log(tmp_path, name, "ros1", fixes)
+    write_pictures(tmp_path, "drone1")
+    result, stated = drafted(tmp_path)
+    assert stated["actor"] == {"log": "watch", "topic": "/fix", "point": "hip", "assumed": True}
+    assert list(stated["logs"]) == ["watch"]
+    assert "mast.bag" in result.text
+    succeeds("ingest", result.path)
+    assert (tmp_path / "flight.session" / "actor.parquet").exists()
+
+
+def test_positions_alone_are_refused_with_the_attitudes_beside_them(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=1, seconds=0.2, clean=True)
+    place = {"header": header(START_NS, "gps"), "latitude": 47.5, "longitude": 8.5, "altitude": 400.0}
+    turned = {"header": header(START_NS, "base_link"), "orientation": {"w": 1.0}}
+    entries = [
+        Entry("/gps", "sensor_msgs/msg/NavSatFix", START_NS, place),
+        Entry("/imu/data", "sensor_msgs/msg/Imu", START_NS, turned),
+    ]
+    write_log(tmp_path, "flight", "ros1", entries)
+    for pose, wanted in (
+        ({"log": "flight.bag", "topic": "/gps", "of": "camera"}, "attitude: /imu/data"),
+        ({"log": "flight.bag", "preset": "mavros"}, "there is /gps, /imu/data"),
+    ):
+        flight.settings["cameras"]["drone1"]["pose"] = pose
+        flight.save()
+        assert wanted in refused("ingest", flight.manifest)

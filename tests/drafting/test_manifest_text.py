@@ -90,7 +90,7 @@ def test_truth_of_another_time_is_told_but_not_stated() -> None:
     findings = Findings([keypoints(0, 9), poses(EPOCH_NS, EPOCH_NS + SECOND), truth])
     text, stated = written(findings)
     assert "truth" not in stated
-    assert "truth: {joints: truth.csv}" in text.text
+    assert "truth: {joints: {path: truth.csv, offset_s: 0}}" in text.text
     assert stated["cameras"]["drone1"]["frame_times"] == {
         "start": 1700000000,
         "fps": 30,

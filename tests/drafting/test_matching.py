@@ -271,6 +271,30 @@ def test_a_lone_camera_takes_what_lies_beside_it_whatever_its_name() -> None:
     assert not draft.cameras[0].poses.named
 
 
+def test_a_lone_camera_takes_the_likeliest_topic_of_the_only_log() -> None:
+    topics = topic("/vision/pose", "poses", "geometry_msgs/msg/PoseStamped"), topic("/odom", "poses")
+    draft = match(Findings([video("DJI_0001.mp4"), recording("flight.mcap", *topics)]))
+    choice = draft.cameras[0].poses
+    assert choice
+    assert (taken(choice), others(choice), choice.named) == ("/odom", ["/vision/pose"], False)
+    two = [recording(f"{name}.mcap", *topics) for name in ("a", "b")]
+    assert match(Findings([video("DJI_0001.mp4"), *two])).cameras[0].poses is None
+    of_others = [topic(f"/drone{k}/odom", "poses") for k in (2, 3)]
+    assert match(Findings([video("drone1.mp4"), recording("f.mcap", *of_others)])).cameras[0].poses is None
+
+
+def test_logged_maps_in_the_frame_of_the_poses_come_first() -> None:
+    maps = [
+        topic("/plan", "maps", "nav_msgs/msg/OccupancyGrid"),
+        topic("/site", "maps", "octomap_msgs/msg/Octomap"),
+        topic("/cloud", "maps", "sensor_msgs/msg/PointCloud2"),
+        replace(topic("/local", "maps", "octomap_msgs/msg/Octomap"), target="base"),
+    ]
+    draft = match(Findings([video("a.mp4"), recording("f.mcap", topic("/odom", "poses"), *maps)]))
+    found = [(c.settings["topic"], c.placed) for c in draft.logged_maps]
+    assert found == [("/site", True), ("/plan", True), ("/local", False), ("/cloud", False)]
+
+
 def test_static_poses_serve_where_no_log_has_any() -> None:
     files = [keypoints("cam1.json"), keypoints("cam2.json")]
     shared = calibration("calibration.toml", "cam1", "cam2", pose=True)

@@ -147,6 +147,7 @@ SEEDS: dict[str, Writer] = {
     "flight": lambda folder: write_flight(folder, seconds=0.2),
     "flight from logs": _logged_flight,
     "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),
+    "gopro": lambda folder: video_tracks.write_gopro(folder / "a.mp4", _truth(folder)),
     "gopro without telemetry": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
     "gpx": _gpx,
     "joints_csv": lambda folder: joints_csv.write_joints(folder / "joints.csv", walking(4)),

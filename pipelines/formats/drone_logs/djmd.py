@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -104,9 +104,9 @@ class DjiVideoFormat:
         _, rows = _read(path)
         dated = rows.clock != "the video's start"
         made = "its times count from the video's time of creation, whole seconds: let clock.sigma_s be 1"
-        return telemetry_of_rows(
-            path, rows, choice, [made if dated else "its times count from the video's start"]
-        )
+        notes = [made if dated else "its times count from the video's start"]
+        telemetry = telemetry_of_rows(path, rows, choice, notes)
+        return replace(telemetry, video_began=(video_made_ns(path) or 0, 1.0 if dated else 0.0))
 
 
 def _names_a_protocol(content: bytes) -> bool:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,7 @@ _KINDS = {
     "d": "f8",
 }
 _FIX_3D = 3
+_PACKET_S = 0.2  # standard deviation of when rows were measured: a packet of a second has but its own time
 _DAYS_TO_2000 = (datetime(2000, 1, 1, tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)).days
 _KNOWN = ("GPS5", "GPS9", "GLPI", "ATTD", "SYST", "ACCL", "GYRO", "CORI", "IORI", "GRAV")
 
@@ -128,14 +129,23 @@ class GoProFormat:
                 angles = np.degrees(turned[1][:, [3, 2, 1]])
                 body = attitude_track("ATTD", _ns(turned[1][:, 0]), turned_as_stated(angles), dropped)
             fit = on_gps_time(path, fit, choice.time, notes)
-            return on_one_clock(path, position, body, None, fit=fit, notes=notes, dropped=dropped)
+            telemetry = on_one_clock(path, position, body, None, fit=fit, notes=notes, dropped=dropped)
+            began_ns = int(np.median(_ns(rows[:, 0]) - flown[0]))
+            return replace(
+                telemetry, video_began=(began_ns if fit is None else _on(fit, began_ns), _PACKET_S)
+            )
         at_ns, places, fixed, fit = _fixes(path, track)
         position = position_track(
             path, "its GPS", at_ns, places, dropped, on_earth=True, height=track.heights,
             unusable={"no 3D fix": ~fixed},
         )  # fmt: skip
         fit = on_gps_time(path, fit, choice.time, notes)
-        return on_one_clock(path, position, None, None, fit=fit, notes=notes, dropped=dropped)
+        telemetry = on_one_clock(path, position, None, None, fit=fit, notes=notes, dropped=dropped)
+        return replace(telemetry, video_began=(0, 0.0) if fit is None else (_on(fit, 0), _PACKET_S))
+
+
+def _on(fit: ClockFit, t_ns: int) -> int:
+    return int(fit.other_ns(np.array([t_ns], dtype=np.int64))[0])
 
 
 def _ns(seconds: Float) -> Int64:

@@ -148,6 +148,7 @@ class KlvFormat:
             clock="UTC",
             notes=tuple(notes),
             dropped=dropped,
+            video_began=None if start_ns is None else (start_ns, 0.0),
         )
 
 

@@ -69,6 +69,7 @@ class _Track:
     view: Float  # [N, 4] likewise, of the picture
     clock: str
     began_ns: int | None  # when the video began, if the records state UTC
+    made_ns: int | None  # else its time of creation
     dropped: Counter[str]
 
 
@@ -143,6 +144,7 @@ class ParrotVideoFormat:
             clock=track.clock,
             notes=(note,),
             dropped=dropped,
+            video_began=(track.made_ns or 0, 1.0) if track.began_ns is None else (track.began_ns, 0.0),
         )
 
 
@@ -240,7 +242,8 @@ def _read(path: Path) -> _Track:
     places[outside | ~places.any(axis=1)] = np.nan
     heights = np.array([(row.sea_m, row.ellipsoid_m) for row in rows])
     by_sea = bool(np.isfinite(heights[np.isfinite(places[:, 0]), 0]).all())
-    t_ns, clock, began_ns = _times(path, at_ns, np.array([row.utc_ns for row in rows], dtype=np.int64))
+    made_ns = video_made_ns(path)
+    t_ns, clock, began_ns = _times(at_ns, np.array([row.utc_ns for row in rows], dtype=np.int64), made_ns)
     return _Track(
         version=version,
         t_ns=t_ns,
@@ -250,11 +253,12 @@ def _read(path: Path) -> _Track:
         view=np.array([row.view_xyzw for row in rows]),
         clock=clock,
         began_ns=began_ns,
+        made_ns=made_ns,
         dropped=dropped,
     )
 
 
-def _times(path: Path, at_ns: Int64, utc_ns: Int64) -> tuple[Int64, str, int | None]:
+def _times(at_ns: Int64, utc_ns: Int64, made_ns: int | None) -> tuple[Int64, str, int | None]:
     """Return the times of records [N], their clock, and when the video began if they state UTC (0: no).
 
     A record without UTC is where its time in the video puts it among the others.
@@ -263,7 +267,6 @@ def _times(path: Path, at_ns: Int64, utc_ns: Int64) -> tuple[Int64, str, int | N
         began = utc_ns[stated] - at_ns[stated]
         began_ns = int(np.median(began - began[0])) + int(began[0])
         return np.where(utc_ns > 0, utc_ns, at_ns + began_ns), "UTC", began_ns
-    made_ns = video_made_ns(path)
     return at_ns + (made_ns or 0), _START if made_ns is None else "the video's time of creation", None
 
 

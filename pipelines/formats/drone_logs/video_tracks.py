@@ -34,11 +34,12 @@ def track_packets(path: Path, is_wanted: Callable[[bytes], bool]) -> Iterator[tu
     Raises:
         DataError: FFmpeg cannot read the file.
     """
+    if (kind := track_container(path)) is None:
+        return
+
     import av
     from av.stream import Discard
 
-    if (kind := track_container(path)) is None:
-        return
     try:
         # Named format and protocol, as for pictures: a playlist must not make FFmpeg open other files.
         with av.open(f"file:{path.absolute()}", format=kind, metadata_errors="replace") as container:
@@ -89,10 +90,11 @@ def made_ns(texts: Iterable[str | None]) -> int | None:
 
 def video_made_ns(path: Path) -> int | None:
     """Return when a video was made by its metadata, whole seconds; None without a date or a video."""
-    import av
-
     if (kind := track_container(path)) is None:
         return None
+
+    import av
+
     try:
         with av.open(f"file:{path.absolute()}", format=kind, metadata_errors="replace") as container:
             texts = [{**container.metadata}.get("creation_time")]

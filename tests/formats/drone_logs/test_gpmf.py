@@ -16,32 +16,19 @@ from pipelines.session.telemetry import Telemetry, TelemetryChoice
 from tests.commands.runner import succeeds
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
+from tests.synthetic.drone_logs import drone_of
+from tests.synthetic.flights import write_flight
+from tests.synthetic.video_tracks import gpmf_item, gpmf_nested, gpmf_numbers, write_gopro
 
 READER = gpmf.FORMAT
 KARMA = "second/karma.mp4"
 
 
-def item(key: str, kind: str, size: int, count: int, data: bytes) -> bytes:
-    head = key.encode() + struct.pack(">BBH", ord(kind) if kind else 0, size, count)
-    return head + data + bytes(-len(data) % 4)
-
-
-def numbers(key: str, kind: str, rows: list[list[int]]) -> bytes:
-    letter = {"l": "i", "s": "h", "S": "H", "L": "I"}[kind]
-    data = b"".join(struct.pack(f">{len(row)}{letter}", *row) for row in rows)
-    return item(key, kind, len(data) // len(rows), len(rows), data)
-
-
-def nested(key: str, *inner: bytes) -> bytes:
-    data = b"".join(inner)
-    return item(key, "", 1, len(data), data)
-
-
 def fixes(utc: str, fix: int, rows: list[list[int]], *, sea: bool = False) -> bytes:
-    scale = numbers("SCAL", "l", [[10_000_000], [10_000_000], [1000], [1000], [100]])
-    above = item("GPSA", "c", 1, 4, b"MSLV") if sea else b""
-    about = [numbers("GPSF", "L", [[fix]]), item("GPSU", "c", 1, 16, utc.encode()), above, scale]
-    return nested("DEVC", nested("STRM", *about, numbers("GPS5", "l", rows)))
+    scale = gpmf_numbers("SCAL", "l", [[10_000_000], [10_000_000], [1000], [1000], [100]])
+    above = gpmf_item("GPSA", "c", 1, 4, b"MSLV") if sea else b""
+    about = [gpmf_numbers("GPSF", "L", [[fix]]), gpmf_item("GPSU", "c", 1, 16, utc.encode()), above, scale]
+    return gpmf_nested("DEVC", gpmf_nested("STRM", *about, gpmf_numbers("GPS5", "l", rows)))
 
 
 def place(k: int) -> list[int]:
@@ -73,6 +60,23 @@ def test_fixes_are_spread_over_their_packets_in_utc(monkeypatch: pytest.MonkeyPa
     assert boot.position.t_ns.tolist() == [10**9 + 500_000_000 * k for k in range(4)]
 
 
+def test_a_video_with_pictures_holds_the_places_in_utc(tmp_path: Path) -> None:
+    truth = drone_of(write_flight(tmp_path / "f", cameras=1, seconds=1.1, clean=True), 0)
+    path = write_gopro(tmp_path / "GOPR0001.MP4", truth, pictures=33)
+    assert READER.recognises(path)
+    assert recognise(path, VideoFormat, "video") is VIDEO
+    telemetry = READER.read_telemetry(path, TelemetryChoice())
+    position = telemetry.position
+    at_ns = np.arange(20) * 100_000_000
+    assert position.t_ns.tolist() == (truth.t_ns[0] + at_ns).tolist()
+    kept = np.minimum(np.searchsorted(truth.t_ns - truth.t_ns[0], at_ns), len(truth.t_ns) - 1)
+    places = np.stack([truth.latitude_deg, truth.longitude_deg], axis=1)[kept]
+    np.testing.assert_allclose(position.values[:, :2], places, rtol=0, atol=0.51e-7)  # whole 1e-7 deg
+    np.testing.assert_allclose(position.values[:, 2], truth.altitude_m[kept], rtol=0, atol=0.51e-3)
+    assert telemetry.video_began == (int(truth.t_ns[0]), gpmf._PACKET_S)
+    assert READER.describe(path)["positions"] == 20
+
+
 def test_the_reference_of_heights_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     packets = [(0, 10**9, fixes("240102030405.500", 3, [place(0)], sea=True))]
     assert read(monkeypatch, packets).position.height == "sea level"
@@ -89,14 +93,17 @@ def test_rows_of_hero_11_have_their_own_time_and_fix(monkeypatch: pytest.MonkeyP
     """2024-01-02 is day 8767 since 2000."""
     scale = [10_000_000, 10_000_000, 1000, 1000, 100, 1, 1000, 100, 1]
     rows = b"".join(struct.pack(">7i2H", *place(k)[:5], 8767, 11_045_500 + 100 * k, 120, 3) for k in range(3))
-    about = [item("TYPE", "c", 1, 9, b"lllllllSS"), numbers("SCAL", "l", [[each] for each in scale])]
-    content = nested("DEVC", nested("STRM", *about, item("GPS9", "?", 32, 3, rows)))
+    about = [
+        gpmf_item("TYPE", "c", 1, 9, b"lllllllSS"),
+        gpmf_numbers("SCAL", "l", [[each] for each in scale]),
+    ]
+    content = gpmf_nested("DEVC", gpmf_nested("STRM", *about, gpmf_item("GPS9", "?", 32, 3, rows)))
     telemetry = read(monkeypatch, [(0, 300_000_000, content)])
     assert telemetry.position.t_ns.tolist() == [1704164645500000000 + 100_000_000 * k for k in range(3)]
 
 
 def test_telemetry_without_positions_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    content = nested("DEVC", nested("STRM", numbers("ACCL", "s", [[1, 2, 3]])))
+    content = gpmf_nested("DEVC", gpmf_nested("STRM", gpmf_numbers("ACCL", "s", [[1, 2, 3]])))
     with refuses("a.mp4", "ACCL"):
         read(monkeypatch, [(0, 10**9, content)])
 
