@@ -159,6 +159,11 @@ class DroneLog(Found):
     video_start: VideoStart | None = None  # of the video beside it, or of the one that holds it
     films: tuple[Span, ...] = ()  # when it says that the camera recorded videos
 
+    def film_of(self, video: Video) -> Span | None:
+        """Return the only recording of about a video's length; None if there is none, or several."""
+        alike = [f for f in self.films if abs(f.last_ns - f.first_ns - video.length_ns) < _LENGTHS_DIFFER_NS]
+        return alike[0] if len(alike) == 1 else None
+
 
 @dataclass(frozen=True)
 class Driver:
@@ -226,6 +231,7 @@ class Findings:
 
 _PART = re.compile(r"(.*)_(\d{1,9})", re.DOTALL)
 _BODIES = frozenset({"base", "body", "imu", "fcu"})
+_LENGTHS_DIFFER_NS = 2_000_000_000  # of a video and of its recording by a flight record
 _LEAST_APART_NS = 10_000_000_000  # of header stamps and receipt; less is transport and start-up
 _FILES_ASKED = 16  # of a folder of keypoints, for their format
 

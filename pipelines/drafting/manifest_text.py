@@ -29,7 +29,7 @@ from pipelines.drafting.found import (
     Video,
     VideoStart,
 )
-from pipelines.drafting.matching import CameraDraft, Candidate, Draft
+from pipelines.drafting.matching import NO_DATE_NS, CameraDraft, Candidate, Draft
 from pipelines.session.manifest import SCHEMA, OwnLog
 
 # Texts that every reader of YAML, old or new, reads as text without quotes.
@@ -82,7 +82,6 @@ def one_line(text: str) -> str:
 
 ASSUMED_FPS = 30
 _BRIDGED_NS = 500_000_000  # ingest's default for the longest gap between two poses
-_LENGTHS_DIFFER_NS = 2_000_000_000  # of a video and of its recording by a flight record
 _MOST_OTHERS = 8  # candidates that are listed after the chosen one
 
 
@@ -207,32 +206,29 @@ class CameraText:
         film, poses = self._film, self._camera.poses
         if film is None or poses is None:
             return None
-        found = poses.taken.found
+        taken = poses.taken.found
         if poses.start_ns is not None:
             return VideoStart(poses.start_ns, "when its pictures move as its poses", sigma_s=0.2)
-        if isinstance(found, DroneLog):
-            if found.video_start is not None and (
-                found.path == film.path or found.path.suffix.lower() == ".srt"
-            ):
-                return found.video_start
-            alike = [
-                f for f in found.films if abs(f.last_ns - f.first_ns - film.length_ns) < _LENGTHS_DIFFER_NS
-            ]
-            if len(alike) == 1:
-                return VideoStart(
-                    alike[0].first_ns, "when the flight record says that a video began", sigma_s=1
-                )
+        for found in (each.found for each in poses.all):  # poses of another log, the clock of its own
+            start = found.video_start if isinstance(found, DroneLog) else None
+            if start is None or found.path != film.path:
+                continue
+            if found is taken or start.start_ns > NO_DATE_NS:
+                return start
+        if isinstance(taken, DroneLog):
+            if taken.video_start is not None and taken.path.suffix.lower() == ".srt":
+                return taken.video_start
+            if (recorded := taken.film_of(film)) is not None:
+                source = "when the flight record says that a video began"
+                return VideoStart(recorded.first_ns, source, sigma_s=1)
         if film.made_ns is None or poses.taken.span is None:
             return None
-        made = Span(film.made_ns, film.made_ns + film.length_ns)
-        if film.path.is_dir() and found.path == film.path:
+        if film.path.is_dir() and taken.path == film.path:
             return VideoStart(film.made_ns, "by the EXIF of its pictures")
-        covered = poses.taken.span.overlap_ns(made) >= film.length_ns
-        return (
-            VideoStart(film.made_ns, "by the time of creation in its metadata", sigma_s=1)
-            if covered
-            else None
-        )
+        made = Span(film.made_ns, film.made_ns + film.length_ns)
+        if poses.taken.span.overlap_ns(made) < film.length_ns:
+            return None
+        return VideoStart(film.made_ns, "by the time of creation in its metadata", sigma_s=1)
 
     def _start(self) -> tuple[Decimal | None, str]:
         """Assume the first frame's time in seconds: the start of poses and truth; None for 0."""

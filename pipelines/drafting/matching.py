@@ -9,6 +9,7 @@ are kept and listed as alternatives.
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -332,6 +333,7 @@ def match(findings: Findings, compare: Compare | None = None) -> Draft:
             camera.gimbal = choose(gimbals)
 
     _pair_drones(cameras, moving, compare)
+    _prefer_attitudes(cameras, moving)
     actors = [c for c in pose_topics if is_called(_topic_of(c), ACTOR)]
     if any(camera.poses and camera.poses.taken.by_gps for camera in cameras):
         names = ((c, f"{_topic_of(c)} {c.found.place[-1]}") for c in _topics(logs, "fixes"))
@@ -486,6 +488,52 @@ def _pair_drones(
         if own is not None and sum(own[0] is log for log, _ in found.values()) == 1:
             log, alike = own
             camera.poses = Choice(log, named=False, why="by their motion", start_ns=alike.start_ns)
+
+
+def _prefer_attitudes(cameras: Sequence[CameraDraft], moving: Sequence[Candidate]) -> None:
+    """Give cameras whose poses lack attitudes the log that has them at that time, if just one does.
+
+    Subtitles or a GoPro's GPS have the camera's name, but a flight record or an autopilot's log has more. The
+    other logs with attitudes become alternatives.
+    """
+    taken = {id(each) for camera in cameras if camera.poses for each in camera.poses.all}
+    free: dict[Path, Candidate] = {}
+    for candidate in moving:
+        path = candidate.found.path
+        if candidate.unturned or candidate.span is None or id(candidate) in taken:
+            continue
+        if path not in free or candidate.rank < free[path].rank:
+            free[path] = candidate
+    wanting = [(c, c.poses) for c in cameras if c.poses and c.poses.taken.unturned and c.gimbal is None]
+    fitting_logs = {c.name: [log for log in free.values() if _is_of_film(log, c)] for c, _ in wanting}
+    uses = Counter(id(log) for logs in fitting_logs.values() for log in logs)
+    for camera, choice in wanting:
+        logs = fitting_logs[camera.name]
+        if len(logs) != 1 or uses[id(logs[0])] != 1:
+            camera.poses = replace(choice, others=(*choice.others, *free.values()))
+            continue
+        if not _share_time(logs[0], choice.taken):
+            camera.frame_times = None  # of another clock
+        why = "by their times, for what has its name has no attitudes"
+        camera.poses = Choice(logs[0], choice.all, named=False, why=why)
+
+
+def _is_of_film(log: Candidate, camera: CameraDraft) -> bool:
+    """Test if a log shares the time of a camera's poses, or recorded one video of its video's length."""
+    if camera.poses and _share_time(log, camera.poses.taken):
+        return True
+    video = camera.videos[0].found if camera.videos else None
+    if not isinstance(video, Video) or not isinstance(log.found, DroneLog):
+        return False
+    return log.found.film_of(video) is not None
+
+
+def _share_time(log: Candidate, other: Candidate) -> bool:
+    """Test if a log has dates and covers half of another one."""
+    if log.span is None or other.span is None or min(log.span.first_ns, other.span.first_ns) < NO_DATE_NS:
+        return False
+    length_ns = other.span.last_ns - other.span.first_ns
+    return 2 * log.span.overlap_ns(other.span) >= length_ns
 
 
 def _own_by_motion(

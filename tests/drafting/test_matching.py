@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipelines.drafting.found import (
     Calibration,
+    DroneLog,
     Edge,
     Findings,
     FrameTimes,
@@ -281,6 +282,35 @@ def test_a_lone_camera_takes_the_likeliest_topic_of_the_only_log() -> None:
     assert match(Findings([video("DJI_0001.mp4"), *two])).cameras[0].poses is None
     of_others = [topic(f"/drone{k}/odom", "poses") for k in (2, 3)]
     assert match(Findings([video("drone1.mp4"), recording("f.mcap", *of_others)])).cameras[0].poses is None
+
+
+def drone_log(path: str, first_s: float, *, turned: bool, films: tuple[Span, ...] = ()) -> DroneLog:
+    times = span(first_s, first_s + 20)
+    return DroneLog(*place(path), "dji", "DJI", "dji", times, 20, SECOND, True, turned, turned, films=films)
+
+
+def test_poses_with_attitudes_of_the_same_time_come_before_those_of_the_camera_s_name() -> None:
+    noon = 1_700_000_000
+    filmed, subtitles = video("DJI_7.mp4"), drone_log("DJI_7.SRT", noon, turned=False)
+    times = FrameTimes(*place("DJI_7.SRT"), "frame_times", "times", "srt", 20, subtitles.span)
+    record = drone_log("record.csv", noon - 5, turned=True)
+    found = match(Findings([filmed, subtitles, times, record])).cameras[0]
+    assert found.poses
+    assert (taken(found.poses), others(found.poses), found.poses.named) == (
+        "record.csv",
+        ["DJI_7.SRT"],
+        False,
+    )
+    assert taken(found.frame_times) == "DJI_7.SRT"
+    # Of another clock, the only recording of the video's length is its own, and the subtitles' are not.
+    apart = drone_log("record.csv", noon + 7200, turned=True, films=(span(noon + 7205, noon + 7215),))
+    found = match(Findings([filmed, subtitles, times, apart])).cameras[0]
+    assert (taken(found.poses), found.frame_times) == ("record.csv", None)
+    # Where two fit, or none, they are alternatives.
+    for free in ([record, drone_log("other.csv", noon, turned=True)], [replace(apart, films=())]):
+        found = match(Findings([filmed, subtitles, times, *free])).cameras[0]
+        assert taken(found.poses) == "DJI_7.SRT"
+        assert sorted(others(found.poses)) == sorted(log.path.name for log in free)
 
 
 def test_logged_maps_in_the_frame_of_the_poses_come_first() -> None:
