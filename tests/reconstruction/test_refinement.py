@@ -303,21 +303,21 @@ def test_white_noise_is_averaged_over_time(stated: bool) -> None:
 
 @pytest.mark.slow
 def test_covariances_of_white_noise_are_calibrated() -> None:
-    """Test 24 flights of 2 s: NEES is 3 +- 0.19, since a flight's mean has a standard deviation of 0.95.
+    """Test 12 flights of 2 s: NEES is 3 +- 0.27, since a flight's mean has a standard deviation of 0.95.
 
     400 flights have this deviation around their mean of 3.01 (docs/measurements-refined.md). The share of
-    95 % ellipsoids varies by 7 % from flight to flight there, so by 1.4 % in the mean. Tolerances are four
+    95 % ellipsoids varies by 7 % from flight to flight there, so by 2 % in the mean. Tolerances are four
     of these.
     """
     squares = []
-    for seed in range(24):
+    for seed in range(12):
         flight = formation(60, 3, [WHITE], seed)
         position, covariance, fallback = refined(flight, [WHITE])
         assert fallback is None
         error = position - flight.truth
         squares.append(np.einsum("tji,tjik,tjk->tj", error, np.linalg.inv(covariance), error))
-    assert np.mean(squares) == pytest.approx(3.0, abs=4 * 0.19)
-    assert (np.array(squares) < CHI2_95).mean() == pytest.approx(0.95, abs=4 * 0.014)
+    assert np.mean(squares) == pytest.approx(3.0, abs=4 * 0.27)
+    assert (np.array(squares) < CHI2_95).mean() == pytest.approx(0.95, abs=4 * 0.02)
 
 
 def test_constant_errors_in_the_body_show_when_the_formation_changes() -> None:
