@@ -1,4 +1,6 @@
-"""Export to mcap: one log of ROS 2 messages, for Foxglove, and but for its videos for RViz.
+"""Export to mcap: one log of ROS 2 messages for Foxglove.
+
+RViz shows it, too, except for the videos: it has no display for CompressedVideo without a plugin.
 
 | topic | type | |
 | --- | --- | --- |

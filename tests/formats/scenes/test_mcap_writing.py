@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+import shutil
+import struct
+import subprocess
+import zlib
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
 import pytest
+from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Message,
+    MessageIndex,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -80,6 +98,101 @@ def test_the_mcap_reader_finds_every_topic_with_a_schema_that_parses(log: Path) 
         assert schema.encoding == "ros2msg"
         stated = get_types_from_msg(schema.data.decode(), schema.name)
         assert stated[schema.name][1] == reference.fielddefs[schema.name][1]
+
+
+def test_the_log_is_as_the_mcap_program_demands(log: Path) -> None:
+    """The checks of `mcap doctor`, which no package of Python's brings, by the library's strict reader."""
+    data = log.read_bytes()
+    with log.open("rb") as file:
+        records = list(StreamReader(file, emit_chunks=True, validate_crcs=True).records)
+    at, places = len(b"\x89MCAP0\r\n"), []
+    for _ in records:
+        length = 9 + struct.unpack_from("<Q", data, at + 1)[0]
+        places.append((at, length))
+        at += length
+    header, footer = records[0], records[-1]
+    assert isinstance(header, Header)
+    assert (header.profile, header.library) == ("ros2", "mocap")
+    assert isinstance(footer, Footer)
+    end = next(k for k, record in enumerate(records) if isinstance(record, DataEnd))
+    assert {type(record) for record in records[1:end]} == {Chunk, MessageIndex}
+
+    known: dict[tuple[type, int], Any] = {}
+    counts: dict[int, int] = {}
+    indexed: list[ChunkIndex] = []
+    last_ns = 0
+    chunks = [k for k, record in enumerate(records) if isinstance(record, Chunk)]
+    for k, following in zip(chunks, [*chunks[1:], end], strict=True):
+        chunk = records[k]
+        assert isinstance(chunk, Chunk)
+        stamps_ns = []
+        for record in breakup_chunk(chunk, validate_crc=True):
+            if isinstance(record, Message):
+                assert (Channel, record.channel_id) in known
+                stamps_ns.append(record.log_time)
+                counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
+                continue
+            assert isinstance(record, Schema | Channel)
+            assert record.id > 0 or isinstance(record, Channel)
+            assert asdict(known.setdefault((type(record), record.id), record)) == asdict(record)
+            if isinstance(record, Channel):
+                assert (Schema, record.schema_id) in known
+        assert stamps_ns == sorted(stamps_ns)
+        assert last_ns <= stamps_ns[0] == chunk.message_start_time
+        assert stamps_ns[-1] == chunk.message_end_time
+        last_ns = stamps_ns[-1]
+        indexes = records[k + 1 : following]
+        rows = []
+        for index in indexes:
+            assert isinstance(index, MessageIndex)
+            rows += [(index.channel_id, *row) for row in index.records]
+        assert len(rows) == len(stamps_ns)
+        for channel, stamp_ns, offset in rows:
+            stream, _ = get_chunk_data_stream(chunk)
+            stream.read(offset)
+            stream.read1()
+            message = Message.read(ReadDataStream(stream._stream), stream.read8())
+            assert (message.channel_id, message.log_time) == (channel, stamp_ns)
+        start, length = places[k]
+        indexed.append(
+            ChunkIndex(
+                chunk_length=length,
+                chunk_start_offset=start,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=chunk.message_end_time,
+                message_index_length=sum(size for _, size in places[k + 1 : following]),
+                message_index_offsets={
+                    index.channel_id: place
+                    for index, (place, _) in zip(indexes, places[k + 1 : following], strict=True)
+                    if isinstance(index, MessageIndex)
+                },
+                message_start_time=chunk.message_start_time,
+                uncompressed_size=chunk.uncompressed_size,
+            )
+        )
+    summary = records[end + 1 : -1]
+    assert [asdict(record) for record in summary if isinstance(record, ChunkIndex)] == [
+        asdict(index) for index in indexed
+    ]
+    (statistics,) = (record for record in summary if isinstance(record, Statistics))
+    assert statistics.channel_message_counts == counts
+    assert statistics.message_count == sum(counts.values())
+    assert (statistics.channel_count, statistics.schema_count) == tuple(
+        sum(kind is each for each, _ in known) for kind in (Channel, Schema)
+    )
+    assert statistics.chunk_count == len(indexed)
+    assert statistics.message_end_time == last_ns
+    assert footer.summary_start == places[end + 1][0]
+    # All of the summary and the footer up to the sum itself.
+    assert footer.summary_crc == zlib.crc32(data[footer.summary_start : places[-1][0] + 9 + 16])
+
+
+@pytest.mark.skipif(shutil.which("mcap") is None, reason="the mcap program is not installed")
+def test_the_mcap_program_finds_nothing_wrong(log: Path) -> None:
+    command = ["mcap", "doctor", "--strict-message-order", str(log)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_skeleton_is_there_at_its_own_times(log: Path) -> None:
