@@ -10,6 +10,11 @@ three drones.
 
 measures instead the most memory and the processor time that `mocap reconstruct` takes on the first of these
 flights, of so many minutes, each in a process of its own. `--given nothing` leaves its noise out.
+
+    python -m benchmarks.long_flights --page demo/mound_walk.session    # the figure of docs/report.md
+
+measures the page of an hour: the session's tables are repeated, its pictures and settings kept. The page is
+written beside the session, as hour.html, and opened in Chromium where that is installed.
 """
 
 from __future__ import annotations
@@ -20,14 +25,28 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import yaml  # type: ignore[import-untyped]
 
 from benchmarks.results_page import markdown_table
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
+from pipelines.report import content_of
+from pipelines.reporting.content import SessionContent
+from pipelines.reporting.page import render_page
+from pipelines.session.description import read_description
 from pipelines.simulate import simulate
+from pipelines.sources.pictures import open_pictures
+from tests.reporting.browser import browser
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SAMPLE = Path(__file__).parents[1] / "sample_data" / "mound_walk" / "scenario.yaml"
 NOISE = (
@@ -79,6 +98,90 @@ def memory_row(seed: int, minutes: float, *, stated: bool) -> str:
         return f"| {minutes:g} | {peak_mb:.0f} | {took_s:.0f} | {json.dumps(used)} |"
 
 
+def repeated(content: SessionContent, seconds: float) -> tuple[SessionContent, dict[str, int]]:
+    """Repeat a session's tables until they last so long; return them, and the frames of each camera once."""
+    spans = [entry.frames for entry in content.session.cameras.values()]
+    first, last = min(span.first_t_ns for span in spans), max(span.last_t_ns for span in spans)
+    period = last - first + 33_333_333
+    count = round(seconds * 1e9 / period)
+    frames = {name: int(table["frame"].max()) + 1 for name, table in content.frames.items()}
+
+    def longer(table: pd.DataFrame, per_round: int = 0) -> pd.DataFrame:
+        inside = table[(table["t_ns"] >= first) & (table["t_ns"] < first + period)]
+        rounds = np.repeat(np.arange(count), len(inside))
+        made = inside.iloc[np.tile(np.arange(len(inside)), count)].reset_index(drop=True)
+        made["t_ns"] += rounds * period
+        if "frame" in made:
+            made["frame"] += rounds * per_round
+        return made
+
+    def all_longer(tables: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+        return {name: longer(table, frames[name]) for name, table in tables.items()}
+
+    cameras = {
+        name: entry.model_copy(
+            update={
+                "frames": entry.frames.model_copy(
+                    update={
+                        "count": count * entry.frames.count,
+                        "last_t_ns": entry.frames.last_t_ns + (count - 1) * period,
+                    }
+                )
+            }
+        )
+        for name, entry in content.session.cameras.items()
+    }
+    made = replace(
+        content,
+        session=content.session.model_copy(update={"cameras": cameras}),
+        skeleton=None if content.skeleton is None else longer(content.skeleton),
+        truth=None if content.truth is None else longer(content.truth),
+        angles=None if content.angles is None else longer(content.angles),
+        poses=all_longer(content.poses),
+        frames=all_longer(content.frames),
+        keypoints=all_longer(content.keypoints),
+        refined=all_longer(content.refined),
+        true_poses=all_longer(content.true_poses),
+    )
+    return made, frames
+
+
+def page_lines(session: Path, minutes: float) -> list[str]:
+    """Write the page of a repeated session; return its size and how long making and opening it took."""
+    content, frames = repeated(content_of(session), 60 * minutes)
+    began_s = time.process_time()
+    with ExitStack() as stack:
+        description = read_description(session)
+        pictures = {
+            name: stack.enter_context(open_pictures(session, description, name))
+            for name, entry in description.cameras.items()
+            if entry.media is not None
+        }
+        html = render_page(
+            content, lambda camera, frame: pictures[camera].read(frame % frames[camera]), "small"
+        )
+    page = session.with_name("hour.html")
+    page.write_text(html, encoding="utf-8")
+    lines = [
+        f"{page}: {minutes:g} minutes, {page.stat().st_size / 1e6:.1f} MB, "
+        f"{time.process_time() - began_s:.0f} processor seconds after its tables were loaded"
+    ]
+    drawn = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+        browser(Path(profile)) as tab,
+    ):
+        tab.show_as()
+        for _ in range(3):
+            opened_s = time.perf_counter()
+            tab.open(page.resolve())
+            tab.wait_for("document.getElementById('viewer').dataset.ready === 'true'")
+            tab.evaluate(drawn)
+            lines.append(f"opened and drawn after {time.perf_counter() - opened_s:.1f} s")
+        assert tab.complaints == []
+    return lines
+
+
 def main() -> None:
     """Fly, reconstruct and print."""
     parser = argparse.ArgumentParser(
@@ -89,7 +192,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=90.0)
     parser.add_argument("--memory", type=float, nargs="+", metavar="MINUTES", help="measure memory instead")
     parser.add_argument("--given", choices=("model", "nothing"), default="model", help="with --memory")
+    parser.add_argument("--page", type=Path, metavar="SESSION", help="measure the page of an hour instead")
+    parser.add_argument("--minutes", type=float, default=60.0, help="with --page")
     arguments = parser.parse_args()
+    if arguments.page:
+        print("\n".join(page_lines(arguments.page, arguments.minutes)))
+        return
     if arguments.memory:
         stated = arguments.given == "model"
         for minutes in arguments.memory:

@@ -49,7 +49,7 @@ from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_p
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = Stage("report", revision=12)
+REPORT = Stage("report", revision=13)
 _FIGURES_REVISION = 6
 
 
@@ -122,7 +122,7 @@ def compare_sessions(
     for folder, place in zip(folders, resolved, strict=True):
         if resolved.count(place) > 1:
             raise DataError(folder, "is stated twice", "state every session once")
-    contents = {label: _content_of(folder) for label, folder in zip(_labels(resolved), folders, strict=True)}
+    contents = {label: content_of(folder) for label, folder in zip(_labels(resolved), folders, strict=True)}
     page = output or resolved[0].parent / "comparison" / "index.html"
     html, _ = render_comparison(contents)
     try:
@@ -281,7 +281,12 @@ def _read_frame(pictures: dict[str, Pictures], camera: str, frame: int) -> Pictu
     return pictures[camera].read(frame) if camera in pictures else None
 
 
-def _content_of(folder: Path) -> SessionContent:
+def content_of(folder: Path) -> SessionContent:
+    """Load all that the page of a session shows.
+
+    Raises:
+        DataError: not a session, or damaged; a table of it was changed.
+    """
     records = _finished_stages(open_session(folder))
     return _load(folder, read_description(folder), records)
 

@@ -8,6 +8,7 @@ origin. A missing value is the smallest integer of either kind, never 0.
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -29,10 +30,15 @@ from pipelines.session.tables import trajectory_from
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_BYTES = 2_400_000
-"""Size to which longer flights are thinned out; a third more in the page, where it is base64."""
+MOST_BYTES = 6_000_000
+"""Size to which longer flights are thinned out; a third more in the page, where it is base64.
+
+A page with the largest choice of pictures, 15 MB, then stays below 25 MB.
+"""
+_SHARE_OF_ELLIPSOIDS = 0.25  # of MOST_BYTES, at least, in longer flights: they change more slowly than joints
 _MOST_TIMES_WITHOUT_SKELETON = 3000
 _FARTHEST_M = 32.767
+_PICTURES_S = 0.2  # apart: more is no film any more, and is noted
 _SIDES = ("", "left", "right")
 
 
@@ -70,8 +76,8 @@ def make_scene(
     body = _Body.of(motion, summary.truth) if motion is not None else None
     arms = [arm for arm in replan.arms if arm.simulated] if replan is not None else []
     all_cameras = len(cameras) + sum(len(arm.cameras) for arm in arms)
-    every = -(-len(all_t_ns) * _bytes_per_time(body, all_cameras) // MOST_BYTES)
-    kept = slice(None, None, every)
+    thinned = _Thinned.of(len(all_t_ns), body, all_cameras)
+    kept = slice(None, None, thinned.every)
     t_ns = all_t_ns[kept]
     placed = [_placed(camera, poses[camera.name], t_ns, summary) for camera in cameras]
     for a, arm in enumerate(arms):
@@ -88,7 +94,7 @@ def make_scene(
         "cameras": [camera.packed(origin) for camera in placed],
     }
     if body is not None:
-        data["body"] = body.packed(kept, origin) | {"names": list(summary.people)}
+        data["body"] = body.packed(thinned, origin) | {"names": list(summary.people)}
     around = surface(replan.terrain) if replan is not None and replan.terrain is not None else None
     if around is not None and around.voxels:
         points = _packed(1000 * (around.points - origin), np.int32)
@@ -100,22 +106,32 @@ def make_scene(
         people=summary.people if body is not None else (),
         truth=body is not None and body.truth is not None,
         ellipsoids=body is not None and body.root is not None,
-        notes=tuple(_notes(every, len(all_t_ns), body, around)),
+        notes=tuple(_notes(thinned, len(all_t_ns), body, around, strips)),
         arms=tuple(arm.name for arm in arms),
         surface="surface" in data,
         film=tuple(strip.camera for strip in strips) if body is not None else (),
     )
 
 
-def _notes(every: int, times: int, body: _Body | None, around: Surface | None) -> list[str]:
+def _notes(
+    thinned: _Thinned, times: int, body: _Body | None, around: Surface | None, strips: Sequence[Strip]
+) -> list[str]:
     """List differences from the tables, in whole sentences."""
     notes = []
-    if every > 1:
+    if thinned.every > 1:
         notes.append(
-            f"The page holds one time in {every} of {whole(times)}, and draws straight lines between them."
+            f"The page holds one time in {thinned.every} of {whole(times)}, and draws straight lines between "
+            "them."
+        )
+    if thinned.ellipsoids_every > 1:
+        notes.append(
+            f"Ellipsoids are those of the nearest of one time in {thinned.ellipsoids_every} of these."
         )
     if body is not None:
         notes += body.notes()
+        steps_s = [float(np.median(np.diff(strip.t_ns))) / 1e9 for strip in strips if len(strip.t_ns) > 1]
+        if steps_s and max(steps_s) > _PICTURES_S:
+            notes.append(f"Pictures are {quantity(max(steps_s), 's')} apart.")
     if around is not None and around.voxels:
         notes.append(
             f"The map: {plural(around.voxels, 'voxel')} of the surface above the ground, drawn as "
@@ -169,9 +185,22 @@ class _Body:
         """Number of people."""
         return int(self.middle.shape[1])
 
-    def packed(self, kept: slice, origin: Float) -> dict[str, object]:
+    @property
+    def bytes_per_time(self) -> int:
+        """Size of all but the ellipsoids at one time."""
+        channels = 3 + 3 * (self.truth is not None)
+        return self.people * (4 * 4 + len(self.joints) * channels * 2)
+
+    @property
+    def bytes_of_ellipsoids(self) -> int:
+        """Size of the ellipsoids at one time."""
+        return 0 if self.root is None else self.people * len(self.joints) * 6 * 2
+
+    def packed(self, thinned: _Thinned, origin: Float) -> dict[str, object]:
         """Return the body as JSON, at the kept times."""
         joints = self.joints
+        kept = slice(None, None, thinned.every)
+        with_ellipsoids = slice(None, None, thinned.every * thinned.ellipsoids_every)
         derived = [
             (name, parents) for name, parents in DERIVED if name not in joints and set(parents) <= set(joints)
         ]
@@ -191,7 +220,8 @@ class _Body:
             "joint": _packed(1000 * self.joint[kept], np.int16),
             "truth": None if self.truth is None else _packed(1000 * self.truth[kept], np.int16),
             # A tenth of a millimetre: the least that anybody states.
-            "root": None if self.root is None else _packed(10_000 * self.root[kept], np.int16),
+            "root": None if self.root is None else _packed(10_000 * self.root[with_ellipsoids], np.int16),
+            "rootEvery": thinned.ellipsoids_every,
         }
 
     def notes(self) -> list[str]:
@@ -276,18 +306,30 @@ def _picture_corners(camera: CameraRow) -> list[float]:
 # --- packing -------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class _Thinned:
+    """Choice of the times that a page holds, so that they need at most MOST_BYTES."""
+
+    every: int  # of the skeleton's times
+    ellipsoids_every: int = 1  # of the times that the page holds
+
+    @classmethod
+    def of(cls, times: int, body: _Body | None, cameras: int) -> _Thinned:
+        per_time = cameras * (3 * 4 + 4 * 2) + (0 if body is None else body.bytes_per_time)
+        ellipsoids = 0 if body is None else body.bytes_of_ellipsoids
+        if times * (per_time + ellipsoids) <= MOST_BYTES:
+            return cls(1)
+        share = _SHARE_OF_ELLIPSOIDS if ellipsoids else 0.0
+        every = math.ceil(times * per_time / ((1 - share) * MOST_BYTES))
+        held = -(-times // every)
+        left = MOST_BYTES - held * per_time
+        return cls(every, math.ceil(held * ellipsoids / left) if ellipsoids else 1)
+
+
 def _times_without_skeleton(summary: Summary) -> Int64:
     count = min(max(camera.entry.frames.count for camera in summary.cameras), _MOST_TIMES_WITHOUT_SKELETON)
     steps = np.round(np.linspace(0, 1e9 * summary.duration_s, count)).astype(np.int64)
     return summary.origin_ns + np.unique(steps)
-
-
-def _bytes_per_time(body: _Body | None, cameras: int) -> int:
-    per_camera = 3 * 4 + 4 * 2
-    if body is None:
-        return cameras * per_camera
-    channels = 3 + 3 * (body.truth is not None) + 6 * (body.root is not None)
-    return cameras * per_camera + body.people * (4 * 4 + len(body.joints) * channels * 2)
 
 
 def _bounds(points: Float) -> tuple[Float, Float]:

@@ -106,7 +106,9 @@ class Browser:
 
     def press(self, key: str) -> None:
         """Press and release a key; one letter types it."""
-        text = {"text": key} if len(key) == 1 else {}
+        text: dict[str, Any] = {"text": key} if len(key) == 1 else {}
+        if key == "Tab":  # moves the focus by its number alone
+            text = {"windowsVirtualKeyCode": 9}
         self.send("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
         self.send("Input.dispatchKeyEvent", type="keyUp", key=key)
 

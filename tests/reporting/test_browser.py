@@ -149,6 +149,52 @@ def test_keys_turn_zoom_step_and_play(opened: Browser) -> None:
     opened.press(" ")
 
 
+_FOCUSED = """(() => {
+  const e = document.activeElement;
+  const style = getComputedStyle(e);
+  const place = e.getBoundingClientRect();
+  const seen = place.bottom > 0 && place.top < innerHeight && place.width > 0;
+  const name = e.id || e.closest("figure, .table")?.id || e.getAttribute("aria-labelledby") || e.hash || "";
+  return [e.tagName, name, seen && style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 1];
+})()"""
+
+
+def test_tab_alone_reaches_player_slider_curves_tables_and_links_with_a_visible_focus(
+    opened: Browser,
+) -> None:
+    opened.evaluate("document.body.focus()")
+    reached: list[tuple[str, str]] = []
+    while True:
+        opened.press("Tab")
+        kind, name, visible = opened.evaluate(_FOCUSED)
+        if kind == "BODY" or len(reached) > 200:
+            break
+        assert visible, (kind, name)
+        reached.append((kind, name))
+    wanted = [
+        ("A", "#motion"),
+        ("CANVAS", "viewer-flight"),
+        ("CANVAS", "viewer-body"),
+        ("BUTTON", "viewer-play"),
+        ("INPUT", "viewer-time"),
+        ("SELECT", "viewer-from"),
+        ("DIV", "cameras-caption"),
+        ("DIV", "figure-time"),
+        ("DIV", "figure-residuals"),
+        ("A", "figure-residuals"),
+        ("DIV", "joints-caption"),
+    ]
+    places = [reached.index(each) for each in wanted]
+    assert places == sorted(places)  # in the order of the page
+
+
+def test_the_slider_steps_by_its_arrow_keys(opened: Browser) -> None:
+    _go_to(opened, 3.0)
+    opened.evaluate("document.getElementById('viewer-time').focus()")
+    opened.send("Input.dispatchKeyEvent", type="rawKeyDown", key="ArrowRight", windowsVirtualKeyCode=39)
+    opened.wait_for(f"Math.abs({_NOW} - 3.03) < 0.006")
+
+
 def test_switches_change_the_drawing(opened: Browser) -> None:
     _go_to(opened, 3.0)
     picture = "document.getElementById('viewer-body').toDataURL()"

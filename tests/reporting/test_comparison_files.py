@@ -19,7 +19,7 @@ def sessions(tmp_path: Path, content: SessionContent, monkeypatch: pytest.Monkey
     folders = [tmp_path / f"{name}.session" for name in ("a", "b")]
     for folder in folders:
         folder.mkdir()
-    monkeypatch.setattr(pipelines.report, "_content_of", lambda _: content)
+    monkeypatch.setattr(pipelines.report, "content_of", lambda _: content)
     monkeypatch.setattr(
         pipelines.report, "render_comparison", lambda contents: (f"{GENERATOR} {' '.join(contents)}", {})
     )

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from pipelines.reporting.content import SessionContent, as_reconstructed
 from pipelines.reporting.panels import make_strips
 from pipelines.reporting.summary import summarise
+from pipelines.reporting.viewer import make_scene
+
+from .reading import numbers
 
 
 def test_pictures_keep_to_their_budget_and_show_the_person(content: SessionContent) -> None:
@@ -21,6 +25,11 @@ def test_pictures_keep_to_their_budget_and_show_the_person(content: SessionConte
         known = strip.joints[np.isfinite(strip.joints)]
         assert np.percentile(known, 5) > 0
         assert np.percentile(known, 95) < 1
+    scene = make_scene(summary, content.poses, strips=strips)
+    assert scene is not None
+    apart_s = max(float(np.median(np.diff(strip.t_ns))) / 1e9 for strip in strips)
+    assert apart_s > 0.2  # which the page says
+    assert numbers(scene.notes[-1]) == [pytest.approx(apart_s, abs=0.05)]
 
 
 def test_without_pictures_there_are_none(content: SessionContent) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipelines.reporting import viewer
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.replanned import summarise_replan
 from pipelines.reporting.summary import summarise
-from pipelines.reporting.viewer import MOST_BYTES, Scene, make_scene
+from pipelines.reporting.viewer import Scene, make_scene
 
 from .comparisons import DRONES, TIMES, make_comparison, positions
 from .conftest import (
@@ -125,8 +126,9 @@ def test_without_truth_and_covariance_there_is_nothing_to_switch_on(content: Ses
     assert scene.notes == ()
 
 
-def test_long_flight_is_thinned_and_says_so(content: SessionContent) -> None:
-    frames = 12_000
+def test_long_flight_is_thinned_and_says_so(content: SessionContent, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer, "MOST_BYTES", 1_500_000)
+    frames = 6000
     long_flight = replace(
         content,
         session=described(make_session(frames)),
@@ -136,14 +138,36 @@ def test_long_flight_is_thinned_and_says_so(content: SessionContent) -> None:
     )
     scene = _scene(long_flight)
     joints = _joints(scene)
-    # Per time: 17 joints of 3 + 3 + 6 numbers of 2 bytes, a middle of 12, three cameras of 20 each.
-    every = -(-frames * (17 * 12 * 2 + 12 + 60) // MOST_BYTES)
-    assert every == 3
-    assert len(joints) == frames // every
-    assert numbers(scene.notes[0]) == [3, 12_000]
+    # Per time: 17 joints of 3 + 3 numbers of 2 bytes, a middle and a height of 16, three cameras of 20 each.
+    per_time, ellipsoids = 17 * 6 * 2 + 16 + 60, 17 * 6 * 2
+    every = -(-frames * per_time // (3 * 1_500_000 // 4))
+    held = frames // every
+    ellipsoids_every = -(-held * ellipsoids // (1_500_000 - held * per_time))
+    assert (every, ellipsoids_every) == (2, 1)
+    assert len(joints) == held
+    assert [numbers(note) for note in scene.notes] == [[2, 6000]]
     expected = true_positions(np.arange(0, frames, every) / 30)[:, JOINTS.index("left_hip")]
     hip = joints[:, 0, JOINTS.index("left_hip")] + _origin(scene, long_flight)
     assert np.nanmax(np.abs(hip - expected - OFFSET_M)) < ROUNDING_M
+
+
+def test_ellipsoids_of_a_long_flight_are_thinned_further(
+    content: SessionContent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert content.skeleton is not None
+    whole: Any = _scene(content).data["body"]
+    # 600 times of 280 bytes are 168 kB: of what is left, a time in three.
+    monkeypatch.setattr(viewer, "MOST_BYTES", 225_000)
+    scene = _scene(content)
+    body: Any = scene.data["body"]
+    assert body["rootEvery"] == 3
+    assert [numbers(note) for note in scene.notes] == [[3]]
+    joints = len(JOINTS)
+    stored = _numbers(body["root"], np.int16, 6).reshape(-1, joints, 6)
+    assert len(stored) == FRAMES // 3
+    assert np.array_equal(
+        stored, _numbers(whole["root"], np.int16, 6).reshape(-1, joints, 6)[::3], equal_nan=True
+    )
 
 
 def test_a_joint_gone_far_astray_is_left_out_and_counted(content: SessionContent) -> None:
