@@ -256,7 +256,7 @@ def _print(result: Reconstructed, *, every_joint: bool) -> None:
     counts = metrics["status_counts"]
     filled = f", {counts['filled']} filled" if counts.get("filled") else ""
     say(f"{metrics['method']}: {counts['ok']} of {counts['all']} joint-frames reconstructed{filled}")
-    if metrics["method"] == "auto":
+    if metrics["method"] == "auto" or metrics["method_used"]["clocks"]:
         say(metrics["method_used"]["summary"])
     if metrics.get("smoothing"):
         done = metrics["smoothing"]

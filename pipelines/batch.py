@@ -76,6 +76,7 @@ class Outcome:
     name: str | None = None
     figures: dict[str, float] = field(default_factory=dict)  # by column of the summary
     warnings: tuple[str, ...] = ()
+    doubt: str | None = None  # code of the doubt that explains the most
     seconds: dict[str, dict[str, float]] = field(default_factory=dict)  # of every stage: wall and cpu
     peak_memory_mb: float | None = None  # of the worker, up to the end of this flight
     worker: int | None = None  # its process id
@@ -240,6 +241,7 @@ def _summed_up(session: Path, stages: Sequence[str]) -> Outcome:
     description = read_description(session)
     found: dict[str, object] = {}
     warnings = list(description.warnings)
+    doubts: list[dict[str, Any]] = [doubt.as_json() for doubt in description.doubts]
     for stage, folder in (("reconstruct", "reconstruct"), ("replan-compare", "replan")):
         if stage not in stages:
             continue
@@ -248,10 +250,16 @@ def _summed_up(session: Path, stages: Sequence[str]) -> Outcome:
         if stage == "reconstruct":
             found |= {name: metrics.get(name) for name in ("reconstructed_share", "mpjpe_mm", "pa_mpjpe_mm")}
             found["reprojection_px"] = metrics["reprojection_px"]["median"]
+            doubts = metrics.get("doubts", [])
         else:
             found |= {f"tilt_deg_{name}": arm["tilt_deg"]["mean"] for name, arm in metrics["arms"].items()}
     figures = {name: float(value) for name, value in found.items() if isinstance(value, int | float)}
-    return Outcome(name=description.flight, figures=figures, warnings=tuple(dict.fromkeys(warnings)))
+    return Outcome(
+        name=description.flight,
+        figures=figures,
+        warnings=tuple(dict.fromkeys(warnings)),
+        doubt=doubts[0]["code"] if doubts else None,
+    )
 
 
 def _peak_memory_mb() -> float:
@@ -377,6 +385,7 @@ def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:
         figures=outcome.figures,
         warnings=outcome.warnings,
         report=report,
+        doubt=outcome.doubt,
     )
 
 

@@ -89,7 +89,8 @@ def _of_session(path: Path) -> dict[str, Any]:
     for stage, record in records.items():
         if stage == "ingest":
             continue
-        facts[stage] = {"settings": record.settings, "counts": record.counts}
+        said = {"warnings": record.warnings} if record.warnings else {}  # doubts are the first of them
+        facts[stage] = said | {"settings": record.settings, "counts": record.counts}
     for stage in outdated(records, description.recorded):
         facts[stage]["out of date"] = "what it was made of has changed since: run it again"
     return facts

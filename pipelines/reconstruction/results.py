@@ -251,7 +251,8 @@ def method_used(
     """Say which parts of a method took part in a reconstruction, which not, and why.
 
     Args:
-        metrics: the figures of `background`, `refinement` and `clock_offset_sigmas_s`, where there are any.
+        metrics: the figures of `background`, `refinement`, `clock_offsets_s` and `clock_offset_sigmas_s`,
+            where there are any.
         cameras: all of them, as loaded.
         known: "stated" or "logged", the source of the pose noise; None without any.
         method: as asked for.
@@ -269,7 +270,9 @@ def method_used(
     }
     ground = metrics.get("ground") or {"moved_m": {}, "reasons": {}}
     used["ground"] = {"cameras": list(ground["moved_m"]), "reasons": ground["reasons"]}
+    offsets_s = metrics.get("clock_offsets_s") or {}
     sigmas_s = metrics.get("clock_offset_sigmas_s") or {}
+    clocks_s = {name: (offsets_s[name], sigma_s) for name, sigma_s in sigmas_s.items() if sigma_s > 0}
     refinement = metrics.get("refinement")
     absent = "robust fits calibrated still cameras better" if method == "auto" else "the method has none"
     reason = absent if refinement is None else refinement["fallback"]
@@ -277,23 +280,24 @@ def method_used(
     guessed = learned or bool(used["background"]["cameras"])
     exact = all(camera.static for camera in cameras)
     used |= {
-        "clocks": [name for name, sigma_s in sigmas_s.items() if sigma_s > 0],
+        "clocks": list(clocks_s),
         "body": {"used": reason is None, "reason": reason},
         "pose_noise": known or ("estimated" if guessed and not exact else "none"),
     }
-    return used | {"summary": _summary(used)}
+    return used | {"summary": _summary(used, clocks_s)}
 
 
-def _summary(used: Mapping[str, Any]) -> str:
-    """Write the parts in one line."""
+def _summary(used: Mapping[str, Any], clocks_s: Mapping[str, tuple[float, float]]) -> str:
+    """Write the parts in one line, with estimated clock offsets and their standard deviations."""
     parts = ["keypoints"]
     if used["body"]["used"]:
         parts.append("motion and bones")
     for name, text in (("background", "backgrounds of"), ("ground", "ground seen by")):
         if used[name]["cameras"]:
             parts.append(f"{text} {', '.join(used[name]['cameras'])}")
-    if used["clocks"]:
-        parts.append(f"estimated clocks of {', '.join(used['clocks'])}")
+    if clocks_s:
+        clocks = [f"{name} ({at:+.3f} s, sigma {sigma_s:.3f} s)" for name, (at, sigma_s) in clocks_s.items()]
+        parts.append(f"estimated clocks of {', '.join(clocks)}")
     noise = {"none": "the poses as exact", "estimated": "pose noise estimated from the pictures"}
     parts.append(noise.get(used["pose_noise"], f"{used['pose_noise']} pose noise"))
     left_out = [] if used["body"]["used"] else [f"motion and bones ({used['body']['reason']})"]

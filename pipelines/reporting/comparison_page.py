@@ -19,7 +19,7 @@ from pipelines.reporting.comparison import (
 from pipelines.reporting.comparison_figures import colour_of, draw_comparison, joints_of, shown_measure
 from pipelines.reporting.content import SessionContent, section, text
 from pipelines.reporting.plates import PALETTE, Plate
-from pipelines.reporting.verdict import Verdict
+from pipelines.reporting.verdict import Verdict, doubts_of_flight
 from pipelines.reporting.wording import THIN, environment, fixed, listing, percent, plural, quantity
 
 GENERATOR = "mocap: sessions side by side"
@@ -115,7 +115,7 @@ def judge(comparison: Comparison) -> Verdict:
     if len(sentences) > 1:
         lead = _best(comparison) or f"{len(comparison.sessions)} sessions, each against the first."
     return Verdict(
-        lead,
+        " ".join([*_doubted(comparison.sessions)[:1], lead]),
         quality=tuple(sentences if len(sentences) > 1 else ())
         + tuple(sentence for pair in comparison.pairs for sentence in _also(pair)),
         certainty=tuple(_how(comparison)),
@@ -235,8 +235,18 @@ def _how(comparison: Comparison) -> list[str]:
     return sentences
 
 
+def _doubted(sessions: Sequence[Judged]) -> list[str]:
+    """State what explains the most of each session whose flight is doubted."""
+    first = [(one, next(iter(doubts_of_flight(one.summary)), None)) for one in sessions]
+    return [
+        f"{named(one)} is doubted: {text(doubt, 'what')} ({text(doubt, 'code')})."
+        for one, doubt in first
+        if doubt is not None
+    ]
+
+
 def _doubts(comparison: Comparison) -> list[str]:
-    doubts = []
+    doubts = _doubted(comparison.sessions)
     for pair in comparison.pairs:
         measure = pair.decisive
         if measure is None:

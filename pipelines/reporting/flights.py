@@ -14,6 +14,7 @@ COLUMNS = (
     "status",
     "failed_stage",
     "error",
+    "doubt",
     "reconstructed_share",
     "mpjpe_mm",
     "pa_mpjpe_mm",
@@ -21,7 +22,7 @@ COLUMNS = (
 )
 """Columns of the table as CSV; then the mean tilt of every planner arm, `warnings` and `report`."""
 
-_FIGURES = COLUMNS[5:]
+_FIGURES = COLUMNS[6:]
 _TILT = "tilt_deg_"
 
 
@@ -36,6 +37,7 @@ class FlightRow:
     figures: dict[str, float]  # by column, without figures that were not measured
     warnings: tuple[str, ...]
     report: str | None  # path of its page, as seen from the summary
+    doubt: str | None = None  # code of the doubt that explains the most
 
     @property
     def status(self) -> str:
@@ -55,7 +57,7 @@ class FlightRow:
     def cells(self) -> list[object]:
         """Return the values of COLUMNS."""
         figures = [self.figures.get(name) for name in _FIGURES]
-        return [self.flight, self.name, self.status, self.failed_stage, self.error, *figures]
+        return [self.flight, self.name, self.status, self.failed_stage, self.error, self.doubt, *figures]
 
 
 def render_flights(rows: Sequence[FlightRow]) -> str:
@@ -69,13 +71,15 @@ def render_flights(rows: Sequence[FlightRow]) -> str:
             rows=rows,
             arms={name: name.removeprefix(_TILT) for name in arms},
             failed=failed,
-            lead=_lead(len(rows), failed),
+            lead=_lead(len(rows), failed, sum(row.doubt is not None for row in rows)),
             plural=wording.plural,
         )
     )
 
 
-def _lead(flights: int, failed: int) -> str:
+def _lead(flights: int, failed: int, doubted: int) -> str:
+    of = f"of {wording.plural(flights, 'flight')}"
+    first = f"{doubted} {of} {'is' if doubted == 1 else 'are'} doubted. " if doubted else ""
     if failed == 0:
-        return f"{wording.plural(flights, 'flight')} went through all stages that were asked for."
-    return f"{failed} of {wording.plural(flights, 'flight')} failed; the others went through."
+        return f"{first}{wording.plural(flights, 'flight')} went through all stages that were asked for."
+    return f"{first}{failed} {of} failed; the others went through."

@@ -372,17 +372,19 @@ def _quality_row(content: SessionContent, summary: Summary, camera: CameraRow) -
         if poses is None or truth is None or still
         else _measured_noise(poses, truth, summary),
         offset=offset,
-        sigma=_clock_words(clock),
+        sigma=_clock_words(clock, number(section(summary.metrics, "clock_offset_sigmas_s"), camera.name)),
         detected=detected,
         confident=confident,
         hidden=content.hidden.get(camera.name),
     )
 
 
-def _clock_words(clock: ClockEntry) -> str:
+def _clock_words(clock: ClockEntry, found_s: float | None) -> str:
+    """Describe how surely a clock is known: by flight.yaml, and where it was estimated after that."""
     sigma_s = clock.prior_sigma_s
     words = f"±{THIN}{quantity(sigma_s, 's', 3)}" if sigma_s else "known"
-    return words + {"stated": "", "assumed": ", assumed", "none": ", not stated"}[clock.start]
+    words += {"stated": "", "assumed": ", assumed", "none": ", not stated"}[clock.start]
+    return f"{words}; estimated to ±{THIN}{quantity(found_s, 's', 3)}" if found_s else words
 
 
 # --- poses ---------------------------------------------------------------------------------------------

@@ -137,9 +137,9 @@ def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
     """Judge quality, certainty and doubts, in sentences that state their numbers."""
     if content.skeleton is None:
         lead = "This session was ingested, but not reconstructed yet: run mocap reconstruct on it."
-        return Verdict(lead, doubts=tuple(_doubts(content, summary)))
+        return Verdict(_doubted(summary) + lead, doubts=tuple(_doubts(content, summary)))
     if summary.motion is None or summary.nothing_measured:
-        return Verdict(_why_nothing(summary), doubts=tuple(_doubts(content, summary)))
+        return Verdict(_doubted(summary) + _why_nothing(summary), doubts=tuple(_doubts(content, summary)))
     return Verdict(
         _lead(summary),
         quality=tuple(_quality(summary)),
@@ -162,10 +162,10 @@ def _why_nothing(summary: Summary) -> str:
 
 def _lead(summary: Summary) -> str:
     share = summary.share or 0.0
-    if doubts := _of_the_flight(summary):
+    if doubted := _doubted(summary):
         return (
-            f"This flight is doubted: {text(doubts[0], 'what')}. "
-            f"{percent(share)} of {plural(summary.total, 'joint-frame')} were reconstructed all the same."
+            f"{doubted}{percent(share)} of {plural(summary.total, 'joint-frame')} were reconstructed "
+            "all the same."
         )
     amount = next(
         words
@@ -279,7 +279,13 @@ def _large_errors(summary: Summary) -> list[str]:
     ]
 
 
-def _of_the_flight(summary: Summary) -> list[dict[str, object]]:
+def _doubted(summary: Summary) -> str:
+    """State the first doubt of the flight, to be put before everything else; empty without one."""
+    doubts = doubts_of_flight(summary)
+    return f"This flight is doubted: {text(doubts[0], 'what')}. " if doubts else ""
+
+
+def doubts_of_flight(summary: Summary) -> list[dict[str, object]]:
     """Return what metrics.json doubts of the flight, what explains the most first; else session.json."""
     if "doubts" not in summary.metrics:
         return [doubt.as_json() for doubt in summary.description.doubts]
@@ -293,7 +299,7 @@ def _stated(doubt: Mapping[str, object]) -> str:
 
 
 def _doubts(content: SessionContent, summary: Summary) -> list[str]:
-    doubts = [_stated(doubt) for doubt in _of_the_flight(summary)]
+    doubts = [_stated(doubt) for doubt in doubts_of_flight(summary)]
     losses = sorted(((n, word) for word, n in summary.counts.items() if word != "ok"), reverse=True)
     if not summary.nothing_measured:
         doubts += [

@@ -75,6 +75,8 @@ def test_every_method_is_served_by_the_clocks_that_were_found(tmp_path: Path, me
     assert abs(metrics["clock_offsets_s"]["drone2"] - 0.2) < 0.005
     assert metrics["clock_offsets_s"]["drone1"] == 0.0
     assert metrics["method_used"]["clocks"] == ["drone2"]
+    found = f"drone2 ({metrics['clock_offsets_s']['drone2']:+.3f} s, sigma "
+    assert found in metrics["method_used"]["summary"]
     assert metrics["mpjpe_mm"] < 0.3 * 240
 
 

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
@@ -268,6 +268,19 @@ def test_what_a_batch_cannot_start_with(tmp_path: Path, monkeypatch: pytest.Monk
     )
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert install_command("batch") in refused("batch", tmp_path / "a" / "*.yaml")
+
+
+def test_doubted_flights_come_first(tmp_path: Path) -> None:
+    right = FlightRow("a.yaml", "a", None, None, {}, (), None)
+    rows = [right, replace(right, flight="b.yaml", doubt="mount")]
+    lead = re.search(r'class="lead">([^<]*)', render_flights(rows))
+    assert lead is not None
+    assert lead[1].startswith("1 of 2 ")
+    usual = re.search(r'class="lead">([^<]*)', render_flights([right, right]))
+    assert usual is not None
+    assert lead[1].endswith(usual[1])
+    batch._store(tmp_path, rows, [Outcome(), Outcome(doubt="mount")])
+    assert pd.read_csv(tmp_path / "summary.csv")["doubt"].fillna("").tolist() == ["", "mount"]
 
 
 def test_page_escapes_what_stands_in_files() -> None:

@@ -187,6 +187,15 @@ def test_unlike_sessions_are_doubted(content: SessionContent) -> None:
     assert one(doubts, "“a” real", "“b” simulated")
 
 
+def test_a_doubted_session_comes_before_who_is_better(content: SessionContent) -> None:
+    doubt = {"code": "mount", "cameras": ["mast"], "what": "W1", "evidence": {}, "remedy": "R1"}
+    doubted = replace(_moved(content, 2), metrics={**(content.metrics or {}), "doubts": [doubt]})
+    verdict = _verdict({"a": content, "b": doubted})
+    assert verdict.lead.startswith("“b”")
+    assert verdict.lead.index("W1") < verdict.lead.index("“a”")
+    assert one(verdict.doubts, "“b”", "W1", "mount")
+
+
 def _three(content: SessionContent) -> dict[str, SessionContent]:
     stages = {name: dict(record) for name, record in content.stages.items()}
     gates = {"method": "robust", "gates": {"pixel_sigma_px": 2.0}}

@@ -60,7 +60,8 @@ def test_who_states_the_pose_noise_is_said(content: SessionContent) -> None:
 def test_clocks_detections_and_sight(content: SessionContent) -> None:
     keypoints = content.keypoints["mast"].copy()
     keypoints.loc[: len(keypoints) // 4 - 1, "confidence"] = 0.1
-    metrics = {**(content.metrics or {}), "clock_offsets_s": {"drone2": -0.05}}
+    clocks = {"clock_offsets_s": {"drone2": -0.05}, "clock_offset_sigmas_s": {"drone2": 0.004}}
+    metrics = {**(content.metrics or {}), **clocks}
     rows = _rows(
         replace(
             content,
@@ -70,7 +71,9 @@ def test_clocks_detections_and_sight(content: SessionContent) -> None:
         )
     )
     assert rows["drone2"].offset == f"0.120{THIN}s −0.050{THIN}s"
-    assert rows["drone2"].sigma == f"±{THIN}0.200{THIN}s"
+    assert rows["drone2"].sigma.startswith(f"±{THIN}0.200{THIN}s")
+    assert rows["drone2"].sigma.endswith(f"±{THIN}0.004{THIN}s")
+    assert rows["drone1"].sigma.count("±") <= 1  # not estimated
     assert rows["mast"].detected == pytest.approx(1 - 30 / 600)
     assert rows["mast"].confident == pytest.approx(0.75)
     assert (rows["drone1"].hidden, rows["drone2"].hidden) == (0.25, None)

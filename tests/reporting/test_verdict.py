@@ -10,6 +10,7 @@ from pipelines.reporting.content import SessionContent, items
 from pipelines.reporting.summary import summarise
 from pipelines.reporting.verdict import Verdict, _rise_of_feet, _speeds, give_verdict
 from pipelines.reporting.wording import STATUS_REASONS, STATUS_REMEDIES, joint_label
+from pipelines.session.description import Doubt
 
 from .conftest import STAGES, described, make_session, make_skeleton
 from .reading import numbers, one
@@ -135,6 +136,19 @@ def test_a_doubt_comes_before_everything_else(content: SessionContent) -> None:
     assert verdict.lead.index("W1") < verdict.lead.index("81.1")
     assert right.lead.split()[0] not in verdict.lead
     assert "R1" in verdict.doubts[0]
+
+
+def test_a_doubt_comes_first_where_nothing_is_reconstructed(content: SessionContent) -> None:
+    doubt = {"code": "mount", "cameras": ["mast"], "what": "W1", "evidence": {}, "remedy": "R1"}
+    session = content.session.model_copy(update={"doubts": [Doubt(**doubt)]})
+    ingested = replace(content, session=session, skeleton=None, metrics=None, truth=None)
+    assert content.skeleton is not None
+    empty = replace(content, skeleton=content.skeleton.iloc[:0], metrics={"doubts": [doubt]})
+    for lacking in (ingested, empty):
+        right = replace(lacking, session=content.session, metrics=lacking.metrics and {"doubts": []})
+        usual = _verdict(right).lead
+        assert _verdict(lacking).lead.endswith(usual)
+        assert 0 < _verdict(lacking).lead.index("W1") < len(_verdict(lacking).lead) - len(usual)
 
 
 def test_speed_and_feet_of_a_straight_climb() -> None:
