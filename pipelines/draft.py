@@ -53,6 +53,7 @@ from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import interpolate_points, multiply
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import OwnLog, read_flight
+from pipelines.session.maps import MapSizeError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import PoseSample
 from pipelines.session.registries import (
@@ -92,6 +93,7 @@ _OTHER_KINDS: dict[str, TopicKind] = {
 }
 """Kinds of topics whose messages are no samples, by type."""
 
+_LOCAL_M = 100_000.0  # coordinates beyond it are those of a map projection
 _WATCHED_NS = 60_000_000_000  # of a video, to compare its motion with logs
 _NOMINAL_FOCAL = 0.8  # of a picture's width: an angle of view of 64 degrees
 _DOWN_DEG = (0.0, 30.0, 60.0, 90.0)  # of a camera whose mount nobody stated
@@ -267,7 +269,15 @@ def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
         made_ns = (index.start_ns or None) if path.is_dir() else created_ns(path)
         return Video(*about, index.count, int(index.pts_ns[-1]), made_ns)
     if isinstance(format_, MapFormat):
-        return Map(*about)
+        fitting_m = None
+        try:
+            grid = format_.read_map(path)
+        except MapSizeError as error:
+            if (fitting_m := error.fitting_m) is None:
+                raise
+            grid = format_.read_map(path, resolution_m=fitting_m)
+        far = float(np.abs(grid.origin[:2]).max()) > _LOCAL_M
+        return Map(*about, fitting_m, projected=far and grid.crs is None)
     if head.format == _FRAME_TIMES:
         stamps = read_frame_times(path)
         key: Literal["csv", "srt"] = "srt" if path.suffix.lower() == ".srt" else "csv"

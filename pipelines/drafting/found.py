@@ -118,6 +118,9 @@ class Video(Found):
 class Map(Found):
     """A map of the surroundings."""
 
+    resolution_m: float | None = None  # at which it fits, if its own would be too fine
+    projected: bool = False  # its coordinates are those of a map projection that it does not name
+
 
 @dataclass(frozen=True)
 class TopicFound:

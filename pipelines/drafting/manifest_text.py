@@ -532,7 +532,7 @@ def write_manifest(draft: Draft, name: str, relative: Callable[[Path], str]) -> 
         *_logs(draft, relative, remarks),
         *_cameras(draft, relative, remarks),
         *_actor(draft, relative, remarks),
-        *_map(draft, relative),
+        *_map(draft, relative, remarks),
         *_truth(draft, relative),
         *_unused(draft, relative),
     ]
@@ -607,10 +607,21 @@ def _actor(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> l
     return lines + [f"# or actor: {flowing(other.settings, relative)}" for other in others]
 
 
-def _map(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
+def _map(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> list[str]:
     """Write the maps: the first file, else a topic that lies where the poses do; the others as comments."""
+    on_earth = any(camera.poses and camera.poses.taken.by_gps for camera in draft.cameras)
     placed = [c for c in draft.logged_maps if c.placed]
-    lines = [entry("map", relative(found.path), found.title) for found in draft.maps]
+    lines = []
+    for found in draft.maps:
+        settings = {"path": relative(found.path), "resolution_m": found.resolution_m}
+        said = [found.title]
+        if found.resolution_m:
+            said.append("at a finer resolution_m it would be too large")
+        if found.projected and on_earth:
+            said.append("missing: crs: EPSG:32632, that of its coordinates")
+            if found is draft.maps[0]:
+                remarks.missing["map: crs, for its coordinates are those of a map projection"] = []
+        lines.append(entry("map", stated(settings, relative), "; ".join(said)))
     lines += [entry("map", c.settings, describe(c)) for c in placed]
     others = [
         entry("map", c.settings, f"{describe(c)}; in another frame than the poses: needs transforms")

@@ -288,7 +288,7 @@ class Draft:
     cameras: list[CameraDraft]
     true_joints: list[Joints]  # the first is taken
     actors: list[Candidate]  # the first is taken
-    maps: list[Found]  # the first is taken
+    maps: list[Map]  # the first is taken
     logged_maps: list[Candidate]  # topics; the first is taken if there is no file and it lies where poses do
     unused: list[Found]
 

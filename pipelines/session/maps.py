@@ -35,6 +35,8 @@ from pipelines.session.storage import as_data_error, jsonable, read_json, write_
 MOST_VOXELS = 200_000_000
 """The most voxels of a grid (0.8 GB as float32); a larger one is refused."""
 
+_MOST_DOUBLINGS = 5  # of a resolution: coarser maps are no obstacles any more
+
 FINEST_M, COARSEST_M = 1e-4, 1e4
 """The smallest and the largest side of a voxel; anything else is a mistake in the file."""
 
@@ -74,25 +76,46 @@ def check_resolution(source: Path | str, resolution_m: float) -> float:
     return resolution_m
 
 
-def check_size(source: Path | str, shape: Sequence[float], resolution_m: float, remedy: str) -> None:
+class MapSizeError(DataError):
+    """Map with too many voxels; `fitting_m` is a resolution, doubled until it fits, or None."""
+
+    def __init__(self, source: Path | str, problem: str, remedy: str, fitting_m: float | None) -> None:
+        self.fitting_m = fitting_m
+        super().__init__(source, problem, remedy)
+
+
+def check_size(source: Path | str, shape: Sequence[float], resolution_m: float, remedy: str = "") -> None:
     """Refuse a grid that would not fit, before anything is allocated for it.
 
     Args:
+        source: for the message.
         shape: voxels along each axis; floats where they come from unchecked coordinates.
-        remedy: what the user can do to make it smaller.
+        resolution_m: side of a voxel.
+        remedy: what the user can do to make it smaller, beside a larger resolution.
 
     Raises:
-        DataError: more than `MOST_VOXELS`, or a shape that is not finite.
+        MapSizeError: more than `MOST_VOXELS`, or a shape that is not finite.
     """
     voxels = math.prod(float(side) for side in shape)
-    if not voxels <= MOST_VOXELS:
-        sides = " x ".join(f"{side:.6g}" for side in shape)
-        raise DataError(
-            source,
-            f"its box is {sides} voxels of {resolution_m:g} m, {voxels * 4 / 1e9:.3g} GB; "
-            f"at most {MOST_VOXELS / 1e6:g} million voxels are read",
-            remedy,
-        )
+    if voxels <= MOST_VOXELS:
+        return
+    fitting_m = next(
+        (
+            resolution_m * 2**k
+            for k in range(1, _MOST_DOUBLINGS)
+            if math.prod(side / 2**k + 1 for side in shape) <= MOST_VOXELS
+        ),
+        None,
+    )
+    sides = " x ".join(f"{side:.6g}" for side in shape)
+    coarser = f"state resolution_m: {fitting_m:g} or more" if fitting_m else "state a larger resolution_m"
+    raise MapSizeError(
+        source,
+        f"its box is {sides} voxels of {resolution_m:g} m, {voxels * 4 / 1e9:.3g} GB; "
+        f"at most {MOST_VOXELS / 1e6:g} million voxels are read",
+        f"{remedy}, or {coarser}" if remedy else coarser,
+        fitting_m,
+    )
 
 
 def describe_grid(

@@ -259,3 +259,32 @@ def test_positions_alone_are_refused_with_the_attitudes_beside_them(tmp_path: Pa
         flight.settings["cameras"]["drone1"]["pose"] = pose
         flight.save()
         assert wanted in refused("ingest", flight.manifest)
+
+
+def test_a_map_is_drafted_as_it_fits_and_its_crs_is_missing_beside_gps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = drone_of(write_flight(tmp_path / "x", cameras=1, seconds=0.2, clean=True), 0)
+    shutil.rmtree(tmp_path / "x")
+    write_ulog(tmp_path / "drone1.ulg", ulog_rows(truth))
+    write_pictures(tmp_path, "drone1")
+    points = np.array([[500_000.0, 5_300_000.0, 0.0], [500_003.9, 5_300_003.9, 3.9]])
+    text = "\n".join(" ".join(map(repr, row)) for row in points.tolist())
+    head = "VERSION .7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n"
+    (tmp_path / "site.pcd").write_text(f"{head}DATA ascii\n{text}\n")
+    monkeypatch.setattr("pipelines.session.maps.MOST_VOXELS", 20**3 - 1)  # 0.2 m takes 20 voxels a side
+    result, stated = drafted(tmp_path)
+    assert stated["map"] == {"path": "site.pcd", "resolution_m": 0.4}
+    assert [line for line in result.missing if line.startswith("map: crs")] == result.missing
+    assert "crs" in refused("ingest", result.path)
+    text = result.path.read_text(encoding="utf-8")
+    result.path.write_text(text.replace("resolution_m: 0.4", "resolution_m: 0.4, crs: EPSG:32617"))
+    assert "by its CRS, EPSG:32617" in refused("ingest", result.path)  # another place in that zone
+
+
+def test_a_map_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / "site.pcd").write_text("VERSION .7\nFIELDS x y z\nSIZE 4 4 4\n")
+    write_pictures(tmp_path, "drone1")
+    result, stated = drafted(tmp_path)
+    assert "map" not in stated
+    assert tmp_path / "site.pcd" in result.left_out

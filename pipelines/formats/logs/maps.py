@@ -338,7 +338,7 @@ def _elevations(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
     low_m = float(np.floor(heights[known].min() / side)) * side
     layers = int(min((heights[known].max() - low_m) // side + 1, 2**40))
     sides = [*(math.ceil(cells * cell_m / side - 1e-6) for cells in heights.shape), layers]
-    check_size(source, sides, side, f"state resolution_m: {2 * side:g} or more")
+    check_size(source, sides, side)
     tops = np.full(sides[:2], -1, dtype=np.int64)
     level = np.where(known, (np.nan_to_num(heights) - low_m) // side, -1).astype(np.int64)
     if side >= cell_m:  # a column is as high as the highest cell whose middle is in it

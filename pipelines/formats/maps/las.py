@@ -85,9 +85,7 @@ class LasFormat:
         cells = np.nan_to_num(np.floor(box.high / side) - low + 1, nan=np.inf)
         shape = np.clip(cells, 1, 2**40).astype(np.int64)  # more is refused
         span = " x ".join(f"{v:.0f}" for v in box.high - box.low)
-        check_size(
-            path, shape.tolist(), side, f"crop it (its box is {span} m), or state a larger resolution_m"
-        )
+        check_size(path, shape.tolist(), side, f"crop it (its box is {span} m)")
         grid = np.full(shape.tolist(), np.nan, dtype=np.float32)
 
         def fill(points: Float) -> None:

@@ -147,7 +147,7 @@ def occupancy_from(
     low, high = leaves.extent()
     first, end = low >> halvings, -(-high >> halvings)
     shape = tuple((end - first).tolist())
-    check_size(source, shape, side_m, f"state resolution_m: {2 * side_m:g} or more, or crop the map")
+    check_size(source, shape, side_m, "crop the map")
     grid = np.full(shape, np.nan, dtype=np.float32)
     with np.errstate(over="ignore"):  # exp(large) is inf, and the probability 0
         probability = (1 / (1 + np.exp(-leaves.log_odds))).astype(np.float32)

@@ -111,7 +111,7 @@ class RosMap:
         side = plan.resolution_m if resolution_m is None else check_resolution(path, resolution_m)
         pixels = _probabilities(path, plan)
         corner, shape = _box(plan, pixels.shape, side)
-        check_size(path, shape, side, f"state resolution_m: {4 * side:g} or more")
+        check_size(path, shape, side)
         plane = _plane(plan, pixels, side)
         return Occupancy(np.repeat(plane[:, :, None], shape[2], axis=2), corner, side)
 

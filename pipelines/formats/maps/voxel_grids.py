@@ -36,8 +36,7 @@ def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) 
     side = check_resolution(source, DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
     finite, dropped = _finite(source, points)
     low, shape = _box(finite, side)
-    remedy = f"crop stray points (its box is {_span(finite)} m), or state a larger resolution_m"
-    check_size(source, shape.tolist(), side, remedy)
+    check_size(source, shape.tolist(), side, f"crop stray points (its box is {_span(finite)} m)")
     grid = np.full(shape.astype(np.int64).tolist(), np.nan, dtype=np.float32)
     grid[*_indices(finite, low, side).T] = 1.0
     return Occupancy(grid, low * side, side, dropped=dropped)
@@ -75,8 +74,7 @@ class VoxelSet:
             return
         self._low = np.minimum(self._low, index.min(axis=0))
         self._high = np.maximum(self._high, index.max(axis=0))
-        remedy = "state a larger resolution_m, or give a topic without stray points"
-        check_size(self._source, self.shape, self._side, remedy)
+        check_size(self._source, self.shape, self._side, "give a topic without stray points")
         shifted = index + _REACH
         keys = np.unique((shifted[:, 0] << 2 * _BITS) | (shifted[:, 1] << _BITS) | shifted[:, 2])
         at = np.searchsorted(self._keys, keys)
@@ -277,9 +275,9 @@ def extruded(
     layer = Occupancy(plan[:, :, None], np.array([0.0, 0.0, -resolution_m / 2]), resolution_m)
     layers = max(1, math.ceil(height_m / side_m - 1e-6))  # 3.0000001 voxels count as three
     sides = [*(math.ceil(cells * resolution_m / side_m) for cells in plan.shape), layers]
-    check_size(source, sides, side_m, f"state resolution_m: {2 * side_m:g} or more")
+    check_size(source, sides, side_m)
     flat = placed(source, layer, world_from_plan, resolution_m=side_m)
-    check_size(source, [*flat.probability.shape[:2], layers], side_m, "state a larger resolution_m")
+    check_size(source, [*flat.probability.shape[:2], layers], side_m)
     floor_m = (rotation @ _centre(layer) + position)[2]
     return Occupancy(
         np.repeat(flat.probability, layers, axis=2), np.array([*flat.origin[:2], floor_m]), side_m
@@ -329,7 +327,7 @@ def _turned(source: str, grid: Occupancy, world_from_plane: Float, side: float) 
     corners = (grid.origin[:2] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * extent) @ world_from_plane.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     x_count, y_count = np.maximum(np.ceil((high - low) / side - 1e-6).astype(int), 1).tolist()
-    check_size(source, [x_count, y_count, layers], side, "state a larger resolution_m")
+    check_size(source, [x_count, y_count, layers], side)
     turned = sampled(grid, world_from_plane, low, (x_count, y_count), side)
     return Occupancy(turned, np.array([*low, grid.origin[2]]), side)
 

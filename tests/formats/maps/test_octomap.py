@@ -205,7 +205,7 @@ def test_a_box_that_would_not_fit_is_refused_before_it_is_made(tmp_path: Path) -
     assert isinstance(high, list)
     file = tmp_path / "wide.bt"
     file.write_bytes(file_of([low, *[None] * 6, high]))
-    with refuses(file, "65536 x 65536 x 65536", 0.2, "resolution_m: 0.4"):
+    with refuses(file, "65536 x 65536 x 65536", 0.2, "resolution_m"):
         READER.read_map(file)
     assert READER.describe(file)["occupied_voxels"] == 2
     coarse = READER.read_map(file, resolution_m=0.2 * 2**8)

@@ -240,7 +240,7 @@ def test_plans_without_content_are_refused(tmp_path: Path) -> None:
 
 def test_a_building_that_would_not_fit_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, pgm(np.zeros((1500, 1500), np.uint8)), resolution=0.01)
-    with refuses(path, "1500 x 1500 x 250", 0.01, "resolution_m: 0.04"):
+    with refuses(path, "1500 x 1500 x 250", 0.01, "resolution_m: 0.02"):
         READER.read_map(path)
     assert READER.describe(path)["occupied_voxels"] == 1500 * 1500 * 250
 
