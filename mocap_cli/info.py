@@ -43,16 +43,17 @@ def _print_facts(facts: Mapping[str, object], indent: int) -> None:
             say(label)
             _print_facts(value, indent + 2)
         else:
-            say(f"{label.ljust(indent + width)}  {_text(value)}")
+            digits = 10 if name.startswith(("latitude", "longitude")) else 6  # 0.01 m
+            say(f"{label.ljust(indent + width)}  {_text(value, digits)}")
 
 
-def _text(value: object) -> str:
+def _text(value: object, digits: int = 6) -> str:
     if value is None or value in ([], {}):
         return "-"
     if isinstance(value, float):
         # Times of day need their milliseconds: the page on drones says to take them over into flight.yaml.
-        return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) >= _LARGE else f"{value:.6g}"
+        return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) >= _LARGE else f"{value:.{digits}g}"
     if isinstance(value, list | tuple):
-        shown = ", ".join(_text(item) for item in value[:_LONGEST_LIST])
+        shown = ", ".join(_text(item, digits) for item in value[:_LONGEST_LIST])
         return f"{shown}, ... ({len(value)})" if len(value) > _LONGEST_LIST else shown
     return one_line(str(value))

@@ -67,6 +67,8 @@ def test_when_a_video_began_is_printed_with_its_milliseconds(tmp_path: Path) -> 
     path = write_track(tmp_path / "P.MP4", [(0, empty), *late], codec="bin_data", pictures=5)
     shown = dict(line.split(maxsplit=1) for line in succeeds("info", path).splitlines() if line[:1] == " ")
     assert float(shown["video_began_s"]) == pytest.approx(truth.t_ns[0] / 1e9 - 0.123, abs=1e-3)
+    west, east = map(float, shown["longitude_deg"].split(", "))
+    assert [west, east] == pytest.approx(sorted(truth.longitude_deg[[0, -1]]), abs=1e-7)  # 0.01 m
 
 
 def test_a_simulated_flight_and_its_summary(tmp_path: Path) -> None:

@@ -100,8 +100,9 @@ class GoProFormat:
         facts["positions"] = len(telemetry.position.t_ns)
         facts["body_attitudes"] = len(telemetry.body.t_ns) if telemetry.body else 0
         facts["clock"] = telemetry.clock
-        if telemetry.fit:
+        if telemetry.fit and telemetry.video_began:
             facts["gps_time"] = describe_fit(telemetry.fit)
+            facts["video_began_s"] = round(telemetry.video_began[0] / 1e9, 3)
         for name, column in zip(
             ("latitude_deg", "longitude_deg", "height_m"), telemetry.position.values.T, strict=True
         ):

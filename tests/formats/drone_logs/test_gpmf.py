@@ -74,7 +74,8 @@ def test_a_video_with_pictures_holds_the_places_in_utc(tmp_path: Path) -> None:
     np.testing.assert_allclose(position.values[:, :2], places, rtol=0, atol=0.51e-7)  # whole 1e-7 deg
     np.testing.assert_allclose(position.values[:, 2], truth.altitude_m[kept], rtol=0, atol=0.51e-3)
     assert telemetry.video_began == (int(truth.t_ns[0]), gpmf._PACKET_S)
-    assert READER.describe(path)["positions"] == 20
+    facts = READER.describe(path)
+    assert (facts["positions"], facts["video_began_s"]) == (20, truth.t_ns[0] / 1e9)
 
 
 def test_the_reference_of_heights_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
