@@ -358,55 +358,56 @@ def _compare(
         known: what is known of the errors: where to look, and how far around.
         most: patches of a pair.
     """
-    patch: list[int] = []
-    pair: list[int] = []
-    covariance, across, shift, design = [], [], [], []
+    cameras, pair = len(views), np.empty(0, dtype=np.int64)
+    patch, covariance = [np.empty(0, dtype=np.int64)], [np.empty((0, 3, 3))]
+    across, shift, design = [np.empty((0, 2, 3))], [np.empty((0, 3))], [np.empty((0, 3, 6 * cameras))]
     for number, (a, b) in enumerate(pairs):
         first, second = views[a], views[b]
         seen_a, position_a, rotation_a, ray_a = first.seen(first.points, first.normal)
         seen_b, position_b, rotation_b, ray_b = second.seen(first.points, first.normal)
         shown = np.flatnonzero(seen_a.any(axis=0) & seen_b.any(axis=0))
-        for i in shown[np.unique(np.linspace(0, len(shown) - 1, min(most, len(shown))).astype(int))].tolist():
-            found = 0
-            for s, t in _alike(seen_a[:, i], seen_b[:, i], ray_a[:, i], ray_b[:, i]):
-                row = np.zeros((3, 6 * len(views)))
-                row[:, 3 * b : 3 * b + 3], row[:, 3 * a : 3 * a + 3] = np.eye(3), -np.eye(3)
-                turns = 3 * len(views)
-                arm = first.points[i] - position_b[t, i]
-                row[:, turns + 3 * b : turns + 3 * b + 3] = -cross_matrix(arm) @ rotation_b[t, i]
-                row[:, turns + 3 * a : turns + 3 * a + 3] = -first.by_turn[i]
-                expected = row @ known.errors
-                spread = row @ known.covariance @ row.T + first.covariance[i]
-                axes = _axes(first.normal[i], ray_b[t, i])
-                # A height is seen beside its place on the plane, along the second camera's ray.
-                onto = np.outer(ray_b[t, i], first.normal[i]) / (ray_b[t, i] @ first.normal[i])
-                fallen = axes @ (np.eye(3) - onto)
-                reach = _SIGMAS * np.sqrt(np.diagonal(fallen @ spread @ fallen.T))
-                moved = _displacement(
-                    _Cut(first.stills[s], position_a[s, i], rotation_a[s, i], first.camera),
-                    _Cut(second.stills[t], position_b[t, i], rotation_b[t, i], second.camera),
-                    first.points[i],
-                    axes,
-                    expected,
-                    reach,
-                )
-                if moved is None:
-                    continue
-                patch.append(len(pair))
-                across.append(np.linalg.svd(ray_b[t, i][None])[2][1:])
-                shift.append(moved)
-                design.append(row)
-                found += 1
-            if found:
-                pair.append(number)
-                covariance.append(first.covariance[i])
+        chosen = shown[np.unique(np.linspace(0, len(shown) - 1, min(most, len(shown))).astype(int))]
+        alike = [
+            (i, *stills)
+            for i in chosen.tolist()
+            for stills in _alike(seen_a[:, i], seen_b[:, i], ray_a[:, i], ray_b[:, i])
+        ]
+        if not alike:
+            continue
+        i, s, t = np.array(alike).T
+        point, normal, ray = first.points[i], first.normal[i], ray_b[t, i]
+        row = np.zeros((len(i), 3, 6 * cameras))
+        row[:, :, 3 * b : 3 * b + 3], row[:, :, 3 * a : 3 * a + 3] = np.eye(3), -np.eye(3)
+        turn_a, turn_b = 3 * (cameras + a), 3 * (cameras + b)
+        row[:, :, turn_b : turn_b + 3] = -cross_matrix(point - position_b[t, i]) @ rotation_b[t, i]
+        row[:, :, turn_a : turn_a + 3] = -first.by_turn[i]
+        spread = row @ known.covariance @ np.swapaxes(row, 1, 2) + first.covariance[i]
+        axes = _axes(normal, ray)
+        # A height is seen beside its place on the plane, along the second camera's ray.
+        onto = ray[:, :, None] * normal[:, None] / (ray * normal).sum(axis=1)[:, None, None]
+        fallen = axes @ (np.eye(3) - onto)
+        moved = _displacements(
+            _Cuts(first, s, position_a[s, i], rotation_a[s, i]),
+            _Cuts(second, t, position_b[t, i], rotation_b[t, i]),
+            _Places(point, axes),
+            row @ known.errors,
+            _SIGMAS * np.sqrt(np.diagonal(fallen @ spread @ np.swapaxes(fallen, 1, 2), axis1=1, axis2=2)),
+        )
+        clear = np.isfinite(moved[:, 0])
+        found, own = np.unique(i[clear], return_inverse=True)
+        patch.append(len(pair) + own)
+        pair = np.append(pair, np.full(len(found), number))
+        covariance.append(first.covariance[found])
+        across.append(np.linalg.svd(ray[clear][:, None])[2][:, 1:])
+        shift.append(moved[clear])
+        design.append(row[clear])
     return _Matches(
-        np.array(patch, dtype=np.int64),
-        np.array(pair, dtype=np.int64),
-        np.array(covariance).reshape(-1, 3, 3),
-        np.array(across).reshape(-1, 2, 3),
-        np.array(shift).reshape(-1, 3),
-        np.array(design).reshape(-1, 3, 6 * len(views)),
+        np.concatenate(patch),
+        pair,
+        np.concatenate(covariance),
+        np.concatenate(across),
+        np.concatenate(shift),
+        np.concatenate(design),
     )
 
 
@@ -440,100 +441,123 @@ def _alike(seen_a: Bool, seen_b: Bool, ray_a: Float, ray_b: Float) -> list[tuple
 
 
 @dataclass(frozen=True)
-class _Cut:
-    """Still that orthophotos are cut out of."""
+class _Places:
+    """Rectangles of cells in planes: K of them."""
 
-    pyramid: dict[int, Picture]
-    position: Float  # [3]
-    rotation: Float  # [3, 3]
-    camera: Camera
+    centre: Float  # [K, 3]
+    axes: Float  # [K, 2, 3] of the cells, unit vectors
 
-    def shown(self, centre: Float, axes: Float, half: Int64) -> tuple[Int64, Int64]:
-        """Find how much of a rectangle of cells about a point the still shows: first and last cell [2].
+    def points(self, cells: Float) -> Float:
+        """Compute the points [K, N, 3] of cells [K, N, 2]."""
+        return np.asarray(self.centre[:, None] + _CELL_M * cells @ self.axes)
 
-        The rectangle has `half` cells [2] on each side along two axes [2, 3]. It keeps its width across the
-        second axis, unless the still is too narrow for it even at the point itself.
-        """
-        across = np.arange(-half[1], half[1] + 1)
-        wide = self._inside(centre + _CELL_M * across[:, None] * axes[1])
-        first, last = _run(wide, int(half[1]))
-        along = np.arange(-half[0], half[0] + 1)[:, None, None] * axes[0]
-        sides = np.array([across[first], across[last]])[:, None] * axes[1]
-        low, high = _run(
-            np.asarray(self._inside(centre + _CELL_M * (along + sides)).all(axis=1)), int(half[0])
-        )
-        return np.array([low - half[0], first - half[1]]), np.array([high - half[0], last - half[1]])
 
-    def _inside(self, points: Float) -> Bool:
-        return self._holds(_pixels(points, self.position, self.rotation, self.camera)[0])
+@dataclass(frozen=True)
+class _Cuts:
+    """Stills that orthophotos are cut out of: K of them."""
 
-    def _holds(self, xy: Float) -> Bool:
-        size = np.array([self.camera.intrinsics.width, self.camera.intrinsics.height])
+    view: _View
+    still: Int64  # [K]
+    position: Float  # [K, 3]
+    rotation: Float  # [K, 3, 3]
+
+    def pixels(self, points: Float) -> tuple[Float, Bool]:
+        """Find the pixels [K, N, 2] of points [K, N, 3], and which of them lie inside the stills [K, N]."""
+        position, rotation = self.position[:, None], self.rotation[:, None]
+        xy, _ = _pixels(points, position, rotation, self.view.camera)
+        size = np.array([self.view.camera.intrinsics.width, self.view.camera.intrinsics.height])
         with np.errstate(invalid="ignore"):
-            return np.asarray(((xy > 0) & (xy < size - 1)).all(axis=-1))
+            return xy, np.asarray(((xy > 0) & (xy < size - 1)).all(axis=-1))
 
-    def orthophoto(self, centre: Float, axes: Float, begins: Int64, ends: Int64) -> Picture | None:
-        """Cut out cells, from `begins` to `ends` [2], along axes [2, 3] about a point; None if not inside."""
+    def shown(self, places: _Places, half: Int64) -> tuple[Int64, Int64]:
+        """Find how much of rectangles about points the stills show: first and last cells [K, 2].
+
+        The rectangles have `half` cells [K, 2] on each side. They keep their width across the second axis,
+        unless a still is too narrow for it even at the point itself.
+        """
+        across, along = (np.arange(-most, most + 1) for most in half.max(axis=0)[::-1])
+        wide = np.zeros((len(half), len(across), 2))
+        wide[:, :, 1] = across
+        first, last = _run(self.pixels(places.points(wide))[1] & (abs(across) <= half[:, 1:]))
+        high = np.zeros((len(half), len(along), 2, 2))
+        high[..., 0] = along[:, None]
+        high[..., 1] = np.stack([first, last], axis=1)[:, None]
+        inside = self.pixels(places.points(high.reshape(len(half), -1, 2)))[1].reshape(high.shape[:3])
+        low, top = _run(inside.all(axis=2) & (abs(along) <= half[:, :1]))
+        return np.stack([low, first], axis=1), np.stack([top, last], axis=1)
+
+    def orthophoto(self, k: int, xy: Float, cells: Int64) -> Picture:
+        """Cut `cells` [2] out of the k-th still, whose corners are at pixels [4, 2] inside it."""
         import cv2
 
-        corners = np.array([begins, [ends[0], begins[1]], ends, [begins[0], ends[1]]])
-        places = centre + corners * _CELL_M @ axes
-        xy, _ = _pixels(places, self.position, self.rotation, self.camera)
-        if not self._holds(xy).all():
-            return None
+        pyramid = self.view.stills[self.still[k]]
         sides_px = np.abs(xy - np.roll(xy, 1, axis=0)).max(axis=1)
-        span_px = float((sides_px / (ends - begins)[[1, 0, 1, 0]]).max())
-        level = int(np.clip(np.log2(max(span_px, 1.0)), min(self.pyramid), _LEVELS))
-        to_still = cv2.getPerspectiveTransform(
-            (corners - begins).astype(np.float32), (xy / 2**level).astype(np.float32)
-        )
-        size = (ends - begins + 1).tolist()
+        span_px = float((sides_px / cells[[1, 0, 1, 0]]).max())
+        level = int(np.clip(np.log2(max(span_px, 1.0)), min(pyramid), _LEVELS))
+        corners = (cells * _CORNERS).astype(np.float32)
+        to_still = cv2.getPerspectiveTransform(corners, (xy / 2**level).astype(np.float32))
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        cut = cv2.warpPerspective(self.pyramid[level], to_still, size, flags=flags)
+        cut = cv2.warpPerspective(pyramid[level], to_still, (cells + 1).tolist(), flags=flags)
         return np.asarray(cv2.GaussianBlur(cut.astype(np.float32), (0, 0), _BLUR_CELLS))
 
 
-def _run(inside: Bool, middle: int) -> tuple[int, int]:
-    """Find the first and the last of the true values about the middle one."""
-    outside = np.flatnonzero(~inside)
-    before, after = outside[outside <= middle], outside[outside >= middle]
-    return int(before.max(initial=-1)) + 1, int(after.min(initial=len(inside))) - 1
+_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+"""Corners of a rectangle, in turn: 0 where it begins, 1 where it ends."""
+
+
+def _run(inside: Bool) -> tuple[Int64, Int64]:
+    """Find the first and the last [K] of the true values about the middle of [K, 2 N + 1], which is 0."""
+    most = inside.shape[1] // 2
+    place = np.arange(-most, most + 1)
+    before = np.where(~inside & (place <= 0), place, -most - 1).max(axis=1)
+    after = np.where(~inside & (place >= 0), place, most + 1).min(axis=1)
+    return before + 1, after - 1
 
 
 def _axes(normal: Float, ray: Float) -> Float:
-    """Build two axes [2, 3] of a plane: away along a ray, and across it."""
-    along = ray - (ray @ normal) * normal
-    along /= np.linalg.norm(along)
-    return np.stack([along, np.cross(normal, along)])
+    """Build two axes [K, 2, 3] of planes by their normals [K, 3]: away along rays [K, 3], and across them."""
+    along = ray - (ray * normal).sum(axis=1, keepdims=True) * normal
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    return np.stack([along, np.cross(normal, along)], axis=1)
 
 
-def _displacement(
-    a: _Cut, b: _Cut, point: Float, axes: Float, expected: Float, reach_m: Float
-) -> Float | None:
-    """Find a patch of one still in another: its shift [3] in the plane beyond `point`; None if not clear.
+def _displacements(a: _Cuts, b: _Cuts, places: _Places, expected: Float, reach_m: Float) -> Float:
+    """Find patches of stills in other stills.
 
     Args:
-        a: the still that the patch is cut out of.
-        b: the still that is searched.
-        point: [3] centre of the patch.
-        axes: [2, 3] of its plane.
-        expected: [3] shift at which the search begins.
-        reach_m: [2] how far it goes along each axis.
+        a: the stills that the patches are cut out of.
+        b: the stills that are searched.
+        places: the patches.
+        expected: [K, 3] shifts at which the searches begin.
+        reach_m: [K, 2] how far they go along each axis.
+
+    Returns:
+        [K, 3] shifts in the planes, NaN where a still does not show enough or no place is clearly alike.
     """
+    half = np.full(reach_m.shape, _HALF_CELLS)
+    reach = np.clip(np.ceil(reach_m / _CELL_M).astype(np.int64), _PEAK_CELLS + 2, _FARTHEST_REACH_CELLS)
+    around = replace(places, centre=places.centre + expected)
+    begins, ends = b.shown(around, half + reach)
+    least = half + _PEAK_CELLS + 2
+    wanted_px, whole = a.pixels(places.points(half[:, None] * (2 * _CORNERS - 1)))
+    searched_px, there = b.pixels(around.points(begins[:, None] + (ends - begins)[:, None] * _CORNERS))
+    usable = whole.all(axis=1) & there.all(axis=1) & (-begins >= least).all(axis=1)
+    usable &= (ends >= least).all(axis=1)
+    moved = np.full(expected.shape, np.nan)
+    for k in np.flatnonzero(usable).tolist():
+        wanted = a.orthophoto(k, wanted_px[k], 2 * half[k])
+        if wanted.std() < _FLAT:
+            continue
+        peak = _peak(b.orthophoto(k, searched_px[k], ends[k] - begins[k]), wanted)
+        if peak is not None:
+            moved[k] = expected[k] + _CELL_M * (peak + begins[k] + half[k]) @ places.axes[k]
+    return moved
+
+
+def _peak(searched: Picture, wanted: Picture) -> Float | None:
+    """Find where a picture shows another one: first cell [2], right and down; None if not clear."""
     import cv2
 
-    half = np.full(2, _HALF_CELLS)
-    wanted = a.orthophoto(point, axes, -half, half)
-    if wanted is None or wanted.std() < _FLAT:
-        return None
-    reach = np.clip(np.ceil(reach_m / _CELL_M).astype(np.int64), _PEAK_CELLS + 2, _FARTHEST_REACH_CELLS)
-    begins, ends = b.shown(point + expected, axes, half + reach)
-    least = half + _PEAK_CELLS + 2
-    if (-begins < least).any() or (ends < least).any():
-        return None
-    searched = b.orthophoto(point + expected, axes, begins, ends)
-    if searched is None:
-        return None
     alike = cv2.matchTemplate(searched, wanted, cv2.TM_CCOEFF_NORMED)
     y, x = np.unravel_index(int(alike.argmax()), alike.shape)
     if not (0 < x < alike.shape[1] - 1 and 0 < y < alike.shape[0] - 1) or alike[y, x] < _ALIKE:
@@ -542,10 +566,7 @@ def _displacement(
     other[max(0, y - _PEAK_CELLS) : y + _PEAK_CELLS + 1, max(0, x - _PEAK_CELLS) : x + _PEAK_CELLS + 1] = -1
     if alike[y, x] - other.max() < _CLEARER:
         return None
-    right = _vertex(*alike[y, x - 1 : x + 2]) + x + begins[0] + half[0]
-    down = _vertex(*alike[y - 1 : y + 2, x]) + y + begins[1] + half[1]
-    moved: Float = expected + _CELL_M * (right * axes[0] + down * axes[1])
-    return moved
+    return np.array([_vertex(*alike[y, x - 1 : x + 2]) + x, _vertex(*alike[y - 1 : y + 2, x]) + y])
 
 
 def _vertex(before: float, top: float, after: float) -> float:
