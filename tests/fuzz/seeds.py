@@ -175,7 +175,7 @@ SEEDS: dict[str, Writer] = {
     "pcd, binary": lambda folder: test_pcd.write(folder / "a.pcd", "binary"),
     "pcd, compressed": lambda folder: test_pcd.write(folder / "a.pcd", "binary_compressed"),
     "picture_tags": lambda folder: test_picture_folder.write(folder / "film"),
-    "pictures": lambda folder: test_picture_folder.write(folder / "film", xmp=False),
+    "pictures": lambda folder: test_picture_folder.write(folder / "film", xmp=""),
     "ply": lambda folder: test_ply.write(folder / "a.ply", "ascii"),
     "ply, binary": lambda folder: test_ply.write(folder / "a.ply", "binary_little_endian"),
     "ros1": lambda folder: logs.write_ros1(folder / "a.bag", entries(0.2)),

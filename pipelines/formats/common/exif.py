@@ -1,7 +1,10 @@
-"""Tags of pictures: times and places in EXIF, and DJI's angles, heights and RTK in XMP.
+"""Tags of pictures: times and places in EXIF, and drones' angles, heights and RTK in XMP.
 
 EXIF is that of JPEG and PNG (CIPA DC-008): the local time without its zone is taken as UTC, as for subtitles,
 unless the offset is there. XMP has DJI's names (`drone-dji:GimbalYawDegree`, ...), as attributes or elements.
+Autel has the same names behind `drone:`, Parrot its own (`drone-parrot:CameraYawDegree`), Skydio angles in
+`drone-skydio:CameraOrientationNED`, as OpenAthena and OpenDroneMap read them. All count yaw from north to
+east and pitch up from the horizon.
 """
 
 from __future__ import annotations
@@ -19,7 +22,11 @@ import numpy as np
 SUFFIXES = (".jpg", ".jpeg", ".png")
 _HEAD = 512 * 1024  # bytes in which cameras write XMP
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_TAG = re.compile(rb"drone-dji:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
+_TAG = re.compile(rb"(?<![\w/-])drone(?:-(?:dji|parrot|skydio))?:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
+_SKYDIO = re.compile(
+    rb"(?s)<drone-skydio:CameraOrientationNED\b(.{1,600}?)(?:/>|</drone-skydio:CameraOrientationNED)"
+)
+_ANGLE = re.compile(rb"[<\s][\w-]+:(Yaw|Pitch|Roll)(?:=\"|>)\s*([^\"<]{1,60})")
 _EXIF, _GPS = 0x8769, 0x8825
 _TAKEN, _OFFSET, _SUBSECOND = 36867, 36881, 37521
 NAMES = {
@@ -27,12 +34,12 @@ NAMES = {
     "longitude": ("GpsLongitude", "GpsLongtitude", "Longitude"),
     "relative": ("RelativeAltitude",),
     "absolute": ("AbsoluteAltitude",),
-    "gb_yaw": ("GimbalYawDegree",),
-    "gb_pitch": ("GimbalPitchDegree",),
-    "gb_roll": ("GimbalRollDegree",),
-    "drone_yaw": ("FlightYawDegree",),
-    "drone_pitch": ("FlightPitchDegree",),
-    "drone_roll": ("FlightRollDegree",),
+    "gb_yaw": ("GimbalYawDegree", "CameraYawDegree"),
+    "gb_pitch": ("GimbalPitchDegree", "CameraPitchDegree"),
+    "gb_roll": ("GimbalRollDegree", "CameraRollDegree"),
+    "drone_yaw": ("FlightYawDegree", "DroneYawDegree"),
+    "drone_pitch": ("FlightPitchDegree", "DronePitchDegree"),
+    "drone_roll": ("FlightRollDegree", "DroneRollDegree"),
     "rtk_flag": ("RtkFlag",),
     "rtk_std_latitude": ("RtkStdLat",),
     "rtk_std_longitude": ("RtkStdLon",),
@@ -70,7 +77,7 @@ def read_tags(path: Path) -> Tags:
 
     try:
         with path.open("rb") as file:
-            xmp = {name.decode(): text.decode("latin-1") for name, text in _TAG.findall(file.read(_HEAD))}
+            xmp = _xmp(file.read(_HEAD))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of damaged tags; the others are taken
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # no picture is decoded here
@@ -86,6 +93,14 @@ def read_tags(path: Path) -> Tags:
             if number is not None:
                 values[column] = number
     return Tags(_taken_ns(taken), values)
+
+
+def _xmp(head: bytes) -> dict[str, str]:
+    """Return the text of each tag by its name without the maker; Skydio's angles under DJI's names."""
+    found = _TAG.findall(head)
+    if skydio := _SKYDIO.search(head):
+        found += [(b"Camera" + angle + b"Degree", text) for angle, text in _ANGLE.findall(skydio[1])]
+    return {name.decode(): text.decode("latin-1") for name, text in found}
 
 
 def _number(text: object) -> float | None:

@@ -1,4 +1,4 @@
-"""Poses in the tags of pictures: places by EXIF, and DJI's angles, heights and RTK by XMP."""
+"""Poses in the tags of pictures: places by EXIF, and drones' angles, heights and RTK by XMP."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _RTK_FIXED = 50
 
 
 class PictureTags:
-    """Reader of the poses of DJI's drones in the pictures of a folder, one for each picture."""
+    """Reader of the poses of drones in the pictures of a folder, one for each picture."""
 
     name = "picture_tags"
     title = "tags of pictures (EXIF, XMP)"

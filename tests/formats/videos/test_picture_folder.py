@@ -29,7 +29,32 @@ XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GpsLatit
  drone-dji:RtkFlag="50" drone-dji:RtkStdLon="0.03" drone-dji:RtkStdLat="0.04"/></x:xmpmeta>"""
 
 
-def write(folder: Path, *, exif: bool = True, xmp: bool = True, offset: str | None = None) -> Path:
+# As OpenAthena (Theta-Limited) and OpenDroneMap read them: attributes, elements, and nested elements.
+OTHERS = {
+    "autel": """<rdf:Description rdf:about="DJI Meta Data" drone:GpsLatitude="{lat:.9f}"
+ drone:GpsLongtitude="11.5" drone:AbsoluteAltitude="530.00" drone:RelativeAltitude="30.{k}"
+ drone:GimbalYawDegree="90.0" drone:GimbalPitchDegree="-30.0" drone:GimbalRollDegree="0.0"/>""",
+    "parrot": """<drone-parrot:CameraRollDegree>0.0</drone-parrot:CameraRollDegree>
+<drone-parrot:CameraPitchDegree>-30.0</drone-parrot:CameraPitchDegree>
+<drone-parrot:CameraYawDegree>90.0</drone-parrot:CameraYawDegree>""",
+    "skydio, attributes": """<drone-skydio:Latitude="{lat:.9f}" drone-skydio:Longitude="11.5"
+ drone-skydio:AbsoluteAltitude="530.0" drone-skydio:RelativeAltitude="30.{k}">
+ <drone-skydio:VehicleOrientationNED drone-skydio:Roll="5" drone-skydio:Pitch="6" drone-skydio:Yaw="7"/>
+ <drone-skydio:CameraOrientationNED drone-skydio:Roll="0" drone-skydio:Pitch="-30" drone-skydio:Yaw="90"/>""",
+    "skydio, elements": """<drone-skydio:Latitude>{lat:.9f}</drone-skydio:Latitude>
+ <drone-skydio:Longitude>11.5</drone-skydio:Longitude>
+ <drone-skydio:AbsoluteAltitude>530.0</drone-skydio:AbsoluteAltitude>
+ <drone-skydio:RelativeAltitude>30.{k}</drone-skydio:RelativeAltitude>
+ <drone-skydio:CameraOrientationNED rdf:parseType="Resource"><drone-skydio:Roll>0</drone-skydio:Roll>
+ <drone-skydio:Pitch>-30</drone-skydio:Pitch><drone-skydio:Yaw>90</drone-skydio:Yaw>
+ </drone-skydio:CameraOrientationNED><drone-skydio:CameraOrientationFLU rdf:parseType="Resource">
+ <drone-skydio:Yaw>12</drone-skydio:Yaw></drone-skydio:CameraOrientationFLU>""",
+}
+
+
+def write(
+    folder: Path, *, exif: bool = True, xmp: str = XMP, offset: str | None = None, gps: bool = False
+) -> Path:
     """Write pictures 9, 10, 11, ... half a second apart: the order of numbers is not that of text."""
     folder.mkdir(exist_ok=True)
     for k in range(COUNT):
@@ -40,7 +65,10 @@ def write(folder: Path, *, exif: bool = True, xmp: bool = True, offset: str | No
             half = 25 + 50 * k
             own = {36867: f"2024:01:02 03:04:{5 + half // 100:02d}", 37521: f"{half % 100:02d}"}
             tags[0x8769] = own | ({36881: offset} if offset else {})
-        text = XMP.format(lat=48.1 + 1e-6 * k, k=k).encode()
+        if gps:
+            degrees = {1: "N", 2: (48.0, 6.0, 0.0036 * k), 3: "E", 4: (11.0, 30.0, 0.0), 6: 530.0}
+            tags[0x8825] = degrees
+        text = xmp.format(lat=48.1 + 1e-6 * k, k=k).encode()
         extra = {"xmp": text} if xmp else {}
         picture.save(path, "JPEG", quality=95, exif=tags, **extra)
     return folder
@@ -79,6 +107,19 @@ def test_tags_of_dji_are_poses(tmp_path: Path) -> None:
     assert any("0.050 m" in note for note in telemetry.notes)  # of 0.03 and 0.04 m
     absolute = TAGS.read_telemetry(folder, TelemetryChoice(altitude="absolute"))
     assert absolute.position.values[:, 2].tolist() == [530.0] * COUNT
+
+
+@pytest.mark.parametrize("maker", OTHERS)
+def test_tags_of_other_makers_are_poses(tmp_path: Path, maker: str) -> None:
+    folder = write(tmp_path / "film", xmp=OTHERS[maker], gps=maker == "parrot")
+    telemetry = TAGS.read_telemetry(folder, TelemetryChoice())
+    height = np.full(COUNT, 530.0) if maker == "parrot" else 30 + 0.1 * np.arange(COUNT)
+    expected = np.stack([48.1 + 1e-6 * np.arange(COUNT), np.full(COUNT, 11.5), height], axis=1)
+    np.testing.assert_allclose(telemetry.position.values, expected, rtol=0, atol=1e-7)  # EXIF has fractions
+    assert telemetry.gimbal is not None
+    assert telemetry.body is None
+    looks = rotate(telemetry.gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(looks, [[np.cos(np.pi / 6), 0, -0.5]] * COUNT, atol=1e-9)  # east, 30 deg down
 
 
 def test_damaged_pictures_are_counted_and_missing_pictures_keep_the_numbers(tmp_path: Path) -> None:
