@@ -4,11 +4,13 @@
     python -m benchmarks.angles --flights kept --write                  # and docs/angles.md gets the tables
     python -m benchmarks.angles --opensim SESSION [--peer POSE2SIM.mot] # beside OpenSim's inverse kinematics
 
-Each flight is reconstructed by `auto` from logs with errors, and by `robust` from the true poses (the floor:
-what the detector alone leaves). Angles are compared with two truths:
+Each flight is reconstructed by `auto` from logs with errors, and from the true poses by `auto` and `robust`:
+errors with true poses are the detector's alone. Angles are compared with two truths:
 
 - those of the true joints, COCO's points of the skin, which all errors of this project refer to;
 - those of the bones: the centres of the joints about which the simulated body turns, and its soles.
+
+With `--folder` each flight's angles are kept there, and an interrupted run goes on.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -31,7 +33,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from benchmarks.accuracy import FLOOR, METHODS, chosen_flights
+from benchmarks.accuracy import METHODS, chosen_flights
 from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
 from benchmarks.corpus.stored import DETECTORS, Flight, flights
 from benchmarks.results_page import markdown_table
@@ -42,6 +44,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.gait import gait_events, summary
 from pipelines.geometry.joint_angles import ANGLES, joint_angles
 from pipelines.reconstruct import Settings, reconstruct
+from pipelines.session.description import read_description
 from pipelines.session.people import true_joints_at
 from pipelines.session.stages import locked
 from pipelines.session.tables import ANGLES as ANGLES_TABLE
@@ -60,6 +63,8 @@ _BONE_OF = {
 }
 _PARTS = {name.removeprefix("left_").removeprefix("right_"): None for name in ANGLES}
 _GAIT = ("cadence_per_min", "step_m", "speed_mps")
+BOUND, FLOOR = "auto with true poses", "robust with true poses"
+EXACT = "white:position_m=0.001,rotation_deg=0.01"  # what BOUND is told of its poses
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,7 @@ def main() -> None:
     parser.add_argument("--flights", nargs="+", default=["kept"], help="tuning, kept, all, or names")
     parser.add_argument("--detector", choices=DETECTORS, default=DETECTORS[1])
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--folder", type=Path, help="keep the angles of each flight here")
     parser.add_argument("--write", action="store_true", help="write the tables of docs/angles.md")
     parser.add_argument("--opensim", type=Path, help="compare a session's angles with OpenSim's instead")
     parser.add_argument("--peer", type=Path, help="a motion of the same times by Pose2Sim's own chain")
@@ -94,11 +100,14 @@ def main() -> None:
     began_s = time.perf_counter()
     with get_context("spawn").Pool(arguments.processes) as pool:
         names = [flight.name for flight in chosen]
-        done = pool.imap(partial(measured, detector=arguments.detector), names, chunksize=1)
+        each = partial(measured, detector=arguments.detector, kept_in=arguments.folder)
+        done = pool.imap(each, names, chunksize=1)
         for name, both in zip(names, done, strict=True):
             found[name] = both
             print(f"{name} after {time.perf_counter() - began_s:.0f} s", file=sys.stderr, flush=True)
-    command = shlex.join(["python", "-m", "benchmarks.angles", *sys.argv[1:]])
+    options = [] if arguments.folder is None else ["--folder", str(arguments.folder)]
+    said = [word for word in sys.argv[1:] if word not in options]
+    command = shlex.join(["python", "-m", "benchmarks.angles", *said])
     lines = [f"    {command}", "", *angles_tables(found), *gait_table(found)]
     print("\n".join(lines))
     if arguments.write:
@@ -112,18 +121,33 @@ def main() -> None:
 # --- measuring -----------------------------------------------------------------------------------------
 
 
-def measured(name: str, detector: str) -> dict[str, Measured]:
-    """Reconstruct a flight by `auto`, and from true poses; the results by `auto` and FLOOR."""
+def measured(name: str, detector: str, kept_in: Path | None = None) -> dict[str, Measured]:
+    """Reconstruct a flight by `auto`, and from true poses; the results by `auto`, BOUND and FLOOR."""
     cv2.setNumThreads(1)
     flight = next(each for each in flights() if each.name == name)
     with tempfile.TemporaryDirectory(prefix="angles-") as folder:
         drawn = DrawnFlight(flight, Path(folder) / "shared")
         drawn.write_shared()
-        return {method: _measured(drawn, flight, detector, method, folder) for method in ("auto", FLOOR)}
+        found = {}
+        for method in ("auto", BOUND, FLOOR):
+            file = None if kept_in is None else kept_in / f"{name}, {detector}, {method}.npz"
+            if file is None or not file.is_file():
+                one = _measured(drawn, flight, detector, method, folder)
+                if file is not None:
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    parts = {part: [] if value is None else value for part, value in asdict(one).items()}
+                    np.savez(file, **parts)
+            else:
+                with np.load(file) as stored:
+                    of: dict[str, Any] = dict(stored)
+                gaits = {part: of[part].tolist() or None for part in ("gait", "true_gait")}
+                one = Measured(**of | gaits)
+            found[method] = one
+    return found
 
 
 def _measured(drawn: DrawnFlight, flight: Flight, detector: str, method: str, folder: str) -> Measured:
-    poses: Any = "true" if method == FLOOR else "logged"
+    poses: Any = "logged" if method == "auto" else "true"
     session = drawn.session(Path(folder) / method, 0, "model", detector, poses=poses)
     with (
         kept_in_place_of_pictures(flight, detector),
@@ -131,9 +155,11 @@ def _measured(drawn: DrawnFlight, flight: Flight, detector: str, method: str, fo
     ):
         with locked(session) as writable:
             detect(writable, detector=detector)
-            if flight.with_pictures and method != FLOOR:
+            if flight.with_pictures and method == "auto":
                 Following(writable).finish()
-        chosen = METHODS["robust" if method == FLOOR else method]
+        chosen = METHODS["robust" if method == FLOOR else "auto"]
+        if method == BOUND:
+            chosen = chosen | {"pose_noise": EXACT}
         metrics = reconstruct(session, Settings(**chosen, detector=detector)).metrics
     table = read_table(session / "reconstruct" / "angles.parquet", ANGLES_TABLE)
     table = table[table["person"] == 0]
@@ -175,32 +201,41 @@ def angles_tables(found: Mapping[str, Mapping[str, Measured]]) -> list[str]:
         columns = [
             index for index, name in enumerate(ANGLES) if name in (part, f"left_{part}", f"right_{part}")
         ]
-        auto, floor = ([both[method] for both in found.values()] for method in ("auto", FLOOR))
+        auto, bound, floor = ([each[method] for each in found.values()] for method in ("auto", BOUND, FLOOR))
         shares = [float(np.isfinite(one.value[:, columns]).mean()) for one in auto]
         if not sum(shares):
             continue
-        inside = [_inside(one, columns) for one in auto]
+
+        def rms(
+            group: Sequence[Measured], truth: str, *, varying: bool = False, columns: list[int] = columns
+        ) -> str:
+            errors = [_errors(one, truth, columns) for one in group]
+            return _rms([_varying(error) for error in errors] if varying else errors)
+
         rows.append(
             [
                 part,
                 f"{100 * np.mean(shares):.0f}",
-                *(
-                    _rms([_errors(one, truth, columns) for one in group])
-                    for truth in ("by_joints", "by_bones")
-                    for group in (auto, floor)
-                ),
-                _rms([_varying(_errors(one, "by_bones", columns)) for one in auto]),
-                _percent(inside),
+                rms(auto, "by_joints"),
+                rms(auto, "by_joints", varying=True),
+                rms(bound, "by_joints"),
+                rms(bound, "by_joints", varying=True),
+                rms(floor, "by_joints"),
+                rms(auto, "by_bones"),
+                rms(auto, "by_bones", varying=True),
+                _percent([_inside(one, columns) for one in auto]),
             ]
         )
     header = [
         "angle",
         "determined %",
         "RMSE deg against the true joints",
-        "floor",
+        "without each flight's mean",
+        BOUND,
+        "without each flight's mean",
+        FLOOR,
         "against the bones",
-        "floor",
-        "the same without each flight's mean",
+        "without each flight's mean",
         "inside 2 sigma % (true joints; ankle: bones)",
     ]
     return [f"{len(found)} flights, one draw of the logs' errors each.", "", *markdown_table(header, rows)]
@@ -281,7 +316,7 @@ _COORDINATES = {
 
 
 def beside_opensim(session: Path, peer: Path | None) -> list[str]:
-    """Compare angles with OpenSim's of the same session, and those with another motion of the same times."""
+    """Compare angles with OpenSim's of the same session, a peer's of the same times, and the truth."""
     with tempfile.TemporaryDirectory(prefix="angles-") as folder:
         written = {path.name: path for path in export(session, ["osim", "angles"], Path(folder)).written}
         solved = next(_storage(path) for name, path in written.items() if name.endswith(".mot"))
@@ -290,29 +325,55 @@ def beside_opensim(session: Path, peer: Path | None) -> list[str]:
     both = None if peer is None else _storage(peer)
     row = np.searchsorted(own["time"], solved["time"])
     rms_mm = 1e3 * float(np.sqrt((errors["marker_error_RMS"] ** 2).mean()))
+    true = _true_angles(session)
     rows = []
     for name, coordinate in _COORDINATES.items():
         for side in SIDES:
             column = f"{coordinate}_{side[0]}"
-            apart = own[f"{side}_{name}"].to_numpy()[row] - solved[column]
-            pair = "" if both is None else f"{(solved[column] - both[column]).abs().median():.1f}"
-            offset = apart.median()
-            left = (apart - offset).abs().median()
-            rows.append(
-                [f"{side}_{name}", f"{apart.abs().median():.1f}", f"{offset:.1f}", f"{left:.1f}", pair]
-            )
-    header = [
-        "angle",
-        "ours from OpenSim's, median deg",
-        "constant offset (median)",
-        "median without it",
-        "OpenSim's from the peer's",
-    ]
+            ours, theirs = own[f"{side}_{name}"].to_numpy()[row], solved[column].to_numpy()
+            pair = "" if both is None else f"{np.median(np.abs(theirs - both[column].to_numpy())):.1f}"
+            cells = [
+                f"{side}_{name}",
+                f"{np.nanmedian(np.abs(ours - theirs)):.1f}",
+                *_apart(ours - theirs),
+                f"{np.nanmedian(own[f'{side}_{name}_sigma'].to_numpy()[row]):.1f}",
+                pair,
+            ]
+            if true is not None:
+                truth = true[row, list(ANGLES).index(f"{side}_{name}")]
+                cells += [*_apart(ours - truth), *_apart(theirs - truth)]
+            rows.append(cells)
+    offset = ("constant offset (median)", "median without it")
+    sigma = "our standard deviation, median"
+    header = ["angle", "ours from OpenSim's, median deg", *offset, sigma, "OpenSim's from the peer's"]
+    if true is not None:
+        header += [
+            f"{whose} from the true joints, {each}" for whose in ("ours", "OpenSim's") for each in offset
+        ]
     return [
         f"{len(solved)} times; markers are {rms_mm:.1f} mm (RMS) off the model's.",
         "",
         *markdown_table(header, rows),
     ]
+
+
+def _apart(difference: Float) -> list[str]:
+    """Write the median of differences [T], and that of what is left without it; empty if none is known."""
+    if not np.isfinite(difference).any():
+        return ["", ""]
+    offset = np.nanmedian(difference)
+    return [f"{offset:.1f}", f"{np.nanmedian(np.abs(difference - offset)):.1f}"]
+
+
+def _true_angles(session: Path) -> Float | None:
+    """Compute the angles [T, A] of person 0's true joints at the skeleton's times; None without truth."""
+    if not read_description(session).has_true_joints:
+        return None
+    table = read_table(session / "reconstruct" / "angles.parquet", ANGLES_TABLE)
+    true = read_table(session / "truth.parquet", TRUTH)
+    joints = tuple(dict.fromkeys(true["joint"]))
+    at_times = true_joints_at(motion_from(true, joints), np.unique(table["t_ns"].to_numpy(np.int64)))
+    return joint_angles(joints, at_times[:, :1]).value_deg[:, 0]
 
 
 def _storage(path: Path) -> pd.DataFrame:

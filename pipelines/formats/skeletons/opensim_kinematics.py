@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,9 @@ _WEIGHTS = (
     100.0,
 )  # of a marker by its covariance, against the median marker: no marker is all or nothing
 _ACCURACY = 1e-5  # of the solver, Pose2Sim's
+_ARMS = tuple(f"{name}_{side}" for side in "rl" for name in ("arm_flex", "arm_add", "arm_rot", "elbow_flex"))
+_FIRST_BEND = 0.6  # rad, of the elbows, where the solver begins
+_BENT_ENOUGH = 1.0  # rad: more of one elbow makes up for nothing of the other
 
 
 @dataclass(frozen=True)
@@ -311,8 +315,8 @@ def solve(
         resting.push_back(rest)
     solver = library.InverseKinematicsSolver(model, reference, resting)
     solver.setAccuracy(_ACCURACY)
-    state.setTime(0.0)
-    solver.assemble(state)
+    bent_s = float(since_s[_most_bent(motion, person, kept)])
+    _assemble(solver, state, coordinates, names, bent_s)
     turns = np.array([c.getMotionType() == library.Coordinate.Rotational for c in coordinates])
     values, errors = np.empty((len(kept), len(coordinates))), np.full((len(kept), len(names)), np.nan)
     for row, time in enumerate(kept.tolist()):
@@ -325,6 +329,55 @@ def solve(
             errors[row, column] = solver.computeCurrentMarkerError(names[column])
     values[:, turns] = np.degrees(values[:, turns])
     return Kinematics(motion.t_ns[kept], tuple(c.getName() for c in coordinates), values, errors)
+
+
+def _assemble(
+    solver: Any, state: Any, coordinates: Sequence[Any], names: Sequence[str], bent_s: float
+) -> None:
+    """Place the model in its pose at the first time.
+
+    From the rest pose alone, the solver may turn an upper arm by half a turn. The elbow, which cannot bend
+    backwards, then stays straight for all times, because each follows from the one before. So of four ways
+    to turn both upper arms, the arms begin with that of the least error at a time when the elbows are bent.
+    """
+    by_name = {coordinate.getName(): coordinate for coordinate in coordinates}
+    arms: dict[str, float] = {}
+    if set(_ARMS).issubset(by_name):
+        state.setTime(bent_s)
+        solver.assemble(state)
+        placed = {name: coordinate.getValue(state) for name, coordinate in by_name.items()}
+        found = []
+        for turns in product((0.0, np.pi), repeat=2):
+            begun = dict(
+                zip(_ARMS, (v for turn in turns for v in (0.0, 0.0, turn, _FIRST_BEND)), strict=True)
+            )
+            for name, value in (placed | begun).items():
+                by_name[name].setValue(state, value, False)
+            solver.assemble(state)
+            error = sum(solver.computeCurrentMarkerError(name) ** 2 for name in names)
+            found.append((error, [by_name[name].getValue(state) for name in _ARMS]))
+        arms = dict(zip(_ARMS, min(found)[1], strict=True))
+    state.setTime(0.0)
+    solver.assemble(state)
+    for name, value in arms.items():
+        by_name[name].setValue(state, value, False)
+    if arms:
+        solver.assemble(state)
+
+
+def _most_bent(motion: JointMotion, person: int, kept: Int64) -> int:
+    """Return the row of `kept` at which both elbows are bent most; 0 without arms."""
+    bend = np.zeros(len(kept))
+    for side in ("left", "right"):
+        arm = [f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist")]
+        if not set(arm).issubset(motion.joints):
+            return 0
+        ends = motion.position[kept, person][:, [motion.joints.index(joint) for joint in arm]]
+        upper, fore = ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 1]
+        across = np.linalg.norm(np.cross(upper, fore), axis=1)
+        found = np.arctan2(across, (upper * fore).sum(axis=1))
+        bend += np.minimum(np.nan_to_num(found), _BENT_ENOUGH)
+    return int(np.argmax(bend))
 
 
 def _at_rest(library: Any, coordinate: Any, weight: float) -> Any:
