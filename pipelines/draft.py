@@ -39,6 +39,7 @@ from pipelines.drafting.matching import NO_DATE_NS, Alike, match
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.subtitles import read_subtitles
+from pipelines.formats.drone_logs.tlog import FORMAT as TLOG
 from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
 from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
@@ -211,7 +212,7 @@ def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found
 
     Return also the reason if it is of no kind, or if one of its kinds cannot be read.
     """
-    found: dict[type[Found], Found] = {}
+    found: dict[type[Found], Sequence[Found]] = {}
     kinds: set[type | None] = set()  # of formats that read it
     problems: list[tuple[Format, DataError]] = []
     *folders, name = path.relative_to(home).parts or (path.name,)
@@ -220,12 +221,16 @@ def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found
         ambiguous = sum(kind_of_format(other) is kind_of_format(format_) for other in formats) > 1
         head = Found(path, place, format_.name, format_.title)
         try:
-            thing = _described(head, format_, ambiguous)
+            if isinstance(format_, TelemetryFormat):
+                things: Sequence[Found] = _drone_logs(head, format_)
+            else:
+                thing = _described(head, format_, ambiguous)
+                things = [thing] if thing else []
         except DataError as error:
             problems.append((format_, error))
             continue
-        if thing is not None:
-            found.setdefault(type(thing), thing)
+        if things:
+            found.setdefault(type(things[0]), things)
             kinds.add(kind_of_format(format_))
     problem = "" if found else "of no use here, left out"
     for format_, cause in problems:
@@ -238,7 +243,7 @@ def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found
         if kind_of_format(format_) not in kinds:
             problem = with_remedy(f"{format_.title} left out: {what}", cause.remedy)
             break
-    return list(found.values()), problem
+    return [thing for things in found.values() for thing in things], problem
 
 
 def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
@@ -254,8 +259,6 @@ def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
         return Keypoints(*about, len(listed), int(listed[0]), int(listed[-1]), ambiguous)
     if isinstance(format_, TrajectoryFormat):
         return Poses(*about, _span(format_.read_trajectory(path).t_ns))
-    if isinstance(format_, TelemetryFormat):
-        return _drone_log(head, format_)
     if isinstance(format_, CalibrationFormat):
         cameras = format_.read_calibration(path)
         held = {name: Lens(c.intrinsics is not None, c.position is not None) for name, c in cameras.items()}
@@ -290,7 +293,7 @@ class _Comparison:
 
     def __init__(self) -> None:
         self._followed: dict[Path, Followed] = {}
-        self._telemetry: dict[Path, Telemetry | None] = {}
+        self._telemetry: dict[tuple[Path, int | None], Telemetry | None] = {}
 
     def __call__(self, video: Video, log: DroneLog) -> Alike | None:
         """Return how well the poses in a log explain the motion in a video's pictures; None without poses.
@@ -300,9 +303,10 @@ class _Comparison:
         """
         if video.path not in self._followed:
             self._followed[video.path] = _followed_points(video.path)
-        if log.path not in self._telemetry:
-            self._telemetry[log.path] = _telemetry_of(log)
-        telemetry = self._telemetry[log.path]
+        key = log.path, log.instance
+        if key not in self._telemetry:
+            self._telemetry[key] = _telemetry_of(log)
+        telemetry = self._telemetry[key]
         if telemetry is None or (track := telemetry.gimbal or telemetry.body) is None:
             return None
         if telemetry.position.on_earth:
@@ -340,7 +344,8 @@ def _telemetry_of(log: DroneLog) -> Telemetry | None:
     reader = FORMATS.get(log.format)
     if not isinstance(reader, TelemetryFormat):
         return None
-    return reader.read_telemetry(log.path, TelemetryChoice(altitude=0.0 if log.height == "stated" else None))
+    altitude = 0.0 if log.height == "stated" else None
+    return reader.read_telemetry(log.path, TelemetryChoice(altitude=altitude, instance=log.instance))
 
 
 def _span(t_ns: Int64) -> Span:
@@ -350,20 +355,26 @@ def _span(t_ns: Int64) -> Span:
 # --- drones' own logs ------------------------------------------------------------------------------------
 
 
-def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
-    """Describe the poses in a drone's own log, with or without attitudes.
+def _drone_logs(head: Found, format_: TelemetryFormat) -> list[DroneLog]:
+    """Describe the poses in a drone's own log, with or without attitudes; those of each vehicle in it.
 
     Raises:
         DataError: it cannot be read, or holds no position.
     """
-    try:
-        telemetry = format_.read_telemetry(head.path, TelemetryChoice())
-    except DataError:  # if only heights are missing, reading with a stated height works
-        telemetry = format_.read_telemetry(head.path, TelemetryChoice(altitude=0.0))
-    track = telemetry.position
     key = _KEYS.get(head.format)
     if key is None:
-        return None
+        return []
+    vehicles = TLOG.vehicles(head.path) if head.format == TLOG.name else []
+    instances = vehicles if len(vehicles) > 1 else [None]
+    return [_drone_log(head, format_, key, instance) for instance in instances]
+
+
+def _drone_log(head: Found, format_: TelemetryFormat, key: OwnLog, instance: int | None) -> DroneLog:
+    try:
+        telemetry = format_.read_telemetry(head.path, TelemetryChoice(instance=instance))
+    except DataError:  # if only heights are missing, reading with a stated height works
+        telemetry = format_.read_telemetry(head.path, TelemetryChoice(altitude=0.0, instance=instance))
+    track = telemetry.position
     start = None
     films = recordings_of(head.path) if head.format == "dji_record" else []
     if head.path.suffix.lower() == ".srt":
@@ -389,6 +400,7 @@ def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
         body=telemetry.body is not None,
         gimbal=telemetry.gimbal is not None,
         height=track.height,
+        instance=instance,
         video_start=start,
         films=tuple(Span(*film) for film in films),
     )

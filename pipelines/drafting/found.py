@@ -159,6 +159,7 @@ class DroneLog(Found):
     body: bool
     gimbal: bool
     height: Height = "unknown"  # zero level of its heights; "stated" if it has no heights
+    instance: int | None = None  # the vehicle, of a log that holds several
     video_start: VideoStart | None = None  # of the video beside it, or of the one that holds it
     films: tuple[Span, ...] = ()  # when it says that the camera recorded videos
 

@@ -141,9 +141,13 @@ def _of_trajectory(found: Poses) -> Candidate:
 
 def _of_drone(found: DroneLog) -> Candidate:
     """Make a candidate of a drone's own log; with gimbal angles, it has the poses of the camera."""
+    of_file = _of_file(found, found.key, found.span)
+    own = () if found.instance is None else (label_of(f"vehicle{found.instance}"),)
     return replace(
-        _of_file(found, found.key, found.span),
-        rank=(0, int(not found.gimbal), found.place),
+        of_file,
+        settings=of_file.settings | {"instance": found.instance},
+        labels=own or of_file.labels,
+        rank=(0, int(not found.gimbal), found.place, found.instance or 0),
         of_body=found.body and not found.gimbal,
         by_gps=found.by_gps,
         unturned=not (found.body or found.gimbal),
@@ -497,13 +501,13 @@ def _prefer_attitudes(cameras: Sequence[CameraDraft], moving: Sequence[Candidate
     other logs with attitudes become alternatives.
     """
     taken = {id(each) for camera in cameras if camera.poses for each in camera.poses.all}
-    free: dict[Path, Candidate] = {}
+    free: dict[tuple[Path, object], Candidate] = {}
     for candidate in moving:
-        path = candidate.found.path
         if candidate.unturned or candidate.span is None or id(candidate) in taken:
             continue
-        if path not in free or candidate.rank < free[path].rank:
-            free[path] = candidate
+        key = candidate.found.path, candidate.settings.get("instance")
+        if key not in free or candidate.rank < free[key].rank:
+            free[key] = candidate
     wanting = [(c, c.poses) for c in cameras if c.poses and c.poses.taken.unturned and c.gimbal is None]
     fitting_logs = {c.name: [log for log in free.values() if _is_of_film(log, c)] for c, _ in wanting}
     uses = Counter(id(log) for logs in fitting_logs.values() for log in logs)

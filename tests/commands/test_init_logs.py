@@ -17,7 +17,7 @@ from pipelines.draft import Drafted, draft
 from pipelines.ingest import ingest
 from tests.commands.runner import refused, succeeds
 from tests.real_data import real_data
-from tests.synthetic.drone_logs import drone_of, px4_entries, ulog_rows, write_ulog
+from tests.synthetic.drone_logs import drone_of, px4_entries, ulog_rows, write_tlog, write_ulog
 from tests.synthetic.flights import LENS, START_NS, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap
@@ -288,3 +288,25 @@ def test_a_map_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
     result, stated = drafted(tmp_path)
     assert "map" not in stated
     assert tmp_path / "site.pcd" in result.left_out
+
+
+def test_each_vehicle_of_a_ground_station_s_log_goes_to_the_camera_of_its_number(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path / "x", cameras=2, seconds=1.0, clean=True)
+    parts = [
+        write_tlog(tmp_path / "x" / f"{k}.tlog", drone_of(flight, k), system=k + 1).read_bytes()
+        for k in range(2)
+    ]
+    (tmp_path / "team.tlog").write_bytes(b"".join(parts))
+    shutil.rmtree(tmp_path / "x")
+    for name in ("drone1", "drone2"):
+        write_pictures(tmp_path, name)
+    result, stated = drafted(tmp_path)
+    assert not result.missing
+    for k in (1, 2):
+        assert stated["cameras"][f"drone{k}"]["pose"] == {"tlog": "team.tlog", "instance": k}
+    poses_of = [
+        pd.read_parquet(ingest(result.path).folder / "cameras" / name / "poses.parquet")
+        for name in ("drone1", "drone2")
+    ]
+    apart = poses_of[0][["x", "y"]].to_numpy()[0] - poses_of[1][["x", "y"]].to_numpy()[0]
+    assert np.linalg.norm(apart) > 1

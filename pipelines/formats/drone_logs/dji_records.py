@@ -136,7 +136,7 @@ class DjiBinaryFormat:
         binary content alone.
         """
         head = first_bytes(path, 256, suffixes=self.suffixes)
-        if _BINARY_NAME.match(path.name) and any(byte < 9 for byte in head):
+        if _BINARY_NAME.match(path.name) and any(byte < 9 or byte >= 0xF8 for byte in head):  # never in UTF-8
             return True
         if path.suffix.lower() == ".dat":
             return head[16:21] == b"BUILD" or head[242:252] == b"DJI_LOG_V3" or head.startswith(b"LOGH")

@@ -92,6 +92,10 @@ class TlogFormat:
         facts["topics"] = [f"{name} {count}" for name, count in sorted(log.named().items())]
         return facts
 
+    def vehicles(self, path: Path) -> list[int]:
+        """List the numbers of the systems that say where they are; errors as for `read_telemetry`."""
+        return _read(path).vehicles()
+
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position, attitude and gimbal of one vehicle; `instance` is its system's number.
 
