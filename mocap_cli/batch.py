@@ -16,6 +16,7 @@ from mocap_cli.options import (
     output_options,
     overwrite_option,
     provider_option,
+    scheduler_option,
     with_provider,
 )
 from mocap_cli.several import expanded
@@ -73,11 +74,7 @@ _settings_options = grouped(
     help="Number of workers on this machine: one for each flight; several for a long video where flights are"
     " fewer [default: all cores].",
 )
-@click.option(
-    "--scheduler",
-    metavar="tcp://HOST:PORT",
-    help="Use the Dask cluster there, whose machines see the same folders under the same paths.",
-)
+@scheduler_option("Use the Dask cluster there.")
 @_settings_options
 @force_option
 @overwrite_option

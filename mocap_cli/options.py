@@ -108,6 +108,15 @@ def with_provider(detector: str, provider: str | None) -> str:
     return f"{detector},provider={provider}"
 
 
+def scheduler_option(help_text: str) -> Option:
+    """Make the option --scheduler, the address of a Dask cluster."""
+    return click.option(
+        "--scheduler",
+        metavar="tcp://HOST:PORT",
+        help=f"{help_text} Its machines see the same folders under the same paths.",
+    )
+
+
 def workers_option(help_text: str) -> Callable[[Command], Command]:
     """Make the option --workers of a simulation; two by default."""
     return click.option(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from mocap_cli.options import (
     grouped,
     output_options,
     provider_option,
+    scheduler_option,
     seed_option,
     with_provider,
 )
@@ -212,6 +214,7 @@ class Shows(click.ParamType[str]):
     show_default="all cores",
     help="Threads; the result does not depend on them.",
 )
+@scheduler_option("Give the pictures to the Dask cluster there, in blocks.")
 @click.option("--strict", is_flag=True, help="Refuse a flight with a doubt (see `mocap check`).")
 @force_option
 @output_options
@@ -221,18 +224,27 @@ def reconstruct_command(
     overlays: tuple[str, ...],
     strict: bool,
     workers: int,
+    scheduler: str | None,
     force: bool,
     shown: Shown,
 ) -> dict[str, Any] | None:
     """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
     from pipelines.overlay import refuse_overlays, write_overlays
     from pipelines.reconstruct import reconstruct
+    from pipelines.session.clusters import Cluster, connected
 
     if overlays:
         refuse_overlays(session, force=force)
-    with watching(shown.level) as progress:
+    with watching(shown.level) as progress, ExitStack() as stack:
+        cluster = Cluster.of(stack.enter_context(connected(scheduler))) if scheduler else None
         result = reconstruct(
-            session, settings, strict=strict, workers=workers, force=force, progress=progress
+            session,
+            settings,
+            strict=strict,
+            workers=workers,
+            cluster=cluster,
+            force=force,
+            progress=progress,
         )
         angles = list(dict.fromkeys(filter(None, overlays)))
         videos = (

@@ -1,19 +1,19 @@
 """Stages over many flights, on Dask; this is the only module above the stages.
 
-A flight is one task. If a worker dies, only its current flight is interrupted; the next worker continues
-this flight where the stages stopped. Sessions are the same as those of single runs, byte for byte.
+A flight is one task, and on a cluster so is each block of its pictures. If a worker dies, only its current
+task is interrupted; the next worker continues a flight where its stages stopped. Sessions are the same as
+those of single runs, byte for byte.
 """
 
 import csv
 import io
 import json
-import logging
 import os
 import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,7 @@ from pipelines.replan import replan
 from pipelines.report import report
 from pipelines.reporting.flights import COLUMNS, FlightRow, render_flights
 from pipelines.reporting.wording import cell_text
+from pipelines.session.clusters import Cluster, connected, local_cluster, result_of
 from pipelines.session.description import read_description
 from pipelines.session.errors import BusyError, DataError, MocapError
 from pipelines.session.progress import Progress, Silent
@@ -40,7 +41,6 @@ STAGES = ("ingest", "reconstruct", "replan-compare", "report")
 _FOLDER = "batch"  # of the summary, if sessions lie beside their flights
 _TABLE, _PAGE, _TIMES = "summary.csv", "summary.html", "run.json"
 _OWNER_LEAVES_S = 30.0
-_ANSWER_S = 20.0
 
 T = TypeVar("T")
 
@@ -64,6 +64,7 @@ class Job:
     settings: Settings
     force: bool
     threads: int = 1  # blocks of its pictures in parallel; results do not depend on it
+    shared: bool = False  # blocks are tasks of the cluster instead, which any of its workers takes
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def batch(
     workers = workers or os.cpu_count() or 1
     threads = 1 if scheduler else max(1, workers // max(len(flights), 1))
     jobs = [
-        Job(_absolute(flight), _absolute(session), settings, force, threads)
+        Job(_absolute(flight), _absolute(session), settings, force, threads, scheduler is not None)
         for flight, session in zip(flights, _sessions(flights, output), strict=True)
     ]
     outcomes = dict(_outcomes(jobs, workers, scheduler, progress))
@@ -217,7 +218,10 @@ def _run(stage: str, job: Job) -> bool:
         case "reconstruct":
             chosen = job.settings
             settings = ReconstructSettings(chosen.method, detector=chosen.detector, every=chosen.every)
-            return reconstruct(job.session, settings, workers=job.threads, force=job.force).skipped
+            cluster = Cluster.of_task() if job.shared else None
+            return reconstruct(
+                job.session, settings, workers=job.threads, cluster=cluster, force=job.force
+            ).skipped
         case "replan-compare":
             return replan(job.session, force=job.force).skipped
         case _:
@@ -290,48 +294,17 @@ def _outcomes(
 
 
 def _result(future: Any, job: Job) -> Outcome:
-    if future.cancelled():
-        return Outcome(error=f"{job.flight}: the Dask cluster went away; give the same command again")
-    error = future.exception()
-    if error is None:
-        result: Outcome = future.result()
-        return result
-    if isinstance(error, need("distributed", "batch").KilledWorker):
-        return Outcome(error=f"{job.flight}: every worker that took it died, perhaps for lack of memory")
-    # The job itself raises nothing, so the cluster has no mocap or another version of it.
-    line = " ".join(f"{type(error).__name__}: {error}".split())
-    return Outcome(error=f"{job.flight}: the Dask worker could not run it ({line})")
+    """Return the outcome of a finished task; the job itself raises nothing, so an error is the cluster's."""
+    try:
+        result: Outcome = result_of(future, job.flight)
+    except MocapError as error:
+        return Outcome(error=str(error))
+    return result
 
 
-@contextmanager
-def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
+def _client(workers: int, scheduler: str | None) -> AbstractContextManager[Any]:
     """Connect to the cluster at an address, or to a temporary local one."""
-    distributed = need("distributed", "batch")
-    if scheduler is not None:
-        try:
-            client = distributed.Client(scheduler, timeout=_ANSWER_S)
-        except (OSError, ValueError, TypeError) as error:
-            raise DataError(
-                f"--scheduler {scheduler}",
-                "no Dask scheduler answers there",
-                "start one with `dask scheduler`, or leave it out to use this machine",
-            ) from error
-        with client:
-            yield client
-        return
-    cluster = distributed.LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        processes=True,
-        host="127.0.0.1",
-        dashboard_address=None,
-        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # its usual port may be taken
-        memory_limit=0,  # Dask pauses workers near a limit for ever if they do not free memory
-        silence_logs=logging.CRITICAL,
-        env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
-    )
-    with cluster, distributed.Client(cluster) as client:
-        yield client
+    return local_cluster(workers) if scheduler is None else connected(scheduler)
 
 
 # --- the summary ---------------------------------------------------------------------------------------

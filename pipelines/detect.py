@@ -12,22 +12,25 @@ their times only. Other poses, clocks and calibrations also change where the act
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import local
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.follow import BLOCK, Following
+from pipelines.follow import BLOCK, FollowedPart, Following
+from pipelines.follow import Block as FollowedBlock
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.keypoints.hints import Hint, actor_hints
 from pipelines.keypoints.tracking import PeopleTracker
+from pipelines.session.clusters import Cluster, SharedSession, contents_of, write_contents
 from pipelines.session.description import (
     Description,
     MediaEntry,
@@ -38,6 +41,7 @@ from pipelines.session.people import logged_actor
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Detections
 from pipelines.session.registries import (
+    AcceleratedDetector,
     Detector,
     KeypointNetworks,
     advice_on,
@@ -45,7 +49,7 @@ from pipelines.session.registries import (
     hashes_of_models,
 )
 from pipelines.session.stage_records import Stage, StageRecord
-from pipelines.session.stages import WritableSession
+from pipelines.session.stages import Run, WritableSession
 from pipelines.session.storage import hash_of, read_json, write_json
 from pipelines.session.tables import (
     FRAMES,
@@ -99,6 +103,7 @@ def detect(
     workers: int = 1,
     force: bool = False,
     following: Following | None = None,
+    cluster: Cluster | None = None,
     progress: Progress | None = None,
 ) -> StageRecord | None:
     """Detect keypoints for cameras without imported ones.
@@ -114,6 +119,7 @@ def detect(
         workers: the number of blocks in parallel; the result does not depend on it.
         force: run it again even if nothing changed.
         following: is shown the pictures too.
+        cluster: works on the blocks instead of threads of this process.
         progress: receives the progress.
 
     Returns:
@@ -167,8 +173,10 @@ def detect(
             "look at `mocap info`, or leave it out",
         )
     progress.start("Detecting keypoints", pictures)
+    if cluster is not None:
+        _gather(cluster, run, work, blocks, chosen, people == 1, following, progress)
     hints_at = _Hints(session.folder, description, media)
-    produce = partial(_produce, work, hints_at, chosen, people == 1, following, progress)
+    produce = partial(_produce_here, work, hints_at, chosen, people == 1, following, progress)
     folders = side_by_side(
         lambda block: run.chunk(block.name, partial(produce, block)), blocks, workers=workers, halt=work.halt
     )
@@ -309,7 +317,6 @@ class _Work:
         self.folder = folder
         self.every = every
         self.halt = Halt()
-        self._of_thread = local()
         self.description = description
         self._frames = {
             name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
@@ -355,12 +362,18 @@ class _Work:
         """Hash the numbers of the frames that are looked at, block by block."""
         return hash_of([sha256(self.frames(block)[0].tobytes()).hexdigest() for block in self.blocks(camera)])
 
-    def networks(self, detector: Detector) -> KeypointNetworks:
-        """Load the detector once for each thread, because only one thread may use its networks at a time."""
-        if not hasattr(self._of_thread, "networks"):
-            self._of_thread.networks = detector.load(threads=1)
-        networks: KeypointNetworks = self._of_thread.networks
-        return networks
+
+_NETWORKS = local()
+"""Networks of each thread: only one thread may use them at a time, and threads of a cluster keep theirs."""
+
+
+def _networks(detector: Detector) -> KeypointNetworks:
+    """Load the detector, once for each thread."""
+    which = detector.name, hashes_of_models(detector)
+    if getattr(_NETWORKS, "which", None) != which:
+        _NETWORKS.loaded, _NETWORKS.which = detector.load(threads=1), which
+    networks: KeypointNetworks = _NETWORKS.loaded
+    return networks
 
 
 def _span_words(start_s: float | None, end_s: float | None) -> str:
@@ -369,7 +382,74 @@ def _span_words(start_s: float | None, end_s: float | None) -> str:
     return f"in the flight{start}{end}"
 
 
-def _produce(
+@dataclass(frozen=True)
+class _Order:
+    """A block for a worker of a Dask cluster."""
+
+    session: SharedSession
+    detector: Detector
+    models: Mapping[str, str]  # SHA-256 by name
+    only_one: bool
+    every: int
+    block: Block
+    followed: FollowedBlock | None
+
+
+def detect_block(order: _Order) -> tuple[dict[str, bytes], dict[str, bytes] | None]:
+    """Detect on a worker; return the files of the block, and those of its background.
+
+    Raises:
+        DataError: the worker has no such session, pictures or models, or others.
+    """
+    folder = order.session.opened()
+    if hashes_of_models(order.detector) != order.models:
+        raise DataError(
+            order.detector.name,
+            "has other model files on a machine of the Dask cluster, or none",
+            "every machine needs the same ones (see `mocap models`)",
+        )
+    description = read_description(folder)
+    work = _Work(folder, description, order.every, (None, None))
+    hints = _Hints(folder, description, [order.block.camera])
+    part = None if order.followed is None else FollowedPart(order.followed)
+    with TemporaryDirectory() as place:
+        detected, followed = Path(place, "detected"), Path(place, "followed")
+        detected.mkdir()
+        followed.mkdir()
+        _produce(work, hints, order.detector, order.only_one, part, Silent(), order.block, detected)
+        if part is not None:
+            part.write(followed)
+        return contents_of(detected), None if part is None else contents_of(followed)
+
+
+def _gather(
+    cluster: Cluster,
+    run: Run,
+    work: _Work,
+    blocks: Sequence[Block],
+    detector: Detector,
+    only_one: bool,
+    following: Following | None,
+    progress: Progress,
+) -> None:
+    """Have the blocks that no earlier run finished worked on by a cluster, and store them as they come."""
+    session, models = SharedSession.at(work.folder), hashes_of_models(detector)
+    missing = [block for block in blocks if not run.has_chunk(block.name)]
+    orders = [
+        _Order(session, detector, models, only_one, work.every, block, _followed(following, block))
+        for block in missing
+    ]
+    progress.advance(sum(work.pictures(block) for block in blocks if block not in missing))
+    on_gpu = isinstance(detector, AcceleratedDetector) and detector.provider != "cpu"
+    for number, (detected, followed) in cluster.each(detect_block, orders, on_gpu=on_gpu, progress=progress):
+        block, background = missing[number], orders[number].followed
+        if following is not None and background is not None and followed is not None:
+            following.keep(background, partial(write_contents, followed))
+        run.chunk(block.name, partial(write_contents, detected))
+        progress.advance(work.pictures(block))
+
+
+def _produce_here(
     work: _Work,
     hints: _Hints,
     detector: Detector,
@@ -379,13 +459,35 @@ def _produce(
     block: Block,
     folder: Path,
 ) -> None:
-    """Write what the detector finds in the pictures of one block."""
-    networks = work.networks(detector)
+    """Write what the detector finds in the pictures of one block, and store its background."""
+    background = _followed(following, block)
+    part = None if background is None else FollowedPart(background)
+    _produce(work, hints, detector, only_one, part, progress, block, folder)
+    if following is not None and part is not None:
+        following.keep(part.block, part.write)
+
+
+def _followed(following: Following | None, block: Block) -> FollowedBlock | None:
+    """Return the block of the background that is followed through the pictures of a detector's block."""
+    return None if following is None else following.block(block.camera, block.first)
+
+
+def _produce(
+    work: _Work,
+    hints: _Hints,
+    detector: Detector,
+    only_one: bool,
+    part: FollowedPart | None,
+    progress: Progress,
+    block: Block,
+    folder: Path,
+) -> None:
+    """Write what the detector finds in the pictures of one block, and show them to a background's part."""
+    networks = _networks(detector)
     frame, t_ns = work.frames(block)
     tracker = PeopleTracker(networks, only_one=only_one)
     found: list[tuple[int, int, Float, Float]] = []
     undecoded = 0
-    part = None if following is None else following.part(block.camera, block.first)
     before = [] if part is None or part.block.before is None else [part.block.before]
     numbers = frame.tolist()
     # Left early, the pictures must not be closed while the next one is being decoded.
@@ -407,8 +509,6 @@ def _produce(
                 (number, seen.track, seen.person.xy, seen.person.confidence)
                 for seen in tracker.step(picture, hint=hint)
             ]
-    if following is not None and part is not None:
-        following.keep(part)
     write_table(folder / "keypoints.parquet", _table(found, networks, frame, t_ns), KEYPOINTS)
     counts = {**tracker.counts, "detections": len(found), "undecoded": undecoded}
     write_json(folder / "counts.json", {"joints": list(networks.joints), "counts": counts})

@@ -10,16 +10,18 @@ others, but that picture binds them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from pipelines.geometry.arrays import Bytes, Int64, Picture
 from pipelines.reconstruction.background_tracks import Follower, rows_to_follow, still_name, tracks_path
+from pipelines.session.clusters import Cluster, SharedSession, contents_of, write_contents
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
@@ -110,6 +112,34 @@ class FollowedPart:
         write_json(folder / "counts.json", counts | {"points": points, "stills": len(self._stills)})
 
 
+def follow_block(order: tuple[SharedSession, Block]) -> dict[str, bytes]:
+    """Follow through the pictures of a block on a worker of a Dask cluster; return its files.
+
+    Raises:
+        DataError: the worker has no such session or pictures, or others.
+    """
+    session, block = order
+    folder = session.opened()
+    part = _follow(folder, read_description(folder), block, Halt(), Silent())
+    with TemporaryDirectory() as place:
+        part.write(Path(place))
+        return contents_of(Path(place))
+
+
+def _follow(
+    folder: Path, description: Description, block: Block, halt: Halt, progress: Progress
+) -> FollowedPart:
+    """Show the pictures of one block to its part."""
+    part = FollowedPart(block)
+    before = [] if block.before is None else [block.before]
+    with open_pictures(folder, description, block.camera) as pictures:
+        for number in before + block.numbers.tolist():
+            halt.check()
+            part.see(number, pictures.read(number))
+            progress.advance(number != block.before)
+    return part
+
+
 class Following:
     """One run of the stage.
 
@@ -147,27 +177,27 @@ class Following:
             f"frames of {name}": hash_of([[block.first, *block.numbers.tolist()] for block in seen])
             for name, seen in self._seen.items()
         }
+        self._at = {(name, block.first): block for name, seen in self._seen.items() for block in seen}
         self._kept: set[str] = set()
         self._run = session.begin(BACKGROUND, settings={"cameras": names}, inputs=inputs, force=force)
 
-    def part(self, camera: str, first: int) -> FollowedPart | None:
-        """Begin the part of a camera's block that begins with row `first`; None if it is not followed."""
-        if self._run.finished:
-            return None
-        return next(
-            (FollowedPart(block) for block in self._seen.get(camera, []) if block.first == first), None
-        )
+    def block(self, camera: str, first: int) -> Block | None:
+        """Return the block of a camera that begins with row `first`; None if it is not followed any more."""
+        return None if self._run.finished else self._at.get((camera, first))
 
-    def keep(self, part: FollowedPart) -> None:
-        """Store a part whose pictures were all seen."""
-        self._run.chunk(part.block.name, part.write)
-        self._kept.add(part.block.name)
+    def keep(self, block: Block, write: Callable[[Path], None]) -> None:
+        """Store a block whose pictures were all seen; `write` puts its files into a folder."""
+        self._run.chunk(block.name, write)
+        self._kept.add(block.name)
 
-    def finish(self, *, workers: int = 1, progress: Progress | None = None) -> StageRecord:
+    def finish(
+        self, *, workers: int = 1, cluster: Cluster | None = None, progress: Progress | None = None
+    ) -> StageRecord:
         """Follow through the pictures that nobody showed, and publish the stage.
 
         Args:
             workers: the number of blocks in parallel; the result does not depend on it.
+            cluster: works on the blocks instead of threads of this process.
             progress: receives the progress.
 
         Raises:
@@ -180,6 +210,8 @@ class Following:
         left = [len(block.numbers) for block in blocks if block.name not in self._kept]
         if left:
             progress.start("Following backgrounds", sum(left))
+        if cluster is not None:
+            self._gather(cluster, blocks, progress)
         halt = Halt()
 
         def follow(block: Block) -> Path:
@@ -218,14 +250,16 @@ class Following:
 
     def _produce(self, block: Block, halt: Halt, progress: Progress, folder: Path) -> None:
         """Follow through the pictures of one block."""
-        part = FollowedPart(block)
-        before = [] if block.before is None else [block.before]
-        with open_pictures(self._folder, self._description, block.camera) as pictures:
-            for number in before + block.numbers.tolist():
-                halt.check()
-                part.see(number, pictures.read(number))
-                progress.advance(number != block.before)
-        part.write(folder)
+        _follow(self._folder, self._description, block, halt, progress).write(folder)
+
+    def _gather(self, cluster: Cluster, blocks: list[Block], progress: Progress) -> None:
+        """Have the blocks that were not shown worked on by a cluster, and store them as they come."""
+        missing = [block for block in blocks if not self._run.has_chunk(block.name)]
+        session = SharedSession.at(self._folder)
+        orders = [(session, block) for block in missing]
+        for number, contents in cluster.each(follow_block, orders, progress=progress):
+            self.keep(missing[number], partial(write_contents, contents))
+            progress.advance(len(missing[number].numbers))
 
     def _assemble(self, camera: str, parts: Iterable[Path]) -> dict[str, int]:
         """Join the parts of a camera; return their counts."""

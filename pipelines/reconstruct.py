@@ -80,6 +80,7 @@ from pipelines.reconstruction.solving import (
     views_with_noise,
 )
 from pipelines.reconstruction.trials import disturbances, disturbed, summary_of_trials
+from pipelines.session.clusters import Cluster
 from pipelines.session.description import (
     Description,
     Doubt,
@@ -151,6 +152,7 @@ def reconstruct(
     *,
     strict: bool = False,
     workers: int = 1,
+    cluster: Cluster | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Reconstructed:
@@ -161,6 +163,7 @@ def reconstruct(
         settings: the settings that determine the result.
         strict: refuse a flight that is doubted.
         workers: the number of threads; the result does not depend on it.
+        cluster: works on the pictures instead of threads; neither does the result depend on that.
         force: run it again even if nothing changed, and the detection too.
         progress: receives the progress.
 
@@ -183,10 +186,10 @@ def reconstruct(
         description = read_description(folder)
         settings = replace(settings, people=settings.people or ("auto" if description.actors else 1))
         following, left_out = _following(session, description, settings, force)
-        detected = _detected(session, settings, workers, force, following, progress)
+        detected = _detected(session, settings, workers, force, following, cluster, progress)
         background = None
         if following is not None:
-            background, left_out = _finished(following, settings, workers, progress)
+            background, left_out = _finished(following, settings, workers, cluster, progress)
         measured = measured_for(detected.settings["detector"]) if detected else None
         run = session.begin(
             RECONSTRUCT,
@@ -282,6 +285,7 @@ def _detected(
     workers: int,
     force: bool,
     following: Following | None,
+    cluster: Cluster | None,
     progress: Progress,
 ) -> StageRecord | None:
     """Run the stage `detect`; return None if every camera has imported keypoints."""
@@ -295,6 +299,7 @@ def _detected(
         workers=workers,
         force=force,
         following=following,
+        cluster=cluster,
         progress=progress,
     )
     if detected is None and (settings.start_s, settings.end_s) != (None, None):
@@ -774,11 +779,11 @@ def _following(
 
 
 def _finished(
-    following: Following, settings: Settings, workers: int, progress: Progress
+    following: Following, settings: Settings, workers: int, cluster: Cluster | None, progress: Progress
 ) -> tuple[StageRecord | None, str | None]:
     """Follow what the detector did not show; None with the reason why `auto` goes without backgrounds."""
     try:
-        return following.finish(workers=workers, progress=progress), None
+        return following.finish(workers=workers, cluster=cluster, progress=progress), None
     except DataError as error:
         if settings.refine_cameras is not None:
             raise

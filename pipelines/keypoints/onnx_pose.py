@@ -11,7 +11,7 @@ The argument of `onnx:` is a model's path, with options for information that its
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
 
@@ -372,6 +372,11 @@ class OnnxDetector:
         return "onnx:" + ",".join(f"{name}={value}" for name, value in sorted(stated.items()))
 
     @property
+    def provider(self) -> str:
+        """The short name of the execution provider that runs the networks."""
+        return self.options.provider
+
+    @property
     def title(self) -> str:
         """File name of the model, and the finder of people."""
         if self.options.people is not None:
@@ -467,7 +472,9 @@ class OnnxFamily:
         for path in (options.model, options.people):
             if path is not None and not path.is_file():
                 raise DataError(path, "does not exist", "give the path of an ONNX model")
-        return OnnxDetector(options)
+        people = None if options.people is None else options.people.absolute()
+        # Other processes, with other working directories, may run it.
+        return OnnxDetector(replace(options, model=options.model.absolute(), people=people))
 
 
 DETECTOR = OnnxFamily()

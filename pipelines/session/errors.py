@@ -25,6 +25,10 @@ class DataError(MocapError):
         self.remedy = remedy
         super().__init__(f"{source}: {problem}" + (f"; {remedy}" if remedy else ""))
 
+    def __reduce__(self) -> tuple[type["DataError"], tuple[Path | str, str, str]]:
+        """Pickle it by its arguments, because it travels between processes."""
+        return type(self), (self.source, self.problem, self.remedy)
+
 
 class BusyError(MocapError):
     """Another process is writing the session."""

@@ -224,6 +224,15 @@ class MeasuredDetector(Detector, Protocol):
 
 
 @runtime_checkable
+class AcceleratedDetector(Detector, Protocol):
+    """A detector whose networks can run on a graphics card."""
+
+    @property
+    def provider(self) -> str:
+        """The short name of what runs the networks: `cpu`, or an accelerator such as `cuda`."""
+
+
+@runtime_checkable
 class DetectorFamily(Protocol):
     """Detectors with an argument after a colon that says which model to run: `--detector NAME:ARGUMENT`."""
 

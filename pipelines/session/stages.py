@@ -213,7 +213,15 @@ class Run:
             name: of the part; the parts of a stage are stored by the stage's key.
             produce: writes the part into the empty folder that it gets.
         """
-        return finished_part(self._session / ".partial" / f"{self._stage.name}-{self._key}" / name, produce)
+        return finished_part(self._chunks / name, produce)
+
+    def has_chunk(self, name: str) -> bool:
+        """Return True if an earlier run finished this part."""
+        return (self._chunks / name).is_dir()
+
+    @property
+    def _chunks(self) -> Path:
+        return self._session / ".partial" / f"{self._stage.name}-{self._key}"
 
     def publish(self, *, counts: Mapping[str, object], warnings: Sequence[str] = ()) -> StageRecord:
         """End the stage: the content of `folder` replaces its earlier files, completely or not at all.

@@ -144,6 +144,16 @@ def is_copy(session: Path) -> bool:
     return session.parent.parent == _cache() / "sessions"
 
 
+def published_version(session: Path) -> str | None:
+    """Return the URL of the version that a copy was made of or published as last; None for other sessions."""
+    root = session.absolute().parent
+    if not is_copy(session.absolute()):
+        return None
+    url = (_noted(root.with_suffix(".json")) or {}).get("url")
+    folder = (_noted(root / "base.json") or {}).get("folder")
+    return f"{url}/{folder}" if url and folder else None
+
+
 def fetched(url: str, *, fresh: bool = False) -> Path:
     """Return the copy of a file or folder of a store; fetch it if it is missing.
 

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
@@ -21,11 +23,17 @@ import pytest
 
 from pipelines import batch
 from pipelines.batch import Job, Outcome, Settings, run_flight
+from pipelines.detect import detect
+from pipelines.follow import Following
 from pipelines.report import Reported
 from pipelines.reporting.flights import FlightRow, render_flights
-from pipelines.session.errors import BusyError
+from pipelines.session.clusters import Cluster as Workers
+from pipelines.session.clusters import SharedSession, connected
+from pipelines.session.errors import BusyError, DataError
 from pipelines.session.registries import install_command
+from pipelines.session.stages import locked
 from tests.commands.runner import MOCAP, content, mocap, refused, succeeds
+from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 from tests.synthetic.flights import write_flight
 
 DASK = str(Path(sys.executable).with_name("dask"))
@@ -52,12 +60,13 @@ class Cluster:
         while not file.exists():
             time.sleep(0.05)
         self.address: str = json.loads(file.read_text(encoding="utf-8"))["address"]
+        # The second stands in for a worker with a graphics card.
         self.workers = [
             self._start(
                 *("worker", "--scheduler-file", file, "--nthreads", "1", "--memory-limit", "0"),
-                *("--no-nanny", "--no-dashboard", "--local-directory", folder),
+                *("--no-nanny", "--no-dashboard", "--local-directory", folder, *resources),
             )
-            for _ in range(2)
+            for resources in ((), ("--resources", "GPU=1"))
         ]
 
     def _start(self, *arguments: str | Path) -> subprocess.Popen[bytes]:
@@ -77,28 +86,78 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     made.close()
 
 
-def flights_and_single_runs(folder: Path, count: int) -> tuple[list[Path], list[dict[str, str]]]:
-    """Write manifests in separate folders; return them and the results of single runs on copies of them."""
+def flights_and_single_runs(folder: Path, detector: str) -> tuple[list[Path], list[dict[str, str]]]:
+    """Write a flight with keypoints and one with videos, and return the results of single runs on copies.
+
+    The first result are their manifests, in separate folders.
+    """
     manifests, single = [], []
-    for k in range(count):
+    for k in range(2):
         for place in ("alone", "batch"):
-            flight = write_flight(folder / place / f"day{k}", seconds=0.4, seed=k)
+            (own := folder / place / f"day{k}").mkdir(parents=True)
+            if k:
+                write_spotted_flight(own, 20)
+            else:
+                write_flight(own, seconds=0.4)
         session = folder / "alone" / f"day{k}" / "flight.session"
         succeeds("ingest", folder / "alone" / f"day{k}" / "flight.yaml")
-        succeeds("reconstruct", session)
+        succeeds("reconstruct", session, "--detector", detector)
         single.append(content(session))
-        manifests.append(flight.manifest)
+        manifests.append(own / "flight.yaml")
     return manifests, single
+
+
+def test_blocks_of_a_flight_on_a_cluster_make_the_bytes_of_one_process(
+    tmp_path: Path, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("pipelines.detect", "pipelines.follow"):
+        monkeypatch.setattr(f"{module}.BLOCK", 10)
+    manifest = write_spotted_flight(tmp_path, 25)
+    here, there, apart = (tmp_path / f"{name}.session" for name in ("here", "there", "apart"))
+    succeeds("ingest", manifest, "-o", here)
+    shutil.copytree(here, there)
+    shutil.copytree(here, apart)
+    detector = spot_detector(tmp_path)
+    with locked(here) as session:
+        following = Following(session)
+        detect(session, detector=detector, following=following)
+        following.finish()
+    with connected(cluster.address) as client, locked(there) as session:
+        following = Following(session)
+        detect(session, detector=detector, following=following, cluster=Workers.of(client))
+        following.finish(cluster=Workers.of(client))
+    assert content(there) == content(here)
+    # Backgrounds without keypoints.
+    with connected(cluster.address) as client, locked(apart) as session:
+        Following(session).finish(cluster=Workers.of(client))
+    assert content(apart / "background") == content(here / "background")
+
+
+def test_parts_for_graphics_cards_go_to_workers_that_have_one(cluster: Cluster) -> None:
+    with connected(cluster.address) as client:
+        client.wait_for_workers(2)
+        on_any = Workers.of(client)
+        found = dict(on_any.each(os.readlink, ["/proc/self"] * 4, on_gpu=True))
+        assert found == dict.fromkeys(range(4), str(cluster.workers[1].pid))
+        # An error of a part arrives as it was raised.
+        with pytest.raises(DataError) as raised:
+            list(
+                on_any.each(
+                    SharedSession.opened, [SharedSession("/nowhere", "key", version("mocap-pipeline"))]
+                )
+            )
+        assert raised.value.source == "/nowhere"
 
 
 @pytest.mark.slow
 def test_cluster_makes_the_bytes_of_single_runs_and_a_killed_worker_loses_nothing(
     tmp_path: Path, cluster: Cluster
 ) -> None:
-    manifests, single = flights_and_single_runs(tmp_path, 2)
+    detector = ("--detector", spot_detector(tmp_path))
+    manifests, single = flights_and_single_runs(tmp_path, detector[1])
     (manifests[1].parent / "broken.yaml").write_text("schema: 1\nname: [", encoding="utf-8")
     pattern = tmp_path / "batch" / "*" / "*.yaml"  # no shell expands it
-    command = ["batch", str(pattern), "--scheduler", cluster.address, "--stages", FEW_STAGES]
+    command = ["batch", str(pattern), "--scheduler", cluster.address, "--stages", FEW_STAGES, *detector]
     process = subprocess.Popen(
         [MOCAP, *command], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -132,7 +191,7 @@ def test_cluster_makes_the_bytes_of_single_runs_and_a_killed_worker_loses_nothin
 
     # The same again, now on a cluster that this machine makes for itself, finds all done, and is silent.
     (manifests[1].parent / "broken.yaml").unlink()
-    local = [MOCAP, "batch", str(pattern), "--workers", "1", "--stages", FEW_STAGES, "--json"]
+    local = [MOCAP, "batch", str(pattern), "--workers", "1", "--stages", FEW_STAGES, "--json", *detector]
     again = subprocess.run(local, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
     assert (again.returncode, again.stderr) == (0, "")
     counts = json.loads(again.stdout)
@@ -262,7 +321,7 @@ def test_what_a_batch_cannot_start_with(tmp_path: Path, monkeypatch: pytest.Monk
     (foreign / "summary.csv").write_text("my,own,table\n", encoding="utf-8")
     assert "--overwrite" in refused("batch", tmp_path / "a" / "*.yaml", "-o", foreign)
     assert mocap("batch", pattern, "--workers", "1", "--scheduler", "tcp://x:1").returncode == 2
-    monkeypatch.setattr(batch, "_ANSWER_S", 0.2)
+    monkeypatch.setattr("pipelines.session.clusters._ANSWER_S", 0.2)
     assert "--scheduler tcp://127.0.0.1:9: " in refused(
         "batch", tmp_path / "a" / "*.yaml", "--scheduler", "tcp://127.0.0.1:9", "-o", tmp_path / "out"
     )
