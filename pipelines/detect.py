@@ -441,12 +441,13 @@ def _gather(
     ]
     progress.advance(sum(work.pictures(block) for block in blocks if block not in missing))
     on_gpu = isinstance(detector, AcceleratedDetector) and detector.provider != "cpu"
-    for number, (detected, followed) in cluster.each(detect_block, orders, on_gpu=on_gpu, progress=progress):
-        block, background = missing[number], orders[number].followed
-        if following is not None and background is not None and followed is not None:
-            following.keep(background, partial(write_contents, followed))
-        run.chunk(block.name, partial(write_contents, detected))
-        progress.advance(work.pictures(block))
+    with closing(cluster.each(detect_block, orders, on_gpu=on_gpu, progress=progress)) as found:
+        for number, (detected, followed) in found:
+            block, background = missing[number], orders[number].followed
+            if following is not None and background is not None and followed is not None:
+                following.keep(background, partial(write_contents, followed))
+            run.chunk(block.name, partial(write_contents, detected))
+            progress.advance(work.pictures(block))
 
 
 def _produce_here(

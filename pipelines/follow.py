@@ -11,6 +11,7 @@ others, but that picture binds them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -257,9 +258,10 @@ class Following:
         missing = [block for block in blocks if not self._run.has_chunk(block.name)]
         session = SharedSession.at(self._folder)
         orders = [(session, block) for block in missing]
-        for number, contents in cluster.each(follow_block, orders, progress=progress):
-            self.keep(missing[number], partial(write_contents, contents))
-            progress.advance(len(missing[number].numbers))
+        with closing(cluster.each(follow_block, orders, progress=progress)) as found:
+            for number, contents in found:
+                self.keep(missing[number], partial(write_contents, contents))
+                progress.advance(len(missing[number].numbers))
 
     def _assemble(self, camera: str, parts: Iterable[Path]) -> dict[str, int]:
         """Join the parts of a camera; return their counts."""

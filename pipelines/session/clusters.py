@@ -7,8 +7,9 @@ Dask gives to another one.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from asyncio import CancelledError
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -59,8 +60,10 @@ class Cluster:
         *,
         on_gpu: bool = False,
         progress: Progress | None = None,
-    ) -> Iterator[tuple[int, R]]:
+    ) -> Generator[tuple[int, R]]:
         """Call a function with every part, and yield number and result in the order in which they end.
+
+        Closed early, the parts that are not done are cancelled.
 
         Args:
             work: a function of a module.
@@ -88,7 +91,8 @@ class Cluster:
                 for future in distributed.as_completed(list(numbers)):
                     yield numbers.pop(future), result_of(future, _PART)
             finally:
-                client.cancel(list(numbers))
+                with suppress(OSError, CancelledError):  # of a cluster that is gone
+                    client.cancel(list(numbers))
 
 
 def result_of(future: Any, what: Path | str) -> Any:
