@@ -315,6 +315,7 @@ def _bag_records() -> Iterator[_Input]:
     small = bz2.compress(_bag_topic(0, "/a") + _bag_message(0))
     both = _bag_chunk(small, "bz2", len(_bag_topic(0, "/a") + _bag_message(0)))
     yield "50,000 chunks of a message", "ros1", "a.bag", _bag(both * 50_000, chunks=50_000)
+    yield "9,000 chunks of a message", "ros1", "a.bag", _bag(both * 9000, chunks=9000)
     topics = b"".join(_bag_topic(k, f"/t{k}") for k in range(60_000))
     yield "60,000 topics", "ros1", "a.bag", _bag(topics)
     messages = b"".join(_bag_message(k) for k in range(60_000))
@@ -486,6 +487,7 @@ def _yaml_calibrations() -> Iterator[_Input]:
         "chain.yaml",
         "".join(f"cam{k}:\n{_LENS}" for k in range(5000)),
     )
+    yield "2,400 cameras", "kalibr", "chain.yaml", "".join(f"cam{k}:\n{_LENS}" for k in range(2400))
     aliases = f"cam0: &c\n{_LENS}" + "".join(f"cam{k}: *c\n" for k in range(1, 50_000))
     yield "50,000 cameras by aliases", "kalibr", "chain.yaml", aliases
     head = f"cam0:\n{_LENS}"
@@ -1269,6 +1271,7 @@ def _telemetry() -> Iterator[_Input]:
         "<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"
     )
     yield "ArduPilot: 200,000 definitions", "ardupilot", "a.bin", own + dataflash(200_000, b"")
+    yield "ArduPilot: 9,000 definitions", "ardupilot", "a.bin", own + dataflash(9000, b"")
     yield (
         "ArduPilot: messages of no length",
         "ardupilot",

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 
 from tests.fuzz.attacking import MOST_MB, MOST_S, attack
 from tests.fuzz.crafted import KINDS, Crafted, crafted
 
 QUICK = ("messages: JSON and protobuf", "videos: boxes")
+REFUSED_AT_ONCE = {"other telemetry": 1, "ROS 1: records": 3, "YAML: calibrations": 2}
+"""Number of the first inputs of a class that are refused by a count, before any of their content is read."""
 
 
 def test_quick_classes_make_no_trouble(tmp_path: Path) -> None:
@@ -16,11 +18,13 @@ def test_quick_classes_make_no_trouble(tmp_path: Path) -> None:
         (folder / "a.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n", encoding="utf-8")
 
     sound = Crafted("sound", "a trajectory", "tum", write, "a.tum")
-    first, *met = attack(chain([sound], crafted(QUICK)), tmp_path)
+    counted = [list(islice(crafted([kind]), number)) for kind, number in REFUSED_AT_ONCE.items()]
+    first, *met = attack(chain([sound], *counted, crafted(QUICK)), tmp_path)
     assert (first.read, first.refused, first.trouble) == (2, 0, "")
     assert 50 < first.mb < MOST_MB
     assert len(KINDS) >= 25
-    assert {each.kind for each in met} == set(QUICK)
+    assert {each.kind for each in met} == {*QUICK, *REFUSED_AT_ONCE}
+    assert not any(each.read for each in met if each.kind in REFUSED_AT_ONCE)
     assert [(each.what, each.trouble) for each in met if each.trouble] == []
     hiding = {f"mdhd: a time scale of {scale}" for scale in (0, 1, 2**32 - 1)}  # one picture of 15
     assert {each.what for each in met if each.refused and not each.read} >= hiding

@@ -41,6 +41,7 @@ from pipelines.session.registries import need
 from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
 
 _START = b"\xa3\x95\x80"  # a FMT message: the first of every log
+_MOST_DEFINITIONS = 10_000  # a log has one for each of up to 256 types, and chance makes one in 16 MB
 _OLD_LOCAL = ("EKF1",)  # until 2015, when the estimator was logged without being flown by: only if asked for
 _HEAD = 3  # bytes before each message's fields
 _3D_FIX = 3
@@ -363,6 +364,7 @@ def _index(path: Path) -> Any:
             if file.read(len(_START)) != _START:
                 raise DataError(path, "is no ArduPilot log", "give the .bin that the autopilot wrote")
         refuse_marks(path, _START[:2])
+        refuse_marks(path, _START, most=_MOST_DEFINITIONS)
     except OSError as error:
         raise damaged(path, error) from error
     kind = need("pymavlink.DFReader", "drones").DFReader_binary

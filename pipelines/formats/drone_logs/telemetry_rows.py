@@ -225,19 +225,25 @@ def on_gps_time(
     return fit
 
 
-def refuse_marks(path: Path, *marks: bytes) -> None:
+def refuse_marks(path: Path, *marks: bytes, most: int | None = None) -> None:
     """Refuse a log with more beginnings of messages than messages fit into it: a parser tries each of them.
 
+    Args:
+        path: the log.
+        marks: bytes with which messages begin.
+        most: number that no recorder exceeds; by default 100,000, or one for eight bytes if that is more.
+
     Raises:
-        DataError: there are more than 100,000, and more than one for eight bytes.
+        DataError: there are more.
         OSError: the file cannot be read.
     """
     size = path.stat().st_size
     if size < _FEW_MARKS:
         return
+    most = most or max(_FEW_MARKS, size // _SMALLEST_MESSAGE)
     with path.open("rb") as file:
         found = sum(block.count(mark) for block in iter(partial(file.read, 1 << 20), b"") for mark in marks)
-    if found > max(_FEW_MARKS, size // _SMALLEST_MESSAGE):
+    if found > most:
         raise DataError(path, f"has {found} beginnings of messages in {size} bytes", "copy it again")
 
 

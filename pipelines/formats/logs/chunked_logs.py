@@ -44,6 +44,10 @@ _INFLATED = 1 << 30  # bytes of all chunks in any file
 _MOST_EXPANSION = 100  # bytes for one in the file
 _RECORDS = 100_000  # in the chunks of any file; one more for each of its bytes
 
+# Recorders write an index behind each chunk but the last. Some leave indices out, of chunks of 1 MB.
+_BARE_CHUNKS = 10_000  # without an index in any file; one more for each 4 kB
+_BARE_SIZE = 4096
+
 _KEPT = 16 << 20  # bytes that freed chunks may hold
 RECORD_AGAIN = "no recorder writes this; copy it again from the drone"
 
@@ -94,6 +98,7 @@ class ChunkedPart(LogPart):
         super().__init__(path, file_size)
         self.file = file
         self.chunks: list[Chunk] = []
+        self._bare = 0  # chunks without an index, other than the last
         self.messages_stated: int | None = None  # by the file's summary
         self._cache: dict[int, memoryview | None] = {}
         self._cached = 0  # bytes
@@ -125,6 +130,21 @@ class ChunkedPart(LogPart):
     @abstractmethod
     def look(self, content: memoryview) -> Content:
         """Find the records of a chunk."""
+
+    def take_chunk(self, chunk: Chunk) -> None:
+        """Add the next chunk of the file.
+
+        Raises:
+            DataError: there are more chunks without an index than any recorder writes. Each must be inflated.
+        """
+        self._bare += bool(self.chunks) and not self.chunks[-1].index
+        if self._bare > max(_BARE_CHUNKS, self.file_size // _BARE_SIZE):
+            raise DataError(
+                self.path,
+                f"holds over {self._bare - 1} chunks without an index in {self.file_size} bytes",
+                RECORD_AGAIN,
+            )
+        self.chunks.append(chunk)
 
     def count_record(self) -> None:
         """Count a record that was found in a chunk.

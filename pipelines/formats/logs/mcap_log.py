@@ -187,7 +187,7 @@ class McapPart(ChunkedPart):
         here = min(stated, self.file_size - data_at)
         if here < 0:
             raise ValueError("nothing of the chunk's content is here")
-        self.chunks.append(Chunk(data_at, here, name, size, crc, cut=here < stated))
+        self.take_chunk(Chunk(data_at, here, name, size, crc, cut=here < stated))
         if (name or "uncompressed") not in self.storage:
             self.storage.append(name or "uncompressed")
 

@@ -194,7 +194,7 @@ class _Bag(ChunkedPart):
         compression = fields[b"compression"].decode()
         here = min(length, self.file_size - data_at)
         chunk = Chunk(data_at, here, compression, _U32.unpack(fields[b"size"])[0], cut=here < length)
-        self.chunks.append(chunk)
+        self.take_chunk(chunk)
         if compression not in self.storage:
             self.storage.append(compression)
 
