@@ -2,7 +2,8 @@
 
 numba puts its cache beside the source, else in the user's cache folder, or in NUMBA_CACHE_DIR. It compiles
 again if the file of the outermost function changed. With this module, it does so also if the file of a
-helper changed. The first compilation of a process is logged, because it takes seconds.
+helper changed. The first compilation of a process is logged, because it takes seconds. Of several processes
+that start together one compiles, and the others wait for what it writes into the cache.
 """
 
 import logging
@@ -14,6 +15,7 @@ from pickle import UnpicklingError
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+from filelock import FileLock, Timeout
 from numba.core import event
 
 LOGGER = logging.getLogger(__name__)
@@ -22,6 +24,8 @@ LOGGER = logging.getLogger(__name__)
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
+
+_WAIT_S = 600.0  # for another process; the largest function takes some ten seconds
 
 _OPTIONS = {
     "error_model": "numpy",  # a division by zero gives inf, as in arrays
@@ -49,6 +53,7 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
     try:
         compiled = numba.njit(function, cache=True, **options)
         _watch_helpers(compiled, function)
+        _compile_in_one_process(compiled)
     except RuntimeError:
         uncached: Callable[Arguments, Result] = numba.njit(function, **options)
         return uncached
@@ -82,7 +87,8 @@ class _Announcement(event.Listener):  # type: ignore[misc]  # numba has no types
     _done = False
 
 
-event.register("numba:compile", _Announcement())
+_ANNOUNCEMENT = _Announcement()
+event.register("numba:compile", _ANNOUNCEMENT)
 
 
 def dispatcher_of(function: Callable[..., object]) -> Any:
@@ -107,3 +113,36 @@ def _watch_helpers(compiled: Any, function: Callable[..., object]) -> None:
     with suppress(AttributeError, OSError):
         states = [Path(name).stat() for name in sorted(files)]
         compiled._cache._cache_file._source_stamp = tuple((state.st_mtime, state.st_size) for state in states)
+
+
+def _compile_in_one_process(compiled: Any) -> None:
+    """Let processes that find nothing in the cache compile one after the other, and look again before.
+
+    The lock is the kernel's, on a file beside the cache's index, so it ends with the process. Where it cannot
+    be made, every process compiles. numba has no public interface for this either.
+    """
+    with suppress(AttributeError):
+        cache, load, compile_ = compiled._cache, compiled._cache.load_overload, compiled.compile
+        index = Path(cache._cache_file._index_path)
+        locks: list[FileLock] = []
+
+        def load_or_wait(signature: object, context: object) -> object:
+            found = load(signature, context)
+            if found is None and cache._enabled:
+                _ANNOUNCEMENT.on_start(None)
+                with suppress(OSError, Timeout):
+                    index.parent.mkdir(parents=True, exist_ok=True)
+                    lock = FileLock(index.with_suffix(".lock"))
+                    lock.acquire(timeout=_WAIT_S)
+                    locks.append(lock)
+                    found = load(signature, context)
+            return found
+
+        def compile_once(signature: object) -> object:
+            try:
+                return compile_(signature)
+            finally:
+                while locks:
+                    locks.pop().release()
+
+        cache.load_overload, compiled.compile = load_or_wait, compile_once

@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import inspect
 import logging
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -145,6 +146,26 @@ def test_the_first_compilation_of_a_process_is_announced_and_no_other(
         load_quarter()(2.0)
         load_quarter()(2)  # another type is compiled as well
     assert [record.name for record in caplog.records] == [LOGGER.name]
+
+
+def test_of_processes_that_start_together_one_compiles(
+    load_quarter: Callable[[], Callable[[float], float]],
+) -> None:
+    began, begin = os.pipe()
+    children = []
+    for _ in range(4):
+        child = os.fork()
+        if not child:
+            os.close(begin)
+            os.read(began, 1)  # until the parent closes its end: all at once
+            right = load_quarter()(2.0) == 0.5
+            dispatcher = dispatcher_of(sys.modules["quarters"].quarter)
+            os._exit(sum(dispatcher.stats.cache_misses.values()) if right else 100)
+        children.append(child)
+    os.close(begin)
+    misses = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
+    os.close(began)
+    assert sorted(misses) == [0, 0, 0, 1]
 
 
 def test_what_was_compiled_ahead_is_found_in_the_cache(
