@@ -1,11 +1,14 @@
-"""Planner arms past a mound, a wall and trees: `python -m benchmarks.arms [--weights | --seeds N | --ahead]`.
+"""Planner arms past a mound, a wall and trees.
+
+    python -m benchmarks.arms [--weights | --seeds N | --ahead | --teams]
 
 Each scenario of sample_data/planning is simulated without video, ingested, and flown again by the fixed and
 the adaptive formation with the weights of its planner.yaml, as `mocap replan-compare` does. All simulated.
 `--weights` flies them with other weights and resolutions too, and prints the figures of each.
 `--seeds` flies them, and the sample flight, many times with different noise of the actor's log, detector and
 poses, and pairs the arms seed by seed. `--ahead` starts the sample flight where the adaptive formation must
-turn past the actor's face, with its forecast and with the actor's way known.
+turn past the actor's face, with its forecast and with the actor's way known, and flies `joint` from there.
+`--teams` flies 2 to 5 drones past the mound by `adaptive` and by `joint`.
 """
 
 from __future__ import annotations
@@ -41,6 +44,7 @@ ACTOR_NOISE_M = 0.2
 
 AHEAD_DEG = (-20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0)
 """Yaws of the first camera at the start from which the sample's formation turns past the actor's face."""
+TEAMS = (2, 3, 4, 5)
 VARIANTS: tuple[Mapping[str, float], ...] = (
     {},
     {"yaws": 8, "knot_s": 2, "horizon_knots": 5},
@@ -59,10 +63,14 @@ def main() -> None:
     parser.add_argument("--weights", action="store_true", help="other weights instead (minutes)")
     parser.add_argument("--seeds", type=int, help="flights with noise of their own instead (minutes)")
     parser.add_argument("--ahead", action="store_true", help="starts ahead of the actor instead")
+    parser.add_argument("--teams", action="store_true", help="2 to 5 drones past the mound instead")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         if arguments.ahead:
             _print_ahead(_sample(Path(temporary)))
+            return
+        if arguments.teams:
+            _print_teams(_scene(_session("mound", Path(temporary))))
             return
         sessions = {name: _session(name, Path(temporary)) for name in NAMES}
         if arguments.seeds:
@@ -87,15 +95,40 @@ def _sample(folder: Path) -> Path:
 
 
 def _print_ahead(session: Path) -> None:
-    """Print tilt and hidden time of `adaptive` by the yaw of the start, with its forecast and foresight."""
+    """Print tilt and hidden time by the yaw of the start, of `adaptive` with forecast and foresight, `joint`.
+
+    `joint` flies once at the range of `adaptive`, and once at ranges of its own.
+    """
     scene = _scene(session)
+    same_range = _with_ranges(scene, scene.config.radius_m)
     rows = []
     for yaw_deg in AHEAD_DEG:
-        started = replace(scene, yaw_rad=float(np.radians(yaw_deg)))
+        yaw_rad = float(np.radians(yaw_deg))
+        started, same = (replace(each, yaw_rad=yaw_rad) for each in (scene, same_range))
         rows.append(
-            [f"{yaw_deg:g}", *(_figures(started, "adaptive", foresight=known) for known in (False, True))]
+            [
+                f"{yaw_deg:g}",
+                *(_figures(started, "adaptive", foresight=known) for known in (False, True)),
+                _figures(same, "joint"),
+                _figures(started, "joint"),
+            ]
         )
-    print("\n".join(markdown_table(["--yaw", "forecast", "way known"], rows)))
+    header = ["--yaw", "adaptive", "adaptive, way known", "joint, 10 m", "joint, 8 to 12 m"]
+    print("\n".join(markdown_table(header, rows)))
+
+
+def _print_teams(scene: Scene) -> None:
+    """Print tilt and hidden time past the mound by the number of drones, at equal range."""
+    rows = []
+    for drones in TEAMS:
+        team = replace(_with_ranges(scene, scene.config.radius_m), drones=drones)
+        rows.append([str(drones), _figures(team, "adaptive"), _figures(team, "joint")])
+    print("\n".join(markdown_table(["drones", "adaptive", "joint, 10 m"], rows)))
+
+
+def _with_ranges(scene: Scene, *ranges_m: float) -> Scene:
+    planner = replace(scene.config, ranges_m=ranges_m)
+    return replace(scene, settings=replace(scene.settings, planner=planner))
 
 
 def _print_comparisons(sessions: Mapping[str, Path], trials: int) -> None:

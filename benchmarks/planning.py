@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm
+from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, JOINT, Arm
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.forecast import Forecast
@@ -73,6 +73,8 @@ def print_central(repeats: int, turns: int) -> list[tuple[str, float, float]]:
         _print_central(
             arm, (8, 10, drones), field, repeats, turns
         )  # their lattice decides at every other knot
+    for drones in (2, 5):
+        _print_central(JOINT, (32, 10, drones), field, repeats, turns)
     return aims
 
 
@@ -91,7 +93,7 @@ def _print_central(
         walked = 40.0 * k / repeats + 1.2 * config.knot_s * np.arange(1, knots + 1)
         actor: NDArray[np.float64] = np.stack([walked, 0 * walked, 0 * walked + 1], axis=1)
         started = time.thread_time()
-        planner.plan(0.0, commanded, Forecast(actor, east), field)
+        planner.plan(1.0 + turn * repeats + k, commanded, Forecast(actor, east), field)  # each is due
         took_ms[turn, k] = 1e3 * (time.thread_time() - started)
     fastest_ms = took_ms.min(axis=0)
     median = float(np.median(fastest_ms))
@@ -110,7 +112,7 @@ def print_replays(turns: int) -> list[tuple[str, float, float]]:
     config = PlannerConfig()
     for field, name in ((mound(), "mound"), (mound(resolution_m=0.2), "mound, 0.2 m")):
         both_s, plans = 0.0, []
-        for arm in (FIXED, ADAPTIVE, COVARIANCE, GREEDY):
+        for arm in (FIXED, ADAPTIVE, COVARIANCE, GREEDY, JOINT):
             runs_s, locals_s = [], []
             for seconds in (2.0, *[75.0] * turns):  # the first compiles
                 started = time.thread_time()

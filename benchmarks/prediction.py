@@ -1,7 +1,8 @@
 """Predicted against measured errors of arms in random worlds: `python -m benchmarks.prediction [--first N]`.
 
 `--bound` also flies arms that know the whole way of the actor, with the same limits, and compares each arm
-with the least error of these in every world.
+with the least error of these in every world, and with the arms of equal range. `--keep FILE` stores the
+flights of each world; worlds that are there are not flown again.
 
 Every arm flies through worlds of `benchmarks.worlds`. One posture of a walk, carried along by the actor, is
 measured by triangulation with modelled keypoints and white pose noise (0.02 m, 0.2 deg), 32 draws. The
@@ -12,10 +13,12 @@ within flights over seconds. All simulated. Worlds from 1000 on were tuned on, t
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,11 +42,15 @@ ARMS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "adaptive": ("adaptive", {}),
     "covariance, 10 m only": ("covariance", {"ranges_m": (10.0,)}),
     "greedy, 10 m only": ("greedy", {"ranges_m": (10.0,)}),
+    "joint, 10 m only": ("joint", {"ranges_m": (10.0,)}),
     "adaptive, 8 m": ("adaptive", {"radius_m": 8.0}),
     "covariance": ("covariance", {}),
     "greedy": ("greedy", {}),
+    "joint, from 8 m": ("joint", {"radius_m": 8.0}),
 }
 """Arms by their names in the tables, with changes of the settings: those of equal range beside each other."""
+EQUAL: Mapping[str, str] = {"joint, 10 m only": "adaptive", "joint, from 8 m": "adaptive, 8 m"}
+"""Arms that are compared with `adaptive` at the same range."""
 FINE: Mapping[str, Any] = {"lattice_yaws": 32, "lattice_knots": 1, "tilts_deg": (10.0, 15.0, 20.0)}
 NEAREST_M = 8.0  # of all arms, but for those that stay at 10 m
 KNOWING: Mapping[str, tuple[str, Mapping[str, Any]]] = {
@@ -51,6 +58,7 @@ KNOWING: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "adaptive, 8 m, 10 deg, way known": ("adaptive", {"radius_m": NEAREST_M, "tilt_deg": 10.0}),
     "covariance, fine, way known": ("covariance", {**FINE, "ranges_m": (8.0, 9.0, 10.0, 11.0, 12.0)}),
     "greedy, way known": ("greedy", {}),
+    "joint, from 8 m, way known": ("joint", {"radius_m": NEAREST_M}),
 }
 """Arms that know the whole way: yaw alone, and yaw, tilt, range and spacing together."""
 NOISE = White(position_m=0.02, rotation_deg=0.2)
@@ -161,15 +169,46 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20, help="worlds (default 20)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--bound", action="store_true", help="compare with flights that know the whole way")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="store flights here, and go on from there")
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.count)
-    with ProcessPoolExecutor(arguments.workers) as pool:
-        flights = [flight for of in pool.map(partial(fly, bound=arguments.bound), seeds) for flight in of]
+    flights = list(_flown(seeds, arguments.workers, arguments.keep, bound=arguments.bound))
     _print_arms(flights)
     if arguments.bound:
         _print_bound(flights)
+        _print_equal(flights)
         flights = [flight for flight in flights if flight.arm not in KNOWING]
     _print_correlations(flights)
+
+
+def _flown(seeds: Sequence[int], workers: int, keep: Path | None, *, bound: bool) -> Iterator[Flight]:
+    """Yield the flights through some worlds: those kept, then those flown now, which are kept as well."""
+    kept = [_read(line) for line in keep.read_text().splitlines()] if keep and keep.exists() else []
+    needed = {*ARMS, *KNOWING} if bound else {*ARMS}
+    done = {seed for seed in seeds if needed <= {flight.arm for flight in kept if flight.seed == seed}}
+    yield from (flight for flight in kept if flight.seed in done and flight.arm in needed)
+    with ProcessPoolExecutor(workers) as pool:
+        for flights in pool.map(partial(fly, bound=bound), [seed for seed in seeds if seed not in done]):
+            yield from flights
+            if keep:
+                with keep.open("a") as file:
+                    file.writelines(f"{_line(flight)}\n" for flight in flights)
+
+
+def _line(flight: Flight) -> str:
+    values = {**asdict(flight), "predicted": flight.predicted.tolist(), "measured": flight.measured.tolist()}
+    return json.dumps(values)
+
+
+def _read(line: str) -> Flight:
+    values = json.loads(line)
+    return Flight(
+        **{
+            **values,
+            "predicted": np.array(values["predicted"], dtype=np.float64),
+            "measured": np.array(values["measured"], dtype=np.float64),
+        }
+    )
 
 
 def _print_arms(flights: Iterable[Flight]) -> None:
@@ -205,6 +244,30 @@ def _print_bound(flights: Sequence[Flight]) -> None:
                 hidden.append(flight.hidden - least.hidden)
         rows.append([arm, f"{np.mean(ratios):.3f}", f"{np.max(ratios):.3f}", f"{100 * np.mean(hidden):+.2f}"])
     header = ["arm", "error over the bound's, mean", "largest", "hidden, points of % more"]
+    print("\n".join(markdown_table(header, rows)))
+
+
+def _print_equal(flights: Sequence[Flight]) -> None:
+    """Print arms over `adaptive` at the same range, world by world: error, hidden time, the worst world."""
+    rows = []
+    for arm, other in EQUAL.items():
+        own, base = ({f.seed: f for f in flights if f.arm == name} for name in (arm, other))
+        ratios = np.array([np.nanmean(own[k].measured) / np.nanmean(base[k].measured) for k in own])
+        hidden = 100 * np.mean([own[k].hidden - base[k].hidden for k in own])
+        right = 100 * np.mean([own[k].right - base[k].right for k in own])
+        worse = int((ratios > 1.01).sum())
+        rows.append(
+            [
+                arm,
+                other,
+                f"{ratios.mean():.3f}",
+                f"{ratios.max():.3f}",
+                f"{worse} of {len(ratios)}",
+                f"{hidden:+.2f}",
+                f"{right:+.2f}",
+            ]
+        )
+    header = ["arm", "over", "error, mean", "largest", "worse by 1 %", "hidden, points", "PCK150, points"]
     print("\n".join(markdown_table(header, rows)))
 
 

@@ -43,8 +43,8 @@ _settings_options = grouped(
     click.option(
         "--arms",
         metavar="NAME,...",
-        help="Arms to compare: adaptive, fixed, covariance, greedy; flown and planned are the logged flight"
-        " and its commands [default: adaptive, fixed, flown where cameras moved, planned where logged].",
+        help="Arms to compare: adaptive, fixed, covariance, greedy, joint; flown and planned are the logged"
+        " flight and its commands [default: adaptive, fixed, flown where cameras moved, planned where logged].",
     ),
     click.option(
         "--drones",
@@ -56,7 +56,7 @@ _settings_options = grouped(
         "radius_m",
         type=FiniteRange(0.5, 500),
         metavar="M",
-        help="Distance of the slots from the actor (`covariance` and `greedy` only start there).",
+        help="Distance of the slots from the actor (`covariance`, `greedy` and `joint` only start there).",
     ),
     click.option(
         "--tilt",

@@ -4,6 +4,7 @@ All share forecast, local planner and tracking. An arm is one object with a name
 `FormationPlanner` for a flight; a package adds one by an entry point in `mocap.planner_arms`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,19 +15,26 @@ from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import (
+    RANGE,
+    TILT,
     YAW,
     FormationPath,
     formation_slots,
     slot_offsets,
+    wrapped,
     yaw_set,
 )
 from pipelines.planning.information import log_determinant, ray_information
 from pipelines.planning.search import (
+    TOO_NEAR,
     Formations,
     Lattice,
     SlotCosts,
+    TeamWeights,
+    Views,
     best_sequence,
     cheapest_slots,
+    cheapest_team,
     cost_map,
     costs_in_frame,
     costs_of_slots,
@@ -37,7 +45,11 @@ from pipelines.planning.search import (
 )
 from pipelines.session.registries import Registry
 
-_TOO_NEAR = 100.0  # cost of a slot within the separation of another drone's: more than any gain
+_TILTS_DEG = (-10.0, 85.0)
+_TRIANGLE = np.triu_indices(3)
+_JOINT_EVERY_S = 0.5 - 1e-6  # between two plans of `joint`: slots move little meanwhile
+_EACH_TURN = 4.0  # times `w_turn`, for each drone of `joint`: drones lag behind slots that move often
+_W_HIDDEN = 0.3  # price of a hidden view, beyond that of its occupied share and of the information lost
 
 
 class FormationPlanner(Protocol):
@@ -98,11 +110,21 @@ class _GreedyArm:
         return _Greedy(config, drones, yaw_rad)
 
 
+@dataclass(frozen=True)
+class _JointArm:
+    name: str = "joint"
+    title: str = "all drones together, any spacing"
+
+    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
+        return _Joint(config, drones, yaw_rad)
+
+
 PLANNER_ARMS: Registry[Arm] = Registry("mocap.planner_arms", "planner arm")
 FIXED: Arm = _FixedArm()
 ADAPTIVE: Arm = _SearchingArm("adaptive", "adaptive formation")
 COVARIANCE: Arm = _SearchingArm("covariance", "adaptive formation, predicted error", predicts_error=True)
 GREEDY: Arm = _GreedyArm()
+JOINT: Arm = _JointArm()
 
 
 class _Fixed:
@@ -202,7 +224,7 @@ class _Greedy:
             cost = cost_map(costs, config) - config.w_error * gain
             for other in taken:
                 apart = np.linalg.norm(offsets - other[:, None], axis=-1)
-                cost += np.where(apart < config.soft_separation_m, _TOO_NEAR, 0.0)
+                cost += np.where(apart < config.soft_separation_m, TOO_NEAR, 0.0)
             sequence, _ = best_sequence(cost, grid, commanded[i])
             at = np.arange(knots)
             known = known + gained[at, sequence][:, None]
@@ -210,6 +232,67 @@ class _Greedy:
             slots[:, i] = grid.states[sequence]
         through = _through(commanded, slots)
         return FormationPath(_knots(t_s, through, self._lattices[0]), through, self._rates)
+
+
+class _Joint:
+    """Planner of yaw, tilt and range of every drone for the least error of all views together.
+
+    Spacing is free, so that nobody has to stay behind an obstacle. All drones choose from the same slots, so
+    that one look at these serves the whole team.
+    """
+
+    def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
+        _, tilt_step, range_step = np.array(config.slot_rates) * config.knot_s
+        neighbour = 4 if drones == 2 else drones  # so many neighbours fill a turn: their yaws are in the set
+        self._yaws = max(round(config.yaws / neighbour), 1) * neighbour
+        tilts = np.clip(config.tilt_rad + tilt_step * np.arange(-1, 2), *np.radians(_TILTS_DEG))
+        ranges = _steps_through(config.radius_m, (*config.ranges_m, config.radius_m), range_step)
+        states = _all_states(yaw_set(self._yaws, yaw_rad), np.unique(tilts), ranges)
+        self._lattice = lattice(
+            states,
+            rates=np.array(config.slot_rates),
+            knot_s=config.knot_s,
+            w_turn=_EACH_TURN * config.w_turn,
+        )
+        self._offsets = slot_offsets(states)
+        information = ray_information(self._offsets, config.errors)[:, *_TRIANGLE]
+        per_yaw = len(states) // self._yaws
+        first = np.arange(len(states))[:, None] + np.arange(drones) * (self._yaws // neighbour) * per_yaw
+        formations = first % len(states)
+        self._views = Views(self._lattice, self._offsets, np.ascontiguousarray(information), formations)
+        self._weights = TeamWeights(config.w_error, config.prior_sigma_m**-2, config.soft_separation_m)
+        off_start = np.abs(wrapped(states[:, YAW] - yaw_rad)) + np.abs(states[:, TILT] - config.tilt_rad)
+        start = formations[int((off_start + np.abs(states[:, RANGE] - config.radius_m)).argmin())]
+        self._team = np.repeat(start[:, None], config.horizon_knots, axis=1)  # [n, T]
+        self._config, self._rates = config, np.array(config.slot_rates)
+        self._path: FormationPath | None = None
+
+    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
+        if self._path is None or t_s - self._path.knot_s[0] >= _JOINT_EVERY_S:
+            self._path = self._planned(t_s, commanded, actor, field)
+        return self._path
+
+    def _planned(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
+        states = self._lattice.states
+        costs = _look(field, actor, states[:, None], self._offsets[:, None], self._config)
+        free = (costs.occluded[..., 0] == 0.0).astype(np.float64)
+        free = (free + self._beside(free)) / 2.0  # drones are not exactly in their slots
+        price = cost_map(costs, self._config) + _W_HIDDEN * (1.0 - free)
+        self._team = cheapest_team(price, free, self._views, self._weights, commanded, self._team)
+        through = _through(commanded, states[self._team.T])
+        return FormationPath(_knots(t_s, through, self._lattice), through, self._rates)
+
+    def _beside(self, values: Float) -> Float:
+        """Return the mean of values [T, S] at the two neighbouring yaws."""
+        by_yaw = values.reshape(len(values), self._yaws, -1)
+        mean: Float = ((np.roll(by_yaw, 1, axis=1) + np.roll(by_yaw, -1, axis=1)) / 2.0).reshape(values.shape)
+        return mean
+
+
+def _steps_through(start: float, reached: Sequence[float], step: float) -> Float:
+    """Return values by steps from a start, as far as they are within those to be reached."""
+    low, high = (round((end - start) / step) for end in (min(reached), max(reached)))
+    return start + step * np.arange(low, high + 1, dtype=np.float64)
 
 
 def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:

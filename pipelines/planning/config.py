@@ -73,7 +73,7 @@ class PlannerConfig:
     yaw_rate_deg_per_s: float = 22.5
     yaw_frame: Frame = "world"  # or yaws count from the actor's heading (forecast.YawZero)
     heading_speed_mps: float = 0.5  # a slower actor stands, and keeps the last heading
-    tilt_rate_deg_per_s: float = 5.0  # tilt and range are searched by `covariance` and `greedy` alone
+    tilt_rate_deg_per_s: float = 5.0  # tilt and range are searched by `covariance`, `greedy`, `joint`
     range_rate_mps: float = 1.0
     tilts_deg: tuple[float, ...] = (5.0, 15.0, 25.0, 35.0)
     ranges_m: tuple[float, ...] = (8.0, 10.0, 12.0)

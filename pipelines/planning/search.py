@@ -29,7 +29,10 @@ from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import YAW, slot_offsets, turned, wrapped
 from pipelines.planning.information import predicted_error, ray_information
 
+TOO_NEAR = 100.0
+"""Cost of a slot too near to another drone's: more than any gain."""
 _REACHED_S = 1e-9  # a cell exactly as far as the rates allow is a neighbour
+_MOST_ROUNDS = 4  # of improving a team's plan drone by drone
 
 
 class Lattice(NamedTuple):
@@ -49,6 +52,23 @@ class Formations(NamedTuple):
     lattice: Lattice
     slots: Float  # [S, n, 3] of each state
     offsets: Float  # [S, n, 3] m, the same from the actor
+
+
+class Views(NamedTuple):
+    """Slots that any drone of a team can take."""
+
+    lattice: Lattice
+    offsets: Float  # [S, 3] m from the actor
+    information: Float  # [S, 6] 1/m^2 of a free view: xx, xy, xz, yy, yz, zz
+    formations: Int64  # [S, n] states of a team of equal spacing whose first drone has each state
+
+
+class TeamWeights(NamedTuple):
+    """Weights of the search for a team, by name; see `PlannerConfig`."""
+
+    w_error: float
+    prior: float  # 1/m^2, of a joint without any camera
+    apart_m: float  # slots of two drones are farther apart
 
 
 class SlotWeights(NamedTuple):
@@ -185,6 +205,143 @@ def _search(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
 @helper
 def _wrapped(angle_rad: float) -> float:
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@helper
+def _log_error(i: Float) -> float:
+    """Compute the logarithm of sqrt(tr I^-1) of [6], the upper triangle of a positive definite matrix."""
+    first = i[3] * i[5] - i[4] * i[4]
+    determinant = i[0] * first - i[1] * (i[1] * i[5] - i[2] * i[4]) + i[2] * (i[1] * i[4] - i[2] * i[3])
+    minors = first + i[0] * i[5] - i[2] * i[2] + i[0] * i[3] - i[1] * i[1]
+    return 0.5 * math.log(minors / determinant)
+
+
+@helper
+def _start_information(total: Float, prior: float) -> None:
+    """Set the information [6] of a joint without any camera."""
+    for k in range(6):
+        total[k] = prior if k in (0, 3, 5) else 0.0
+
+
+@helper
+def _add_view(total: Float, share: float, views: Views, s: int) -> None:
+    for k in range(6):
+        total[k] += share * views.information[s, k]
+
+
+@helper
+def _is_near(views: Views, s: int, r: int, apart_m: float) -> bool:
+    square = 0.0
+    for axis in range(3):
+        square += (views.offsets[s, axis] - views.offsets[r, axis]) ** 2
+    return square < apart_m * apart_m
+
+
+@helper
+def _team_cost(
+    price: Float, free: Float, views: Views, w: TeamWeights, commanded: Float, team: Int64
+) -> float:
+    """Compute what `cheapest_team` minimises, of states [n, T]."""
+    drones, times = team.shape
+    known = np.zeros(6)
+    total = 0.0
+    for t in range(times):
+        _start_information(known, w.prior)
+        for i in range(drones):
+            s = team[i, t]
+            total += price[t, s]
+            _add_view(known, free[t, s], views, s)
+            for j in range(i):
+                if _is_near(views, s, team[j, t], w.apart_m):
+                    total += TOO_NEAR
+            for axis in range(3):
+                before = commanded[i, axis] if t == 0 else views.lattice.states[team[i, t - 1], axis]
+                way = views.lattice.states[s, axis] - before
+                if axis == YAW:
+                    way = _wrapped(way)
+                total += views.lattice.w_turn / 2.0 * abs(way) / views.lattice.rates[axis]
+        total += w.w_error * _log_error(known)
+    return total
+
+
+@helper
+def _improve_team(
+    price: Float, free: Float, views: Views, w: TeamWeights, commanded: Float, team: Int64
+) -> None:
+    """Replace each drone's states by the cheapest ones, given the others', until nobody finds better ones."""
+    drones, times = team.shape
+    cost = np.empty(price.shape)
+    others, known = np.zeros(6), np.zeros(6)
+    for _ in range(_MOST_ROUNDS):
+        changed = False
+        for i in range(drones):
+            for t in range(times):
+                _start_information(others, w.prior)
+                for j in range(drones):
+                    if j != i:
+                        _add_view(others, free[t, team[j, t]], views, team[j, t])
+                for s in range(price.shape[1]):
+                    for k in range(6):
+                        known[k] = others[k]
+                    _add_view(known, free[t, s], views, s)
+                    cost[t, s] = price[t, s] + w.w_error * _log_error(known)
+                    for j in range(drones):
+                        if j != i and _is_near(views, s, team[j, t], w.apart_m):
+                            cost[t, s] += TOO_NEAR
+            found = _search(cost, views.lattice, commanded[i])[0]
+            for t in range(times):
+                changed = changed or found[t] != team[i, t]
+                team[i, t] = found[t]
+        if not changed:
+            return
+
+
+@helper
+def _cheapest_formation(price: Float, free: Float, views: Views, w: TeamWeights, commanded: Float) -> Int64:
+    """Find the cheapest states [n, T] of equal spacing."""
+    (times, states), drones = price.shape, commanded.shape[0]
+    cost = np.zeros(price.shape)
+    known = np.zeros(6)
+    for t in range(times):
+        for s in range(states):
+            _start_information(known, w.prior)
+            for i in range(drones):
+                r = views.formations[s, i]
+                cost[t, s] += price[t, r]
+                _add_view(known, free[t, r], views, r)
+            cost[t, s] += w.w_error * _log_error(known)
+    sequence = _search(cost, views.lattice, commanded[0])[0]
+    team = np.empty((drones, times), np.int64)
+    for t in range(times):
+        for i in range(drones):
+            team[i, t] = views.formations[sequence[t], i]
+    return team
+
+
+@cached
+def cheapest_team(
+    price: Float, free: Float, views: Views, w: TeamWeights, commanded: Float, before: Int64
+) -> Int64:
+    """Find states [n, T] of a team that none of its drones can improve alone.
+
+    The cost is the sum of the slots' prices, of turning and of the logarithm of the predicted error. It is
+    descended, drone by drone, from the plan before and from the cheapest formation of equal spacing; the
+    cheaper result is taken.
+
+    Args:
+        price: [T, S] cost of a drone in each state.
+        free: [T, S] share of the view that is free, 0 to 1.
+        commanded: [n, 3] slots now.
+        before: [n, T] the plan before.
+    """
+    best, least = before, math.inf
+    for start in (before, _cheapest_formation(price, free, views, w, commanded)):
+        team = start.copy()
+        _improve_team(price, free, views, w, commanded, team)
+        cost = _team_cost(price, free, views, w, commanded, team)
+        if cost < least:
+            best, least = team, cost
+    return best
 
 
 @helper

@@ -421,7 +421,10 @@ def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:
 
 
 BAD = {
-    "unknown arm": (["--arms", "adaptive,clever"], "there are adaptive, covariance, fixed, greedy, flown"),
+    "unknown arm": (
+        ["--arms", "adaptive,clever"],
+        "there are adaptive, covariance, fixed, greedy, joint, flown",
+    ),
     "unknown noise": (["--pose-noise", "pink:position_m=1"], "pink"),
     "out of range": (["--radius", "0.5", "--yaws", "360", "--horizon", "600"], "horizon_knots"),
 }

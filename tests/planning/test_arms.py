@@ -7,14 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.planning.arms import ADAPTIVE
+from pipelines.planning.arms import ADAPTIVE, JOINT
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import formation_slots, slot_offsets, wrapped, yaw_set
 from pipelines.planning.search import best_sequence, cost_map, costs_of_slots, lattice
-from tests.planning.worlds import trees
+from tests.planning.worlds import trees, wall
 
 WORLD = trees()
+WALL = wall(1.0)
 
 
 @settings(max_examples=20)
@@ -43,3 +44,39 @@ def test_a_plan_is_the_cheapest_sequence_through_the_cost_map(seed: int, drones:
     assert path.slots[1:, :, 1:] == pytest.approx(slots[sequence][..., 1:])
     assert wrapped(path.slots[1:, :, 0] - slots[sequence][..., 0]) == pytest.approx(0.0, abs=1e-12)
     assert (np.abs(np.diff(path.slots[..., 0], axis=0)) <= np.pi).all()
+
+
+@pytest.mark.parametrize("drones", [2, 5])
+def test_nobody_of_a_joint_plan_stays_behind_a_wall(drones: int) -> None:
+    """Each formation of five drones has somebody behind the wall; free spacing leaves nobody there."""
+    config, field = PlannerConfig(), WALL
+    actor = np.tile([12.0, 0.0, 1.0], (config.horizon_knots, 1))
+    form = {"tilt_rad": config.tilt_rad, "range_m": config.radius_m}
+    commanded = formation_slots(np.array([0.4]), drones, **form)[0]
+    yaws = np.linspace(-np.pi, np.pi, 180)
+    equal = costs_of_slots(field, actor[:1], slot_offsets(formation_slots(yaws, drones, **form)), config)
+    fewest = (equal.occluded[0] > 0).sum(axis=-1).min()
+    assert (fewest > 0) == (drones == 5)
+
+    path = JOINT.start(config, drones=drones, yaw_rad=0.4).plan(
+        0.0, commanded, Forecast(actor, np.zeros(len(actor))), field
+    )
+
+    offsets = slot_offsets(path.slots[-1])
+    costs = costs_of_slots(field, actor[:1], offsets[None], config)
+    assert costs.occluded.max() == 0
+    assert costs.obstacle.max() < 1
+    apart = np.linalg.norm(offsets[:, None] - offsets, axis=-1)[~np.eye(drones, dtype=bool)]
+    assert apart.min() >= config.soft_separation_m
+    most = np.array(config.slot_rates) * config.knot_s
+    assert (np.abs(np.diff(path.slots, axis=0)) <= most + 1e-9).all()
+    assert config.ranges_m[0] <= path.slots[..., 2].min() <= path.slots[..., 2].max() <= config.ranges_m[-1]
+
+
+def test_a_joint_plan_is_made_twice_a_second() -> None:
+    config = PlannerConfig()
+    planner = JOINT.start(config, drones=2, yaw_rad=0.0)
+    commanded = formation_slots(np.zeros(1), 2, tilt_rad=config.tilt_rad, range_m=config.radius_m)[0]
+    actor = Forecast(np.tile([12.0, 0.0, 1.0], (config.horizon_knots, 1)), np.zeros(config.horizon_knots))
+    made = [planner.plan(t_s, commanded, actor, WALL).knot_s[0] for t_s in np.arange(0, 1.15, 0.1)]
+    assert made == pytest.approx([0.0] * 5 + [0.5] * 5 + [1.0] * 2)

@@ -6,12 +6,22 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.geometry.arrays import Float
-from pipelines.planning.formation import wrapped, yaw_set
-from pipelines.planning.search import Lattice, best_sequence, lattice
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.planning.config import ErrorModel
+from pipelines.planning.formation import slot_offsets, wrapped, yaw_set
+from pipelines.planning.information import predicted_error, ray_information
+from pipelines.planning.search import (
+    TOO_NEAR,
+    Lattice,
+    TeamWeights,
+    Views,
+    best_sequence,
+    cheapest_team,
+    lattice,
+)
 
 RATES = np.array([np.radians(22.5), np.radians(5.0), 1.0])
 
@@ -106,3 +116,42 @@ def test_a_start_out_of_reach_goes_to_the_nearest_state() -> None:
     grid = yaw_ring(3)
     found, _ = best_sequence(np.zeros((2, 3)), grid, np.array([np.radians(50), 0.26, 10.0]))
     assert wrapped(grid.states[found, 0]) == pytest.approx(0.0, abs=1e-12)
+
+
+@settings(max_examples=5)
+@given(st.integers(0, 10_000), st.sampled_from([2, 3]))
+def test_no_drone_of_a_team_has_a_cheaper_sequence(seed: int, drones: int) -> None:
+    """Every other sequence of one drone costs more, and so do the plan before and all equal spacings."""
+    rng = np.random.default_rng(seed)
+    yaws, times, w_turn = 6, 3, 0.05
+    grid = yaw_ring(yaws, knot_s=3.0, w_turn=w_turn)  # 60 deg and 22.5 deg/s: the neighbours are in reach
+    offsets = slot_offsets(grid.states)
+    information = ray_information(offsets, ErrorModel())
+    formations = (np.arange(yaws)[:, None] + np.arange(drones) * (yaws // drones)) % yaws
+    triangle = np.ascontiguousarray(information[:, *np.triu_indices(3)])
+    views = Views(grid, offsets, triangle, np.ascontiguousarray(formations))
+    weights = TeamWeights(w_error=1.0, prior=0.25, apart_m=4.5)
+    price, free = rng.random((times, yaws)), rng.integers(0, 3, (times, yaws)) / 2.0
+    commanded = grid.states[formations[rng.integers(yaws)]]
+    before = np.repeat(formations[rng.integers(yaws)][:, None], times, axis=1)
+
+    def costs(teams: Int64) -> Float:
+        """Compute the cost of teams [P, n, T] by definition; inf where a rate is exceeded."""
+        yaw = np.concatenate([np.tile(commanded[:, :1], (len(teams), 1, 1)), grid.states[teams, 0]], axis=-1)
+        ways = np.abs(wrapped(np.diff(yaw, axis=-1)))
+        at = np.arange(times)
+        known = 0.25 * np.eye(3) + np.einsum("pnt,pntij->ptij", free[at, teams], information[teams])
+        same = sum((teams[:, i] == teams[:, j]).sum(axis=-1) for i in range(drones) for j in range(i))
+        total = price[at, teams].sum(axis=(1, 2)) + w_turn / 2.0 * (ways / RATES[0]).sum(axis=(1, 2))
+        total = total + np.log(predicted_error(known)).sum(axis=-1) + TOO_NEAR * same  # others are 10 m apart
+        return np.where((ways <= RATES[0] * 3.0 + 1e-9).all(axis=(1, 2)), total, np.inf)
+
+    found = cheapest_team(price, free, views, weights, commanded, before)
+    every = np.array(list(product(range(yaws), repeat=times)))
+    (least,) = costs(found[None])
+    assert np.isfinite(least)
+    for i in range(drones):
+        others = np.repeat(found[None], len(every), axis=0)
+        others[:, i] = every
+        assert costs(others).min() >= least - 1e-9
+    assert least <= min(costs(before[None])[0], costs(formations[every].swapaxes(1, 2)).min()) + 1e-9
