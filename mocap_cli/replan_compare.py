@@ -44,7 +44,8 @@ _settings_options = grouped(
         "--arms",
         metavar="NAME,...",
         help="Arms to compare: adaptive, fixed, covariance, greedy, joint; flown and planned are the logged"
-        " flight and its commands [default: adaptive, fixed, flown where cameras moved, planned where logged].",
+        " flight and its commands [default: adaptive, fixed, flown where cameras moved, planned where"
+        " logged].",
     ),
     click.option(
         "--drones",
