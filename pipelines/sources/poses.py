@@ -584,7 +584,7 @@ class FlightPoses:
         if gimbal is None:
             if own is None or camera.pose.of == "body":
                 return None
-            self._note(f"{name}: its camera is turned as {own.name} of {camera.pose.telemetry_source} say")
+            self._note(f"{name}: its camera is turned by {own.name} of {camera.pose.telemetry_source}")
             return self._at_world_times(camera.pose, telemetry, own)
         if gimbal.fixed is None and gimbal.log is None:
             if own is None:
@@ -606,7 +606,7 @@ class FlightPoses:
                     f"write relative_to: {moved.relative_to}",
                 )
             self._note(
-                f"{name}: its camera is turned as {own.name} of {camera.pose.telemetry_source} say,"
+                f"{name}: its camera is turned by {own.name} of {camera.pose.telemetry_source},"
                 f" relative to the {meant} as stated"
             )
             return replace(moved, quaternion_xyzw=turned, relative_to=meant)
