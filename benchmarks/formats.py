@@ -96,8 +96,16 @@ def outcome(folder: Path, name: str, path: Path) -> tuple[str, str, str]:
         value = next((counts[k] for k in (*_COUNTS[key], key) if k in counts), None)
         if value is not None:
             theirs = len(value) if isinstance(value, dict | list) else value
-            return read, f"{facts[key]} {key.replace('_', ' ')}", f"{theirs} ({reader})"
+            return read, f"{facts[key]} {key.replace('_', ' ')}{_dropped(key, facts)}", f"{theirs} ({reader})"
     return read, f"{facts[counted[0]]} {counted[0].replace('_', ' ')}" if counted else "", reader
+
+
+def _dropped(key: str, facts: dict[str, Any]) -> str:
+    """Write the rows that our reader leaves out, by cause."""
+    causes = [
+        (name.removeprefix("dropped: "), n) for name, n in facts.items() if name.startswith("dropped: ")
+    ]
+    return "".join(f", {count} dropped ({cause})" for cause, count in causes) if key == "rows" else ""
 
 
 def ordinary(folder: Path, name: str, path: Path) -> tuple[str, dict[str, Any]]:
@@ -106,8 +114,31 @@ def ordinary(folder: Path, name: str, path: Path) -> tuple[str, dict[str, Any]]:
     facts = every.get(name) or every.get(re.sub(r"\.yaml$", ".pgm", name), {})
     if facts:
         return str(facts.get("reader", "")).split(" (")[0].split(",")[0], facts
+    if path.is_dir():
+        return _people(sorted(path.glob("*.json")))
     counter = _READERS.get(path.suffix.lower())
-    return counter(path) if counter and path.is_file() else ("", {})
+    return counter(path) if counter else ("", {})
+
+
+def _people(files: list[Path]) -> tuple[str, dict[str, Any]]:
+    """Count the people of OpenPose with any keypoint, or the instances of MMPose."""
+    count = 0
+    for path in files:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        listed = content.get("people", []) if isinstance(content, dict) else content
+        people = [each for each in listed if isinstance(each, dict)]
+        count += sum(any(each.get("pose_keypoints_2d", each.get("keypoints", ()))) for each in people)
+    return ("json", {"people": count}) if files else ("", {})
+
+
+def _filestorage(path: Path) -> tuple[str, dict[str, Any]]:
+    if not path.read_bytes().startswith(b"%YAML"):
+        return "", {}
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    names = ("Camera.fx", "Camera1.fx", "Camera2.fx")
+    cameras = sum(not storage.getNode(name).empty() for name in names)
+    storage.release()
+    return "OpenCV", {"cameras": cameras}
 
 
 def _bag(path: Path) -> tuple[str, dict[str, Any]]:
@@ -175,6 +206,8 @@ _READERS = {
     ".pcd": _pcd,
     ".trc": _trc,
     ".srt": _subtitles,
+    ".json": lambda path: _people([path]),
+    ".yaml": _filestorage,
 }
 
 
