@@ -126,8 +126,9 @@ def _people(files: list[Path]) -> tuple[str, dict[str, Any]]:
     for path in files:
         content = json.loads(path.read_text(encoding="utf-8"))
         listed = content.get("people", []) if isinstance(content, dict) else content
-        people = [each for each in listed if isinstance(each, dict)]
-        count += sum(any(each.get("pose_keypoints_2d", each.get("keypoints", ()))) for each in people)
+        people: list[dict[str, Any]] = [each for each in listed if isinstance(each, dict)]
+        keypoints = [each.get("pose_keypoints_2d") or each.get("keypoints") or [] for each in people]
+        count += sum(map(any, keypoints))
     return ("json", {"people": count}) if files else ("", {})
 
 
