@@ -539,6 +539,7 @@ def _triangulated(
 ) -> tuple[_Seen, Views, Triangulation, Callable[[Views], Triangulation]]:
     """Observe and triangulate by the method, or by what it starts from; the last result is its solver."""
     seen = flight.waiting.put(_observe(flight, cameras, settings))
+    flight.waiting.release()
     views = views_with_noise(cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers)
     solve = solver_for(
         settings.method, cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers

@@ -30,6 +30,7 @@ Result = TypeVar("Result")
 
 _SEGMENT = 256  # times of the skeleton
 _KEPT_BYTES = 100e6  # of a half's factors, before segments are factorised twice
+_WORTH = 0.1  # share of a half's factors below which none are kept
 _HELD = 1e10  # 1 / m^2, of a bone length
 
 
@@ -176,12 +177,15 @@ def _sweep(half: Half, state: State, halt: Halt) -> _Swept:
     fronts, kept = [], {}
     log_determinant = 0.0
     bytes_per_time = 8 * 3 * system.problem.joints * system.size
+    kept_times = _KEPT_BYTES / bytes_per_time
+    if kept_times < _WORTH * half.count:
+        kept_times = 0.0
     for index, (first, last) in enumerate(_segments(half)):
         halt.check()
         fronts.append(front.packed())
         factors, part = _eliminate(half, state, front, first, last)
         log_determinant += part
-        if bytes_per_time * last < _KEPT_BYTES or last == half.count:
+        if last < kept_times or last == half.count:
             kept[index] = factors
     return _Swept(half, state, fronts, kept, front, log_determinant)
 

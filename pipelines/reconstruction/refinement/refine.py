@@ -149,6 +149,7 @@ def refine(
         tuple(_of_joints(sighting, part) for sighting in sightings),
         _renumbered(bones, part),
         _without_gaps(t_s, start[:, part]),
+        np.ones(int(part.sum()), dtype=np.bool_),
         threads,
     )
     del sightings  # a clock's offset and the choice of joints made copies
@@ -183,20 +184,18 @@ def refine(
 
 @dataclass(frozen=True)
 class _Views:
-    """Constants from which a problem is built."""
+    """Constants from which a problem of some joints is built; its arrays are those of all J."""
 
     t_s: Float  # [T]
     sightings: tuple[Sighting, ...]
-    bones: Int64  # [B, 2]
+    bones: Int64  # [B, 2] of the joints that are taken
     start: Float  # [T, J, 3] m, without gaps
+    taken: Bool  # [J]
     threads: int
 
     def of(self, joints: Bool) -> _Views:
-        """Take some of the joints [J]."""
-        sightings = tuple(_of_joints(sighting, joints) for sighting in self.sightings)
-        return replace(
-            self, sightings=sightings, bones=_renumbered(self.bones, joints), start=self.start[:, joints]
-        )
+        """Take some of the joints [J]; copies of a long flight are made only while they are needed."""
+        return replace(self, bones=_renumbered(self.bones, joints), taken=joints)
 
     def corrected_by(self, corrections: Sequence[tuple[Float, Float]]) -> _Views:
         """Correct the poses of each camera by errors [F, 10] at times [F]."""
@@ -212,13 +211,16 @@ class _Views:
 
     def problem(self) -> Problem:
         """Build the problem of the whole flight."""
-        return build(self.t_s, self.sightings, self.bones, threads=self.threads)
+        return self._problem_at(self.t_s)
 
     def stretches(self) -> tuple[Problem, Float]:
         """Build that of the stretches from which the prior is learned, and take their start [T', J, 3]."""
         chosen = _stretches(len(self.t_s))
-        problem = build(self.t_s[chosen], self.sightings, self.bones, threads=self.threads)
-        return problem, self.start[chosen]
+        return self._problem_at(self.t_s[chosen]), self.start[chosen][:, self.taken]
+
+    def _problem_at(self, t_s: Float) -> Problem:
+        sightings = tuple(_of_joints(sighting, self.taken) for sighting in self.sightings)
+        return build(t_s, sightings, self.bones, threads=self.threads)
 
 
 @dataclass(frozen=True)
@@ -242,7 +244,7 @@ def _refined(views: _Views, whole: _Views, guiding: Bool, prior: _Prior, *, meas
         LinAlgError: its equations are singular.
     """
     known, cameras, problem = prior.known, len(prior.known.poses), views.problem()
-    state = initial_state(problem, known, views.start)
+    state = initial_state(problem, known, views.start[:, views.taken])
     clock_s, clock_left_s = _clocks(problem, known, state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)

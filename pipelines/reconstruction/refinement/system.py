@@ -148,21 +148,13 @@ def loss(system: System, state: State) -> float:
 
 def prior_cost(system: System, state: State) -> float:
     """Compute minus twice the logarithm of the prior, up to a constant."""
-    problem, known, layout = system.problem, system.knowledge, system.layout
-    before, after = np.diff(problem.t_s)[:-1], np.diff(problem.t_s)[1:]
-    slopes = np.diff(state.position, axis=0) / np.diff(problem.t_s)[:, None, None]
-    acceleration = 2 * np.diff(slopes, axis=0) / (before + after)[:, None, None]
-    weight = 0.5 * (before + after) / system.usual_step_s
-    cost = np.einsum(
-        "t,tji,jk,tki->", weight, acceleration, system.inverse_acceleration, acceleration, optimize=True
-    )
-    lengths = state.shared[layout.bone_column :]
-    cost += np.sum(((_bone_lengths(problem, state.position) - lengths) / known.bone_sigma_m) ** 2)
-    cost /= system.grown(state) ** 2
-    precision = system.white_precision[system.pictures.white_row]
-    there = np.isfinite(precision[:, 0, 0])
-    white = state.white[there]
-    cost += np.sum((precision[there] @ white[..., None])[..., 0] * white)
+    layout, rows = system.layout, system.pictures.white_row
+    cost = _body_cost(system, state)
+    for first in range(0, len(rows), AT_ONCE):
+        precision = system.white_precision[rows[first : first + AT_ONCE]]
+        there = np.isfinite(precision[:, 0, 0])
+        white = state.white[first : first + AT_ONCE][there]
+        cost += float(np.sum((precision[there] @ white[..., None])[..., 0] * white))
     for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
         begins = state.knots[0] if at_knots else state.shared
         cost += np.sum(begins[column : column + 3] ** 2) / process.sigma0**2
@@ -173,11 +165,23 @@ def prior_cost(system: System, state: State) -> float:
     return float(cost)
 
 
-def _bone_lengths(problem: Problem, position: Float) -> Float:
-    """Compute the bone lengths [T, B] m."""
-    ends = position[:, problem.bones]
-    lengths: Float = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
-    return lengths
+def _body_cost(system: System, state: State) -> float:
+    """Compute the part of `prior_cost` that is by motion and bones, some times at once."""
+    problem, cost = system.problem, 0.0
+    lengths = state.shared[system.layout.bone_column :]
+    for first in range(0, len(problem.t_s), AT_ONCE):
+        some = slice(first, first + AT_ONCE + 2)  # an acceleration takes three times
+        t_s, position = problem.t_s[some], state.position[some]
+        before, after = np.diff(t_s)[:-1], np.diff(t_s)[1:]
+        slopes = np.diff(position, axis=0) / np.diff(t_s)[:, None, None]
+        acceleration = 2 * np.diff(slopes, axis=0) / (before + after)[:, None, None]
+        weight = 0.5 * (before + after) / system.usual_step_s
+        inverse = system.inverse_acceleration
+        cost += np.einsum("t,tji,jk,tki->", weight, acceleration, inverse, acceleration, optimize=True)
+        ends = position[:AT_ONCE, problem.bones]
+        missed = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1) - lengths
+        cost += np.sum((missed / system.knowledge.bone_sigma_m) ** 2)
+    return float(cost) / system.grown(state) ** 2
 
 
 # --- halves --------------------------------------------------------------------------------------------
