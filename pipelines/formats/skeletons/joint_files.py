@@ -219,7 +219,10 @@ _MIDDLE_BONES = {"hip": ("hips", "pelvis", "root"), "neck": ("neck", "lowerneck"
 
 
 def bone_joints(bones: tuple[str, ...]) -> tuple[str, ...]:
-    """Name the joints at which bones begin: ours where the bone is known, else the bone's own name."""
+    """Name the joints at which bones begin: ours where the bone is known, else the bone's own name.
+
+    Acclaim's bone `head` begins at the base of the skull: it must not pass for our joint `head`, its top.
+    """
     plain = {bone: re.sub(r"[^a-z]", "", bone.rsplit(":", 1)[-1].lower()) for bone in bones}
     named: dict[str, str] = {}
     for side in ("left", "right"):
@@ -234,4 +237,6 @@ def bone_joints(bones: tuple[str, ...]) -> tuple[str, ...]:
         found = next((bone for variant in variants for bone in bones if plain[bone] == variant), None)
         if found:
             named[found] = joint
+    if any(name.endswith("femur") for name in plain.values()):
+        named |= {bone: "head_base" for bone in bones if bone == "head"}
     return tuple(named.get(bone, bone) for bone in bones)
