@@ -1,4 +1,4 @@
-"""Makes docs/notebook.ipynb: the lines of notebook.md, run on the sample flight, with all their output.
+"""Makes examples/notebook.ipynb: the lines of notebook.md, run on the sample flight, with all their output.
 
 `python docs/notebook.py --write` runs them in a copy of sample_data/mound_walk: about a minute.
 """
@@ -18,7 +18,7 @@ from typing import Any
 import matplotlib as mpl
 
 PAGE = Path(__file__).with_name("notebook.md")
-NOTEBOOK = PAGE.with_suffix(".ipynb")
+NOTEBOOK = PAGE.parents[1] / "examples" / "notebook.ipynb"
 FLIGHT = PAGE.parents[1] / "sample_data" / "mound_walk"
 
 

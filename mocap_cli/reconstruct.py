@@ -230,13 +230,17 @@ def reconstruct_command(
 ) -> dict[str, Any] | None:
     """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
     from pipelines.overlay import refuse_overlays, write_overlays
+    from pipelines.precompile import precompile_for
     from pipelines.reconstruct import reconstruct
     from pipelines.session.clusters import Cluster, connected
+    from pipelines.session.stages import open_session
 
     if overlays:
         refuse_overlays(session, force=force)
+    open_session(session)  # a wrong session is refused before anything is compiled
     with watching(shown.level) as progress, ExitStack() as stack:
         cluster = Cluster.of(stack.enter_context(connected(scheduler))) if scheduler else None
+        precompile_for("reconstruct", progress)
         result = reconstruct(
             session,
             settings,

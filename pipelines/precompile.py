@@ -16,7 +16,8 @@ from enum import StrEnum
 from importlib import import_module
 from importlib.resources import files
 from itertools import cycle
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 from pipelines.session.progress import Progress, Silent
 
@@ -31,39 +32,75 @@ def listed() -> Signatures:
     return signatures
 
 
-def precompile(workers: int, progress: Progress | None = None) -> list[str]:
-    """Compile all functions of the list that are not in numba's cache yet.
+def precompile(
+    workers: int, progress: Progress | None = None, names: Sequence[str] | None = None
+) -> list[str]:
+    """Compile functions of the list that are not in numba's cache yet.
 
     Args:
         workers: the number of processes; functions are dealt out to them, largest first.
+        names: the functions; by default all.
 
     Returns:
         The functions of the list that do not exist, or not for the listed types. They are compiled at their
         first use, like all that the list lacks.
     """
     progress = progress or Silent()
-    names = list(listed())
+    names = list(listed()) if names is None else names
     progress.start("Compiling", len(names))
     shares: list[list[str]] = [[] for _ in range(workers)]
     for name, share in zip(names, cycle(shares), strict=False):
         share.append(name)
     running = [
         subprocess.Popen(  # noqa: S603
-            [sys.executable, "-m", "pipelines.precompile", *share], stdout=subprocess.PIPE, text=True
+            [sys.executable, "-m", "pipelines.precompile", *share],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # what fails is an outcome
+            text=True,
+            start_new_session=True,  # Ctrl-C reaches them by their parent alone
         )
         for share in shares
         if share
     ]
     outdated: list[str] = []
-    for process in running:
-        assert process.stdout is not None  # noqa: S101  # it is a pipe
-        for line in process.stdout:
-            name, _, outcome = line.rpartition(" ")
-            if outcome.strip() == Outcome.OUTDATED:
-                outdated.append(name)
-            progress.advance()
-        process.wait()
+    try:
+        for process in running:
+            assert process.stdout is not None  # noqa: S101  # it is a pipe
+            for line in process.stdout:
+                name, _, outcome = line.rpartition(" ")
+                if outcome.strip() == Outcome.OUTDATED:
+                    outdated.append(name)
+                progress.advance()
+    finally:
+        for process in running:
+            process.terminate()
+            process.communicate()
     return outdated
+
+
+def precompile_for(stage: Literal["reconstruct", "replan"], progress: Progress) -> None:
+    """Compile the functions of a stage on all cores, with one line, if this machine has few of them.
+
+    Without it, the stage compiles them one after the other.
+    """
+    names = [name for name in listed() if name.startswith("pipelines.planning.") == (stage == "replan")]
+    if 2 * sum(map(is_compiled, names)) >= len(names):  # not all: an outdated one never is
+        return
+    progress.note("compiling numerical functions for this processor, once")
+    precompile(os.cpu_count() or 1, progress, names)
+
+
+def is_compiled(name: str) -> bool:
+    """Test if numba's cache has any code of a function; True where there can be no cache."""
+    from pipelines.geometry.compilation import dispatcher_of
+
+    module, _, function = name.partition(":")
+    try:
+        dispatcher = dispatcher_of(getattr(import_module(module), function))
+        # numba has no public name for it.
+        return Path(dispatcher._cache._cache_file._index_path).is_file()
+    except (ImportError, AttributeError):
+        return True
 
 
 class Outcome(StrEnum):

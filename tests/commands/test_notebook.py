@@ -22,7 +22,7 @@ def test_the_page_of_functions_is_that_of_the_docstrings() -> None:
 
 
 def test_the_executed_notebook_has_the_lines_of_the_page() -> None:
-    made = json.loads(PAGE.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    made = json.loads((PAGE.parents[1] / "examples" / "notebook.ipynb").read_text(encoding="utf-8"))
     cells = [cell for cell in made["cells"] if cell["cell_type"] == "code"]
     expected = runpy.run_path(str(PAGE.with_suffix(".py")))["cells_of"](PAGE.read_text(encoding="utf-8"))
     assert ["".join(cell["source"]) for cell in cells] == expected, "run `python docs/notebook.py --write`"

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from pipelines import precompile
 from pipelines.geometry.compilation import LOGGER, _Announcement, cached, dispatcher_of
 from pipelines.precompile import Outcome, compile_function, entry_of, listed, type_of
+from pipelines.session.progress import Silent
 
 SOURCE = """
 from pipelines.geometry.compilation import cached, helper
@@ -175,6 +177,30 @@ def test_what_was_compiled_ahead_is_found_in_the_cache(
     assert compile_function("quarters:quarter", [["float64"]]) is Outcome.COMPILED
     load_quarter()
     assert compile_function("quarters:quarter", [["float64"]]) is Outcome.CACHED
+
+
+def test_a_function_is_compiled_once_its_code_is_in_the_cache(
+    load_quarter: Callable[[], Callable[[float], float]],
+) -> None:
+    quarter = load_quarter()
+    assert not precompile.is_compiled("quarters:quarter")
+    quarter(2.0)
+    assert precompile.is_compiled("quarters:quarter")
+    assert precompile.is_compiled("quarters:gone")  # nothing that could be compiled ahead
+
+
+@pytest.mark.parametrize(("there", "compiled"), [(0, True), (1, True), (2, False)])
+def test_a_stage_compiles_its_own_functions_ahead_where_most_are_missing(
+    monkeypatch: pytest.MonkeyPatch, there: int, compiled: bool
+) -> None:
+    of_stage = ["pipelines.planning.search:a", "pipelines.planning.local:b", "pipelines.planning.local:c"]
+    names = [*of_stage, "pipelines.geometry.x:d"]
+    done: list[list[str]] = []
+    monkeypatch.setattr(precompile, "listed", lambda: {name: [] for name in names})
+    monkeypatch.setattr(precompile, "is_compiled", lambda name: name in names[:there])
+    monkeypatch.setattr(precompile, "precompile", lambda _workers, _progress, some: done.append(some))
+    precompile.precompile_for("replan", Silent())
+    assert done == ([of_stage] if compiled else [])
 
 
 @pytest.mark.parametrize("entry", ["float64 1A", "float64"])
