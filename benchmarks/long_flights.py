@@ -10,6 +10,7 @@ three drones.
 
 measures instead the most memory and the processor time that `mocap reconstruct` takes on the first of these
 flights, of so many minutes, each in a process of its own. `--given nothing` leaves its noise out.
+`--repeat 15` repeats the flight so often, which takes less time than to simulate an hour.
 
     python -m benchmarks.long_flights --page demo/mound_walk.session    # the figure of docs/report.md
 
@@ -32,6 +33,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import yaml  # type: ignore[import-untyped]
 
 from benchmarks.results_page import markdown_table
@@ -41,6 +45,7 @@ from pipelines.report import content_of
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.page import render_page
 from pipelines.session.description import read_description
+from pipelines.session.storage import sha256_of
 from pipelines.simulate import simulate
 from pipelines.sources.pictures import open_pictures
 from tests.reporting.browser import browser
@@ -75,8 +80,11 @@ def scenario(seed: int, seconds: float) -> dict[str, object]:
     return document | {"seed": seed, "duration_s": seconds}
 
 
-def memory_row(seed: int, minutes: float, *, stated: bool) -> str:
-    """Fly, and reconstruct by the command; return a row: minutes, peak MB, processor seconds, method used."""
+def memory_row(seed: int, minutes: float, times: int, *, stated: bool) -> str:
+    """Fly, and reconstruct by the command; return a row: minutes, peak MB, processor seconds, method used.
+
+    The flight is repeated so many times.
+    """
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         (place / "scenario.yaml").write_text(yaml.safe_dump(scenario(seed, 60 * minutes)))
@@ -87,6 +95,7 @@ def memory_row(seed: int, minutes: float, *, stated: bool) -> str:
                 del camera["pose_noise"]
         (place / "made" / "flown.yaml").write_text(yaml.safe_dump(manifest))
         session = ingest(place / "made" / "flown.yaml", place / "flown.session").folder
+        repeat_tables(session, times)
         process = subprocess.Popen(  # noqa: S603  # our own command, with folders made here
             [Path(sys.executable).parent / "mocap", "reconstruct", session], stdout=subprocess.DEVNULL
         )
@@ -95,7 +104,30 @@ def memory_row(seed: int, minutes: float, *, stated: bool) -> str:
             raise SystemExit(f"mocap reconstruct ended with {os.waitstatus_to_exitcode(status)}")
         used = json.loads((session / "reconstruct" / "metrics.json").read_text())["method_used"]
         peak_mb, took_s = usage.ru_maxrss * 1024 / 1e6, usage.ru_utime + usage.ru_stime
-        return f"| {minutes:g} | {peak_mb:.0f} | {took_s:.0f} | {json.dumps(used)} |"
+        return f"| {minutes * times:g} | {peak_mb:.0f} | {took_s:.0f} | {json.dumps(used)} |"
+
+
+def repeat_tables(session: Path, times: int) -> None:
+    """Repeat an ingested flight; people and drones jump back where it begins again."""
+    path = session / "ingest" / "stage.json"
+    record = json.loads(path.read_text())
+    tables = {name: pq.read_table(session / name) for name in record["outputs"] if name.endswith(".parquet")}
+    stamps = [each["t_ns"].to_numpy() for each in tables.values()]
+    lasts_ns = max(int(t_ns[-1]) for t_ns in stamps) - min(int(t_ns[0]) for t_ns in stamps) + 10**8
+    for name, table in tables.items():
+        frames = tables.get(str(Path(name).with_name("frames.parquet")))
+        later = {"t_ns": lasts_ns, "pts_ns": lasts_ns, "frame": 0 if frames is None else frames.num_rows}
+        with pq.ParquetWriter(session / name, table.schema) as writer:
+            for k in range(times):
+                columns = [
+                    pc.add(table[column.name], pa.scalar(k * later.get(column.name, 0), column.type))
+                    if column.name in later
+                    else table[column.name]
+                    for column in table.schema
+                ]
+                writer.write_table(pa.table(columns, schema=table.schema))
+        record["outputs"][name] = sha256_of(session / name)
+    path.write_text(json.dumps(record))
 
 
 def repeated(content: SessionContent, seconds: float) -> tuple[SessionContent, dict[str, int]]:
@@ -191,6 +223,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=90.0)
     parser.add_argument("--memory", type=float, nargs="+", metavar="MINUTES", help="measure memory instead")
+    parser.add_argument("--repeat", type=int, default=1, metavar="TIMES", help="with --memory")
     parser.add_argument("--given", choices=("model", "nothing"), default="model", help="with --memory")
     parser.add_argument("--page", type=Path, metavar="SESSION", help="measure the page of an hour instead")
     parser.add_argument("--minutes", type=float, default=60.0, help="with --page")
@@ -201,7 +234,7 @@ def main() -> None:
     if arguments.memory:
         stated = arguments.given == "model"
         for minutes in arguments.memory:
-            print(memory_row(arguments.first, minutes, stated=stated), flush=True)
+            print(memory_row(arguments.first, minutes, arguments.repeat, stated=stated), flush=True)
         return
     rows = []
     for seed in range(arguments.first, arguments.first + arguments.count):
