@@ -1,5 +1,6 @@
 """Processor time that compiling the numerical functions takes, and the list `pipelines/data/kernels.json`.
 
+python -m benchmarks.kernels                       # compiles the list
 python -m benchmarks.kernels SESSION...            # reconstructs and replays with an empty cache
 python -m benchmarks.kernels SESSION... --write    # and makes the list from what was compiled
 
@@ -29,16 +30,16 @@ LIST = Path(__file__).resolve().parents[1] / "pipelines" / "data" / "kernels.jso
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("sessions", nargs="+", type=Path, metavar="SESSION")
+    parser.add_argument("sessions", nargs="*", type=Path, metavar="SESSION")
     parser.add_argument("--write", action="store_true", help="write the list")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as cache:
         os.environ["NUMBA_CACHE_DIR"] = cache  # before numba is imported
-        seconds, signatures = compiled_by(arguments.sessions)
+        seconds, signatures = compiled_by(arguments.sessions) if arguments.sessions else (of_list(), {})
     for name, taken in sorted(seconds.items(), key=lambda item: -item[1]):
         print(f"{taken:6.2f} s  {name}")
     print(f"{sum(seconds.values()):6.2f} s  of processor time for {len(seconds)} functions")
-    if arguments.write:
+    if arguments.write and arguments.sessions:
         slowest_first = {name: signatures[name] for name in sorted(signatures, key=lambda n: -seconds[n])}
         kept = not_reached(signatures)
         print(f"{len(kept)} listed functions were not called and stay: {', '.join(kept) or 'none'}")
@@ -54,6 +55,21 @@ def not_reached(signatures: Mapping[str, object]) -> Signatures:
         return find_spec(module) is not None and hasattr(import_module(module), function)
 
     return {name: kinds for name, kinds in listed().items() if name not in signatures and exists(name)}
+
+
+def of_list() -> dict[str, float]:
+    """Compile the functions of the list one after the other; return seconds of processor time."""
+    from pipelines.precompile import compile_function, listed
+
+    everything = listed()
+    for name in everything:
+        import_module(name.partition(":")[0])
+    seconds = {}
+    for name, kinds in everything.items():
+        began_s = time.process_time()
+        compile_function(name, kinds)
+        seconds[name] = time.process_time() - began_s
+    return seconds
 
 
 def compiled_by(sessions: list[Path]) -> tuple[dict[str, float], dict[str, list[list[object]]]]:
