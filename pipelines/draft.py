@@ -148,7 +148,8 @@ def draft(
             [(path, reason)] = left_out.items()
         raise DataError(path, reason, "" if "; " in reason else EXPECTED)
 
-    flight = match(findings, _Comparison())
+    comparison = _Comparison()
+    flight = match(findings, comparison, comparison.distance_m)
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
     problem = _write(target, manifest.text)
     return Drafted(
@@ -303,10 +304,7 @@ class _Comparison:
         """
         if video.path not in self._followed:
             self._followed[video.path] = _followed_points(video.path)
-        key = log.path, log.instance
-        if key not in self._telemetry:
-            self._telemetry[key] = _telemetry_of(log)
-        telemetry = self._telemetry[key]
+        telemetry = self._read(log)
         if telemetry is None or (track := telemetry.gimbal or telemetry.body) is None:
             return None
         if telemetry.position.on_earth:
@@ -329,6 +327,26 @@ class _Comparison:
             if explained is not None:
                 found.append(Alike(*explained))
         return max(found, key=lambda alike: float(np.nansum(alike.gain)), default=None)
+
+    def distance_m(self, log: DroneLog, other: DroneLog) -> float | None:
+        """Return the median distance across of positions on Earth in two logs, at the times of the first."""
+        tracks = [each.position for each in map(self._read, (log, other)) if each and each.position.on_earth]
+        if len(tracks) < 2:
+            return None
+        place = Place(*tracks[0].values[0].tolist())
+        own, theirs = (
+            enu_from_geodetic(track.values[:, 0], track.values[:, 1], track.values[:, 2] * 0, place)[:, :2]
+            for track in tracks
+        )
+        there = interpolate_points(tracks[1].t_ns, theirs, tracks[0].t_ns, max_gap_ns=_BRIDGED_NS)
+        apart_m = np.linalg.norm(own - there, axis=1)
+        return float(np.nanmedian(apart_m)) if np.isfinite(apart_m).any() else None
+
+    def _read(self, log: DroneLog) -> Telemetry | None:
+        key = log.path, log.instance
+        if key not in self._telemetry:
+            self._telemetry[key] = _telemetry_of(log)
+        return self._telemetry[key]
 
 
 def _followed_points(path: Path) -> Followed:

@@ -67,6 +67,7 @@ _MAP_TYPES = ("Octomap", "GridMap", "OccupancyGrid")
 """Types of whole maps, the preferred first; clouds of points are a sensor's, seldom in the frame of poses."""
 _GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "ptz", "camera", "cam"})
 NO_DATE_NS = 10**17  # stamps below it count from boot
+_SAME_DRONE_M = 30.0  # between two receivers on one drone
 _MANY_CAMERAS = 200  # of one calibration file: more are the pictures of one moving camera
 
 
@@ -309,8 +310,15 @@ Compare = Callable[[Video, DroneLog], Alike | None]
 """Comparison of a video with a drone's log; None if one of them shows no motion."""
 
 
-def match(findings: Findings, compare: Compare | None = None) -> Draft:
-    """Find the cameras, and what belongs to each; `compare` decides where neither names nor times do."""
+Distance = Callable[[DroneLog, DroneLog], float | None]
+"""Median distance across (m) of the positions in two drones' logs; None if they share no time or place."""
+
+
+def match(findings: Findings, compare: Compare | None = None, distance: Distance | None = None) -> Draft:
+    """Find the cameras, and what belongs to each; `compare` decides where neither names nor times do.
+
+    `distance` decides between logs of one time, for cameras whose own positions lack attitudes.
+    """
     logs = _log_names(with_stamps(joined(findings.of(Recording))))
     cameras = _cameras(findings, logs)
     moving, still = _moving_poses(findings, logs), _calibrated(findings, "pose")
@@ -337,7 +345,7 @@ def match(findings: Findings, compare: Compare | None = None) -> Draft:
             camera.gimbal = choose(gimbals)
 
     _pair_drones(cameras, moving, compare)
-    _prefer_attitudes(cameras, moving)
+    _prefer_attitudes(cameras, moving, distance)
     actors = [c for c in pose_topics if is_called(_topic_of(c), ACTOR)]
     if any(camera.poses and camera.poses.taken.by_gps for camera in cameras):
         names = ((c, f"{_topic_of(c)} {c.found.place[-1]}") for c in _topics(logs, "fixes"))
@@ -494,11 +502,13 @@ def _pair_drones(
             camera.poses = Choice(log, named=False, why="by their motion", start_ns=alike.start_ns)
 
 
-def _prefer_attitudes(cameras: Sequence[CameraDraft], moving: Sequence[Candidate]) -> None:
+def _prefer_attitudes(
+    cameras: Sequence[CameraDraft], moving: Sequence[Candidate], distance: Distance | None
+) -> None:
     """Give cameras whose poses lack attitudes the log that has them at that time, if just one does.
 
-    Subtitles or a GoPro's GPS have the camera's name, but a flight record or an autopilot's log has more. The
-    other logs with attitudes become alternatives.
+    Subtitles or a GoPro's GPS have the camera's name, but a flight record or an autopilot's log has more. Of
+    several, that of the same drone was where its positions are. The others become alternatives.
     """
     taken = {id(each) for camera in cameras if camera.poses for each in camera.poses.all}
     free: dict[tuple[Path, object], Candidate] = {}
@@ -509,7 +519,10 @@ def _prefer_attitudes(cameras: Sequence[CameraDraft], moving: Sequence[Candidate
         if key not in free or candidate.rank < free[key].rank:
             free[key] = candidate
     wanting = [(c, c.poses) for c in cameras if c.poses and c.poses.taken.unturned and c.gimbal is None]
-    fitting_logs = {c.name: [log for log in free.values() if _is_of_film(log, c)] for c, _ in wanting}
+    fitting_logs = {
+        c.name: _nearest([log for log in free.values() if _is_of_film(log, c)], choice.taken, distance)
+        for c, choice in wanting
+    }
     uses = Counter(id(log) for logs in fitting_logs.values() for log in logs)
     for camera, choice in wanting:
         logs = fitting_logs[camera.name]
@@ -518,8 +531,26 @@ def _prefer_attitudes(cameras: Sequence[CameraDraft], moving: Sequence[Candidate
             continue
         if not _share_time(logs[0], choice.taken):
             camera.frame_times = None  # of another clock
-        why = "by their times, for what has its name has no attitudes"
+        why = "by time and place, for what has its name has no attitudes"
         camera.poses = Choice(logs[0], choice.all, named=False, why=why)
+
+
+def _nearest(logs: Sequence[Candidate], own: Candidate, distance: Distance | None) -> list[Candidate]:
+    """Leave out logs that were elsewhere than a camera's own positions; of several, keep a clear nearest."""
+    near: list[tuple[float, Candidate]] = []
+    unknown: list[Candidate] = []
+    for log in logs:
+        metres = None
+        if distance is not None and isinstance(own.found, DroneLog) and isinstance(log.found, DroneLog):
+            metres = distance(own.found, log.found)
+        if metres is None:
+            unknown.append(log)
+        elif metres < _SAME_DRONE_M:
+            near.append((metres, log))
+    near.sort(key=lambda pair: pair[0])
+    if len(near) > 1 and not unknown and 2 * near[0][0] < near[1][0]:
+        return [near[0][1]]
+    return [*(log for _, log in near), *unknown]
 
 
 def _is_of_film(log: Candidate, camera: CameraDraft) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,15 @@ from pipelines.draft import Drafted, draft
 from pipelines.ingest import ingest
 from tests.commands.runner import refused, succeeds
 from tests.real_data import real_data
-from tests.synthetic.drone_logs import drone_of, px4_entries, ulog_rows, write_tlog, write_ulog
+from tests.synthetic.drone_logs import (
+    drone_of,
+    px4_entries,
+    ulog_rows,
+    write_record,
+    write_srt,
+    write_tlog,
+    write_ulog,
+)
 from tests.synthetic.flights import LENS, START_NS, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap
@@ -310,3 +319,21 @@ def test_each_vehicle_of_a_ground_station_s_log_goes_to_the_camera_of_its_number
     ]
     apart = poses_of[0][["x", "y"]].to_numpy()[0] - poses_of[1][["x", "y"]].to_numpy()[0]
     assert np.linalg.norm(apart) > 1
+
+
+def test_two_drones_of_dji_get_their_own_flight_records(tmp_path: Path) -> None:
+    """Subtitles without gimbal angles name the video; the records, of one hour, have the angles."""
+    flight = write_flight(tmp_path / "x", cameras=2, seconds=1.0, clean=True)
+    for k, record in enumerate(("late", "early")):
+        truth = drone_of(flight, k)
+        path = write_srt(tmp_path / f"DJI_{k}.SRT", truth)
+        text = re.sub(r"\[gb_yaw[^]]*\]", "", path.read_text(encoding="utf-8"))
+        path.write_text(text, encoding="utf-8")
+        write_record(tmp_path / f"{record}.csv", truth)
+        write_video(tmp_path / f"DJI_{k}.mp4", even_ticks(15, step=6000))
+    shutil.rmtree(tmp_path / "x")
+    write_lens(tmp_path)
+    result, stated = drafted(tmp_path)
+    assert not result.missing
+    assert [camera["pose"]["dji"] for camera in stated["cameras"].values()] == ["late.csv", "early.csv"]
+    assert frames_with_poses(result.path) == 15

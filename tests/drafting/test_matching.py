@@ -313,6 +313,29 @@ def test_poses_with_attitudes_of_the_same_time_come_before_those_of_the_camera_s
         assert sorted(others(found.poses)) == sorted(log.path.name for log in free)
 
 
+def test_of_two_records_of_one_hour_each_goes_to_the_drone_that_was_there() -> None:
+    noon = 1_700_000_000
+    own = [drone_log(f"DJI_{k}.SRT", noon, turned=False) for k in (1, 2)]
+    records = [drone_log(f"{name}.csv", noon, turned=True) for name in "ab"]
+    films = [video(f"DJI_{k}.mp4") for k in (1, 2)]
+
+    def distance(log: DroneLog, other: DroneLog) -> float | None:
+        return (
+            0.0
+            if (log.path.name, other.path.name) in {("DJI_1.SRT", "b.csv"), ("DJI_2.SRT", "a.csv")}
+            else 8.0
+        )
+
+    draft = match(Findings([*films, *own, *records]), distance=distance)
+    assert [taken(c.poses) for c in draft.cameras] == ["b.csv", "a.csv"]
+    # A single record goes to the drone that was there, and none where all were elsewhere.
+    draft = match(
+        Findings([*films, *own, records[0]]), distance=lambda log, _: 50.0 * (log.path.name == "DJI_1.SRT")
+    )
+    assert [taken(c.poses) for c in draft.cameras] == ["DJI_1.SRT", "a.csv"]
+    assert not any(taken(c.poses) == "a.csv" for c in match(Findings([*films, *own, records[0]])).cameras)
+
+
 def test_logged_maps_in_the_frame_of_the_poses_come_first() -> None:
     maps = [
         topic("/plan", "maps", "nav_msgs/msg/OccupancyGrid"),
