@@ -2,7 +2,8 @@
 
 `--bound` also flies arms that know the whole way of the actor, with the same limits, and compares each arm
 with the least error of these in every world, and with the arms of equal range. `--keep FILE` stores the
-flights of each world; worlds that are there are not flown again.
+flights of each world; worlds that are there are not flown again. `--joint` flies `joint` and `adaptive`
+alone, a third of the time.
 
 Every arm flies through worlds of `benchmarks.worlds`. One posture of a walk, carried along by the actor, is
 measured by triangulation with modelled keypoints and white pose noise (0.02 m, 0.2 deg), 32 draws. The
@@ -61,6 +62,8 @@ KNOWING: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "joint, from 8 m, way known": ("joint", {"radius_m": NEAREST_M}),
 }
 """Arms that know the whole way: yaw alone, and yaw, tilt, range and spacing together."""
+PAIRS = (*EQUAL, *EQUAL.values(), "adaptive, 8 m, way known", "joint, from 8 m, way known")
+"""Arms of `--joint`."""
 NOISE = White(position_m=0.02, rotation_deg=0.2)
 TRIALS = 32
 EVERY = 2  # tracking steps from picture to picture
@@ -81,8 +84,14 @@ class Flight:
     range_m: float
 
 
-def fly(seed: int, *, bound: bool = False) -> list[Flight]:
-    """Fly all arms through one world and measure; with `bound` those that know the whole way, too."""
+def arms_of(*, bound: bool, pairs: bool) -> dict[str, tuple[str, Mapping[str, Any]]]:
+    """Choose arms: with `bound` those that know the whole way, too; with `pairs` those of `PAIRS` alone."""
+    every = {**ARMS, **KNOWING} if bound else ARMS
+    return {name: arm for name, arm in every.items() if not pairs or name in PAIRS}
+
+
+def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]]) -> list[Flight]:
+    """Fly arms through one world and measure."""
     world = world_of(seed)
     field = world.field()
     walking = walk(1.0, 2.0, seed=0)
@@ -93,7 +102,7 @@ def fly(seed: int, *, bound: bool = False) -> list[Flight]:
         rotation_sigma_deg=NOISE.rotation_deg,
     )
     found = []
-    for arm, (name, changes) in ({**ARMS, **KNOWING} if bound else ARMS).items():
+    for arm, (name, changes) in arms.items():
         config = replace(PlannerConfig(), errors=errors, **changes)
         done = replay(
             PLANNER_ARMS.get(name),
@@ -170,9 +179,11 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--bound", action="store_true", help="compare with flights that know the whole way")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="store flights here, and go on from there")
+    parser.add_argument("--joint", action="store_true", help="`joint` and `adaptive` alone")
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.count)
-    flights = list(_flown(seeds, arguments.workers, arguments.keep, bound=arguments.bound))
+    arms = arms_of(bound=arguments.bound, pairs=arguments.joint)
+    flights = list(_flown(seeds, arms, arguments.workers, arguments.keep))
     _print_arms(flights)
     if arguments.bound:
         _print_bound(flights)
@@ -181,14 +192,18 @@ def main() -> None:
     _print_correlations(flights)
 
 
-def _flown(seeds: Sequence[int], workers: int, keep: Path | None, *, bound: bool) -> Iterator[Flight]:
+def _flown(
+    seeds: Sequence[int],
+    arms: Mapping[str, tuple[str, Mapping[str, Any]]],
+    workers: int,
+    keep: Path | None,
+) -> Iterator[Flight]:
     """Yield the flights through some worlds: those kept, then those flown now, which are kept as well."""
     kept = [_read(line) for line in keep.read_text().splitlines()] if keep and keep.exists() else []
-    needed = {*ARMS, *KNOWING} if bound else {*ARMS}
-    done = {seed for seed in seeds if needed <= {flight.arm for flight in kept if flight.seed == seed}}
-    yield from (flight for flight in kept if flight.seed in done and flight.arm in needed)
+    done = {seed for seed in seeds if set(arms) <= {flight.arm for flight in kept if flight.seed == seed}}
+    yield from (flight for flight in kept if flight.seed in done and flight.arm in arms)
     with ProcessPoolExecutor(workers) as pool:
-        for flights in pool.map(partial(fly, bound=bound), [seed for seed in seeds if seed not in done]):
+        for flights in pool.map(partial(fly, arms=arms), [seed for seed in seeds if seed not in done]):
             yield from flights
             if keep:
                 with keep.open("a") as file:
@@ -234,7 +249,7 @@ def _print_arms(flights: Iterable[Flight]) -> None:
 def _print_bound(flights: Sequence[Flight]) -> None:
     """Print each arm's error over the least of those that know the way, world by world, and what it hides."""
     rows = []
-    for arm in ARMS:
+    for arm in dict.fromkeys(flight.arm for flight in flights if flight.arm in ARMS):
         ratios, hidden = [], []
         for flight in flights:
             if flight.arm == arm:

@@ -48,7 +48,6 @@ from pipelines.session.registries import Registry
 _TILTS_DEG = (-10.0, 85.0)
 _TRIANGLE = np.triu_indices(3)
 _JOINT_EVERY_S = 0.5 - 1e-6  # between two plans of `joint`: slots move little meanwhile
-_EACH_TURN = 4.0  # times `w_turn`, for each drone of `joint`: drones lag behind slots that move often
 _W_HIDDEN = 0.3  # price of a hidden view, beyond that of its occupied share and of the information lost
 
 
@@ -249,10 +248,7 @@ class _Joint:
         ranges = _steps_through(config.radius_m, (*config.ranges_m, config.radius_m), range_step)
         states = _all_states(yaw_set(self._yaws, yaw_rad), np.unique(tilts), ranges)
         self._lattice = lattice(
-            states,
-            rates=np.array(config.slot_rates),
-            knot_s=config.knot_s,
-            w_turn=_EACH_TURN * config.w_turn,
+            states, rates=np.array(config.slot_rates), knot_s=config.knot_s, w_turn=config.w_turn
         )
         self._offsets = slot_offsets(states)
         information = ray_information(self._offsets, config.errors)[:, *_TRIANGLE]
