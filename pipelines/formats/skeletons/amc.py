@@ -140,8 +140,8 @@ def _built(sections: dict[str, list[list[str]]]) -> _Skeleton:
     for block in _blocks(sections["bonedata"]):
         stated = {row[0].lower(): row[1:] for row in block}
         bone = _Bone(dof=tuple(word.lower() for word in stated.get("dof", [])))
-        direction = np.array([float(word) for word in stated["direction"][:3]])
-        bone.vector = direction * float(stated["length"][0])
+        direction = np.array([_number(word) for word in stated["direction"][:3]])
+        bone.vector = direction * _number(stated["length"][0])
         bone.axis = _turn(stated["axis"][3] if len(stated["axis"]) > 3 else "XYZ", stated["axis"], radians)
         if bone.vector.shape != (3,) or any(not re.fullmatch("r[xyz]", dof) for dof in bone.dof):
             raise ValueError(f"bone {stated['name'][0]} has {' '.join(bone.dof)}")
@@ -154,7 +154,9 @@ def _built(sections: dict[str, list[list[str]]]) -> _Skeleton:
                 raise ValueError(f"{child} has two parents")
             known[child].parent = words[0]
             bones[child] = known[child]
-    length = float(units.get("length", "1"))
+    length = _number(units.get("length", "1"))
+    if length <= 0:
+        raise ValueError(f"length {length:g}")
     return _Skeleton(bones, _INCH_M / length, radians)
 
 
@@ -169,9 +171,17 @@ def _blocks(rows: list[list[str]]) -> Iterator[list[list[str]]]:
             block.append(row)
 
 
+def _number(word: str) -> float:
+    """Return a number; raise ValueError if it is none, or absurd."""
+    value = float(word)
+    if not abs(value) < _LARGEST:
+        raise ValueError(f"number {word[:20]}")
+    return value
+
+
 def _turn(order: str, words: list[str], radians: bool) -> Float:
     """Return the rotation of three angles; the first axis of the order is applied first."""
-    angles = np.array([float(word) for word in words[:3]])
+    angles = np.array([_number(word) for word in words[:3]])
     angles = angles if radians else np.radians(angles)
     if sorted(order.upper()) != ["X", "Y", "Z"] or len(angles) != 3:
         raise ValueError(f"axis {order}")

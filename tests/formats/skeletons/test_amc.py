@@ -125,6 +125,10 @@ def test_a_last_frame_that_is_cut_is_left_out_and_counted(tmp_path: Path) -> Non
         ("axis XYZ", "axis XYW"),
         (":hierarchy", ":tree"),
         ("length 7", "length"),
+        ("length 7", "length 1e99"),
+        ("length 0.45", "length 0"),
+        ("axis 0 0 90", "axis -inf 0 90"),
+        ("orientation 0 0 0", "orientation nan 0 0"),
     ],
 )
 def test_faulty_skeletons_are_refused(tmp_path: Path, old: str, new: str) -> None:
