@@ -59,13 +59,12 @@ def test_the_report_shows_the_comparison_of_the_session(tmp_path: Path) -> None:
     assert page.read_bytes() == first
 
     succeeds("replan-compare", session, "--trials", "2", "--arms", "adaptive,fixed")
-    succeeds("report", session)
-    assert 'dir="auto">flown</th>' in shown
-    assert 'dir="auto">flown</th>' not in page.read_text(encoding="utf-8")
-    assert 'id="sweep"' not in shown
     succeeds("replan-sweep", session, "--trials", "2", "--radius", "8,10")
     succeeds("report", session)
+    assert 'dir="auto">flown</th>' in shown
+    assert 'id="sweep"' not in shown
     swept = json.loads((session / "sweep" / "metrics.json").read_text(encoding="utf-8"))
     shown = unescape(page.read_text(encoding="utf-8"))
+    assert 'dir="auto">flown</th>' not in shown
     assert swept["verdict"][1:] in shown
     assert 'id="figure-tradeoff"' in shown
