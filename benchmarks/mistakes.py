@@ -7,9 +7,8 @@
     python -m benchmarks.mistakes --acrobats 40    # the same of people who lie or turn cartwheels
     python -m benchmarks.mistakes --right 200 --any --seed 2000    # of both kinds
     python -m benchmarks.mistakes --corpus tuning|kept [--draws 1] [--mistake none] [FLIGHT ...]  # film
-    python -m benchmarks.mistakes --time    # of the doubts in `reconstruct`, and of `check` on ten minutes
-    python -m benchmarks.mistakes --headings 60    # when a heading 8 deg off shows in the rays
-    python -m benchmarks.mistakes --late    # why clocks that are all late are not told without film
+    python -m benchmarks.mistakes --time    # of doubts in `reconstruct`, of `check` on ten minutes, on film
+    python -m benchmarks.mistakes --untold 60    # what untold mistakes change, and what chance does
 
 Right flights (simulated, modelled keypoints) are described anew with one mistake each. A mistake counts if
 the error of the skeleton grows by more than 20 %, or nothing can be reconstructed. `named`: the first doubt
@@ -30,11 +29,11 @@ import csv
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import permutations, product
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any, get_args
@@ -63,7 +62,7 @@ from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.reconstruction.doubts.diagnosis import Diagnosis, doubts_of
 from pipelines.reconstruction.doubts.faults import Fault, fit
-from pipelines.reconstruction.doubts.hypotheses import Trial
+from pipelines.reconstruction.doubts.hypotheses import RATES, Trial
 from pipelines.reconstruction.doubts.scene import Sampled, Scene, scene_of
 from pipelines.reconstruction.doubts.score import base_of, score
 from pipelines.session.description import Doubt
@@ -528,7 +527,7 @@ class Mistake:
     codes: tuple[str, ...]
     change: Change
     fits: Callable[[Flight], bool] = lambda _: True
-    loses_place: Callable[[Flight], bool] = lambda _: False  # of the world: root-relative errors are compared
+    compared: Callable[[Flight], str] = lambda _: "mpjpe_mm"  # another error where the world's place is lost
 
 
 def _mistakes() -> list[Mistake]:
@@ -540,6 +539,10 @@ def _mistakes() -> list[Mistake]:
 
     def own(flight: Flight) -> bool:
         return not flight.carried
+
+    def unplaced_pair(flight: Flight) -> bool:
+        """Test if nothing says which of two drones is where its log says."""
+        return flight.drones == 2 and not flight.actor and not flight.map
 
     return [
         Mistake("videos swapped", ("videos_swapped",), swapped),
@@ -558,14 +561,25 @@ def _mistakes() -> list[Mistake]:
         Mistake("clock 0.5 s, all", ("clock",), of_cameras(clock(0.5))),
         Mistake("25 for 30 Hz, all", ("frame_rate",), of_cameras(rate(25))),
         Mistake("25 for 30 Hz, one", ("frame_rate",), of_cameras(rate(25), one)),
-        Mistake("origin 3 m, one", ("origin",), moved(np.array([2.4, -1.8, 0]), one)),
+        Mistake(
+            "origin 3 m, one",
+            ("origin",),
+            moved(np.array([2.4, -1.8, 0]), one),
+            compared=lambda flight: "root_mpjpe_mm" if unplaced_pair(flight) else "mpjpe_mm",
+        ),
         Mistake(
             "north 20 deg, one",
             ("origin",),
             of_poses(lambda pose: compose((still, turned("z", 20)), pose), one),
+            compared=lambda flight: "pa_mpjpe_mm" if unplaced_pair(flight) else "mpjpe_mm",
         ),
         Mistake("heading 8 deg, one", ("pose",), of_poses(heading(8), one)),
-        Mistake("own origins", ("origin",), own_origins, loses_place=lambda flight: not flight.actor),
+        Mistake(
+            "own origins",
+            ("origin",),
+            own_origins,
+            compared=lambda flight: "mpjpe_mm" if flight.actor else "root_mpjpe_mm",
+        ),
         Mistake("another's topic", ("pose",), same_topic),
         Mistake("camera_from_world", ("convention",), of_poses(lambda pose: invert(*pose))),
         Mistake("w x y z", ("convention",), of_poses(lambda pose: (pose[0], np.roll(pose[1], 1, axis=-1)))),
@@ -882,6 +896,14 @@ def any_right_flight(seed: int, folder: Path) -> Flight:
     return acrobatic_flight(seed, folder) if seed % 3 == 0 else right_flight(seed)
 
 
+def _print_check(what: str, path: Path) -> None:
+    start, clock_s = process_time(), perf_counter()
+    doubts = check(path).doubts
+    took, took_s = process_time() - start, perf_counter() - clock_s
+    said = f"{doubts[0].code}: {doubts[0].what}" if doubts else "none"
+    print(f"| `check` of {what} | {took:.1f} | {took_s:.1f} | {said} |", flush=True)
+
+
 _LONG = Flight(
     "long3",
     3,
@@ -896,11 +918,15 @@ _LONG = Flight(
 
 
 def print_times(folder: Path) -> None:
-    """Print processor seconds: of the doubts in `reconstruct` of the sample, of `check` on ten minutes."""
-    sample = Path(__file__).parents[1] / "sample_data" / "mound_walk" / "flight.yaml"
+    """Print processor seconds: of the doubts in `reconstruct` of the sample, and of `check`.
+
+    What is checked is the sample's film, right and with clocks that are off, and a flight of ten minutes.
+    """
+    sample = folder / "sample"
+    shutil.copytree(Path(__file__).parents[1] / "sample_data" / "mound_walk", sample, dirs_exist_ok=True)
     session = folder / "sample.session"
     shutil.rmtree(session, ignore_errors=True)
-    ingest(sample, session)
+    ingest(sample / "flight.yaml", session)
     detect_s = process_time()
     with locked(session) as writable:
         detect(writable, detector=DETECTORS[0])
@@ -917,20 +943,19 @@ def print_times(folder: Path) -> None:
         start = process_time()
         reconstruct(session, Settings())
         whole = process_time() - start
-    print("| | processor s | s | doubts |\n| --- | --- | --- | --- |")
+    print("| | processor s | s | doubt |\n| --- | --- | --- | --- |")
     print(f"| detection of the sample | {detect_s:.1f} | | |")
     print(f"| `reconstruct` of the sample, with doubts | {whole:.1f} | | |")
     print(f"| of that, doubts | {seconds[0]:.2f} | | |")
-    manifest = mistaken(Described(_LONG, folder / _LONG.name), None)
-    for said, path in (("", manifest), (", ingested", folder / _LONG.name / "first.session")):
-        start, clock_s = process_time(), perf_counter()
-        doubts = check(path).doubts
-        took, took_s = process_time() - start, perf_counter() - clock_s
-        print(f"| `check` of 600 s{said} | {took:.1f} | {took_s:.1f} | {len(doubts)} |")
+    _print_check("600 s", mistaken(Described(_LONG, folder / _LONG.name), None))
+    _print_check("600 s, ingested", folder / _LONG.name / "first.session")
+    _print_check("the sample's film", sample / "flight.yaml")
+    for late_s, names in ((0.5, ["drone1", "drone2"]), (-0.5, ["drone1", "drone2"]), (0.3, ["drone1"])):
+        document = YAML(typ="safe").load((sample / "flight.yaml").read_text(encoding="utf-8"))
+        _later(document["cameras"], names, late_s)
+        what = f"the same, clocks of {' and '.join(names)} {late_s:+.1f} s"
+        _print_check(what, written(document, sample / "late.yaml"))
     print(f"doubts take {seconds[0] / (whole - seconds[0]):.1%} on top of the rest of `reconstruct`")
-
-
-_LATE_S = 0.5
 
 
 def sampled_of(manifest: Path) -> Sampled:
@@ -946,51 +971,70 @@ def sampled_of(manifest: Path) -> Sampled:
     return seen[0]
 
 
-def print_headings(folder: Path, right: int) -> None:
-    """Print by how much a turned heading lowers the chi^2: of headings 8 deg off, and of right flights."""
-
-    def gain(manifest: Path) -> tuple[float, float]:
-        sampled = sampled_of(manifest)
-        scene = scene_of(sampled)
-        stated = fit(sampled, scene, "none", 0).cost
-        turns = [fit(sampled, scene, "heading", index).cost for index in range(len(sampled.cameras))]
-        return stated, stated - min(turns)
-
-    print("| flight | heading of drone1 off by | chi^2 | less with a heading turned |")
-    print("| --- | --- | --- | --- |")
-    for flight, degrees in product([*FLIGHTS, *KEPT_ASIDE], (8, -8)):
-        manifest = mistaken(Described(flight, folder / flight.name), of_poses(heading(degrees), "drone1"))
-        stated, less = gain(manifest)
-        print(f"| {flight.name} | {degrees} deg | {stated:.1f} | {less:.1f} |", flush=True)
-    drawn = [right_flight(seed) for seed in range(100, 100 + right)]
-    gains = [gain(mistaken(Described(each, folder / each.name), None))[1] for each in drawn]
-    middle, high = np.percentile(gains, [50, 95])
-    print(f"{right} right flights: {middle:.1f} less (median), 95 % at most {high:.1f}, all {max(gains):.1f}")
+def _times_of_all(trial: Trial) -> list[Scene]:
+    late_s = [seconds for seconds in np.linspace(-1, 1, 21) if abs(seconds) > 0.01]
+    slower = [np.full(len(trial.names), factor) for factor in RATES]
+    scenes = [trial.late(float(seconds), trial.every) for seconds in late_s]
+    return scenes + [scene_of(trial.flight, trial.described, slower=each) for each in slower]
 
 
-def print_late(folder: Path) -> None:
-    """Print how well flights whose clocks are all late fit: as stated, at the right times, and at best."""
+def _orders(trial: Trial) -> list[Scene]:
+    orders = [each for each in permutations(trial.every) if each != tuple(trial.every)]
+    return [scene_of(trial.flight, trial.described, order=each) for each in orders]
 
-    def misfit(sampled: Sampled, scene: Scene) -> float:
-        """Return the chi^2 for each picture: other times show fewer."""
-        pictures = int(np.isfinite(scene.rays[..., 0]).any(axis=-1).sum())
-        return fit(sampled, scene, "none", 0).cost / pictures
 
-    print("| flight | chi^2 a picture, as stated | right | best | at s | score as stated | right |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
-    for flight in FLIGHTS:
-        sampled = sampled_of(mistaken(Described(flight, folder / flight.name), of_cameras(clock(_LATE_S))))
-        described = scene_of(sampled)
-        base, stated = base_of(sampled, described)
-        trial = Trial(sampled, described, base)
-        late_s = np.linspace(-1, 1, 21)
-        scenes = [trial.late(float(late), trial.every) for late in late_s]
-        costs = [misfit(sampled, scene) for scene in scenes]
-        right = int(np.argmin(np.abs(late_s + _LATE_S)))
-        best = int(np.argmin(costs))
-        chi2 = f"{costs[late_s.size // 2]:.2f} | {costs[right]:.2f} | {costs[best]:.2f} | {late_s[best]:+.1f}"
-        total = score(sampled, scenes[right], base).total
-        print(f"| {flight.name} | {chi2} | {stated.total:.1f} | {total:.1f} |", flush=True)
+def _headings(trial: Trial) -> list[Scene]:
+    return [fit(trial.flight, trial.described, "heading", index).scene for index in trial.every]
+
+
+# Mistakes that are not told everywhere, and the scenes among which the one without the mistake is.
+UNTOLD: dict[str, Callable[[Trial], list[Scene]]] = {
+    "clock 0.5 s, all": _times_of_all,
+    "25 for 30 Hz, all": _times_of_all,
+    "videos cycled": _orders,
+    "heading 8 deg, one": _headings,
+}
+
+
+def _gains(sampled: Sampled, kinds: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return by how much the best scene of each kind lowers the chi^2 of the rays, and the score.
+
+    Other times show other pictures: the chi^2 is that of a picture, times the pictures of the description.
+    """
+
+    def chi2(scene: Scene) -> float:
+        pictures = np.isfinite([each.rays[..., 0] for each in (scene, trial.described)]).any(axis=-1)
+        seen, described = pictures.sum(axis=(1, 2))
+        return fit(sampled, scene, "none", 0).cost * described / seen if seen else np.inf
+
+    base, stated = base_of(sampled, scene_of(sampled))
+    trial = Trial(sampled, scene_of(sampled), base)
+    gains: dict[Callable[[Trial], list[Scene]], tuple[float, float]] = {}
+    for undone in dict.fromkeys(UNTOLD[kind] for kind in kinds):
+        scenes = undone(trial)
+        least = min(score(sampled, scene, base).total for scene in scenes)
+        gains[undone] = chi2(trial.described) - min(map(chi2, scenes)), stated.total - least
+    return {kind: gains[UNTOLD[kind]] for kind in kinds}
+
+
+def print_untold(folder: Path, seeds: Iterable[int], names: list[str]) -> None:
+    """Print by how much undoing a mistake lowers chi^2 and score, of mistaken and of right flights."""
+    untold = [each for each in MISTAKES if each.name in UNTOLD and (not names or each.name in names)]
+    print("| mistake | flight | chi^2 less | score less |\n| --- | --- | --- | --- |")
+    for mistake, flight in product(untold, [*FLIGHTS, *KEPT_ASIDE]):
+        if mistake.fits(flight):
+            wrong = sampled_of(mistaken(Described(flight, folder / flight.name), mistake.change))
+            chi2, less = _gains(wrong, [mistake.name])[mistake.name]
+            print(f"| {mistake.name} | {flight.name} | {chi2:.1f} | {less:.1f} |", flush=True)
+    right: dict[str, list[tuple[float, float]]] = {}
+    for flight in map(right_flight, seeds):
+        sampled = sampled_of(mistaken(Described(flight, folder / flight.name), None))
+        for name, gains in _gains(sampled, [each.name for each in untold if each.fits(flight)]).items():
+            right.setdefault(name, []).append(gains)
+    for name, found in right.items():
+        quantiles = np.percentile(found, [50, 95, 100], axis=0).T
+        said = " | ".join(f"{a:.1f}, 95 % at most {b:.1f}, all {c:.1f}" for a, b, c in quantiles)
+        print(f"| {name} | {len(found)} right ones | {said} |", flush=True)
 
 
 def _later(cameras: dict[str, Any], names: list[str], seconds: float) -> None:
@@ -1066,39 +1110,40 @@ def main() -> None:
     parser.add_argument("--mistake", action="append", default=[], help="Only these; repeat it for several.")
     parser.add_argument("--bound", type=int, default=0, metavar="N", help="Draws of a remedy's sigmas.")
     parser.add_argument("--right", type=int, metavar="N", help="Check random right flights instead.")
-    parser.add_argument("--seed", type=int, default=100, help="The first seed of --right.")
+    parser.add_argument("--seed", type=int, help="The first of the right flights or acrobats.")
     parser.add_argument("--any", action="store_true", help="Let every third of --right be an acrobat.")
     parser.add_argument(
         "--acrobats", type=int, metavar="N", help="The same of people who lie or turn wheels."
     )
     parser.add_argument("--less-usual", action="store_true", help="Make less usual mistakes instead.")
     parser.add_argument("--time", action="store_true", help="Measure what the doubts cost.")
-    parser.add_argument("--late", action="store_true", help="Look at flights whose clocks are all late.")
     parser.add_argument(
-        "--headings", type=int, metavar="N", help="Turn headings, and those of N right flights."
+        "--untold", type=int, metavar="N", help="Undo mistakes that are not told, also on N right flights."
     )
     parser.add_argument("--corpus", choices=HALVES, help="Check the flights of the corpus instead.")
     parser.add_argument("--draws", type=int, default=1, help="Draws of the corpus's pose errors.")
     parser.add_argument("flights", nargs="*")
     options = parser.parse_args()
+
+    def seeds(count: int, first: int) -> range:
+        first = first if options.seed is None else options.seed
+        return range(first, first + count)
+
     if options.right:
         draw: Callable[[int], Flight] = right_flight
         if options.any:
             draw = partial(any_right_flight, folder=options.folder)
-        doubted_right_flights(options.folder, map(draw, range(options.seed, options.seed + options.right)))
+        doubted_right_flights(options.folder, map(draw, seeds(options.right, 100)))
         return
     if options.acrobats:
-        seeds = range(1000, 1000 + options.acrobats)
-        doubted_right_flights(options.folder, (acrobatic_flight(seed, options.folder) for seed in seeds))
+        flights_of = (acrobatic_flight(seed, options.folder) for seed in seeds(options.acrobats, 1000))
+        doubted_right_flights(options.folder, flights_of)
         return
     if options.time:
         print_times(options.folder)
         return
-    if options.late:
-        print_late(options.folder)
-        return
-    if options.headings:
-        print_headings(options.folder, options.headings)
+    if options.untold:
+        print_untold(options.folder, seeds(options.untold, 100), options.mistake)
         return
     if options.corpus:
         doubted_corpus(
@@ -1144,9 +1189,8 @@ def tried(
 
     Of a remedy that does not mend, so many draws show what errors its standard deviations allow.
     """
-    compared = "mpjpe_mm"
-    if mistake.loses_place(described.flight):
-        compared = "root_mpjpe_mm"
+    compared = mistake.compared(described.flight)
+    if compared != "mpjpe_mm":
         right = measured(mistaken(described, None), compared)[0] or float("nan")
     manifest = mistaken(described, mistake.change)
     error, doubts, stopped = measured(manifest, compared)
@@ -1160,7 +1204,7 @@ def tried(
     said = f"{first['code']}: {first['what']}" if first else (stopped or "nothing")
     counts = error is None or error > 1.2 * right
     verdict = ("yes" if named else "NO") if counts else f"({'yes' if named else 'no'})"
-    mending = f"{after or 0:.0f}" + (f", root-relative; right: {right:.0f}" if compared != "mpjpe_mm" else "")
+    mending = f"{after or 0:.0f}" + (f", {compared}; right: {right:.0f}" if compared != "mpjpe_mm" else "")
     if draws and first is not None and after and not mended:
         mending += f"; {_bound(described, mistake, first, draws)}"
     row(described.flight.name, mistake.name, error, said, verdict, mending if after else why)
@@ -1178,7 +1222,7 @@ def _bound(described: Described, mistake: Mistake, doubt: dict[str, Any], draws:
     names = [name for name in described.names if f"cameras.{name}." in doubt["remedy"]]
     covariance = _covariance_of_origins(described, mistake) if mistake.name == "own origins" else None
     draw = np.random.default_rng(0)
-    compared = "root_mpjpe_mm" if mistake.loses_place(described.flight) else "mpjpe_mm"
+    compared = mistake.compared(described.flight)
     errors: list[float] = []
     for _ in range(draws):
         if covariance is None:

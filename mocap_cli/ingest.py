@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Longest time before the first or after the last logged pose at which a frame gets a pose.",
 )
-@click.option("--strict", is_flag=True, help="Refuse a flight of which anything is lost or damaged.")
+@click.option("--strict", is_flag=True, help="Refuse a flight of which anything is lost, damaged or doubted.")
 @overwrite_option
 @force_option
 @output_options

@@ -105,7 +105,7 @@ def ingest(
         session: the output folder; by default `<name of the manifest>.session` beside it.
         max_pose_gap_s: frames between two logged poses further apart than this have no pose.
         max_extrapolation_s: frames further than this before or after all logged poses have none.
-        strict: refuse a flight if any part of it could not be read or used.
+        strict: refuse a flight if any part of it could not be read or used, or if its logs are doubted.
         overwrite: write also to a target that holds something else.
         force: read everything again even if nothing changed.
 
@@ -139,7 +139,7 @@ def ingest(
                 note_sources(target, sources, stamps)
                 stored_description = read_description(target)
                 if strict:
-                    _refuse_losses(flight_path, stored_description)
+                    _refuse_unsound(flight_path, stored_description)
                 return Ingested(target, run.record, stored_description, skipped=True)
 
             progress.start("Reading cameras", len(flight.cameras))
@@ -180,7 +180,7 @@ def ingest(
                 warnings=warnings,
             )
             if strict:
-                _refuse_losses(flight_path, description)
+                _refuse_unsound(flight_path, description)
             write_json(run.folder / "session.json", description.model_dump(mode="json", by_alias=True))
             record = run.publish(counts=_counts(entries), warnings=warnings)
             note_sources(target, sources, stamps)
@@ -506,8 +506,8 @@ def _store_camera(reader: _FlightReader, name: str, check_sources: Callable[[], 
     check_sources()
 
 
-def _refuse_losses(flight_path: Path, description: Description) -> None:
-    """Refuse a flight of which anything was dropped, in one line with all losses by part and cause."""
+def _refuse_unsound(flight_path: Path, description: Description) -> None:
+    """Refuse a flight of which anything was dropped, in one line by part and cause, or that is doubted."""
     parts = {
         f"{name}: {what}": dropped
         for name, camera in description.cameras.items()
@@ -531,6 +531,8 @@ def _refuse_losses(flight_path: Path, description: Description) -> None:
             f"is not whole, and --strict was given ({'; '.join(lost)})",
             "copy what is damaged again, or ingest without --strict",
         )
+    for doubt in description.doubts:
+        raise DataError(flight_path, f"is doubted: {doubt.what} ({doubt.code})", doubt.remedy)
 
 
 def _refuse_ways_out(flight: Flight, path: Path) -> None:

@@ -36,6 +36,7 @@ from benchmarks.mistakes import (
     of_mounts,
     of_poses,
     own_origins,
+    rate,
     renamed,
     same_topic,
     sampled_of,
@@ -90,7 +91,7 @@ CASES: dict[str, tuple[str, Change]] = {
     "gimbal": ("gimbal", fixed_gimbal(-DOWN_DEG, "world")),
     "clock": ("clock", of_cameras(clock(0.3), "drone1")),
     "heading": ("pose", of_poses(heading(8), "drone1")),
-    "topic": ("pose", same_topic),
+    "rate": ("frame_rate", of_cameras(rate(25), "drone1")),  # the rays tell it, the score hardly
     "feet": ("unit", of_poses(lambda pose: (pose[0] / 0.3048, pose[1]))),
 }
 
@@ -147,6 +148,7 @@ def test_ingest_doubts_what_the_logs_alone_show(
     found = json.loads((session / "session.json").read_text())["doubts"]
     assert {doubt["code"] for doubt in found} == {code}
     assert all(set(doubt) == {"code", "cameras", "what", "evidence", "remedy"} for doubt in found)
+    assert f"({code})" in refused("ingest", flight.folder / "flight.yaml", "-o", session, "--strict")
 
 
 @pytest.mark.parametrize("with_actor", [True, False])
@@ -200,6 +202,8 @@ def test_reconstruct_states_doubts_and_strict_refuses(flight: Described, tmp_pat
     assert metrics["doubts"][0]["remedy"].startswith("cameras.drone1.mount: {looks: forward, down_deg: 15")
     assert "(mount)" in refused("reconstruct", session, "--method", "robust", "--strict")
     assert (session / "reconstruct" / "metrics.json").exists()
+    told = json.loads(succeeds("info", session, "--json"))["readings"][0]["reconstruct"]
+    assert metrics["doubts"][0]["remedy"] in told["warnings"][0]
 
 
 def test_what_cannot_be_reconstructed_names_the_mistake(flight: Described, tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from pipelines.reconstruction.doubts.faults import (
     zoom,
 )
 from pipelines.reconstruction.doubts.hypotheses import (
+    LEAST_GAIN_OF_TIMES,
     RATES,
     TIMES,
     Hypothesis,
@@ -202,7 +203,9 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> Diagnosis
     if causes and causes[0].scene is not None and _is_noise(flight, causes[0].scene, hypotheses):
         causes = []
     if not causes or np.isfinite(causes[0].cost):
-        causes = _faults([*_without_number(trial, hypotheses), *hypotheses], stated.cost, described) or causes
+        discrete = _without_number(trial, hypotheses)
+        of_one = _of_one_clock(trial, hypotheses, stated.cost)
+        causes = _faults([*discrete, *of_one, *hypotheses], stated.cost, described) or causes
     causes = [each for each in causes if _leaves_no_doubt(flight, each)] or _below_zero(trial)
     doubts = [_doubt(_with_sigma(trial, each), found, described) for each in causes]
     if doubts or base.total >= DOUBTFUL:
@@ -255,6 +258,35 @@ def _without_number(trial: Trial, hypotheses: Sequence[Hypothesis]) -> list[Hypo
     return []
 
 
+def _of_one_clock(trial: Trial, hypotheses: Sequence[Hypothesis], stated: float) -> list[Hypothesis]:
+    """Return clocks and frame rates of one camera with their cost, to compete with faults.
+
+    The rays tell them more surely than the score does. By how much they lower the chi^2 of the moments that
+    they show is taken from that of all moments, so that costs can be compared.
+
+    Args:
+        trial: the flight.
+        hypotheses: all that were tried.
+        stated: the cost of a fit without a fault.
+    """
+    found = []
+    for each in hypotheses:
+        if each.scene is None or each.code not in TIMES or each.alike is not None:
+            continue
+        if each.total <= trial.base.total - LEAST_GAIN_OF_TIMES:
+            described = _same_moments(trial, each.scene)
+            gain = fit(trial.flight, described, "none", 0).cost - _cost(trial, each)
+            numbers = 0 if each.penalty <= _DISCRETE else 1
+            found.append(replace(each, cost=stated - gain + numbers * _COST_OF_NUMBER))
+    return [each for each in found if np.isfinite(each.cost)]
+
+
+def _same_moments(trial: Trial, scene: Scene) -> Scene:
+    """Return the description where another scene has rays, too."""
+    seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
+    return replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
+
+
 def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
     """Return True if a hypothesis explains markedly more than the description of the same moments.
 
@@ -268,8 +300,7 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
     if not _leaves_no_doubt(trial.flight, hypothesis):
         return False
     is_odd = trial.base.total >= ODD
-    seen = np.isfinite(hypothesis.scene.rays[..., :1]).any(axis=2, keepdims=True)
-    described = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
+    described = _same_moments(trial, hypothesis.scene)
     if hypothesis.code in TIMES or not is_odd:
         of_one_clock = hypothesis.code in TIMES and hypothesis.alike is None
         least = -_ALIKE_COST if of_one_clock else GAIN
@@ -383,9 +414,7 @@ def _gain_of_rays(trial: Trial, late: Lateness) -> float:
     if len(late.cameras) == len(trial.names):
         return 0.0
     scene = trial.late(late.late_s, late.cameras)
-    seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
-    same = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
-    costs = [fit(trial.flight, each, "none", 0).cost for each in (same, scene)]
+    costs = [fit(trial.flight, each, "none", 0).cost for each in (_same_moments(trial, scene), scene)]
     return costs[0] - costs[1] if np.isfinite(costs).all() else 0.0
 
 

@@ -26,13 +26,15 @@ RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 TIMES = ("clock", "frame_rate")
 """Codes of what is tried on every flight."""
 
+LEAST_GAIN_OF_TIMES = 1.0
+"""Score that clocks and frame rates must gain to be scored exactly: half of what their margin asks."""
+
 _FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
 _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _FLU_FROM_FRD = np.diag([1.0, -1, -1])
 _BODY_AXES = {"enu": "FLU", "ned": "FRD"}
 _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
 _SPARE = 2.0  # hypotheses whose scores are farther from the best need no exact score
-_LEAST_GAIN = 1.0  # nor do clocks and rates that explain less than this, half of what their margin asks
 _REACH = 10.0  # how much worse than the description the best of a grid may be, beside which a best may lie
 _REACH_OF_TIMES = 1.0  # the same of the finer grid of clocks
 _USUAL_STATURE = 0.17  # 95 % of grown-ups differ by less, logarithm
@@ -82,7 +84,7 @@ class Trial:
         """Score a hypothesis."""
         if hypothesis.scene is None:
             return hypothesis
-        least = _LEAST_GAIN if hypothesis.code in TIMES else -_SPARE
+        least = LEAST_GAIN_OF_TIMES if hypothesis.code in TIMES else -_SPARE
         found = score(
             self.flight,
             hypothesis.scene,
