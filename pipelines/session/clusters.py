@@ -127,6 +127,9 @@ def connected(scheduler: str) -> Iterator[Any]:
         DataError: Dask is not installed, or no scheduler answers there.
     """
     distributed = need("distributed", "batch")
+    for name in list(logging.root.manager.loggerDict):
+        if name.partition(".")[0] == "distributed":  # a lost connection is one line, not a traceback
+            logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(scheduler, timeout=_ANSWER_S)
     except (OSError, ValueError, TypeError) as error:
