@@ -38,6 +38,9 @@ from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 _STAMP = 8  # bytes of the station's clock before each packet
 _MARKS = re.compile(rb"[\xfd\xfe]")
+_MOST_WRONG = (
+    200_000  # marks without a packet, and ten for each packet: 25 MB of chance in a log full of damage
+)
 _SIGNED, _SIGNATURE = 1, 13  # flag in a packet of MAVLink 2, and the bytes of its signature
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 _LARGEST_US = 2**62
@@ -364,15 +367,23 @@ def _read(path: Path) -> _Packets:
 def _packets(
     content: mmap.mmap, definitions: Mapping[int, Any], dropped: MutableMapping[str, int]
 ) -> Iterator[_Packet]:
-    """Yield the packets whose checksum is right; stretches without any are counted."""
-    place, in_order = 0, True
+    """Yield the packets whose checksum is right; stretches without any are counted.
+
+    Raises:
+        ValueError: by far the most beginnings are of no packet.
+    """
+    place, in_order, right, wrong = 0, True, 0, 0
     while place + _STAMP < len(content):
         packet = _packet(content, place, definitions)
         if packet is not None:
             in_order = True
+            right += 1
             yield packet
             place += _STAMP + (_packet_size(content, place + _STAMP) or 0)
             continue
+        wrong += 1
+        if wrong > _MOST_WRONG + 10 * right:
+            raise ValueError(f"only {right} of {right + wrong} packets have the right checksum")
         following = _MARKS.search(content, place + _STAMP + 1)
         if in_order:
             cause = "cut off" if following is None else "damaged stretch"

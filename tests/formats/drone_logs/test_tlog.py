@@ -10,6 +10,7 @@ import pytest
 
 from pipelines.formats.drone_logs.tlog import FORMAT
 from pipelines.geometry.poses import rotate
+from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 from tests.formats.refusals import refuses
@@ -186,6 +187,20 @@ def test_damage_costs_the_packets_that_it_hits(tmp_path: Path, truth: DroneTruth
     assert list(read(hit).dropped.values()) == [1]
     hit.write_bytes(whole.read_bytes()[: len(data) // 2])
     assert rows // 2 <= len(read(hit).position.t_ns) <= rows // 2 + 1
+
+
+def test_a_log_without_right_checksums_is_given_up(
+    tmp_path: Path, truth: DroneTruth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.formats.drone_logs.tlog._MOST_WRONG", 100)
+    whole = write_tlog(tmp_path / "a.tlog", truth).read_bytes()
+    path, wrong = tmp_path / "wrong.tlog", bytes(8) + b"\xfe" + bytes(7)
+    path.write_bytes(whole + wrong * 101)
+    described = FORMAT.describe(path)
+    assert described["dropped: damaged stretch"] == 1
+    path.write_bytes(whole + wrong * (102 + 10 * int(str(described["messages"]))))
+    with pytest.raises(DataError):
+        read(path)
 
 
 def test_refusals(tmp_path: Path, truth: DroneTruth) -> None:
