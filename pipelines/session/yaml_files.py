@@ -143,7 +143,7 @@ def _plain(annotation: Any) -> Any:
 
 
 _MOST_BITS = 1024  # a float holds integers of fewer
-_MOST_MARKS = 50_000  # signs that separate values: the parser reads 20,000 in a second
+_MOST_MARKS = 30_000  # signs that separate values: the parser reads 10,000 to 20,000 in a second
 _MOST_MERGED = 100_000  # entries that merge keys copy
 
 

@@ -47,6 +47,9 @@ _RECORDS = 100_000  # in the chunks of any file; one more for each of its bytes
 # Recorders write an index behind each chunk but the last. Some leave indices out, of chunks of 1 MB.
 _BARE_CHUNKS = 10_000  # without an index in any file; one more for each 4 kB
 _BARE_SIZE = 4096
+# Some recorders write an index of no message for each channel that a chunk does not hold.
+_EMPTY_INDICES = 10_000  # in any file; one more for each 256 bytes
+_EMPTY_SIZE = 256
 
 _KEPT = 16 << 20  # bytes that freed chunks may hold
 RECORD_AGAIN = "no recorder writes this; copy it again from the drone"
@@ -99,6 +102,7 @@ class ChunkedPart(LogPart):
         self.file = file
         self.chunks: list[Chunk] = []
         self._bare = 0  # chunks without an index, other than the last
+        self._empty = 0  # indices of no message
         self.messages_stated: int | None = None  # by the file's summary
         self._cache: dict[int, memoryview | None] = {}
         self._cached = 0  # bytes
@@ -145,6 +149,21 @@ class ChunkedPart(LogPart):
                 RECORD_AGAIN,
             )
         self.chunks.append(chunk)
+
+    def take_index(self, rows: Int64) -> None:
+        """Add an index [n, 3] of channel, stamp and place to the last chunk.
+
+        Raises:
+            DataError: there are more empty ones than any recorder writes.
+        """
+        self._empty += not len(rows)
+        if self._empty > max(_EMPTY_INDICES, self.file_size // _EMPTY_SIZE):
+            raise DataError(
+                self.path,
+                f"holds over {self._empty - 1} empty indices in {self.file_size} bytes",
+                RECORD_AGAIN,
+            )
+        self.chunks[-1].index.append(rows)
 
     def count_record(self) -> None:
         """Count a record that was found in a chunk.

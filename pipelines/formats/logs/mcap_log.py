@@ -120,7 +120,7 @@ class McapPart(ChunkedPart):
                     break
                 run = self._extended(run, position, end) if kind == _MESSAGE else None
                 if kind == _INDEX and self.chunks:
-                    self.chunks[-1].index.append(self._index_rows(content_at, length))
+                    self.take_index(self._index_rows(content_at, length))
                 elif kind in {_SCHEMA, _CHANNEL, _STATISTICS}:
                     self._take_record(
                         kind, self.bytes_at(content_at, min(length, CHUNK_LIMIT)), self.channels

@@ -100,7 +100,7 @@ class _Bag(ChunkedPart):
                 if end > self.file_size:
                     break
                 if kind == _INDEX and self.chunks:
-                    self.chunks[-1].index.append(self._index_rows(fields, data_at, length))
+                    self.take_index(self._index_rows(fields, data_at, length))
                 elif kind == _CONNECTION:
                     self._take_connection(fields, self.bytes_at(data_at, length))
             except (struct.error, ValueError, KeyError, IndexError):
