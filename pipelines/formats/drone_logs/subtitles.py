@@ -19,6 +19,7 @@ _CLOCK = re.compile(
 # Some Mavic 2 write no display times: a number, then the clock time on a line of its own.
 _UNTIMED = re.compile(r"(?m)^\d+[ \t]*\n(?=\d{4}[-./]\d{1,2}[-./]\d{1,2} +\d)")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_LARGEST_NS = 2**63  # in the year 2262
 _SLOW_NS = 500_000_000  # subtitles further apart than this come once a second, with whole seconds
 
 
@@ -107,7 +108,8 @@ def _clock_ns(text: str) -> int | None:
         elapsed = datetime(*whole, tzinfo=UTC) - _EPOCH  # type: ignore[misc,arg-type]  # six integers
     except ValueError:
         return None
-    return elapsed // timedelta(microseconds=1) * 1000 + milliseconds * 1_000_000 + microseconds * 1000
+    t_ns = elapsed // timedelta(microseconds=1) * 1000 + milliseconds * 1_000_000 + microseconds * 1000
+    return t_ns if abs(t_ns) < _LARGEST_NS else None
 
 
 def _timecode_ns(block: re.Match[str]) -> int:

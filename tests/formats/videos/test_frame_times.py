@@ -159,6 +159,14 @@ def test_real_subtitles_without_frame_times(name: str, problem: str) -> None:
         read_frame_times(real_data(f"logs/dji_srt/{name}"))
 
 
+@pytest.mark.parametrize("year", ["0001", "2262", "9999"])
+def test_a_clock_beyond_all_times_is_none(tmp_path: Path, year: str) -> None:
+    clocks = ["2022-08-07 13:40:40,774,808", f"{year}-08-07 13:40:40,814,808", "2022-08-07 13:40:40,854,808"]
+    stamps = read_frame_times(written(tmp_path / "a.srt", subtitles(clocks)))
+    assert stamps.frame.tolist() == [0, 2]
+    assert list(stamps.dropped.values()) == [1]
+
+
 def test_clocks_of_every_spelling(tmp_path: Path) -> None:
     clocks = ["2022-08-07 13:40:40,774,808", "2022-08-07 13:40:40.875", "2022.8.7 13:40:41"]
     stamps = read_frame_times(written(tmp_path / "f.srt", subtitles(clocks)))
