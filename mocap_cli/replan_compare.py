@@ -195,9 +195,10 @@ def replan_compare_command(
     detector and poses. Every figure of a replay is simulated; `flown` and `planned` are what the log says.
     """
     from pipelines.precompile import precompile_for
-    from pipelines.replan import replan
+    from pipelines.replan import refuse_name, replan
     from pipelines.session.stages import open_session
 
+    refuse_name(name)
     open_session(session)  # a wrong session is refused before anything is compiled
     with watching(shown.level) as progress:
         precompile_for("replan", progress)

@@ -126,7 +126,7 @@ def replan(
     settings = settings or Settings()
     progress = progress or Silent()
     refuse_unknown(settings.arms or ())
-    _refuse_name(name)
+    refuse_name(name)
     with locked(folder) as session:
         description, reconstructed, inputs = inputs_of(session)
         stated = settings_by_name(settings)
@@ -180,8 +180,12 @@ def replan(
     return Replanned(folder, record, metrics, skipped=False)
 
 
-def _refuse_name(name: str | None) -> None:
-    """Refuse a name that cannot be a folder of its own among the tables and those of the arms."""
+def refuse_name(name: str | None) -> None:
+    """Refuse a name that cannot be a folder of its own among the tables and those of the arms.
+
+    Raises:
+        DataError: it cannot.
+    """
     if name is None:
         return
     if not _NAME.fullmatch(name) or name.casefold().endswith(_ENDINGS):
