@@ -62,7 +62,7 @@ _SHOWN_BY = {"reconstruct": ("overlay",)}
 """Stages that only show another stage's result; they are removed when that result is replaced."""
 
 _LOCK = ".lock"
-_LEFT_BY_KILLED_INGEST = {".lock", ".lock.pid", ".partial", "ingest.new", "run.json.new"}
+_LEFT_BY_KILLED_INGEST = {".lock", ".lock.pid", ".partial", "ingest.new", "run.json", "run.json.new"}
 
 
 class Session:
@@ -240,11 +240,12 @@ class Run:
             counts=jsonable(counts),
             warnings=jsonable(list(warnings)),
         )
+        # Before the record, with which a kill no longer undoes the stage: the report states these versions.
+        self._stopwatch.note(self._session, self._stage.name)
         write_json(self.folder / "stage.json", {"schema": SCHEMA, **asdict(self._record)})
         sync(self._session)
         self.outdated = _outdated(self._session, self._record)
         _roll_forward(self._session, self._stage.name)
-        self._stopwatch.note(self._session, self._stage.name)
         return self._record
 
     def _outputs(self) -> dict[str, str]:

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from pipelines.session.errors import BusyError, DataError
-from pipelines.session.stage_records import COMMANDS, SCHEMA, NewerSchemaError, Stage, key_of
+from pipelines.session.stage_records import COMMANDS, SCHEMA, NewerSchemaError, Stage, key_of, versions_of
 from pipelines.session.stages import Run, locked, open_session
 from pipelines.session.storage import read_json, sha256_of, write_json
 
@@ -187,6 +187,7 @@ def test_kill_at_every_step_and_again_while_mending(prepared: tuple[Path, Path],
             assert_every_stage_is_whole(folder)
         work(folder)
         assert contents(folder) == expected, f"killed at step {step}"
+        assert versions_of(folder).keys() == versions_of(end).keys(), f"killed at step {step}"
     assert step > 40, "the faults were not injected"
 
 

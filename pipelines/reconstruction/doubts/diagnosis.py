@@ -261,8 +261,8 @@ def _without_number(trial: Trial, hypotheses: Sequence[Hypothesis]) -> list[Hypo
 def _of_one_clock(trial: Trial, hypotheses: Sequence[Hypothesis], stated: float) -> list[Hypothesis]:
     """Return clocks and frame rates of one camera with their cost, to compete with faults.
 
-    The rays tell them more surely than the score does. By how much they lower the chi^2 of the moments that
-    they show is taken from that of all moments, so that costs can be compared.
+    The chi^2 of the rays is more sensitive to them than the score. Their gain of chi^2, on the moments that
+    they show, is subtracted from the chi^2 of all moments, so that costs can be compared.
 
     Args:
         trial: the flight.
