@@ -18,6 +18,10 @@ from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 _ATTEMPTS, _QUICKER = 5, 0.7  # to hit a command before it ends
 _FRAMES = 40  # replaying takes a second at the least
 _EXPORTED = "trc,c3d,bvh,csv,tum,mcap"
+_SMALL_STUDY = (
+    *("--seconds", "8", "--rate", "5", "--trials", "2", "--workers", "1"),
+    *("--methods", "dlt,robust", "--levels", "medium"),
+)
 SCENARIO = """\
 schema: 1
 name: Kills
@@ -69,15 +73,33 @@ def commands_on(folder: Path) -> dict[str, Command]:
     ingested, reconstructed, replanned, reported = (
         folder / f"{name}.session" for name in ("ingested", "reconstructed", "replanned", "reported")
     )
-    exported, simulated = folder / "exported", folder / "simulated"
+    exported, simulated, studied = (folder / name for name in ("exported", "simulated", "studied"))
+    detected, batched = folder / "detected.session", folder / "batched"
     detection = ("--detector", detector, "--workers", "1")
+    background = ("--method", "robust", "--refine-cameras", "background")  # most of it is detection
     return {
         "ingest": Command(["ingest", manifest, "-o", ingested], ingested),
+        "detect": Command(["reconstruct", detected, *background, *detection], detected, before=ingested),
         "reconstruct": Command(["reconstruct", reconstructed, *detection], reconstructed, before=ingested),
         "replan-compare": Command(["replan-compare", replanned], replanned, before=reconstructed),
         "report": Command(["report", reported], reported, before=replanned),
         "export": Command(["export", reconstructed, "-o", exported, "--to", _EXPORTED], exported, ()),
         "simulate": Command(["simulate", folder / "scenario.yaml", "-o", simulated], simulated),
+        "ablate": Command(["ablate", "tilt", *_SMALL_STUDY, "-o", studied], studied),
+        "batch": Command(
+            [
+                "batch",
+                manifest,
+                "-o",
+                batched,
+                "--stages",
+                "ingest,reconstruct",
+                "--method",
+                "robust",
+                *detection,
+            ],
+            batched,
+        ),
     }
 
 
