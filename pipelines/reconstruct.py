@@ -104,7 +104,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-RECONSTRUCT = Stage("reconstruct", revision=19)
+RECONSTRUCT = Stage("reconstruct", revision=20)
 
 _LONGEST_FILL_S = 10.0
 
@@ -701,15 +701,16 @@ def _people_warnings(people: Mapping[str, Any]) -> list[str]:
 
 
 def _phantom_warnings(phantoms: Mapping[str, int]) -> list[str]:
-    """Write how many bodies that two cameras see were taken for nobody, by cause."""
+    """Write how many bodies that two cameras see were left out, by cause."""
     words = {
         "ground": "not on the ground",
         "size": "not of a person's size",
         "misfit": "seen at different places by different cameras",
         "same": "a second image of a person",
+        "bystander": "beyond the cameras and never in all of their pictures, a bystander",
     }
     causes = ", ".join(f"{count} {words[cause]}" for cause, count in phantoms.items())
-    return [f"bodies that are no people, by --persons auto: {causes}"] if causes else []
+    return [f"bodies that --persons auto left out: {causes}"] if causes else []
 
 
 def _no_people_warnings(no_people: Mapping[str, Mapping[str, int]]) -> list[str]:

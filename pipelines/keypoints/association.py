@@ -15,7 +15,6 @@ from pipelines.geometry.arrays import Bool, Float
 from pipelines.keypoints.grouping import Followed, follow
 from pipelines.keypoints.no_people import (
     Body,
-    Ground,
     Scene,
     Views,
     level_of_most_seen,
@@ -49,7 +48,7 @@ class Association:
     no_people: dict[
         str, Int64
     ]  # [C] detections by the causes of `NoPeople`, which are not used; and those kept
-    phantoms: dict[str, int]  # bodies that two cameras see and that are no people, by `why_no_person`
+    phantoms: dict[str, int]  # bodies that two cameras see and that are left out, by `why_no_person`
     reasons: tuple[str, ...]  # messages for the user, one line each
 
 
@@ -126,8 +125,9 @@ def associate(
     refused: Counter[str] = Counter()
     if people is None:
         views = Views(xy, confidence, position, rotation, sigma)
-        ground = None if scene is None else scene.ground or level_of_most_seen(seen)
-        refused = _add_people(chains, tracks, time_s, seen.track, views, ground)
+        if scene is not None and scene.ground is None:
+            scene = scene._replace(ground=level_of_most_seen(seen))
+        refused = _add_people(chains, tracks, time_s, seen.track, views, scene)
     chosen = np.stack([_detections(seen.track, chain.owner, chain.taken) for chain in chains], axis=-1)
     resumed = np.array([max(0, len(chain.taken) - 1) for chain in chains], np.int64)
     if not np.any(chosen >= 0):
@@ -244,9 +244,9 @@ def _add_people(
     time_s: Float,
     track: Int64,
     views: Views,
-    ground: Ground | None,
+    scene: Scene | None,
 ) -> Counter[str]:
-    """Add everybody else who is a person; return how many bodies are none, by `why_no_person`.
+    """Add everybody else who is a person; return how many bodies are left out, by `why_no_person`.
 
     Bodies come in the order of how much they are seen. After one that is seen too shortly there are only
     pieces of bodies, which are not counted.
@@ -261,7 +261,7 @@ def _add_people(
     while tracks and len(chains) < _MOST_PEOPLE:
         chain, tracks = _next_chain(tracks, time_s)
         candidate = body(chain)
-        cause = why_no_person(candidate, people, time_s, views, ground)
+        cause = why_no_person(candidate, people, time_s, views, scene)
         if cause == "short":
             break
         if cause:

@@ -75,21 +75,23 @@ class Body(NamedTuple):
     middle: Float  # [T, 3] m, NaN where fewer than two cameras see the body
 
 
-def why_no_person(body: Body, people: list[Body], time_s: Float, views: Views, ground: Ground | None) -> str:
-    """Say why a body that two cameras see is no further person; empty if it is one.
+def why_no_person(body: Body, people: list[Body], time_s: Float, views: Views, scene: Scene | None) -> str:
+    """Say why a body that two cameras see is no further person to reconstruct; empty if it is one.
 
     Args:
         body: the detections in question.
         people: those already taken for people.
         time_s: [T] s, increasing.
         views: all detections.
-        ground: the surroundings, if known.
+        scene: the surroundings, if known.
 
     Returns:
         "short": seen by two cameras for less than a second, or never together with anybody, as the pieces
         of one lost person; "same": alongside a person, and never with them in one picture; "ground": too
-        high or too low; "size": not of a person's extent; "misfit": the views do not fit each other.
+        high or too low; "size": not of a person's extent; "misfit": the views do not fit each other;
+        "bystander": beyond the ring of the cameras, and never in all of their pictures.
     """
+    ground = None if scene is None else scene.ground
     step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     there: Bool = np.isfinite(body.middle[:, 0])
     together = np.zeros(len(there), np.bool_)
@@ -113,7 +115,34 @@ def why_no_person(body: Body, people: list[Body], time_s: Float, views: Views, g
     extent_m, misfit = _body_of(body.choice, rows[:: -(-len(rows) // _SAMPLES)], views)
     if not _USUAL_EXTENT_M[0] <= extent_m <= _EXTENT_M[1]:
         return "size"
-    return "misfit" if misfit > _LARGEST_MISFIT else ""
+    if misfit > _LARGEST_MISFIT:
+        return "misfit"
+    return "bystander" if scene is not None and _is_bystander(body, people, views, scene.fields) else ""
+
+
+def _is_bystander(body: Body, people: list[Body], views: Views, fields: Float) -> bool:
+    """Test if a body stands beyond the cameras that film the people, and never in all of their pictures.
+
+    Cameras about a person look inwards. Whoever is further from everybody taken for a person than half of the
+    cameras are is behind one of them. Two cameras on one side do not look inwards, and see them both.
+    """
+    rows = np.flatnonzero(np.isfinite(body.middle[:, 0]))
+    off = np.array([np.hypot(*(body.middle[rows] - one.middle[rows]).T[:2]) for one in people])
+    if not np.isfinite(off).any():
+        return False
+    off = np.where(np.isfinite(off), off, np.inf)
+    nearest = np.array([one.middle[rows] for one in people])[off.argmin(axis=0), np.arange(len(rows))]
+    met = np.isfinite(nearest[:, 0])
+    rows, nearest, apart = rows[met], nearest[met], off.min(axis=0)[met]
+    position, rotation = views.position[rows], views.rotation[rows]
+    posed = np.isfinite(position).all(axis=-1) & np.isfinite(rotation).all(axis=(-2, -1))
+    ring = np.where(posed, np.hypot(*np.moveaxis(position - nearest[:, None], -1, 0)[:2]), np.nan)
+    whole = np.ones(len(rows), np.bool_)
+    for c, field in enumerate(fields):
+        shown = _in_picture(body.middle[rows, None], position[:, c], rotation[:, c], field)[:, 0]
+        whole &= shown | ~posed[:, c]
+    beyond = apart > np.nanmedian(ring, axis=1)
+    return bool(beyond.mean() > _MOST and whole.mean() < _COMPANY)
 
 
 def _body_of(choice: Int64, rows: NDArray[np.intp], views: Views) -> tuple[float, float]:
@@ -301,16 +330,24 @@ def _others_look(
     for c in range(position.shape[1]):
         if c == camera:
             continue
-        origin, turned = position[time, c], rotation[time, c]
-        u, v, depth = np.einsum("nij,nki->jnk", turned, places - origin[:, None])
-        left, top, right, bottom = scene.fields[c]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            across, along = (u / depth - left) / (right - left), (v / depth - top) / (bottom - top)
-            inside = (np.minimum(across, along) > _EDGE) & (np.maximum(across, along) < 1 - _EDGE)
-        whole = (inside & (depth > 0) | ~usual).all(axis=1) & np.isfinite(depth).all(axis=1)
+        origin = position[time, c]
+        inside = _in_picture(places, origin, rotation[time, c], scene.fields[c], margin=_EDGE)
+        whole = (inside | ~usual).all(axis=1) & np.isfinite(origin).all(axis=1)
         rows = np.flatnonzero(whole & ~looked)
         looked[rows] = ~_hidden(origin[rows], places[rows], usual[rows], scene.ground)
     return looked
+
+
+def _in_picture(
+    places: Float, position: Float, rotation: Float, field: Float, *, margin: float = 0.0
+) -> Bool:
+    """Test which places [N, K, 3] are in the pictures of one camera [N], apart from a margin (a share)."""
+    u, v, depth = np.einsum("nij,nki->jnk", rotation, places - position[:, None])
+    left, top, right, bottom = field
+    with np.errstate(invalid="ignore", divide="ignore"):
+        across, along = (u / depth - left) / (right - left), (v / depth - top) / (bottom - top)
+        inside = (np.minimum(across, along) > margin) & (np.maximum(across, along) < 1 - margin)
+    return np.asarray(inside & (depth > 0), dtype=np.bool_)
 
 
 def _hidden(origin: Float, places: Float, usual: Bool, ground: Ground | None) -> Bool:

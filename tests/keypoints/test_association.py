@@ -41,7 +41,9 @@ class Scene:
     sigma: Float
     who: Int64 = field(repr=False)  # [T, C, D] the person, -1 none
 
-    def associate(self, people: int | None = 1, *logs: Path, sigma_m: float = 0.5) -> Association:
+    def associate(
+        self, people: int | None = 1, *logs: Path, sigma_m: float = 0.5, reach: float = 1.0
+    ) -> Association:
         heights, cameras = np.ones(len(self.time_s)), self.xy.shape[1]
         actors = [np.c_[log(self.time_s), heights] for log in logs]
         return associate(
@@ -54,7 +56,9 @@ class Scene:
             actors=np.stack(actors, axis=1) if actors else None,
             actor_sigma_m=sigma_m,
             people=people,
-            scene=None if people else Surroundings(_level, np.tile([-1.0, -1.0, 1.0, 1.0], (cameras, 1))),
+            scene=None
+            if people
+            else Surroundings(_level, np.tile([-reach, -reach, reach, reach], (cameras, 1))),
         )
 
     def chosen(self, result: Association, person: int = 0) -> Int64:
@@ -310,6 +314,31 @@ def test_phantoms_are_refused_and_counted(cause: str, shape: Shape) -> None:
     assert result.phantoms == {cause: 1}
     who = [scene.chosen(result, person) for person in range(result.choice.shape[2])]
     assert sorted(int(np.bincount(own[own >= 0]).argmax()) for own in who) == [0, 2]
+
+
+@pytest.mark.parametrize("away_m", [13.0, 7.0])
+def test_a_bystander_stands_beyond_the_cameras_and_is_never_in_all_pictures(away_m: float) -> None:
+    """Let two opposite cameras see somebody behind camera 0, or in front of it, where they are a person.
+
+    The cameras stand 9.7 m from the middle of the actor's way, and show 45 degrees to each side.
+    """
+    stands = straight((away_m * np.cos(0.3), away_m * np.sin(0.3)), (0.0, 0.0))
+    scene = film([straight((-0.5, 0.0), (0.2, 0.0)), stands])
+    for camera in (0, 1, 4):
+        scene = scene.hide(1, camera)
+    result = scene.associate(None)
+    behind = away_m > RANGE_M
+    assert result.choice.shape[2] == (1 if behind else 2)
+    assert result.phantoms == ({"bystander": 1} if behind else {})
+
+
+def test_who_is_in_all_pictures_is_no_bystander() -> None:
+    """Let two cameras that face each other see somebody 13 m to the side, further away than they are."""
+    stands = straight((-13.0 * np.sin(0.3), 13.0 * np.cos(0.3)), (0.0, 0.0))
+    scene = film([straight((-0.5, 0.0), (0.2, 0.0)), stands], cameras=2)
+    result = scene.associate(None, reach=2.0)
+    assert result.choice.shape[2] == 2
+    assert result.phantoms == {}
 
 
 def test_a_bystander_is_not_taken_for_the_actor_where_the_actor_is_hidden() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.keypoints.association import associate
+from pipelines.keypoints.no_people import Scene
 from tests.real_data import real_data
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
@@ -40,10 +41,13 @@ def test_the_person_of_interest_is_the_one_the_peer_associated() -> None:
     shape = (FRAMES, len(CAMERAS))
     xy = np.full((*shape, MOST_PEOPLE, JOINTS, 2), np.nan)
     confidence = np.zeros((*shape, MOST_PEOPLE, JOINTS))
+    fields: list[Float] = []
     position, rotation, sigma = np.empty((*shape, 3)), np.empty((*shape, 3, 3)), np.empty(shape)
     for c, camera in enumerate(CAMERAS):
         one = calibration[camera]
         matrix, distortion = np.array(one["matrix"]), np.array(one["distortions"])
+        corners = np.array([[[0.0, 0.0]], [[float(x) for x in one["size"]]]])
+        fields.append(cv2.undistortPoints(corners, matrix, distortion).ravel())
         world_from_camera = cv2.Rodrigues(np.array(one["rotation"]))[0].T
         rotation[:, c] = world_from_camera
         position[:, c] = -world_from_camera @ np.array(one["translation"])
@@ -68,6 +72,6 @@ def test_the_person_of_interest_is_the_one_the_peer_associated() -> None:
     assert agreed >= 398
     assert result.views[0] == 400
     assert np.all(result.people == 2)  # one bystander stands in the view of two cameras
-    everybody = associate(*seen, people=None)  # and so is the second person, of these cameras alone
-    assert np.array_equal(everybody.choice[..., 0], result.choice[..., 0])
-    assert (everybody.choice[..., 1:] >= 0).sum(axis=0).T.tolist() == [[FRAMES, FRAMES, 0, 0]]
+    everybody = associate(*seen, people=None, scene=Scene(None, np.array(fields)))
+    assert np.array_equal(everybody.choice, result.choice)  # and is behind the other two: no second person
+    assert everybody.phantoms == {"bystander": 1}
