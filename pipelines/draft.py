@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from pipelines.drafting.found import (
+    Angles,
     Calibration,
     Driver,
     DroneLog,
@@ -53,7 +54,7 @@ from pipelines.geometry.geodesy import Place, enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import interpolate_points, multiply
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import OwnLog, read_flight
+from pipelines.session.manifest import AngleLog, OwnLog, read_flight
 from pipelines.session.maps import MapSizeError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import PoseSample
@@ -70,7 +71,7 @@ from pipelines.session.registries import (
     VideoFormat,
 )
 from pipelines.session.storage import as_data_error
-from pipelines.session.telemetry import Telemetry, TelemetryChoice, TelemetryFormat
+from pipelines.session.telemetry import AttitudeFormat, Telemetry, TelemetryChoice, TelemetryFormat
 from pipelines.session.unknown_files import EXPECTED
 
 _FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
@@ -87,6 +88,9 @@ _KEYS: dict[str, OwnLog] = {
     "parrot": "parrot",
 }
 """The key in a manifest for each format of a drone's own log."""
+
+_ANGLE_KEYS: dict[OwnLog, AngleLog] = {"dji": "dji", "gopro": "gopro", "parrot": "parrot"}
+"""The key in a gimbal for each key of a log whose angles are of use without its positions."""
 
 _OTHER_KINDS: dict[str, TopicKind] = {
     **dict.fromkeys(MAP_TYPES, "maps"),
@@ -373,18 +377,40 @@ def _span(t_ns: Int64) -> Span:
 # --- drones' own logs ------------------------------------------------------------------------------------
 
 
-def _drone_logs(head: Found, format_: TelemetryFormat) -> list[DroneLog]:
+def _drone_logs(head: Found, format_: TelemetryFormat) -> list[Found]:
     """Describe the poses in a drone's own log, with or without attitudes; those of each vehicle in it.
 
+    Attitudes that come without positions, or without north, are a thing of their own.
+
     Raises:
-        DataError: it cannot be read, or holds no position.
+        DataError: it cannot be read, or holds neither positions nor attitudes.
     """
     key = _KEYS.get(head.format)
     if key is None:
         return []
     vehicles = TLOG.vehicles(head.path) if head.format == TLOG.name else []
     instances = vehicles if len(vehicles) > 1 else [None]
-    return [_drone_log(head, format_, key, instance) for instance in instances]
+    try:
+        logs = [_drone_log(head, format_, key, instance) for instance in instances]
+    except DataError:
+        if angles := _angles(head, format_, key):
+            return [*angles]
+        raise
+    whole = any(log.gimbal for log in logs)
+    return [*logs, *([] if whole else _angles(head, format_, key))]
+
+
+def _angles(head: Found, format_: Format, key: OwnLog) -> list[Angles]:
+    """Describe the camera's attitudes in a log that can be used for them alone; empty without any."""
+    angle_key = _ANGLE_KEYS.get(key)
+    if angle_key is None or not isinstance(format_, AttitudeFormat):
+        return []
+    try:
+        found = format_.read_attitudes(head.path)
+    except DataError:
+        return []
+    about = (head.path, head.place, head.format, head.title)
+    return [Angles(*about, angle_key, len(found.camera.t_ns), found.knows_north)]
 
 
 def _drone_log(head: Found, format_: TelemetryFormat, key: OwnLog, instance: int | None) -> DroneLog:

@@ -288,7 +288,7 @@ class _FlightReader:
                 detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics)
             detections = near_picture(detections, intrinsics)
         frames = self._cameras.frames(name, camera, video, detections, intrinsics)
-        trajectory = self._poses.trajectory(name, camera, int(frames.t_ns[0]))
+        trajectory = self._poses.trajectory(name, camera, frames)
         if camera.pose_noise:
             noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", camera.pose_noise)
         if detections is not None:

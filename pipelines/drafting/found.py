@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple, TypeVar
 
 from pipelines.drafting.labels import OPTICAL, Label, Place, is_called, label_of, label_of_place
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import OwnLog, read_flight
+from pipelines.session.manifest import AngleLog, OwnLog, read_flight
 from pipelines.session.registries import (
     FORMATS,
     CalibrationFormat,
@@ -170,6 +170,15 @@ class DroneLog(Found):
 
 
 @dataclass(frozen=True)
+class Angles(Found):
+    """Attitudes of a camera in a log, for the positions of another one."""
+
+    key: AngleLog  # its key in a gimbal
+    count: int
+    knows_north: bool
+
+
+@dataclass(frozen=True)
 class Driver:
     """Topics of a drone in a log that make poses together: those of a preset, or two that are named."""
 
@@ -215,7 +224,7 @@ class Recording(Found):
         return Span(min(s.first_ns for s in spans), max(s.last_ns for s in spans))
 
 
-_KINDS = (Video, Keypoints, Recording, DroneLog, Poses, Calibration, FrameTimes, Joints, Map)
+_KINDS = (Video, Keypoints, Recording, DroneLog, Angles, Poses, Calibration, FrameTimes, Joints, Map)
 
 
 @dataclass(frozen=True)

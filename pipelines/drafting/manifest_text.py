@@ -17,6 +17,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from pipelines.drafting.found import (
+    Angles,
     Calibration,
     DroneLog,
     Found,
@@ -320,6 +321,10 @@ class CameraText:
         if self._camera.poses is None:
             return []
         taken = self._camera.poses.taken
+        if self._camera.gimbal is None and (taken.unturned or taken.of_body):
+            own = self._camera.angles
+            if own is not None and isinstance(own.found, Angles):
+                return self._own_angles(own, own.found, taken)
         if taken.unturned and self._camera.gimbal is None:
             self._miss("gimbal: how the camera was turned, for its log does not say it")
             return [
@@ -332,11 +337,7 @@ class CameraText:
             return []
         choice = self._camera.gimbal
         if choice is None:
-            self._assume("mount", "the camera looks forward, level, from the body's origin")
-            settings = {"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}
-            return [
-                self._entry("mount", settings, "assumed: along the body's x axis, level, no lever arm (m)")
-            ]
+            return [self._fixed_mount()]
         self._miss("gimbal: relative_to, what its angles are relative to")
         lines = ["gimbal:", *(f"  {entry(key, value)}" for key, value in choice.taken.settings.items())]
         lines.append(
@@ -349,6 +350,24 @@ class CameraText:
             lines.append("  assumed: true")
         lines.append("# mount: {looks: forward, translation: [0, 0, 0]}  # the lever arm to the gimbal, m")
         return [*lines, *self._others("gimbal", choice.others)]
+
+    def _fixed_mount(self) -> str:
+        self._assume("mount", "the camera looks forward, level, from the body's origin")
+        settings = {"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}
+        return self._entry("mount", settings, "assumed: along the body's x axis, level, no lever arm (m)")
+
+    def _own_angles(self, own: Candidate, found: Angles, taken: Candidate) -> list[str]:
+        """Write the camera's attitudes in its own video, for poses that lack them."""
+        lever_arm = "# mount: {looks: forward, translation: [0, 0, 0]}  # the lever arm to the gimbal, m"
+        held = f"{found.count} attitudes of the camera in its video"
+        if found.knows_north:
+            return [self._entry("gimbal", own.settings, held), lever_arm]
+        unsure = entry("gimbal", stated({**own.settings, "yaw_deg": 90}, self._relative), "")
+        heading = "yaw_deg is where its first picture looks, from north to east"
+        if taken.of_body:
+            return [self._fixed_mount(), commented(f"# or {unsure}", f"if it turned in a gimbal: {heading}")]
+        self._miss("gimbal: yaw_deg, the heading of its first picture, which a GoPro does not log")
+        return [commented(f"# {unsure}", f"missing: {heading} ({held})"), lever_arm]
 
     def _noise(self) -> list[str]:
         if self._camera.poses is None or self._camera.poses.taken.span is None:

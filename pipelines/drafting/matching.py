@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from pipelines.drafting.found import (
+    Angles,
     Calibration,
     DroneLog,
     Findings,
@@ -271,6 +272,7 @@ class CameraDraft:
     frame_times: Choice | None = None
     poses: Choice | None = None
     gimbal: Choice | None = None
+    angles: Candidate | None = None  # attitudes in its own video
     intrinsics: Choice | None = None
     true_poses: Choice | None = None
 
@@ -282,7 +284,8 @@ class CameraDraft:
     def mentioned(self) -> list[Candidate]:
         """List every candidate that the manifest mentions for it, also those in comments."""
         choices = (self.frame_times, self.poses, self.gimbal, self.intrinsics, self.true_poses)
-        return [*self.videos, *self.keypoints, *(c for choice in choices if choice for c in choice.all)]
+        angles = [self.angles] if self.angles else []
+        return [*self.videos, *self.keypoints, *angles, *(c for each in choices if each for c in each.all)]
 
 
 @dataclass(frozen=True)
@@ -344,6 +347,10 @@ def match(findings: Findings, compare: Compare | None = None, distance: Distance
         if camera.poses and (camera.poses.taken.of_body or camera.poses.taken.unturned):
             camera.gimbal = choose(gimbals)
 
+    for camera in cameras:
+        films = [video.found.path for video in camera.videos[:1]]
+        own = [found for found in findings.of(Angles) if found.path in films]
+        camera.angles = _of_file(own[0], own[0].key) if own else None
     _pair_drones(cameras, moving, compare)
     _prefer_attitudes(cameras, moving, distance)
     actors = [c for c in pose_topics if is_called(_topic_of(c), ACTOR)]

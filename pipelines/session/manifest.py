@@ -304,12 +304,23 @@ class FixedAngles(Part):
     roll_deg: float = Field(0.0, ge=-180, le=180)
 
 
+AngleLog = Literal["dji", "gopro", "parrot"]
+"""The key of a log in a gimbal, whose angles of the camera are used without its positions."""
+
+
+_ANGLE_LOGS: tuple[AngleLog, ...] = get_args(AngleLog)
+
+
 class Gimbal(Guess):
-    """Source of the gimbal's angles: a topic, fixed angles, or the drone's own log that gives the pose."""
+    """Source of the gimbal's angles: a topic, fixed angles, another log, or the log that gives the pose."""
 
     log: str | None = None
     topic: str | None = None
     fixed: FixedAngles | None = None
+    dji: str | None = None  # video, flight record or subtitles
+    gopro: str | None = None  # video with a track of GPMF
+    parrot: str | None = None  # video with Parrot's track
+    yaw_deg: float | None = Field(None, ge=-360, le=360)  # heading of the first picture, where none is logged
     relative_to: RelativeTo | None = None
     order: Literal["ypr", "rpy", "pry"] = "ypr"
     units: Literal["deg", "rad"] = "deg"
@@ -317,8 +328,21 @@ class Gimbal(Guess):
 
     @model_validator(mode="after")
     def _complete(self) -> Gimbal:
-        if self.fixed is not None and self.log is not None:
-            raise ValueError("has a log and fixed angles: leave one of them out")
+        sources: dict[str, object] = {"a log": self.log, "fixed angles": self.fixed}
+        sources |= {key: getattr(self, key) for key in _ANGLE_LOGS}
+        if len(stated := [name for name, source in sources.items() if source is not None]) > 1:
+            raise ValueError(f"has {' and '.join(stated)}: leave all but one of them out")
+        if self.gopro is not None and self.yaw_deg is None:
+            raise ValueError(
+                "lacks yaw_deg, the heading of the first picture from north to east: a GoPro logs how it"
+                " turned from there on, not where north is"
+            )
+        if self.gopro is None and self.yaw_deg is not None:
+            raise ValueError("yaw_deg: only a gopro has that; write fixed: {yaw_deg, pitch_deg}")
+        if self.gopro is not None and self.relative_to not in {None, "world"}:
+            raise ValueError("relative_to: a GoPro's attitudes are those in the world, leave it out")
+        if self.own_log is not None and self.topic is None:
+            return self
         if self.log is not None:
             missing = [name for name in ("topic", "relative_to") if getattr(self, name) is None]
             if missing:
@@ -328,6 +352,16 @@ class Gimbal(Guess):
         elif self.fixed is None and self.relative_to is None:
             raise ValueError("needs log and topic, fixed angles, or what the drone's own are relative_to")
         return self
+
+    @property
+    def own_log(self) -> tuple[AngleLog, str] | None:
+        """Key and path of the log whose angles are used without its positions; None for another source."""
+        return next(((key, path) for key in _ANGLE_LOGS if (path := getattr(self, key)) is not None), None)
+
+    @property
+    def is_of_pose(self) -> bool:
+        """True if the angles are those of the log that gives the pose."""
+        return self.log is None and self.fixed is None and self.own_log is None
 
 
 class IntrinsicsSource(Guess):
@@ -395,7 +429,7 @@ class Camera(Part):
         if carried and self.pose.of != "body" and not may_carry:
             raise ValueError("a mount or gimbal needs the pose of the body: add `of: body` to `pose`")
         gimbal = self.gimbal
-        if gimbal and gimbal.log is None and gimbal.fixed is None and not self.pose.is_telemetry:
+        if gimbal and gimbal.is_of_pose and not self.pose.is_telemetry:
             raise ValueError("gimbal: needs log and topic, or fixed: {yaw_deg: 90, pitch_deg: -30}")
         if self.pose.static and self.pose.of == "body":
             raise ValueError("a still camera's pose is its own: leave `of: body` and the mount out")

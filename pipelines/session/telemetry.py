@@ -64,6 +64,17 @@ class Telemetry:
 
 
 @dataclass(frozen=True)
+class Attitudes:
+    """Attitudes of a camera by the telemetry of its video, or by another log, which may lack positions."""
+
+    camera: AttitudeTrack  # relative to the world
+    clock: str  # as in `Telemetry`
+    knows_north: bool = True  # False: it looks north in the first picture, and only its turns are known
+    video_began_ns: int | None = None  # by the clock of the times; None for a log that is no video
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class TelemetryChoice:
     """The user's choice among several sources in a drone's log; None leaves the choice to the reader."""
 
@@ -79,6 +90,14 @@ class TelemetryFormat(Format, Protocol):
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position and attitudes, in ENU and FLU; raise DataError if there is no position."""
+
+
+@runtime_checkable
+class AttitudeFormat(Format, Protocol):
+    """Logs whose angles of the camera are of use without their positions."""
+
+    def read_attitudes(self, path: Path) -> Attitudes:
+        """Read the attitudes of the camera, in ENU and FLU; raise DataError if there are none."""
 
 
 @runtime_checkable

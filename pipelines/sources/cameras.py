@@ -41,7 +41,7 @@ _LARGEST_SHARE_OUTSIDE = 0.5
 class PosesOfCameras(Protocol):
     """Reader of the poses of cameras, for videos whose start is estimated, and of trigger times."""
 
-    def trajectory(self, name: str, camera: Camera, first_frame_ns: int) -> Trajectory:
+    def trajectory(self, name: str, camera: Camera, frames: CameraFrames | None) -> Trajectory:
         """Read world_from_camera over time."""
 
     def triggers(self, kind: TriggerLog, stated: str) -> Int64:
@@ -210,7 +210,7 @@ class FlightCameras:
         remedy = "say start: SECONDS instead, or give the stamps of a log"
         if camera.video is None or camera.video.path is None or camera.pose.static:
             raise DataError(place, "start_from: motion needs a video and poses that move", remedy)
-        poses = self._poses.trajectory(name, camera, 0)
+        poses = self._poses.trajectory(name, camera, None)
         some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + _WATCHED_NS))
         try:
             fit = fit_start(

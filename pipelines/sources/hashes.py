@@ -101,12 +101,14 @@ def stated_paths(flight: Flight) -> list[str]:
         pose, times, video = camera.pose, camera.frame_times, camera.video
         take(pose.tum, pose.csv, pose.static.path if pose.static else None, camera.intrinsics.path)
         take(camera.keypoints.path if camera.keypoints else None)
-        gimbal_log = camera.gimbal.log if camera.gimbal else None
+        gimbal = camera.gimbal
+        angles = gimbal.own_log if gimbal else None
         for log in (
             pose.log,
             pose.own_log[1] if pose.own_log else None,
             camera.intrinsics.log,
-            gimbal_log,
+            gimbal.log if gimbal else None,
+            angles[1] if angles else None,
         ):
             take_log(log)
         if times:

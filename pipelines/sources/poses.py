@@ -32,6 +32,7 @@ from pipelines.geometry.poses import (
     mounted_covariance,
     multiply,
     quaternion_from_matrix,
+    quaternion_from_rotation_vector,
 )
 from pipelines.session.description import Doubt
 from pipelines.session.errors import DataError
@@ -41,6 +42,7 @@ from pipelines.session.records import Occupancy, Trajectory
 from pipelines.session.registries import FORMATS, Format, TrajectoryFormat, recognise
 from pipelines.session.stores import located
 from pipelines.session.telemetry import (
+    AttitudeFormat,
     AttitudeTrack,
     PositionTrack,
     Telemetry,
@@ -50,6 +52,7 @@ from pipelines.session.telemetry import (
 )
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
+from pipelines.sources.parts import CameraFrames
 from pipelines.sources.projections import Projection, is_usable
 from pipelines.sources.world import (
     as_stated,
@@ -114,8 +117,13 @@ class FlightPoses:
 
     # --- cameras ---------------------------------------------------------------------------------------
 
-    def trajectory(self, name: str, camera: Camera, first_frame_ns: int) -> Trajectory:
+    def trajectory(self, name: str, camera: Camera, frames: CameraFrames | None) -> Trajectory:
         """Read world_from_camera over time; a static camera has one row, at its first frame.
+
+        Args:
+            name: name of the camera.
+            camera: its description.
+            frames: times of its pictures; None if they follow from the poses.
 
         Raises:
             DataError: nothing usable, or the manifest does not state the camera's mount on the body.
@@ -123,9 +131,11 @@ class FlightPoses:
         pose = camera.pose
         if pose.static:
             source, still = self._stated_poses(name, camera)
-            return replace(self._local(source, still), t_ns=np.array([first_frame_ns]))
+            first_ns = int(frames.t_ns[0]) if frames is not None else 0
+            return replace(self._local(source, still), t_ns=np.array([first_ns]))
+        angles = None if camera.gimbal is None else self._stated_angles(name, camera, frames)
         if pose.is_telemetry:
-            return in_world(self._joined_trajectory(name, camera), pose.world_from_source)
+            return in_world(self._joined_trajectory(name, camera, angles), pose.world_from_source)
         source, stated = self._stated_poses(name, camera)
         of_camera = self._is_of_camera(camera)
         if of_camera and pose.log and pose.of is None and pose.child is None:
@@ -133,7 +143,9 @@ class FlightPoses:
                 f"{name}: poses in {pose.log} are taken as the camera's (say `of: body` with a mount if not)"
             )
         local = self._local(source, stated)
-        return in_world(local if of_camera else self._on_body(name, camera, local), pose.world_from_source)
+        if not of_camera:
+            local = self._on_body(name, camera, local, angles)
+        return in_world(local, pose.world_from_source)
 
     def _stated_poses(self, name: str, camera: Camera) -> tuple[Path, Trajectory]:
         """Read poses of a camera or of its body, in ENU axes, but not yet out of a map projection."""
@@ -190,15 +202,17 @@ class FlightPoses:
             place = f"{self._manifest}: cameras.{name}.mount"
             raise DataError(place, str(error), "say how the camera sits on the body") from None
 
-    def _on_body(self, name: str, camera: Camera, body: Trajectory) -> Trajectory:
-        """Compute the poses of the camera from those of the body that carries it."""
+    def _on_body(
+        self, name: str, camera: Camera, body: Trajectory, angles: AttitudeTrack | None
+    ) -> Trajectory:
+        """Compute the poses of the camera from those of the body that carries it, and of its gimbal."""
         lever_arm, rotation = self._mounted(name, camera.mount)
         world_from_body = (body.position, body.quaternion_xyzw)
         dropped = dict(body.dropped)
-        if camera.gimbal is None:
+        if angles is None:
             position, quaternion = compose_mount(world_from_body, (lever_arm, rotation))
         else:
-            position, quaternion, lost = self._on_gimbal(camera, body, lever_arm, rotation)
+            position, quaternion, lost = self._on_gimbal(angles, body, lever_arm, rotation)
             dropped |= lost
         known = ~np.isnan(quaternion[:, 0])
         if not known.any():
@@ -217,17 +231,13 @@ class FlightPoses:
             quaternion_xyzw=quaternion[known],
             covariance=covariance,
             dropped=dropped,
-            body_xyzw=body.quaternion_xyzw[known] if camera.gimbal is not None else None,
+            body_xyzw=body.quaternion_xyzw[known] if angles is not None else None,
         )
 
     def _on_gimbal(
-        self, camera: Camera, body: Trajectory, lever_arm: Float, rotation: Float
+        self, track: AttitudeTrack, body: Trajectory, lever_arm: Float, rotation: Float
     ) -> tuple[Float, Float, dict[str, int]]:
         """Compute positions and rotations of a camera on a gimbal; also return losses by cause."""
-        gimbal = camera.gimbal
-        if gimbal is None:
-            raise ValueError("the camera has no gimbal")
-        track = self._stated_angles(gimbal)
         attitude = self._at(track, body.t_ns)
         position, quaternion = compose_gimbal(
             (body.position, body.quaternion_xyzw),
@@ -241,8 +251,16 @@ class FlightPoses:
             lost["pose without gimbal angles"] = without
         return position, quaternion, lost
 
-    def _stated_angles(self, gimbal: Gimbal) -> AttitudeTrack:
-        """Return the attitude of a gimbal with a topic or fixed angles, in our axes at world times."""
+    def _stated_angles(self, name: str, camera: Camera, frames: CameraFrames | None) -> AttitudeTrack | None:
+        """Return the attitude of a gimbal by the source that the manifest names, in our axes at world times.
+
+        None if it names none: the angles are those of the drone's own log that gives the pose.
+        """
+        gimbal = camera.gimbal
+        if gimbal is None or gimbal.is_of_pose:
+            return None
+        if gimbal.own_log is not None:
+            return self._angles_alone(name, camera, gimbal, frames)
         relative_to = gimbal.relative_to or "world"
         if gimbal.fixed is not None:
             angles = np.array([[gimbal.fixed.yaw_deg, gimbal.fixed.pitch_deg, gimbal.fixed.roll_deg]])
@@ -254,6 +272,54 @@ class FlightPoses:
         turned = attitude_in_enu(logged.quaternion_xyzw, relative_to=relative_to, axes=axes)
         lost = {f"gimbal angles: {cause}": count for cause, count in logged.dropped.items()}
         return AttitudeTrack(topic, logged.t_ns, turned, relative_to, dropped=lost)
+
+    def _angles_alone(
+        self, name: str, camera: Camera, gimbal: Gimbal, frames: CameraFrames | None
+    ) -> AttitudeTrack:
+        """Read the camera's attitudes from a log whose positions are not used.
+
+        Those inside the camera's own video are at the times of its pictures, those of another log by its
+        clock.
+
+        Raises:
+            DataError: there are none, or nothing places them in time.
+        """
+        kind, stated = gimbal.own_log or ("dji", "")
+        path, place = self._one_file(stated), f"{self._manifest}: cameras.{name}.gimbal"
+        reader = _reader(kind, path)
+        if not isinstance(reader, AttitudeFormat):
+            raise DataError(path, "gives no angles without positions", "name it as the pose, or another log")
+        found = reader.read_attitudes(path)
+        track = found.camera
+        own = camera.video.path if camera.video else None
+        if found.video_began_ns is not None and own and located(self._base, own).samefile(path):
+            if frames is None:
+                raise DataError(
+                    place,
+                    "its attitudes are at the times of its pictures, which start_from: motion cannot find by"
+                    " them",
+                    "state frame_times: {start: SECONDS}",
+                )
+            track = replace(track, t_ns=_at_pictures(track.t_ns - found.video_began_ns, frames))
+            clock = "at the times of its pictures"
+        elif found.clock == "the video's start":
+            raise DataError(
+                path,
+                "has angles that count from its own start, and is not the camera's video",
+                "name that video, if they are in it",
+            )
+        else:
+            track = replace(track, t_ns=self._world_times(stated, track.t_ns, int(track.t_ns[0])))
+            clock = f"by {found.clock}"
+        track = _turned_as_named(place, stated, track, gimbal)
+        if not found.knows_north:
+            heading = quaternion_from_rotation_vector(np.array([0.0, 0.0, -np.radians(gimbal.yaw_deg or 0)]))
+            track = replace(track, quaternion_xyzw=multiply(heading, track.quaternion_xyzw))
+        for note in found.notes:
+            self._note(note)
+        self._note(f"{name}: its camera is turned by {track.name} of {stated}, {clock}")
+        lost = {f"gimbal angles: {cause}": count for cause, count in track.dropped.items()}
+        return replace(track, dropped=lost)
 
     def _at(self, track: AttitudeTrack, t_ns: Int64) -> Float:
         """Interpolate attitudes [N, 4] at given times, NaN outside the track; fixed angles always hold."""
@@ -414,7 +480,7 @@ class FlightPoses:
                 reader = _reader(kind, path)
                 if not isinstance(reader, TelemetryFormat):
                     raise DataError(path, f"the format {kind} reads no telemetry")
-                self._telemetry[key] = reader.read_telemetry(path, choice)
+                self._telemetry[key] = _positions_of(reader, path, choice)
         return self._telemetry[key]
 
     def _logged_telemetry(self, pose: PoseSource, choice: TelemetryChoice) -> Telemetry:
@@ -430,6 +496,13 @@ class FlightPoses:
                 axes = self._axes(pose.axes, opened.settings.axes)
                 found = read_pair(recording, source, pose.topic or "", pose.attitude or "", axes, stamps)
             return replace(found, dropped=dict(Counter(found.dropped) + opened.lost))
+
+    def _own_angles(self, pose: PoseSource) -> str:
+        """Return the gimbal's entry that takes the attitudes without north in the log of a pose, or ""."""
+        if pose.own_log is None:
+            return ""
+        path = self._one_file(pose.own_log[1])
+        return _entry_of_angles(_reader(pose.own_log[0], path), path)
 
     def log_clock(self, camera: Camera) -> ClockFit | None:
         """Return the fit of a drone's log clock to GPS time; None without one."""
@@ -532,8 +605,8 @@ class FlightPoses:
 
     # --- poses of cameras ------------------------------------------------------------------------------
 
-    def _joined_trajectory(self, name: str, camera: Camera) -> Trajectory:
-        """Compute world_from_camera over time from a drone's own log.
+    def _joined_trajectory(self, name: str, camera: Camera, angles: AttitudeTrack | None) -> Trajectory:
+        """Compute world_from_camera over time from a drone's own log, and the stated angles of its gimbal.
 
         The stamps are those of positions or of attitudes, whichever have the higher rate. The others are
         interpolated, never across a gap.
@@ -546,7 +619,7 @@ class FlightPoses:
         telemetry = self._read(pose)
         for note in telemetry.notes:
             self._note(note)
-        body, gimbal = telemetry.body, self._gimbal(name, camera, telemetry)
+        body, gimbal = telemetry.body, angles or self._gimbal(name, camera, telemetry)
         self._refuse_unturned(name, camera, telemetry, gimbal)
         stated = pose.telemetry_source
         settings = self._logs.settings(stated)
@@ -579,38 +652,27 @@ class FlightPoses:
         return self._complete(name, settings, dropped, t_ns, position, multiply(turned, quaternion))
 
     def _gimbal(self, name: str, camera: Camera, telemetry: Telemetry) -> AttitudeTrack | None:
-        """Return the manifest's angles, or those of the drone's own log unless the body's are asked for."""
+        """Return the angles of the drone's own log, unless the body's attitudes are asked for."""
         gimbal, own = camera.gimbal, telemetry.gimbal
         if gimbal is None:
             if own is None or camera.pose.of == "body":
                 return None
             self._note(f"{name}: its camera is turned by {own.name} of {camera.pose.telemetry_source}")
             return self._at_world_times(camera.pose, telemetry, own)
-        if gimbal.fixed is None and gimbal.log is None:
-            if own is None:
-                raise DataError(
-                    self._manifest,
-                    f"cameras.{name}.gimbal: {camera.pose.telemetry_source} holds no gimbal angles",
-                    "name the log and topic that do, or fixed angles",
-                )
-            moved = self._at_world_times(camera.pose, telemetry, own)
-            meant = gimbal.relative_to or "world"
-            if meant in moved.stated:
-                turned = attitude_in_enu(moved.stated[meant], relative_to=meant, axes="ned")
-            elif meant == moved.relative_to:
-                turned = moved.quaternion_xyzw
-            else:
-                raise DataError(
-                    f"{self._manifest}: cameras.{name}.gimbal",
-                    f"{own.name} of {camera.pose.telemetry_source} cannot be taken relative to the {meant}",
-                    f"write relative_to: {moved.relative_to}",
-                )
-            self._note(
-                f"{name}: its camera is turned by {own.name} of {camera.pose.telemetry_source},"
-                f" relative to the {meant} as stated"
+        if own is None:
+            raise DataError(
+                self._manifest,
+                f"cameras.{name}.gimbal: {camera.pose.telemetry_source} holds no gimbal angles",
+                "name the log and topic that do, or fixed angles",
             )
-            return replace(moved, quaternion_xyzw=turned, relative_to=meant)
-        return self._stated_angles(gimbal)
+        moved = self._at_world_times(camera.pose, telemetry, own)
+        place = f"{self._manifest}: cameras.{name}.gimbal"
+        turned = _turned_as_named(place, camera.pose.telemetry_source, moved, gimbal)
+        self._note(
+            f"{name}: its camera is turned by {own.name} of {camera.pose.telemetry_source},"
+            f" relative to the {turned.relative_to} as stated"
+        )
+        return turned
 
     def _at_world_times(self, pose: PoseSource, telemetry: Telemetry, track: AttitudeTrack) -> AttitudeTrack:
         since_ns = int(telemetry.position.t_ns[0])
@@ -622,9 +684,9 @@ class FlightPoses:
         place = f"{self._manifest}: cameras.{name}"
         stated = camera.pose.telemetry_source
         if telemetry.body is None and gimbal is None:
-            raise DataError(
-                place, f"{stated} says where the drone was but not how it was turned", _ADD_ANGLES
-            )
+            own = self._own_angles(camera.pose)
+            remedy = f"add {own} with the heading of its first picture" if own else _ADD_ANGLES
+            raise DataError(place, f"{stated} says where the drone was but not how it was turned", remedy)
         if telemetry.body is None and gimbal is not None and gimbal.relative_to != "world":
             raise DataError(
                 place,
@@ -683,6 +745,57 @@ class FlightPoses:
                 f"{name}: {track.name} states its own sigma as {horizontal:.3g} m across and {vertical:.3g} m"
                 " in height"
             )
+
+
+def _positions_of(reader: TelemetryFormat, path: Path, choice: TelemetryChoice) -> Telemetry:
+    """Read a drone's own log; if angles of the camera are all that it holds, say what they are good for."""
+    try:
+        return reader.read_telemetry(path, choice)
+    except DataError as error:
+        entry = _entry_of_angles(reader, path) if error.remedy.startswith("name another log") else ""
+        if not entry:
+            raise
+        remedy = f"name another log of positions as pose, and {entry}"
+        raise DataError(error.source, error.problem, remedy) from None
+
+
+def _entry_of_angles(reader: Format, path: Path) -> str:
+    """Return the manifest's entry for a log's angles without its positions; "" if it holds none."""
+    if not isinstance(reader, AttitudeFormat):
+        return ""
+    try:
+        knows_north = reader.read_attitudes(path).knows_north
+    except DataError:
+        return ""
+    heading = "" if knows_north else ", yaw_deg: 90"
+    return f"gimbal: {{{reader.name.partition('_')[0]}: {path.name}{heading}}}"
+
+
+def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: Gimbal) -> AttitudeTrack:
+    """Return logged angles of a gimbal relative to what the manifest names, by default what the log means.
+
+    Raises:
+        DataError: the log's angles cannot be meant so.
+    """
+    meant = gimbal.relative_to or "world"
+    if gimbal.relative_to is None or (meant == track.relative_to and meant not in track.stated):
+        return track
+    if meant not in track.stated:
+        raise DataError(
+            place,
+            f"{track.name} of {source} cannot be taken relative to the {meant}",
+            f"write relative_to: {track.relative_to}",
+        )
+    turned = attitude_in_enu(track.stated[meant], relative_to=meant, axes="ned")
+    return replace(track, quaternion_xyzw=turned, relative_to=meant)
+
+
+def _at_pictures(since_ns: Int64, frames: CameraFrames) -> Int64:
+    """Return world times [N] of times in a video [N], by its pictures; at their rate beyond them."""
+    inside = np.interp(since_ns, frames.pts_ns, frames.t_ns - frames.t_ns[0])
+    beyond = np.minimum(since_ns - frames.pts_ns[0], 0) + np.maximum(since_ns - frames.pts_ns[-1], 0)
+    at_ns: Int64 = np.rint(inside).astype(np.int64) + beyond + frames.t_ns[0]
+    return at_ns
 
 
 def _reader(kind: str, path: Path) -> Format:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,8 @@ from tests.synthetic.drone_logs import (
 from tests.synthetic.flights import SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap, write_ros2
-from tests.synthetic.video_tracks import write_djmd, write_klv, write_parrot
+from tests.synthetic.video_tracks import gopro_turns, write_djmd, write_gopro, write_klv, write_parrot
+from tests.synthetic.videos import SIZE
 
 WORLD = {
     "origin": {
@@ -486,3 +488,71 @@ def test_a_video_starts_at_the_time_of_its_container(tmp_path: Path) -> None:
     described = ingest(flight.manifest).description
     assert described.cameras["drone1"].frames.first_t_ns == int(flight.t_ns[0]) + 250_000_000
     assert any("say clock: {sigma_s: 1}" in line for line in described.warnings)
+
+
+def _of_gopro(folder: Path, name: str, truth: DroneTruth, picture: Any) -> dict[str, Any]:
+    turns = gopro_turns(truth.t_ns.tolist(), picture)
+    write_gopro(folder / f"{name}_own.mp4", truth, turned=turns, places=False, pictures=30)
+    return {"gopro": f"{name}_own.mp4", "yaw_deg": float(truth.gimbal_ypr_deg[0, 0])}
+
+
+def _of_dji(folder: Path, name: str, truth: DroneTruth, _picture: Any) -> dict[str, Any]:
+    nowhere = replace(truth, latitude_deg=truth.latitude_deg * 0, longitude_deg=truth.longitude_deg * 0)
+    write_djmd(folder / f"{name}_own.mp4", nowhere, pictures=30)
+    return {"dji": f"{name}_own.mp4"}
+
+
+def _of_parrot(folder: Path, name: str, truth: DroneTruth, _picture: Any) -> dict[str, Any]:
+    write_parrot(folder / f"{name}_own.mp4", truth, pictures=30)
+    return {"parrot": f"{name}_own.mp4"}
+
+
+@pytest.mark.parametrize(("angles", "degrees"), [(_of_gopro, 0.02), (_of_dji, 0.12), (_of_parrot, 0.02)])
+@pytest.mark.parametrize("kind", ["srt", "tum"])
+def test_attitudes_in_a_video_turn_the_camera_of_another_log(
+    tmp_path: Path, angles: Any, degrees: float, kind: str
+) -> None:
+    """Positions of subtitles, or of a body whose attitude is that of its log; the camera turns by itself."""
+
+    def write(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+        if kind == "srt":
+            write_srt(folder / f"{name}.SRT", truth, gimbal=False)
+            return {"dji": f"{name}.SRT", "altitude": "absolute"}
+        write_trajectory(folder / f"{name}_body.tum", Trajectory(truth.t_ns, truth.enu, truth.body))
+        return {"tum": f"{name}_body.tum", "of": "body"}
+
+    flight = with_poses(tmp_path, write)
+    for k, name in enumerate(flight.cameras):
+        camera = flight.settings["cameras"][name]
+        truth = drone_of(flight, k)
+        camera["gimbal"] = angles(tmp_path, name, truth, flight.camera_quaternion[k])
+        # The telemetry is at the times of the camera's own pictures, whatever zero they have.
+        path = next(value for key, value in camera["gimbal"].items() if key != "yaw_deg")
+        camera |= {"video": path, "frame_times": {"start": float(truth.t_ns[0]) / 1e9}, "keypoints": None}
+        camera["intrinsics"] = {"width": SIZE[0], "height": SIZE[1], "fx": 300, "fy": 300, "cx": 80, "cy": 60}
+    flight.save()
+    ingest(flight.manifest)
+    for k in range(2):
+        poses = poses_of(flight, flight.cameras[k])
+        nearest = np.abs(flight.t_ns[:, None] - poses["t_ns"].to_numpy()[None]).argmin(axis=0)
+        turned = multiply(
+            conjugate(flight.camera_quaternion[k][nearest]), poses[["qx", "qy", "qz", "qw"]].to_numpy()
+        )
+        assert float(np.degrees(2 * np.abs(turned[:, :3])).max()) < degrees
+
+
+def test_attitudes_from_elsewhere_are_refused_where_nothing_places_them(tmp_path: Path) -> None:
+    flight = with_poses(tmp_path, _srt)
+    name = flight.cameras[0]
+    truth = drone_of(flight, 0)
+    camera = flight.settings["cameras"][name]
+    camera["gimbal"] = _of_gopro(tmp_path, name, truth, flight.camera_quaternion[0])
+    flight.save()
+    assert "is not the camera's video" in refused("ingest", flight.manifest)
+    del camera["gimbal"]["yaw_deg"]
+    flight.save()
+    assert "yaw_deg" in refused("ingest", flight.manifest)
+    camera["gimbal"] = None
+    camera["pose"] = {"gopro": f"{name}_own.mp4"}
+    flight.save()
+    assert f"gimbal: {{gopro: {name}_own.mp4, yaw_deg: 90}}" in refused("ingest", flight.manifest)

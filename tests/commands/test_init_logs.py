@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from tests.synthetic.flights import LENS, START_NS, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap
 from tests.synthetic.map_logs import grid_entry
-from tests.synthetic.video_tracks import write_djmd, write_gopro, write_klv, write_parrot
+from tests.synthetic.video_tracks import gopro_turns, write_djmd, write_gopro, write_klv, write_parrot
 from tests.synthetic.videos import SIZE, even_ticks, write_video
 
 FRAMES = 30
@@ -209,6 +210,47 @@ def test_a_video_begins_when_the_telemetry_in_it_says(
         assert "gimbal: {fixed:" in refused("ingest", result.path)
         text = result.path.read_text(encoding="utf-8").replace("# gimbal: {fixed", "gimbal: {fixed")
         result.path.write_text(text, encoding="utf-8")
+    assert frames_with_poses(result.path) == 33
+
+
+def _uncommented(path: Path, line: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert f"# {line}" in text
+    path.write_text(text.replace(f"# {line}", line), encoding="utf-8")
+
+
+@pytest.mark.parametrize("places", [True, False])
+def test_a_gopros_turns_are_drafted_without_a_heading(tmp_path: Path, places: bool) -> None:
+    """Nothing but the user knows where it looked first: the flight is complete with that alone."""
+    flight = write_flight(tmp_path / "x", cameras=1, seconds=1.1, clean=True)
+    truth = drone_of(flight, 0)
+    shutil.rmtree(tmp_path / "x")
+    turns = gopro_turns(truth.t_ns.tolist(), flight.camera_quaternion[0])
+    write_gopro(tmp_path / "GX010001.MP4", truth, pictures=33, turned=turns, places=places)
+    write_lens(tmp_path)
+    if not places:
+        write_srt(tmp_path / "GX010001.SRT", truth, gimbal=False)
+    result, _ = drafted(tmp_path)
+    assert len(result.missing) == 1
+    assert "yaw_deg" in result.missing[0]
+    said = refused("ingest", result.path)
+    assert ("yaw_deg" if places else "gimbal:") in said
+    _uncommented(result.path, "gimbal: {gopro: GX010001.MP4, yaw_deg: 90}")
+    assert frames_with_poses(result.path) == 33
+
+
+def test_a_djis_angles_without_a_fix_are_drafted_for_the_positions_of_another_log(tmp_path: Path) -> None:
+    truth = drone_of(write_flight(tmp_path / "x", cameras=1, seconds=1.1, clean=True), 0)
+    shutil.rmtree(tmp_path / "x")
+    nowhere = replace(truth, latitude_deg=truth.latitude_deg * 0, longitude_deg=truth.longitude_deg * 0)
+    write_djmd(tmp_path / "DJI_1.MP4", nowhere, pictures=33)
+    write_srt(tmp_path / "DJI_1.SRT", truth, gimbal=False)
+    write_lens(tmp_path)
+    result, stated = drafted(tmp_path)
+    (camera,) = stated["cameras"].values()
+    assert camera["pose"]["dji"] == "DJI_1.SRT"
+    assert camera["gimbal"] == {"dji": "DJI_1.MP4"}
+    assert result.missing == []
     assert frames_with_poses(result.path) == 33
 
 

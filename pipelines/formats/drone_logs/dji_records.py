@@ -15,7 +15,7 @@ import csv
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from itertools import islice
@@ -25,11 +25,17 @@ import numpy as np
 
 from pipelines.formats.common.files import first_bytes, read_head
 from pipelines.formats.common.rows import describe_times
-from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, range_of, telemetry_of_rows
+from pipelines.formats.drone_logs.dji_rows import (
+    DjiRows,
+    any_finite,
+    attitudes_of_rows,
+    range_of,
+    telemetry_of_rows,
+)
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.storage import as_data_error, refuse_special, text_encoding
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.telemetry import Attitudes, Telemetry, TelemetryChoice
 
 _FIRST_YEAR, _LAST_YEAR = 1970, 2200  # of dates; others are damage
 _LONGEST_S = 1e6  # of a record, from its start: more is damage
@@ -108,18 +114,17 @@ class DjiRecordFormat:
             DataError: no flight record, no position, or no height while the user states none.
         """
         record = _read(path)
-        t_ns, timed = record.times
-        placed = {"latitude": np.where(record.placed, record.columns["latitude"], np.nan)}
-        rows = DjiRows(
-            t_ns,
-            timed,
-            {**record.columns, **placed},
-            record.clock,
-            body=record.angles("drone"),
-            gimbal=record.angles("gb"),
-            dropped=record.dropped,
-        )
-        return telemetry_of_rows(path, rows, choice, record.notes)
+        return telemetry_of_rows(path, record.rows, choice, record.notes)
+
+    def read_attitudes(self, path: Path) -> Attitudes:
+        """Read the gimbal's angles, also where the drone had no position.
+
+        Raises:
+            DataError: no flight record, or no angles in it.
+        """
+        record = _read(path)
+        found = attitudes_of_rows(path, record.rows)
+        return replace(found, notes=tuple(f"{path}: {note}" for note in record.notes))
 
 
 class DjiBinaryFormat:
@@ -236,6 +241,21 @@ class _Record:
             return np.full_like(angles, np.nan)
         angles[np.isnan(angles[:, 2]) & np.isfinite(angles[:, 0]), 2] = 0
         return angles
+
+    @property
+    def rows(self) -> DjiRows:
+        """The rows in the form that all files of DJI's share."""
+        t_ns, timed = self.times
+        placed = {"latitude": np.where(self.placed, self.columns["latitude"], np.nan)}
+        return DjiRows(
+            t_ns,
+            timed,
+            {**self.columns, **placed},
+            self.clock,
+            body=self.angles("drone"),
+            gimbal=self.angles("gb"),
+            dropped=self.dropped,
+        )
 
     @property
     def films(self) -> list[tuple[int, int]]:

@@ -18,7 +18,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.telemetry import AttitudeTrack, Height, Telemetry, TelemetryChoice
+from pipelines.session.telemetry import Attitudes, AttitudeTrack, Height, Telemetry, TelemetryChoice
 
 _HIGHEST_M = 500  # above the take-off: the largest height that DJI's drones reach
 
@@ -79,6 +79,21 @@ def telemetry_of_rows(
         notes=tuple(f"{path}: {note}" for note in said),
         dropped=dropped,
     )
+
+
+def attitudes_of_rows(path: Path, found: DjiRows, video_began_ns: int | None = None) -> Attitudes:
+    """Build the attitudes of the camera, whatever the rows say of positions.
+
+    Raises:
+        DataError: no row has angles of the gimbal.
+    """
+    dropped = dict(found.dropped)
+    camera = angles_track(
+        found.names[1], found.t_ns[found.timed], found.gimbal[found.timed], dropped, rows=found.rows
+    )
+    if camera is None:
+        raise DataError(path, "holds no gimbal angles", "name the log and topic that do, or fixed angles")
+    return Attitudes(replace(camera, dropped=dropped), found.clock, video_began_ns=video_began_ns)
 
 
 def choose_height(

@@ -15,16 +15,23 @@ Angles are those of an FRD body and gimbal in NED (docs/drones.md).
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import describe_times
-from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, range_of, telemetry_of_rows
+from pipelines.formats.drone_logs.dji_rows import (
+    DjiRows,
+    any_finite,
+    attitudes_of_rows,
+    range_of,
+    telemetry_of_rows,
+)
 from pipelines.formats.drone_logs.subtitles import Subtitles, parse_subtitles, read_subtitles
 from pipelines.geometry.arrays import Float
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.telemetry import Attitudes, Telemetry, TelemetryChoice
 
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _BRACKETS = re.compile(r"\[([^\[\]\n]{1,300})\]")
@@ -100,22 +107,35 @@ class DjiSrtFormat:
             DataError: no subtitles, no position in any, or no height while the user states none.
         """
         subtitles = read_subtitles(path)
-        columns = _columns(subtitles.texts)
-        t_ns, timed = subtitles.times()
-        rows = DjiRows(
-            t_ns,
-            timed,
-            columns,
-            _clock_name(subtitles),
-            body=_angles(columns, "drone"),
-            gimbal=_angles(columns, "gb"),
-            names=("F.PRY", "its gimbal angles"),
-            rows="subtitles",
-        )
-        return telemetry_of_rows(path, rows, choice, [_note_on_clock(subtitles)])
+        return telemetry_of_rows(path, _rows(subtitles), choice, [_note_on_clock(subtitles)])
+
+    def read_attitudes(self, path: Path) -> Attitudes:
+        """Read the gimbal's angles, also where the drone had no position.
+
+        Raises:
+            DataError: no subtitles, or no angles in any.
+        """
+        subtitles = read_subtitles(path)
+        found = attitudes_of_rows(path, _rows(subtitles))
+        return replace(found, notes=(f"{path}: {_note_on_clock(subtitles)}",))
 
 
 # --- content of a subtitle -----------------------------------------------------------------------------
+
+
+def _rows(subtitles: Subtitles) -> DjiRows:
+    columns = _columns(subtitles.texts)
+    t_ns, timed = subtitles.times()
+    return DjiRows(
+        t_ns,
+        timed,
+        columns,
+        _clock_name(subtitles),
+        body=_angles(columns, "drone"),
+        gimbal=_angles(columns, "gb"),
+        names=("F.PRY", "its gimbal angles"),
+        rows="subtitles",
+    )
 
 
 def _columns(texts: Sequence[str]) -> dict[str, Float]:

@@ -18,7 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, range_of, telemetry_of_rows
+from pipelines.formats.drone_logs.dji_rows import (
+    DjiRows,
+    any_finite,
+    attitudes_of_rows,
+    range_of,
+    telemetry_of_rows,
+)
 from pipelines.formats.drone_logs.video_tracks import (
     Place,
     field_at,
@@ -30,7 +36,7 @@ from pipelines.formats.drone_logs.video_tracks import (
 )
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.telemetry import Attitudes, Telemetry, TelemetryChoice
 
 _PROTOCOL = re.compile(rb"dvtm_[A-Za-z0-9_-]{1,40}\.proto")
 _PICTURE = 3
@@ -108,6 +114,14 @@ class DjiVideoFormat:
         telemetry = telemetry_of_rows(path, rows, choice, notes)
         return replace(telemetry, video_began=(video_made_ns(path) or 0, 1.0 if dated else 0.0))
 
+    def read_attitudes(self, path: Path) -> Attitudes:
+        """Read the gimbal's angles, also where the drone had no position.
+
+        Raises:
+            DataError: no such track, a model whose fields are not public, or no angles.
+        """
+        return attitudes_of_rows(path, _read(path)[1], video_made_ns(path) or 0)
+
 
 def _names_a_protocol(content: bytes) -> bool:
     return _PROTOCOL.search(content[:4096]) is not None
@@ -178,6 +192,8 @@ def _row(picture: bytes, layout: _Layout) -> list[float]:
         unit = field_at(place, (1,))
         scale = 1.0 if layout.degrees or unit == 1 else 180.0 / np.pi
         latitude, longitude = (real_number(field_at(place, (number,))) * scale for number in (2, 3))
+        if latitude == longitude == 0:  # no fix
+            latitude = longitude = np.nan
     if isinstance(height := field_at(picture, (*layout.position, 2)), int):
         absolute = signed_number(height) / 1000
     if layout.relative and field_at(picture, layout.relative[:-1]) is not None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from pipelines.formats.drone_logs.video_tracks import (
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
-from pipelines.session.telemetry import Height, Telemetry, TelemetryChoice
+from pipelines.session.telemetry import Attitudes, AttitudeTrack, Height, Telemetry, TelemetryChoice
 
 # Latitude, longitude, height with the number of satellites; w, x, y, z of the body and of the picture's view.
 _RECORDS = {b"P2": struct.Struct(">8x3i8x8h12x"), b"P3": struct.Struct(">8x3i8x4h8x4h20x")}
@@ -127,9 +127,7 @@ class ParrotVideoFormat:
             height=track.height,
             unusable={"no position": np.asarray(~np.isfinite(track.places).all(axis=1))},
         )
-        body, view = (
-            attitude_in_enu(each, relative_to="world", axes="ned") for each in (track.body, track.view)
-        )
+        body = attitude_in_enu(track.body, relative_to="world", axes="ned")
         if track.began_ns is not None:
             note = f"{path}: the video began at {track.began_ns / 1e9:.3f} by the times of its records"
         else:
@@ -138,14 +136,31 @@ class ParrotVideoFormat:
         return Telemetry(
             position=position,
             body=attitude_track("its body's attitude", track.t_ns, body, dropped),
-            gimbal=attitude_track(
-                "its pictures' view", track.t_ns, view, dropped, stated={"world": track.view}
-            ),
+            gimbal=_view_of(track, dropped),
             clock=track.clock,
             notes=(note,),
             dropped=dropped,
             video_began=(track.made_ns or 0, 1.0) if track.began_ns is None else (track.began_ns, 0.0),
         )
+
+    def read_attitudes(self, path: Path) -> Attitudes:
+        """Read the attitude of the pictures' view, also where the drone had no position.
+
+        Raises:
+            DataError: no such track, or no attitude in any record.
+        """
+        track = _read(path)
+        dropped = dict(track.dropped)
+        view = _view_of(track, dropped)
+        if view is None:
+            raise DataError(path, "holds no attitude of its pictures", "name gimbal angles of another log")
+        began_ns = (track.made_ns or 0) if track.began_ns is None else track.began_ns
+        return Attitudes(replace(view, dropped=dropped), track.clock, video_began_ns=began_ns)
+
+
+def _view_of(track: _Track, dropped: dict[str, int]) -> AttitudeTrack | None:
+    view = attitude_in_enu(track.view, relative_to="world", axes="ned")
+    return attitude_track("its pictures' view", track.t_ns, view, dropped, stated={"world": track.view})
 
 
 def _is_record(content: bytes) -> bool:

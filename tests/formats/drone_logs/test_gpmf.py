@@ -10,15 +10,30 @@ import pytest
 
 from pipelines.formats.drone_logs import gpmf
 from pipelines.formats.videos.video import FORMAT as VIDEO
-from pipelines.geometry.poses import rotate
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.mounting import body_from_camera
+from pipelines.geometry.poses import (
+    conjugate,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotate,
+    rotation_vector_from_quaternion,
+)
 from pipelines.session.registries import VideoFormat, recognise
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 from tests.commands.runner import succeeds
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
-from tests.synthetic.drone_logs import drone_of
+from tests.synthetic.drone_logs import DroneTruth, drone_of
 from tests.synthetic.flights import write_flight
-from tests.synthetic.video_tracks import gpmf_item, gpmf_nested, gpmf_numbers, write_gopro
+from tests.synthetic.video_tracks import (
+    gopro_turns,
+    gpmf_item,
+    gpmf_nested,
+    gpmf_numbers,
+    write_gopro,
+    write_track,
+)
 
 READER = gpmf.FORMAT
 KARMA = "second/karma.mp4"
@@ -145,3 +160,92 @@ def test_a_flight_takes_poses_from_the_video(tmp_path: Path) -> None:
         "    intrinsics: {width: 854, height: 480, fx: 500, fy: 500, cx: 426.5, cy: 239.5}\n"
     )
     succeeds("ingest", tmp_path / "flight.yaml")
+
+
+# --- attitudes -----------------------------------------------------------------------------------------
+
+_QUANTUM_DEG = 0.02  # a part of a quaternion is a whole 1/32767, in each of four of them
+
+
+def filmed(folder: Path) -> tuple[DroneTruth, Float, Float]:
+    """Return a drone, and the turns of its pictures and of the camera whose shaking was taken out of them."""
+    flight = write_flight(folder, cameras=1, seconds=1.9, clean=True)
+    picture = flight.camera_quaternion[0]
+    steps = np.arange(len(picture))[:, None] / np.array([9.0, 7.0, 5.0])
+    shaken = quaternion_from_rotation_vector(np.sin(steps) * [0.05, 0.03, 0.04])
+    return drone_of(flight, 0), picture, multiply(picture, shaken)
+
+
+def between_deg(one: Float, other: Float) -> float:
+    turned = rotation_vector_from_quaternion(multiply(conjugate(one), other))
+    return float(np.degrees(np.linalg.norm(turned, axis=1)).max())
+
+
+def rows_of(truth: DroneTruth, t_ns: Float) -> Float:
+    since_ns = truth.t_ns - truth.t_ns[0]
+    return np.minimum(np.searchsorted(since_ns, t_ns - t_ns[0]), len(since_ns) - 1)
+
+
+def test_turns_of_the_stabilised_pictures_are_level_and_begin_in_the_north(tmp_path: Path) -> None:
+    truth, picture, camera = filmed(tmp_path / "f")
+    turns = gopro_turns(truth.t_ns.tolist(), picture, camera)
+    found = READER.read_attitudes(write_gopro(tmp_path / "a.mp4", truth, pictures=60, turned=turns))
+    assert (found.clock, found.video_began_ns, found.knows_north) == ("UTC by GPS", int(truth.t_ns[0]), False)
+    heading = np.radians(truth.gimbal_ypr_deg[0, 0])
+    to_east = quaternion_from_rotation_vector(np.array([0.0, 0.0, -heading]))
+    seen = multiply(multiply(to_east, found.camera.quaternion_xyzw), body_from_camera("forward"))
+    assert between_deg(seen, picture[rows_of(truth, found.camera.t_ns)]) < _QUANTUM_DEG
+
+
+def test_turns_are_those_of_another_reader(tmp_path: Path) -> None:
+    """telemetry-parser multiplies both quaternions for Gyroflow, whose axes are right, up and backward."""
+    reader = pytest.importorskip("telemetry_parser")
+    truth, picture, camera = filmed(tmp_path / "f")
+    turns = gopro_turns(truth.t_ns.tolist(), picture, camera)
+    path = write_gopro(tmp_path / "a.mp4", truth, turned=turns)
+    packets = [each["Quaternion"]["Data"] for each in reader.Parser(str(path)).telemetry()]
+    told = np.array([[row["v"][axis] for axis in "xyzw"] for packet in packets for row in packet])
+    told = told * [1, -1, -1, 1]
+    optical = body_from_camera("forward")
+    ours = multiply(READER.read_attitudes(path).camera.quaternion_xyzw, optical)
+    assert between_deg(multiply(conjugate(told[0]), told), multiply(conjugate(ours[0]), ours)) < _QUANTUM_DEG
+
+
+def test_turns_without_a_direction_of_gravity_are_refused(tmp_path: Path) -> None:
+    truth, picture, _ = filmed(tmp_path / "f")
+    turns = gopro_turns(truth.t_ns.tolist(), picture, gravity=False)
+    path = write_gopro(tmp_path / "a.mp4", truth, turned=turns)
+    with refuses(path, "gravity"):
+        READER.read_attitudes(path)
+    assert READER.describe(path)["positions"] == 20
+
+
+def test_turns_that_contradict_gravity_are_refused(tmp_path: Path) -> None:
+    """The orientations of a camera that rolls over, beside the gravity of one that stands still."""
+    truth, picture, _ = filmed(tmp_path / "f")
+    angle = np.linspace(0, np.pi, len(picture))[:, None]
+    rolled = multiply(picture[:1], quaternion_from_rotation_vector(angle * [0.0, 0.0, 1.0]))
+    scale = gpmf_numbers("SCAL", "s", [[32767]])
+    packets = [
+        (k * 10**9, gpmf_nested("DEVC", content[: content.index(b"GRAV") - 20], still))
+        for k, (content, still) in enumerate(
+            zip(
+                gopro_turns(truth.t_ns.tolist(), rolled),
+                [gpmf_nested("STRM", scale, gpmf_numbers("GRAV", "s", [[0, 32767, 0]] * 30))] * 2,
+                strict=True,
+            )
+        )
+    ]
+    path = write_track(tmp_path / "a.mp4", packets, codec="bin_data", last_s=1)
+    with refuses(path, "GRAV"):
+        READER.read_attitudes(path)
+
+
+def test_orientations_that_are_none_are_counted(tmp_path: Path) -> None:
+    truth, picture, _ = filmed(tmp_path / "f")
+    first, second = gopro_turns(truth.t_ns.tolist(), picture)
+    place = second.index(b"CORI") + 8
+    broken = second[:place] + bytes(8) + second[place + 8 :]
+    found = READER.read_attitudes(write_gopro(tmp_path / "a.mp4", truth, turned=[first, broken]))
+    assert list(found.camera.dropped.values()) == [1]
+    assert len(found.camera.t_ns) == 59
