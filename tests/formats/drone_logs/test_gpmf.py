@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.formats.drone_logs import gpmf
 from pipelines.formats.videos.video import FORMAT as VIDEO
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import (
     conjugate,
@@ -181,9 +181,10 @@ def between_deg(one: Float, other: Float) -> float:
     return float(np.degrees(np.linalg.norm(turned, axis=1)).max())
 
 
-def rows_of(truth: DroneTruth, t_ns: Float) -> Float:
+def rows_of(truth: DroneTruth, t_ns: Int64) -> Int64:
     since_ns = truth.t_ns - truth.t_ns[0]
-    return np.minimum(np.searchsorted(since_ns, t_ns - t_ns[0]), len(since_ns) - 1)
+    rows: Int64 = np.minimum(np.searchsorted(since_ns, t_ns - t_ns[0]), len(since_ns) - 1)
+    return rows
 
 
 def test_turns_of_the_stabilised_pictures_are_level_and_begin_in_the_north(tmp_path: Path) -> None:
