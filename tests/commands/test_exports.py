@@ -17,7 +17,7 @@ from pipelines.formats.skeletons import c3d, trc
 from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
-from tests.commands.runner import content, mocap_process, refusal, refused, succeeds
+from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
 from tests.commands.test_overlay import filmed_flight, session_of
 from tests.formats.skeletons.test_trc import opensim
 from tests.synthetic.flights import START_NS, write_flight
@@ -70,6 +70,17 @@ def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_pa
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
     # 0.4 s of video at 5 pictures per second.
     assert counts["/drone1/image/video"] == counts["/drone1/camera_info"] == 2
+
+
+@pytest.mark.parametrize("name", ["csv", "parquet", "mcap", "rerun"])
+def test_a_session_without_a_skeleton_gives_the_cameras_and_says_so(tmp_path: Path, name: str) -> None:
+    flight = write_flight(tmp_path, cameras=2, seconds=0.2, clean=True)
+    succeeds("ingest", flight.manifest)
+    result = mocap("export", tmp_path / "flight.session", "--to", name)
+    assert (result.returncode, "mocap reconstruct" in result.stderr) == (0, True)
+    files = json.loads((tmp_path / "flight.export" / RECORD).read_text(encoding="utf-8"))["files"]
+    assert all(len(facts["notes"]) == 1 for facts in files.values())
+    assert refused("export", tmp_path / "flight.session", "--to", "trc").count("mocap reconstruct") == 1
 
 
 def test_pictures_lie_where_the_skeleton_does(filmed: Path) -> None:

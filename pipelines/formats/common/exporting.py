@@ -63,6 +63,14 @@ def tracks_of(recording: Recording) -> dict[str, Trajectory]:
     return {name: track for name, track in tracks.items() if len(track.t_ns)}
 
 
+def note_no_skeleton(recording: Recording, export: str) -> None:
+    """Note that an export holds the cameras alone, if the session has no skeleton yet."""
+    if recording.motion is None or not recording.motion.position.size:
+        recording.progress.note(
+            f"{export}: no skeleton yet, the cameras alone are written: run `mocap reconstruct` first"
+        )
+
+
 def write_tables(
     recording: Recording,
     folder: Path,
@@ -72,6 +80,8 @@ def write_tables(
 ) -> list[Path]:
     """Write a recording's tables: `<name>` with the joints, `<name>_<camera>` with a camera's poses.
 
+    A note says if there are no joints.
+
     Raises:
         DataError: it has neither joints nor camera poses.
     """
@@ -80,6 +90,8 @@ def write_tables(
     if recording.motion is not None and recording.motion.position.size:
         paths.append(folder / f"{name}{suffix}")
         write_joints(paths[-1], recording.motion)
+    else:
+        note_no_skeleton(recording, suffix[1:])
     for camera, trajectory in tracks_of(recording).items():
         paths.append(folder / f"{name}_{safe_file_name(camera)}{suffix}")
         write_poses(paths[-1], trajectory)

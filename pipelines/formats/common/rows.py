@@ -64,7 +64,7 @@ def parse_table(
 
     If the last line does not parse, its writing was probably interrupted: it is left out and counted in
     `truncated`. Where commas do not separate cells and the first row has no dot but in a date, commas before
-    digits are decimal.
+    digits are decimal; if every one of them could also separate thousands, the table is refused.
 
     Args:
         body: its text below the header.
@@ -74,12 +74,14 @@ def parse_table(
         first_line: the number of the body's first line in the file, for messages.
 
     Raises:
-        DataError: another line has the wrong number of cells, or a cell that is not a number.
+        DataError: another line has the wrong number of cells, a cell that is not a number, or the commas of
+            its numbers are decimal or separate thousands.
     """
     import pyarrow as pa
 
     body = re.sub(r"\n[ \t]*#[^\n]*", "\n", "\n" + body)[1:]
     if delimiter in ";\t" and "." not in _DATE.sub("", (body.strip() + "\n").partition("\n")[0]):
+        _refuse_thousands(path, body, delimiter)
         body = re.sub(r",(?=\d)", ".", body)
     wanted = {**text, **numbers}
     for truncated in (0, 1):
@@ -104,6 +106,26 @@ def parse_table(
                 truncated=truncated,
             )
     raise AssertionError("both attempts either return or raise")
+
+
+def _refuse_thousands(path: Path, body: str, delimiter: str) -> None:
+    """Refuse numbers with commas of which each may be decimal or separate thousands, as in 1,234.
+
+    A comma is decimal behind a leading zero, and before more or fewer than three digits.
+    """
+    cells = rf"(?:^|{delimiter})[ \"]*(?=[^{delimiter}\n]*,)(?:{{}})[ \"]*(?={delimiter}|\r?$)"
+    undated = _DATE.sub("", body) if "-" in body else body
+    found = re.search(cells.format(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+"), undated, re.MULTILINE)
+    if found is None:
+        return
+    decimal = r"[+-]?(?:0+,\d+|\d*,(?:\d{1,2}|\d{4,})|\d{4,},\d+)(?:[eE][+-]?\d+)?"
+    if re.search(cells.format(decimal), undated, re.MULTILINE) is None:
+        shown = found[0].strip(f'{delimiter} "')
+        raise DataError(
+            path,
+            f"has numbers like {shown}, which may be {shown.replace(',', '.')} or {shown.replace(',', '')}",
+            "save it with decimal dots and without marks between thousands",
+        )
 
 
 def _parse_csv(

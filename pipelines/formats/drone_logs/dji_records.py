@@ -63,6 +63,8 @@ _CLOCK = re.compile(
     r"\s*([aApP])?\.?[mM]?\.?Z?"
 )
 _DAY_OF_NAME = re.compile(r"(\d{4})[-_](\d{2})[-_](\d{2})")
+_MARK = re.compile(r"[.,](?=\d)")
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _PREFIX = struct.Struct("<QHB")  # of a binary record: where its details lie, their length, and the version
 _BINARY_NAME = re.compile(r"DJIFlightRecord_|FLY\d{3}\.dat$", re.IGNORECASE)
@@ -349,10 +351,16 @@ def _read(path: Path) -> _Record:
     clocks: list[str] = []
     filming: list[bool] = []
     damaged = 0
+    decimal_commas = heading.delimiter != ","  # until a latitude shows which mark is decimal
     try:
         for row in _rows(path, heading):
             try:
-                numbers = {n: _number(row[column]) for n, (column, _) in heading.numbers.items()}
+                if (mark := _MARK.search(row[heading.numbers["latitude"][0]])) is not None:
+                    decimal_commas = mark[0] == ","
+                numbers = {
+                    name: _number(row[column], decimal_commas=decimal_commas)
+                    for name, (column, _) in heading.numbers.items()
+                }
                 clock = " ".join(row[column].strip() for column in heading.clock)
                 films = heading.films is not None and row[heading.films].strip().lower() in {"1", "true"}
             except (ValueError, IndexError):
@@ -400,10 +408,14 @@ def _rows(path: Path, heading: _Heading) -> Iterator[list[str]]:
                 yield row
 
 
-def _number(cell: str) -> float:
-    """Parse a number with a decimal dot or comma; a blank cell is NaN."""
+def _number(cell: str, *, decimal_commas: bool) -> float:
+    """Parse a number whose commas are decimal or separate thousands; a blank cell is NaN."""
     text = cell.strip()
-    return float(text.replace(",", ".") if text.count(",") == 1 and "." not in text else text or "nan")
+    if "," not in text:
+        return float(text or "nan")
+    if decimal_commas and text.count(",") == 1 and "." not in text:
+        return float(text.replace(",", "."))
+    return float(text.replace(",", "") if not decimal_commas and _THOUSANDS.fullmatch(text) else text)
 
 
 def _parse_clocks(path: Path, texts: Sequence[str], notes: list[str]) -> tuple[Int64, bool]:

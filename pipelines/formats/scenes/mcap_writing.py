@@ -30,7 +30,13 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.calibrations.ros_camera_info import ros_distortion
-from pipelines.formats.common.exporting import ellipsoids_95, safe_file_name, shown_surface, thinned
+from pipelines.formats.common.exporting import (
+    ellipsoids_95,
+    note_no_skeleton,
+    safe_file_name,
+    shown_surface,
+    thinned,
+)
 from pipelines.formats.logs.ros2_writing import Ros2Recording
 from pipelines.formats.videos.video_writing import H264Stream
 from pipelines.geometry.arrays import Float
@@ -69,6 +75,7 @@ class McapExport:
         times = [track.t_ns for track in tracks.values()] + ([motion.t_ns] if motion is not None else [])
         if not times:
             raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
+        note_no_skeleton(recording, self.name)
         start_ns, end_ns = min(int(t[0]) for t in times), max(int(t[-1]) for t in times)
         if start_ns < 0 or end_ns >= _LATEST_NS:
             raise DataError(

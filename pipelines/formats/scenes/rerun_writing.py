@@ -25,6 +25,7 @@ import numpy as np
 from pipelines.formats.common.exporting import (
     ellipsoids_95,
     file_names_of_people,
+    note_no_skeleton,
     safe_file_name,
     shown_surface,
     thinned,
@@ -59,6 +60,7 @@ class RerunExport:
         motion, tracks = recording.motion, recording.tracks
         if motion is None and not tracks:
             raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
+        note_no_skeleton(recording, self.name)
         rr = need("rerun", "rerun")
         name = safe_file_name(recording.name)
         path = folder / f"{name}.rrd"

@@ -163,6 +163,14 @@ def test_semicolons_and_decimal_commas(tmp_path: Path) -> None:
     assert np.degrees(np.arctan2(ahead[0], ahead[1])) == pytest.approx(-80)
 
 
+@pytest.mark.parametrize("height", ['"1,234"', '"1,234.0"', "1234"])
+def test_thousands_beside_decimal_dots(tmp_path: Path, height: str) -> None:
+    path = tmp_path / "a.csv"
+    heading = "time(millisecond),latitude,longitude,height_above_takeoff(feet)\n"
+    path.write_text(f"{heading}0,47.5,8.25,{height}\n100,47.5,8.25,{height}\n", encoding="utf-8")
+    assert read(path).position.values[0, 2] == pytest.approx(1234 * FOOT_M)
+
+
 def test_damage_is_counted(tmp_path: Path) -> None:
     path = airdata(tmp_path / "a.csv")
     lines = path.read_text().split("\n")
