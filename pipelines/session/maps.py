@@ -299,7 +299,8 @@ class _StoredGrid:
     def _small(self, name: str, kinds: str, shape: tuple[int, ...]) -> NDArray[Any]:
         member = f"{name}.npy"
         try:
-            if self._archive.getinfo(member).file_size > _SMALL_MEMBER:
+            info = self._archive.getinfo(member)
+            if max(info.file_size, info.compress_size) > _SMALL_MEMBER:
                 raise ValueError(f"{name} is larger than {_SMALL_MEMBER} bytes")
             array: NDArray[Any] = np.lib.format.read_array(
                 BytesIO(self._archive.read(member)), allow_pickle=False

@@ -81,8 +81,9 @@ class LasFormat:
             dropped = cloud.hand_over(box.add)
         if not box.count:
             raise DataError(path, "holds no point that can be used", _COPY)
-        low = np.floor(box.low / side)
-        cells = np.nan_to_num(np.floor(box.high / side) - low + 1, nan=np.inf)
+        with np.errstate(over="ignore", invalid="ignore"):  # coordinates of a damaged scale
+            low = np.floor(box.low / side)
+            cells = np.nan_to_num(np.floor(box.high / side) - low + 1, nan=np.inf)
         shape = np.clip(cells, 1, 2**40).astype(np.int64)  # more is refused
         span = " x ".join(f"{v:.0f}" for v in box.high - box.low)
         check_size(path, shape.tolist(), side, f"crop it (its box is {span} m)")

@@ -174,7 +174,7 @@ def written_points(path: Path, body: Bytes, skipped: int, count: int, columns: t
     check_count(path, count, len(rows))
     try:
         points = np.loadtxt(rows[:count], dtype=np.float64, comments=None, usecols=columns, ndmin=2)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:  # the latter for columns of an absurd number
         raise DataError(
             path, f"a row of points is damaged ({str(error)[:100]})", "export it again"
         ) from error

@@ -92,6 +92,16 @@ def test_damaged_headers_are_refused(tmp_path: Path, size: int) -> None:
         READER.read_map(path)
 
 
+def test_points_of_an_absurd_scale_are_refused(tmp_path: Path) -> None:
+    """The scale of x stands behind byte 131; numpy's warning must not reach the terminal."""
+    path = write(tmp_path / "cloud.las")
+    content = bytearray(path.read_bytes())
+    content[131:139] = struct.pack("<d", 1e305)
+    path.write_bytes(content)
+    with refuses(path, "crop it"):
+        READER.read_map(path, resolution_m=1e-3)
+
+
 def test_a_decompressor_that_ends_its_process_ends_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -165,6 +165,10 @@ XYZ = ("x y z", "4 4 4", "F F F", "1 1 1")
         (header("x y z", "4 4 3", "F F F", "1 1 1", 1, "ascii") + b"1 2 3\n", "field z is 1 times F3"),
         (header("x y z", "4 4 4", "F F F", "1 1 -1", 1, "ascii") + b"1 2 3\n", "field z is -1 times"),
         (header("x y z", "4 4 4", "F F F", "1 1 2", 1, "ascii") + b"1 2 3 4\n", "more than one x, y or z"),
+        (
+            header("x f y z", "4 4 4 4", "F F F F", f"1 {2**63} 1 1", 1, "ascii") + b"1 2 3 4\n",
+            "row of points is damaged",
+        ),
         (header(*XYZ, 1, "zipped") + b"1 2 3\n", "DATA is 'zipped'"),
         (header(*XYZ, 0, "ascii"), "states 0 x 1 and 0 points"),
         (header(*XYZ, 2, "ascii") + b"1 2 3\n", "1 of 2 points are there"),
