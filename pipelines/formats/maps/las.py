@@ -84,8 +84,8 @@ class LasFormat:
         with np.errstate(over="ignore", invalid="ignore"):  # coordinates of a damaged scale
             low = np.floor(box.low / side)
             cells = np.nan_to_num(np.floor(box.high / side) - low + 1, nan=np.inf)
+            span = " x ".join(f"{v:.0f}" for v in box.high - box.low)
         shape = np.clip(cells, 1, 2**40).astype(np.int64)  # more is refused
-        span = " x ".join(f"{v:.0f}" for v in box.high - box.low)
         check_size(path, shape.tolist(), side, f"crop it (its box is {span} m)")
         grid = np.full(shape.tolist(), np.nan, dtype=np.float32)
 
@@ -268,7 +268,8 @@ def _blocks(path: Path, cloud: Any) -> Iterator[_Block]:
         read += len(chunk)
         bad = np.isin(np.asarray(chunk.classification), _NOISE)
         hidden = np.asarray(chunk.withheld).astype(bool) & ~bad
-        points = np.stack([np.asarray(chunk[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):  # a damaged scale: the box is then refused
+            points = np.stack([np.asarray(chunk[axis], dtype=np.float64) for axis in "xyz"], axis=1)
         yield _Block(points[~bad & ~hidden], int(bad.sum()), int(hidden.sum()))
 
 

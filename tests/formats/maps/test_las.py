@@ -92,11 +92,12 @@ def test_damaged_headers_are_refused(tmp_path: Path, size: int) -> None:
         READER.read_map(path)
 
 
-def test_points_of_an_absurd_scale_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("scale", [1e305, 1.7e308])
+def test_points_of_an_absurd_scale_are_refused(tmp_path: Path, scale: float) -> None:
     """The scale of x stands behind byte 131; numpy's warning must not reach the terminal."""
     path = write(tmp_path / "cloud.las")
     content = bytearray(path.read_bytes())
-    content[131:139] = struct.pack("<d", 1e305)
+    content[131:139] = struct.pack("<d", scale)
     path.write_bytes(content)
     with refuses(path, "crop it"):
         READER.read_map(path, resolution_m=1e-3)
