@@ -55,7 +55,19 @@ _UNREAD = (
     (re.compile(rb"P[1-6]\s"), "a PGM picture", "of a floor plan, name the .yaml beside it"),
     (re.compile(rb"(?s).{4}ftyp|\x1aE\xdf\xa3|RIFF....AVI "), "a video without pictures", _COPY),
     (re.compile(rb"%PDF"), "a PDF document", ""),
+    (re.compile(rb"PK\x03\x04.{26}[\w.-]{1,60}\.npy", re.DOTALL),
+     "a NumPy archive of other arrays than a map's",
+     "a map has probability or occupancy, origin and resolution_m; save a calibration as YAML, poses as CSV"),
     (re.compile(rb"PK\x03\x04"), "a ZIP archive", "unpack it"),
+    (re.compile(rb"ASTM-E57"), "an E57 point cloud", "convert it to LAS or PLY (CloudCompare does)"),
+    (re.compile(rb"II\*\0|MM\0\*"), "a TIFF picture",
+     "save a sequence of pictures as JPEG or PNG, a height model as points (LAS, PLY)"),
+    (re.compile(rb"(?:\s*(?:#|mtllib|o |g )[^\n]*\n)*\s*v\s+-?[\d.]+\s|solid [^\n]*\n\s*facet"),
+     "a mesh (OBJ or STL)", "sample points of it, and save them as PLY (CloudCompare does)"),
+    (re.compile(rb"glTF"), "a glTF scene", "sample points of a map, and save them as PLY"),
+    (re.compile(rb"RRF\d"), "a recording of Rerun", "name the log or the session that it was made of"),
+    (re.compile(rb"\x80[\x02-\x05].*\.$", re.DOTALL), "a pickle of Python", "save its arrays as CSV"),
+    (re.compile(rb"(?:\xef\xbb\xbf)?WEBVTT"), "subtitles as WebVTT", "convert them to .srt (FFmpeg does)"),
     (re.compile(rb"\x1f\x8b"), "a gzip archive", "unpack it"),
     (re.compile(rb"7z\xbc\xaf|Rar!"), "an archive", "unpack it"),
     (re.compile(rb"\x89HDF|MATLAB 5"), "an HDF5 or MATLAB file", "export its tables as CSV"),
@@ -172,6 +184,10 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
                 problem = f"is a table of places on Earth whose writer is not known, with {columns}"
                 lacks = "a writer that is known" if any("yaw" in name for name in names) else "attitudes, too"
                 return Likeness(problem, f"poses need {lacks}: give the drone's own log")
+            if {"roll", "pitch", "yaw"} <= names:
+                problem = f"is a table of angles, with {columns}"
+                remedy = "convert them to quaternions qx, qy, qz, qw: their order and axes are not stated"
+                return Likeness(problem, remedy)
             remedy = "poses need a time, x, y, z, qx, qy, qz, qw; joints person, joint, x, y, z"
             return Likeness(f"is a table with {columns}", f"{remedy}, by name in the first line")
     return Likeness(f"is text that begins with {lines[0][:_WIDEST]!r}")

@@ -51,6 +51,16 @@ SUBTITLE = "1\n00:00:00,000 --> 00:00:01,000\nHello\n"
         ("a.csv", b"Datetime (UTC),Latitude,Longitude\n1,2,3\n", "places on Earth"),
         ("a.dat", b"\x01\x02\x03\x04\0\0", "01 02 03 04"),
         ("a.txt", b"Dear diary\n", "Dear diary"),
+        ("a.npz", b"PK\x03\x04" + bytes(26) + b"camera.npy", "NumPy"),
+        ("a.e57", b"ASTM-E57" + bytes(40), "E57"),
+        ("a.tif", b"II*\0" + bytes(40), "TIFF"),
+        ("a.obj", b"# a\nmtllib a.mtl\nv 0.1 -2 3\n", "mesh"),
+        ("a.stl", b"solid a\n  facet normal 0 0 1\n", "mesh"),
+        ("a.glb", b"glTF" + bytes(40), "glTF"),
+        ("a.rrd", b"RRF2" + bytes(40), "Rerun"),
+        ("a.pkl", b"\x80\x04\x95\0\0.", "pickle"),
+        ("a.vtt", b"WEBVTT\n\n00:00.000 --> 00:01.000\na\n", "WebVTT"),
+        ("a.csv", b"time,x,y,z,roll,pitch,yaw\n0,1,2,3,4,5,6\n", "angles"),
     ],
 )
 def test_the_line_names_what_the_file_looks_like(

@@ -44,6 +44,10 @@ _MOST_WRONG = (
 _SIGNED, _SIGNATURE = 1, 13  # flag in a packet of MAVLink 2, and the bytes of its signature
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 _LARGEST_US = 2**62
+_LIKE_PACKETS = re.compile(
+    rb"\0[\0-\x0f].{6}[\xfd\xfe]", re.DOTALL
+)  # a clock until 2100, and a packet's first byte
+_SEARCHED = 64 * 1024  # bytes of a file of that name
 _FIRST_US, _LAST_US = 946_684_800_000_000, 4_102_444_800_000_000  # the years 2000 and 2100
 _UNIX_US = 10**15  # stamps in microseconds above it count from 1970, others from boot
 _YAW_IN_VEHICLE, _YAW_IN_EARTH = 32, 64  # GIMBAL_DEVICE_FLAGS
@@ -69,16 +73,14 @@ class TlogFormat:
     suffixes: tuple[str, ...] = (".tlog", ".mavlink")
 
     def recognises(self, path: Path) -> bool:
-        """Return True if it begins with three packets behind plausible times."""
-        head = first_bytes(path, 1024)
-        place = 0
-        for _ in range(3):
-            stamp_us = int.from_bytes(head[place : place + _STAMP], "big")
-            size = _packet_size(head, place + _STAMP)
-            if size is None or not _FIRST_US < stamp_us < _LAST_US:
-                return False
-            place += _STAMP + size
-        return True
+        """Return True if it begins with three packets behind plausible times.
+
+        If its name says that it is one, they may stand behind some damage.
+        """
+        if _are_packets(first_bytes(path, 1024), 0):
+            return True
+        head = first_bytes(path, _SEARCHED, suffixes=self.suffixes)
+        return any(_are_packets(head, match.start()) for match in _LIKE_PACKETS.finditer(head))
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe messages by name, vehicles, times, GPS time, losses of the radio link and damage."""
@@ -416,6 +418,17 @@ def _packet(content: mmap.mmap, place: int, definitions: Mapping[int, Any]) -> _
         return None  # of an unknown message only its length can be tested
     stamp_us = int.from_bytes(content[place:start], "big")
     return _Packet(stamp_us, system, component, sequence, message, packet[head:end])
+
+
+def _are_packets(head: bytes, place: int) -> bool:
+    """Test if three packets behind plausible times follow each other."""
+    for _ in range(3):
+        stamp_us = int.from_bytes(head[place : place + _STAMP], "big")
+        size = _packet_size(head, place + _STAMP)
+        if size is None or not _FIRST_US < stamp_us < _LAST_US:
+            return False
+        place += _STAMP + size
+    return True
 
 
 def _packet_size(content: bytes | mmap.mmap, start: int) -> int | None:

@@ -161,6 +161,19 @@ def test_pictures_that_cannot_be_counted(tmp_path: Path, truth: DroneTruth) -> N
         FORMAT.picture_times(without, TelemetryChoice())
 
 
+def test_a_log_whose_head_is_lost_is_read_by_its_name(tmp_path: Path, truth: DroneTruth) -> None:
+    whole = write_tlog(tmp_path / "whole.tlog", truth)
+    path = tmp_path / "a.tlog"
+    path.write_bytes(whole.read_bytes()[11:])
+    assert FORMAT.recognises(path)
+    telemetry = read(path)
+    assert len(telemetry.position.t_ns) >= len(truth.t_ns) - 1
+    assert sum(telemetry.dropped.values()) >= 1
+    unnamed = tmp_path / "a.dat"
+    unnamed.write_bytes(path.read_bytes())
+    assert not FORMAT.recognises(unnamed)
+
+
 def test_several_vehicles_are_asked_for(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_tlog(tmp_path / "a.tlog", truth)
     other = write_tlog(tmp_path / "b.tlog", truth, system=7)
