@@ -265,6 +265,8 @@ def _mount(
     if every is None or "TimeUS" not in every or "Pitch" not in every:
         return None
     mounts = np.unique(every.integers("I")).tolist() if "I" in every else [0]
+    if not mounts:  # every row is damaged
+        return None
     rows = every.of(mounts[0], "I")
     if len(mounts) > 1:
         notes.append(f"has {len(mounts)} mounts (MNT): took the angles of the first, {mounts[0]}")

@@ -3,8 +3,12 @@
 The record is the only place where most consumer drones log their gimbal's angles. The CSV has the columns
 that the exporting service chose, in feet or metres, often in both. Known are those of Airdata
 (`time(millisecond),datetime(utc),latitude,...,height_above_takeoff(feet),...,gimbal_pitch(degrees)`), of
-Flight Reader and CsvView (`CUSTOM.updateTime [local],OSD.flyTime [s],OSD.latitude,...,GIMBAL.pitch`) and of
-PhantomHelp's log viewer (`Time(seconds),...,Altitude(feet),Altitude(meters),...,Pitch,Roll,Yaw`).
+Flight Reader (`CUSTOM.updateTime [local],OSD.flyTime [s],OSD.latitude,...,GIMBAL.pitch`), PhantomHelp
+(`Time(seconds),...,Altitude(feet),Altitude(meters),...,Pitch,Roll,Yaw`), Litchi
+(`latitude,longitude,altitude(m),...,gimbalPitchRaw`, in tenths of a degree) and dji-log-parser
+(`CUSTOM.dateTime,OSD.flyTime,OSD.latitude`; `OSD.lalitude` in its first versions). DatCon and CsvView make
+one of the drone's own record (`Clock:offsetTime,IMU_ATTI(0):Latitude,...,IMU_ATTI(0):yaw:C`). The reference
+of its gimbal's yaw is not public, so that is left out.
 
 Angles are those of an FRD body and gimbal in NED (docs/drones.md).
 """
@@ -41,23 +45,32 @@ _FIRST_YEAR, _LAST_YEAR = 1970, 2200  # of dates; others are damage
 _LONGEST_S = 1e6  # of a record, from its start: more is damage
 _METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "metres": 1.0, "ft": 0.3048, "feet": 0.3048}
 _SECONDS = {"millisecond": 1e-3, "ms": 1e-3, "seconds": 1.0, "s": 1.0}
+_IN_SECONDS = ("osd.flytime", "clock:offsettime", "offsettime")  # without a unit
 _LENGTHS = {  # the preferred name first
-    "relative": ("height_above_takeoff", "osd.height", "altitude"),
-    "absolute": ("altitude_above_sealevel", "osd.altitude"),
+    "relative": (
+        *("height_above_takeoff", "osd.height", "altitude"),
+        *("imu_atti:relativeheight", "general:relativeheight"),
+    ),
+    "absolute": ("altitude_above_sealevel", "osd.altitude", "gps:heightmsl"),
 }
 _ELAPSED = ("time", "osd.flytime")
 _NUMBERS = {
-    "latitude": ("latitude", "osd.latitude"),
-    "longitude": ("longitude", "osd.longitude"),
-    "drone_yaw": ("compass_heading", "osd.yaw", "yaw"),
-    "drone_pitch": ("pitch", "osd.pitch"),
-    "drone_roll": ("roll", "osd.roll"),
-    "gb_yaw": ("gimbal_heading", "gimbal.yaw"),
-    "gb_pitch": ("gimbal_pitch", "gimbal.pitch"),
-    "gb_roll": ("gimbal_roll", "gimbal.roll"),
+    "latitude": ("latitude", "osd.latitude", "osd.lalitude", "imu_atti:latitude", "gps:lat"),
+    "longitude": ("longitude", "osd.longitude", "imu_atti:longitude", "gps:long"),
+    "drone_yaw": ("compass_heading", "osd.yaw", "yaw", "imu_atti:yaw"),
+    "drone_pitch": ("pitch", "osd.pitch", "imu_atti:pitch"),
+    "drone_roll": ("roll", "osd.roll", "imu_atti:roll"),
+    "gb_yaw": ("gimbal_heading", "gimbal.yaw", "gimbalyawraw"),
+    "gb_pitch": ("gimbal_pitch", "gimbal.pitch", "gimbalpitchraw"),
+    "gb_roll": ("gimbal_roll", "gimbal.roll", "gimbalrollraw"),
 }
-_FILMS = ("isvideo", "camera.isvideo")
-_HEADING = re.compile(r"([^\[(]+?)\s*(?:[\[(]([^\])]*)[\])])?")
+_CLOCKS = {  # columns of date and time of day, each with the zone that the heading states
+    "utc": ((("datetime", "utc"),), (("custom.datetime", ""),), (("gps:datetimestamp", ""),)),
+    "local": ((("datetime", "local"),), (("custom.date", "local"), ("custom.updatetime", "local"))),
+}
+_FILMS = ("isvideo", "camera.isvideo", "istakingvideo")
+_OF_DATCON = re.compile(r"\(0\)(?=:)|:[cd](?=$|\[)")  # the number of a unit, the kind of a value
+_HEADING = re.compile(r"([^\[(]+?)\s*(?:[\[(]([^\])]*)[\])]+)?")
 _CLOCK = re.compile(
     r"(\d{1,4})[-/.](\d{1,2})[-/.](\d{1,4})[ T]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?"
     r"\s*([aApP])?\.?[mM]?\.?Z?"
@@ -163,11 +176,13 @@ class DjiBinaryFormat:
 
 
 def _binary(path: Path) -> DataError:
+    ways = "Airdata, PhantomHelp or Flight Reader; dji-log-parser"
+    if path.suffix.lower() == ".dat":
+        ways = "DatCon or CsvView"
     return DataError(
         path,
         "is DJI's binary flight record, which mocap does not decode",
-        "convert it to CSV (Airdata, PhantomHelp or Flight Reader; dji-log-parser) and give that: pose:"
-        " {dji: RECORD.csv}",
+        f"convert it to CSV ({ways}) and give that: pose: {{dji: RECORD.csv}}",
     )
 
 
@@ -234,7 +249,7 @@ class _Record:
             ahead_ns = ahead_ns[ticks] + np.diff(since_ns[both])[ticks - 1] // 2
         else:
             ahead_ns = ahead_ns + 500_000_000
-        return since_ns + int(np.median(ahead_ns)), known
+        return since_ns + int(np.median(ahead_ns - ahead_ns[0])) + int(ahead_ns[0]), known
 
     def angles(self, part: str) -> Float:
         """Return yaw, pitch, roll [N, 3] in degrees; NaN for a gimbal that is 0 throughout."""
@@ -284,20 +299,18 @@ def _find_heading(text: str) -> _Heading | None:
         cells = next(csv.reader([lines[line]], delimiter=delimiter), [])
     except csv.Error:
         return None
-    matches = [_HEADING.fullmatch(cell.strip().lower()) for cell in cells]
+    matches = [_HEADING.fullmatch(_OF_DATCON.sub("", cell.strip().lower())) for cell in cells]
     names = [(match[1], match[2] or "") if match else ("", "") for match in matches]
     numbers: dict[str, tuple[int, float]] = {}
     for name, known in _NUMBERS.items():
         if (column := _column(names, known)) is not None:
-            numbers[name] = (column, 1.0)
+            numbers[name] = (column, 0.1 if names[column][0].endswith("raw") else 1.0)
     for name, known in _LENGTHS.items():
         if found := _measured(names, known, _METRES):
             numbers[name] = found
-    if found := _measured(names, _ELAPSED, _SECONDS):
+    if found := _measured(names, _ELAPSED, _SECONDS) or _measured(names, _IN_SECONDS, {"": 1.0}):
         numbers["elapsed"] = found
-    zone, clock = next(
-        ((zone, c) for zone in ("utc", "local") if (c := _clock_columns(names, zone))), ("", ())
-    )
+    zone, clock = next(((zone, c) for zone in _CLOCKS if (c := _clock_columns(names, zone))), ("", ()))
     told = numbers.keys() & {"relative", "absolute", "drone_pitch", "gb_pitch"}
     if not numbers.keys() >= {"latitude", "longitude"} or not told or not ("elapsed" in numbers or clock):
         return None
@@ -324,8 +337,7 @@ def _measured(
 
 def _clock_columns(names: Sequence[tuple[str, str]], zone: str) -> tuple[int, ...]:
     """Return the columns of the date and the time of day in a zone; empty without."""
-    for date, time in (("datetime", ""), ("custom.date", "custom.updatetime")):
-        wanted = [(name, zone) for name in (date, time) if name]
+    for wanted in _CLOCKS[zone]:
         if all(name in names for name in wanted):
             return tuple(names.index(name) for name in wanted)
     return ()

@@ -178,6 +178,15 @@ def test_damage(tmp_path: Path, truth: DroneTruth, capfd: pytest.CaptureFixture[
         read(path)
 
 
+def test_a_mount_whose_only_message_is_cut_off_gives_no_angles(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_dataflash(tmp_path / "a.bin", truth, kinds=("GPS", "POS", "ATT"))
+    message = dataflash("MNT", 83_000_000, 0, 0, 0.0, 0, -90.0, 0, 0.0, 0, 0.0)
+    path.write_bytes(path.read_bytes() + definition("MNT") + message[:-8])
+    telemetry = read(path)
+    assert telemetry.gimbal is None
+    assert telemetry.body is not None
+
+
 def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_dataflash(tmp_path / "a.bin", truth, kinds=("GPS", "ATT"))
     with refuses(path, "local", "gps"):
