@@ -1,7 +1,7 @@
 """Stage `draft`: write a flight.yaml for files and folders; it can be ingested or says what is missing."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -44,6 +44,8 @@ from pipelines.formats.drone_logs.tlog import FORMAT as TLOG
 from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
 from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
+from pipelines.formats.poses.kitti import times_of
+from pipelines.formats.skeletons.amc import skeleton_of
 from pipelines.formats.videos.frame_times import read_frame_times
 from pipelines.formats.videos.picture_motion import followed_points
 from pipelines.formats.videos.video import created_ns, index_video
@@ -145,7 +147,8 @@ def draft(
         raise DataError(target, "exists", "choose another with --output, or replace it with --overwrite")
     findings, unread = _read_all(things, home, progress or Silent())
     left_out = search.left_out | unread
-    left_out.pop(_absolute(target), None)
+    for path in (_absolute(target), *_read_beside(findings)):
+        left_out.pop(path, None)
     if not findings.all():
         path, reason = home, f"holds nothing that can be used ({len(left_out)} files)"
         if len(left_out) == 1:
@@ -164,6 +167,15 @@ def draft(
         assumed=manifest.assumed,
         left_out=left_out,
     )
+
+
+_BESIDE: dict[str, Callable[[Path], Path]] = {"kitti": times_of, "amc": skeleton_of}
+"""Functions that find the file that belongs to one of a format, by the format's name."""
+
+
+def _read_beside(findings: Findings) -> list[Path]:
+    """List the files that were read with others: the times of a trajectory, the skeleton of a motion."""
+    return [_BESIDE[found.format](found.path) for found in findings.all() if found.format in _BESIDE]
 
 
 def _absolute(path: Path) -> Path:

@@ -400,6 +400,12 @@ def joined(recordings: Sequence[Recording]) -> list[Recording]:
     return sorted(result, key=lambda recording: recording.place)
 
 
+def _ahead_ns(recording: Recording) -> int:
+    """Return the largest difference of a log's header stamps from receipt."""
+    every: list[TopicFound | Driver] = [*recording.topics, *recording.drivers]
+    return max((part.lead_ns for part in every if part.lead_ns is not None), key=abs, default=0)
+
+
 def with_stamps(recordings: Sequence[Recording]) -> list[Recording]:
     """Choose one kind of stamps for all logs; with it, the spans are those of these stamps.
 
@@ -426,7 +432,9 @@ def with_stamps(recordings: Sequence[Recording]) -> list[Recording]:
     alike = len(known) == len(leads) and max(known) - min(known) <= longest_ns
     ahead_ns = int(max(known, key=abs))
     if not alike:
-        return [replace(recording, stamps="receive", ahead_ns=ahead_ns) for recording in recordings]
+        return [
+            replace(recording, stamps="receive", ahead_ns=_ahead_ns(recording)) for recording in recordings
+        ]
     return [
         replace(
             recording,

@@ -32,7 +32,7 @@ _GENERIC_TEXT = """
 _GENERIC = TRUTH_WORDS | frozenset(_GENERIC_TEXT.split())
 """Words for the kind of a thing, which do not name its owner. With a number (cam01) they do name a camera."""
 _GENERIC_NUMBERED = re.compile(
-    r"(?i)(?<![^\W_])(?:rosbag2|halpe26|coco17|coco133|body25b?|blazepose33|[hx]26[45]|[23]d|\d{3,4}p|\d+fps)"
+    r"(?i)(?<![^\W_])(?:rosbag2|ros[12]|px4|halpe26|coco17|coco133|body25b?|blazepose33|[hx]26[45]|[23]d|\d{3,4}p|\d+fps)"
     r"(?![^\W_])"
 )
 _WORD = re.compile(r"[^\W\d_]+[0-9]*|[0-9]+")

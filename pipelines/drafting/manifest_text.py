@@ -585,15 +585,19 @@ def _logs(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> li
         paths = [relative(path) for path in log.parts]
         settings: dict[str, object] = {"path": paths[0] if len(paths) == 1 else paths, "stamps": log.stamps}
         remark = f"{log.title}, {spanned(log.span)}"
-        if log.ahead_ns:
+        if log.stamps == "receive" and abs(log.ahead_ns) < 10**9:
+            remark += "; receipt, as the header stamps of another log are of another clock"
+        elif log.ahead_ns:
             remark += (
-                f"; header stamps are {log.ahead_ns / 1e9:.3f} s ahead of receipt, assumed: {log.stamps}"
+                f"; header stamps are {abs(log.ahead_ns) / 1e9:.3f} s"
+                f" {'ahead of' if log.ahead_ns > 0 else 'behind'} receipt, assumed: {log.stamps}"
             )
+        if log.stamps == "receive" or log.ahead_ns:
             what = (
                 f"logs: {log.stamps} stamps, for header stamps and those of receipt are of different clocks"
             )
             remarks.assumed[what] = []
-        if several or log.ahead_ns:
+        if several or log.ahead_ns or log.stamps == "receive":
             settings["assumed"] = True
         lines.append("  " + entry(name, settings, remark))
     if several:
@@ -695,4 +699,6 @@ def _held(found: Found) -> str:
     if not isinstance(found, Recording):
         return ""
     topics = [topic.name for topic in found.topics if topic.count]
+    presets = [driver.settings for driver in found.drivers if "preset" in driver.settings]
+    topics += [" of ".join(str(each) for each in settings.values() if each) for settings in presets]
     return f" with {one_line(', '.join(topics[:_NAMES_LISTED]))}" if topics else " without poses or pictures"

@@ -32,6 +32,10 @@ class Likeness(NamedTuple):
     remedy: str = ""
 
 
+_AS_RECORD = (
+    "give the drone's own log; or, if its angles are degrees to the east, up and to the right, name the"
+    " columns as a flight record does: time(seconds), latitude, longitude, altitude(meters), yaw, pitch, roll"
+)
 _COPY = "it is damaged or of another kind: copy it again from where it was recorded"
 
 # Kind, the bytes at its beginning, the endings of its name. A file of this name with another beginning is
@@ -182,8 +186,9 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
             columns = f"the columns {_listed(cells)}" if named else f"{len(cells)} columns without names"
             if {"latitude", "longitude"} <= (names := {cell.lower() for cell in cells}):
                 problem = f"is a table of places on Earth whose writer is not known, with {columns}"
-                lacks = "a writer that is known" if any("yaw" in name for name in names) else "attitudes, too"
-                return Likeness(problem, f"poses need {lacks}: give the drone's own log")
+                turned = any(angle in name for name in names for angle in ("yaw", "heading", "pitch"))
+                remedy = _AS_RECORD if turned else "poses need attitudes, too: give the drone's own log"
+                return Likeness(problem, remedy)
             if {"roll", "pitch", "yaw"} <= names:
                 problem = f"is a table of angles, with {columns}"
                 remedy = "convert them to quaternions qx, qy, qz, qw: their order and axes are not stated"

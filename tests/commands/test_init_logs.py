@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 from pipelines.draft import Drafted, draft
 from pipelines.ingest import ingest
 from tests.commands.runner import refused, succeeds
+from tests.formats.skeletons.test_amc import write as write_motion
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
     drone_of,
@@ -262,6 +263,48 @@ def test_telemetry_that_cannot_be_read_is_named_beside_its_video(tmp_path: Path)
     assert "dvtm_wm999" in result.left_out[path]
     assert "name the .SRT" in result.left_out[path]
     assert len(result.missing) == 2  # poses, intrinsics
+
+
+def test_two_of_px4s_namespaces_are_two_drones(tmp_path: Path) -> None:
+    """The 4 of px4 is no number of a drone."""
+    flight = write_flight(tmp_path / "x", cameras=2, seconds=0.5, clean=True)
+    entries = [entry for k in (0, 1) for entry in px4_entries(drone_of(flight, k), f"/px4_{k + 1}")]
+    shutil.rmtree(tmp_path / "x")
+    write_mcap(tmp_path / "rosbag.mcap", sorted(entries, key=lambda entry: entry.stamp_ns))
+    for name in ("drone1", "drone2"):
+        write_video(tmp_path / f"{name}.mp4", even_ticks(15))
+    write_lens(tmp_path)
+    result, stated = drafted(tmp_path)
+    spaces = [camera["pose"]["namespace"] for camera in stated["cameras"].values()]
+    assert (spaces, result.missing) == (["/px4_1", "/px4_2"], [])
+    for name in ("drone1", "drone2"):
+        (tmp_path / f"{name}.mp4").rename(tmp_path / f"{name}00.mp4")
+    result = draft([tmp_path], overwrite=True)
+    assert "px4 of /px4_2" in result.text
+
+
+def test_logs_of_which_one_has_simulation_time_are_ordered_by_receipt(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "drone1.mcap", poses("/pose", UPTIME_NS - START_NS))
+    write_mcap(tmp_path / "drone2.mcap", poses("/pose", 0))
+    write_pictures(tmp_path, "drone1")
+    shutil.copyfile(tmp_path / "drone1.json", tmp_path / "drone2.json")
+    result, stated = drafted(tmp_path)
+    assert [log["stamps"] for log in stated["logs"].values()] == ["receive"] * 2
+    apart = [line for line in result.text.splitlines() if " behind receipt" in line]
+    assert [line.split(":")[0].strip() for line in apart] == ["drone1"]  # nothing is wrong with drone2's own
+    assert len(ingest(result.path).description.cameras) == 2
+
+
+def test_files_that_are_read_with_others_are_not_left_out(tmp_path: Path) -> None:
+    write_pictures(tmp_path, "drone1")
+    rows = [f"1 0 0 {k} 0 1 0 0 0 0 1 0" for k in range(FRAMES)]
+    (tmp_path / "drone1.txt").write_text("\n".join(rows), encoding="utf-8")
+    (tmp_path / "times.txt").write_text("\n".join(str(k / 30) for k in range(FRAMES)), encoding="utf-8")
+    write_motion(tmp_path)
+    result, stated = drafted(tmp_path)
+    assert result.left_out == {}
+    assert stated["cameras"]["drone1"]["pose"]["tum"] == "drone1.txt"
+    assert "10_04.amc" in result.text
 
 
 def test_a_map_in_the_frame_of_the_poses_is_drafted(tmp_path: Path) -> None:

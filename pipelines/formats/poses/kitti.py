@@ -65,7 +65,7 @@ class KittiFormat:
             first_line=1,
         )
         rows = table.stack([str(column) for column in range(12)]).reshape(-1, 3, 4)
-        times = _times_of(path)
+        times = times_of(path)
         t_ns, readable = parse_stamps(times, read_text(times).split())
         if len(t_ns) < len(rows):
             raise DataError(
@@ -92,7 +92,8 @@ def _is_rotation(matrices: Float) -> Bool:
         return np.asarray(near & (np.linalg.det(np.nan_to_num(matrices)) > 0), dtype=np.bool_)
 
 
-def _times_of(path: Path) -> Path:
+def times_of(path: Path) -> Path:
+    """Return the file with the times of a trajectory; raise DataError without one."""
     places = (
         path.with_name("times.txt"),
         path.with_name(f"{path.stem}_times.txt"),

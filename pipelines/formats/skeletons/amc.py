@@ -65,7 +65,7 @@ class AmcFormat:
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe the skeleton's file, joints, times and box."""
-        skeleton = _skeleton_of(path)
+        skeleton = skeleton_of(path)
         motion = self.read_joints(path, unit=None, axes=None)
         return {
             "skeleton": skeleton.name,
@@ -79,7 +79,7 @@ class AmcFormat:
         Raises:
             DataError: no skeleton, a bone that it lacks, numbers that are missing, or no frame.
         """
-        asf = _skeleton_of(path)
+        asf = skeleton_of(path)
         skeleton = _read_skeleton(asf)
         values, cut = _read_frames(path, skeleton)
         starts = _starts(skeleton, values)
@@ -91,7 +91,8 @@ class AmcFormat:
         return JointMotion(t_ns, names, position[:, None], dropped={"frame cut off": 1} if cut else {})
 
 
-def _skeleton_of(path: Path) -> Path:
+def skeleton_of(path: Path) -> Path:
+    """Return the file of the skeleton of a motion; raise DataError without one."""
     beside = sorted(path.parent.glob("*.[aA][sS][fF]"))
     for stem in (path.stem, path.stem.rpartition("_")[0]):
         for each in beside:
