@@ -57,6 +57,7 @@ from pipelines.reconstruction.refining import (
     FoundClocks,
     RefinedFlight,
     RobustFlight,
+    doubted_people,
     find_clocks,
     refine_flight,
     shifted,
@@ -448,6 +449,7 @@ def _attempt(
     if settings.method == "auto" and are_calibrated(cameras, observations):
         refines = False
     progress.advance()
+    doubted = doubted_people(observations, views, result, seen.association.doubts, settings.pixel_sigma)
     result = refused_people(result, observations, seen.anybody)
     progress.advance()
     refined = None
@@ -477,7 +479,7 @@ def _attempt(
         truth=truth,
         solve=solve,
     )
-    people = {"people": _people_seen(description, cameras, seen.association)}
+    people = {"people": _people_seen(description, cameras, seen.association, doubted)}
     metrics |= of_people(people["people"]["names"], observations, result, truth)
     readout = _readout(cameras, seen)
     parts = background | (refined.metrics if refined else {}) | _clock_metrics(cameras, clocks, refined)
@@ -558,6 +560,7 @@ def _robust_flight(
     workers: int,
 ) -> RobustFlight:
     """Collect what the refinement starts from."""
+    doubts = doubted_people(seen.observations, views, result, seen.association.doubts, settings.pixel_sigma)
     return RobustFlight(
         cameras,
         seen.found,
@@ -572,6 +575,7 @@ def _robust_flight(
         pixel_sigma=settings.pixel_sigma,
         between=flight.description.pose_interpolation,
         threads=workers,
+        trusted=np.array([not doubt for doubt in doubts]),
         waiting=flight.waiting,
     )
 
@@ -670,14 +674,16 @@ def chosen_detections(cameras: Sequence[Camera], found: Candidates, association:
 
 
 def _people_seen(
-    description: Description, cameras: Sequence[Camera], association: Association
+    description: Description, cameras: Sequence[Camera], association: Association, doubted: Sequence[str]
 ) -> dict[str, Any]:
     """Count people seen at once, times with more people than requested, and unused detections."""
     asked = association.choice.shape[2]
+    names = description.names_of_people(asked)
     return {
         "asked": asked,
         "phantoms": association.phantoms,
-        "names": description.names_of_people(asked),
+        "names": names,
+        "doubted": {name: cause for name, cause in zip(names, doubted, strict=True) if cause},
         "seen_at_once": int(association.people.max(initial=0)),
         "times": len(association.people),
         "times_with_more": int((association.people > asked).sum()),
@@ -696,16 +702,31 @@ def _people_warnings(people: Mapping[str, Any]) -> list[str]:
     return [
         *_no_people_warnings(people["no_people"]),
         *_phantom_warnings(people["phantoms"]),
+        *_doubted_warnings(people["doubted"]),
         *_unused_warnings(people),
+    ]
+
+
+_NO_BODY = {
+    "ground": "not on the ground",
+    "size": "not of a person's size",
+    "misfit": "seen at different places by different cameras",
+}
+
+
+def _doubted_warnings(doubted: Mapping[str, str]) -> list[str]:
+    """Write who may be no person, and is therefore not used to correct cameras and clocks."""
+    words = _NO_BODY | {"residual": "its views disagree more than those of the first person"}
+    return [
+        f"{name} may be nobody, or mixed up with others ({words[cause]}): cameras and clocks are corrected"
+        f" without {name}"
+        for name, cause in doubted.items()
     ]
 
 
 def _phantom_warnings(phantoms: Mapping[str, int]) -> list[str]:
     """Write how many bodies that two cameras see were left out, by cause."""
-    words = {
-        "ground": "not on the ground",
-        "size": "not of a person's size",
-        "misfit": "seen at different places by different cameras",
+    words = _NO_BODY | {
         "same": "a second image of a person",
         "bystander": "beyond the cameras and never in all of their pictures, a bystander",
     }

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from pipelines.geometry.arrays import Bool, Float
+from pipelines.keypoints.common_errors import without_common_errors
+from pipelines.keypoints.exchanges import undo_exchanges
 from pipelines.keypoints.grouping import Followed, follow
 from pipelines.keypoints.no_people import (
     Body,
@@ -19,6 +21,7 @@ from pipelines.keypoints.no_people import (
     Views,
     level_of_most_seen,
     tell_no_people,
+    why_no_body,
     why_no_person,
 )
 
@@ -49,6 +52,7 @@ class Association:
         str, Int64
     ]  # [C] detections by the causes of `NoPeople`, which are not used; and those kept
     phantoms: dict[str, int]  # bodies that two cameras see and that are left out, by `why_no_person`
+    doubts: tuple[str, ...]  # [P] why each of the people may be nobody, by `why_no_body`; "" without a doubt
     reasons: tuple[str, ...]  # messages for the user, one line each
 
 
@@ -81,10 +85,11 @@ def associate(
 
     Detections of different cameras are grouped into bodies by how near their viewing rays pass each
     other, in units of the stated angular noise, and bodies are followed over time by the continuity of
-    each camera's picture and by their place (see `grouping`). Of the bodies each logged person is the one
-    that fits their log best, so that the sum over all of them is greatest; nobody stands in for a logged
-    person whom no camera sees. Others are those seen in most camera-frames by two cameras or more, ties by
-    confidence. The order of detections within a camera and frame does not matter.
+    each camera's picture and by their place (see `grouping`). Where several are seen, this is done again
+    without the pose errors that all bodies of a picture share (`common_errors`). Of the bodies each logged
+    person is the one that fits their log best, so that the sum over all of them is greatest; nobody stands in
+    for a logged person whom no camera sees. Others are those seen in most camera-frames by two cameras or
+    more, ties by confidence. The order of detections within a camera and frame does not matter.
 
     Args:
         time_s: [T] seconds, strictly increasing.
@@ -112,27 +117,39 @@ def associate(
     logged = [] if actors is None else [actors[:, k] for k in range(actors.shape[1])]
     if logged:
         logs = np.stack([np.c_[log, np.full(len(log), actor_sigma_m)] for log in logged], axis=1)
-    seen = follow(time_s, xy, confidence, position, rotation, sigma, logs)
+    views = Views(xy, confidence, position, rotation, sigma)
+    seen = follow(time_s, *views, logs)
     dropped: dict[str, Int64] = {}
+    kept = seen.track >= 0
     if scene is not None:
-        things = tell_no_people(seen, xy, confidence, position, rotation, sigma, scene)
+        things = tell_no_people(seen, *views, scene)
         dropped = {cause: which.sum((0, 2)) for cause, which in things._asdict().items()}
-        if (out := things.ground | things.alone).any():
-            confidence = np.where(out[..., None], 0.0, confidence)
-            seen = follow(time_s, xy, confidence, position, rotation, sigma, logs)
+        kept &= ~(things.ground | things.alone)
+    again = bool((kept != (seen.track >= 0)).any())
+    if again:
+        views = views._replace(confidence=np.where(kept[..., None], confidence, 0.0))
+    several = bool((kept.sum(axis=-1) > 1).any())
+    if several:
+        views, before = without_common_errors(time_s, views, undo_exchanges(time_s, views, seen)), views
+        again |= views is not before
+    if again:
+        seen = follow(time_s, *views, logs)
+        seen = undo_exchanges(time_s, views, seen) if several else seen
+    xy, confidence = views.xy, views.confidence
     tracks = _tracks(seen, np.where(np.isfinite(xy).all(-1) & (confidence > 0), confidence, 0.0))
     chains, tracks, reasons = _chains(tracks, time_s, logged, actor_sigma_m, people)
     refused: Counter[str] = Counter()
+    if scene is not None and scene.ground is None:
+        scene = scene._replace(ground=level_of_most_seen(seen))
     if people is None:
-        views = Views(xy, confidence, position, rotation, sigma)
-        if scene is not None and scene.ground is None:
-            scene = scene._replace(ground=level_of_most_seen(seen))
         refused = _add_people(chains, tracks, time_s, seen.track, views, scene)
-    chosen = np.stack([_detections(seen.track, chain.owner, chain.taken) for chain in chains], axis=-1)
+    bodies = [chain.body(seen.track) for chain in chains]
+    doubts = tuple(why_no_body(body, views, scene) for body in bodies)
+    chosen = np.stack([body.choice for body in bodies], axis=-1)
     resumed = np.array([max(0, len(chain.taken) - 1) for chain in chains], np.int64)
     if not np.any(chosen >= 0):
         reasons.append(_nobody(seen.nearest))
-    return _counted(chosen, seen, resumed, dropped, refused, tuple(reasons))
+    return _counted(chosen, seen, resumed, dropped, refused, doubts, tuple(reasons))
 
 
 def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
@@ -206,6 +223,11 @@ class _Chain:
             return False
         return self.offer(track)
 
+    def body(self, track: Int64) -> Body:
+        """Return the detections and places of the person, from the track [T, C, D] of each detection."""
+        middle = np.where((self.owner >= 0)[:, None], self.place, np.nan)
+        return Body(_detections(track, self.owner, self.taken), middle)
+
 
 def _chains(
     tracks: list[_Track], time_s: Float, logs: list[Float], sigma_m: float, people: int | None
@@ -251,16 +273,11 @@ def _add_people(
     Bodies come in the order of how much they are seen. After one that is seen too shortly there are only
     pieces of bodies, which are not counted.
     """
-
-    def body(chain: _Chain) -> Body:
-        middle = np.where((chain.owner >= 0)[:, None], chain.place, np.nan)
-        return Body(_detections(track, chain.owner, chain.taken), middle)
-
     refused: Counter[str] = Counter()
-    people = [body(chain) for chain in chains if chain.taken]
+    people = [chain.body(track) for chain in chains if chain.taken]
     while tracks and len(chains) < _MOST_PEOPLE:
         chain, tracks = _next_chain(tracks, time_s)
-        candidate = body(chain)
+        candidate = chain.body(track)
         cause = why_no_person(candidate, people, time_s, views, scene)
         if cause == "short":
             break
@@ -345,6 +362,7 @@ def _counted(
     resumed: Int64,
     dropped: dict[str, Int64],
     phantoms: Mapping[str, int],
+    doubts: tuple[str, ...],
     reasons: tuple[str, ...],
 ) -> Association:
     """Build the result: the choice with its counts."""
@@ -371,5 +389,6 @@ def _counted(
         unused=(seen.track >= 0).sum((0, 2)) - present.sum((0, 1)),
         no_people=dropped,
         phantoms=dict(sorted(phantoms.items())),
+        doubts=doubts,
         reasons=reasons,
     )

@@ -91,7 +91,6 @@ def why_no_person(body: Body, people: list[Body], time_s: Float, views: Views, s
         high or too low; "size": not of a person's extent; "misfit": the views do not fit each other;
         "bystander": beyond the ring of the cameras, and never in all of their pictures.
     """
-    ground = None if scene is None else scene.ground
     step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     there: Bool = np.isfinite(body.middle[:, 0])
     together = np.zeros(len(there), np.bool_)
@@ -104,20 +103,31 @@ def why_no_person(body: Body, people: list[Body], time_s: Float, views: Views, s
             return "same"
     if (there if not people else together).sum() * step_s < _LEAST_S:
         return "short"
-    if ground is not None:
-        height, doubt = _heights(ground, body.middle[there])
+    if cause := why_no_body(body, views, scene):
+        return cause
+    return "bystander" if scene is not None and _is_bystander(body, people, views, scene.fields) else ""
+
+
+def why_no_body(body: Body, views: Views, scene: Scene | None) -> str:
+    """Say why detections are not one person's body; empty if they are, or if two cameras never see it.
+
+    Returns:
+        "ground", "size" or "misfit", as for `why_no_person`.
+    """
+    rows = np.flatnonzero(np.isfinite(body.middle[:, 0]))
+    if not len(rows):
+        return ""
+    if scene is not None and scene.ground is not None:
+        height, doubt = _heights(scene.ground, body.middle[rows])
         known = np.isfinite(height)
         slack = _DOUBTED * doubt[known]
         off = (height[known] - slack > _USUAL_HEIGHT_M[1]) | (height[known] + slack < _HEIGHT_M[0])
         if known.any() and off.mean() > _MOST:
             return "ground"
-    rows = np.flatnonzero(there)
     extent_m, misfit = _body_of(body.choice, rows[:: -(-len(rows) // _SAMPLES)], views)
     if not _USUAL_EXTENT_M[0] <= extent_m <= _EXTENT_M[1]:
         return "size"
-    if misfit > _LARGEST_MISFIT:
-        return "misfit"
-    return "bystander" if scene is not None and _is_bystander(body, people, views, scene.fields) else ""
+    return "misfit" if misfit > _LARGEST_MISFIT else ""
 
 
 def _is_bystander(body: Body, people: list[Body], views: Views, fields: Float) -> bool:

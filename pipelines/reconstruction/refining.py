@@ -47,6 +47,10 @@ _SEARCHED = 300  # times of the skeleton that the search for clock offsets uses,
 _MOST_SHIFTS = 6  # of the clocks; offsets of 0.2 s took one to five
 _UNDETERMINED = 0.5  # a clock is determined if its posterior sigma is below this share of its prior sigma
 _FEWEST_GUIDES = 6
+_WORST = (
+    75.0  # percentile of a person's squared residuals: the right views of half of a flight hide no others
+)
+_LARGEST_RATIO = 2.0  # of squared residuals to the first person's; those of right people were within 1.3
 _OF_LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # ends of the names of limbs' joints
 _HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid as a bone
 
@@ -68,6 +72,7 @@ class RobustFlight:
     pixel_sigma: float  # px, of a good keypoint
     between: Interpolation  # rules for interpolating between logged poses
     threads: int  # see `triangulate`
+    trusted: Bool  # [P] people who determine cameras and clocks; the others are triangulated afterwards
     only_guides: bool = False  # other joints are not refined
     waiting: Waiting | None = None  # where the arrays wait meanwhile
 
@@ -97,6 +102,52 @@ class RefinedFlight:
     cameras: pd.DataFrame | None  # t_ns, camera and pose of every picture; None after a fallback
     metrics: dict[str, Any]
     warnings: list[str]
+
+
+def doubted_people(
+    observations: Observations, views: Views, result: Triangulation, doubts: Sequence[str], pixel_sigma: float
+) -> list[str]:
+    """Say of each person why they must not determine cameras and clocks; "" for those who do.
+
+    Views that show different things pull their cameras. Pose errors move all people of a picture by about the
+    same: what the joints of a person have in common in each picture is therefore compared with the first
+    person who is not doubted. A right person who is left out costs little: they are placed with the corrected
+    cameras all the same.
+
+    Args:
+        observations: the people's rays.
+        views: the same, one row for each joint-frame.
+        result: `robust` of the views.
+        doubts: [P] causes that are known already, "" for none.
+        pixel_sigma: standard deviation of a good keypoint (px).
+
+    Returns:
+        [P] the causes; "residual" where the views disagree too much. If everybody is doubted, nobody is.
+    """
+    shape = observations.confidence.shape
+    away = result.points[:, None] - views.position[views.pose_index]
+    x, y, depth = np.einsum("ncij,nci->jnc", views.rotation[views.pose_index], away)
+    ahead = np.where((depth > 0) & (views.weight > 0), depth, np.nan)
+    missed = (np.stack([x / ahead, y / ahead], axis=-1) - views.rays) * views.focal[:, None]
+    missed = missed.reshape(*shape, 2)
+    unseen: Bool = np.asarray(np.isnan(missed).all(axis=2, keepdims=True))
+    common = np.nanmedian(np.where(unseen, 0.0, missed), axis=2)  # [T, P, C, 2] px
+    count = (~unseen[:, :, 0, :, 0]).sum(axis=-1)
+    squares = np.where(count > 1, (common**2).sum(axis=(-2, -1)) / np.maximum(2 * count - 3, 1), np.inf)
+    met = (observations.confidence > 0).any(axis=2).sum(
+        axis=-1
+    ) > 1  # and of these, all joints may be refused
+    levels = [
+        float(np.percentile(own[seen], _WORST)) if seen.any() else np.inf
+        for own, seen in zip(squares.T, met.T, strict=True)
+    ]
+    sure = [level for level, doubt in zip(levels, doubts, strict=True) if not doubt and np.isfinite(level)]
+    if not sure:
+        return [""] * len(levels)
+    most = _LARGEST_RATIO * max(sure[0], pixel_sigma**2)
+    return [
+        doubt or ("residual" if level > most else "") for level, doubt in zip(levels, doubts, strict=True)
+    ]
 
 
 def refine_flight(flight: RobustFlight) -> RefinedFlight:
@@ -158,7 +209,10 @@ def _initial_clock_offsets_s(flight: RobustFlight) -> Float:
     every = -(-times // _SEARCHED)
 
     def views_at(shift_s: float) -> Views:
-        return _observe_with_offsets(flight, np.where(flight.clock_sigma_s > 0, shift_s, 0.0), every)[1]
+        offset_s = np.where(flight.clock_sigma_s > 0, shift_s, 0.0)
+        observed, views = _observe_with_offsets(flight, offset_s, every)
+        weight = np.where(flight.trusted[:, None, None], observed.confidence, 0.0)
+        return replace(views, weight=weight.reshape(views.weight.shape))
 
     return initial_offsets_s(views_at, len(range(0, times, every)), flight.clock_sigma_s)
 
@@ -185,7 +239,7 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
     """Run the refinement with these clock offsets, starting from these points."""
     _, people, joints, _ = flight.observations.confidence.shape
     cameras = shifted(flight.cameras, offset_s)
-    start = started.points.reshape(-1, people, joints, 3)
+    start = np.where(flight.trusted[:, None, None], started.points.reshape(-1, people, joints, 3), np.nan)
     if flight.only_guides:
         start = np.where(flight.guides[:, None], start, np.nan)
     sightings = [_sighting(flight, c, camera) for c, camera in enumerate(cameras)]

@@ -97,6 +97,7 @@ def test_people_beyond_those_asked_for_are_counted_and_said(tmp_path: Path) -> N
     assert run(session)["people"] == {
         "asked": 1,
         "phantoms": {},
+        "doubted": {},
         "names": ["person0"],
         "seen_at_once": 2,
         "times": times,
