@@ -47,6 +47,7 @@ from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
 from pipelines.formats.poses.kitti import times_of
 from pipelines.formats.skeletons.amc import skeleton_of
 from pipelines.formats.videos.frame_times import read_frame_times
+from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
 from pipelines.formats.videos.picture_motion import followed_points
 from pipelines.formats.videos.video import created_ns, index_video
 from pipelines.geometry.arrays import Int64
@@ -169,6 +170,9 @@ def draft(
     )
 
 
+_CLOCKS: dict[str, Literal["whole seconds", "none"]] = {SHARED_SECONDS: "whole seconds", UNTIMED: "none"}
+"""Clocks of sequences of pictures by the codec of their index."""
+
 _BESIDE: dict[str, Callable[[Path], Path]] = {"kitti": times_of, "amc": skeleton_of}
 """Functions that find the file that belongs to one of a format, by the format's name."""
 
@@ -287,7 +291,7 @@ def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
     if isinstance(format_, VideoFormat):
         index = format_.index(path)
         made_ns = (index.start_ns or None) if path.is_dir() else created_ns(path)
-        return Video(*about, index.count, int(index.pts_ns[-1]), made_ns)
+        return Video(*about, index.count, int(index.pts_ns[-1]), made_ns, _CLOCKS.get(index.codec, "own"))
     if isinstance(format_, MapFormat):
         fitting_m = None
         try:

@@ -112,6 +112,7 @@ class Video(Found):
     frames: int
     length_ns: int
     made_ns: int | None = None  # its start or its end, in UTC, by its metadata
+    clock: Literal["own", "whole seconds", "none"] = "own"  # of its pictures, where they are in a folder
 
 
 @dataclass(frozen=True)

@@ -174,6 +174,10 @@ class CameraText:
             return self._said("frame_times", choice.all, describe(choice.taken))
         if self._camera.videos and self._film is None:
             return []  # the log's own stamps
+        if self._film and self._film.clock == "none":
+            self._miss("frame_times: when its pictures were taken, for their EXIF does not say it")
+            why = "their EXIF has no times that rise; or a csv"
+            return [f"# frame_times: {{start: SECONDS, fps: {ASSUMED_FPS}}}  # missing: {why}"]
         if (known := self._known_start) is not None:
             settings = {"start": (Decimal(known.start_ns) / 10**9).normalize()}
             if not known.sigma_s:
@@ -225,7 +229,8 @@ class CameraText:
         if film.made_ns is None or poses.taken.span is None:
             return None
         if film.path.is_dir() and taken.path == film.path:
-            return VideoStart(film.made_ns, "by the EXIF of its pictures")
+            whole = film.clock == "whole seconds"
+            return VideoStart(film.made_ns, "by the EXIF of its pictures", sigma_s=1 if whole else 0)
         made = Span(film.made_ns, film.made_ns + film.length_ns)
         if poses.taken.span.overlap_ns(made) < film.length_ns:
             return None

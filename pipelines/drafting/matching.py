@@ -175,7 +175,8 @@ def _of_drivers(logs: Mapping[str, Recording]) -> Iterator[Candidate]:
 
 
 def _is_true(found: Found) -> bool:
-    return is_called(found.place[-1], TRUTH_WORDS)
+    """Test if a thing's name, or that of a folder above it, says that it is the truth."""
+    return any(is_called(name, TRUTH_WORDS) for name in found.place)
 
 
 def _of_calibration(found: Calibration, camera: str) -> Candidate:

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
-from pipelines.formats.videos.picture_folder import UNTIMED, taken_ns
+from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED, taken_ns
 from pipelines.formats.videos.picture_motion import followed_points
 from pipelines.formats.videos.video import black_bars, created_ns
 from pipelines.geometry.arrays import Int64
@@ -137,6 +137,11 @@ class FlightCameras:
                 self._manifest,
                 f"cameras.{name}: its pictures have no times in EXIF that rise from one to the next",
                 "write frame_times: {start: SECONDS, fps: 30}, or give a csv",
+            )
+        if video is not None and video.codec == SHARED_SECONDS and camera.clock is None:
+            self._note(
+                f"{name}: several of its pictures share a second in EXIF and are spread evenly over it: say"
+                " clock: {sigma_s: 1}"
             )
         if logged is None:
             return replace(pictures, t_ns=self._start_ns(name, camera, times) + pictures.pts_ns)
@@ -341,7 +346,7 @@ def _ticks_ns(count: int, fps: Fraction) -> Int64:
 def _made_ns(path: Path) -> int | None:
     if not path.is_dir():
         return created_ns(path)
-    times = taken_ns(path)
+    times, _ = taken_ns(path)
     return None if times is None else int(times[0])
 
 

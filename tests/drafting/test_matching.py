@@ -422,10 +422,11 @@ def test_frame_times_go_to_the_video_of_their_name() -> None:
     assert [taken(c.frame_times) for c in draft.cameras] == ["DJI_0001.SRT", "DJI_0002.SRT"]
 
 
-def test_joints_are_true_only_by_name() -> None:
-    joints = [Joints(*place(name), "trc", "TRC", span(0, 10)) for name in ("result.trc", "truth.trc")]
+def test_joints_are_true_only_by_name_or_folder() -> None:
+    names = ("result.trc", "truth.trc", "truth/walk.trc")
+    joints = [Joints(*place(name), "trc", "TRC", span(0, 10)) for name in names]
     draft = match(Findings([video("a.mp4"), *joints]))
-    assert [found.path.name for found in draft.true_joints] == ["truth.trc"]
+    assert [found.path.name for found in draft.true_joints] == ["truth.trc", "walk.trc"]
     assert [found.path.name for found in draft.unused] == ["result.trc"]
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,8 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.geometry.arrays import Int64
+
 SUFFIXES = (".jpg", ".jpeg", ".png")
 _HEAD = 512 * 1024  # bytes in which cameras write XMP
+_SECOND_NS = 1_000_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _TAG = re.compile(rb"(?<![\w/-])drone(?:-(?:dji|parrot|skydio))?:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
 _SKYDIO = re.compile(
@@ -93,6 +96,26 @@ def read_tags(path: Path) -> Tags:
             if number is not None:
                 values[column] = number
     return Tags(_taken_ns(taken), values)
+
+
+def picture_times(tags: Sequence[Tags]) -> tuple[Int64, bool]:
+    """Return the time of each picture, ns [N], 0 where it states none; True if some share a whole second.
+
+    Cameras without parts of seconds give all pictures of a second one time. These are spread evenly over it,
+    as many in the first and the last second as usual.
+    """
+    t_ns = np.array([each.t_ns or 0 for each in tags], dtype=np.int64)
+    steps = np.diff(t_ns)
+    if not t_ns.all() or (steps > 0).all() or (steps < 0).any() or (t_ns % _SECOND_NS).any():
+        return t_ns, False
+    _, second, counts = np.unique(t_ns, return_inverse=True, return_counts=True)
+    usual = round(float(np.median(counts[1:-1]))) if len(counts) > 2 else int(counts.max())
+    room = counts.copy()
+    room[[0, -1]] = np.maximum(counts[[0, -1]], usual)
+    before = np.arange(len(t_ns)) - (np.cumsum(counts) - counts)[second]  # pictures of the same second
+    before += np.where(second == 0, room[0] - counts[0], 0)  # the first second is full at its end
+    spread: Int64 = t_ns + (before * _SECOND_NS // room[second]).astype(np.int64)
+    return spread, True
 
 
 def _xmp(head: bytes) -> dict[str, str]:

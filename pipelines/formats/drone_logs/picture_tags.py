@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.exif import NAMES, Tags, picture_files, read_tags
+from pipelines.formats.common.exif import NAMES, Tags, picture_files, picture_times, read_tags
 from pipelines.formats.drone_logs.dji_rows import DjiRows, any_finite, telemetry_of_rows
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 _RTK_FIXED = 50
+SHARED = "several of its pictures share a second: they are spread evenly over it: let clock.sigma_s be 1"
 
 
 class PictureTags:
@@ -24,16 +25,16 @@ class PictureTags:
     suffixes: tuple[str, ...] = ("",)
 
     def recognises(self, path: Path) -> bool:
-        """Return True for a folder of pictures whose first says when and where it was taken."""
+        """Return True for a folder of pictures whose first says where it was taken."""
         files = picture_files(path) if path.is_dir() else []
-        first = read_tags(files[0]) if files else Tags(None)
-        return first.t_ns is not None and "latitude" in first.values
+        return "latitude" in (read_tags(files[0]) if files else Tags(None)).values
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe places, heights, angles and RTK."""
-        _, columns = _columns(path)
+        t_ns, _, columns = _columns(path)
         ranged = [name for name in columns if any_finite(columns[name])]
         return {
+            "times": int(np.count_nonzero(t_ns)),
             "positions": int(np.count_nonzero(np.isfinite(columns["latitude"]))),
             "rtk_fixed": int(np.count_nonzero(columns["rtk_flag"] == _RTK_FIXED)),
             **{
@@ -48,8 +49,15 @@ class PictureTags:
         Raises:
             DataError: no pictures, no time or position in any, or no height while the user states none.
         """
-        t_ns, columns = _columns(path)
+        t_ns, shared, columns = _columns(path)
+        if not t_ns.any():
+            raise DataError(
+                path,
+                "has pictures that say where they were taken but not when (no DateTimeOriginal in EXIF)",
+                "name another log of poses, or restore the pictures as the drone wrote them",
+            )
         notes = ["its clock is the drone's local time, taken as UTC"]
+        notes += [SHARED] if shared else []
         fixed = columns["rtk_flag"] == _RTK_FIXED
         if fixed.any():
             across = np.nanmax(np.hypot(columns["rtk_std_latitude"], columns["rtk_std_longitude"]))
@@ -71,14 +79,15 @@ class PictureTags:
         return telemetry_of_rows(path, rows, choice, notes)
 
 
-def _columns(path: Path) -> tuple[Int64, dict[str, Float]]:
+def _columns(path: Path) -> tuple[Int64, bool, dict[str, Float]]:
+    """Return times and columns of all pictures, and True if some share a second (`picture_times`)."""
     files = picture_files(path)
     if not files:
         raise DataError(path, "is no folder of pictures", "name the folder that holds them")
     tags = [read_tags(file) for file in files]
-    t_ns = np.array([each.t_ns or 0 for each in tags], dtype=np.int64)
+    t_ns, shared = picture_times(tags)
     columns = {name: np.array([each.values.get(name, np.nan) for each in tags]) for name in NAMES}
-    return t_ns, columns | {"altitude": np.full(len(tags), np.nan)}
+    return t_ns, shared, columns | {"altitude": np.full(len(tags), np.nan)}
 
 
 def _angles(columns: Mapping[str, Float], part: str) -> Float:

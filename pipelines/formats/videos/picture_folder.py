@@ -11,7 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from pipelines.formats.common.exif import picture_files, read_tags
+from pipelines.formats.common.exif import picture_files, picture_times, read_tags
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import VideoIndex
@@ -19,6 +19,12 @@ from pipelines.session.records import VideoIndex
 _MOST_PIXELS = 1 << 27  # as of videos
 UNTIMED = "pictures without times"
 """Codec of an index whose stamps only count the pictures, because EXIF has no times or they do not rise."""
+SHARED_SECONDS = "pictures of whole seconds"
+"""Codec of an index with several pictures in each second of EXIF, which are spread evenly over it."""
+_SAID = {
+    UNTIMED: "none in EXIF",
+    SHARED_SECONDS: "EXIF, whole seconds; pictures of one second are spread evenly over it",
+}
 
 
 class PictureFolder:
@@ -37,7 +43,7 @@ class PictureFolder:
         index = self.index(path)
         return {
             "frames": index.count,
-            "times": "none in EXIF" if index.codec == UNTIMED else "EXIF",
+            "times": _SAID.get(index.codec, "EXIF"),
             "span_s": None if index.codec == UNTIMED else index.span_s,
             "picture": f"{index.width} x {index.height} px",
         }
@@ -50,7 +56,7 @@ class PictureFolder:
         """
         with FolderPictures(path) as pictures:
             first = pictures.read(0)
-            times = taken_ns(path)
+            times, shared = taken_ns(path)
         if first is None:
             raise DataError(path, "has a first picture that cannot be decoded", "take it out of the folder")
         stamps = times if times is not None else np.arange(len(pictures.files), dtype=np.int64) * 10**9
@@ -60,16 +66,18 @@ class PictureFolder:
             width=first.shape[1],
             height=first.shape[0],
             rotation_deg=0,
-            codec="pictures" if times is not None else UNTIMED,
+            codec=UNTIMED if times is None else SHARED_SECONDS if shared else "pictures",
             variable=times is not None,
         )
 
 
-def taken_ns(path: Path) -> Int64 | None:
-    """Return when each picture of a folder was taken, ns; None if one has no time or they do not rise."""
-    times = [read_tags(file).t_ns for file in picture_files(path)]
-    known = np.array([each or 0 for each in times], dtype=np.int64)
-    return known if known.all() and (np.diff(known) > 0).all() else None
+def taken_ns(path: Path) -> tuple[Int64 | None, bool]:
+    """Return when each picture of a folder was taken, ns, and True if some share a second (`picture_times`).
+
+    The times are None if a picture has none or they do not rise.
+    """
+    t_ns, shared = picture_times([read_tags(file) for file in picture_files(path)])
+    return (t_ns if t_ns.all() and (np.diff(t_ns) > 0).all() else None), shared
 
 
 class FolderPictures:

@@ -10,13 +10,15 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from pipelines.formats.common.exif import Tags, picture_times
 from pipelines.formats.drone_logs import picture_tags
 from pipelines.formats.videos import picture_folder
-from pipelines.formats.videos.picture_folder import UNTIMED, FolderPictures
+from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED, FolderPictures
 from pipelines.geometry.poses import rotate
 from pipelines.session.registries import VideoFormat, recognise
 from pipelines.session.telemetry import TelemetryChoice
-from tests.commands.runner import refused, succeeds
+from tests.commands.runner import mocap, refused, succeeds
+from tests.formats.refusals import refuses
 
 READER: VideoFormat = picture_folder.FORMAT
 TAGS = picture_tags.FORMAT
@@ -53,7 +55,13 @@ OTHERS = {
 
 
 def write(
-    folder: Path, *, exif: bool = True, xmp: str = XMP, offset: str | None = None, gps: bool = False
+    folder: Path,
+    *,
+    exif: bool = True,
+    xmp: str = XMP,
+    offset: str | None = None,
+    gps: bool = False,
+    parts: bool = True,
 ) -> Path:
     """Write pictures 9, 10, 11, ... half a second apart: the order of numbers is not that of text."""
     folder.mkdir(exist_ok=True)
@@ -63,7 +71,8 @@ def write(
         tags = Image.Exif()
         if exif:
             half = 25 + 50 * k
-            own = {36867: f"2024:01:02 03:04:{5 + half // 100:02d}", 37521: f"{half % 100:02d}"}
+            own = {36867: f"2024:01:02 03:04:{5 + half // 100:02d}"}
+            own |= {37521: f"{half % 100:02d}"} if parts else {}
             tags[0x8769] = own | ({36881: offset} if offset else {})
         if gps:
             degrees = {1: "N", 2: (48.0, 6.0, 0.0036 * k), 3: "E", 4: (11.0, 30.0, 0.0), 6: 530.0}
@@ -174,3 +183,51 @@ def test_pictures_without_times_need_a_rate(tmp_path: Path) -> None:
     assert "fps" in refused("ingest", manifest)
     manifest.write_text(text.replace("{start: 0}", "{start: 0, fps: 2}"))
     succeeds("ingest", manifest)
+
+
+S_NS = 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("seconds", "expected"),
+    [
+        ([4, 5, 5, 6], [4.5, 5.0, 5.5, 6.0]),  # two a second, from half past the first one on
+        ([4, 5, 5, 5, 5, 6, 6, 6, 6, 9], [4.75, 5, 5.25, 5.5, 5.75, 6, 6.25, 6.5, 6.75, 9]),
+        ([4, 4], [4, 4.5]),
+        ([4, 5, 6], [4, 5, 6]),
+        ([4, 4, 3], [4, 4, 3]),  # as they are: the reader refuses times that fall
+    ],
+)
+def test_pictures_of_one_second_are_spread_over_it(seconds: list[int], expected: list[float]) -> None:
+    t_ns, shared = picture_times([Tags(second * S_NS) for second in seconds])
+    assert (t_ns / S_NS).tolist() == expected
+    assert shared is (expected != seconds)
+    fine, shared = picture_times([Tags(4 * S_NS), Tags(4 * S_NS + 1), Tags(4 * S_NS + 1)])
+    assert (fine[-1] - fine[0], shared) == (1, False)
+
+
+def test_pictures_and_their_poses_share_the_times_within_a_second(tmp_path: Path) -> None:
+    folder = write(tmp_path / "film", parts=False)  # at 5.25, 5.75, 6.25 and 6.75 s
+    index = READER.index(folder)
+    assert index.codec == SHARED_SECONDS
+    assert index.pts_ns.tolist() == [500_000_000 * k for k in range(COUNT)]
+    telemetry = TAGS.read_telemetry(folder, TelemetryChoice())
+    assert telemetry.position.t_ns.tolist() == (index.start_ns + index.pts_ns).tolist()
+    assert any("sigma_s" in note for note in telemetry.notes)
+    matrix = "[[50.0, 0, 32], [0, 50.0, 24], [0, 0, 1]]"
+    lens = f"[cam_0]\nsize = [64, 48]\nmatrix = {matrix}\ndistortions = [0, 0, 0, 0, 0]\n"
+    (tmp_path / "lens.toml").write_text(lens, encoding="utf-8")
+    succeeds("init", tmp_path)
+    text = (tmp_path / "flight.yaml").read_text(encoding="utf-8")
+    assert "clock: {offset_s: 0, sigma_s: 1}" in text
+    succeeds("ingest", tmp_path / "flight.yaml")
+
+
+def test_pictures_without_times_are_drafted_as_lacking_them(tmp_path: Path) -> None:
+    folder = write(tmp_path / "film", exif=False)
+    with refuses(folder, "not when"):
+        TAGS.read_telemetry(folder, TelemetryChoice())
+    drafted = mocap("init", tmp_path)
+    assert "not when" in drafted.stdout + drafted.stderr
+    text = (tmp_path / "flight.yaml").read_text(encoding="utf-8")
+    assert "# frame_times: {start: SECONDS, fps: 30}  # missing" in text
