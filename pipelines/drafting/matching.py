@@ -69,6 +69,7 @@ _MAP_TYPES = ("Octomap", "GridMap", "OccupancyGrid")
 _GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "ptz", "camera", "cam"})
 NO_DATE_NS = 10**17  # stamps below it count from boot
 _SAME_DRONE_M = 30.0  # between two receivers on one drone
+_MISSED = 0.1  # part of a video's frames that its own subtitles may lack
 _MANY_CAMERAS = 200  # of one calibration file: more are the pictures of one moving camera
 
 
@@ -344,7 +345,7 @@ def match(findings: Findings, compare: Compare | None = None, distance: Distance
         if camera.poses and not camera.poses.taken.is_true:
             camera.true_poses = choose(truth)
         camera.intrinsics = choose(lenses, shared=True)
-        camera.frame_times = choose(stamps) if "log" not in _video(camera) else None
+        camera.frame_times = _own_stamps(camera, choose(stamps), moving)
         if camera.poses and (camera.poses.taken.of_body or camera.poses.taken.unturned):
             camera.gimbal = choose(gimbals)
 
@@ -376,6 +377,22 @@ def match(findings: Findings, compare: Compare | None = None, distance: Distance
         ]
         + [log for log in logs.values() if log.path not in used],
     )
+
+
+def _own_stamps(camera: CameraDraft, choice: Choice | None, moving: Sequence[Candidate]) -> Choice | None:
+    """Leave out subtitles of no matching name that are those of another film.
+
+    They are if they count other pictures than the video has, or if the video has a clock of its own.
+    """
+    if choice is None or "log" in _video(camera):
+        return None
+    stamps, film = choice.taken.found, camera.videos[0].found if camera.videos else None
+    if choice.taken.affinity(camera.label) >= NUMBER or not isinstance(film, Video):
+        return choice
+    if not isinstance(stamps, FrameTimes) or stamps.key != "srt":
+        return choice
+    clocked = any(isinstance(log.found, DroneLog) and log.found.path == film.path for log in moving)
+    return None if clocked or abs(stamps.rows - film.frames) > _MISSED * film.frames else choice
 
 
 def _logged_maps(logs: Mapping[str, Recording], cameras: Sequence[CameraDraft]) -> list[Candidate]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from pipelines.drafting.found import (
     Calibration,
     DroneLog,
@@ -420,6 +422,20 @@ def test_frame_times_go_to_the_video_of_their_name() -> None:
     ]
     draft = match(Findings([video("DJI_0001.mp4"), video("DJI_0002.mp4"), *stamps]))
     assert [taken(c.frame_times) for c in draft.cameras] == ["DJI_0001.SRT", "DJI_0002.SRT"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "clock", "own"),
+    [(300, False, True), (280, False, True), (900, False, False), (300, True, False)],
+)
+def test_subtitles_of_another_name_are_taken_only_for_a_film_of_their_length(
+    rows: int, clock: bool, own: bool
+) -> None:
+    stamps = FrameTimes(*place("DJI_0001.SRT"), "frame_times", "frame times", "srt", rows, span(0, 10))
+    inside = drone_log("GX010009.MP4", 0, turned=False)
+    draft = match(Findings([video("GX010009.MP4"), stamps, *([inside] if clock else [])]))
+    assert [taken(c.frame_times) for c in draft.cameras] == ["DJI_0001.SRT" if own else ""]
+    assert [found.path.name for found in draft.unused] == ([] if own else ["DJI_0001.SRT"])
 
 
 def test_joints_are_true_only_by_name_or_folder() -> None:

@@ -25,7 +25,7 @@ from pipelines.session.registries import (
     TrajectoryFormat,
     VideoFormat,
 )
-from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat, TriggerFormat
+from pipelines.session.telemetry import AttitudeFormat, TelemetryChoice, TelemetryFormat, TriggerFormat
 
 
 class NotOneLineError(AssertionError):
@@ -93,6 +93,8 @@ def _ways_of(format_: Format, path: Path) -> Iterator[Callable[[], object]]:
         yield partial(_look, path)
     if isinstance(format_, TelemetryFormat):
         yield lambda: format_.read_telemetry(path, TelemetryChoice())
+    if isinstance(format_, AttitudeFormat):
+        yield lambda: format_.read_attitudes(path)
     if isinstance(format_, TriggerFormat):
         yield lambda: format_.picture_times(path, TelemetryChoice())
 

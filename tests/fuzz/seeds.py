@@ -120,6 +120,13 @@ def _map_log(folder: Path) -> None:
     logs.write_mcap(folder / "maps.mcap", maps, "cdr", compression="none")
 
 
+def _turned_gopro(folder: Path) -> None:
+    truth = _truth(folder)
+    still = [[1.0, 0.0, 0.0, 0.0]] * len(truth.t_ns)
+    turns = video_tracks.gopro_turns(truth.t_ns.tolist(), still)
+    video_tracks.write_gopro(folder / "a.mp4", truth, turned=turns)
+
+
 def _gpx(folder: Path) -> None:
     points = [test_gpx.point(k) for k in range(4)]
     test_gpx.write(folder, test_gpx.track(*points), test_gpx.track(*points))
@@ -148,6 +155,7 @@ SEEDS: dict[str, Writer] = {
     "flight from logs": _logged_flight,
     "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),
     "gopro": lambda folder: video_tracks.write_gopro(folder / "a.mp4", _truth(folder)),
+    "gopro with attitudes": _turned_gopro,
     "gopro without telemetry": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
     "gpx": _gpx,
     "joints_csv": lambda folder: joints_csv.write_joints(folder / "joints.csv", walking(4)),

@@ -65,7 +65,12 @@ _NUMBERS = {
     "gb_roll": ("gimbal_roll", "gimbal.roll", "gimbalrollraw"),
 }
 _CLOCKS = {  # columns of date and time of day, each with the zone that the heading states
-    "utc": ((("datetime", "utc"),), (("custom.datetime", ""),), (("gps:datetimestamp", ""),)),
+    "utc": (
+        (("datetime", "utc"),),
+        (("custom.date", "utc"), ("custom.updatetime", "utc")),
+        (("custom.datetime", ""),),
+        (("gps:datetimestamp", ""),),
+    ),
     "local": ((("datetime", "local"),), (("custom.date", "local"), ("custom.updatetime", "local"))),
 }
 _FILMS = ("isvideo", "camera.isvideo", "istakingvideo")

@@ -75,11 +75,13 @@ class KittiFormat:
         upright = np.where(turned[:, None, None], rows[:, :, :3], np.eye(3))
         quaternion = quaternion_from_matrix(_WORLD @ upright)
         quaternion[~turned] = np.nan
+        with np.errstate(invalid="ignore"):  # an infinite number is dropped with its row
+            position = rows[:, :, 3] @ _WORLD.T
         return clean_poses(
             path,
             t_ns[: len(rows)],
             readable[: len(rows)],
-            rows[:, :, 3] @ _WORLD.T,
+            position,
             quaternion,
             truncated=table.truncated,
         )
