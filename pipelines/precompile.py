@@ -3,6 +3,10 @@
 numba compiles a function for the types of its arguments. data/kernels.json lists the functions and types that
 reconstruction and replay call (`python -m benchmarks.kernels --write` makes it from a flight). All others are
 compiled at their first use.
+
+`python -m pipelines.precompile` compiles them for every processor of a level and puts the code beside the
+program (`compilation.SHIPPED`). From there it goes into the wheel. Where that code does not hold, the first
+command compiles for its own processor.
 """
 
 from __future__ import annotations
@@ -16,7 +20,6 @@ from enum import StrEnum
 from importlib import import_module
 from importlib.resources import files
 from itertools import cycle
-from pathlib import Path
 from typing import Any, Literal
 
 from pipelines.session.progress import Progress, Silent
@@ -33,13 +36,17 @@ def listed() -> Signatures:
 
 
 def precompile(
-    workers: int, progress: Progress | None = None, names: Sequence[str] | None = None
+    workers: int,
+    progress: Progress | None = None,
+    names: Sequence[str] | None = None,
+    environment: Mapping[str, str] | None = None,
 ) -> list[str]:
     """Compile functions of the list that are not in numba's cache yet.
 
     Args:
         workers: the number of processes; functions are dealt out to them, largest first.
         names: the functions; by default all.
+        environment: variables of these processes, beside those of this one.
 
     Returns:
         The functions of the list that do not exist, or not for the listed types. They are compiled at their
@@ -56,6 +63,7 @@ def precompile(
             [sys.executable, "-m", "pipelines.precompile", *share],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,  # what fails is an outcome
+            env={**os.environ, **(environment or {})},
             text=True,
             start_new_session=True,  # Ctrl-C reaches them by their parent alone
         )
@@ -91,14 +99,11 @@ def precompile_for(stage: Literal["reconstruct", "replan"], progress: Progress) 
 
 
 def is_compiled(name: str) -> bool:
-    """Test if numba's cache has any code of a function; True where there can be no cache."""
-    from pipelines.geometry.compilation import dispatcher_of
+    """Test if there is any code of a function; True where there can be no cache."""
+    from pipelines.geometry.compilation import has_code
 
-    module, _, function = name.partition(":")
     try:
-        dispatcher = dispatcher_of(getattr(import_module(module), function))
-        # numba has no public name for it.
-        return Path(dispatcher._cache._cache_file._index_path).is_file()
+        return has_code(_function(name))
     except (ImportError, AttributeError):
         return True
 
@@ -122,14 +127,18 @@ def compile_function(name: str, signatures: Sequence[Sequence[object]]) -> Outco
 
     from pipelines.geometry.compilation import dispatcher_of
 
-    module, _, function = name.partition(":")
     try:
-        dispatcher = dispatcher_of(getattr(import_module(module), function))
+        dispatcher = dispatcher_of(_function(name))
         for signature in signatures:
             dispatcher.compile(tuple(type_of(each) for each in signature))
     except (ImportError, AttributeError, TypeError, NumbaError):
         return Outcome.OUTDATED
     return Outcome.COMPILED if sum(dispatcher.stats.cache_misses.values()) else Outcome.CACHED
+
+
+def _function(name: str) -> Any:
+    module, _, function = name.partition(":")
+    return getattr(import_module(module), function)
 
 
 def type_of(text: object) -> Any:
@@ -159,12 +168,26 @@ def entry_of(kind: Any) -> object:
     return str(kind)
 
 
+def _for_every_processor() -> dict[str, str]:
+    """Return the variables with which numba compiles what comes with the program.
+
+    There are none if this processor is of another kind.
+    """
+    from pipelines.geometry.compilation import EVERY_PROCESSOR, has_every_feature
+
+    return {"NUMBA_CPU_NAME": EVERY_PROCESSOR, "NUMBA_CPU_FEATURES": ""} if has_every_feature() else {}
+
+
 def main(names: Sequence[str]) -> None:
     """Compile functions and print the outcome of each; without names all, and exit 1 if any is outdated."""
+    from pipelines.geometry.compilation import outdated_files
+
     if not names:
-        outdated = precompile(os.cpu_count() or 1)
+        outdated = precompile(os.cpu_count() or 1, environment=_for_every_processor())
         if outdated:
             raise SystemExit(f"pipelines/data/kernels.json is older than the code of {', '.join(outdated)}")
+        for path in outdated_files(map(_function, listed())):
+            path.unlink()
     everything = listed()
     for name in names:
         print(name, compile_function(name, everything[name]), flush=True)  # noqa: T201  # read by precompile
