@@ -83,6 +83,8 @@ def one_line(text: str) -> str:
 
 ASSUMED_FPS = 30
 _BRIDGED_NS = 500_000_000  # ingest's default for the longest gap between two poses
+_AXES = {"joints_csv": "metres, z up", "c3d": "y up, or z up, as it says"}
+"""How a format's joints are read, by its name; all others have y up."""
 _MOST_OTHERS = 8  # candidates that are listed after the chosen one
 
 
@@ -665,10 +667,12 @@ def _truth(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
     lines: list[str] = []
     spans = [camera.poses.taken.span for camera in draft.cameras if camera.poses]
     logged = [span for span in spans if span]
+    remark = ""
     for joints in draft.true_joints:
         meets = not logged or any(joints.span.overlap_ns(span) >= 0 for span in logged)
         if meets and "joints" not in known:
             known["joints"] = relative(joints.path)
+            remark = f"{_AXES.get(joints.format, 'y up')}; where it is not so: joints: {{path, unit, axes}}"
             continue
         why = "" if meets else ", when there are no poses: add offset_s to its times"
         shown = relative(joints.path) if meets else {"path": relative(joints.path), "offset_s": 0}
@@ -681,7 +685,6 @@ def _truth(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
     if poses:
         known["poses"] = poses
     if known:
-        remark = "metres, z up; where it is not so: joints: {path, unit, axes}" if "joints" in known else ""
         lines.insert(0, entry("truth", stated(known, relative), remark))
     return ["", *lines] if lines else []
 

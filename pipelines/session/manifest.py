@@ -594,6 +594,11 @@ def read_flight(path: Path) -> Flight:
             every problem that was found.
     """
     flight = read_yaml_model(
-        path, Flight, "flight manifest", newest=SCHEMA, shape="a mapping with `schema: 1` and `cameras:`"
+        path,
+        Flight,
+        "flight manifest",
+        newest=SCHEMA,
+        shape="a mapping with `schema: 1` and `cameras:`",
+        made="`mocap init FOLDER` drafts one",
     )
     return flight if flight.name else flight.model_copy(update={"name": path.stem})

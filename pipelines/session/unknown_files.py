@@ -52,6 +52,9 @@ _BEGINNINGS = (
     ("a NumPy archive", b"PK\x03\x04", (".npz",)),
 )
 
+# Endings of other binary files.
+_BINARY = {".tlog", ".laz", ".las", ".mp4", ".mov", ".m4v", ".avi", ".lrv", ".ts", ".mts", ".klv", ".c3d"}
+
 # Kinds that are known by their first bytes but not read, and the step that makes them usable.
 _UNREAD = (
     (re.compile(rb"\xff\xd8\xff"), "a JPEG picture", "of a sequence of pictures, name the folder"),
@@ -141,7 +144,7 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
     for kind, magic, _ in _BEGINNINGS:
         if head.startswith(magic):
             return Likeness(f"begins as {kind} but is none that can be read", _COPY)
-    if path.suffix.lower() in {".tlog", ".laz", ".las"}:
+    if path.suffix.lower() in _BINARY:
         return Likeness(f"is called {path.suffix} but holds nothing of that kind", _COPY)
     if (b"\0" in head or _undecodable(head)) and text_encoding(head) != "utf-16":
         if not any(c < 32 and c not in b"\t\n\f\r" for c in head):
@@ -184,7 +187,8 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
         if len(cells) > 2 and len(lines) > 1 and lines[1].count(mark) > len(cells) // 2:
             named = sum(bool(re.match(r"[A-Za-z_]", cell)) for cell in cells) > len(cells) / 2
             columns = f"the columns {_listed(cells)}" if named else f"{len(cells)} columns without names"
-            if {"latitude", "longitude"} <= (names := {cell.lower() for cell in cells}):
+            names = {cell.lower() for cell in cells}
+            if names & {"latitude", "lat"} and names & {"longitude", "lon", "lng", "long"}:
                 problem = f"is a table of places on Earth whose writer is not known, with {columns}"
                 turned = any(angle in name for name in names for angle in ("yaw", "heading", "pitch"))
                 remedy = _AS_RECORD if turned else "poses need attitudes, too: give the drone's own log"

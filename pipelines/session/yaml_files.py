@@ -64,7 +64,7 @@ def keys_of(model: type[Part]) -> set[str]:
     return {field.alias or name for name, field in model.model_fields.items()}
 
 
-def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape: str) -> M:
+def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape: str, made: str = "") -> M:
     """Read and validate a file.
 
     Args:
@@ -72,14 +72,16 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
         noun: the name of such a file ("flight manifest").
         newest: the newest version of the schema.
         shape: a description of the file's form, for the message if the file is no mapping.
+        made: how one is made, for the message if the file is another one.
 
     Raises:
         DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
             every problem that was found.
     """
-    raw = _read_yaml(path, noun)
+    how = f" ({made})" if made else ""
+    raw = _read_yaml(path, noun, how)
     if not isinstance(raw, Mapping):
-        raise DataError(path, f"is no {noun}", f"it must be {shape}")
+        raise DataError(path, f"is no {noun}", f"it must be {shape}{how}")
     if isinstance(raw.get("schema"), int) and raw["schema"] > newest:
         raise DataError(
             path, f"has schema {raw['schema']}, newer than {newest}", "use a newer version of mocap"
@@ -91,16 +93,18 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
         raise DataError(path, "; ".join(dict.fromkeys(problems))) from None
 
 
-def _read_yaml(path: Path, noun: str) -> object:
+def _read_yaml(path: Path, noun: str, how: str) -> object:
     refuse_special(path)
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise DataError(path, f"is larger than {_LARGEST_FILE} bytes", f"this is no {noun}")
         text = plain_text(path.read_bytes(), errors="strict")
     except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror})", f"give the path of a {noun}") from None
+        raise DataError(
+            path, f"cannot be read ({error.strerror})", f"give the path of a {noun}{how}"
+        ) from None
     except UnicodeDecodeError:
-        raise DataError(path, "is no UTF-8 text", f"give the path of a {noun}") from None
+        raise DataError(path, "is no UTF-8 text", f"give the path of a {noun}{how}") from None
     return plain_yaml(path, text)
 
 

@@ -85,6 +85,21 @@ def test_a_video_that_counts_from_elsewhere_starts_with_the_first_pose_rounded_u
     assert remark.startswith("drone1: frame_times: start,")
 
 
+@pytest.mark.parametrize(
+    ("name", "format_", "axes"),
+    [
+        ("truth.csv", "joints_csv", "metres, z up"),
+        ("truth.c3d", "c3d", "as it says"),
+        ("truth.bvh", "bvh", "y up"),
+    ],
+)
+def test_the_axes_of_true_joints_are_told_as_they_are_read(name: str, format_: str, axes: str) -> None:
+    truth = Joints(*about(name, format_), Span(0, SECOND))
+    text, stated = written(Findings([keypoints(0, 9), poses(0, SECOND), truth]))
+    assert stated["truth"] == {"joints": name}
+    assert f"{axes}; where it is not so" in text.text
+
+
 def test_truth_of_another_time_is_told_but_not_stated() -> None:
     truth = Joints(*about("truth.csv"), Span(0, 10 * SECOND))
     findings = Findings([keypoints(0, 9), poses(EPOCH_NS, EPOCH_NS + SECOND), truth])
