@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -404,7 +405,7 @@ def align_each(source: Float, target: Float, *, with_scale: bool) -> Alignment:
     )
 
 
-def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> dict[str, float]:
+def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> dict[str, Any]:
     """Count who was found, missed and confused over time, as the field does for several people.
 
     A reconstructed person is at a true one if the mean difference of their common joints is at most
@@ -421,7 +422,8 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
     Returns:
         `present`: joint times of true people; of these `misses`; `phantoms`: reconstructed people at no true
         one; `switches`; `mota`: 1 - (misses + phantoms + switches) / present; `idf1`; `within_m`. NaN for the
-        two shares if no true person is present.
+        two shares if no true person is present. `by_person`: for each reconstructed person the times as a
+        phantom, and the misses and switches of the true one who is theirs in IDF1 (None without one).
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -430,9 +432,10 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
     mean = np.where(both[..., None], offset, 0.0).sum(axis=3) / np.maximum(both.sum(axis=3), 1)[..., None]
     distance: Float = np.where(both.sum(axis=3) > 0, np.linalg.norm(mean, axis=-1), np.inf)
     distance[distance > within_m] = np.inf
-    found, total = (int(np.isfinite(own[..., 0]).any(axis=2).sum()) for own in (position, truth))
+    phantom, missed = (np.isfinite(own[..., 0]).any(axis=2).sum(axis=0) for own in (position, truth))
+    found, total = int(phantom.sum()), int(missed.sum())
     last: dict[int, int] = {}
-    matches = switches = 0
+    switched = np.zeros(truth.shape[1], np.int64)
     for near in distance:
         pairs: dict[int, int] = {}
         for q, p in sorted(last.items()):
@@ -445,12 +448,15 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
         for p, q in np.transpose(linear_sum_assignment(cost)).tolist():
             if free[p, q] < np.inf:
                 pairs[q] = p
-                switches += last.get(q, p) != p
+                switched[q] += last.get(q, p) != p
         last |= pairs
-        matches += len(pairs)
+        missed[list(pairs)] -= 1
+        phantom[list(pairs.values())] -= 1
     at = (distance < np.inf).sum(axis=0)
-    same = int(at[linear_sum_assignment(at, maximize=True)].sum())
-    misses, phantoms = total - matches, found - matches
+    theirs = linear_sum_assignment(at, maximize=True)
+    same = int(at[theirs].sum())
+    true_one = {p: q for p, q in np.transpose(theirs).tolist() if at[p, q]}
+    misses, phantoms, switches = int(missed.sum()), int(phantom.sum()), int(switched.sum())
     return {
         "within_m": within_m,
         "present": total,
@@ -459,4 +465,12 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
         "switches": switches,
         "mota": 1 - (misses + phantoms + switches) / total if total else np.nan,
         "idf1": 2 * same / (total + found) if total else np.nan,
+        "by_person": [
+            {
+                "phantoms": int(phantom[p]),
+                "misses": int(missed[true_one[p]]) if p in true_one else None,
+                "switches": int(switched[true_one[p]]) if p in true_one else None,
+            }
+            for p in range(position.shape[1])
+        ],
     }

@@ -115,23 +115,26 @@ def of_people(
 
     Returns:
         `by_person`: for each name the `coverage` (share of the times with any measured joint), the
-        `reconstructed_share` of joint-frames, and with truth the `mpjpe_mm`; `tracking`: see
-        `tracking_errors`, None without truth.
+        `reconstructed_share` of joint-frames, and with truth the `mpjpe_mm`, `misses`, `switches` and
+        `phantoms`; `tracking`: see `tracking_errors`, None without truth.
     """
     shape = observations.confidence.shape[:3]
     ok = result.status.reshape(shape) == _OK
     position = np.where(ok[..., None], result.points.reshape(*shape, 3), np.nan)
     own = None if truth is None else _own_truth(position, truth)
+    tracking = None if truth is None else tracking_errors(position, truth)
+    confused = [{}] * len(names) if tracking is None else tracking.pop("by_person")
     return {
         "by_person": {
             name: {
                 "coverage": float(ok[:, k].any(axis=1).mean()),
                 "reconstructed_share": float(ok[:, k].mean()),
                 "mpjpe_mm": None if own is None else _mean_mm(position[:, k] - own[:, k]),
+                **confused[k],
             }
             for k, name in enumerate(names)
         },
-        "tracking": None if truth is None else tracking_errors(position, truth),
+        "tracking": tracking,
     }
 
 

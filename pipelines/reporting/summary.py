@@ -266,6 +266,9 @@ class PersonErrors:
     coverage: float | None  # share of the times with any measured joint
     reconstructed: float | None  # share of joint-frames
     mpjpe_mm: float | None
+    switches: float | None  # in person-frames, as the next two
+    misses: float | None
+    phantoms: float | None
 
 
 def errors_by_person(summary: Summary) -> list[PersonErrors]:
@@ -277,6 +280,9 @@ def errors_by_person(summary: Summary) -> list[PersonErrors]:
             coverage=number(section(own, name), "coverage"),
             reconstructed=number(section(own, name), "reconstructed_share"),
             mpjpe_mm=number(section(own, name), "mpjpe_mm"),
+            switches=number(section(own, name), "switches"),
+            misses=number(section(own, name), "misses"),
+            phantoms=number(section(own, name), "phantoms"),
         )
         for name in own
         if len(own) > 1

@@ -257,5 +257,14 @@ def test_who_was_missed_and_confused_is_counted() -> None:
     position[9, 2] = [-2.0, 0.0, 0.0]
     found = tracking_errors(position + np.array([0.3, 0.0, 0.0]), truth)
     assert (found["present"], found["misses"], found["phantoms"], found["switches"]) == (20, 2, 1, 2)
+    assert found["by_person"] == [
+        {
+            "phantoms": 0,
+            "misses": 0,
+            "switches": 1,
+        },  # at five times the second true one, and at three the first
+        {"phantoms": 0, "misses": 2, "switches": 1},
+        {"phantoms": 1, "misses": None, "switches": None},
+    ]
     assert found["mota"] == pytest.approx(1 - 5 / 20)
     assert found["idf1"] == pytest.approx(2 * 10 / (20 + 19))
