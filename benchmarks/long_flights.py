@@ -8,9 +8,16 @@ three drones.
 
     python -m benchmarks.long_flights --memory 2 5 10
 
-measures instead the most memory and the processor time that `mocap reconstruct` takes on the first of these
-flights, of so many minutes, each in a process of its own. `--given nothing` leaves its noise out.
-`--repeat 15` repeats the flight so often, which takes less time than to simulate an hour.
+measures instead the most memory and the processor time that `mocap reconstruct` and `mocap report` take on
+the first of these flights, of so many minutes, each in a process of its own. `--given nothing` leaves its
+noise out. `--repeat 15` repeats the flight so often, which takes less time than to simulate an hour;
+`--session` takes an ingested flight of so many minutes instead of flying one.
+
+    python -m benchmarks.long_flights --segments 60 300 900 --minutes 12 --first 302
+
+reconstructs one flight in segments of so many seconds, each in turn, and says what that costs: errors, NEES,
+and the error of the acceleration about the seams beside that elsewhere. `--session` takes an ingested flight
+instead of flying one, in which the truth is known.
 
     python -m benchmarks.long_flights --page demo/mound_walk.session    # the figure of docs/report.md
 
@@ -23,14 +30,18 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+from unittest.mock import patch
 
 import numpy as np
 import pyarrow as pa
@@ -41,11 +52,15 @@ import yaml  # type: ignore[import-untyped]
 from benchmarks.results_page import markdown_table
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruction import segments
 from pipelines.report import content_of
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.page import render_page
 from pipelines.session.description import read_description
+from pipelines.session.people import true_joints_at
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.storage import sha256_of
+from pipelines.session.tables import motion_from
 from pipelines.simulate import simulate
 from pipelines.sources.pictures import open_pictures
 from tests.reporting.browser import browser
@@ -80,31 +95,80 @@ def scenario(seed: int, seconds: float) -> dict[str, object]:
     return document | {"seed": seed, "duration_s": seconds}
 
 
-def memory_row(seed: int, minutes: float, times: int, *, stated: bool) -> str:
-    """Fly, and reconstruct by the command; return a row: minutes, peak MB, processor seconds, method used.
+def flown(seed: int, minutes: float, place: Path, *, stated: bool) -> Path:
+    """Fly a flight of so many minutes without film and ingest it; return its session."""
+    (place / "scenario.yaml").write_text(yaml.safe_dump(scenario(seed, 60 * minutes)))
+    simulate(place / "scenario.yaml", place / "made", video=False)
+    manifest = yaml.safe_load((place / "made" / "flight.yaml").read_text())
+    if not stated:
+        for camera in manifest["cameras"].values():
+            del camera["pose_noise"]
+    (place / "made" / "flown.yaml").write_text(yaml.safe_dump(manifest))
+    return ingest(place / "made" / "flown.yaml", place / "flown.session").folder
 
-    The flight is repeated so many times.
+
+def memory_rows(session: Path, minutes: float) -> Iterator[str]:
+    """Reconstruct by the command, and report; yield rows: minutes, command, peak MB, processor seconds.
+
+    The command has one process; with more of them each takes as much.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder)
-        (place / "scenario.yaml").write_text(yaml.safe_dump(scenario(seed, 60 * minutes)))
-        simulate(place / "scenario.yaml", place / "made", video=False)
-        manifest = yaml.safe_load((place / "made" / "flight.yaml").read_text())
-        if not stated:
-            for camera in manifest["cameras"].values():
-                del camera["pose_noise"]
-        (place / "made" / "flown.yaml").write_text(yaml.safe_dump(manifest))
-        session = ingest(place / "made" / "flown.yaml", place / "flown.session").folder
-        repeat_tables(session, times)
+    for command in (["reconstruct", "--workers", "1"], ["report"]):
         process = subprocess.Popen(  # noqa: S603  # our own command, with folders made here
-            [Path(sys.executable).parent / "mocap", "reconstruct", session], stdout=subprocess.DEVNULL
+            [Path(sys.executable).parent / "mocap", command[0], session, *command[1:]],
+            stdout=subprocess.DEVNULL,
         )
         _, status, usage = os.wait4(process.pid, 0)
         if status:
-            raise SystemExit(f"mocap reconstruct ended with {os.waitstatus_to_exitcode(status)}")
-        used = json.loads((session / "reconstruct" / "metrics.json").read_text())["method_used"]
+            raise SystemExit(f"mocap {command[0]} ended with {os.waitstatus_to_exitcode(status)}")
         peak_mb, took_s = usage.ru_maxrss * 1024 / 1e6, usage.ru_utime + usage.ru_stime
-        return f"| {minutes * times:g} | {peak_mb:.0f} | {took_s:.0f} | {json.dumps(used)} |"
+        yield f"| {minutes:g} | {command[0]} | {peak_mb:.0f} | {took_s:.0f} |"
+
+
+SEGMENT_COLUMNS = (
+    *("seconds of a segment", "segments", "MPJPE mm", "root-relative mm", "NEES", "in the 95 % ellipsoids %"),
+    *("acceleration error m/s^2", "the same about seams", "memory MB"),
+)
+_ABOUT_NS = 4_000_000_000  # of a seam: results go over from one segment to the next within 3 s of it
+_CHI2_95 = 7.815  # of three numbers
+
+
+def segments_row(session: Path, length_s: float) -> list[str]:
+    """Reconstruct a session in segments of this length; return a row of SEGMENT_COLUMNS."""
+    before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    with patch.object(segments, "LENGTH_S", length_s):
+        metrics = reconstruct(session, workers=1, force=True).metrics
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    skeleton = pq.read_table(session / "reconstruct" / "skeleton.parquet").to_pandas()
+    joints = tuple(dict.fromkeys(skeleton["joint"]))
+    t_ns = np.unique(skeleton["t_ns"].to_numpy())
+    truth = motion_from(pq.read_table(session / "truth.parquet").to_pandas(), joints)
+    true = true_joints_at(truth, t_ns)[:, 0]
+    found = skeleton[["x", "y", "z"]].to_numpy().reshape(len(t_ns), len(joints), 3)
+    covariance = np.zeros((len(skeleton), 3, 3))
+    rows, columns = np.triu_indices(3)
+    covariance[:, rows, columns] = skeleton[list(POINT_COVARIANCE_COLUMNS)].to_numpy()
+    covariance[:, columns, rows] = covariance[:, rows, columns]
+    missed = (found - true).reshape(-1, 3)
+    there = np.isfinite(missed).all(axis=1) & (skeleton["status"] == "ok").to_numpy()
+    whitened = np.linalg.solve(covariance[there], missed[there][..., None])[..., 0]
+    nees = np.sum(missed[there] * whitened, axis=1)
+    step_s = float(np.median(np.diff(t_ns))) / 1e9
+    change = np.linalg.norm(np.diff(found - true, 2, axis=0), axis=2) / step_s**2
+    seams_ns = read_description(session).start_ns + np.array(
+        [1e9 * of["first_s"] for of in metrics.get("segments", [])[1:]]
+    )
+    near = (np.abs(t_ns[1:-1, None] - seams_ns) < _ABOUT_NS).any(axis=1)
+    return [
+        f"{length_s:g}",
+        f"{len(metrics.get('segments', [0]))}",
+        f"{metrics['mpjpe_mm']:.1f}",
+        f"{metrics['root_mpjpe_mm']:.1f}",
+        f"{nees.mean():.2f}",
+        f"{100 * (nees < _CHI2_95).mean():.1f}",
+        f"{np.nanmean(change[~near]):.2f}",
+        f"{np.nanmean(change[near]):.2f}" if near.any() else "",
+        f"{peak_mb:.0f}" if peak_mb > before_mb else f"at most {peak_mb:.0f}",
+    ]
 
 
 def repeat_tables(session: Path, times: int) -> None:
@@ -226,15 +290,35 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=1, metavar="TIMES", help="with --memory")
     parser.add_argument("--given", choices=("model", "nothing"), default="model", help="with --memory")
     parser.add_argument("--page", type=Path, metavar="SESSION", help="measure the page of an hour instead")
-    parser.add_argument("--minutes", type=float, default=60.0, help="with --page")
+    parser.add_argument("--minutes", type=float, default=60.0, help="with --page and --segments")
+    parser.add_argument("--segments", type=float, nargs="+", metavar="SECONDS", help="compare their lengths")
+    parser.add_argument("--session", type=Path, help="with --segments and --memory: an ingested flight")
     arguments = parser.parse_args()
+    stated = arguments.given == "model"
     if arguments.page:
         print("\n".join(page_lines(arguments.page, arguments.minutes)))
         return
+    if arguments.segments:
+        with tempfile.TemporaryDirectory() as folder:
+            session = Path(folder) / "flown.session"
+            if arguments.session is None:
+                session = flown(arguments.first, arguments.minutes, Path(folder), stated=stated)
+            else:
+                shutil.copytree(arguments.session, session)
+            rows = [segments_row(session, length_s) for length_s in sorted(arguments.segments)]
+        print("\n".join(markdown_table(SEGMENT_COLUMNS, rows)))
+        return
     if arguments.memory:
-        stated = arguments.given == "model"
         for minutes in arguments.memory:
-            print(memory_row(arguments.first, minutes, arguments.repeat, stated=stated), flush=True)
+            with tempfile.TemporaryDirectory() as folder:
+                session = Path(folder) / "flown.session"
+                if arguments.session is None:
+                    session = flown(arguments.first, minutes, Path(folder), stated=stated)
+                else:
+                    shutil.copytree(arguments.session, session)
+                repeat_tables(session, arguments.repeat)
+                for row in memory_rows(session, minutes * arguments.repeat):
+                    print(row, flush=True)
         return
     rows = []
     for seed in range(arguments.first, arguments.first + arguments.count):

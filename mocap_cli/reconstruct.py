@@ -212,9 +212,9 @@ class Shows(click.ParamType[str]):
     type=click.IntRange(1, 256),
     default=lambda: os.cpu_count() or 1,
     show_default="all cores",
-    help="Threads; the result does not depend on them.",
+    help="Threads, or processes for the segments of a long flight; the result does not depend on them.",
 )
-@scheduler_option("Give the pictures to the Dask cluster there, in blocks.")
+@scheduler_option("Give the pictures, and a long flight, to the Dask cluster there, in parts.")
 @click.option("--strict", is_flag=True, help="Refuse a flight with a doubt (see `mocap check`).")
 @force_option
 @output_options

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.geometry.arrays import Picture
+import numpy as np
+
+from pipelines.geometry.arrays import Bool, Int64, Picture
 from pipelines.planning.loading import load_flight
 from pipelines.planning.scene import hidden_shares
 from pipelines.reporting.comparison import compare, labels_of
 from pipelines.reporting.comparison_figures import draw_comparison
 from pipelines.reporting.comparison_page import GENERATOR, render_comparison
-from pipelines.reporting.content import ReplanContent, SessionContent, StudyContent, section
+from pipelines.reporting.content import (
+    ReplanContent,
+    SessionContent,
+    StudyContent,
+    estimated_clocks,
+    section,
+)
 from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
 from pipelines.reporting.page import draw_session, render_page
 from pipelines.reporting.panels import Video
@@ -40,6 +49,8 @@ from pipelines.session.tables import (
     SEEN,
     SKELETON,
     TRUTH,
+    read_column,
+    read_rows,
     read_table,
 )
 from pipelines.session.whole_folders import STUDY_MARK, is_made, whole_folder
@@ -48,6 +59,7 @@ from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_p
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 REPORT = Stage("report", revision=13)
 _FIGURES_REVISION = 6
@@ -291,16 +303,97 @@ def content_of(folder: Path) -> SessionContent:
     return _load(folder, read_description(folder), records)
 
 
+_MOST_TIMES = 18_000
+"""The most times of the skeleton that a page is drawn from: ten minutes at 30 Hz."""
+
+_STRETCH_NS = 600_000_000_000  # of a flight whose lines of sight are looked at together
+
+
+class _Shown:
+    """The times of a flight that its page shows: of a long one every k-th, and what was recorded about them.
+
+    Args:
+        folder: the session.
+        t_ns: all times of the skeleton, or of the pictures where there is none.
+        metrics: reconstruct/metrics.json.
+    """
+
+    def __init__(self, folder: Path, t_ns: Int64, metrics: Mapping[str, object] | None) -> None:
+        self.every = max(-(-len(t_ns) // _MOST_TIMES), 1)
+        self._folder = folder
+        self._t_ns = t_ns[:: self.every]
+        self._offset_ns = estimated_clocks(metrics or {})
+        self._frames: dict[str, pd.DataFrame] = {}
+
+    def table(self, name: str, schema: pa.Schema) -> pd.DataFrame:
+        """Read the rows of a table that were written at these times."""
+        path = self._folder / name
+        if self.every == 1:
+            return read_table(path, schema)
+        return read_rows(path, schema, _among(read_column(path, "t_ns"), self._t_ns))
+
+    def about(self, name: str, schema: pa.Schema) -> pd.DataFrame:
+        """Read the rows of a table of other times that lie next to these."""
+        path = self._folder / name
+        if self.every == 1:
+            return read_table(path, schema)
+        own_ns = read_column(path, "t_ns")
+        stamps = np.unique(own_ns)
+        if not len(stamps):
+            return read_table(path, schema)
+        after = np.searchsorted(stamps, self._t_ns).clip(0, len(stamps) - 1)
+        next_to = np.concatenate([after, (after - 1).clip(0), (0, len(stamps) - 1)])
+        return read_rows(path, schema, _among(own_ns, stamps[np.unique(next_to)]))
+
+    def frames(self, camera: str) -> pd.DataFrame:
+        """Read the frames of a camera that are nearest to these times."""
+        table = read_table(self._folder / "cameras" / camera / "frames.parquet", FRAMES)
+        if self.every == 1 or not len(table):
+            return table
+        stamps = table["t_ns"].to_numpy(np.int64) + self._offset_ns.get(camera, 0)
+        after = np.searchsorted(stamps, self._t_ns).clip(0, len(stamps) - 1)
+        before = (after - 1).clip(0)
+        nearer = np.where(self._t_ns - stamps[before] <= stamps[after] - self._t_ns, before, after)
+        rows = np.unique(np.concatenate([nearer, (0, len(stamps) - 1)]))
+        return table.iloc[rows].reset_index(drop=True)
+
+    def keypoints(self, stage: str, camera: str) -> pd.DataFrame:
+        """Read the keypoints in these frames."""
+        path = self._folder / stage / camera / "keypoints.parquet"
+        if self.every == 1:
+            return read_table(path, KEYPOINTS)
+        shown = self.frames(camera)["frame"].to_numpy(np.int64)
+        return read_rows(path, KEYPOINTS, _among(read_column(path, "frame"), shown))
+
+
+def _among(values: Int64, chosen: Int64) -> Bool:
+    """Test which values [N] are among the chosen, sorted ones."""
+    if not len(chosen):
+        return np.zeros(len(values), dtype=np.bool_)
+    place = np.searchsorted(chosen, values).clip(0, len(chosen) - 1)
+    return np.asarray(chosen[place] == values, dtype=np.bool_)
+
+
+def _times(folder: Path, description: Description, *, reconstructed: bool) -> Int64:
+    """Return the times of the skeleton, or those of the camera with the most pictures."""
+    if reconstructed:
+        return np.unique(read_column(folder / "reconstruct" / "skeleton.parquet", "t_ns"))
+    camera = max(description.cameras, key=lambda name: description.cameras[name].frames.count)
+    return np.unique(read_column(folder / "cameras" / camera / "frames.parquet", "t_ns"))
+
+
 def _load(folder: Path, description: Description, records: dict[str, StageRecord]) -> SessionContent:
     reconstructed = "reconstruct" in records
+    metrics = read_json(folder / "reconstruct" / "metrics.json") if reconstructed else None
+    shown = _Shown(folder, _times(folder, description, reconstructed=reconstructed), metrics)
     keypoints = {
-        name: read_table(folder / "cameras" / name / "keypoints.parquet", KEYPOINTS)
+        name: shown.keypoints("cameras", name)
         for name, entry in description.cameras.items()
         if entry.keypoints
     }
     if "detect" in records:
         keypoints |= {
-            name: read_table(folder / "detect" / name / "keypoints.parquet", KEYPOINTS)
+            name: shown.keypoints("detect", name)
             for name in records["detect"].counts["cameras"]
             if name not in keypoints
         }
@@ -308,25 +401,20 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
     return SessionContent(
         name=session_name(folder),
         session=description,
-        skeleton=read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON) if reconstructed else None,
-        metrics=read_json(folder / "reconstruct" / "metrics.json") if reconstructed else None,
-        truth=read_table(folder / "truth.parquet", TRUTH) if description.has_true_joints else None,
-        poses={
-            name: read_table(folder / "cameras" / name / "poses.parquet", POSES)
-            for name in description.cameras
-        },
-        frames={
-            name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
-            for name in description.cameras
-        },
+        every=shown.every,
+        skeleton=shown.table("reconstruct/skeleton.parquet", SKELETON) if reconstructed else None,
+        metrics=metrics,
+        truth=shown.about("truth.parquet", TRUTH) if description.has_true_joints else None,
+        poses={name: shown.about(f"cameras/{name}/poses.parquet", POSES) for name in description.cameras},
+        frames={name: shown.frames(name) for name in description.cameras},
         keypoints=keypoints,
         stages={name: asdict(record) for name, record in records.items()},
         replan=_load_replan(folder, records["replan"], maps) if "replan" in records else None,
         sweep=read_json(folder / "sweep" / "metrics.json") if "sweep" in records else None,
-        refined=_by_camera(folder, "reconstruct/cameras.parquet", records.get("reconstruct")),
-        true_poses=_by_camera(folder, "truth_poses.parquet", records["ingest"]),
+        refined=_by_camera(shown, "reconstruct/cameras.parquet", records.get("reconstruct")),
+        true_poses=_by_camera(shown, "truth_poses.parquet", records["ingest"]),
         hidden=_load_hidden(folder, description, records, maps),
-        angles=_load_angles(folder, records.get("reconstruct")),
+        angles=_load_angles(shown, records.get("reconstruct")),
         made_by=versions_of(folder),
         outdated=tuple(outdated(records, description.recorded)),
     )
@@ -338,24 +426,41 @@ def _load_hidden(
     """Compute the share of the flight in which the map hides the actor; empty without a map or an actor."""
     if not maps:
         return {}
-    try:
-        flight = load_flight(folder, description, records.get("reconstruct"), pose_noise=None)
-    except DataError:
-        return {}
-    return hidden_shares(flight, description, maps)
+    found: list[tuple[float, dict[str, float]]] = []
+    frames = [entry.frames for entry in description.cameras.values()]
+    first_ns, last_ns = min(of.first_t_ns for of in frames), max(of.last_t_ns for of in frames)
+    count = max(-(-(last_ns - first_ns) // _STRETCH_NS), 1)
+    edges = np.linspace(first_ns, last_ns, count + 1).round().astype(np.int64).tolist()
+    for span_ns in pairwise(edges) if count > 1 else [None]:
+        try:
+            flight = load_flight(
+                folder, description, records.get("reconstruct"), pose_noise=None, span_ns=span_ns
+            )
+        except DataError:
+            continue
+        lasts_ns = float(np.ptp(flight.actor_t_ns))
+        found.append((lasts_ns, hidden_shares(flight, description, maps)))
+    if len(found) == 1:
+        return found[0][1]
+    shares: dict[str, float] = {}
+    for name in description.cameras:
+        own = [(lasts_ns, of[name]) for lasts_ns, of in found if name in of]
+        if own:
+            shares[name] = sum(weight * share for weight, share in own) / sum(weight for weight, _ in own)
+    return shares
 
 
-def _load_angles(folder: Path, record: StageRecord | None) -> pd.DataFrame | None:
+def _load_angles(shown: _Shown, record: StageRecord | None) -> pd.DataFrame | None:
     """Read the joint angles; None of a reconstruction without them."""
     name = "reconstruct/angles.parquet"
-    return read_table(folder / name, ANGLES) if record is not None and name in record.outputs else None
+    return shown.table(name, ANGLES) if record is not None and name in record.outputs else None
 
 
-def _by_camera(folder: Path, name: str, record: StageRecord | None) -> dict[str, pd.DataFrame]:
+def _by_camera(shown: _Shown, name: str, record: StageRecord | None) -> dict[str, pd.DataFrame]:
     """Split a table of poses by camera; empty if the stage of this record wrote none."""
     if record is None or name not in record.outputs:
         return {}
-    table = read_table(folder / name, CAMERA_POSES).sort_values(["camera", "t_ns"])
+    table = shown.about(name, CAMERA_POSES).sort_values(["camera", "t_ns"])
     return {str(name): own[POSES.names].reset_index(drop=True) for name, own in table.groupby("camera")}
 
 

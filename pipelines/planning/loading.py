@@ -23,6 +23,7 @@ from pipelines.session.tables import (
     POSES,
     SKELETON,
     TRUTH,
+    Span,
     motion_from,
     read_table,
     trajectory_from,
@@ -85,22 +86,28 @@ class LoggedFlight:
 
 
 def load_flight(
-    folder: Path, description: Description, reconstructed: StageRecord | None, *, pose_noise: str | None
+    folder: Path,
+    description: Description,
+    reconstructed: StageRecord | None,
+    *,
+    pose_noise: str | None,
+    span_ns: Span | None = None,
 ) -> LoggedFlight:
     """Read the flight, cut to the time in which the actor and all moving cameras are known.
 
     Args:
         reconstructed: the record of stage `reconstruct`, None where that has not run.
         pose_noise: errors of the poses, in place of those stated in the session.
+        span_ns: only what was recorded between these times; None for all.
 
     Raises:
         DataError: the actor's position is unknown, or not known while the cameras flew; an unknown noise
             model.
     """
     warnings: list[str] = []
-    skeleton, skeleton_source = _skeleton(folder, description, reconstructed)
-    t_ns, actor, source = _actor(folder, description, reconstructed, warnings)
-    cameras, poses_source, noise_source = _cameras(folder, description, pose_noise)
+    skeleton, skeleton_source = _skeleton(folder, description, reconstructed, span_ns)
+    t_ns, actor, source = _actor(folder, description, reconstructed, warnings, span_ns)
+    cameras, poses_source, noise_source = _cameras(folder, description, pose_noise, span_ns)
     if noise_source == "nobody":
         warnings.append("nobody states the noise of the cameras' poses: taken as exact; state --pose-noise")
     hips = _hips(skeleton) if skeleton is not None and skeleton_source == "truth" else None
@@ -177,18 +184,18 @@ def planned_positions(flight: LoggedFlight, t_ns: Int64) -> tuple[Float, Bool]:
 
 
 def _skeleton(
-    folder: Path, description: Description, reconstructed: StageRecord | None
+    folder: Path, description: Description, reconstructed: StageRecord | None, span_ns: Span | None
 ) -> tuple[JointMotion | None, Source | None]:
     """Return the true skeleton, or else the reconstructed one."""
     if description.truth is not None and description.has_true_joints:
-        table = read_table(folder / "truth.parquet", TRUTH)
+        table = read_table(folder / "truth.parquet", TRUTH, span_ns)
         return motion_from(table, tuple(description.truth.joints)), "truth"
-    return (None, None) if reconstructed is None else (_reconstruction(folder), "reconstruction")
+    return (None, None) if reconstructed is None else (_reconstruction(folder, span_ns), "reconstruction")
 
 
-def _reconstruction(folder: Path) -> JointMotion:
+def _reconstruction(folder: Path, span_ns: Span | None) -> JointMotion:
     """Read the reconstructed skeleton; joints that are not `ok` are NaN."""
-    table = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
+    table = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON, span_ns)
     table = table[table["person"] == 0]
     motion = motion_from(table, tuple(dict.fromkeys(table["joint"])))
     if motion.status is not None:
@@ -213,9 +220,10 @@ def _actor(
     description: Description,
     reconstructed: StageRecord | None,
     warnings: list[str],
+    span_ns: Span | None,
 ) -> tuple[Int64, Float, Source]:
     """Return the planners' input of the actor: the log, or without one the reconstructed hips."""
-    logged = logged_actor(folder, description)
+    logged = logged_actor(folder, description, span_ns)
     if logged is not None and description.actor is not None:
         if description.actor.point in ("feet", "head"):
             warnings.append(
@@ -229,7 +237,7 @@ def _actor(
             "has no logged actor and no reconstruction to take one from",
             "run `mocap reconstruct`, or name the actor's topic under `actor:` in flight.yaml",
         )
-    hips = _hips(_reconstruction(folder))
+    hips = _hips(_reconstruction(folder, span_ns))
     if hips is None:
         raise DataError(
             folder,
@@ -268,12 +276,15 @@ def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.in
 
 
 def _cameras(
-    folder: Path, description: Description, pose_noise: str | None
+    folder: Path, description: Description, pose_noise: str | None, span_ns: Span | None
 ) -> tuple[tuple[SessionCamera, ...], Source, str]:
-    true_poses = _true_poses(folder, description)
+    true_poses = _true_poses(folder, description, span_ns)
     cameras, stating = [], set()
     for name, entry in description.cameras.items():
-        logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
+        own_ns = None if entry.poses.static else span_ns
+        logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES, own_ns))
+        if not len(logged.t_ns):
+            raise DataError(folder, f"{name} has no poses in this span")
         noise, stated_by = _noise(name, entry, logged, pose_noise)
         stating.add(stated_by)
         cameras.append(
@@ -288,12 +299,12 @@ def _cameras(
     return tuple(cameras), "truth" if true_poses else "log", _said_by(stating)
 
 
-def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]:
+def _true_poses(folder: Path, description: Description, span_ns: Span | None) -> dict[str, Trajectory]:
     """Return the true poses of all cameras, if all of them are known."""
     moving = {name for name, entry in description.cameras.items() if not entry.poses.static}
     if description.truth is None or not moving or not moving <= set(description.truth.cameras):
         return {}
-    table = read_table(folder / "truth_poses.parquet", CAMERA_POSES)
+    table = read_table(folder / "truth_poses.parquet", CAMERA_POSES, span_ns)
     return {name: trajectory_from(table[table["camera"] == name]) for name in sorted(moving)}
 
 

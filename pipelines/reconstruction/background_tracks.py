@@ -142,7 +142,12 @@ def load_tracks(session: Path, camera: Camera) -> Followed | None:
         return off_people(Tracks(picture[known], point[known], xy[known]), boxes)
 
     parts = table_parts(path, TRACKS)
-    begins = np.searchsorted(numbers, np.array([first for first, _ in parts], dtype=np.int64))
+    firsts = np.array([first for first, _ in parts], dtype=np.int64)
+    if len(numbers):  # of a camera of which only a stretch was loaded: no parts before or after it
+        there = slice(*np.searchsorted(firsts, (numbers[0], numbers[-1] + 1)))
+        there = slice(max(there.start - 1, 0), there.stop)
+        parts, firsts = parts[there], firsts[there]
+    begins = np.searchsorted(numbers, firsts)
     return Followed(rows, begins, [partial(load, read) for _, read in parts])
 
 

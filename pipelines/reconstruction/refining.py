@@ -6,7 +6,7 @@ are inliers and which joints are reconstructed. Positions and covariances are th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -180,6 +180,30 @@ class FoundClocks:
     sigma_s: Float  # [C] posterior standard deviation; the prior's where only the search found it, 0 if held
     prior_s: Float  # [C] prior standard deviation for later estimates; 0 for clocks that are held
     common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
+
+
+def agreed_clocks(names: Sequence[str], found: Sequence[Mapping[str, Mapping[str, float]]]) -> FoundClocks:
+    """Agree on the clocks that some segments found.
+
+    Most segments decide whether a clock is held. Of the offsets that were found, the median is taken, with
+    the median of their standard deviations: an offset that the whole flight shares is hardly surer than that.
+
+    Args:
+        names: of all C cameras.
+        found: of each segment `offset_s`, `sigma_s` and `prior_s` by camera, and `common_sigma_s` of "".
+    """
+    offset_s, sigma_s, prior_s = np.zeros((3, len(names)))
+    for c, name in enumerate(names):
+        own = [each[name] for each in found if name in each]
+        moved = [each for each in own if each["prior_s"] > 0]
+        if 2 * len(moved) > len(own):
+            prior_s[c] = max(each["prior_s"] for each in moved)
+            own = moved
+        if own:
+            offset_s[c] = np.median([each["offset_s"] for each in own])
+            sigma_s[c] = np.median([each["sigma_s"] for each in own])
+    common_s = float(np.median([each[""]["common_sigma_s"] for each in found])) if found else 0.0
+    return FoundClocks(offset_s, sigma_s, prior_s, common_s)
 
 
 def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:

@@ -43,6 +43,32 @@ _UNMEASURED = dict.fromkeys(
 """Placeholder for errors without truth."""
 
 
+def of_times(
+    observations: Observations, views: Views, result: Triangulation, rows: slice
+) -> tuple[Observations, Views, Triangulation]:
+    """Return what belongs to some of the times, which are rows of `observations`."""
+    each = observations.confidence[0, ..., 0].size
+    start, stop, _ = rows.indices(len(observations.t_ns))
+    joint_frames = slice(start * each, stop * each)
+    some = ("t_ns", "rays", "confidence", "position", "rotation", "pose_sigma", "pose_covariance")
+    of_all = {name: getattr(observations, name) for name in some}
+    return (
+        replace(observations, **{name: value[rows] for name, value in of_all.items() if value is not None}),
+        replace(
+            views,
+            rays=views.rays[joint_frames],
+            weight=views.weight[joint_frames],
+            pose_index=views.pose_index[joint_frames] - start,
+            position=views.position[rows],
+            rotation=views.rotation[rows],
+            pose_sigma=views.pose_sigma[rows],
+        ),
+        replace(
+            result, **{field.name: getattr(result, field.name)[joint_frames] for field in fields(result)}
+        ),
+    )
+
+
 def assess(
     observations: Observations,
     views: Views,

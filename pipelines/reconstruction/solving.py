@@ -34,7 +34,7 @@ from pipelines.geometry.triangulation import (
     triangulate_pictures,
 )
 from pipelines.reconstruction.observations import Camera, Observations
-from pipelines.session.errors import DataError
+from pipelines.session.errors import NoViewsError
 
 
 def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_sigma: float) -> Float:
@@ -54,7 +54,7 @@ def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_
     """
     posed = ~np.isnan(position[..., 0])
     if not posed.any():
-        raise DataError("the cameras", "have no pose at any picture", "check clocks and pose logs")
+        raise NoViewsError("the cameras", "have no pose at any picture", "check clocks and pose logs")
     middle = position[posed].mean(axis=0)
     columns = []
     for c, camera in enumerate(cameras):

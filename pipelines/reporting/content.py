@@ -57,6 +57,7 @@ class SessionContent:
     outdated: tuple[str, ...] = ()  # stages whose inputs have changed since
     angles: pd.DataFrame | None = None  # tables.ANGLES, where the reconstruction has them
     studies: tuple[StudyContent, ...] = ()  # that stand beside the flight
+    every: int = 1  # times of the skeleton of which one was loaded, with what was recorded about it
 
 
 FULL_SCALE = 10_000

@@ -74,6 +74,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None, vi
             quality=quality(content, summary),
             hidden=bool(content.hidden),
             made_by=_made_by(content),
+            every=content.every,
             viewer_script=Markup(script),  # noqa: S704 - our own file
             policy=_policy(
                 script, pictures=bool(strips) or (overlays is not None and overlays["pictures"] > 0)

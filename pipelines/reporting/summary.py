@@ -135,6 +135,9 @@ def summarise(content: SessionContent) -> Summary:
     error = errors_mm(motion, truth) if motion is not None and truth is not None else None
     counts = _status_counts(motion) if motion is not None else {}
     metrics = content.metrics or {}
+    if content.every > 1:  # rows were left out, but were counted
+        stated = section(metrics, "status_counts")
+        counts = {word: int(number(stated, word) or 0) for word in STATUS if number(stated, word)}
     total = sum(counts.values())
     return Summary(
         origin_ns=origin_ns,
@@ -459,4 +462,4 @@ def _detection(content: SessionContent, camera: CameraRow) -> tuple[float | None
         return 1 - camera.entry.keypoints.frames_without_person / max(count, 1), confident
     counts = section(section(content.stages.get("detect", {}), "counts"), "cameras")
     looked = number(section(counts, camera.name), "frames") or camera.entry.frames.count
-    return float(min(table["frame"].nunique() / max(looked, 1), 1.0)), confident
+    return float(min(content.every * table["frame"].nunique() / max(looked, 1), 1.0)), confident

@@ -1,4 +1,4 @@
-"""Parts of one flight on the workers of a Dask cluster, and the connection to the cluster.
+"""Parts of one flight on the workers of a Dask cluster or on processes, and the connection to the cluster.
 
 A part is a call of a function of this package. Its result depends on its arguments and on the session, which
 every worker finds under the same path or in an object store, and on nothing else. The result travels back to
@@ -7,12 +7,18 @@ Dask gives to another one.
 """
 
 import logging
+import multiprocessing
+import os
+import signal
 from asyncio import CancelledError
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from threading import Thread
 from typing import Any, Self, TypeVar
 
 from pipelines.session.errors import DataError, MocapError
@@ -93,6 +99,58 @@ class Cluster:
             finally:
                 with suppress(OSError, CancelledError):  # of a cluster that is gone
                     client.cancel(list(numbers))
+
+
+class Processes:
+    """Processes of this machine, which take parts as the workers of a cluster do.
+
+    Args:
+        count: of the processes; with one, this process works.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = 1 if multiprocessing.current_process().daemon else count
+
+    def each(self, work: Callable[[T], R], parts: Sequence[T]) -> Generator[tuple[int, R]]:
+        """Call a function with every part, and yield number and result in the order in which they end.
+
+        Closed early, all processes end.
+
+        Args:
+            work: a function of a module.
+            parts: its arguments.
+
+        Raises:
+            MocapError: the first error that a part raised, or a process was killed.
+        """
+        if self._count == 1 or len(parts) < 2:
+            yield from ((number, work(part)) for number, part in enumerate(parts))
+            return
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(self._count, len(parts)), context, initializer=_end_with_parent)
+        try:
+            numbers = {pool.submit(work, part): number for number, part in enumerate(parts)}
+            for future in as_completed(list(numbers)):
+                yield numbers.pop(future), future.result()
+        except BrokenProcessPool as error:
+            raise DataError("a process of mocap", "was killed, perhaps for lack of memory") from error
+        finally:
+            for process in list((pool._processes or {}).values()):  # a part takes a minute
+                process.terminate()
+            pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """Leave Ctrl-C to the process that gave the parts, and end when that has ended, however it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def wait() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
+    Thread(target=wait, daemon=True).start()
 
 
 def result_of(future: Any, what: Path | str) -> Any:

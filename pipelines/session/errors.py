@@ -30,5 +30,9 @@ class DataError(MocapError):
         return type(self), (self.source, self.problem, self.remedy)
 
 
+class NoViewsError(DataError):
+    """At no time do two cameras have pictures and a pose."""
+
+
 class BusyError(MocapError):
     """Another process is writing the session."""

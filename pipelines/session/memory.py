@@ -29,6 +29,16 @@ def return_freed_arrays() -> None:
         set_option(_M_MMAP_THRESHOLD, _LARGE)
 
 
+def available_bytes() -> int | None:
+    """Return the memory that new processes may take without swapping; None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        sizes = dict(line.split(":", 1) for line in lines)
+        return 1024 * int(sizes["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return None
+
+
 class Waiting:
     """Arrays in files without a name, which take memory only while they are used.
 

@@ -10,7 +10,7 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.description import Description
 from pipelines.session.records import JointMotion
-from pipelines.session.tables import ACTOR, read_table
+from pipelines.session.tables import ACTOR, Span, read_table
 
 _GAP_NS = 2_000_000_000  # no interpolation between two stamps that are further apart
 
@@ -27,17 +27,27 @@ class LoggedActor:
         return interpolate_points(self.t_ns, self.hips, t_ns, max_gap_ns=_GAP_NS)
 
 
-def logged_actor(folder: Path, description: Description) -> LoggedActor | None:
+def logged_actor(folder: Path, description: Description, span_ns: Span | None = None) -> LoggedActor | None:
     """Load the actor of a session, the first of several; None where none was logged.
+
+    Args:
+        folder: the session.
+        description: its session.json.
+        span_ns: only what is known of these times.
 
     Raises:
         DataError: the table is damaged.
     """
-    return next(iter(logged_people(folder, description)), None)
+    return next(iter(logged_people(folder, description, span_ns)), None)
 
 
-def logged_people(folder: Path, description: Description) -> list[LoggedActor]:
+def logged_people(folder: Path, description: Description, span_ns: Span | None = None) -> list[LoggedActor]:
     """Load all people of a session who were logged: person 0, 1, ... in this order.
+
+    Args:
+        folder: the session.
+        description: its session.json.
+        span_ns: only what is known of these times.
 
     Raises:
         DataError: the table is damaged.
@@ -45,7 +55,8 @@ def logged_people(folder: Path, description: Description) -> list[LoggedActor]:
     entries = description.logged_people
     if not entries:
         return []
-    table = read_table(folder / "actor.parquet", ACTOR)
+    about = None if span_ns is None else (span_ns[0] - _GAP_NS, span_ns[1] + _GAP_NS)
+    table = read_table(folder / "actor.parquet", ACTOR, about)
     person, t_ns = table["person"].to_numpy(np.int64), table["t_ns"].to_numpy(np.int64)
     place = table[["x", "y", "z"]].to_numpy(np.float64)
     return [

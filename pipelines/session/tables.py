@@ -17,12 +17,15 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Int64
+from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Detections, JointMotion, Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd
+
+Span = tuple[int, int]
+"""First and last time, ns."""
 
 _T_NS, _CAMERA, _PERSON = ("t_ns", pa.int64()), ("camera", pa.string()), ("person", pa.int64())
 _FRAME, _JOINT, _STATUS = ("frame", pa.int64()), ("joint", pa.string()), ("status", pa.string())
@@ -140,8 +143,13 @@ def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], p
     return [(metadata.row_group(k).column(0).statistics.min, partial(read, k)) for k in filled]
 
 
-def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
+def read_table(path: Path, schema: pa.Schema, span_ns: Span | None = None) -> pd.DataFrame:
     """Read a table and check that it holds the columns of `schema` (more are allowed and kept).
+
+    Args:
+        path: the file.
+        schema: the columns.
+        span_ns: only rows with times from the first to the second, both included; others take no memory.
 
     Raises:
         DataError: not a Parquet file, truncated, or columns are missing; or a small file of many equal rows,
@@ -151,12 +159,108 @@ def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
 
     try:
         with path.open("rb") as file:
-            _refuse_bomb(path, pq.ParquetFile(file).metadata)
-            table = pq.read_table(file)
+            opened = pq.ParquetFile(file)
+            _refuse_bomb(path, opened.metadata)
+            has_times = span_ns is not None and "t_ns" in opened.schema_arrow.names
+            table = _rows_within(opened, span_ns) if span_ns and has_times else pq.read_table(file)
     except (OSError, pa.ArrowException) as error:
         raise DataError(
             path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
         ) from error
+    return _frame_of(path, table, schema)
+
+
+def read_first(path: Path, schema: pa.Schema) -> pd.DataFrame:
+    """Read the first row of a table, and no row of an empty one.
+
+    Raises:
+        DataError: not a Parquet file, truncated, or columns are missing.
+    """
+    import pyarrow.parquet as pq
+
+    try:
+        with path.open("rb") as file:
+            batches = pq.ParquetFile(file).iter_batches(1, columns=schema.names)
+            first = next(iter(batches), None)
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(
+            path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
+        ) from error
+    frame: pd.DataFrame = (
+        schema.empty_table() if first is None else pa.Table.from_batches([first])
+    ).to_pandas()
+    return frame
+
+
+def read_column(path: Path, name: str) -> NDArray[Any]:
+    """Read one column of a table.
+
+    Raises:
+        DataError: not a Parquet file, truncated, or without this column.
+    """
+    import pyarrow.parquet as pq
+
+    again = "run the stage that wrote it again with --force"
+    try:
+        with path.open("rb") as file:
+            opened = pq.ParquetFile(file)
+            _refuse_bomb(path, opened.metadata)
+            batches = opened.iter_batches(_ROWS_AT_ONCE, columns=[name])
+            parts = [batch.column(0).to_numpy(zero_copy_only=False) for batch in batches]
+    except (OSError, pa.ArrowException, IndexError) as error:
+        raise DataError(path, "cannot be read as Parquet", again) from error
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+def read_rows(path: Path, schema: pa.Schema, chosen: Bool) -> pd.DataFrame:
+    """Read some rows of a table; others take no memory.
+
+    Args:
+        path: the file.
+        schema: its columns.
+        chosen: [N] of all rows.
+
+    Raises:
+        DataError: see `read_table`.
+    """
+    import pyarrow.parquet as pq
+
+    kept, first = [], 0
+    try:
+        with path.open("rb") as file:
+            opened = pq.ParquetFile(file)
+            _refuse_bomb(path, opened.metadata)
+            for batch in opened.iter_batches(_ROWS_AT_ONCE):
+                kept.append(batch.filter(pa.array(chosen[first : first + batch.num_rows])))
+                first += batch.num_rows
+            table = pa.Table.from_batches(kept, opened.schema_arrow)
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(
+            path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
+        ) from error
+    return _frame_of(path, table, schema)
+
+
+def _rows_within(file: Any, span_ns: Span) -> pa.Table:
+    """Read the rows of a Parquet file whose times lie within a span, a few at a time."""
+    import pyarrow.compute as pc
+
+    first, last = (pa.scalar(t_ns, pa.int64()) for t_ns in span_ns)
+    column = file.schema_arrow.names.index("t_ns")
+    groups = []
+    for number in range(file.metadata.num_row_groups):
+        known = file.metadata.row_group(number).column(column).statistics
+        if known is None or not known.has_min_max or (known.max >= span_ns[0] and known.min <= span_ns[1]):
+            groups.append(number)
+    kept = []
+    for batch in file.iter_batches(_ROWS_AT_ONCE, row_groups=groups):
+        within = pc.and_(pc.greater_equal(batch["t_ns"], first), pc.less_equal(batch["t_ns"], last))
+        kept.append(batch.filter(within))
+    return pa.Table.from_batches(kept, file.schema_arrow)
+
+
+def _frame_of(path: Path, table: pa.Table, schema: pa.Schema) -> pd.DataFrame:
+    """Check the columns and numbers of a table that was read."""
     missing = [name for name in schema.names if name not in table.column_names]
     if missing:
         raise DataError(path, f"lacks the columns {', '.join(missing)}", "run the stage again with --force")
@@ -172,7 +276,7 @@ def _refuse_absurd_numbers(path: Path, frame: pd.DataFrame) -> None:
         raise DataError(path, "holds times that do not increase", again)
     for name in map(str, frame.columns):
         values = frame[name].to_numpy()
-        largest = _LATEST_NS if name.endswith("_ns") else _LARGEST
+        largest = LATEST_NS if name.endswith("_ns") else _LARGEST
         if values.dtype.kind in "if" and len(values):
             wrong = (values > largest) | (values < -largest)
             if name not in (*_POSITION, *_QUATERNION):
@@ -191,8 +295,10 @@ def _refuse_bomb(path: Path, metadata: Any) -> None:
         raise DataError(path, problem, "run the stage that wrote it again with --force")
 
 
+_ROWS_AT_ONCE = 1 << 16  # of a table of which only a span is kept
 _LARGEST = 1e15  # of any number; squares of much larger ones overflow
-_LATEST_NS = 2**62 - 1  # differences of two such times fit int64
+LATEST_NS = 2**62 - 1
+"""The latest time; differences of two such times fit int64."""
 _CELL = 8  # bytes
 _INFLATED, _MOST_EXPANSION = 1 << 28, 100  # bytes of any table, and for each byte of its file
 _POSITION = ["x", "y", "z"]

@@ -25,6 +25,8 @@ from pipelines import batch
 from pipelines.batch import Job, Outcome, Settings, run_flight
 from pipelines.detect import detect
 from pipelines.follow import Following
+from pipelines.reconstruct import reconstruct
+from pipelines.reconstruction import segments
 from pipelines.report import Reported
 from pipelines.reporting.flights import FlightRow, render_flights
 from pipelines.session.clusters import Cluster as Workers
@@ -131,6 +133,21 @@ def test_blocks_of_a_flight_on_a_cluster_make_the_bytes_of_one_process(
     with connected(cluster.address) as client, locked(apart) as session:
         Following(session).finish(cluster=Workers.of(client))
     assert content(apart / "background") == content(here / "background")
+
+
+def test_segments_of_a_long_flight_on_a_cluster_make_the_bytes_of_one_process(
+    tmp_path: Path, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"LENGTH_S": 2.0, "OVERLAP_S": 1.0, "_BLENDED_NS": 600_000_000}.items():
+        monkeypatch.setattr(segments, name, value)
+    manifest = write_flight(tmp_path, cameras=3, seconds=5.0).manifest
+    here, there = tmp_path / "here.session", tmp_path / "there.session"
+    succeeds("ingest", manifest, "-o", here)
+    shutil.copytree(here, there)
+    assert len(reconstruct(here, workers=1).metrics["segments"]) == 3
+    with connected(cluster.address) as client:
+        reconstruct(there, cluster=Workers.of(client))
+    assert content(there / "reconstruct") == content(here / "reconstruct")
 
 
 def test_parts_for_graphics_cards_go_to_workers_that_have_one(cluster: Cluster) -> None:
