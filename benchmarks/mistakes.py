@@ -32,6 +32,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import partial
 from itertools import permutations, product
 from pathlib import Path
@@ -39,6 +40,7 @@ from time import perf_counter, process_time
 from typing import Any, get_args
 from unittest.mock import patch
 
+import av
 import numpy as np
 from ruamel.yaml import YAML
 
@@ -57,6 +59,7 @@ from pipelines.geometry.poses import (
     matrix_from_quaternion,
     multiply,
     quaternion_from_matrix,
+    quaternion_from_rotation_vector,
 )
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
@@ -618,6 +621,15 @@ def fixed_gimbal(pitch_deg: float, relative_to: str) -> Change:
     return apply
 
 
+def with_white_errors(pose: Pose) -> Pose:
+    """Add errors of 0.3 m and 2 deg to every pose, anew in each; what is stated of them stays."""
+    draw = np.random.default_rng(5)
+    position, quaternion = pose
+    turn = draw.normal(0, np.radians(2), (len(position), 3))
+    erring = multiply(quaternion, quaternion_from_rotation_vector(turn))
+    return position + draw.normal(0, 0.3, position.shape), erring
+
+
 def renamed(pixels: Float, *parts: str) -> Float:
     """Exchange left and right in the names of some joints of COCO."""
     order = [
@@ -665,6 +677,10 @@ def _less_usual() -> list[Mistake]:
         ),
         Mistake("gimbal: of world", ("gimbal",), fixed_gimbal(-DOWN_DEG, "world"), carried),
         Mistake("gimbal: pitch's sign", ("gimbal", "mount"), fixed_gimbal(DOWN_DEG, "body"), carried),
+        Mistake("errors 0.3 m, 2 deg, not stated", ("noise",), of_poses(with_white_errors)),
+        Mistake(
+            "poses backwards, one", ("pose",), of_poses(lambda pose: (pose[0][::-1], pose[1][::-1]), one)
+        ),
         Mistake("x and y exchanged", ("axes",), of_poses(x_and_y)),
         Mistake("all headings 90 deg", ("pose", "axes", "mount"), of_all(90)),
         Mistake("all headings -30 deg", ("pose",), of_all(-30)),
@@ -917,10 +933,61 @@ _LONG = Flight(
 )
 
 
+def ten_minutes_of_film(sample: Path, session: Path, folder: Path) -> Path:
+    """Repeat the sample's film and poses until they last ten minutes; return the manifest.
+
+    Poses jump where the repetitions meet. The middle, which `check` looks at, lies between two of these.
+    """
+    folder.mkdir(exist_ok=True)
+    document = YAML(typ="safe").load((sample / "flight.yaml").read_text(encoding="utf-8"))
+    for name, camera in document["cameras"].items():
+        length_s = _repeat_film(sample / f"{name}.mp4", folder / f"{name}.mp4", _REPETITIONS)
+        track = trajectory_from(read_table(session / "cameras" / name / "poses.parquet", POSES))
+        start_ns, length_ns = round(float(camera["frame_times"]["start"]) * 1e9), round(length_s * 1e9)
+        used = (track.t_ns >= start_ns) & (track.t_ns < start_ns + length_ns)
+        rows = [
+            f"{(stamp + turn * length_ns) / 1e9:.6f} " + " ".join(f"{value:.6f}" for value in [*p, *q])
+            for turn in range(_REPETITIONS)
+            for stamp, p, q in zip(
+                track.t_ns[used].tolist(), track.position[used], track.quaternion_xyzw[used], strict=True
+            )
+        ]
+        (folder / f"{name}.tum").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        camera["pose"] = {"tum": f"{name}.tum", "of": "camera"}
+        camera["intrinsics"] = str(sample / camera["intrinsics"])
+        del camera["mount"], camera["gimbal"]
+    document["map"] = str(sample / document["map"])
+    for key in ("logs", "actor", "truth"):
+        del document[key]
+    return written(document, folder / "flight.yaml")
+
+
+_REPETITIONS = 51  # of 12 s
+
+
+def _repeat_film(film: Path, repeated: Path, times: int) -> float:
+    """Write a film so many times one after the other, without coding it anew; return its length in s."""
+    with av.open(str(film)) as source, av.open(str(repeated), "w") as target:
+        stream = source.streams.video[0]
+        base = stream.time_base or Fraction(1, 1000)
+        packets = [packet for packet in source.demux(stream) if packet.dts is not None]
+        copy = target.add_stream_from_template(stream)
+        stamps = sorted(packet.pts or 0 for packet in packets)
+        length = stamps[-1] - stamps[0] + (stamps[-1] - stamps[0]) // (len(stamps) - 1)
+        for turn, packet in product(range(times), packets):
+            again = av.Packet(bytes(packet))
+            again.pts, again.dts = (packet.pts or 0) + turn * length, (packet.dts or 0) + turn * length
+            again.is_keyframe, again.time_base = packet.is_keyframe, base
+            again.duration, again.stream = packet.duration, copy
+            target.mux(again)
+        return float(length * base)
+
+
 def print_times(folder: Path) -> None:
     """Print processor seconds: of the doubts in `reconstruct` of the sample, and of `check`.
 
-    What is checked is the sample's film, right and with clocks that are off, and a flight of ten minutes.
+    What is checked is the sample's film, right, ten minutes long, and with clocks that are off, and a flight
+    of ten minutes with keypoints.
     """
     sample = folder / "sample"
     shutil.copytree(Path(__file__).parents[1] / "sample_data" / "mound_walk", sample, dirs_exist_ok=True)
@@ -950,6 +1017,7 @@ def print_times(folder: Path) -> None:
     _print_check("600 s", mistaken(Described(_LONG, folder / _LONG.name), None))
     _print_check("600 s, ingested", folder / _LONG.name / "first.session")
     _print_check("the sample's film", sample / "flight.yaml")
+    _print_check("ten minutes of film", ten_minutes_of_film(sample, session, folder / "ten"))
     for late_s, names in ((0.5, ["drone1", "drone2"]), (-0.5, ["drone1", "drone2"]), (0.3, ["drone1"])):
         document = YAML(typ="safe").load((sample / "flight.yaml").read_text(encoding="utf-8"))
         _later(document["cameras"], names, late_s)

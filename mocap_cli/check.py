@@ -42,6 +42,7 @@ def check_command(
     `mocap reconstruct` does the same. A flight without keypoints is looked at for a few seconds.
     """
     from pipelines.check import check
+    from pipelines.session.description import said_remedy
 
     with watching(shown.level) as progress:
         result = check(path, pose_noise=pose_noise, detector=detector, workers=workers, progress=progress)
@@ -54,8 +55,8 @@ def check_command(
     for doubt in result.doubts:
         say(f"{doubt.code}: {doubt.what}")
         say("  " + ", ".join(f"{name} {value:g}" for name, value in doubt.evidence.items()))
-        for line in doubt.remedy.split("; ") if doubt.remedy else []:
-            say(f"  set {line}")
+        for line in said_remedy(doubt.remedy):
+            say(f"  {line}")
     if not result.doubts:
         looked = f" (looked at: {result.pictures})" if result.pictures else ""
         say(f"{path}: no doubt{looked}")

@@ -19,7 +19,7 @@ from pipelines.reporting.wording import (
     quantity,
     whole,
 )
-from pipelines.session.description import said_doubts
+from pipelines.session.description import said_doubt, said_doubts
 
 # Below this share of measured times a joint is named among the doubts.
 DOUBTFUL_COVERAGE = 0.8
@@ -294,8 +294,7 @@ def doubts_of_flight(summary: Summary) -> list[dict[str, object]]:
 
 def _stated(doubt: Mapping[str, object]) -> str:
     """State a doubt of the flight as `reconstruct` warns of it."""
-    remedy = text(doubt, "remedy")
-    return f"doubt ({text(doubt, 'code')}): {text(doubt, 'what')}" + (f"; set {remedy}" if remedy else "")
+    return said_doubt(text(doubt, "code"), text(doubt, "what"), text(doubt, "remedy"))
 
 
 def _doubts(content: SessionContent, summary: Summary) -> list[str]:

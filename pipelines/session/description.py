@@ -90,6 +90,8 @@ class PosesEntry(Entry):
     gimbal: str | None = None  # what a gimbal's angles of a topic, or fixed ones, are relative to
     gimbal_fixed: bool = False  # they are fixed
     gimbal_axes: Literal["enu", "ned"] = "enu"  # that they are in
+    gimbal_log: str | None = None  # that holds the gimbal's angles
+    gimbal_topic: str | None = None  # of that log
     mount: MountEntry | None = None  # None where poses are the camera's own, or a gimbal turns it
     in_gimbal: MountEntry | None = None  # how the camera sits in the gimbal that turns it
     axes: Literal["enu", "ned"] = "enu"  # that the source's poses are read in
@@ -363,10 +365,19 @@ def said_assumptions(assumptions: Sequence[str]) -> list[str]:
 
 def said_doubts(doubts: list[Doubt]) -> list[str]:
     """State doubts as warnings of a stage, with the lines that mend them."""
-    return [
-        f"doubt ({doubt.code}): {doubt.what}" + (f"; set {doubt.remedy}" if doubt.remedy else "")
-        for doubt in doubts
-    ]
+    return [said_doubt(doubt.code, doubt.what, doubt.remedy) for doubt in doubts]
+
+
+def said_doubt(code: str, what: str, remedy: str) -> str:
+    """State a doubt in one line."""
+    lines = "; ".join(said_remedy(remedy))
+    return f"doubt ({code}): {what}" + (f"; {lines}" if lines else "")
+
+
+def said_remedy(remedy: str) -> list[str]:
+    """State the lines of a remedy: keys of flight.yaml are set, anything else is said as it is."""
+    lines = remedy.split("; ") if remedy else []
+    return [f"set {line}" if line.startswith(("cameras.", "map.")) else line for line in lines]
 
 
 def read_description(session: Path) -> Description:

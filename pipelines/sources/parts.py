@@ -194,6 +194,8 @@ def _poses_entry(
         gimbal=_gimbal_of(camera),
         gimbal_fixed=camera.gimbal is not None and camera.gimbal.fixed is not None,
         gimbal_axes=axes[1],
+        gimbal_log=camera.gimbal.log if camera.gimbal is not None else None,
+        gimbal_topic=camera.gimbal.topic if camera.gimbal is not None else None,
         axes=axes[0],
         mount=None if camera.gimbal else _mount_entry(camera),
         in_gimbal=_mount_entry(camera) if camera.gimbal else None,

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,8 @@ from benchmarks.mistakes import (
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import compose, invert
 from pipelines.reconstruction.doubts.diagnosis import CODES, diagnose
+from pipelines.reconstruction.doubts.scene import scene_of
+from pipelines.reconstruction.doubts.score import score
 from pipelines.reconstruction.doubts.turning import Lateness
 from pipelines.session.description import read_description
 from tests.commands.runner import refused, succeeds
@@ -383,7 +386,54 @@ def test_limbs_that_cross_are_doubted_without_a_cause(flight: Described) -> None
 
     first = doubts_of(mistaken(flight, with_keypoints(legs_crossed)))[0]
     assert (first["code"], first["remedy"]) == ("body", "")
-    assert first["evidence"]["crossed"] > 10
+    assert first["evidence"]["sigmas"] > 10
+
+
+def test_knees_and_elbows_bend_forwards_unless_left_is_right(flight: Described) -> None:
+    def share(change: Change | None) -> float:
+        sampled = sampled_of(mistaken(flight, change))
+        return score(sampled, scene_of(sampled)).odd["bend"].evidence["bent_forwards_share"]
+
+    assert share(None) > 0.8
+    assert share(with_keypoints(lambda pixels, _: pixels[COCO_SWAPPED])) < 0.2
+
+
+def test_feet_that_rise_more_than_slopes_do_are_odd(flight: Described) -> None:
+    sampled = sampled_of(mistaken(flight, None))._replace(ground=None)
+    scene = scene_of(sampled)
+    assert score(sampled, scene).odd["level"].sigmas == 0
+    climbing = scene.position + np.linspace(0, 8, scene.position.shape[1])[:, None] * [0, 0, 1]
+    level = score(sampled, replace(scene, position=climbing)).odd["level"]
+    assert level.sigmas > 5
+    assert level.evidence["rise_m"] == pytest.approx(0.8 * 8, abs=1)  # from the 10th to the 90th percentile
+
+
+def test_the_distance_to_the_logged_actor_is_stated(flight: Described) -> None:
+    def up(mistaken: Mistaken) -> None:
+        of_poses(lambda pose: (pose[0] + [3, 4, 0], pose[1]))(mistaken)
+        del mistaken.manifest["map"]
+
+    doubts = doubts_of(mistaken(flight, up))
+    actor = next(doubt for doubt in doubts if doubt["code"] == "actor")
+    assert actor["evidence"]["from_actor_m"] == pytest.approx(5, abs=0.5)
+
+
+def test_one_camera_that_no_single_fault_explains_is_named(flight: Described) -> None:
+    backwards = of_poses(lambda pose: (pose[0][::-1], pose[1][::-1]), "drone1")
+    first = doubts_of(mistaken(flight, backwards))[0]
+    assert (first["code"], first["cameras"]) == ("pose", ["drone1"])
+
+
+def test_the_gimbal_of_another_log_is_exchanged_with_its_pose(flight: Described, tmp_path: Path) -> None:
+    def as_drone2(manifest: dict[str, Any]) -> None:
+        one, two = (manifest["cameras"][name] for name in ("drone1", "drone2"))
+        one["pose"], one["gimbal"] = dict(two["pose"]), dict(two["gimbal"])
+
+    manifest = as_made(flight, tmp_path / "topics", as_drone2)
+    first = doubts_of(manifest)[0]
+    assert first["code"] == "pose"
+    assert with_remedy(manifest, first["remedy"])
+    assert doubts_of(manifest) == []
 
 
 def test_drones_below_zero_count_z_downwards(flight: Described) -> None:

@@ -96,6 +96,13 @@ def test_a_frame_rate_is_found() -> None:
     assert rate.slower == pytest.approx(25 / 30)
 
 
+def test_the_frame_rate_of_one_camera_is_found() -> None:
+    rate = found([late(0.0, 0.1), late(0.0, 1.3, 1.2)])
+    assert rate is not None
+    assert rate.cameras == (1,)
+    assert rate.slower == pytest.approx(25 / 30)
+
+
 def test_cameras_that_do_not_turn_tell_nothing() -> None:
     still = Turning(0.1, T_NS + 500_000_000, swings=False)
     clock = found([still, still])

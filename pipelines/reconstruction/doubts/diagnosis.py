@@ -42,7 +42,15 @@ from pipelines.reconstruction.doubts.hypotheses import (
     turn_about,
 )
 from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
-from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, score, solve
+from pipelines.reconstruction.doubts.score import (
+    STATURE_M,
+    Score,
+    base_of,
+    residual_px,
+    residuals_px,
+    score,
+    solve,
+)
 from pipelines.reconstruction.doubts.turning import (
     LEAST_GAIN,
     Lateness,
@@ -107,6 +115,7 @@ _ALIKE = 1.0  # hypotheses whose scores are this close are stated together
 _COST_OF_NUMBER = 2.0  # of chi^2, as in Akaike's criterion
 _ALIKE_COST = 4.0  # of faults that are stated together
 _SAME_RESIDUAL = 1.1
+_PENALTY_OF_CAMERA = 2.5  # of leaving one out
 _DISCRETE = 0.8  # the largest penalty of a hypothesis without a free number
 
 
@@ -196,17 +205,20 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> Diagnosis
         hypotheses += list(of_descriptions(trial))
     if odd or stated.strain >= STRAINED:
         hypotheses += list(_of_faults(trial))
-        noisy = _of_noise(trial, stated.cost)
-        hypotheses += [trial.scored(noisy)] if noisy else []
+        hypotheses += [trial.scored(noisy) for noisy in _of_noise(trial, stated.cost)]
     hypotheses.sort(key=lambda each: each.total)
     causes = _causes(trial, hypotheses)
     if causes and causes[0].scene is not None and _is_noise(flight, causes[0].scene, hypotheses):
         causes = []
+    below_zero = _below_zero(trial)
     if not causes or np.isfinite(causes[0].cost):
         discrete = _without_number(trial, hypotheses)
         of_one = _of_one_clock(trial, hypotheses, stated.cost)
-        causes = _faults([*discrete, *of_one, *hypotheses], stated.cost, described) or causes
-    causes = [each for each in causes if _leaves_no_doubt(flight, each)] or _below_zero(trial)
+        faults = _faults([*discrete, *of_one, *hypotheses], stated.cost, described)
+        causes = below_zero or faults or causes  # of logs upside down, a fault of one only seems to explain
+    causes = [each for each in causes if _leaves_no_doubt(flight, each)] or below_zero
+    if not causes and base.total >= DOUBTFUL:
+        causes = _bad_camera(trial)
     doubts = [_doubt(_with_sigma(trial, each), found, described) for each in causes]
     if doubts or base.total >= DOUBTFUL:
         doubts += _oddities(found, described, flight, alone=not doubts)
@@ -313,7 +325,8 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
         return False
     if hypothesis.alike is not None:
         flight, stated_scene = trial.as_stated(*hypothesis.alike)
-        unposed = float(np.log1p(same.odd.get("unposed", 0.0) ** 2))  # that is so at the stated times alone
+        # That is so at the stated times alone.
+        unposed = float(np.log1p(same.odd["unposed"].sigmas ** 2)) if "unposed" in same.odd else 0.0
         if hypothesis.total > score(flight, stated_scene, trial.base).total + unposed - margin:
             return False
     missed = [residual_px(scene, solve(scene)) for scene in (described, hypothesis.scene)]
@@ -353,6 +366,32 @@ def _below_zero(trial: Trial) -> list[Hypothesis]:
     )
     alike = turned.score is not None and turned.score.total <= trial.base.total + _ALIKE
     return [turned] if alike else []
+
+
+def _bad_camera(trial: Trial) -> list[Hypothesis]:
+    """Find the one camera of three or more without which nothing is odd, where no mistake explains it."""
+    if len(trial.names) < 3:
+        return []
+    tried = []
+    for index, name in enumerate(trial.names):
+        rays = trial.described.rays.copy()
+        rays[index] = np.nan
+        what = f"{name} does not fit the others, which fit each other: its poses, clock or lens may be wrong"
+        tried.append(
+            trial.scored(
+                Hypothesis(
+                    "pose",
+                    (name,),
+                    what,
+                    remedies.another_pose(trial.flight.cameras, index),
+                    _PENALTY_OF_CAMERA,
+                    replace(trial.described, rays=rays),
+                )
+            )
+        )
+    best, second = sorted(tried, key=lambda each: each.total)[:2]
+    explains = best.total <= min(trial.base.total - MARGIN, second.total - _ALIKE)
+    return [best] if explains and _leaves_no_doubt(trial.flight, best) else []
 
 
 def _is_noise(flight: Sampled, cause: Scene, hypotheses: list[Hypothesis]) -> bool:
@@ -396,13 +435,13 @@ def _of_turns(trial: Trial, tried: Sequence[Lateness]) -> list[Hypothesis]:
         return []
     names, cameras = trial.names, trial.flight.cameras
     whose = "all cameras" if len(late.cameras) == len(names) else names[late.cameras[0]]
-    by = "by how their backgrounds turn"
+    by = "as the turning of their backgrounds shows"
     if late.slower != 1:
         code, remedy = "frame_rate", remedies.frame_rate(cameras, late.cameras, late.slower)
-        what = f"the pictures of {whose} follow each other {late.slower:.3g} times as slowly as stated, {by}"
+        what = f"the frame rate of {whose} is {remedies.times_faster(late.slower)}, {by}"
     else:
         code, remedy = "clock", remedies.clock(cameras, late.cameras, late.late_s)
-        what = f"the pictures of {whose} were taken {late.late_s:+.3f} s from where their clocks say, {by}"
+        what = f"the pictures of {whose} were taken {remedies.earlier_or_later(late.late_s)}, {by}"
     found = {"turning_gain": round(late.gain, 1)}
     found |= {"clock_sigma_s": _rounded(late.sigma_s)} if late.slower == 1 else {}
     named = tuple(names[index] for index in late.cameras)
@@ -410,10 +449,14 @@ def _of_turns(trial: Trial, tried: Sequence[Lateness]) -> list[Hypothesis]:
 
 
 def _gain_of_rays(trial: Trial, late: Lateness) -> float:
-    """Return by how much the clock of some cameras lowers the chi^2 of the rays; 0 of times of all."""
+    """Return by how much other times of some cameras lower the chi^2 of the rays; 0 of times of all."""
     if len(late.cameras) == len(trial.names):
         return 0.0
-    scene = trial.late(late.late_s, late.cameras)
+    slower = np.ones(len(trial.names))
+    slower[list(late.cameras)] = late.slower
+    late_s = np.zeros(len(trial.names))
+    late_s[list(late.cameras)] = late.late_s
+    scene = scene_of(trial.flight, trial.described, late_s=late_s, slower=slower)
     costs = [fit(trial.flight, each, "none", 0).cost for each in (_same_moments(trial, scene), scene)]
     return costs[0] - costs[1] if np.isfinite(costs).all() else 0.0
 
@@ -461,48 +504,63 @@ def _of_faults(trial: Trial) -> Iterator[Hypothesis]:
             yield trial.scored(_of_fault(trial, fault, penalty))
 
 
-def _of_noise(trial: Trial, stated: float) -> Hypothesis | None:
-    """Try if errors of all poses, some times larger than stated, fit as a fault of one would.
+def _of_noise(trial: Trial, stated: float) -> list[Hypothesis]:
+    """Try if errors of all poses, or of one camera's, some times larger than stated, fit as a fault would.
 
     Args:
         trial: the flight.
         stated: the cost of a fit with the errors as stated.
 
     Returns:
-        None if they do not, or nothing is stated of them.
+        That of all and that of the camera that it explains most; none that explains nothing, or where
+        nothing is stated of the errors.
     """
     if not all(trial.flight.cameras[index].states_noise for index in trial.moving):
-        return None
-    factors = [(factor, 1.0) for factor in _NOISE_FACTORS] + [(1.0, factor) for factor in _NOISE_FACTORS]
-    found = [_noisier(trial, lasting, changing) for lasting, changing in factors]
-    half = len(_NOISE_FACTORS)
+        return []
+    found = [_noisiest(trial, trial.every, stated, _NOISE_FACTORS)]
+    if len(trial.names) > 2 and trial.moving:  # of two, either errs more
+        of_one = (_noisiest(trial, [index], stated, _NOISE_FACTORS_OF_ONE) for index in trial.moving)
+        found.append(min(of_one, key=lambda each: each.cost))
+    return [each for each in found if each.cost < stated]
+
+
+def _noisiest(trial: Trial, group: Sequence[int], stated: float, larger: tuple[float, ...]) -> Hypothesis:
+    """Fit errors of some cameras' poses that last, that change, and of both kinds, by the best factors."""
+    factors = [(factor, 1.0) for factor in larger] + [(1.0, factor) for factor in larger]
+    found = [_noisier(trial, lasting, changing, group) for lasting, changing in factors]
+    half = len(larger)
     both = [min(part, key=lambda each: each.cost) for part in (found[:half], found[half:])]
     if all(each.cost < stated for each in both):
         chosen = [factors[found.index(each)] for each in both]
-        found.append(_noisier(trial, chosen[0][0], chosen[1][1]))
-    best = min(found, key=lambda each: each.cost)
-    return best if best.cost < stated else None
+        found.append(_noisier(trial, chosen[0][0], chosen[1][1], group))
+    return min(found, key=lambda each: each.cost)
 
 
-def _noisier(trial: Trial, lasting: float, changing: float) -> Hypothesis:
-    """Fit errors of all poses that are larger by given factors: those that last, and those that change."""
+def _noisier(trial: Trial, lasting: float, changing: float, group: Sequence[int]) -> Hypothesis:
+    """Fit errors of some cameras' poses that are larger by given factors: lasting ones, changing ones."""
     scene = trial.described
+    larger = np.ones((len(trial.names), 2))
+    larger[list(group)] = lasting, changing
     constant2 = np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0)
     sigma = scene.sigma.copy()
-    sigma[:, 2:] *= changing
-    sigma[:, :2] = np.sqrt(lasting**2 * constant2 + sigma[:, 4:] ** 2)
+    sigma[:, 2:] *= larger[:, 1:]
+    sigma[:, :2] = np.sqrt(larger[:, :1] ** 2 * constant2 + sigma[:, 4:] ** 2)
     wider = replace(scene, sigma=sigma)
     # Larger errors are less likely to be what they are: 6 of each camera, and 2 of each picture.
     pictures = np.isfinite(scene.rays[..., 0]).any(axis=-1).sum(axis=1)
     before, after = (picture_variance(each) for each in (scene, wider))
-    unlikely = 12 * len(trial.names) * np.log(lasting) + 2 * float(pictures @ np.log(after / before))
+    unlikely = 12 * len(group) * np.log(lasting) + 2 * float(pictures @ np.log(after / before))
     parts = (("constant", lasting), ("changing", changing))
     said = ", ".join(f"{part} ones {factor:g} times" for part, factor in parts if factor > 1)
+    everyone, one = len(group) == len(trial.names), trial.names[group[0]]
+    what = "errors of the poses are larger than stated"
+    if not everyone:
+        what = f"the poses of {one} do not fit the other cameras: their errors are larger than stated"
     return Hypothesis(
-        "noise",
-        trial.names,
-        f"errors of the poses are larger than stated: {said}",
-        remedies.pose_noise(trial.flight.cameras, lasting, changing),
+        "noise" if everyone else "pose",
+        trial.names if everyone else (one,),
+        f"{what}, {said}",
+        remedies.pose_noise(trial.flight.cameras, group, lasting, changing),
         np.inf,  # its score says nothing: larger errors excuse everything
         wider,
         cost=fit(trial.flight, wider, "none", 0).cost + unlikely,
@@ -510,6 +568,7 @@ def _noisier(trial: Trial, lasting: float, changing: float) -> Hypothesis:
 
 
 _NOISE_FACTORS = (2.0, 4.0, 8.0)
+_NOISE_FACTORS_OF_ONE = (4.0, 8.0, 16.0, 32.0)  # a camera whose poses are wrong throughout
 _PENALTIES = {
     "shift": 1.8,
     "heading": 1.3,
@@ -607,22 +666,26 @@ def _rounded(value: float) -> float:
 
 # What is odd about a person, by the name it has in a score: the code of its doubt, and the sentence.
 _ODD = {
-    "size": ("body", "the person is {stature:.2f} m tall; grown-ups are {usual:.2f} m, 95 % within 17 %"),
+    "size": ("body", "the person is {stature_m:.3g} m tall; grown-ups are {usual:.2f} m, 95 % within 17 %"),
     "shape": ("body", "the lengths of the limbs are not in the proportions of people"),
-    "limp": ("body", "the lengths of the limbs change over time"),
-    "upright": ("body", "the person does not stand upright"),
+    "limp": ("body", "the lengths of the limbs change over time, by {limb_spread:.0%}"),
+    "upright": ("body", "the person does not stand upright, but leans by {lean_deg:.0f} deg"),
     "wander": ("body", "the person leans to and fro"),
     "face": ("body", "the face looks backwards, or left is right"),
     "crossed": ("body", "limbs cross: left and right are exchanged in the names of some joints, not of all"),
+    "bend": ("body", "knees or elbows bend the wrong way"),
     "course": ("body", "the person walks sideways or backwards"),
-    "slide": ("body", "the foot that stands slides"),
-    "speed": ("body", "the person is faster than people run"),
-    "climb": ("body", "the person rises and falls faster than people do"),
-    "above": ("ground", "the person is above the drones"),
-    "ground": ("ground", "the feet are not on the ground of the map"),
-    "unposed": ("clock", "pictures were taken when nothing logs a pose"),
-    "actor": ("actor", "the person is elsewhere than the logged actor"),
-    "actor_path": ("actor", "the person takes another way than the logged actor"),
+    "slide": ("body", "the foot that stands slides, with {foot_mps:.1f} m/s"),
+    "speed": ("body", "the person is faster than people run: {pace_mps:.1f} m/s"),
+    "climb": ("body", "the person rises and falls faster than people do: {climb_mps:.1f} m/s"),
+    "above": ("ground", "the person is {above_m:.1f} m above the drones"),
+    "ground": ("ground", "the feet are {feet_above_ground_m:+.1f} m from the ground of the map"),
+    "beside": ("ground", "the person is beside the map"),
+    "level": ("ground", "the feet rise by {rise_m:.1f} m on a way of {walked_m:.1f} m"),
+    "unposed": ("clock", "pictures were taken when nothing logs a pose: {unposed_share:.0%} of one camera's"),
+    "actor": ("actor", "the person is {from_actor_m:.1f} m from the logged actor"),
+    "actor_path": ("actor", "the person takes another way than the logged actor, {path_apart_m:.1f} m apart"),
+    "unused": ("residual", "{unused_share:.0%} of the joints cannot be used: their rays miss each other"),
     "behind": ("residual", "joints are behind the cameras that see them"),
     "parallax": ("residual", "the cameras look from the same side: the rays hardly cross"),
 }
@@ -635,23 +698,25 @@ def _oddities(described: Score, scene: Scene, flight: Sampled, *, alone: bool) -
     Where no cause is stated beside it (`alone`), the rays are what is odd if nothing else is.
     """
     names = [camera.name for camera in flight.cameras]
-    residual = residual_px(scene, solve(scene))
-    odd = sorted(described.odd.items(), key=lambda item: -item[1])
+    solved = solve(scene)
+    odd = sorted(described.odd.items(), key=lambda item: -item[1].sigmas)
     found: dict[str, Doubt] = {}
-    for name, value in odd:
-        if value >= _LEAST_ODD and name in _ODD:
+    for name, (sigmas, measured) in odd:
+        if sigmas >= _LEAST_ODD and name in _ODD:
             code, said = _ODD[name]
-            what = said.format(stature=described.stature_m, usual=STATURE_M)
-            evidence = {name: round(float(value), 2)}
+            what = said.format(usual=STATURE_M, **measured)
+            evidence = {key: _rounded(value) for key, value in (*measured.items(), ("sigmas", sigmas))}
             found.setdefault(code, Doubt(code=code, cameras=names, what=what, evidence=evidence, remedy=""))
-    if described.misfit > _LEAST_ODD or "residual" in found or (alone and not found):
+    if described.misfit > _LEAST_ODD or (alone and not found):
         times = f"{described.misfit:.1f} times"
         what = f"the rays miss each other by {times} what keypoints and poses are stated to err by"
         evidence = {
             "misfit": round(described.misfit, 2),
-            "residual_px": residual,
+            "residual_px": residual_px(scene, solved),
             "scatter": round(described.scatter, 2),
         }
+        each = zip(names, residuals_px(scene, solved), strict=True)
+        evidence |= {f"residual_px_{name}": value for name, value in each}
         evidence = {name: value for name, value in evidence.items() if np.isfinite(value)}
         found["residual"] = Doubt(code="residual", cameras=names, what=what, evidence=evidence, remedy="")
     return list(found.values())

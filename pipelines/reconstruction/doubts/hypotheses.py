@@ -249,7 +249,7 @@ def of_times(trial: Trial) -> Iterator[Hypothesis]:
             lambda seconds, index=index: Hypothesis(  # type: ignore[misc]
                 "clock",
                 pair_of(trial, [index]),
-                f"the pictures of {names[index]} were taken {seconds:+.3f} s from where their clock says",
+                f"the pictures of {names[index]} were taken {remedies.earlier_or_later(seconds)}",
                 remedies.clock(described, [index], seconds),
                 1.0 + abs(seconds) / 2,
                 trial.late(seconds, [index]),
@@ -274,7 +274,7 @@ def of_times(trial: Trial) -> Iterator[Hypothesis]:
                 Hypothesis(
                     "frame_rate",
                     pair_of(trial, group),
-                    f"the pictures of {said} follow each other {factor:.3g} times as slowly as stated",
+                    f"the frame rate of {said} is {remedies.times_faster(factor)}",
                     remedies.frame_rate(described, group, factor),
                     penalty,
                     scene_of(trial.flight, trial.described, slower=slower),
@@ -329,11 +329,11 @@ def _mounted(trial: Trial) -> Iterator[Hypothesis]:
             continue
         whose = _whose(trial, group)
         for degrees in (90, 180, 270):
-            turn = turn_about("z", degrees)
+            turn, side = turn_about("z", degrees), "left" if degrees <= 180 else "right"
             yield Hypothesis(
                 "mount",
                 tuple(trial.names[index] for index in group),
-                f"{whose} rolled by {degrees} deg about the optical axis",
+                f"{whose} rolled by {_signed(degrees)} deg about the optical axis",
                 remedies.mount(trial.flight.cameras, group, _after(turn)),
                 penalty,
                 trial.turned_in_camera(turn, group),
@@ -341,11 +341,16 @@ def _mounted(trial: Trial) -> Iterator[Hypothesis]:
             yield Hypothesis(
                 "mount",
                 tuple(trial.names[index] for index in group),
-                f"{whose} mounted {degrees} deg to the left of where it is said to look",
+                f"{whose} mounted {abs(_signed(degrees))} deg to the {side} of where it is said to look",
                 remedies.mount(trial.flight.cameras, group, _before(turn)),
                 penalty,
                 trial.turned_in_body(turn, group),
             )
+
+
+def _signed(degrees: int) -> int:
+    """Return an angle of -180 to 180 deg."""
+    return degrees if degrees <= 180 else degrees - 360
 
 
 def _tilts_negated(trial: Trial) -> Iterator[Hypothesis]:
@@ -481,7 +486,7 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
         rotation, position = rotation.copy(), position.copy()
         rotation[still], position[still] = scene.rotation[still], scene.position[still]
         changed = replace(scene, rotation=rotation, position=position)
-        return Hypothesis(code, names, what, remedy or f"make the log again: {what}", 0.5, changed)
+        return Hypothesis(code, names, what, remedy or f"write the log again, since {what}", 0.5, changed)
 
     mounts = np.stack([trial.mount(index) for index in trial.every])[:, None]
     camera, place = scene.rotation, scene.position
@@ -501,8 +506,10 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
         return turned
 
     camera_inverse, body_inverse = np.swapaxes(camera, -1, -2), np.swapaxes(body, -1, -2)
+    stated = cameras[trial.moving[0]].entry.poses
+    inverse, z = stated.inverse, "up" if stated.z == "down" else "down"
     # The exchange of axes is its own inverse.
-    right_axes = "enu" if cameras[trial.moving[0]].entry.poses.axes == "ned" else "ned"
+    right_axes = "enu" if stated.axes == "ned" else "ned"
     yield from (
         hypothesis(
             "axes",
@@ -520,7 +527,7 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
         ),
         hypothesis(
             "axes",
-            "the positions count z downwards, the attitudes do not",
+            f"the positions count z {z}wards, the attitudes do not",
             remedies.upside_down(cameras),
             camera,
             place * [1.0, 1.0, -1.0],
@@ -528,28 +535,28 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
         hypothesis("axes", "the positions have x and y exchanged", "", camera, place[..., [1, 0, 2]]),
         hypothesis(
             "convention",
-            "the poses are camera_from_world",
+            f"the poses are {_read('camera', inverse)}",
             remedies.inverse(cameras),
             camera_inverse,
             -np.einsum("ctij,ctj->cti", camera_inverse, place),
         ),
         hypothesis(
             "convention",
-            "the poses are body_from_world",
+            f"the poses are {_read('body', inverse)}",
             remedies.inverse(cameras),
             carried_by(body_inverse),
             -np.einsum("ctij,ctj->cti", body_inverse, place),
         ),
         hypothesis(
             "convention",
-            "the attitudes are camera_from_world, the positions are not",
+            f"the attitudes are {_read('camera', inverse)}, the positions are not",
             "",
             camera_inverse,
             place,
         ),
         hypothesis(
             "convention",
-            "the attitudes are body_from_world, the positions are not",
+            f"the attitudes are {_read('body', inverse)}, the positions are not",
             "",
             body_inverse @ mounts,
             place,
@@ -605,12 +612,17 @@ def _conventions(trial: Trial) -> Iterator[Hypothesis]:
         yield Hypothesis(
             "unit",
             names,
-            known if factor < 1 else f"{known}, and {factor:.3g} times what is read",
+            known if factor < 1 else f"{known}, and {factor:.4g} times what is read",
             remedies.pose(cameras, f"unit: {unit}"),
             0.5,
             replace(scene, position=(place - arms) * factor + arms),
             same_scatter=True,
         )
+
+
+def _read(of: str, inverse: bool) -> str:
+    """Return how poses are written that were read as inverse, or not, by mistake."""
+    return f"world_from_{of}" if inverse else f"{of}_from_world"
 
 
 def _pixels(trial: Trial) -> Iterator[Hypothesis]:
@@ -730,7 +742,7 @@ def _each_number(trial: Trial) -> Iterator[Hypothesis | None]:
             lambda seconds: Hypothesis(
                 "clock",
                 names,
-                f"the pictures of all cameras were taken {seconds:+.3f} s from where their clocks say",
+                f"the pictures of all cameras were taken {remedies.earlier_or_later(seconds)}",
                 remedies.clock(cameras, every, seconds),
                 1.0 + abs(seconds) / 2,
                 trial.late(seconds, every),

@@ -42,6 +42,16 @@ def _rounded(rate: float) -> str:
     return f"{rate:.0f}" if abs(round(rate) - rate) < 0.005 * rate else f"{rate:.3f}"
 
 
+def times_faster(factor: float) -> str:
+    """State a frame rate beside the stated one, where pictures follow each other `factor` times as slowly."""
+    return f"{1 / factor:.3g} times what is stated"
+
+
+def earlier_or_later(seconds: float) -> str:
+    """State by how much pictures were taken at another time than stated."""
+    return f"{abs(seconds):.3f} s {'later' if seconds > 0 else 'earlier'} than stated"
+
+
 def videos(cameras: Sequence[Filmed], order: Sequence[int]) -> str:
     """Give cameras each other's pictures, or keypoints where those came with the flight."""
 
@@ -155,9 +165,11 @@ def _moving(cameras: Sequence[Filmed]) -> list[int]:
 
 
 def keypoints_size(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
-    """State the size of the pictures that keypoints are of."""
+    """State the size of the pictures that keypoints are of; of film, calibrate the lens for its pictures."""
 
     def said(camera: Filmed) -> str:
+        if camera.entry.keypoints is None:
+            return _lens(camera, factor, factor)
         width, height = camera.intrinsics.width * factor, camera.intrinsics.height * factor
         return f"keypoints.image_size: [{width:.0f}, {height:.0f}]"
 
@@ -174,13 +186,19 @@ _MIRRORS = {
 
 
 def mirrored(cameras: Sequence[Filmed], group: Sequence[int], value: str) -> str:
-    """State that keypoints are mirrored, besides what is stated of that: twice is not at all."""
+    """State that keypoints are mirrored, besides what is stated of that: twice is not at all.
+
+    No line does that for film, in which the keypoints are still to be found: it is turned over itself.
+    """
     lines = []
     for index in group:
-        known = cameras[index].entry.keypoints
+        known, name = cameras[index].entry.keypoints, cameras[index].name
+        if known is None and value != "names":
+            flip = "vflip" if value == "y" else "hflip"
+            lines.append(f"mirror the film of {name} back, as with `ffmpeg -i FILM -vf {flip} NEW`")
+            continue
         parts = _MIRRORS[value] ^ _MIRRORS[str(known.mirrored if known else False).lower()]
-        needed = next((key for key, each in _MIRRORS.items() if each == parts), None)
-        name = cameras[index].name
+        needed = next((key for key, each in _MIRRORS.items() if each == parts), None) if known else None
         lines.append(
             f"cameras.{name}.keypoints.mirrored: {needed}"
             if needed
@@ -191,19 +209,20 @@ def mirrored(cameras: Sequence[Filmed], group: Sequence[int], value: str) -> str
 
 def intrinsics(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
     """Multiply the focal lengths of cameras."""
-
-    def said(camera: Filmed) -> str:
-        own = camera.intrinsics
-        model = "" if own.model == "none" else f", model: {own.model}, distortion: {list(own.distortion)}"
-        return (
-            f"intrinsics: {{width: {own.width}, height: {own.height}, fx: {own.fx * factor:.1f},"
-            f" fy: {own.fy * factor:.1f}, cx: {own.cx:.1f}, cy: {own.cy:.1f}{model}}}"
-        )
-
-    return _lines(cameras, group, said)
+    return _lines(cameras, group, lambda camera: _lens(camera, factor, 1.0))
 
 
-def pose_noise(cameras: Sequence[Filmed], lasting: float, changing: float) -> str:
+def _lens(camera: Filmed, focal: float, centre: float) -> str:
+    """State the intrinsics of a camera, with factors on the focal length and the principal point."""
+    own = camera.intrinsics
+    model = "" if own.model == "none" else f", model: {own.model}, distortion: {list(own.distortion)}"
+    return (
+        f"intrinsics: {{width: {own.width}, height: {own.height}, fx: {own.fx * focal:.1f},"
+        f" fy: {own.fy * focal:.1f}, cx: {own.cx * centre:.1f}, cy: {own.cy * centre:.1f}{model}}}"
+    )
+
+
+def pose_noise(cameras: Sequence[Filmed], group: Sequence[int], lasting: float, changing: float) -> str:
     """State larger errors of poses: factors on constant ones, and on those that change."""
 
     def said(camera: Filmed) -> str:
@@ -216,7 +235,7 @@ def pose_noise(cameras: Sequence[Filmed], lasting: float, changing: float) -> st
             f" rotation_deg: {changing * np.degrees(sigma.varying_rotation_rad):.3g}}}}}"
         )
 
-    return _lines(cameras, _moving(cameras), said)
+    return _lines(cameras, [index for index in group if not cameras[index].static], said)
 
 
 def origin(cameras: Sequence[Filmed], index: int, shift: Float | None, yaw_deg: float | None) -> str:
@@ -236,3 +255,9 @@ def own_origins(cameras: Sequence[Filmed], shifts: Float) -> str:
     """Place the worlds of all logs, which are moved by `shifts` [C, 3] m."""
     moved = [index for index in range(len(cameras)) if np.abs(shifts[index]).max() > 0]
     return "; ".join(origin(cameras, index, shifts[index], None) for index in moved)
+
+
+def another_pose(cameras: Sequence[Filmed], index: int) -> str:
+    """Ask for other poses of a camera, or for the flight without it."""
+    name = cameras[index].name
+    return f"cameras.{name}.pose: {{log: ..., topic: ...}}  # that of {name}; or leave {name} out"

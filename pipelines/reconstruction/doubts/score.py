@@ -10,6 +10,7 @@ Lower is better. A score adds three things:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import combinations
 from typing import NamedTuple
 
@@ -57,9 +58,22 @@ _LYING = 1.2  # the most that lying counts, and bending down or a cartwheel: peo
 _WALKING = 0.7  # least cosine of a body against the vertical, of somebody who walks
 _WALKING_SHARE = 0.8  # least share of the moments in which they do: else they lie down, or turn cartwheels
 _HEAD_DOWN = -0.3  # cosine of a body against the vertical: less is head down for most of a flight
+_UNUSED_SIGMAS = 4.0
+_USUALLY_UNUSED = 0.2  # most of the joints; below 0.01 on right flights
+_BENT_COSINE = np.cos(np.radians(30))  # of a limb's two parts: less is clearly bent
+_CLEARLY = 0.5  # least cosine of where a joint bends, against forwards
+_HANGING = 0.5  # least cosine of an upper arm against downwards
+_SLOPE = 0.3  # of ground that no map shows
 _HALF_BODY_M = 0.5
 SCATTER_WEIGHT = 12.0
 SCATTER_RANGE = (0.4, 30.0)  # what is less is no better: keypoints scatter by themselves
+
+
+class Oddity(NamedTuple):
+    """Deviation of one thing about the person from what is usual."""
+
+    sigmas: float  # in its own standard deviations
+    evidence: Mapping[str, float]  # what was measured
 
 
 class Score(NamedTuple):
@@ -68,7 +82,7 @@ class Score(NamedTuple):
     total: float
     misfit: float  # of rays, standard deviations
     scatter: float  # of rays within pictures, over the pixel noise
-    odd: dict[str, float]  # how odd each thing about the person is, in its own standard deviations
+    odd: dict[str, Oddity]
     stature_m: float
 
 
@@ -130,8 +144,9 @@ def score(
     misfit = _misfit(solved, good)
     # Two cameras have one draw of constant errors between them: chi^2 of few.
     soft = 2.0 if len(scene.focal_px) == 2 else 1.5
-    behind = (1 - float(solved.in_front[good].mean())) / 0.05
-    total = float(2 * np.log1p((misfit / soft) ** 2) + np.log1p(behind**2))
+    share_behind = 1 - float(solved.in_front[good].mean())
+    behind = Oddity(share_behind / 0.05, {"behind_share": share_behind})
+    total = float(2 * np.log1p((misfit / soft) ** 2) + np.log1p(behind.sigmas**2))
     reference = None if base is None or same_scatter else base.scatter
     gain = 0.0 if reference is None else SCATTER_WEIGHT * np.log(reference / SCATTER_RANGE[0])
     if total - gain > limit:
@@ -144,8 +159,9 @@ def score(
     person = _person(flight, scene, solved)
     if person is None:
         return Score(IMPOSSIBLE, misfit, np.inf, {}, np.nan)
-    odd = {"parallax": _parallax(solved)} | person.odd
-    total += sum(float(np.log1p(min(value, 50.0) ** 2)) for value in odd.values() if np.isfinite(value))
+    odd = {"parallax": _parallax(solved), "unused": _unused(solved, good, misfit)} | person.odd
+    sigmas = [each.sigmas for each in odd.values() if np.isfinite(each.sigmas)]
+    total += sum(float(np.log1p(min(value, 50.0) ** 2)) for value in sigmas)
     odd["behind"] = behind
     return Score(total, misfit, scatter, odd, person.stature_m)
 
@@ -170,7 +186,15 @@ def _misfit(solved: Solved, good: Bool) -> float:
     return float(np.sqrt(total / count))
 
 
-def _parallax(solved: Solved) -> float:
+def _unused(solved: Solved, good: Bool, misfit: float) -> Oddity:
+    """Measure the share of joints whose rays miss each other by far more than usual: gates reject them."""
+    freedom = 2 * solved.views[good] - 3
+    gate = (_UNUSED_SIGMAS * max(misfit, 1.0)) ** 2
+    share = float((solved.chi2[good] > gate * freedom).mean())
+    return Oddity(max(0.0, share - _USUALLY_UNUSED) / 0.05, {"unused_share": share})
+
+
+def _parallax(solved: Solved) -> Oddity:
     """Say how far the best pair of cameras is from seeing a person from two sides (0.1 rad)."""
     best = 0.0
     for one, other in combinations(range(len(solved.seen)), 2):
@@ -179,7 +203,7 @@ def _parallax(solved: Solved) -> float:
             cosine = (solved.direction[one][both] * solved.direction[other][both]).sum(axis=-1)
             sine = np.sqrt(np.maximum(0.0, 1.0 - cosine**2))
             best = max(best, _median(sine))
-    return max(0.0, 0.1 / max(best, 1e-4) - 1)
+    return Oddity(max(0.0, 0.1 / max(best, 1e-4) - 1), {"parallax_deg": float(np.degrees(np.arcsin(best)))})
 
 
 def _scatter(scene: Scene, solved: Solved) -> float:
@@ -244,7 +268,7 @@ def _median_of_rows(values: Float) -> Float:
 
 
 class _Person(NamedTuple):
-    odd: dict[str, float]
+    odd: dict[str, Oddity]
     stature_m: float
 
 
@@ -257,15 +281,16 @@ def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
         return None
     stature = float(np.nanmedian(statures))
     odd = {
-        "size": max(0.0, abs(np.log(stature / STATURE_M)) - 0.08) / 0.09,
-        "shape": float(np.nanmedian(np.abs(np.log(statures / stature)))) / 0.10,
+        "size": Oddity(max(0.0, abs(np.log(stature / STATURE_M)) - 0.08) / 0.09, {"stature_m": stature}),
+        "shape": _shape(lengths, statures / stature),
+        "unposed": _unposed(scene),
     }
-    odd["unposed"] = _unposed(scene) / 0.05
     odd |= body.posture()
     far_m = _distances(solved)
     # The cameras that see a joint change, and with them the errors that they have in common.
     limp = float(np.nanmedian([_spread(length) for length, _ in lengths]))
-    odd["limp"] = limp / (0.10 + 0.5 * _moved_by(scene.sigma[:, :2], far_m))
+    usual = 0.10 + 0.5 * _moved_by(scene.sigma[:, :2], far_m)
+    odd["limp"] = Oddity(limp / usual, {"limb_spread": limp})
     keypoint_m = float(np.sqrt(np.mean(pixel_variance(scene)) * np.mean((far_m / scene.focal_px) ** 2)))
     odd |= body.motion(flight, stature, _moved_by(scene.sigma[:, 2:4], far_m), keypoint_m)
     odd |= _place(flight, scene, body, far_m)
@@ -283,11 +308,21 @@ def stature_m(joints: Float) -> float:
     return _median(_statures(_Body(joints).lengths()))
 
 
-def _unposed(scene: Scene) -> float:
-    """Return the share of moments with a person in the picture and no pose, of the camera with the most."""
+def _shape(lengths: list[tuple[Float, float]], relative: Float) -> Oddity:
+    """Measure the limbs' proportions, from the stature for which each is usual over that of the person."""
+    names = [f"{start}_to_{end}" for start, end, _ in _LIMBS] + ["torso"]
+    worst = int(np.nanargmax(np.abs(np.log(relative))))
+    length_m = _median(lengths[worst][0])
+    measured = {f"{names[worst]}_m": length_m, "usual_m": length_m / float(relative[worst])}
+    return Oddity(float(np.nanmedian(np.abs(np.log(relative)))) / 0.10, measured)
+
+
+def _unposed(scene: Scene) -> Oddity:
+    """Measure the share of moments with a person in the picture and no pose, of the camera with the most."""
     seen = np.isfinite(scene.rays[..., 0]).any(axis=-1)
     posed = np.isfinite(scene.position).all(axis=-1)
-    return min(0.2, float((seen & ~posed).mean(axis=1).max()))
+    share = float((seen & ~posed).mean(axis=1).max())
+    return Oddity(min(0.2, share) / 0.05, {"unposed_share": share})
 
 
 class _Body:
@@ -311,21 +346,55 @@ class _Body:
         limbs = [(np.linalg.norm(self[start] - self[end], axis=-1), share) for start, end, share in _LIMBS]
         return [*limbs, (np.linalg.norm(self.hips - self.shoulders, axis=-1), _TORSO)]
 
-    def posture(self) -> dict[str, float]:
-        """Say how far the person is from upright, from a face in front, and from limbs on their own sides."""
+    def posture(self) -> dict[str, Oddity]:
+        """Measure how upright the person is, where the face is, and on which sides and how the limbs are."""
         cosine = self.cosine
         middle = _median(cosine)
+        lean = {"lean_deg": float(np.degrees(np.arccos(middle)))}
+        leaning, head_down = min((1 - middle) / 0.15, _LYING), max(0.0, _HEAD_DOWN - middle) / 0.05
+        same_sides, bent = self._same_sides(), self._bent_as_people()
         odd = {
-            "upright": min((1 - middle) / 0.15, _LYING) + max(0.0, _HEAD_DOWN - middle) / 0.05,
-            "wander": min(_median(np.abs(cosine - middle)) / 0.1, _LYING),
+            "upright": Oddity(leaning + head_down, lean),
+            "wander": Oddity(min(_median(np.abs(cosine - middle)) / 0.1, _LYING), lean),
+            "crossed": Oddity(max(0.0, 0.5 - same_sides) / 0.03, {"uncrossed_share": same_sides}),
+            "bend": Oddity(max(0.0, 0.4 - bent) / 0.06, {"bent_forwards_share": bent}),
         }
-        odd["crossed"] = max(0.0, 0.5 - self._same_sides()) / 0.03
         forwards = self._forwards()
         nose = ((self["nose"] - (self["left_ear"] + self["right_ear"]) / 2) * forwards).sum(axis=-1)
         nose = nose[np.isfinite(nose)]
         if len(nose) > _FEWEST_MOMENTS:
-            odd["face"] = max(0.0, 0.6 - float((nose > 0).mean())) / 0.06
+            ahead = float((nose > 0).mean())
+            odd["face"] = Oddity(max(0.0, 0.6 - ahead) / 0.06, {"nose_in_front_share": ahead})
         return odd
+
+    def _bent_as_people(self) -> float:
+        """Return the least share of bent knees, or of bent elbows of hanging arms, that bend as people's do.
+
+        A knee is ahead of the line from hip to ankle, an elbow behind that from shoulder to wrist. What is
+        hardly bent, or bent sideways, does not count; 1 where few are bent.
+        """
+        upwards, forwards = (
+            each / np.linalg.norm(each, axis=-1, keepdims=True)
+            for each in (self.shoulders - self.hips, self._forwards())
+        )
+        shares = []
+        for root, middle, tip, sign in (("hip", "knee", "ankle", 1), ("shoulder", "elbow", "wrist", -1)):
+            right: list[Bool] = []
+            for side in ("left", "right"):
+                upper = self[f"{side}_{middle}"] - self[f"{side}_{root}"]
+                lower = self[f"{side}_{tip}"] - self[f"{side}_{middle}"]
+                upper_m, lower_m = np.linalg.norm(upper, axis=-1), np.linalg.norm(lower, axis=-1)
+                line = (upper + lower) / np.linalg.norm(upper + lower, axis=-1, keepdims=True)
+                apex = upper - (upper * line).sum(axis=-1, keepdims=True) * line
+                ahead = sign * (apex * forwards).sum(axis=-1) / np.linalg.norm(apex, axis=-1)
+                counts = (upper * lower).sum(axis=-1) / (upper_m * lower_m) < _BENT_COSINE
+                counts &= np.abs(ahead) > _CLEARLY
+                if middle == "elbow":
+                    counts &= -(upper * upwards).sum(axis=-1) / upper_m > _HANGING
+                right.append(ahead[counts] > 0)
+            if sum(map(len, right)) > _FEWEST_MOMENTS:
+                shares.append(float(np.concatenate(right).mean()))
+        return min(shares, default=1.0)
 
     def _same_sides(self) -> float:
         """Return the least share of moments in which two pairs of joints have left and right on one side."""
@@ -346,7 +415,7 @@ class _Body:
         forwards: Float = np.cross(upwards, self["right_hip"] - self["left_hip"])
         return forwards
 
-    def motion(self, flight: Sampled, stature: float, white_m: float, keypoint_m: float) -> dict[str, float]:
+    def motion(self, flight: Sampled, stature: float, white_m: float, keypoint_m: float) -> dict[str, Oddity]:
         """Say how oddly the person moves: not forwards, faster than people, or with a foot that slides.
 
         Args:
@@ -364,13 +433,14 @@ class _Body:
             for name in ("left_ankle", "right_ankle")
         ]
         of_foot = float(np.hypot(noise, np.sqrt(2) * keypoint_m / step_s))
-        climbed = _median(np.abs(moved[:, 2]))
+        climbed, slid = _median(np.abs(moved[:, 2])), _median(np.minimum(*feet))
+        fast, ahead = _quantile(pace, 0.75), self._ahead(flight, white_m)
+        slides = max(0.0, slid - 0.4 * stature / 1.7 - of_foot) / (0.5 + of_foot / 2)
         return {
-            "course": max(0.0, 0.5 - self._ahead(flight, white_m)) / 0.15,
-            "speed": max(0.0, _quantile(pace, 0.75) - 4.0 - 1.5 * noise) / (2 + noise),
-            "climb": max(0.0, climbed - 0.5 - noise) / (0.5 + noise / 2),
-            "slide": max(0.0, _median(np.minimum(*feet)) - 0.4 * stature / 1.7 - of_foot)
-            / (0.5 + of_foot / 2),
+            "course": Oddity(max(0.0, 0.5 - ahead) / 0.15, {"course_cosine": ahead}),
+            "speed": Oddity(max(0.0, fast - 4.0 - 1.5 * noise) / (2 + noise), {"pace_mps": fast}),
+            "climb": Oddity(max(0.0, climbed - 0.5 - noise) / (0.5 + noise / 2), {"climb_mps": climbed}),
+            "slide": Oddity(slides, {"foot_mps": slid}),
         }
 
     def _ahead(self, flight: Sampled, white_m: float) -> float:
@@ -413,28 +483,43 @@ def _moved_by(sigma: Float, far_m: Float) -> float:
     return float(np.sqrt(np.mean(sigma[:, 0] ** 2 + (far_m * sigma[:, 1]) ** 2)))
 
 
-def _place(flight: Sampled, scene: Scene, body: _Body, far_m: Float) -> dict[str, float]:
-    """Say how far the person is from where people are: below drones, on the ground, at the logged actor."""
-    odd: dict[str, float] = {}
+def _place(flight: Sampled, scene: Scene, body: _Body, far_m: Float) -> dict[str, Oddity]:
+    """Measure how far the person is from where people are: under drones, on the ground, at the actor."""
+    odd: dict[str, Oddity] = {}
     stated_m, white_m = _moved_by(scene.sigma[:, :2], far_m), _moved_by(scene.sigma[:, 2:4], far_m)
     if not all(camera.static for camera in flight.cameras):
-        odd["above"] = max(0.0, _median(body.hips[:, 2]) - _median(scene.position[..., 2])) / 2.0
+        above_m = _median(body.hips[:, 2]) - _median(scene.position[..., 2])
+        odd["above"] = Oddity(max(0.0, above_m) / 2.0, {"above_m": above_m})
     if flight.ground is not None:
         foot = np.fmin(body["left_ankle"][:, 2], body["right_ankle"][:, 2])
         under = flight.ground.under(body.hips)
         on_map = np.isfinite(under)
-        if on_map.sum() < 0.5 * np.isfinite(body.hips[:, 0]).sum():
-            odd["ground"] = 6.0
+        known = np.isfinite(body.hips[:, 0]).sum()
+        if on_map.sum() < 0.5 * known:
+            odd["beside"] = Oddity(6.0, {"on_map_share": float(on_map.sum() / max(known, 1))})
         else:
-            height = abs(_median((foot - under)[on_map]) - _ANKLE_ABOVE_GROUND_M)
-            odd["ground"] = max(0.0, height - 0.25 - 2 * stated_m) / 0.25
+            height_m = _median((foot - under)[on_map]) - _ANKLE_ABOVE_GROUND_M
+            above = max(0.0, abs(height_m) - 0.25 - 2 * stated_m) / 0.25
+            odd["ground"] = Oddity(above, {"feet_above_ground_m": height_m})
+    else:
+        odd["level"] = _level(body, white_m)
     if flight.hips is not None and np.isfinite(flight.hips[:, 0]).any():
         apart = body.hips - flight.hips
         constant = np.array([_median(apart[:, axis]) for axis in range(3)])
-        odd["actor"] = max(0.0, float(np.linalg.norm(constant)) - 0.25 - 2 * stated_m) / 0.4
-        path = _median(np.linalg.norm(apart - constant, axis=-1))
-        odd["actor_path"] = max(0.0, path - 0.45 - 2 * white_m) / 0.3
-    return {name: value for name, value in odd.items() if np.isfinite(value)}
+        apart_m = float(np.linalg.norm(constant))
+        path_m = _median(np.linalg.norm(apart - constant, axis=-1))
+        odd["actor"] = Oddity(max(0.0, apart_m - 0.25 - 2 * stated_m) / 0.4, {"from_actor_m": apart_m})
+        odd["actor_path"] = Oddity(max(0.0, path_m - 0.45 - 2 * white_m) / 0.3, {"path_apart_m": path_m})
+    return {name: each for name, each in odd.items() if np.isfinite(each.sigmas)}
+
+
+def _level(body: _Body, white_m: float) -> Oddity:
+    """Measure by how much the lowest joint rises above its lowest level, more than slopes excuse."""
+    lowest = np.fmin.reduce(body.joints[..., 2], axis=1)
+    rise_m = _quantile(lowest, 0.9) - _quantile(lowest, 0.1)
+    walked_m = float(np.linalg.norm([_quantile(xy, 0.95) - _quantile(xy, 0.05) for xy in body.hips[:, :2].T]))
+    excused_m = 0.5 + _SLOPE * walked_m + 3 * white_m
+    return Oddity(max(0.0, rise_m - excused_m) / 0.3, {"rise_m": rise_m, "walked_m": walked_m})
 
 
 def _finite(values: Float) -> Float:
@@ -462,8 +547,16 @@ def _spread(values: Float) -> float:
 
 def residual_px(scene: Scene, solved: Solved) -> float:
     """Return the median distance (px) of keypoints from the joints that were triangulated from them."""
+    return round(_median(_residuals_px(scene, solved)), 2)
+
+
+def residuals_px(scene: Scene, solved: Solved) -> list[float]:
+    """Return the same of each camera."""
+    return [round(_median(each), 2) for each in _residuals_px(scene, solved)]
+
+
+def _residuals_px(scene: Scene, solved: Solved) -> Float:
     toward = solved.joints[None] - np.nan_to_num(scene.position)[:, :, None, :]
     with np.errstate(invalid="ignore", divide="ignore"):
         across = np.linalg.norm(np.cross(solved.direction, toward), axis=-1) / np.abs(solved.depth)
-    pixels = np.where(solved.seen, across * scene.focal_px[:, None, None], np.nan)
-    return round(_median(pixels), 2)
+    return np.where(solved.seen, across * scene.focal_px[:, None, None], np.nan)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -135,7 +136,7 @@ def _vectors(rotation: Float) -> Float:
 def lateness(
     cameras: Sequence[Camera], turns: Mapping[int, Turns], between: Interpolation, factors: Sequence[float]
 ) -> list[Lateness]:
-    """Find the clocks of all cameras and of each, and the frame rates of all, by which the turns fit best.
+    """Find the clocks and the frame rates, of all cameras and of each, by which the turns fit best.
 
     Args:
         cameras: of the flight.
@@ -151,14 +152,18 @@ def lateness(
         return []
     grid = np.arange(-_LONGEST_S, _LONGEST_S + _STEP_S / 2, _STEP_S)
     by_clock = {i: _gains(cameras[i], found, between, [(s, 1.0) for s in grid]) for i, found in known.items()}
-    by_rate = [_gains(cameras[i], found, between, [(0.0, f) for f in factors]) for i, found in known.items()]
+    by_rate = {
+        i: _gains(cameras[i], found, between, [(0.0, f) for f in factors]) for i, found in known.items()
+    }
     everyone = tuple(range(len(cameras)))
     tried = [_best_clock((i,), grid, [curve]) for i, curve in by_clock.items()]
+    groups: list[tuple[int, ...]] = [(i,) for i in known]
     if len(known) == len(cameras):
+        groups.append(everyone)
         tried.append(_best_clock(everyone, grid, list(by_clock.values())))
-        for factor, each in zip(factors, zip(*by_rate, strict=True), strict=True):
-            gain, explained = _summed(each)
-            tried.append(Lateness(everyone, 0.0, factor, gain, float("nan")) if explained else None)
+    for group, (place, factor) in product(groups, enumerate(factors)):
+        gain, explained = _summed([by_rate[i][place] for i in group])
+        tried.append(Lateness(group, 0.0, factor, gain, float("nan")) if explained else None)
     return sorted((each for each in tried if each is not None), key=lambda each: -each.gain)
 
 
