@@ -49,6 +49,7 @@ from benchmarks.mistakes import (
 )
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import compose, invert
+from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.diagnosis import CODES, diagnose
 from pipelines.reconstruction.doubts.scene import scene_of
 from pipelines.reconstruction.doubts.score import score
@@ -434,6 +435,18 @@ def test_the_gimbal_of_another_log_is_exchanged_with_its_pose(flight: Described,
     assert first["code"] == "pose"
     assert with_remedy(manifest, first["remedy"])
     assert doubts_of(manifest) == []
+
+
+def test_film_has_no_keys_of_keypoints(flight: Described) -> None:
+    cameras = [
+        replace(camera, entry=camera.entry.model_copy(update={"keypoints": None}))
+        for camera in sampled_of(mistaken(flight, None)).cameras
+    ]
+    assert remedies.mirrored(cameras, [0], "true").startswith("mirror the film of drone1 back")
+    lens = remedies.keypoints_size(cameras, [1], 2.0)  # calibrated in pictures of half the size
+    fx = float(lens.partition("fx: ")[2].partition(",")[0])
+    assert lens.startswith("cameras.drone2.intrinsics: ")
+    assert fx == pytest.approx(2 * cameras[1].intrinsics.fx, abs=0.1)
 
 
 def test_drones_below_zero_count_z_downwards(flight: Described) -> None:

@@ -103,6 +103,16 @@ def test_the_frame_rate_of_one_camera_is_found() -> None:
     assert rate.slower == pytest.approx(25 / 30)
 
 
+def test_a_frame_rate_counts_from_the_first_picture_of_the_flight() -> None:
+    """Look at pictures from 2.4 s on, as `check` does, of cameras whose rate is stated wrongly."""
+    whole: list[Any] = [late(0.0, phase, 1.2) for phase in (0.1, 1.3)]
+    turns = {index: turns_of(camera, camera.followed()) for index, camera in enumerate(whole)}
+    part = [replace(camera, frame_t_ns=camera.frame_t_ns[60:]) for camera in whole]
+    first, *_ = lateness(part, turns, BETWEEN, RATES, [0, 0])
+    assert first.slower == pytest.approx(25 / 30)
+    assert first.gain > 50 + max(each.gain for each in lateness(part, turns, BETWEEN, RATES))
+
+
 def test_cameras_that_do_not_turn_tell_nothing() -> None:
     still = Turning(0.1, T_NS + 500_000_000, swings=False)
     clock = found([still, still])

@@ -168,7 +168,8 @@ def doubts_of(
         for index, camera in enumerate(cameras)
         if isinstance(tracks := followed.get(camera.name), Followed)
     }
-    late = lateness(cameras, turns, between, RATES)
+    first_ns = [description.cameras[camera.name].frames.first_t_ns for camera in cameras]
+    late = lateness(cameras, turns, between, RATES, first_ns)
     return diagnose(_less_odd(known(chosen=chosen), known()), late).doubts
 
 
@@ -228,7 +229,7 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> Diagnosis
 def _causes(trial: Trial, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     """Return the hypotheses that score next to the best, one of each code; none if it explains too little.
 
-    Those without a free number are first.
+    Those without a free number are first. Of clocks and frame rates, which are alike, the better score is.
     """
     explaining: list[Hypothesis] = []
     for each in hypotheses:
@@ -239,9 +240,14 @@ def _causes(trial: Trial, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         if _explains(trial, each):
             explaining.append(each)
     causes: dict[str, Hypothesis] = {}
-    for each in sorted(explaining, key=lambda each: (each.penalty > _DISCRETE, each.total)):
+    free = [each for each in explaining if each.penalty > _DISCRETE and each.code not in TIMES]
+    for each in [*(each for each in explaining if each not in free), *free]:
         causes.setdefault(each.code, each)
-    discrete = [each for each in causes.values() if each.penalty <= _DISCRETE and each.scene is not None]
+    discrete = [
+        each
+        for each in causes.values()
+        if each.penalty <= _DISCRETE and each.scene is not None and each.code not in TIMES
+    ]
     if len(discrete) > 1:  # alike in what is odd: the rays tell which of them fits
         costs = {each.code: _cost(trial, each) for each in discrete}
         least = min(costs.values()) + _ALIKE_COST  # where they do not tell, what is odd does, to a tenth

@@ -351,7 +351,8 @@ def scene_of(
         seen = source.pixels if pixels is None else pixels[index]
         since = (source.t_ns - flight.t_ns[0]).astype(np.float64)
         if slower is not None:
-            since = since[0] + (since - since[0]) * slower[index]
+            first = float(source.entry.frames.first_t_ns - flight.t_ns[0])  # few may have been looked at
+            since = first + (since - first) * slower[index]
         if late_s is not None:
             since = since + late_s[index] * 1e9
         at = _interpolated(since, seen, (flight.t_ns - flight.t_ns[0]).astype(np.float64))

@@ -134,7 +134,11 @@ def _vectors(rotation: Float) -> Float:
 
 
 def lateness(
-    cameras: Sequence[Camera], turns: Mapping[int, Turns], between: Interpolation, factors: Sequence[float]
+    cameras: Sequence[Camera],
+    turns: Mapping[int, Turns],
+    between: Interpolation,
+    factors: Sequence[float],
+    first_ns: Sequence[int] | None = None,
 ) -> list[Lateness]:
     """Find the clocks and the frame rates, of all cameras and of each, by which the turns fit best.
 
@@ -143,6 +147,7 @@ def lateness(
         turns: of those of them whose backgrounds were followed, by index.
         between: how poses are interpolated.
         factors: between the times of pictures that are tried.
+        first_ns: the first picture of each camera; by default the first of those that were looked at.
 
     Returns:
         The largest gain first; none if too little turns, or the logs turn otherwise at all times.
@@ -152,9 +157,9 @@ def lateness(
         return []
     grid = np.arange(-_LONGEST_S, _LONGEST_S + _STEP_S / 2, _STEP_S)
     by_clock = {i: _gains(cameras[i], found, between, [(s, 1.0) for s in grid]) for i, found in known.items()}
-    by_rate = {
-        i: _gains(cameras[i], found, between, [(0.0, f) for f in factors]) for i, found in known.items()
-    }
+    starts = [int(each.frame_t_ns[0]) for each in cameras] if first_ns is None else first_ns
+    rates = [(0.0, factor) for factor in factors]
+    by_rate = {i: _gains(cameras[i], found, between, rates, start_ns=starts[i]) for i, found in known.items()}
     everyone = tuple(range(len(cameras)))
     tried = [_best_clock((i,), grid, [curve]) for i, curve in by_clock.items()]
     groups: list[tuple[int, ...]] = [(i,) for i in known]
@@ -207,7 +212,12 @@ def is_sure_clock(late: Lateness) -> bool:
 
 
 def _gains(
-    camera: Camera, turns: Turns, between: Interpolation, times: Sequence[tuple[float, float]]
+    camera: Camera,
+    turns: Turns,
+    between: Interpolation,
+    times: Sequence[tuple[float, float]],
+    *,
+    start_ns: int = 0,
 ) -> list[tuple[float, float, float]]:
     """Return by how much other times lower the chi^2; the squares that they leave, and those of the turns.
 
@@ -218,13 +228,13 @@ def _gains(
         turns: its turns.
         between: how poses are interpolated.
         times: seconds that are added, and factors of the times since the first picture.
+        start_ns: the time of the first picture.
     """
-    start = int(camera.frame_t_ns[0])
     stated, _ = _left(camera, turns, between, turns.first_ns, turns.second_ns)
     found = []
     for late_s, slower in times:
         first_ns, second_ns = (
-            start + ((t_ns - start) * slower).astype(np.int64) + round(late_s * 1e9)
+            start_ns + ((t_ns - start_ns) * slower).astype(np.int64) + round(late_s * 1e9)
             for t_ns in (turns.first_ns, turns.second_ns)
         )
         left, logged = _left(camera, turns, between, first_ns, second_ns)
