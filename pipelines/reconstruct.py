@@ -774,6 +774,10 @@ class _Joined:
     @property
     def doubts(self) -> list[Doubt]:
         """Doubts of at least half of the segments."""
+        return self._doubts[0]
+
+    @cached_property
+    def _doubts(self) -> tuple[list[Doubt], list[tuple[Doubt, int, int]]]:
         return doubts_of_flight([part["metrics"]["doubts"] for part in self.parts if part["metrics"]])
 
     @property
@@ -840,6 +844,12 @@ class _Joined:
         told += [
             f"from {begins_s[k]:.0f} s on another person may be the actor: state --persons, or log the actor"
             for k in self.strangers
+        ]
+        made = [k for k, part in enumerate(self.parts) if part["metrics"]]
+        told += [
+            f"{count} of {len(made)} segments, first that from {begins_s[made[k]]:.0f} s to"
+            f" {ends_s[made[k]]:.0f} s: {said_doubts([doubt])[0]}"
+            for doubt, count, k in self._doubts[1]
         ]
         return told + warnings_of_flight([part["warnings"] for part in self.parts if part["metrics"]])
 

@@ -427,12 +427,25 @@ def figures_of_flight(metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return flight
 
 
-def doubts_of_flight(doubts: Sequence[Sequence[Mapping[str, Any]]]) -> list[Doubt]:
-    """Choose the doubts of at least half of the segments, those of most segments first."""
+def doubts_of_flight(
+    doubts: Sequence[Sequence[Mapping[str, Any]]],
+) -> tuple[list[Doubt], list[tuple[Doubt, int, int]]]:
+    """Choose the doubts of at least half of the segments, those of most segments first, and list the others.
+
+    Returns:
+        The doubts; and those that fewer segments have, with their number and the first of these segments. A
+        mistake that begins in the middle of a flight is one of the latter, and so is a false alarm.
+    """
     codes = Counter(code for of in doubts for code in {each["code"] for each in of})
-    often = [code for code, count in codes.most_common() if 2 * count >= len(doubts)]
-    first = {code: next(each for of in doubts for each in of if each["code"] == code) for code in often}
-    return [Doubt.model_validate(each) for each in first.values()]
+    often, seldom = [], []
+    for code, count in codes.most_common():
+        first, found = next((k, d) for k, of in enumerate(doubts) for d in of if d["code"] == code)
+        doubt = Doubt.model_validate(found)
+        if 2 * count >= len(doubts):
+            often.append(doubt)
+        else:
+            seldom.append((doubt, count, first))
+    return often, seldom
 
 
 def warnings_of_flight(warnings: Sequence[Sequence[str]]) -> list[str]:

@@ -204,8 +204,9 @@ def test_clocks_are_those_of_most_segments() -> None:
 
 def test_doubts_and_warnings_of_segments() -> None:
     doubt = {"code": "clock", "cameras": ["a"], "what": "it is late", "evidence": {}, "remedy": "x"}
-    assert [each.code for each in doubts_of_flight([[doubt], [], [doubt]])] == ["clock"]
-    assert doubts_of_flight([[doubt], [], []]) == []
+    [often], seldom = doubts_of_flight([[doubt], [], [doubt]])
+    assert (often.code, seldom) == ("clock", [])
+    assert doubts_of_flight([[], [], [doubt]]) == ([], [(often, 1, 2)])
     said = warnings_of_flight([["a: 3 left out"], ["a: 5 left out", "b"], ["a: 0.5 left out"]])
     assert said == ["a: 3 left out", "b (so, or alike, in 1 of 3 segments)"]
 
