@@ -16,8 +16,8 @@ noise out. `--repeat 15` repeats the flight so often, which takes less time than
     python -m benchmarks.long_flights --segments 60 300 900 --minutes 12 --first 302
 
 reconstructs one flight in segments of so many seconds, each in turn, and says what that costs: errors, NEES,
-and the error of the acceleration about the seams beside that elsewhere. `--session` takes an ingested flight
-instead of flying one, in which the truth is known.
+and the error of the acceleration about the seams of the shortest segments beside that elsewhere. `--session`
+takes an ingested flight instead of flying one, in which the truth is known.
 
     python -m benchmarks.long_flights --page demo/mound_walk.session    # the figure of docs/report.md
 
@@ -38,7 +38,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from unittest.mock import patch
@@ -50,6 +50,7 @@ import pyarrow.parquet as pq
 import yaml  # type: ignore[import-untyped]
 
 from benchmarks.results_page import markdown_table
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.reconstruction import segments
@@ -126,18 +127,33 @@ def memory_rows(session: Path, minutes: float) -> Iterator[str]:
 
 SEGMENT_COLUMNS = (
     *("seconds of a segment", "segments", "MPJPE mm", "root-relative mm", "NEES", "in the 95 % ellipsoids %"),
-    *("acceleration error m/s^2", "the same about seams", "memory MB"),
+    *("acceleration error m/s^2", "the same about seams", "memory so far MB"),
 )
 _ABOUT_NS = 4_000_000_000  # of a seam: results go over from one segment to the next within 3 s of it
 _CHI2_95 = 7.815  # of three numbers
 
 
-def segments_row(session: Path, length_s: float) -> list[str]:
-    """Reconstruct a session in segments of this length; return a row of SEGMENT_COLUMNS."""
-    before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+@dataclass(frozen=True)
+class Divided:
+    """Result of a reconstruction in segments of one length."""
+
+    cells: list[str]  # of SEGMENT_COLUMNS, without those of accelerations and memory
+    seams_ns: Float
+    t_ns: Int64  # [T]
+    change: Float  # [T - 2, J] m/s^2, error of the acceleration
+    peak_mb: float  # of this process until then
+
+    def row(self, seams_ns: Float) -> list[str]:
+        """Return its row, with the error of the acceleration about these seams."""
+        near = (np.abs(self.t_ns[1:-1, None] - seams_ns) < _ABOUT_NS).any(axis=1)
+        apart = [f"{np.nanmean(self.change[rows]):.2f}" if rows.any() else "" for rows in (~near, near)]
+        return [*self.cells, *apart, f"{self.peak_mb:.0f}"]
+
+
+def in_segments(session: Path, length_s: float) -> Divided:
+    """Reconstruct a session in segments of this length."""
     with patch.object(segments, "LENGTH_S", length_s):
         metrics = reconstruct(session, workers=1, force=True).metrics
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     skeleton = pq.read_table(session / "reconstruct" / "skeleton.parquet").to_pandas()
     joints = tuple(dict.fromkeys(skeleton["joint"]))
     t_ns = np.unique(skeleton["t_ns"].to_numpy())
@@ -153,22 +169,21 @@ def segments_row(session: Path, length_s: float) -> list[str]:
     whitened = np.linalg.solve(covariance[there], missed[there][..., None])[..., 0]
     nees = np.sum(missed[there] * whitened, axis=1)
     step_s = float(np.median(np.diff(t_ns))) / 1e9
-    change = np.linalg.norm(np.diff(found - true, 2, axis=0), axis=2) / step_s**2
-    seams_ns = read_description(session).start_ns + np.array(
-        [1e9 * of["first_s"] for of in metrics.get("segments", [])[1:]]
+    parts = metrics.get("segments", [])
+    return Divided(
+        [
+            f"{length_s:g}",
+            f"{max(len(parts), 1)}",
+            f"{metrics['mpjpe_mm']:.1f}",
+            f"{metrics['root_mpjpe_mm']:.1f}",
+            f"{nees.mean():.2f}",
+            f"{100 * (nees < _CHI2_95).mean():.1f}",
+        ],
+        read_description(session).start_ns + np.array([1e9 * of["first_s"] for of in parts[1:]]),
+        t_ns,
+        np.linalg.norm(np.diff(found - true, 2, axis=0), axis=2) / step_s**2,
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     )
-    near = (np.abs(t_ns[1:-1, None] - seams_ns) < _ABOUT_NS).any(axis=1)
-    return [
-        f"{length_s:g}",
-        f"{len(metrics.get('segments', [0]))}",
-        f"{metrics['mpjpe_mm']:.1f}",
-        f"{metrics['root_mpjpe_mm']:.1f}",
-        f"{nees.mean():.2f}",
-        f"{100 * (nees < _CHI2_95).mean():.1f}",
-        f"{np.nanmean(change[~near]):.2f}",
-        f"{np.nanmean(change[near]):.2f}" if near.any() else "",
-        f"{peak_mb:.0f}" if peak_mb > before_mb else f"at most {peak_mb:.0f}",
-    ]
 
 
 def repeat_tables(session: Path, times: int) -> None:
@@ -305,7 +320,8 @@ def main() -> None:
                 session = flown(arguments.first, arguments.minutes, Path(folder), stated=stated)
             else:
                 shutil.copytree(arguments.session, session)
-            rows = [segments_row(session, length_s) for length_s in sorted(arguments.segments)]
+            results = [in_segments(session, length_s) for length_s in sorted(arguments.segments)]
+        rows = [result.row(results[0].seams_ns) for result in results]
         print("\n".join(markdown_table(SEGMENT_COLUMNS, rows)))
         return
     if arguments.memory:

