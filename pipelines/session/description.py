@@ -370,14 +370,16 @@ def said_doubts(doubts: list[Doubt]) -> list[str]:
 
 def said_doubt(code: str, what: str, remedy: str) -> str:
     """State a doubt in one line."""
-    lines = "; ".join(said_remedy(remedy))
-    return f"doubt ({code}): {what}" + (f"; {lines}" if lines else "")
+    return f"doubt ({code}): {what}" + (f"; {_said_to_do(remedy)}" if remedy else "")
 
 
 def said_remedy(remedy: str) -> list[str]:
     """State the lines of a remedy: keys of flight.yaml are set, anything else is said as it is."""
-    lines = remedy.split("; ") if remedy else []
-    return [f"set {line}" if line.startswith(("cameras.", "map.")) else line for line in lines]
+    return [_said_to_do(line) for line in remedy.split("; ")] if remedy else []
+
+
+def _said_to_do(remedy: str) -> str:
+    return f"set {remedy}" if remedy.startswith(("cameras.", "map.")) else remedy
 
 
 def read_description(session: Path) -> Description:
