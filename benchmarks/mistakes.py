@@ -623,8 +623,8 @@ def fixed_gimbal(pitch_deg: float, relative_to: str) -> Change:
 
 def with_white_errors(pose: Pose) -> Pose:
     """Add errors of 0.3 m and 2 deg to every pose, anew in each; what is stated of them stays."""
-    draw = np.random.default_rng(5)
     position, quaternion = pose
+    draw = np.random.default_rng(round(1e6 * float(np.abs(position[0]).sum())))  # another one for each camera
     turn = draw.normal(0, np.radians(2), (len(position), 3))
     erring = multiply(quaternion, quaternion_from_rotation_vector(turn))
     return position + draw.normal(0, 0.3, position.shape), erring
