@@ -35,7 +35,9 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as cache:
         os.environ["NUMBA_CACHE_DIR"] = cache  # before numba is imported
-        import_module("pipelines.geometry.compilation").SHIPPED = Path(cache)  # before its functions are made
+        from pipelines.geometry import compilation
+
+        compilation.SHIPPED = Path(cache)  # before functions are made
         seconds, signatures = compiled_by(arguments.sessions) if arguments.sessions else (of_list(), {})
     for name, taken in sorted(seconds.items(), key=lambda item: -item[1]):
         print(f"{taken:6.2f} s  {name}")
