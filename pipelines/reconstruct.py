@@ -120,6 +120,7 @@ from pipelines.session.description import (
     read_description,
     said_assumptions,
     said_doubts,
+    said_remedy,
 )
 from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.maps import each_map
@@ -1437,8 +1438,9 @@ def _refuse_doubted(folder: Path, doubts: Sequence[Mapping[str, Any]], *, strict
     """Refuse a flight with a doubt if `strict`."""
     if strict and doubts:
         first = doubts[0]
-        more = f" ({len(doubts) - 1} more doubts)" if len(doubts) > 1 else ""
-        raise DataError(folder, f"is doubted: {first['what']} ({first['code']}){more}", str(first["remedy"]))
+        more = f", the first of {len(doubts)} doubts" if len(doubts) > 1 else ""
+        remedy = "; ".join(said_remedy(str(first["remedy"])))
+        raise DataError(folder, f"is doubted: {first['what']} ({first['code']}{more})", remedy)
 
 
 def _unused_cameras(cameras: list[Camera], result: Triangulation) -> list[str]:
