@@ -52,7 +52,7 @@ from pipelines.geometry.poses import compose, invert
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.diagnosis import CODES, diagnose
 from pipelines.reconstruction.doubts.scene import scene_of
-from pipelines.reconstruction.doubts.score import score
+from pipelines.reconstruction.doubts.score import _LIMBS, _TORSO, _shape, score
 from pipelines.reconstruction.doubts.turning import Lateness
 from pipelines.session.description import read_description
 from tests.commands.runner import refused, succeeds
@@ -489,3 +489,13 @@ def test_errors_far_larger_than_stated_are_noise(tmp_path: Path) -> None:
     # Errors were stated a tenth of what they are; one of the factors 2, 4 and 8 is nearest.
     stated = YAML(typ="safe").load(manifest.read_text())["cameras"]["drone1"]["pose_noise"]["white"]
     assert 0.5 / 4 <= stated["position_m"] <= 0.5 * 1.6
+
+
+def test_a_torso_without_length_is_measured_like_any_other() -> None:
+    """Give every limb the length that is usual for 1.7 m, and put the hips at the shoulders."""
+    shares = [share for _, _, share in _LIMBS]
+    lengths = [(np.full(3, 1.7 * share), share) for share in shares]
+    with np.errstate(divide="ignore"):
+        found = _shape([*lengths, (np.zeros(3), _TORSO)], 1.7)
+    assert found.sigmas == pytest.approx(0.0)
+    assert found.evidence == {"torso_m": 0.0, "usual_m": pytest.approx(1.7 * _TORSO)}

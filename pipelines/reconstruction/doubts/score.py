@@ -273,16 +273,16 @@ class _Person(NamedTuple):
 
 
 def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
-    """Say how odd the person is; None if too few limbs are seen."""
+    """Say how odd the person is; None if too few limbs are seen, or most have no length."""
     body = _Body(solved.joints)
     lengths = body.lengths()
     statures = _statures(lengths)
-    if np.isfinite(statures).sum() < 5:
+    if np.isfinite(statures).sum() < 5 or not np.nanmedian(statures) > 0:
         return None
     stature = float(np.nanmedian(statures))
     odd = {
         "size": Oddity(max(0.0, abs(np.log(stature / STATURE_M)) - 0.08) / 0.09, {"stature_m": stature}),
-        "shape": _shape(lengths, statures / stature),
+        "shape": _shape(lengths, stature),
         "unposed": _unposed(scene),
     }
     odd |= body.posture()
@@ -308,13 +308,14 @@ def stature_m(joints: Float) -> float:
     return _median(_statures(_Body(joints).lengths()))
 
 
-def _shape(lengths: list[tuple[Float, float]], relative: Float) -> Oddity:
-    """Measure the limbs' proportions, from the stature for which each is usual over that of the person."""
+def _shape(lengths: list[tuple[Float, float]], stature: float) -> Oddity:
+    """Measure the limbs' proportions: the lengths of limbs over those that are usual for a stature in m."""
     names = [f"{start}_to_{end}" for start, end, _ in _LIMBS] + ["torso"]
-    worst = int(np.nanargmax(np.abs(np.log(relative))))
-    length_m = _median(lengths[worst][0])
-    measured = {f"{names[worst]}_m": length_m, "usual_m": length_m / float(relative[worst])}
-    return Oddity(float(np.nanmedian(np.abs(np.log(relative)))) / 0.10, measured)
+    off = np.abs(np.log(_statures(lengths) / stature))  # infinite for a limb without length
+    worst = int(np.nanargmax(off))
+    length, share = lengths[worst]
+    measured = {f"{names[worst]}_m": _median(length), "usual_m": share * stature}
+    return Oddity(min(float(np.nanmedian(off)), 5.0) / 0.10, measured)
 
 
 def _unposed(scene: Scene) -> Oddity:
