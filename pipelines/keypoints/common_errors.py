@@ -88,11 +88,13 @@ def _missed(views: Views, rotation: Float, detection: Int64, rows: slice) -> Flo
     xy = np.take_along_axis(views.xy[rows], taken[..., None], axis=2)[:, :, 0]
     confidence = np.take_along_axis(views.confidence[rows], taken, axis=2)[:, :, 0]
     position, rotation = views.position[rows], rotation[rows]
-    there = (detection[rows] >= 0)[..., None] & (confidence > 0) & np.isfinite(xy).all(axis=-1)
+    posed = np.isfinite(position).all(axis=-1) & np.isfinite(rotation).all(axis=(-2, -1))
+    there = ((detection[rows] >= 0) & posed)[..., None] & (confidence > 0) & np.isfinite(xy).all(axis=-1)
     there &= (there.sum(axis=1) > 1)[:, None]
     ray = np.concatenate([np.where(there[..., None], xy, 0.0), np.ones((*there.shape, 1))], axis=-1)
     ray = np.einsum("ncij,nckj->ncki", np.nan_to_num(rotation), ray)
-    ray = np.where(there[..., None], ray / np.linalg.norm(ray, axis=-1, keepdims=True), 0.0)
+    length = np.where(there[..., None], np.linalg.norm(ray, axis=-1, keepdims=True), np.inf)
+    ray = ray / length  # 0 where nothing is seen
     origin = np.nan_to_num(position)[:, :, None]
     several = there.any(axis=1)
     normal = there.sum(axis=1)[..., None, None] * np.eye(3) - np.einsum("ncki,nckj->nkij", ray, ray)
