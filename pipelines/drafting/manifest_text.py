@@ -84,7 +84,7 @@ def one_line(text: str) -> str:
 ASSUMED_FPS = 30
 _BRIDGED_NS = 500_000_000  # ingest's default for the longest gap between two poses
 _AXES = {"joints_csv": "metres, z up", "c3d": "y up, or z up, as it says"}
-"""How a format's joints are read, by its name; all others have y up."""
+"""Axes in which the joints of a format are read, by its name; all others have y up."""
 _MOST_OTHERS = 8  # candidates that are listed after the chosen one
 
 
