@@ -30,6 +30,10 @@ class DataError(MocapError):
         return type(self), (self.source, self.problem, self.remedy)
 
 
+class NoPositionsError(DataError):
+    """A log holds no position; its attitudes may be of use all the same."""
+
+
 class NoViewsError(DataError):
     """At no time do two cameras have pictures and a pose."""
 

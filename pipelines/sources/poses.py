@@ -35,7 +35,7 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
 )
 from pipelines.session.description import Doubt
-from pipelines.session.errors import DataError
+from pipelines.session.errors import DataError, NoPositionsError
 from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan, PoseSource, TriggerLog
 from pipelines.session.manifest import Log as LogSource
 from pipelines.session.records import Occupancy, Trajectory
@@ -751,8 +751,8 @@ def _positions_of(reader: TelemetryFormat, path: Path, choice: TelemetryChoice) 
     """Read a drone's own log; if angles of the camera are all that it holds, say what they are good for."""
     try:
         return reader.read_telemetry(path, choice)
-    except DataError as error:
-        entry = _entry_of_angles(reader, path) if error.remedy.startswith("name another log") else ""
+    except NoPositionsError as error:
+        entry = _entry_of_angles(reader, path)
         if not entry:
             raise
         remedy = f"name another log of positions as pose, and {entry}"

@@ -42,7 +42,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.geometry.poses import conjugate, interpolate_points, multiply, rotate
-from pipelines.session.errors import DataError
+from pipelines.session.errors import DataError, NoPositionsError
 from pipelines.session.telemetry import Attitudes, Height, Telemetry, TelemetryChoice
 
 _KINDS = {
@@ -274,7 +274,7 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
         return at_ns, rows[:, :3], np.asarray(fixed), fit
     if (found := track.stream("GPS5", 3)) is None:
         known = ", ".join(sorted(set(track.rows) & set(_KNOWN))) or "none that is known"
-        raise DataError(
+        raise NoPositionsError(
             path, f"its telemetry holds no position (streams: {known})", "name another log of poses"
         )
     at_ns, rows = found

@@ -18,7 +18,7 @@ from pipelines.geometry.poses import (
     interpolate_poses,
     multiply,
 )
-from pipelines.session.errors import DataError
+from pipelines.session.errors import DataError, NoPositionsError
 from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry, TelemetryChoice
 
 _UNEVEN_S = 0.5  # scatter of GPS times beyond what late messages explain
@@ -56,7 +56,7 @@ def position_track(
     keep = kept_rows(t_ns, causes, found)
     if not keep.any():
         counts = ", ".join(f"{count} {cause}" for cause, count in found.items()) or "it is empty"
-        raise DataError(source, f"{name} holds no usable position ({counts})", "name another log")
+        raise NoPositionsError(source, f"{name} holds no usable position ({counts})", "name another log")
     for cause, count in found.items():
         dropped[cause] = dropped.get(cause, 0) + count
     return PositionTrack(
