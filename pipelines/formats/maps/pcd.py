@@ -8,9 +8,7 @@ field, all of the second, and so on. VIEWPOINT, the pose of the sensor, is not a
 
 import re
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -175,60 +173,12 @@ def _decompressed(path: Path, body: Bytes, header: _Header) -> Bytes:
             f"states {size} bytes for {header.points} points of {header.stride} bytes in {packed_size} bytes",
             _EXPORT_AGAIN,
         )
+    from pipelines.formats.maps.lzf import decompress
+
     values = np.zeros(size, dtype=np.uint8)
     if decompress(packed, values) != size:
         raise DataError(path, "its compressed points are damaged", "copy it again or export it again")
     return values
-
-
-@cache
-def _compiled() -> Callable[[Bytes, Bytes], int]:
-    from pipelines.geometry.compilation import cached
-
-    return cached(_unpack_lzf)
-
-
-def decompress(packed: Bytes, target: Bytes) -> int:
-    """Fill `target` from an LZF stream, compiled.
-
-    The stream (liblzf by Marc Lehmann, lzf_d.c) is a sequence of instructions, each with a byte c first:
-
-    - c < 32: copy the c + 1 bytes that follow;
-    - else: repeat (c >> 5) + 2 bytes of the output (if c >> 5 is 7, a byte to add to the length follows) from
-      ((c & 31) << 8) + next byte + 1 bytes back; the two may overlap.
-
-    Returns:
-        The bytes written, or -1 if the stream is cut off, too long or points outside.
-    """
-    return _compiled()(packed, target)
-
-
-def _unpack_lzf(packed: Bytes, target: Bytes) -> int:
-    read, written = 0, 0
-    while read < len(packed):
-        control = int(packed[read])
-        read += 1
-        if control < 32:
-            length = control + 1
-            if read + length > len(packed) or written + length > len(target):
-                return -1
-            target[written : written + length] = packed[read : read + length]
-            read += length
-        else:
-            length = (control >> 5) + 2
-            if length == 9 and read < len(packed):
-                length += int(packed[read])
-                read += 1
-            if read >= len(packed):
-                return -1
-            source = written - ((control & 31) << 8) - int(packed[read]) - 1
-            read += 1
-            if source < 0 or written + length > len(target):
-                return -1
-            for k in range(length):  # one by one, because the two ranges may overlap
-                target[written + k] = target[source + k]
-        written += length
-    return written
 
 
 FORMAT = PcdFormat()

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.maps import pcd
+from pipelines.formats.maps.lzf import decompress
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
@@ -63,7 +64,7 @@ def squeezed(content: bytes) -> bytes:
 
 def unpacked(packed: bytes, size: int) -> bytes | None:
     target = np.zeros(size, dtype=np.uint8)
-    written = pcd.decompress(np.frombuffer(packed, np.uint8), target)
+    written = decompress(np.frombuffer(packed, np.uint8), target)
     return target[:written].tobytes() if written >= 0 else None
 
 
