@@ -142,7 +142,10 @@ def _function(name: str) -> Any:
 
 
 def type_of(text: object) -> Any:
-    """Make numba's type from its entry in the list: `float64`, `float64 2C` or {class: [types]}."""
+    """Make numba's type from its entry in the list: `float64`, `float64 2C` or {class: [types]}.
+
+    `uint8 1C const` is an array that cannot be written into, as one of a file's bytes.
+    """
     types: Any = import_module("numba.core.types")
 
     if isinstance(text, Mapping):
@@ -152,7 +155,10 @@ def type_of(text: object) -> Any:
         return types.BaseTuple.from_types([type_of(field) for field in fields], named)
     scalar, _, array = str(text).partition(" ")
     dtype = getattr(types, scalar)
-    return types.Array(dtype, int(array[:-1]), array[-1]) if array else dtype
+    if not array:
+        return dtype
+    shape, _, const = array.partition(" ")
+    return types.Array(dtype, int(shape[:-1]), shape[-1], readonly=const == "const")
 
 
 def entry_of(kind: Any) -> object:
@@ -164,7 +170,7 @@ def entry_of(kind: Any) -> object:
         name = "tuple" if made is tuple else f"{made.__module__}:{made.__qualname__}"
         return {name: [entry_of(field) for field in kind.types]}
     if isinstance(kind, types.Array):
-        return f"{kind.dtype} {kind.ndim}{kind.layout}"
+        return f"{kind.dtype} {kind.ndim}{kind.layout}{'' if kind.mutable else ' const'}"
     return str(kind)
 
 
