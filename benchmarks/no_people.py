@@ -26,13 +26,13 @@ import numpy as np
 
 from benchmarks.detectors import DETECTORS, REAL, SAMPLE, real_flight
 from pipelines import detect as stage
+from pipelines.attempt import find_people, ground_of
 from pipelines.geometry.arrays import Bool
 from pipelines.ingest import ingest
 from pipelines.keypoints import association, tracking
 from pipelines.keypoints.blazepose import BlazePose
 from pipelines.keypoints.calibration import measured_for, read_calibration
 from pipelines.keypoints.no_people import Scene, tell_no_people
-from pipelines.reconstruct import find_people, ground_of
 from pipelines.reconstruction.loading import load_cameras, load_truth
 from pipelines.reconstruction.observations import Candidates
 from pipelines.session.description import Description, read_description

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipelines.attempt import chosen_detections, find_people
 from pipelines.detect import DETECT, cameras_to_detect, detect
 from pipelines.follow import BACKGROUND, Following, cameras_to_follow
 from pipelines.ingest import ingest
-from pipelines.reconstruct import chosen_detections, find_people
 from pipelines.reconstruction.background_tracks import Followed, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.loading import load_cameras

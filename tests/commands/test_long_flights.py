@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines import reconstruct as stage
-from pipelines import report
+from pipelines import report, segmented
+from pipelines.attempt import Source
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.reconstruction import segments
 from pipelines.report import content_of
@@ -90,7 +90,7 @@ def test_a_long_flight_goes_on_with_the_segments_that_are_missing(
 ) -> None:
     session = ingested(write_flight(tmp_path, seconds=6.0))
     done: list[int] = []
-    work = stage.reconstruct_segment
+    work = segmented.reconstruct_segment
 
     def counted(order: Any) -> dict[str, bytes]:
         done.append(order.segment.number)
@@ -101,10 +101,10 @@ def test_a_long_flight_goes_on_with_the_segments_that_are_missing(
             raise DataError("the power", "failed")
         return counted(order)
 
-    monkeypatch.setattr(stage, "reconstruct_segment", killed)
+    monkeypatch.setattr(segmented, "reconstruct_segment", killed)
     with pytest.raises(DataError, match="failed"):
         reconstruct(session, Settings(method="robust"), workers=1)
-    monkeypatch.setattr(stage, "reconstruct_segment", counted)
+    monkeypatch.setattr(segmented, "reconstruct_segment", counted)
     reconstruct(session, Settings(method="robust"), workers=1)
     assert done == [0, 1, 2]
     assert reconstruct(session, Settings(method="robust"), workers=1).skipped
@@ -182,7 +182,7 @@ def test_a_doubted_long_flight_is_refused_when_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_segments: None
 ) -> None:
     session = ingested(write_flight(tmp_path, seconds=4.5))
-    monkeypatch.setattr(stage._Source, "doubts", lambda *_: [a_doubt()])
+    monkeypatch.setattr(Source, "doubts", lambda *_: [a_doubt()])
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     assert "is doubted: it is late (clock)" in refused(
         "reconstruct", session, "--method", "robust", "--strict", "--workers", "1"
