@@ -269,7 +269,7 @@ def measure_draw(drawn: DrawnFlight, cases: Sequence[Case]) -> Iterator[tuple[Ca
         )
         with (
             kept_in_place_of_pictures(flight, first.detector),
-            patch("pipelines.reconstruct.find_clocks", find_once),
+            patch("pipelines.attempt.find_clocks", find_once),
         ):
             with locked(session) as writable:
                 detect(writable, detector=first.detector)
@@ -281,7 +281,7 @@ def measure_draw(drawn: DrawnFlight, cases: Sequence[Case]) -> Iterator[tuple[Ca
                 settings = Settings(**method, people=1, detector=first.detector)
                 began_s = time.process_time()
                 try:
-                    with nullcontext() if timed else patch("pipelines.reconstruct.doubts_of", _no_doubts):
+                    with nullcontext() if timed else patch("pipelines.attempt.doubts_of", _no_doubts):
                         metrics = reconstruct(session, settings).metrics
                 except DataError as error:
                     yield case, Outcome(error=str(error))

@@ -151,7 +151,7 @@ def _measured(drawn: DrawnFlight, flight: Flight, detector: str, method: str, fo
     session = drawn.session(Path(folder) / method, 0, "model", detector, poses=poses)
     with (
         kept_in_place_of_pictures(flight, detector),
-        patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []),
+        patch("pipelines.attempt.doubts_of", lambda *_, **__: []),
     ):
         with locked(session) as writable:
             detect(writable, detector=detector)

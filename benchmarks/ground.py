@@ -123,7 +123,7 @@ def bound_cameras(drawn: DrawnFlight, session: Path) -> Bound:
         with locked(session) as writable:
             detect(writable, detector=DETECTORS[0])
             Following(writable).finish()
-        with patch("pipelines.reconstruct.bind_positions", bind):
+        with patch("pipelines.attempt.bind_positions", bind):
             try:
                 reconstruct(session, Settings())
             except _BoundError:

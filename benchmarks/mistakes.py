@@ -1006,7 +1006,7 @@ def print_times(folder: Path) -> None:
         seconds.append(process_time() - start)
         return found
 
-    with patch("pipelines.reconstruct.doubts_of", timed):
+    with patch("pipelines.attempt.doubts_of", timed):
         start = process_time()
         reconstruct(session, Settings())
         whole = process_time() - start
@@ -1266,7 +1266,7 @@ def tried(
     named = first is not None and first["code"] in mistake.codes
     after, why = None, ""
     if first is not None and named and with_remedy(manifest, first["remedy"]):
-        with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):  # only the error is looked at
+        with patch("pipelines.attempt.doubts_of", lambda *_, **__: []):  # only the error is looked at
             after, _, why = measured(manifest, compared)
     mended = after is not None and after <= 1.1 * right
     said = f"{first['code']}: {first['what']}" if first else (stopped or "nothing")
@@ -1307,7 +1307,7 @@ def _bound(described: Described, mistake: Mistake, doubt: dict[str, Any], draws:
                 changes.append(of_poses(heading(turn), name))
             else:
                 changes.append(of_poses(partial(compose, (np.zeros(3), turned("z", turn))), name))
-        with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):
+        with patch("pipelines.attempt.doubts_of", lambda *_, **__: []):
             found = measured(mistaken(described, partial(_each_of, changes)), compared)[0]
         errors.append(float("nan") if found is None else found)
     low, middle, high = np.nanpercentile(errors, [5, 50, 95])

@@ -25,7 +25,7 @@ def test_keypoints_of_little_worth_are_used_and_drawn(
     knots = {name: np.array([[0.5, worth, 100.0]]) for name, worth in (("*", 0.9), ("wrist", 0.1))}
     measured = tmp_path / "measured.csv"
     write_calibration(measured, Calibration("a test", "near", knots))
-    for place in ("pipelines.keypoints.calibration", "pipelines.reconstruct"):
+    for place in ("pipelines.keypoints.calibration", "pipelines.reconstruct", "pipelines.attempt"):
         monkeypatch.setattr(f"{place}.measured_for", lambda _: measured)
     session = tmp_path / "flight.session"
     ingest(write_spotted_flight(tmp_path, 6), session)
