@@ -70,11 +70,12 @@ results: setup
 	$(BIN)/mocap models fetch blazepose
 	$(BIN)/python -m benchmarks.results
 
-# Damaged files and crafted ones into every reader, and every stage killed at fifty moments, for some minutes each.
+# Damaged files and crafted ones into every reader, commands killed at fifty moments, and losses of power, for some minutes each.
 fuzz: setup
 	$(BIN)/python -m tests.fuzz --inputs 2000
 	$(BIN)/python -m tests.fuzz --crafted
 	$(BIN)/python -m tests.kills --kills 50
+	$(BIN)/python -m tests.kills --power
 
 # The wheel in an empty environment.
 wheel:

@@ -33,7 +33,7 @@ from pipelines.session.errors import BusyError, DataError, MocapError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.registries import need
 from pipelines.session.stages import names_of
-from pipelines.session.storage import as_data_error, read_json, write_whole
+from pipelines.session.storage import as_data_error, make_folder, read_json, write_whole
 from pipelines.session.stores import as_urls, fetched, get, put, staged, url_of
 
 STAGES = ("ingest", "reconstruct", "replan-compare", "report")
@@ -213,7 +213,7 @@ def _run(stage: str, job: Job) -> bool:
     """Run a stage; return True if there was nothing to do."""
     match stage:
         case "ingest":
-            job.session.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(job.session.parent)
             return ingest(job.flight, job.session, force=job.force).skipped
         case "reconstruct":
             chosen = job.settings
@@ -393,7 +393,7 @@ def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome])
             if url := url_of(folder / name):
                 put(url, encoded)
                 continue
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             write_whole(folder / name, encoded)
     except OSError as error:
         raise as_data_error(error, folder) from error

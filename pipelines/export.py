@@ -25,7 +25,15 @@ from pipelines.session.records import Recording
 from pipelines.session.registries import EXPORTS, ChoiceOfAxes, ChoiceOfTime, Export
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import open_session, session_name
-from pipelines.session.storage import as_data_error, read_json, remove_tree, sha256_of, write_json
+from pipelines.session.storage import (
+    as_data_error,
+    make_folder,
+    read_json,
+    remove_tree,
+    sha256_of,
+    sync,
+    write_json,
+)
 from pipelines.session.tables import ANGLES, FRAMES, POSES, SKELETON, motion_from, read_table, trajectory_from
 from pipelines.session.whole_folders import working_folder
 from pipelines.sources.pictures import open_pictures
@@ -90,7 +98,7 @@ def export(
     target = output or folder.resolve().with_name(f"{session_name(folder)}.export")
     is_new = not target.exists()
     try:
-        target.mkdir(parents=True, exist_ok=True)
+        make_folder(target)
         with _work_in(target) as work:
             made: dict[Path, dict[str, Any]] = {}
             for format_ in exports:
@@ -340,6 +348,8 @@ def _move(made: Mapping[Path, dict[str, Any]], target: Path, overwrite: bool) ->
                 place, "exists and was not exported so", "choose another --output, or add --overwrite"
             )
         (unchanged if there == facts["sha256"] else written).append((path, place))
+    for path, _ in written:
+        sync(path)
     for path, place in written:
         path.replace(place)
     files = ours | {path.name: facts for path, facts in made.items()}

@@ -36,6 +36,7 @@ from pipelines.session.stage_records import (
 from pipelines.session.storage import (
     as_data_error,
     jsonable,
+    make_folder,
     read_json,
     remove_tree,
     sha256_of,
@@ -326,7 +327,7 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
         _refuse_newer_session(folder)
         if create:
             _check_target(folder, overwrite=overwrite)
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
         elif not _is_interrupted(folder):
             _check_session(folder)
         with held(folder / _LOCK, folder):
@@ -417,7 +418,7 @@ def _roll_forward(folder: Path, stage: str) -> None:
     """Publish a complete `<stage>.new`.
 
     Every step can be repeated, and the stage's folder, with its record, is renamed last. After a kill between
-    any two steps, doing all of them again completes the publication.
+    any two steps, or a loss of power, doing all of them again completes the publication.
     """
     new, old = _new_folder(folder, stage), _old(folder, stage)
     record = read_record(new / "stage.json")
@@ -431,9 +432,10 @@ def _roll_forward(folder: Path, stage: str) -> None:
             _move(new / entry, folder / entry)
     for shown in _outdated(folder, record):
         _move(folder / shown, old / shown)
+    for changed in (old, new, folder):  # else the last rename might reach the disk before the others
+        sync(changed)
     _move(folder / stage, old / stage)
     new.rename(folder / stage)
-    sync(old)
     sync(folder)
     remove_tree(old)
 

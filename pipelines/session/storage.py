@@ -241,6 +241,14 @@ def _refuse_constant(name: str) -> None:
     raise ValueError(f"holds {name}, which is not JSON")
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it that are missing, so that they survive a loss of power."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in missing:
+        sync(path.parent)
+
+
 def sync_tree(folder: Path) -> None:
     """Sync a folder and everything in it to disk, so that it survives a loss of power."""
     for path in [*folder.rglob("*"), folder]:

@@ -34,6 +34,7 @@ from pipelines.session.storage import (
     read_json,
     remove_tree,
     sha256_of,
+    sync,
     sync_tree,
     write_json,
 )
@@ -323,8 +324,9 @@ class Copy:
 
     def remove(self) -> None:
         """Remove the copy."""
-        remove_tree(self.folder)
         remove_tree(self._root / "base.json")
+        sync(self._root)  # else a loss of power might leave the note beside a part of the copy
+        remove_tree(self.folder)
 
     def _own_files(self) -> dict[str, str]:
         """Compute the SHA-256 of every file that belongs to the session, by name."""
@@ -385,11 +387,13 @@ class Copy:
                     "is not what mocap wrote (other SHA-256)",
                     "put back what it wrote, or ingest again with another URL",
                 )
+        sync_tree(new)
         with suppress(OSError):
             (self.folder / ".partial").rename(new / ".partial")
         remove_tree(self.folder)
         if files:
             new.rename(self.folder)
+        sync(self._root)
 
     def _point(self, number: int, text: bytes) -> None:
         """Create NUMBER.json, which makes a version the newest; BusyError if another writer has made one."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from pipelines.session.errors import BusyError, DataError
-from pipelines.session.storage import as_data_error, read_json, remove_tree, sync, sync_tree
+from pipelines.session.storage import as_data_error, make_folder, read_json, remove_tree, sync, sync_tree
 
 SIMULATION_MARK = "simulation.json"
 """The file that is in every folder of `mocap simulate`."""
@@ -81,7 +81,7 @@ def working_folder(work: Path, target: Path) -> Iterator[Path]:
         BusyError: another process uses it.
     """
     try:
-        work.mkdir(parents=True, exist_ok=True)
+        make_folder(work)
         with held(work / _LOCK, target):
             yield work
     finally:

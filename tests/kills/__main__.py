@@ -1,4 +1,4 @@
-"""Long run of the kill tests: `python -m tests.kills`, and with `--dask 30` that of killed workers."""
+"""Long run of the kill tests: `python -m tests.kills`; `--dask 30` kills workers, `--power` loses power."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tests.kills.clusters import print_soak
 from tests.kills.killing import commands_on, soak
+from tests.kills.power import print_replays
 
 
 def main() -> int:
@@ -21,7 +22,11 @@ def main() -> int:
         "--dask", type=float, metavar="MINUTES", help="kill workers under `mocap batch` instead"
     )
     parser.add_argument("--kill-every", type=float, default=60.0, metavar="S", help="with --dask")
+    parser.add_argument("--power", action="store_true", help="replay losses of power instead")
+    parser.add_argument("--moments", type=int, default=100, help="of each command, with --power")
     stated = parser.parse_args()
+    if stated.power:
+        return print_replays(stated.only or (), moments=stated.moments, seed=stated.seed)
     if stated.dask is not None:
         return print_soak(stated.dask, kill_every_s=stated.kill_every, seed=stated.seed)
     found = []

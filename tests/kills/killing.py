@@ -18,7 +18,7 @@ from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 _ATTEMPTS, _QUICKER = 5, 0.7  # to hit a command before it ends
 _FRAMES = 40  # replaying takes a second at the least
 _EXPORTED = "trc,c3d,bvh,csv,tum,mcap"
-_SMALL_STUDY = (
+SMALL_STUDY = (
     *("--seconds", "8", "--rate", "5", "--trials", "2", "--workers", "1"),
     *("--methods", "dlt,robust", "--levels", "medium"),
 )
@@ -85,7 +85,7 @@ def commands_on(folder: Path) -> dict[str, Command]:
         "report": Command(["report", reported], reported, before=replanned),
         "export": Command(["export", reconstructed, "-o", exported, "--to", _EXPORTED], exported, ()),
         "simulate": Command(["simulate", folder / "scenario.yaml", "-o", simulated], simulated),
-        "ablate": Command(["ablate", "tilt", *_SMALL_STUDY, "-o", studied], studied),
+        "ablate": Command(["ablate", "tilt", *SMALL_STUDY, "-o", studied], studied),
         "batch": Command(
             [
                 "batch",

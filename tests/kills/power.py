@@ -1,0 +1,642 @@
+"""Losses of power, replayed from a trace: what was not synced is lost, in part or whole, at any moment.
+
+A trace is recorded while a command runs in this process. The whole folder is compared before and after
+each call that renames, removes, makes or syncs something, so that what libraries in C write is seen as well.
+From a trace follow the states of the disk that a loss of power may leave after each of its steps:
+
+- Of a file, what was there at its last sync is there, or what was written since. That may also be cut
+  anywhere, be zeros, or be missing.
+- Of a folder, the entries are there as of its last sync. Each change since then has reached the disk or has
+  not, independently of all others, except of those of the same name. A rename is done wholly or not at all.
+
+That is less than journaling file systems promise, which keep the order of changes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial, wraps
+from pathlib import Path
+from threading import RLock
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from pipelines.session.errors import DataError
+from pipelines.session.stage_records import STAGES
+from pipelines.session.stages import open_session
+from tests.commands.runner import content, mocap, succeeds
+from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
+from tests.kills.killing import SCENARIO, SMALL_STUDY, kept
+from tests.synthetic.flights import write_flight
+
+Key = tuple[int, str]  # node of a folder, and a name in it
+
+ROOT = 0  # node of the recorded folder
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Change of entries of folders: a node comes, goes, or is renamed."""
+
+    node: int
+    gone: Key | None
+    come: Key | None
+    is_folder: bool
+
+    @property
+    def keys(self) -> set[Key]:
+        """The entries that it changes."""
+        return {key for key in (self.gone, self.come) if key is not None}
+
+    @property
+    def moved(self) -> tuple[int, int] | None:
+        """The two folders of a rename from one into another; None for other changes."""
+        if self.gone is None or self.come is None or self.gone[0] == self.come[0]:
+            return None
+        return self.gone[0], self.come[0]
+
+
+@dataclass(frozen=True)
+class Content:
+    """New content of a file."""
+
+    node: int
+    content: bytes
+
+
+@dataclass(frozen=True)
+class Synced:
+    """Sync of a file or a folder."""
+
+    node: int
+
+
+Step = Entry | Content | Synced
+
+
+@dataclass
+class Trace:
+    """Steps by which a folder changed, after those that made it as it was at first."""
+
+    steps: list[Step] = field(default_factory=list)
+    first: int = 0  # number of steps that made it as it was at first
+
+
+@dataclass(frozen=True)
+class Disk:
+    """State of a folder: nodes of all entries, and contents of files."""
+
+    entries: Mapping[Key, int]
+    contents: Mapping[int, bytes]  # of files only
+
+    def write(self, folder: Path) -> None:
+        """Write the state into an empty folder; what no entry leads to is lost."""
+        inside: dict[int, list[tuple[str, int]]] = {}
+        for (parent, name), node in self.entries.items():
+            inside.setdefault(parent, []).append((name, node))
+
+        def write(node: int, place: Path) -> None:
+            for name, child in inside.get(node, []):
+                if child in self.contents:
+                    (place / name).write_bytes(self.contents[child])
+                else:
+                    (place / name).mkdir()
+                    write(child, place / name)
+
+        write(ROOT, folder)
+
+
+# --- recording -----------------------------------------------------------------------------------------
+
+_CHANGING = ("rename", "replace", "remove", "unlink", "mkdir", "rmdir", "link", "truncate", "ftruncate")
+_SYNCING = ("fsync", "fdatasync")
+
+
+class Recorder:
+    """Comparison of a folder with what it was, before and after each call that changes or syncs entries.
+
+    Args:
+        folder: the folder.
+        durable: a folder in it that never loses anything, as an object store.
+    """
+
+    def __init__(self, folder: Path, durable: Path | None = None) -> None:
+        self.trace = Trace()
+        self._folder, self._durable = folder, durable
+        self._nodes: dict[int, int] = {}  # by inode
+        self._entries: dict[Key, int] = {}
+        self._contents: dict[int, bytes] = {}
+        self._count = ROOT
+        self._lock = RLock()
+        self._look()
+        self.trace.steps += [Synced(node) for node in [ROOT, *self._nodes.values()]]
+        self.trace.first = len(self.trace.steps)
+
+    @contextmanager
+    def recording(self) -> Iterator[Trace]:
+        """Record what happens meanwhile."""
+        with ExitStack() as stack:
+            for name in _CHANGING:
+                stack.enter_context(patch.object(os, name, self._around(getattr(os, name))))
+            for name in _SYNCING:
+                stack.enter_context(patch.object(os, name, self._around(getattr(os, name), syncs=True)))
+            yield self.trace
+        self._look()
+
+    def _around(self, call: Callable[..., Any], *, syncs: bool = False) -> Callable[..., Any]:
+        @wraps(call)
+        def called(*arguments: Any, **options: Any) -> Any:
+            with self._lock:
+                self._look()
+                result = call(*arguments, **options)
+                if syncs:
+                    inode = os.fstat(arguments[0]).st_ino
+                    if inode == self._folder.stat().st_ino:
+                        self.trace.steps.append(Synced(ROOT))
+                    elif inode in self._nodes:
+                        self.trace.steps.append(Synced(self._nodes[inode]))
+                else:
+                    self._look()
+                return result
+
+        return called
+
+    def _look(self) -> None:
+        """Append the steps that lead from the folder as it was at the last look to what it is now."""
+        found: list[tuple[tuple[int, str], int, Path, bool]] = []  # inode of the folder, name; inode
+
+        def walk(folder: Path, inode: int) -> None:
+            with os.scandir(folder) as entries:
+                for entry in sorted(entries, key=lambda entry: entry.name):
+                    assert not entry.is_symlink(), entry.path
+                    own = entry.stat(follow_symlinks=False).st_ino
+                    found.append(((inode, entry.name), own, Path(entry.path), entry.is_dir()))
+                    if entry.is_dir():
+                        walk(Path(entry.path), own)
+
+        walk(self._folder, -1)
+        there = {inode for _, inode, _, _ in found}
+        nodes = {inode: node for inode, node in self._nodes.items() if inode in there}
+        places = {node: key for key, node in self._entries.items()}
+        steps: list[Step] = []
+        entries: dict[Key, int] = {}
+        came: list[tuple[Key, int, bool]] = []
+        for (parent, name), inode, _, is_folder in found:
+            if inode not in nodes:
+                self._count += 1
+                nodes[inode] = self._count
+            key = (ROOT if parent == -1 else nodes[parent], name)
+            entries[key] = nodes[inode]
+            if self._entries.get(key) != nodes[inode]:
+                came.append((key, nodes[inode], is_folder))
+        renamed = {node for _, node, _ in came if node in places}
+        gone = [key for key, node in self._entries.items() if node not in renamed and key not in entries]
+        for key in reversed(gone):
+            node = self._entries[key]
+            steps.append(Entry(node, key, None, node not in self._contents))
+        contents: dict[int, bytes] = {}
+        lasting: set[int] = set()
+        for (parent, _), inode, path, is_folder in found:
+            node = nodes[inode]
+            if not is_folder:
+                contents[node] = path.read_bytes()
+                if self._contents.get(node) != contents[node]:
+                    steps.append(Content(node, contents[node]))
+            if self._durable is not None and path.is_relative_to(self._durable):
+                lasting |= {ROOT if parent == -1 else nodes[parent], node}
+        steps += [Synced(step.node) for step in steps if step.node in lasting]
+        steps += [Entry(node, places.get(node), key, is_folder) for key, node, is_folder in came]
+        parents = {parent for step in steps if isinstance(step, Entry) for parent, _ in step.keys}
+        steps += [Synced(node) for node in sorted(parents & lasting)]
+        self.trace.steps += steps
+        self._nodes, self._entries, self._contents = nodes, entries, contents
+
+
+# --- what may be left ----------------------------------------------------------------------------------
+
+
+def losses(
+    trace: Trace, choice: np.random.Generator, *, moments: int, each: int
+) -> Iterator[tuple[int, Disk]]:
+    """Yield states that a loss of power after some steps may leave, with the number of steps before it.
+
+    Nothing unsynced is left; all entries, without content and with any; all but one of the changes of
+    entries; one alone of them; those before a moment, as a journal leaves them; any of them. The same state
+    is yielded once for one number of steps.
+
+    Args:
+        trace: all steps.
+        choice: chooses what is left of unsynced files, and changes.
+        moments: the most moments; the last step is always one of them.
+        each: the most changes that are left out, or made, alone.
+    """
+    last = len(trace.steps)
+    counts = trace.first + choice.permutation(last - trace.first)[: moments - 1]
+    for count in sorted({*counts.tolist(), last}):
+        steps = trace.steps[:count]
+        entries = [k for k, step in enumerate(steps) if isinstance(step, Entry)]
+        certain = _certain(steps, entries)
+        open_ = [k for k in entries if k not in certain]
+        alone = choice.permutation(open_)[:each].tolist()
+        subsets = [set(), set(open_), set(open_), *({k} for k in alone), *(set(open_) - {k} for k in alone)]
+        subsets.append(set(open_[: int(choice.integers(len(open_) + 1))]))
+        subsets.append({k for k in open_ if choice.random() < 0.5})
+        seen = set()
+        for number, subset in enumerate(subsets):
+            done = _done(steps, entries, certain, subset)
+            disk = Disk(done, _left(steps, None if number < 2 else choice))
+            mark = hash((frozenset(disk.entries.items()), frozenset(disk.contents.items())))
+            if mark not in seen:
+                seen.add(mark)
+                yield count, disk
+
+
+def _certain(steps: Sequence[Step], entries: Sequence[int]) -> set[int]:
+    """Return the changes of entries that syncs have brought to the disk, with all that these need.
+
+    A change of an entry needs the earlier changes of the same entry. A rename out of a folder that is there
+    needs the making of the folder into which it leads.
+    """
+    synced: dict[int, int] = {}
+    for k, step in enumerate(steps):
+        if isinstance(step, Synced):
+            synced[step.node] = k
+    made = _makings(steps, entries)
+    certain: set[int] = set()
+    needed = {k for k in entries if any(synced.get(parent, -1) > k for parent, _ in _entry(steps, k).keys)}
+    while needed - certain:
+        certain |= needed
+        keys: set[Key] = set()
+        for k in reversed(entries):
+            if k in certain or _entry(steps, k).keys & keys:
+                certain.add(k)
+                keys |= _entry(steps, k).keys
+        uncertain = {node for node, (k, _) in made.items() if k not in certain}
+        needed = {
+            made[node][0]
+            for k in certain
+            if (move := _entry(steps, k).moved) and not _floating(move[0], uncertain, made)
+            for node in _floating(move[1], uncertain, made)
+        }
+    return certain
+
+
+def _done(
+    steps: Sequence[Step], entries: Sequence[int], certain: set[int], chosen: set[int]
+) -> dict[Key, int]:
+    """Return the entries after the certain and the chosen changes, without chosen ones that need others."""
+    made = _makings(steps, entries)
+    found: dict[Key, int] = {}
+    missing: set[Key] = set()
+    nowhere: set[int] = set()  # folders whose making is missing
+    for k in entries:
+        step = _entry(steps, k)
+        lost = (
+            step.moved is not None
+            and bool(_floating(step.moved[1], nowhere, made))
+            and not _floating(step.moved[0], nowhere, made)
+        )
+        if k not in certain and (k not in chosen or step.keys & missing or lost):
+            missing |= step.keys
+            if step.gone is None:
+                nowhere.add(step.node)
+            continue
+        if step.gone is not None:
+            found.pop(step.gone, None)
+        if step.come is not None:
+            found[step.come] = step.node
+    return found
+
+
+def _entry(steps: Sequence[Step], k: int) -> Entry:
+    step = steps[k]
+    assert isinstance(step, Entry)
+    return step
+
+
+def _makings(steps: Sequence[Step], entries: Sequence[int]) -> dict[int, tuple[int, int]]:
+    """Return for every node the step that made it, and the node of the folder in which."""
+    made = {}
+    for k in entries:
+        step = _entry(steps, k)
+        if step.gone is None and step.come is not None:
+            made[step.node] = k, step.come[0]
+    return made
+
+
+def _floating(node: int, missing: set[int], made: Mapping[int, tuple[int, int]]) -> list[int]:
+    """Return which of the missing folders a folder was made in, itself among them."""
+    above = []
+    while node != ROOT:
+        if node in missing:
+            above.append(node)
+        node = made[node][1]
+    return above
+
+
+def _left(steps: Sequence[Step], choice: np.random.Generator | None) -> dict[int, bytes]:
+    """Return what is left of every file: as of its last sync, or with a choice any of what may be left."""
+    synced: dict[int, bytes] = {}
+    last: dict[int, bytes] = {}
+    for step in steps:
+        if isinstance(step, Entry) and not step.is_folder:
+            last.setdefault(step.node, b"")
+            synced.setdefault(step.node, b"")
+        elif isinstance(step, Content):
+            last[step.node] = step.content
+            synced.setdefault(step.node, b"")
+        elif isinstance(step, Synced) and step.node in last:
+            synced[step.node] = last[step.node]
+    if choice is None:
+        return synced
+    return {
+        node: content if synced[node] == content else _torn(synced[node], content, choice)
+        for node, content in last.items()
+    }
+
+
+def _torn(old: bytes, new: bytes, choice: np.random.Generator) -> bytes:
+    """Return an old content, a new one, or something between."""
+    cut = int(choice.integers(len(new) + 1))
+    return (old, new, new[:cut], new[:cut] + bytes(len(new) - cut), b"")[int(choice.integers(5))]
+
+
+# --- commands ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """Command that is recorded, with what was there before it."""
+
+    name: str
+    arguments: Sequence[str | Path]
+    version: Callable[[], Mapping[str, str]]  # what readers find; DataError if that is damaged
+    files: Callable[[], Mapping[str, str]]  # the result, which is the same after every run
+    before: Callable[[], object] = lambda: None  # makes an earlier version
+    durable: Path | None = None  # a folder that never loses anything
+    whole: bool = True  # False if every file, or every stage, is whole for itself
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Result of the states after losses of power in one command."""
+
+    case: str
+    steps: int
+    states: int  # all of them were opened
+    run_again: int  # of these
+    troubles: Sequence[str]
+
+
+def cases_on(folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Case]]:
+    """Yield commands, each with the folder that holds all that it reads and writes.
+
+    Args:
+        folder: is filled with flights and sessions.
+        names: of the commands; all by default.
+    """
+    for name, make in _CASES.items():
+        if not names or name in names:
+            place = folder / name.replace(" ", "_")
+            place.mkdir()
+            yield place, make(name, place)
+
+
+def replay(folder: Path, case: Case, *, moments: int, each: int, again: int, seed: int) -> Lost:
+    """Record a command, and look at states that a loss of power may leave.
+
+    Args:
+        folder: holds everything that the command reads and writes.
+        case: the command.
+        moments: see `losses`, and so `each`.
+        again: states in which the command is given again, chosen at random.
+        seed: seed of the moments, of what is left of unsynced files, and of the choice.
+    """
+    choice = np.random.default_rng(seed)
+    case.before()
+    before = case.version()
+    recorder = Recorder(folder, case.durable)
+    with recorder.recording() as trace:
+        done = mocap(*case.arguments)
+    assert done.returncode == 0, done.stderr
+    expected, after = case.files(), case.version()
+    assert before != after
+    states = list(losses(trace, choice, moments=moments, each=each))
+    chosen = set(choice.permutation(len(states))[:again].tolist())
+    troubles, steps = [], len(trace.steps) - trace.first
+    for number, (count, disk) in enumerate(states):
+        shutil.rmtree(folder)
+        folder.mkdir()
+        disk.write(folder)
+        possible = [after] if count == len(trace.steps) else [before, after]
+        trouble = _damage(case, possible) or (_trouble_again(case, expected) if number in chosen else "")
+        if trouble:
+            troubles.append(f"after {count - trace.first} of {steps} steps: {trouble}")
+    return Lost(case.name, steps, len(states), len(chosen), troubles)
+
+
+def _damage(case: Case, possible: Sequence[Mapping[str, str]]) -> str:
+    """Return how a state is none of the possible versions; empty if it is one."""
+    try:
+        found = case.version()
+    except DataError as error:
+        return f"damaged: {error}"
+    whole = set().union(*(of.items() for of in possible))
+    if found in possible or (not case.whole and len(possible) > 1 and found.items() <= whole):
+        return ""
+    return f"no version: {sorted(set(found.items()) ^ set(possible[-1].items()))[:3]}"
+
+
+def _trouble_again(case: Case, expected: Mapping[str, str]) -> str:
+    """Give the command again; return what goes wrong."""
+    done = mocap(*case.arguments)
+    if done.returncode:
+        return f"exit status {done.returncode}: {done.stderr[-300:]}"
+    differing = {path for path, _ in set(expected.items()) ^ set(case.files().items())}
+    return f"other bytes: {', '.join(sorted(differing)[:5])}" if differing else ""
+
+
+def version_of_session(session: Path) -> dict[str, str]:
+    """Return the key of every stage; none without a session.
+
+    Raises:
+        DataError: a file of a finished stage is missing or has another content.
+    """
+    if not (session / "session.json").exists() and not (session / "ingest.new" / "stage.json").exists():
+        return {}
+    opened = open_session(session)
+    records = {stage: opened.intact_record(stage) for stage in STAGES}
+    return {stage: record.key for stage, record in records.items() if record is not None}
+
+
+def _files_beside(folder: Path) -> dict[str, str]:
+    """List a folder as `kept` does, with what was left beside it; empty without one."""
+    left = [path.name for path in folder.parent.iterdir() if path.name.startswith(".")]
+    return (kept(folder) if folder.exists() else {}) | dict.fromkeys(left, "left behind")
+
+
+def _visible(folder: Path) -> dict[str, str]:
+    """List the files of a folder that other programs take for results."""
+    found = kept(folder) if folder.exists() else {}
+    return {
+        name: digest for name, digest in found.items() if not name.startswith(".") and name[-4:] != ".new"
+    }
+
+
+def _made(folder: Path) -> dict[str, str]:
+    """List a folder that is made whole; between two renames, that which the same command puts back."""
+    return _visible(folder if folder.exists() else folder.parent / f".{folder.name}.making" / "old")
+
+
+def _published(session: Path) -> dict[str, str]:
+    """List the files of the newest version of a session in a store, with their hashes."""
+    pointers = sorted(session.glob("*.json"))
+    if not pointers:
+        return {}
+    newest = json.loads(pointers[-1].read_text(encoding="utf-8"))
+    stated = {name: digest for name, digest in newest["files"].items() if name != "run.json"}
+    if content(session / newest["folder"]) != stated:
+        raise DataError(session, "is damaged")
+    return stated
+
+
+def _of_session(
+    name: str,
+    session: Path,
+    arguments: Sequence[str | Path],
+    before: Callable[[], object] = lambda: None,
+) -> Case:
+    version, files = partial(version_of_session, session), partial(_files_beside, session)
+    return Case(name, arguments, version, files, before)
+
+
+def _ingest(name: str, place: Path) -> Case:
+    session, manifest = place / "flown.session", write_flight(place, seconds=0.3).manifest
+    return _of_session(name, session, ["ingest", manifest, "-o", session])
+
+
+def _ingest_again(name: str, place: Path) -> Case:
+    session, flight = place / "flown.session", write_flight(place, seconds=0.3)
+
+    def before() -> None:
+        succeeds("ingest", flight.manifest, "-o", session)
+        del flight.settings["truth"]
+        flight.save()
+
+    return _of_session(name, session, ["ingest", flight.manifest, "-o", session], before)
+
+
+def _ingested(place: Path, seconds: float = 0.3) -> Path:
+    session = place / "flown.session"
+    succeeds("ingest", write_flight(place, seconds=seconds).manifest, "-o", session)
+    return session
+
+
+def _reconstruct(name: str, place: Path) -> Case:
+    session = _ingested(place)
+    before = partial(succeeds, "reconstruct", session, "--method", "dlt")
+    return _of_session(name, session, ["reconstruct", session, "--method", "robust"], before)
+
+
+def _detect(name: str, place: Path) -> Case:
+    """Detection in blocks, which are kept in `.partial`."""
+    session = place / "flown.session"
+    succeeds("ingest", write_spotted_flight(place, 20), "-o", session)
+    options = ("--method", "robust", "--refine-cameras", "background", "--detector", spot_detector(place))
+    made = _of_session(name, session, ["reconstruct", session, *options, "--workers", "1"])
+    return replace(made, whole=False)
+
+
+def _report(name: str, place: Path) -> Case:
+    session = _ingested(place)
+    succeeds("reconstruct", session, "--method", "robust")
+    before = partial(succeeds, "report", session, "--video", "none")
+    return _of_session(name, session, ["report", session], before)
+
+
+def _replan(name: str, place: Path) -> Case:
+    session = _ingested(place, 1.5)
+    succeeds("reconstruct", session, "--method", "robust")
+    return _of_session(name, session, ["replan-compare", session])
+
+
+def _export(name: str, place: Path) -> Case:
+    session, target = _ingested(place), place / "exported"
+    succeeds("reconstruct", session, "--method", "robust")
+    before = partial(succeeds, "export", session, "-o", target, "--to", "trc", "--unit", "m")
+    arguments: list[str | Path] = ["export", session, "-o", target, "--to", "trc,tum,csv"]
+    files = partial(_visible, target)
+    return Case(name, arguments, files, files, before, whole=False)
+
+
+def _simulate(name: str, place: Path) -> Case:
+    scenario, target = place / "scenario.yaml", place / "simulated"
+
+    def before() -> None:
+        scenario.write_text(SCENARIO.replace("seed: 3", "seed: 4"), encoding="utf-8")
+        succeeds("simulate", scenario, "-o", target)
+        scenario.write_text(SCENARIO, encoding="utf-8")
+
+    files = partial(_files_beside, target)
+    return Case(name, ["simulate", scenario, "-o", target], partial(_made, target), files, before)
+
+
+def _ablate(name: str, place: Path) -> Case:
+    target = place / "studied"
+    files = partial(_files_beside, target)
+    return Case(name, ["ablate", "tilt", *SMALL_STUDY, "-o", target], partial(_made, target), files)
+
+
+def _store(name: str, place: Path) -> Case:
+    """A session in an object store, which loses nothing; its copy on this machine does."""
+    store, flown = place / "store", place / "flown"
+    flown.mkdir()
+    url = f"file://{store}/flown.session"
+    published = partial(_published, store / "flown.session")
+    before = partial(succeeds, "ingest", write_flight(flown, seconds=0.3).manifest, "-o", url)
+    arguments = ["reconstruct", url, "--method", "robust"]
+    return Case(name, arguments, published, published, before, durable=store)
+
+
+_CASES: Mapping[str, Callable[[str, Path], Case]] = {
+    "ingest": _ingest,
+    "ingest again": _ingest_again,
+    "reconstruct": _reconstruct,
+    "detect": _detect,
+    "replan-compare": _replan,
+    "report": _report,
+    "export": _export,
+    "simulate": _simulate,
+    "ablate": _ablate,
+    "store": _store,
+}
+
+
+def print_replays(names: Sequence[str], *, moments: int, seed: int) -> int:
+    """Replay losses of power in commands and print each; return 1 if any made trouble."""
+    found = []
+    with tempfile.TemporaryDirectory() as place, patch.dict(os.environ):
+        os.environ.pop("XDG_CACHE_HOME", None)
+        for folder, case in cases_on(Path(place), names):
+            if case.durable is not None:
+                os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
+            lost = replay(folder, case, moments=moments, each=2, again=moments // 2, seed=seed)
+            found.append(lost)
+            print(  # noqa: T201
+                f"{lost.case}: {lost.states} states after {lost.steps} steps, {lost.run_again} of them run"
+                f" again, {len(lost.troubles)} made trouble",
+                flush=True,
+            )
+            for trouble in lost.troubles[:5]:
+                print(f"    {trouble}", flush=True)  # noqa: T201
+    troubles = sum(len(lost.troubles) for lost in found)
+    print(f"{sum(lost.states for lost in found)} losses of power, {troubles} made trouble")  # noqa: T201
+    return 1 if troubles else 0
