@@ -18,7 +18,7 @@ from pipelines.reporting.comparison import (
 )
 from pipelines.reporting.comparison_figures import colour_of, draw_comparison, joints_of, shown_measure
 from pipelines.reporting.content import SessionContent, section, text
-from pipelines.reporting.plates import PALETTE, Plate
+from pipelines.reporting.plates import PALETTE, Plate, as_csv
 from pipelines.reporting.verdict import Verdict, doubts_of_flight
 from pipelines.reporting.wording import THIN, environment, fixed, listing, percent, plural, quantity
 
@@ -55,10 +55,43 @@ def render_comparison(contents: Mapping[str, SessionContent]) -> tuple[str, dict
             colour_of=lambda session: PALETTE[colour_of(comparison, session)],
             judgement=_judgement,
             moment=wording.moment,
+            tables=_tables(comparison),
             settings=_differing_settings(comparison),
         )
     )
     return page, plates
+
+
+def _tables(comparison: Comparison) -> dict[str, str]:
+    """Write the tables of measures and of pairs as CSV; empty cells are missing numbers."""
+    measures = [
+        {"measure": measure.key, "unit": measure.unit, "session": one.label, **_columns(found)}
+        for measure in comparison.measures
+        for one in comparison.sessions
+        if (found := one.estimates.get(measure.key)) is not None
+    ]
+    pairs = [
+        {
+            "measure": measure.key,
+            "unit": measure.unit,
+            "first": pair.first.label,
+            "other": pair.other.label,
+            "first_mean": found.first,
+            "other_mean": found.other,
+            **_columns(found.estimate),
+            "pairs": found.pairs,
+            "joints": found.joints,
+            "lower": found.lower,
+        }
+        for pair in comparison.pairs
+        for measure, found in pair.by_measure
+    ]
+    return {name: as_csv(rows) for name, rows in (("measures", measures), ("pairs", pairs)) if rows}
+
+
+def _columns(estimate: Estimate) -> dict[str, float | None]:
+    low, high = estimate.interval or (None, None)
+    return {"value": estimate.value, "low": low, "high": high}
 
 
 def _title(comparison: Comparison) -> str:

@@ -232,13 +232,20 @@ class Plate:
 
         No spreadsheet takes a text of it for a formula.
         """
-        written = {}
-        for name, numbers in self.numbers.items():
-            texts = numbers.select_dtypes(exclude="number").map(cell_text)
-            written[name] = numbers.assign(**texts).to_csv(
-                index=False, float_format="%.9g", lineterminator="\n"
-            )
-        return written
+        return {name: _written(numbers) for name, numbers in self.numbers.items()}
+
+
+def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
+    """Write rows by column, of the same columns, as `Plate.csv` does."""
+    import pandas as pd
+
+    return _written(pd.DataFrame(rows))
+
+
+def _written(numbers: pd.DataFrame) -> str:
+    texts = numbers.select_dtypes(exclude="number").map(cell_text)
+    written: str = numbers.assign(**texts).to_csv(index=False, float_format="%.9g", lineterminator="\n")
+    return written
 
 
 def table(**columns: object) -> pd.DataFrame:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
@@ -224,6 +226,20 @@ def test_three_sessions_are_set_against_the_first(content: SessionContent, page:
     assert row[5:] == [f"{len(JOINTS)} of {len(JOINTS)}", "better"]
 
 
+def test_figures_and_tables_come_with_their_numbers(page: str) -> None:
+    written = [unquote(link.split(",", 1)[1]) for link in Outline(page).links if link.startswith("data:")]
+    tables = [pd.read_csv(io.StringIO(text)) for text in written]
+    assert len(tables) == 5  # of three figures, the measures and the pairs
+    measures = next(
+        one for one in tables if list(one) == ["measure", "unit", "session", "value", "low", "high"]
+    )
+    of = measures[measures["measure"] == "mpjpe"].set_index("session")["value"]
+    pairs = next(one for one in tables if "first_mean" in one)
+    row = pairs[(pairs["measure"] == "mpjpe") & (pairs["other"] == "c")].iloc[0]
+    assert row["value"] == pytest.approx(of["c"] - of["a"])
+    assert (row["first_mean"], row["other_mean"]) == pytest.approx((of["a"], of["c"]))
+
+
 def test_settings_that_differ_are_listed(page: str) -> None:
     text = Outline(page).text
     assert "reconstruct: gates.pixel_sigma_px 3.0 3.0 2.0" in text
@@ -235,7 +251,7 @@ def test_page_needs_nothing_and_is_the_same_every_time(content: SessionContent, 
     outline = Outline(page)
     assert render_comparison(_three(content))[0] == page
     assert GENERATOR in page[:2048]
-    assert all(link.startswith("#") for link in outline.links)
+    assert all(link.startswith(("#", "data:text/csv;")) for link in outline.links)
     assert outline.scripts == []
     assert len(set(outline.ids)) == len(outline.ids)
     assert set(outline.references) <= set(outline.ids)
@@ -253,7 +269,7 @@ def test_names_from_files_stay_text(content: SessionContent, page: str) -> None:
     # No kind of element or attribute that a page with harmless names does not have.
     assert set(outline.elements) <= set(Outline(page).elements)
     assert outline.scripts == []
-    assert all(link.startswith("#") for link in outline.links)
+    assert all(link.startswith(("#", "data:text/csv;")) for link in outline.links)
     text = outline.text.replace("\x00", "\ufffd")
     for name in HOSTILE:
         assert text.count(" ".join(name.replace("\x00", "\ufffd").split())[:30]) >= 6, name
