@@ -10,8 +10,9 @@ three drones.
 
 measures instead the most memory and the processor time that `mocap reconstruct` and `mocap report` take on
 the first of these flights, of so many minutes, each in a process of its own. `--given nothing` leaves its
-noise out. `--repeat 15` repeats the flight so often, which takes less time than to simulate an hour;
-`--session` takes an ingested flight of so many minutes instead of flying one.
+noise out. `--repeat 15` repeats the flight to and fro so often, which takes less time than to simulate an
+hour; with several numbers each in turn. `--film` films the flight, and repeats what was found in its
+pictures. `--session` takes an ingested flight of so many minutes instead of flying one.
 
     python -m benchmarks.long_flights --segments 60 300 900 --minutes 12 --first 302
 
@@ -37,10 +38,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 import numpy as np
@@ -49,17 +50,22 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import yaml  # type: ignore[import-untyped]
 
+from benchmarks.cluster import FRAME_NS, write_film
 from benchmarks.results_page import markdown_table
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.reconstruction import segments
+from pipelines.reconstruction.background_tracks import still_name
 from pipelines.report import content_of
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.page import render_page
 from pipelines.session.description import read_description
+from pipelines.session.errors import DataError
 from pipelines.session.people import true_joints_at
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
+from pipelines.session.stage_records import Stage, key_of
+from pipelines.session.stages import Run, WritableSession
 from pipelines.session.storage import sha256_of
 from pipelines.session.tables import motion_from
 from pipelines.simulate import simulate
@@ -96,16 +102,21 @@ def scenario(seed: int, seconds: float) -> dict[str, object]:
     return document | {"seed": seed, "duration_s": seconds}
 
 
-def flown(seed: int, minutes: float, place: Path, *, stated: bool) -> Path:
-    """Fly a flight of so many minutes without film and ingest it; return its session."""
-    (place / "scenario.yaml").write_text(yaml.safe_dump(scenario(seed, 60 * minutes)))
-    simulate(place / "scenario.yaml", place / "made", video=False)
+def flown(seed: int, minutes: float, place: Path, *, stated: bool, film: bool = False) -> Path:
+    """Fly a flight of so many minutes and ingest it; return its session. With film, detect people in it."""
+    document = scenario(seed, 60 * minutes)
+    (place / "scenario.yaml").write_text(yaml.safe_dump(document))
+    simulate(place / "scenario.yaml", place / "made", video=film)
     manifest = yaml.safe_load((place / "made" / "flight.yaml").read_text())
     if not stated:
         for camera in manifest["cameras"].values():
             del camera["pose_noise"]
     (place / "made" / "flown.yaml").write_text(yaml.safe_dump(manifest))
-    return ingest(place / "made" / "flown.yaml", place / "flown.session").folder
+    session = ingest(place / "made" / "flown.yaml", place / "flown.session").folder
+    if film:
+        reconstruct(session)
+        shutil.rmtree(session / "reconstruct")
+    return session
 
 
 def memory_rows(session: Path, minutes: float) -> Iterator[str]:
@@ -186,27 +197,108 @@ def in_segments(session: Path, length_s: float) -> Divided:
     )
 
 
-def repeat_tables(session: Path, times: int) -> None:
-    """Repeat an ingested flight; people and drones jump back where it begins again."""
-    path = session / "ingest" / "stage.json"
-    record = json.loads(path.read_text())
-    tables = {name: pq.read_table(session / name) for name in record["outputs"] if name.endswith(".parquet")}
-    stamps = [each["t_ns"].to_numpy() for each in tables.values()]
-    lasts_ns = max(int(t_ns[-1]) for t_ns in stamps) - min(int(t_ns[0]) for t_ns in stamps) + 10**8
-    for name, table in tables.items():
-        frames = tables.get(str(Path(name).with_name("frames.parquet")))
-        later = {"t_ns": lasts_ns, "pts_ns": lasts_ns, "frame": 0 if frames is None else frames.num_rows}
-        with pq.ParquetWriter(session / name, table.schema) as writer:
-            for k in range(times):
-                columns = [
-                    pc.add(table[column.name], pa.scalar(k * later.get(column.name, 0), column.type))
-                    if column.name in later
-                    else table[column.name]
-                    for column in table.schema
-                ]
-                writer.write_table(pa.table(columns, schema=table.schema))
-        record["outputs"][name] = sha256_of(session / name)
-    path.write_text(json.dumps(record))
+def lengthen(session: Path, turns: int) -> None:
+    """Make an ingested flight longer: to and fro in turns, so that people, drones and pictures do not jump.
+
+    What was found in its pictures is repeated as well, and its stages get the keys of the longer flight.
+    Longer videos are written into a new folder beside the session, `<session>.films`.
+    """
+    path = session / "session.json"
+    document = json.loads(path.read_text())
+    spans = {name: entry["frames"] for name, entry in document["cameras"].items()}
+    start = min(span["first_t_ns"] for span in spans.values())
+    end = max(span["last_t_ns"] for span in spans.values())
+    period = end - start + FRAME_NS
+    counts = {
+        name: pq.read_metadata(session / "cameras" / name / "frames.parquet").num_rows for name in spans
+    }
+    records = {}
+    for stage in ("ingest", "detect", "background", "reconstruct"):
+        if (session / stage / "stage.json").exists():
+            records[stage] = json.loads((session / stage / "stage.json").read_text())
+    films = session.with_name(f"{session.name}.films")
+    for name, entry in document["cameras"].items():
+        if entry["media"] is not None:
+            film, pts = (
+                films / f"{name}.mp4",
+                pq.read_table(session / "cameras" / name / "frames.parquet")["pts_ns"],
+            )
+            films.mkdir(exist_ok=True)
+            write_film(session / entry["media"]["paths"][0], film, pts.to_numpy(), turns)
+            entry["media"]["paths"] = [f"../{films.name}/{film.name}"]
+            document["sources"][entry["media"]["sources"][0]] = sha256_of(film)
+    for record in records.values():
+        for name in [name for name in record["outputs"] if name.endswith(".parquet")]:
+            _lengthen_table(
+                session / name, turns, (start, end), period, counts.get(Path(name).parent.name, 0)
+            )
+        for name in [name for name in record["outputs"] if name.endswith(".jpg")]:
+            count, number = counts[Path(name).parts[1]], int(Path(name).stem)
+            for turn in range(1, turns):
+                there = turn * count + (count - 1 - number if turn % 2 else number)
+                other = Path(name).with_name(still_name(there))
+                os.link(session / name, session / other)
+                record["outputs"][other.as_posix()] = record["outputs"][name]
+    for name, entry in document["cameras"].items():
+        last = pq.read_table(session / "cameras" / name / "frames.parquet")["t_ns"][-1].as_py()
+        entry["frames"] |= {"count": turns * counts[name], "last_t_ns": last}
+    path.write_text(json.dumps(document))
+    if "detect" in records:
+        records["detect"]["counts"]["rows"] = {name: [0, turns * count] for name, count in counts.items()}
+    for stage, record in records.items():
+        for name in [name for name in record["outputs"] if not name.endswith(".jpg")]:
+            record["outputs"][name] = sha256_of(session / name)
+        (session / stage / "stage.json").write_text(json.dumps(record))
+    _give_new_keys(session)
+
+
+def _lengthen_table(path: Path, turns: int, span: tuple[int, int], period: int, frames: int) -> None:
+    """Repeat a table to and fro, one part of it after the other; rows outside the span are left out."""
+    start, end = span
+    old = path.rename(path.with_suffix(".once"))
+    with pq.ParquetFile(old) as source, pq.ParquetWriter(path, source.schema_arrow) as writer:
+        there = [name for name in ("t_ns", "pts_ns", "frame", "point") if name in source.schema_arrow.names]
+        most = {name: pc.max(pq.read_table(old, columns=[name])[name]).as_py() for name in there}
+        # Of each column: what a number and its mirrored one add up to, and what each turn adds.
+        mirrors = most | {"t_ns": start + end, "frame": frames - 1}
+        added = {"t_ns": period, "pts_ns": period, "frame": frames, "point": most.get("point", 0) + 1}
+        groups = list(range(source.num_row_groups))
+        for turn in range(turns):
+            back = turn % 2 == 1
+            for group in groups[::-1] if back else groups:
+                rows = source.read_row_group(group)
+                if "t_ns" in there:
+                    inside = pc.greater_equal(rows["t_ns"], start), pc.less_equal(rows["t_ns"], end)
+                    rows = rows.filter(pc.and_(*inside))
+                if back:
+                    rows = rows.take(np.arange(rows.num_rows)[::-1])
+                for name in there:
+                    values = rows[name].to_numpy().astype(np.int64)
+                    values = (mirrors[name] - values if back and name != "point" else values) + turn * added[
+                        name
+                    ]
+                    place = rows.column_names.index(name)
+                    field = rows.schema.field(place)
+                    rows = rows.set_column(place, field, pa.array(values, field.type))
+                writer.write_table(rows)
+    old.unlink()
+
+
+def _give_new_keys(session: Path) -> None:
+    """Give the stages that looked at pictures the keys of their present inputs, so that they are finished."""
+    begin = WritableSession.begin
+
+    def begin_anew(self: WritableSession, stage: Stage, **given: Any) -> Run:
+        if stage.name == "reconstruct":
+            raise DataError(session, "was only prepared")
+        path = session / stage.name / "stage.json"
+        record = json.loads(path.read_text())
+        key = key_of(stage, given["settings"], given["inputs"])
+        path.write_text(json.dumps(record | {"key": key, "inputs": given["inputs"]}))
+        return begin(self, stage, **given)
+
+    with patch.object(WritableSession, "begin", begin_anew), suppress(DataError):
+        reconstruct(session)
 
 
 def repeated(content: SessionContent, seconds: float) -> tuple[SessionContent, dict[str, int]]:
@@ -302,7 +394,8 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=90.0)
     parser.add_argument("--memory", type=float, nargs="+", metavar="MINUTES", help="measure memory instead")
-    parser.add_argument("--repeat", type=int, default=1, metavar="TIMES", help="with --memory")
+    parser.add_argument("--repeat", type=int, nargs="+", default=[1], metavar="TIMES", help="with --memory")
+    parser.add_argument("--film", action="store_true", help="with --memory: film it")
     parser.add_argument("--given", choices=("model", "nothing"), default="model", help="with --memory")
     parser.add_argument("--page", type=Path, metavar="SESSION", help="measure the page of an hour instead")
     parser.add_argument("--minutes", type=float, default=60.0, help="with --page and --segments")
@@ -327,14 +420,18 @@ def main() -> None:
     if arguments.memory:
         for minutes in arguments.memory:
             with tempfile.TemporaryDirectory() as folder:
-                session = Path(folder) / "flown.session"
-                if arguments.session is None:
-                    session = flown(arguments.first, minutes, Path(folder), stated=stated)
-                else:
-                    shutil.copytree(arguments.session, session)
-                repeat_tables(session, arguments.repeat)
-                for row in memory_rows(session, minutes * arguments.repeat):
-                    print(row, flush=True)
+                once = arguments.session or flown(
+                    arguments.first, minutes, Path(folder), stated=stated, film=arguments.film
+                )
+                for turns in arguments.repeat:
+                    # Beside the other, because paths to its videos are relative.
+                    session = once.with_name(f"{once.stem}-{turns}.session")
+                    shutil.copytree(once, session)
+                    lengthen(session, turns)
+                    for row in memory_rows(session, minutes * turns):
+                        print(row, flush=True)
+                    shutil.rmtree(session)
+                    shutil.rmtree(session.with_name(f"{session.name}.films"), ignore_errors=True)
         return
     rows = []
     for seed in range(arguments.first, arguments.first + arguments.count):

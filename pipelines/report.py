@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Int64, Picture
+from pipelines.geometry.arrays import Int64, Picture
 from pipelines.planning.loading import load_flight
 from pipelines.planning.scene import hidden_shares
 from pipelines.reporting.comparison import compare, labels_of
@@ -32,6 +32,7 @@ from pipelines.reporting.studies import summarise_studies
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
+from pipelines.session.memory import return_freed_arrays, return_unused
 from pipelines.session.records import Occupancy
 from pipelines.session.stage_records import Stage, StageRecord, outdated, versions_of
 from pipelines.session.stages import Session, locked, open_session, session_name
@@ -49,7 +50,8 @@ from pipelines.session.tables import (
     SEEN,
     SKELETON,
     TRUTH,
-    read_column,
+    count_rows,
+    distinct,
     read_rows,
     read_table,
 )
@@ -89,6 +91,7 @@ def report(
         BusyError: another process writes the session.
     """
     studied = [read_study(study) for study in studies]
+    return_freed_arrays()
     with locked(folder) as session:
         records = _finished_stages(session)
         inputs = {name: digest for record in records.values() for name, digest in record.outputs.items()}
@@ -306,7 +309,10 @@ def content_of(folder: Path) -> SessionContent:
 _MOST_TIMES = 18_000
 """The most times of the skeleton that a page is drawn from: ten minutes at 30 Hz."""
 
-_STRETCH_NS = 600_000_000_000  # of a flight whose lines of sight are looked at together
+_MOST_ROWS = 400_000
+"""The most rows of its table: twelve thousand times of one person with 33 joints."""
+
+_STRETCH_NS = 180_000_000_000  # of a flight whose lines of sight are looked at together
 
 
 class _Shown:
@@ -315,11 +321,12 @@ class _Shown:
     Args:
         folder: the session.
         t_ns: all times of the skeleton, or of the pictures where there is none.
+        rows: of the skeleton's table, one for each time, person and joint; 0 where there is none.
         metrics: reconstruct/metrics.json.
     """
 
-    def __init__(self, folder: Path, t_ns: Int64, metrics: Mapping[str, object] | None) -> None:
-        self.every = max(-(-len(t_ns) // _MOST_TIMES), 1)
+    def __init__(self, folder: Path, t_ns: Int64, rows: int, metrics: Mapping[str, object] | None) -> None:
+        self.every = max(-(-len(t_ns) // _MOST_TIMES), -(-rows // _MOST_ROWS), 1)
         self._folder = folder
         self._t_ns = t_ns[:: self.every]
         self._offset_ns = estimated_clocks(metrics or {})
@@ -330,20 +337,19 @@ class _Shown:
         path = self._folder / name
         if self.every == 1:
             return read_table(path, schema)
-        return read_rows(path, schema, _among(read_column(path, "t_ns"), self._t_ns))
+        return _rows(path, schema, "t_ns", self._t_ns)
 
     def about(self, name: str, schema: pa.Schema) -> pd.DataFrame:
         """Read the rows of a table of other times that lie next to these."""
         path = self._folder / name
         if self.every == 1:
             return read_table(path, schema)
-        own_ns = read_column(path, "t_ns")
-        stamps = np.unique(own_ns)
+        stamps = distinct(path, "t_ns")
         if not len(stamps):
             return read_table(path, schema)
         after = np.searchsorted(stamps, self._t_ns).clip(0, len(stamps) - 1)
         next_to = np.concatenate([after, (after - 1).clip(0), (0, len(stamps) - 1)])
-        return read_rows(path, schema, _among(own_ns, stamps[np.unique(next_to)]))
+        return _rows(path, schema, "t_ns", stamps[np.unique(next_to)])
 
     def frames(self, camera: str) -> pd.DataFrame:
         """Read the frames of a camera that are nearest to these times."""
@@ -363,29 +369,29 @@ class _Shown:
         if self.every == 1:
             return read_table(path, KEYPOINTS)
         shown = self.frames(camera)["frame"].to_numpy(np.int64)
-        return read_rows(path, KEYPOINTS, _among(read_column(path, "frame"), shown))
+        return _rows(path, KEYPOINTS, "frame", shown)
 
 
-def _among(values: Int64, chosen: Int64) -> Bool:
-    """Test which values [N] are among the chosen, sorted ones."""
-    if not len(chosen):
-        return np.zeros(len(values), dtype=np.bool_)
-    place = np.searchsorted(chosen, values).clip(0, len(chosen) - 1)
-    return np.asarray(chosen[place] == values, dtype=np.bool_)
+def _rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.DataFrame:
+    """Read rows of a long table, see `read_rows`, and give back the memory of the others."""
+    table = read_rows(path, schema, name, chosen)
+    return_unused()
+    return table
 
 
 def _times(folder: Path, description: Description, *, reconstructed: bool) -> Int64:
     """Return the times of the skeleton, or those of the camera with the most pictures."""
     if reconstructed:
-        return np.unique(read_column(folder / "reconstruct" / "skeleton.parquet", "t_ns"))
+        return distinct(folder / "reconstruct" / "skeleton.parquet", "t_ns")
     camera = max(description.cameras, key=lambda name: description.cameras[name].frames.count)
-    return np.unique(read_column(folder / "cameras" / camera / "frames.parquet", "t_ns"))
+    return distinct(folder / "cameras" / camera / "frames.parquet", "t_ns")
 
 
 def _load(folder: Path, description: Description, records: dict[str, StageRecord]) -> SessionContent:
     reconstructed = "reconstruct" in records
     metrics = read_json(folder / "reconstruct" / "metrics.json") if reconstructed else None
-    shown = _Shown(folder, _times(folder, description, reconstructed=reconstructed), metrics)
+    rows = count_rows(folder / "reconstruct" / "skeleton.parquet") if reconstructed else 0
+    shown = _Shown(folder, _times(folder, description, reconstructed=reconstructed), rows, metrics)
     keypoints = {
         name: shown.keypoints("cameras", name)
         for name, entry in description.cameras.items()
@@ -440,6 +446,7 @@ def _load_hidden(
             continue
         lasts_ns = float(np.ptp(flight.actor_t_ns))
         found.append((lasts_ns, hidden_shares(flight, description, maps)))
+        return_unused()
     if len(found) == 1:
         return found[0][1]
     shares: dict[str, float] = {}

@@ -38,6 +38,7 @@ A page with the largest choice of pictures, 15 MB, then stays below 25 MB.
 _SHARE_OF_ELLIPSOIDS = 0.25  # of MOST_BYTES, at least, in longer flights: they change more slowly than joints
 _MOST_TIMES_WITHOUT_SKELETON = 3000
 _FARTHEST_M = 32.767
+_MATRICES_AT_ONCE = 1 << 15  # whose square roots are computed: others take no memory meanwhile
 _PICTURES_S = 0.2  # apart: more is no film any more, and is noted
 _SIDES = ("", "left", "right")
 
@@ -241,16 +242,17 @@ class _Body:
 
 def _square_root(covariance: Float) -> Float | None:
     """Compute Cholesky factors [..., 6] of covariances [..., 6] (upper triangles); None without any."""
-    full = full_covariance(covariance).reshape(-1, 3, 3)
-    known = np.isfinite(full).all(axis=(1, 2))
-    positive = np.zeros(len(full), dtype=np.bool_)
-    positive[known] = np.linalg.eigvalsh(full[known])[:, 0] > 0
-    if not positive.any():
-        return None
     rows, columns = np.tril_indices(3)
-    root = np.full((len(full), 6), np.nan)
-    root[positive] = np.linalg.cholesky(full[positive])[:, rows, columns]
-    return root.reshape(covariance.shape)
+    upper = covariance.reshape(-1, 6)
+    root = np.full(upper.shape, np.nan)
+    for first in range(0, len(upper), _MATRICES_AT_ONCE):
+        part = slice(first, first + _MATRICES_AT_ONCE)
+        full = full_covariance(upper[part])
+        known = np.isfinite(full).all(axis=(1, 2))
+        positive = np.zeros(len(full), dtype=np.bool_)
+        positive[known] = np.linalg.eigvalsh(full[known])[:, 0] > 0
+        root[part][positive] = np.linalg.cholesky(full[positive])[:, rows, columns]
+    return root.reshape(covariance.shape) if np.isfinite(root).any() else None
 
 
 # --- cameras -------------------------------------------------------------------------------------------

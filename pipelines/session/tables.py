@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Int64
+from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Detections, JointMotion, Trajectory
 
@@ -192,8 +192,8 @@ def read_first(path: Path, schema: pa.Schema) -> pd.DataFrame:
     return frame
 
 
-def read_column(path: Path, name: str) -> NDArray[Any]:
-    """Read one column of a table.
+def distinct(path: Path, name: str) -> Int64:
+    """Return the different integers in a column of a table, sorted; memory grows with their number alone.
 
     Raises:
         DataError: not a Parquet file, truncated, or without this column.
@@ -206,33 +206,46 @@ def read_column(path: Path, name: str) -> NDArray[Any]:
             opened = pq.ParquetFile(file)
             _refuse_bomb(path, opened.metadata)
             batches = opened.iter_batches(_ROWS_AT_ONCE, columns=[name])
-            parts = [batch.column(0).to_numpy(zero_copy_only=False) for batch in batches]
+            parts = [np.unique(batch.column(0).to_numpy(zero_copy_only=False)) for batch in batches]
     except (OSError, pa.ArrowException, IndexError) as error:
         raise DataError(path, "cannot be read as Parquet", again) from error
-    return np.concatenate(parts) if parts else np.empty(0)
+    return np.unique(np.concatenate(parts)) if parts else np.empty(0, np.int64)
 
 
-def read_rows(path: Path, schema: pa.Schema, chosen: Bool) -> pd.DataFrame:
-    """Read some rows of a table; others take no memory.
+def count_rows(path: Path) -> int:
+    """Return the number of rows of a table; DataError if it cannot be read."""
+    import pyarrow.parquet as pq
+
+    try:
+        return int(pq.read_metadata(path).num_rows)
+    except (OSError, pa.ArrowException) as error:
+        again = "run the stage that wrote it again with --force"
+        raise DataError(path, "cannot be read as Parquet", again) from error
+
+
+def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.DataFrame:
+    """Read the rows of a table that have one of these integers in a column; others take no memory.
 
     Args:
         path: the file.
         schema: its columns.
-        chosen: [N] of all rows.
+        name: one of them.
+        chosen: sorted.
 
     Raises:
         DataError: see `read_table`.
     """
     import pyarrow.parquet as pq
 
-    kept, first = [], 0
+    kept = []
     try:
         with path.open("rb") as file:
             opened = pq.ParquetFile(file)
             _refuse_bomb(path, opened.metadata)
             for batch in opened.iter_batches(_ROWS_AT_ONCE):
-                kept.append(batch.filter(pa.array(chosen[first : first + batch.num_rows])))
-                first += batch.num_rows
+                values = batch.column(batch.schema.get_field_index(name)).to_numpy(zero_copy_only=False)
+                place = np.searchsorted(chosen, values).clip(0, max(len(chosen) - 1, 0))
+                kept.append(batch.filter(pa.array(chosen[place] == values)) if len(chosen) else batch[:0])
             table = pa.Table.from_batches(kept, opened.schema_arrow)
     except (OSError, pa.ArrowException) as error:
         raise DataError(
@@ -265,19 +278,19 @@ def _frame_of(path: Path, table: pa.Table, schema: pa.Schema) -> pd.DataFrame:
     if missing:
         raise DataError(path, f"lacks the columns {', '.join(missing)}", "run the stage again with --force")
     frame: pd.DataFrame = table.to_pandas()
-    _refuse_absurd_numbers(path, frame[schema.names])
+    _refuse_absurd_numbers(path, frame, schema.names)
     return frame
 
 
-def _refuse_absurd_numbers(path: Path, frame: pd.DataFrame) -> None:
+def _refuse_absurd_numbers(path: Path, frame: pd.DataFrame, names: Sequence[str]) -> None:
     """Refuse numbers that no stage writes, before they overflow in a later step; NaN is missing."""
     again = "run the stage that wrote it again with --force"
-    if list(frame.columns) == POSES.names and (np.diff(frame["t_ns"].to_numpy()) <= 0).any():
+    if list(names) == POSES.names and (np.diff(frame["t_ns"].to_numpy()) <= 0).any():
         raise DataError(path, "holds times that do not increase", again)
-    for name in map(str, frame.columns):
-        values = frame[name].to_numpy()
-        largest = LATEST_NS if name.endswith("_ns") else _LARGEST
-        if values.dtype.kind in "if" and len(values):
+    for name in names:
+        if frame[name].dtype.kind in "if" and len(frame):
+            values = frame[name].to_numpy()
+            largest = LATEST_NS if name.endswith("_ns") else _LARGEST
             wrong = (values > largest) | (values < -largest)
             if name not in (*_POSITION, *_QUATERNION):
                 wrong &= np.isfinite(values)

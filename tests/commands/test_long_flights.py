@@ -191,14 +191,15 @@ def test_a_doubted_long_flight_is_refused_when_asked(
     assert [doubt["code"] for doubt in result.metrics["doubts"]] == ["clock"]
 
 
+@pytest.mark.parametrize(("limit", "most"), [("_MOST_TIMES", 20), ("_MOST_ROWS", 20 * 17)])
 def test_the_page_of_a_long_flight_is_drawn_from_some_of_its_times(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, most: int
 ) -> None:
     flight = write_flight(tmp_path, seconds=2.0)
     session = ingested(flight)
     reconstruct(session, Settings(method="robust"), workers=1)
     whole = content_of(session)
-    monkeypatch.setattr(report, "_MOST_TIMES", 20)
+    monkeypatch.setattr(report, limit, most)
     some = content_of(session)
     assert (whole.every, some.every) == (1, 3)
     assert whole.skeleton is not None
