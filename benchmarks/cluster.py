@@ -9,11 +9,12 @@ other work may keep the cores busy: those of the blocks, and those of the proces
 the owner. Machines that do nothing else take as long as the busiest worker and then the owner; one worker
 takes all blocks. The same command continues an interrupted run.
 
-    python -m benchmarks.cluster sleep --flights 10000 --workers 16 64 256
+    python -m benchmarks.cluster sleep --flights 10000 --workers 4 16 64 256
 
 runs flights of tasks that sleep: a task for each, as `mocap batch` has it, that gives one block to the
-cluster and waits. The workers share one process, so that 256 fit on this machine; the scheduler has a process
-of its own, whose processor time is measured, also while the workers do nothing.
+cluster and waits. Eight workers share a process, so that 256 fit on this machine. Blocks sleep longer on more
+workers, so that the same number of flights ends each second. The scheduler has a process of its own, whose
+processor time is measured, also while the workers do nothing.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def main() -> None:
     film.set_defaults(run=lambda given: print_film(given.folder, given.minutes, given.every, given.workers))
     sleep = parts.add_parser("sleep", help="many flights that sleep")
     sleep.add_argument("--flights", type=int, default=10_000)
-    sleep.add_argument("--workers", type=int, nargs="+", default=[16, 64, 256])
+    sleep.add_argument("--workers", type=int, nargs="+", default=[4, 16, 64, 256])
     sleep.set_defaults(run=lambda given: print_sleep(given.flights, given.workers))
     given = parser.parse_args()
     given.run(given)
@@ -214,20 +215,16 @@ def pictures_of(reader: VideoReader, count: int, backwards: bool) -> Iterator[Pi
 
 # --- many flights that sleep ---------------------------------------------------------------------------
 
-TASK_S = 0.05
+FLIGHTS_PER_S = 60  # that end, at most: the workers' own work is not to keep all cores busy
+WORKERS_TOGETHER = 8  # in a process: they take turns there
 IDLE_S = 10.0
 
 
-def block(_: int) -> None:
-    """Sleep as long as a block."""
-    time.sleep(TASK_S)
-
-
-def flight(number: int) -> int:
-    """Give a block to the cluster, as a flight's task does."""
-    for _ in Cluster.of_task().each(block, [number]):
+def flight(sleep_s: float) -> float:
+    """Give a block to the cluster that sleeps, as a flight's task gives its blocks."""
+    for _ in Cluster.of_task().each(time.sleep, [sleep_s]):
         pass
-    return number
+    return sleep_s
 
 
 def print_sleep(flights: int, counts: list[int]) -> None:
@@ -241,10 +238,11 @@ def print_sleep(flights: int, counts: list[int]) -> None:
             time.sleep(IDLE_S)
             started_s, started = client.run_on_scheduler(time.process_time), time.perf_counter()
             idle_s = (started_s - idle_s) / IDLE_S
-            done = client.gather(client.map(flight, range(flights), pure=False))
+            sleep_s = workers / FLIGHTS_PER_S
+            done = client.gather(client.map(flight, [sleep_s] * flights, pure=False))
             took_s = time.perf_counter() - started
             spent_s = client.run_on_scheduler(time.process_time) - started_s
-            assert done == list(range(flights))
+            assert done == [sleep_s] * flights
         tasks = 2 * flights
         each_ms = 1000 * (spent_s - idle_s * took_s) / tasks
         rows.append(
@@ -296,17 +294,21 @@ asyncio.run(main())
 
 @contextmanager
 def emulated_workers(address: str, count: int) -> Iterator[None]:
-    """Start workers of one thread each, all in one other process."""
-    process = subprocess.Popen(  # noqa: S603  # this program
-        [sys.executable, "-c", _WORKERS, address, str(count)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    """Start workers of one thread each, several in a process."""
+    processes = [
+        subprocess.Popen(  # noqa: S603  # this program
+            [sys.executable, "-c", _WORKERS, address, str(min(WORKERS_TOGETHER, count - first))],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for first in range(0, count, WORKERS_TOGETHER)
+    ]
     try:
         yield
     finally:
-        process.kill()
-        process.wait()
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 if __name__ == "__main__":

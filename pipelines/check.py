@@ -3,12 +3,15 @@
 A flight that was not ingested yet is read into a temporary session. Where no keypoints are known, the
 detector looks at a few seconds in the middle of the flight, in a temporary copy: a check changes no session.
 The backgrounds of these pictures are followed, too: only they tell that all cameras' clocks are alike wrong.
+A long flight is checked in the segments in which it would be reconstructed: a doubt is the flight's if half
+of them have it, and a warning otherwise.
 """
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from pipelines.attempt import chosen_detections, find_people
@@ -17,14 +20,17 @@ from pipelines.follow import BACKGROUND, Following, cameras_to_follow
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import Followed, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
-from pipelines.reconstruction.loading import load_cameras
+from pipelines.reconstruction.loading import load_cameras, load_time_base
 from pipelines.reconstruction.observations import Camera
-from pipelines.session.description import Description, Doubt, read_description
-from pipelines.session.errors import DataError
+from pipelines.reconstruction.segments import Segment, divided, doubts_of_flight
+from pipelines.session.description import Description, Doubt, read_description, said_doubts
+from pipelines.session.errors import DataError, NoViewsError
+from pipelines.session.memory import return_freed_arrays, return_unused
 from pipelines.session.people import logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import WritableSession, locked
+from pipelines.session.tables import Span
 
 _LOOK_S = 8.0
 """Seconds in the middle of a flight that the detector looks at."""
@@ -63,6 +69,7 @@ def check(
         BusyError: another process writes the session.
     """
     progress = progress or Silent()
+    return_freed_arrays()
     if path.is_dir():
         if _has_keypoints(path):
             return _checked(path, pose_noise, detector, workers, progress)
@@ -94,20 +101,58 @@ def _checked(
             raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
         description = read_description(folder)
         detected, pictures = _detected(session, description, detector, workers, progress)
-        cameras, _ = load_cameras(
-            folder, description, detected, min_confidence=_CONFIDENT, pose_noise=pose_noise
-        )
-        actors = logged_people(folder, description)
-        found, association, _ = find_people(cameras, description.pose_interpolation, actors)
-        doubts = doubts_of(
-            folder,
-            description,
-            cameras,
-            chosen=chosen_detections(cameras, found, association),
-            followed=_followed(session, cameras),
-            pose_noise=pose_noise,
-        )
-    return Checked(doubts, list(description.warnings), pictures)
+        _, t_ns = load_time_base(folder, description, detected, None)
+        segments = divided(t_ns)
+        looked_at = partial(_doubts, session, description, detected, pose_noise)
+        if len(segments) == 1:
+            return Checked(looked_at(None), list(description.warnings), pictures)
+        found = [
+            doubts for segment in segments if (doubts := _doubts_of_some(looked_at, segment)) is not None
+        ]
+        often, seldom = doubts_of_flight([[doubt.as_json() for doubt in doubts] for doubts in found])
+        warnings = [
+            f"{count} of {len(found)} segments: {said_doubts([doubt])[0]}" for doubt, count, _ in seldom
+        ]
+    return Checked(often, [*description.warnings, *warnings], pictures)
+
+
+def _doubts_of_some(looked_at: Callable[[Span], list[Doubt]], segment: Segment) -> list[Doubt] | None:
+    """Return the doubts of a segment of a long flight; None if too few cameras have pictures there."""
+    try:
+        return looked_at(segment.span_ns)
+    except NoViewsError:
+        return None
+    finally:
+        return_unused()
+
+
+def _doubts(
+    session: WritableSession,
+    description: Description,
+    detected: StageRecord | None,
+    pose_noise: str | None,
+    span_ns: Span | None,
+) -> list[Doubt]:
+    """Doubt what cannot be right in a span of time, or in all the time."""
+    folder = session.folder
+    cameras, _ = load_cameras(
+        folder,
+        description,
+        detected,
+        min_confidence=_CONFIDENT,
+        pose_noise=pose_noise,
+        span_ns=span_ns,
+    )
+    actors = logged_people(folder, description, span_ns)
+    found, association, _ = find_people(cameras, description.pose_interpolation, actors)
+    return doubts_of(
+        folder,
+        description,
+        cameras,
+        chosen=chosen_detections(cameras, found, association),
+        followed=_followed(session, cameras),
+        pose_noise=pose_noise,
+    )
 
 
 def _followed(session: WritableSession, cameras: Sequence[Camera]) -> dict[str, Followed]:

@@ -13,8 +13,10 @@ import pytest
 
 from pipelines import report, segmented
 from pipelines.attempt import Source
+from pipelines.check import check
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.reconstruction import segments
+from pipelines.reconstruction.observations import Camera
 from pipelines.report import content_of
 from pipelines.reporting.summary import summarise
 from pipelines.session.camera_poses import poses_at
@@ -189,6 +191,30 @@ def test_a_doubted_long_flight_is_refused_when_asked(
     )
     result = reconstruct(session, Settings(method="robust"), workers=1, progress=Silent())
     assert [doubt["code"] for doubt in result.metrics["doubts"]] == ["clock"]
+
+
+def test_a_long_flight_is_checked_in_segments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_segments: None
+) -> None:
+    flight = write_flight(tmp_path, seconds=6.0)
+    session = ingested(flight)
+    spans = []
+
+    def doubts_of(_folder: Path, _of: object, cameras: list[Camera], **_: object) -> list[Doubt]:
+        spans.append(cameras[0].frame_t_ns[[0, -1]])
+        code = "poses" if len(spans) == 1 else "clock"
+        return [a_doubt().model_copy(update={"code": code})]
+
+    monkeypatch.setattr("pipelines.check.doubts_of", doubts_of)
+    checked = check(session)
+    assert len(spans) == 3
+    assert [np.ptp(span) > 5.9e9 for span in spans] == [False, True, False]  # with a second on either side
+    assert (spans[0][0], spans[-1][1]) == (flight.t_ns[0], flight.t_ns[-1])
+    assert [doubt.code for doubt in checked.doubts] == ["clock"]
+    assert "1 of 3 segments" in checked.warnings[-1]
+    monkeypatch.setattr(segments, "LENGTH_S", 60.0)
+    check(session)
+    assert len(spans) == 4
 
 
 @pytest.mark.parametrize(("limit", "most"), [("_MOST_TIMES", 20), ("_MOST_ROWS", 20 * 17)])
