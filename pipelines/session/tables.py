@@ -7,7 +7,7 @@ found has no row, and is read back as NaN.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -205,7 +205,7 @@ def distinct(path: Path, name: str) -> Int64:
         with path.open("rb") as file:
             opened = pq.ParquetFile(file)
             _refuse_bomb(path, opened.metadata)
-            batches = opened.iter_batches(_ROWS_AT_ONCE, columns=[name])
+            batches = _batches(opened, [name])
             parts = [np.unique(batch.column(0).to_numpy(zero_copy_only=False)) for batch in batches]
     except (OSError, pa.ArrowException, IndexError) as error:
         raise DataError(path, "cannot be read as Parquet", again) from error
@@ -242,7 +242,7 @@ def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.Dat
         with path.open("rb") as file:
             opened = pq.ParquetFile(file)
             _refuse_bomb(path, opened.metadata)
-            for batch in opened.iter_batches(_ROWS_AT_ONCE):
+            for batch in _batches(opened):
                 values = batch.column(batch.schema.get_field_index(name)).to_numpy(zero_copy_only=False)
                 place = np.searchsorted(chosen, values).clip(0, max(len(chosen) - 1, 0))
                 kept.append(batch.filter(pa.array(chosen[place] == values)) if len(chosen) else batch[:0])
@@ -252,6 +252,15 @@ def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.Dat
             path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
         ) from error
     return _frame_of(path, table, schema)
+
+
+def _batches(opened: Any, columns: Sequence[str] | None = None) -> Iterator[Any]:
+    """Yield the rows of a Parquet file in small batches, one row group after the other.
+
+    A single iterator over all groups would hold memory of each until its end: 1.5 GB for 14.6 million rows.
+    """
+    for group in range(opened.metadata.num_row_groups):
+        yield from opened.iter_batches(_ROWS_AT_ONCE, row_groups=[group], columns=columns)
 
 
 def _rows_within(file: Any, span_ns: Span) -> pa.Table:
