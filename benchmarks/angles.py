@@ -5,7 +5,9 @@
     python -m benchmarks.angles --opensim SESSION [--peer POSE2SIM.mot] # beside OpenSim's inverse kinematics
 
 Each flight is reconstructed by `auto` from logs with errors, and from the true poses by `auto` and `robust`:
-errors with true poses are the detector's alone. Angles are compared with two truths:
+errors with true poses are the detector's alone. A bound that no method can reach knows the true distances
+from the cameras, too. Each view puts a joint at its true depth, and the views used by `robust` are averaged.
+Angles are compared with two truths:
 
 - those of the true joints, COCO's points of the skin, which all errors of this project refer to;
 - those of the bones: the centres of the joints about which the simulated body turns, and its soles.
@@ -43,7 +45,10 @@ from pipelines.follow import Following
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.gait import gait_events, summary
 from pipelines.geometry.joint_angles import ANGLES, joint_angles
+from pipelines.geometry.triangulation import Triangulation, Views
 from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruction.observations import Observations
+from pipelines.reconstruction.results import angles_parts
 from pipelines.session.description import read_description
 from pipelines.session.people import true_joints_at
 from pipelines.session.stages import locked
@@ -64,7 +69,10 @@ _BONE_OF = {
 _PARTS = {name.removeprefix("left_").removeprefix("right_"): None for name in ANGLES}
 _GAIT = ("cadence_per_min", "step_m", "speed_mps")
 BOUND, FLOOR = "auto with true poses", "robust with true poses"
+DEPTHS = "true poses and depths"
 EXACT = "white:position_m=0.001,rotation_deg=0.01"  # what BOUND is told of its poses
+FLEXIONS = ("hip_flexion", "knee_flexion", "elbow_flexion")
+AIM_DEG = 5.0
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ def main() -> None:
     options = [] if arguments.folder is None else ["--folder", str(arguments.folder)]
     said = [word for word in sys.argv[1:] if word not in options]
     command = shlex.join(["python", "-m", "benchmarks.angles", *said])
-    lines = [f"    {command}", "", *angles_tables(found), *gait_table(found)]
+    lines = [f"    {command}", "", *angles_tables(found), "", *flexions_table(found), *gait_table(found)]
     print("\n".join(lines))
     if arguments.write:
         text = PAGE.read_text(encoding="utf-8")
@@ -122,14 +130,14 @@ def main() -> None:
 
 
 def measured(name: str, detector: str, kept_in: Path | None = None) -> dict[str, Measured]:
-    """Reconstruct a flight by `auto`, and from true poses; the results by `auto`, BOUND and FLOOR."""
+    """Reconstruct a flight by `auto`, and from true poses; the results by `auto`, BOUND, FLOOR and DEPTHS."""
     cv2.setNumThreads(1)
     flight = next(each for each in flights() if each.name == name)
     with tempfile.TemporaryDirectory(prefix="angles-") as folder:
         drawn = DrawnFlight(flight, Path(folder) / "shared")
         drawn.write_shared()
         found = {}
-        for method in ("auto", BOUND, FLOOR):
+        for method in ("auto", BOUND, FLOOR, DEPTHS):
             file = None if kept_in is None else kept_in / f"{name}, {detector}, {method}.npz"
             if file is None or not file.is_file():
                 one = _measured(drawn, flight, detector, method, folder)
@@ -152,12 +160,13 @@ def _measured(drawn: DrawnFlight, flight: Flight, detector: str, method: str, fo
     with (
         kept_in_place_of_pictures(flight, detector),
         patch("pipelines.attempt.doubts_of", lambda *_, **__: []),
+        patch("pipelines.attempt.angles_parts", wraps=angles_parts) as written,
     ):
         with locked(session) as writable:
             detect(writable, detector=detector)
             if flight.with_pictures and method == "auto":
                 Following(writable).finish()
-        chosen = METHODS["robust" if method == FLOOR else "auto"]
+        chosen = METHODS["robust" if method in (FLOOR, DEPTHS) else "auto"]
         if method == BOUND:
             chosen = chosen | {"pose_noise": EXACT}
         metrics = reconstruct(session, Settings(**chosen, detector=detector)).metrics
@@ -175,14 +184,58 @@ def _measured(drawn: DrawnFlight, flight: Flight, detector: str, method: str, fo
     at_times = true_joints_at(motion_from(true, joints), t_ns)[:, :1]
     by_bones = np.stack(list(bones.values()), axis=1)
     walked = gait_events(tuple(bones), t_ns, by_bones)
+    value = table["value_deg"].to_numpy(np.float64).reshape(-1, len(ANGLES))
+    if method == DEPTHS:
+        observations, views, result = written.call_args.args
+        seen = at_true_depths(views, result, observations, joints, at_times[:, 0])
+        value = joint_angles(observations.joints, seen[:, None]).value_deg[:, 0]
     return Measured(
-        table["value_deg"].to_numpy(np.float64).reshape(-1, len(ANGLES)),
+        value,
         table["sigma_deg"].to_numpy(np.float64).reshape(-1, len(ANGLES)),
         joint_angles(joints, at_times).value_deg[:, 0],
         joint_angles(tuple(bones), by_bones[:, None]).value_deg[:, 0],
         _gait_figures(metrics["gait"]["0"]),
         None if walked is None else _gait_figures(summary(walked, t_ns, tuple(bones))),
     )
+
+
+def at_true_depths(
+    views: Views,
+    result: Triangulation,
+    observations: Observations,
+    joints: Sequence[str],
+    true: Float,
+) -> Float:
+    """Compute joints [T, J, 3] m of person 0 from their keypoints at the true distances from the cameras.
+
+    Views are averaged by their weights. NaN where no view was used, or the truth does not have the joint.
+
+    Args:
+        views: of all joint-frames, with true poses.
+        result: their triangulation; its inliers are used.
+        observations: of which they are.
+        joints: of the truth.
+        true: [T, joints, 3] m.
+    """
+    times, people, own = observations.confidence.shape[:3]
+    place = np.full((times, own, 3), np.nan)
+    for j, name in enumerate(observations.joints):
+        if name in joints:
+            place[:, j] = true[:, list(joints).index(name)]
+    first = np.arange(times * people * own).reshape(times, people, own)[:, 0]
+    index = views.pose_index[first]
+    rotation = views.rotation[index]
+    away = np.einsum("tjcki,tjck->tjci", rotation, place[:, :, None] - views.position[index])
+    aside = (views.rays[first] - away[..., :2] / away[..., 2:]) * away[..., 2:]
+    error = np.einsum("tjcik,tjck->tjci", rotation[..., :2], aside)
+    used = result.inlier[first] & np.isfinite(error).all(axis=-1)
+    weight = np.where(used, views.weight[first], 0.0)
+    with np.errstate(invalid="ignore"):
+        mean = (
+            np.einsum("tjc,tjci->tji", weight, np.where(used[..., None], error, 0.0))
+            / weight.sum(-1)[..., None]
+        )
+    return np.asarray(place + mean)
 
 
 def _gait_figures(figures: Mapping[str, Any] | None) -> list[float] | None:
@@ -201,7 +254,9 @@ def angles_tables(found: Mapping[str, Mapping[str, Measured]]) -> list[str]:
         columns = [
             index for index, name in enumerate(ANGLES) if name in (part, f"left_{part}", f"right_{part}")
         ]
-        auto, bound, floor = ([each[method] for each in found.values()] for method in ("auto", BOUND, FLOOR))
+        auto, bound, floor, depths = (
+            [each[method] for each in found.values()] for method in ("auto", BOUND, FLOOR, DEPTHS)
+        )
         shares = [float(np.isfinite(one.value[:, columns]).mean()) for one in auto]
         if not sum(shares):
             continue
@@ -221,6 +276,7 @@ def angles_tables(found: Mapping[str, Mapping[str, Measured]]) -> list[str]:
                 rms(bound, "by_joints"),
                 rms(bound, "by_joints", varying=True),
                 rms(floor, "by_joints"),
+                rms(depths, "by_joints"),
                 rms(auto, "by_bones"),
                 rms(auto, "by_bones", varying=True),
                 _percent([_inside(one, columns) for one in auto]),
@@ -234,11 +290,39 @@ def angles_tables(found: Mapping[str, Mapping[str, Measured]]) -> list[str]:
         BOUND,
         "without each flight's mean",
         FLOOR,
+        DEPTHS,
         "against the bones",
         "without each flight's mean",
         "inside 2 sigma % (true joints; ankle: bones)",
     ]
     return [f"{len(found)} flights, one draw of the logs' errors each.", "", *markdown_table(header, rows)]
+
+
+def flexions_table(found: Mapping[str, Mapping[str, Measured]]) -> list[str]:
+    """Write a line for each flight: the RMSE of flexions by `auto`, BOUND, FLOOR and DEPTHS."""
+    rows, missed = [], dict.fromkeys(FLEXIONS, 0)
+    for name, each in found.items():
+        cells = [name]
+        for part in FLEXIONS:
+            columns = [list(ANGLES).index(f"{side}_{part}") for side in SIDES]
+            written = [
+                _rms([_errors(each[method], "by_joints", columns)]) or "-"
+                for method in ("auto", BOUND, FLOOR, DEPTHS)
+            ]
+            missed[part] += written[0] != "-" and float(written[0]) > AIM_DEG
+            cells += [" / ".join(written), _percent([_inside(each["auto"], columns)]).partition(" ")[0]]
+        rows.append(cells)
+    header = ["flight"]
+    for part in FLEXIONS:
+        header += [part, "inside 2 sigma %"]
+    counts = ", ".join(f"{part} in {count}" for part, count in missed.items())
+    return [
+        f"By flight, RMSE deg against the true joints: `auto` / {BOUND} / {FLOOR} / {DEPTHS}. `auto` is above"
+        f" {AIM_DEG:g} deg for {counts} of {len(found)} flights.",
+        "",
+        *markdown_table(header, rows),
+        "",
+    ]
 
 
 def _errors(one: Measured, truth: str, columns: Sequence[int]) -> Float:
@@ -331,7 +415,10 @@ def beside_opensim(session: Path, peer: Path | None) -> list[str]:
         for side in SIDES:
             column = f"{coordinate}_{side[0]}"
             ours, theirs = own[f"{side}_{name}"].to_numpy()[row], solved[column].to_numpy()
-            pair = "" if both is None else f"{np.median(np.abs(theirs - both[column].to_numpy())):.1f}"
+            pair = ""
+            if both is not None:
+                peers = np.interp(solved["time"], both["time"], both[column], left=np.nan, right=np.nan)
+                pair = f"{np.nanmedian(np.abs(theirs - peers)):.1f}"
             cells = [
                 f"{side}_{name}",
                 f"{np.nanmedian(np.abs(ours - theirs)):.1f}",

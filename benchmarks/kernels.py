@@ -1,7 +1,7 @@
 """Processor time that compiling the numerical functions takes, and the list `pipelines/data/kernels.json`.
 
 python -m benchmarks.kernels                       # compiles the list
-python -m benchmarks.kernels SESSION...            # reconstructs and replays with an empty cache
+python -m benchmarks.kernels SESSION...            # simulates, reconstructs and replays with an empty cache
 python -m benchmarks.kernels SESSION... --write    # and makes the list from what was compiled
 
 Functions of ingest and detection, which a session does not run again, keep their entries while they exist.
@@ -21,6 +21,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import yaml
 
 if TYPE_CHECKING:
     from pipelines.precompile import Signatures
@@ -76,12 +78,16 @@ def of_list() -> dict[str, float]:
 
 
 def compiled_by(sessions: list[Path]) -> tuple[dict[str, float], dict[str, list[list[object]]]]:
-    """Reconstruct and replay sessions; return seconds and types of the arguments of all that was compiled."""
+    """Simulate, reconstruct and replay; return seconds and types of the arguments of all that was compiled.
+
+    The simulated flight is the first second of the sample flight, with and without pictures.
+    """
     from numba.core import event
 
     from pipelines.precompile import entry_of
     from pipelines.reconstruct import reconstruct
     from pipelines.replan import replan
+    from pipelines.simulate import example_scenario, simulate
 
     seconds: dict[str, float] = defaultdict(float)
     signatures: dict[str, list[list[object]]] = defaultdict(list)
@@ -100,6 +106,12 @@ def compiled_by(sessions: list[Path]) -> tuple[dict[str, float], dict[str, list[
                 signatures[name].append([entry_of(kind) for kind in event.data["args"]])
 
     event.register("numba:compile", Listener())
+    with tempfile.TemporaryDirectory() as folder:
+        scenario = yaml.safe_load(example_scenario("mound_walk").read_text(encoding="utf-8"))
+        short = Path(folder) / "scenario.yaml"
+        short.write_text(yaml.safe_dump(scenario | {"duration_s": 1}), encoding="utf-8")
+        for video in (False, True):
+            simulate(short, Path(folder) / f"{video}", video=video)
     for session in sessions:
         reconstruct(session, force=True)
         replan(session, force=True)

@@ -1,8 +1,8 @@
 """Compilation of the numerical functions before their first use, so that no command has to wait for it.
 
 numba compiles a function for the types of its arguments. data/kernels.json lists the functions and types that
-reconstruction and replay call (`python -m benchmarks.kernels --write` makes it from a flight). All others are
-compiled at their first use.
+simulation, reconstruction and replay call (`python -m benchmarks.kernels --write` makes it from a flight).
+All others are compiled at their first use.
 
 `python -m pipelines.precompile` compiles them for every processor of a level and puts the code beside the
 program (`compilation.SHIPPED`). From there it goes into the wheel. Where that code does not hold, the first
@@ -91,7 +91,12 @@ def precompile_for(stage: Literal["reconstruct", "replan"], progress: Progress) 
 
     Without it, the stage compiles them one after the other.
     """
-    names = [name for name in listed() if name.startswith("pipelines.planning.") == (stage == "replan")]
+    names = [
+        name
+        for name in listed()
+        if name.startswith("pipelines.planning.") == (stage == "replan")
+        and not name.startswith("pipelines.simulation.")
+    ]
     if 2 * sum(map(is_compiled, names)) >= len(names):  # not all: an outdated one never is
         return
     progress.note("compiling numerical functions for this processor, once")
