@@ -217,7 +217,7 @@ def revision() -> str:
     files = [*(ROOT / "pipelines").rglob("*.py"), *(ROOT / "pipelines").rglob("data/*")]
     files += [Path(__file__), *CORPUS.glob("*.py")]
     digest = sha256()
-    for path in sorted(files):
+    for path in sorted(filter(Path.is_file, files)):  # a folder holds compiled functions
         digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
 
