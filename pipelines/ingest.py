@@ -386,6 +386,7 @@ class _FlightReader:
                     sources=self._logs.settings(actor.log).path,
                     topic=actor.topic,
                     point=actor.point,
+                    weight=actor.weight,
                     count=len(trajectory.t_ns),
                     dropped=trajectory.dropped,
                 )

@@ -68,7 +68,7 @@ from pipelines.simulation.scenario import DetectorErrors
 if TYPE_CHECKING:
     import pandas as pd
 
-REPLAN_STAGE = Stage("replan", revision=5)
+REPLAN_STAGE = Stage("replan", revision=6)
 
 _HEIGHT_M = 1.75  # of the person, for their size in the modelled detector's pictures
 _SKELETON = "reconstruct/skeleton.parquet"
@@ -338,6 +338,7 @@ def fly_and_measure(scene: Scene, errors: DetectorErrors, arm: str, folder: Path
     measured = measure_arm(scene, flown, partial(detect_by_model, joints=joints, errors=errors))
     write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)
     np.save(folder / "known.npy", flown.known)
+    np.save(folder / "aim.npy", flown.aim)
     facts: dict[str, object] = {
         "separation": flown.separation,
         "safety": flown.safety,
@@ -346,7 +347,9 @@ def fly_and_measure(scene: Scene, errors: DetectorErrors, arm: str, folder: Path
     }
     if measured is not None:
         np.save(folder / "error_m.npy", measured.error_m)
-        first = JointMotion(scene.t_ns[scene.pictures], joints, measured.first[:, None])
+        pictures = scene.t_ns[scene.pictures]
+        by_person = measured.first.reshape(len(pictures), len(scene.people), -1, 3)
+        first = JointMotion(pictures, joints, by_person)
         write_table(folder / "skeleton.parquet", motion_table(first), TRUTH)
         write_table(folder / "seen.parquet", seen_joints(scene, flown, measured), SEEN)
         facts |= {"seen_share": measured.seen_share, "joint_frames": measured.joint_frames}
@@ -360,7 +363,13 @@ def read_result(folder: Path) -> ArmResult:
     table = read_table(folder / "trajectories.parquet", REPLAN)
     errors = folder / "error_m.npy"
     return ArmResult(
-        flight=flight_from(table, np.load(folder / "known.npy"), facts["separation"], facts["safety"]),
+        flight=flight_from(
+            table,
+            np.load(folder / "aim.npy"),
+            np.load(folder / "known.npy"),
+            facts["separation"],
+            facts["safety"],
+        ),
         error_m=np.load(errors) if errors.exists() else None,
         seen_share=facts["seen_share"],
         joint_frames=facts["joint_frames"],

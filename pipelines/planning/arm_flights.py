@@ -7,7 +7,7 @@ detector and of the logged poses are random, with the same seeds for every arm o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -19,12 +19,13 @@ from pipelines.geometry.poses import invert, look_at, matrix_from_quaternion, ra
 from pipelines.geometry.triangulation import Views, locate
 from pipelines.planning.arms import Arm
 from pipelines.planning.distance_field import DistanceField, MapsInTurn, looked, visible
-from pipelines.planning.forecast import ActorFilter
+from pipelines.planning.forecast import ActorFilter, PeopleFilter
 from pipelines.planning.formation import TILT, YAW, slot_of
+from pipelines.planning.groups import hidden_by_people, sights
 from pipelines.planning.loading import planned_positions
 from pipelines.planning.replay import Start, replay
 from pipelines.planning.scene import Scene
-from pipelines.planning.scores import predicted_errors, seen_actor
+from pipelines.planning.scores import errors_of_views
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,6 +51,7 @@ class ArmFlight:
     position: Float  # [N, T, 3] m, world
     quaternion_xyzw: Float  # [N, T, 4] world_from_camera
     slots: Float  # [N, T, 3] commanded yaw (rad, continuous), tilt (rad), range (m); NaN for `flown`
+    aim: Float  # [N, T, P] shares of people in the place that each camera films
     known: Bool  # [N, T] False where a log has a gap and the position goes straight on
     separation: dict[str, int]  # local plans by `Separation`; empty for logged arms
     safety: dict[str, int]  # local plannings by `guard.Flown`; likewise
@@ -66,26 +68,52 @@ def logged_arm(scene: Scene, name: str) -> ArmFlight:
     if name == FLOWN:
         position, quaternion, known = scene.flown
         names = tuple(camera.name for camera in scene.flight.cameras)
-        return ArmFlight(names, position, quaternion, np.full_like(position, np.nan), known, {}, {})
+        slots = np.full_like(position, np.nan)
+        return ArmFlight(names, position, quaternion, slots, _on_the_middle(scene, known), known, {}, {})
     position, known = planned_positions(scene.flight, scene.t_ns)
     estimates = _estimates(scene)
     slots = slot_of(position - estimates)
     slots[..., YAW] = np.unwrap(slots[..., YAW], axis=1)
+    aim = _on_the_middle(scene, known)
     return ArmFlight(
-        tuple(scene.flight.planned), position, look_at(position, estimates), slots, known, {}, {}
+        tuple(scene.flight.planned), position, look_at(position, estimates), slots, aim, known, {}, {}
     )
+
+
+def _on_the_middle(scene: Scene, known: Bool) -> Float:
+    """Return the aim [N, T, P] of cameras that film the weighted middle."""
+    return np.broadcast_to(scene.weights, (*known.shape, len(scene.weights)))
+
+
+def aimed_at(scene: Scene, flown: ArmFlight) -> Float:
+    """Compute the places [N, T, 3] that the cameras film, by the reference of the scores."""
+    places: Float = np.einsum("ntp,ptx->ntx", flown.aim, scene.people)
+    return places
+
+
+def seen_people(scene: Scene, flown: ArmFlight) -> Bool:
+    """Test [P, N, T] who is seen from which camera."""
+    return sights(flown.position, looks_rad(flown), scene.people, scene.maps, scene.config)
+
+
+def looks_rad(flown: ArmFlight) -> Float:
+    """Compute the yaw [N, T] of the optical axes from east."""
+    axis = matrix_from_quaternion(flown.quaternion_xyzw)[..., 2]
+    yaw: Float = np.arctan2(axis[..., 1], axis[..., 0])
+    return yaw
 
 
 def _estimates(scene: Scene) -> Float:
     """Estimate the actor's positions [T, 3] as planners do, from no later measurement."""
     flight, config = scene.flight, scene.config
-    actor = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
+    each = [ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m) for _ in scene.people]
+    actor, known = PeopleFilter(each, scene.weights), np.isfinite(flight.actor[..., 0])
     log_s = (flight.actor_t_ns - flight.actor_t_ns[0]) / 1e9
     until = np.searchsorted(flight.actor_t_ns, scene.t_ns, side="right")
     found, taken = np.empty((len(scene.t_ns), 3)), 0
     for k, t_s in enumerate((scene.t_ns - flight.actor_t_ns[0]) / 1e9):
-        for row in range(taken, until[k]):
-            actor.measure(log_s[row], flight.actor[row])
+        for row, person in np.argwhere(known[taken : until[k]]):
+            actor.measure(log_s[taken + row], flight.actor[taken + row, person], person)
         taken = int(until[k])
         found[k] = actor.forecast(np.array([t_s]))[0]
     return found
@@ -103,12 +131,14 @@ def fly_arm(scene: Scene, arm: Arm, *, foresight: bool = False) -> ArmFlight:
         mode=scene.settings.mode,
         seed=scene.settings.seed,
         foresight=foresight,
+        weights=scene.flight.weights,
     )
     return ArmFlight(
         names=tuple(scene.names),
         position=done.position,
         quaternion_xyzw=done.quaternion_xyzw,
         slots=done.slots,
+        aim=done.aim,
         known=np.ones(done.position.shape[:2], dtype=np.bool_),
         separation=done.separation,
         safety=done.safety,
@@ -118,7 +148,10 @@ def fly_arm(scene: Scene, arm: Arm, *, foresight: bool = False) -> ArmFlight:
 
 
 def measure_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | None:
-    """Simulate what an arm's cameras measure of the actor's skeleton; None without a skeleton."""
+    """Simulate what an arm's cameras measure of everybody's skeleton; None without a skeleton.
+
+    It is known which keypoints belong to whom.
+    """
     if scene.joints is None:
         return None
     cameras = scene.flight.cameras
@@ -135,14 +168,19 @@ def measure_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | No
         joints=scene.joints,
         middle=scene.actor[pictures],
     )
-    return measure(
-        paths,
-        scene.maps_at(paths.t_ns),
-        detect,
-        start_m=scene.config.sight_start_m,
-        trials=scene.settings.trials,
-        seed=scene.settings.seed,
-    )
+    people, each = scene.people[:, pictures], np.split(scene.joints, len(scene.people), axis=1)
+    found = [
+        measure(
+            replace(paths, joints=each[p], middle=people[p], person=p, others=np.delete(people, p, axis=0)),
+            scene.maps_at(paths.t_ns),
+            detect,
+            start_m=scene.config.sight_start_m,
+            trials=scene.settings.trials,
+            seed=scene.settings.seed,
+        )
+        for p in range(len(people))
+    ]
+    return joined(found)
 
 
 def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
@@ -151,8 +189,8 @@ def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
 
     count, times = flown.position.shape[:2]
     position, slots = _rows(flown.position), _rows(flown.slots)
-    error = predicted_errors(flown.position, scene.actor, scene.maps, scene.config)
-    seen = seen_actor(flown.position, scene.actor, scene.maps, scene.config)
+    seen = seen_people(scene, flown)
+    error = errors_of_views(flown.position, scene.people, seen, scene.config).mean(axis=0)
     table = pd.DataFrame(
         {
             "t_ns": np.repeat(scene.t_ns, count),
@@ -163,24 +201,25 @@ def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
     table[_QUATERNION] = _rows(flown.quaternion_xyzw)
     table["formation_yaw_rad"] = np.repeat(flown.slots[0, :, 0], count)
     table[_SLOT] = slots
-    table["tilt_rad"] = _rows(slot_of(flown.position - scene.actor))[:, TILT]
-    table["visible"] = seen.T.ravel()
+    table["tilt_rad"] = _rows(slot_of(flown.position - aimed_at(scene, flown)))[:, TILT]
+    table["visible"] = seen.any(axis=0).T.ravel()
     table["predicted_error_m"] = np.repeat(np.where(np.isfinite(error), error, np.nan), count)
     return table
 
 
 def seen_joints(scene: Scene, flown: ArmFlight, measured: Measured) -> pd.DataFrame:
-    """Return the rows of `tables.SEEN`: the skeleton once a second, as seen by each camera."""
+    """Return the rows of `tables.SEEN`: the first person's joints once a second, as seen by each camera."""
     import pandas as pd
 
     if scene.joints is None or scene.flight.skeleton is None:
         raise ValueError("the scene has no skeleton")
     t_s, t_ns = scene.t_s[scene.pictures], scene.t_ns[scene.pictures]
     looks = np.unique(np.searchsorted(t_s, np.arange(0.0, t_s[-1] + 1e-9, _LOOK_EVERY_S) - 1e-9))
-    pixels, free = (values[:, looks].swapaxes(0, 1) for values in (measured.pixels, measured.free))
+    first = slice(len(scene.flight.skeleton.joints))
+    pixels, free = (values[:, looks, first].swapaxes(0, 1) for values in (measured.pixels, measured.free))
     status = np.where(np.isnan(pixels[..., 0]), "outside", np.where(free, "seen", "hidden"))  # [K, N, J]
     logged = flown.known[:, scene.pictures][:, looks].T
-    known = np.isfinite(scene.joints[looks, :, 0])[:, None] & logged[..., None]
+    known = np.isfinite(scene.joints[looks, first, 0])[:, None] & logged[..., None]
     time, camera, joint = np.nonzero(known)
     return pd.DataFrame(
         {
@@ -195,11 +234,12 @@ def seen_joints(scene: Scene, flown: ArmFlight, measured: Measured) -> pd.DataFr
 
 
 def flight_from(
-    table: pd.DataFrame, known: Bool, separation: dict[str, int], safety: dict[str, int]
+    table: pd.DataFrame, aim: Float, known: Bool, separation: dict[str, int], safety: dict[str, int]
 ) -> ArmFlight:
     """Rebuild the flight that `trajectories` stored."""
     names, position, quaternion = poses_from(table)
-    return ArmFlight(names, position, quaternion, _dense(table, _SLOT, len(names)), known, separation, safety)
+    slots = _dense(table, _SLOT, len(names))
+    return ArmFlight(names, position, quaternion, slots, aim, known, separation, safety)
 
 
 def poses_from(table: pd.DataFrame) -> tuple[tuple[str, ...], Float, Float]:
@@ -259,6 +299,8 @@ class CameraPaths:
     noise: Sequence[Sequence[NoiseModel]]
     joints: Float  # [T, J, 3] m, world; NaN where unknown
     middle: Float  # [T, 3] m, world, of the person
+    person: int = 0  # number, for draws of their own
+    others: Float | None = None  # [Q, T, 3] m, world: hips of others, who can stand in the way
 
 
 @dataclass(frozen=True)
@@ -297,6 +339,9 @@ def measure(
         lambda field, rows: visible(field, paths.position[:, rows, None], standing_in[rows], start_m=start_m),
         axis=1,
     )
+    if paths.others is not None and len(paths.others):
+        eyes, others = paths.position[:, :, None], paths.others[:, None, :, None]
+        free &= ~hidden_by_people(eyes, standing_in, others)
     sigma = np.stack([_pose_sigma(paths, i) for i in range(cameras)], axis=1)
     error = np.full((trials, times, count), np.nan, dtype=np.float32)
     first = np.full(joints.shape, np.nan)
@@ -311,6 +356,8 @@ def measure(
                 paths.noise[i], paths.t_ns, path, paths.quaternion_xyzw[i], rng
             )
             logged_rotation[:, i] = matrix_from_quaternion(turned)
+            if paths.person:
+                rng = np.random.default_rng([seed, trial, i, paths.person])
             xy, confidence = detect(pixels[i], free[i], path, paths.middle, _focal(lens), rng)
             rays[:, :, i] = undistort(xy, lens)
             weight[:, :, i] = np.where(confidence >= MIN_CONFIDENCE, confidence, 0.0)
@@ -333,6 +380,20 @@ def measure(
     total = cameras * int(known.sum())
     seen_share = float((seen & known).sum() / total) if total else 0.0
     return Measured(error, first, seen_share, int(known.sum()), pixels, free)
+
+
+def joined(people: Sequence[Measured]) -> Measured:
+    """Join what was measured of several people: their joints in a row."""
+    frames = [person.joint_frames for person in people]
+    seen = sum(person.seen_share * count for person, count in zip(people, frames, strict=True))
+    return Measured(
+        error_m=np.concatenate([person.error_m for person in people], axis=2),
+        first=np.concatenate([person.first for person in people], axis=1),
+        seen_share=seen / sum(frames) if sum(frames) else 0.0,
+        joint_frames=sum(frames),
+        pixels=np.concatenate([person.pixels for person in people], axis=2),
+        free=np.concatenate([person.free for person in people], axis=2),
+    )
 
 
 def _pixels(paths: CameraPaths, i: int) -> Float:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.distance_field import DistanceField, visible
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import (
     RANGE,
@@ -20,11 +20,14 @@ from pipelines.planning.formation import (
     YAW,
     FormationPath,
     formation_slots,
+    slot_of,
     slot_offsets,
     wrapped,
     yaw_set,
 )
+from pipelines.planning.groups import Choice, Worth, hidden_by_people, in_view, plan_in_turn
 from pipelines.planning.information import log_determinant, ray_information
+from pipelines.planning.scores import coverage, view_quality
 from pipelines.planning.search import (
     TOO_NEAR,
     Formations,
@@ -48,6 +51,7 @@ from pipelines.session.registries import Registry
 _TILTS_DEG = (-10.0, 85.0)
 _TRIANGLE = np.triu_indices(3)
 _JOINT_EVERY_S = 0.5 - 1e-6  # between two plans of `joint`: slots move little meanwhile
+_ASIDE_M = 1.0  # slots of `group` are so much farther from everybody than drones have to be
 _W_HIDDEN = 0.3  # price of a hidden view, beyond that of its occupied share and of the information lost
 
 
@@ -118,12 +122,22 @@ class _JointArm:
         return _Joint(config, drones, yaw_rad)
 
 
+@dataclass(frozen=True)
+class _GroupArm:
+    name: str = "group"
+    title: str = "several people, each drone films whom the others miss"
+
+    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
+        return _Group(config, drones, yaw_rad)
+
+
 PLANNER_ARMS: Registry[Arm] = Registry("mocap.planner_arms", "planner arm")
 FIXED: Arm = _FixedArm()
 ADAPTIVE: Arm = _SearchingArm("adaptive", "adaptive formation")
 COVARIANCE: Arm = _SearchingArm("covariance", "adaptive formation, predicted error", predicts_error=True)
 GREEDY: Arm = _GreedyArm()
 JOINT: Arm = _JointArm()
+GROUP: Arm = _GroupArm()
 
 
 class _Fixed:
@@ -242,7 +256,7 @@ class _Joint:
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
         _, tilt_step, range_step = np.array(config.slot_rates) * config.knot_s
-        neighbour = 4 if drones == 2 else drones  # so many neighbours fill a turn: their yaws are in the set
+        neighbour = _in_a_turn(drones)
         self._yaws = max(round(config.yaws / neighbour), 1) * neighbour
         tilts = np.clip(config.tilt_rad + tilt_step * np.arange(-1, 2), *np.radians(_TILTS_DEG))
         ranges = _steps_through(config.radius_m, (*config.ranges_m, config.radius_m), range_step)
@@ -283,6 +297,130 @@ class _Joint:
         by_yaw = values.reshape(len(values), self._yaws, -1)
         mean: Float = ((np.roll(by_yaw, 1, axis=1) + np.roll(by_yaw, -1, axis=1)) / 2.0).reshape(values.shape)
         return mean
+
+
+class _Group:
+    """Planner for several people: for each drone its yaw, and whom it films.
+
+    A drone films one person or the weighted middle of all, from the tilt and range of the settings. All
+    drones maximise the worth of their views together (`groups.Worth`): for each person, by weight, the
+    information on a joint, as `greedy`, and the view quality, in units of a face seen straight from that
+    range. It plans twice a second.
+    """
+
+    def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
+        neighbour = _in_a_turn(drones)
+        yaws = yaw_set(max(round(config.yaws / neighbour), 1) * neighbour, yaw_rad)
+        states = _all_states(yaws, np.array([config.tilt_rad]), np.array([config.radius_m]))
+        self._lattice = lattice(
+            states, rates=np.array(config.slot_rates), knot_s=config.knot_s, w_turn=config.w_turn
+        )
+        self._config, self._rates = config, np.array(config.slot_rates)
+        self._aims: list[Float] | None = None  # [P] of each drone
+        self._path: FormationPath | None = None
+
+    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
+        if self._path is None or t_s - self._path.knot_s[0] >= _JOINT_EVERY_S:
+            self._path = self._planned(t_s, commanded, actor, field)
+        return self._path
+
+    def _planned(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
+        config = self._config
+        people = actor.position[None] if actor.people is None else actor.people  # [P, T, 3]
+        weight = np.ones(len(people)) if actor.weight is None else actor.weight
+        shares = weight / weight.sum()
+        aims = [*np.eye(len(people))[weight > 0.0], *([shares] if len(people) > 1 else [])]
+        views = [self._views(aim, people, actor.heading_rad, field) for aim in aims]
+        choices, kept = [], []
+        for slot, before in zip(commanded, self._aims or [shares] * len(commanded), strict=True):
+            place = before @ people[:, 0] + slot_offsets(_from_east(slot, actor.heading_rad[:1])[0])
+            kept.append([np.array_equal(aim, before) for aim in aims])
+            choices.append(
+                [
+                    view._replace(start=slot)
+                    if same
+                    else self._from_elsewhere(view, place, aim @ people[:, 0], actor)
+                    for aim, view, same in zip(aims, views, kept[-1], strict=True)
+                ]
+            )
+        face = float(view_quality(np.eye(1, 7) / config.radius_m**2, np.ones(1)))
+        paths = plan_in_turn(
+            choices,
+            Worth(
+                len(people) * shares,
+                config.w_error / face,
+                config.w_error,
+                config.prior_sigma_m**-2,
+                config.soft_separation_m,
+            ),
+        )
+        self._aims = [aims[choice] for choice, _ in paths]
+        slots = self._lattice.states[np.stack([path for _, path in paths], axis=1)]  # [T, n, 3]
+        stays = np.array([own[choice] for own, (choice, _) in zip(kept, paths, strict=True)])
+        through = _through(np.where(stays[:, None], commanded, slots[0]), slots)
+        return FormationPath(_knots(t_s, through, self._lattice), through, self._rates, np.stack(self._aims))
+
+    def _views(self, aim: Float, people: Float, heading_rad: Float, field: DistanceField) -> Choice:
+        """Compute prices and views of all slots about a place among people [P, T, 3]."""
+        config = self._config
+        place = aim @ people.swapaxes(0, 1)  # [T, 3]
+        slots = _from_east(self._lattice.states, heading_rad)  # [T, S, 3]
+        position, looks_rad = place[:, None] + slot_offsets(slots), slots[..., YAW] + np.pi
+        at_knots = people.swapaxes(0, 1)[:, None]  # [T, 1, P, 3]
+        eyes = position[:, :, None]
+        seen = visible(field, eyes, at_knots, start_m=config.sight_start_m)
+        if len(people) > 1:
+            seen &= in_view(eyes, looks_rad[..., None], at_knots, config.errors.fov_rad)
+            for p in range(len(people)):
+                others = np.delete(people, p, axis=0)[:, :, None]
+                seen[..., p] &= ~hidden_by_people(position, at_knots[:, :, p], others)
+        covered = coverage(
+            position, looks_rad, at_knots, np.zeros(at_knots.shape[:-1]), fov_rad=config.errors.fov_rad
+        )
+        offset = eyes - at_knots
+        costs = costs_in_frame(field, Forecast(place, heading_rad), self._lattice.states[:, None], config)
+        near = np.linalg.norm(offset, axis=-1).min(axis=-1) < config.actor_distance_m + _ASIDE_M
+        return Choice(
+            lattice=self._lattice,
+            start=self._lattice.states[0],
+            price=cost_map(costs, config) + np.where(near, TOO_NEAR, 0.0),
+            position=position,
+            covered=covered * seen[..., None],
+            information=ray_information(offset, config.errors) * seen[..., None, None],
+        )
+
+    def _from_elsewhere(self, view: Choice, place: Float, about: Float, actor: Forecast) -> Choice:
+        """Return the views of a drone that begins to film somebody else: none before it can have arrived.
+
+        It flies there from `place` [3] at its limits of acceleration and speed, from rest to rest.
+        """
+        config = self._config
+        way = np.linalg.norm(view.position - place, axis=-1)
+        most_m = config.speed_mps**2 / config.acceleration_mps2
+        takes_s = np.where(
+            way < most_m,
+            2.0 * np.sqrt(way / config.acceleration_mps2),
+            (way + most_m) / config.speed_mps,
+        )
+        there = takes_s <= config.knot_s * np.arange(1, len(way) + 1)[:, None]
+        start = _from_east(slot_of(place - about), -actor.heading_rad[:1])[0]
+        return view._replace(
+            start=start,
+            covered=view.covered * there[..., None, None],
+            information=None if view.information is None else view.information * there[..., None, None, None],
+        )
+
+
+def _from_east(slots: Float, heading_rad: Float) -> Float:
+    """Return slots [..., 3] whose yaws count from headings [T] with yaws from east, [T, ..., 3]."""
+    found = np.repeat(slots[None], len(heading_rad), axis=0)
+    found[..., YAW] += heading_rad.reshape(-1, *[1] * (slots.ndim - 1))
+    return found
+
+
+def _in_a_turn(drones: int) -> int:
+    """Return how many neighbours of a formation fill a turn: so many equal parts of it hold their yaws."""
+    return 4 if drones == 2 else drones
 
 
 def _steps_through(start: float, reached: Sequence[float], step: float) -> Float:

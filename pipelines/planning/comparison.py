@@ -12,11 +12,12 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Float32, Int64
 from pipelines.geometry.bootstrap import LEVEL, STRETCH_S, intervals
-from pipelines.planning.arm_flights import LOGGED, ArmFlight
+from pipelines.planning.arm_flights import LOGGED, ArmFlight, aimed_at, looks_rad, seen_people
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.scene import Scene
-from pipelines.planning.scores import score, seen_actor
+from pipelines.planning.scores import blind_s, score, view_quality
+from pipelines.planning.scores import coverage as viewed
 
 REFERENCE = "fixed"
 """Arm that the others are compared with; the first arm where it is missing."""
@@ -183,7 +184,17 @@ def measure_alone(scene: Scene, name: str, result: ArmResult) -> dict[str, Any]:
 
 def _scores(scene: Scene, name: str, result: ArmResult, shared: Bool | None) -> dict[str, Any]:
     flown = result.flight
-    found = score(scene.t_s, flown.position, scene.actor, scene.maps, scene.config, near=scene.near)
+    seen = seen_people(scene, flown)
+    found = score(
+        scene.t_s,
+        flown.position,
+        aimed_at(scene, flown),
+        scene.maps,
+        scene.config,
+        near=scene.near,
+        people=scene.people,
+        seen=seen,
+    )
     own, common, covered = _errors(scene, result, shared)
     return {
         **found,
@@ -201,7 +212,48 @@ def _scores(scene: Scene, name: str, result: ArmResult, shared: Bool | None) -> 
             "seen_share": result.seen_share,
             "joint_frames": result.joint_frames,
         },
+        **_by_person(scene, result, seen, shared),
     }
+
+
+def _by_person(scene: Scene, result: ArmResult, seen: Bool, shared: Bool | None) -> dict[str, Any]:
+    """Compute the view quality over all people, and of several people the figures of each.
+
+    View quality is a mean over time; that over all people is the sum by weight.
+    """
+    flown, people = result.flight, scene.people
+    covered = viewed(
+        flown.position,
+        looks_rad(flown),
+        people.swapaxes(0, 1),
+        np.zeros(people.shape[1::-1]),
+        fov_rad=scene.config.errors.fov_rad,
+    )
+    covered = (covered * seen.transpose(1, 2, 0)[..., None]).sum(axis=0)  # [T, P, 7]
+    each = [float(view_quality(covered[:, [p]], np.ones(1)).mean()) for p in range(len(people))]
+    over_all = {"view_quality": float(scene.weights @ each)}
+    if len(people) == 1:
+        return over_all
+    by_person: dict[str, Any] = {}
+    for p, name in enumerate(scene.flight.people):
+        figures = by_person[name] = {
+            "weight": float(scene.flight.weights[p]),
+            "occluded_share": float(1.0 - seen[p].mean()),
+            "blind_s": blind_s(scene.t_s, seen[p : p + 1]),
+            "view_quality": each[p],
+        }
+        if result.error_m is None or shared is None or scene.joints is None:
+            continue
+        joints = result.error_m.shape[2] // len(people)
+        own = slice(p * joints, (p + 1) * joints)
+        error, frames = result.error_m[:, :, own], int(np.isfinite(scene.joints[:, own, 0]).sum())
+        seed = scene.settings.seed
+        figures |= {
+            "mpjpe_mm": _json(mean_of_trials(mpjpe_mm(error, shared[:, :, own]), seed)),
+            "coverage": _json(mean_of_trials(coverage(error, frames), seed)),
+            "pck150": _json(mean_of_trials(pck(error, frames), seed)),
+        }
+    return over_all | {"by_person": by_person}
 
 
 def _errors(
@@ -275,12 +327,13 @@ def _over_flights(scene: Scene, one: Float32, other: Float32, both: Bool) -> dic
 
 
 def _tilt_deg(scene: Scene, flown: ArmFlight) -> Float:
-    tilt_deg: Float = np.degrees(slot_of(flown.position - scene.actor)[..., TILT])
+    tilt_deg: Float = np.degrees(slot_of(flown.position - aimed_at(scene, flown))[..., TILT])
     return tilt_deg
 
 
 def _hidden(scene: Scene, flown: ArmFlight) -> Float:
-    return np.where(seen_actor(flown.position, scene.actor, scene.maps, scene.config), 0.0, 1.0)
+    hidden: Float = 1.0 - seen_people(scene, flown).mean(axis=0)
+    return hidden
 
 
 def _best(

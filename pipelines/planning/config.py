@@ -33,7 +33,7 @@ _MOST = {
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """Errors of cameras for the ray model: those of the poses, and of a detector by tilt.
+    """Cameras for the ray model: errors of the poses and, by tilt, of a detector; and the field of view.
 
     A replay takes them from its session (`scene.build_scene`). The defaults are logs of usual drones, and
     BlazePose as `simulation/data/blazepose_errors.csv` has it.
@@ -44,6 +44,7 @@ class ErrorModel:
     tilts_deg: tuple[float, ...] = (-0.4, 14.1, 28.9, 43.9, 59.3)  # constant beyond the ends
     keypoint_sigma_m: tuple[float, ...] = (0.0198, 0.0202, 0.0247, 0.0314, 0.0386)  # per axis, at the person
     placed_share: tuple[float, ...] = (0.990, 0.988, 0.973, 0.954, 0.842)  # of joints that are found
+    fov_rad: float = math.pi / 3  # level field of view
 
 
 @dataclass(frozen=True)

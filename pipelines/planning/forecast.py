@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.planning.config import PlannerConfig
 
 _FIRST_SPEED_MPS = 3.0  # standard deviation per axis before a second measurement: people run
 
 
 class Forecast(NamedTuple):
-    """The actor at the T knots of a plan."""
+    """The actor at the T knots of a plan; of several people their weighted middle, and each of the P."""
 
     position: Float  # [T, 3] metres, world
     heading_rad: Float  # [T] zero of yaws, counterclockwise from east: 0 in the world frame
+    people: Float | None = None  # [P, T, 3] metres, world; None: the actor alone
+    weight: Float | None = None  # [P]; None: all alike
 
     def each(self, every: int) -> Forecast:
         """Return every so many knots, at least the last one."""
         rows = slice(every - 1, None, every) if len(self.position) >= every else slice(-1, None)
-        return Forecast(self.position[rows], self.heading_rad[rows])
+        people = None if self.people is None else self.people[:, rows]
+        return Forecast(self.position[rows], self.heading_rad[rows], people, self.weight)
 
 
 class ActorFilter:
@@ -83,6 +87,10 @@ class ActorFilter:
         where: Float = self._state[0] + ahead[:, None] * self._state[1]
         return where
 
+    def each(self, t_s: Float) -> Float:
+        """Forecast everybody whom the filter follows, [1, T, 3]; see `PeopleFilter`."""
+        return self.forecast(t_s)[None]
+
     def _predicted(self, t_s: float) -> tuple[Float, Float]:
         if self._t_s is None:
             raise ValueError("nothing was measured yet")
@@ -117,6 +125,47 @@ class Foresight(ActorFilter):
         known = np.stack([np.interp(t_s, times_s, way[:, axis]) for axis in range(3)], axis=-1)
         where: Float = known + np.maximum(t_s - times_s[-1], 0.0)[:, None] * self._last_mps
         return where
+
+
+class PeopleFilter:
+    """Estimates of several people, each with a filter; as one actor they are their weighted middle.
+
+    Args:
+        filters: of person 0, 1, ...
+        weight: [P] not negative, one of them above 0.
+    """
+
+    def __init__(self, filters: Sequence[ActorFilter], weight: Float) -> None:
+        self._filters, self._weight = tuple(filters), weight / weight.sum()
+
+    def measure(self, t_s: float, position: Float, person: int = 0) -> None:
+        """Update with a measured position [3] of a person; see `ActorFilter.measure`."""
+        self._filters[person].measure(t_s, position)
+
+    def at(self, t_s: float) -> tuple[Float, Float, Float]:
+        """Predict the state of the middle; errors of people are independent. See `ActorFilter.at`."""
+        position, velocity, covariance = zip(*(each.at(t_s) for each in self._filters), strict=True)
+        middle, moving = (np.tensordot(self._weight, np.stack(part), 1) for part in (position, velocity))
+        return middle, moving, np.tensordot(self._weight**2, np.stack(covariance), 1)
+
+    def forecast(self, t_s: Float) -> Float:
+        """Forecast the middle [T, 3]; see `ActorFilter.forecast`."""
+        middle: Float = np.tensordot(self._weight, self.each(t_s), 1)
+        return middle
+
+    def each(self, t_s: Float) -> Float:
+        """Forecast every person, [P, T, 3]."""
+        return np.stack([each.forecast(t_s) for each in self._filters])
+
+
+def positions_at(t_ns: Int64, people: Float, at_ns: Int64) -> Float:
+    """Interpolate measured positions [A, P, 3] of people, NaN where somebody was not measured: [P, T, 3]."""
+    found = np.empty((people.shape[1], len(at_ns), 3))
+    for p in range(people.shape[1]):
+        own = np.isfinite(people[:, p]).all(axis=1)
+        for axis in range(3):
+            found[p, :, axis] = np.interp(at_ns, t_ns[own], people[own, p, axis])
+    return found
 
 
 _SURE = 3.0  # standard deviations of the speed; its direction is used only above

@@ -71,6 +71,7 @@ class FormationPath:
     knot_s: Float  # [K + 1] the first is the time of planning
     slots: Float  # [K + 1, n, 3] the first are those commanded then; yaw is continuous
     rates: Float  # [3] rad/s, rad/s, m/s
+    aim: Float | None = None  # [n, P] shares of people in the place that each camera films; None: the middle
 
     def at(self, t_s: Float) -> Float:
         """Return commanded slots [T, n, 3] at times [T]; constant before the first knot and after the last.

@@ -21,7 +21,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, Grid, barred, zone_distances
-from pipelines.planning.forecast import ActorFilter
+from pipelines.planning.forecast import ActorFilter, PeopleFilter
 from pipelines.planning.tracking import (
     POSITION,
     VELOCITY,
@@ -60,7 +60,7 @@ class _Around(NamedTuple):
 
     field: DistanceField
     others: Float  # [M, K + 1, 3] m, committed positions of the other drones
-    actor: Float  # [K + 1, 3] m, forecast of the actor
+    people: Float  # [P, K + 1, 3] m, forecast of the actor, or of everybody who is filmed
 
 
 @dataclass(frozen=True)
@@ -113,13 +113,15 @@ class Guard:
         """Return the motion of each drone from now on, [K, 4, 3], which ends at rest."""
         return [states[age:] for states, age in zip(self._states, self._age, strict=True)]
 
-    def admit(self, drone: int, t_s: float, plan: Plan, actor: ActorFilter, field: DistanceField) -> Plan:
+    def admit(
+        self, drone: int, t_s: float, plan: Plan, actor: ActorFilter | PeopleFilter, field: DistanceField
+    ) -> Plan:
         """Commit a drone to the best safe motion, and return the plan that is flown.
 
         `plan` is the local planner's, from the drone's place and now.
         """
         after_s = self._flying.period_s * np.arange(self._states.shape[1], dtype=np.float64)
-        around = _Around(field, self._others(drone), actor.forecast(t_s + after_s))
+        around = _Around(field, self._others(drone), actor.each(t_s + after_s))
         least = self._least(self._states[drone, self._age[drone], POSITION], around)
         tried = []
         for motion in self._motions(drone, t_s, plan, around):
@@ -151,7 +153,7 @@ class Guard:
         now = (
             float(around.field.sample(place)[0]),
             float(np.linalg.norm(around.others[:, 0] - place, axis=-1).min(initial=np.inf)),
-            float(np.linalg.norm(around.actor[0] - place)),
+            float(np.linalg.norm(around.people[:, 0] - place, axis=-1).min()),
         )
         # The actor's estimate errs by about the log's noise.
         stated = (
@@ -208,9 +210,11 @@ class Guard:
     def _ways_out(self, here: Float, around: _Around) -> list[tuple[Flown, Float]]:
         """Return velocities for ways out.
 
-        They go up, up and off the nearest obstacle, or away from the actor, faster than the actor.
+        They go up, up and off the nearest obstacle, or away from the actor, faster than the actor. Of several
+        people the nearest one counts.
         """
-        actor, place = around.actor, here[POSITION]
+        place = here[POSITION]
+        actor = around.people[np.linalg.norm(around.people[:, 0] - place, axis=-1).argmin()]
         up = np.array([0.0, 0.0, _CLIMB_MPS])
         level = around.field.sample(place)[1] * [1.0, 1.0, 0.0]
         off = level / max(float(np.linalg.norm(level)), 1e-9) * _ASIDE_MPS
@@ -234,14 +238,14 @@ class Guard:
         """
         apart = np.linalg.norm(around.others - states[:, POSITION], axis=-1).min(initial=np.inf)
         rows = slice(0, self._ticks_ahead + 1)
-        place, actor = ahead[rows, POSITION], around.actor[rows]
+        place, people = ahead[rows, POSITION], around.people[:, rows]
         return _Motion(
             kind,
             plan,
             states,
             least_clearance(around.field.grid, states, stopped, self._flying.period_s),
             float(apart),
-            float(np.linalg.norm([actor - place, actor[0] - place], axis=-1).min()),
+            float(np.linalg.norm([people - place, people[:, :1] - place], axis=-1).min()),
         )
 
     def _steered(self, t_s: float, here: Float, velocity: Float) -> Plan:

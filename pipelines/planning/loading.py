@@ -11,10 +11,11 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel, White
 from pipelines.geometry.poses import gaps, interpolate_points
+from pipelines.planning.forecast import positions_at
 from pipelines.session.camera_poses import COMMAND_LINE, known_variances, poses_at, stated_models
 from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.errors import DataError
-from pipelines.session.people import logged_actor
+from pipelines.session.people import logged_people
 from pipelines.session.records import JointMotion, Trajectory
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.tables import (
@@ -37,6 +38,8 @@ _GAP_NS = 1_000_000_000  # longer gaps of the actor's measurements give a warnin
 _COMMAND_HOLDS_NS = 2_000_000_000  # longest time for which a command holds; planners send several a second
 _SHORTEST_S = 1.0
 _HIPS = ("left_hip", "right_hip")
+_FAR_M = 1e6
+_LEAST_SHARE = 0.5  # of the first person's times: others who are reconstructed less are not filmed again
 
 
 @dataclass(frozen=True)
@@ -55,17 +58,21 @@ class LoggedFlight:
     """The logged flight, as far as the session knows it."""
 
     actor_t_ns: Int64  # [A] ascending
-    actor: Float  # [A, 3] m, world: input of the planners, the middle of the hips
+    actor: Float  # [A, P, 3] m, world: input of the planners, the middle of the hips; NaN: not measured then
     actor_source: Source
-    hips: JointMotion | None  # the true hips, [T, 1, 1, 3], NaN where unknown; None without truth
-    skeleton: JointMotion | None  # [T, 1, J, 3] of the first person, NaN where unknown
+    hips: JointMotion | None  # the true hips, [T, P, 1, 3], NaN where unknown; None without truth
+    skeleton: JointMotion | None  # [T, P, J, 3] NaN where unknown
     skeleton_source: Source | None
     cameras: tuple[SessionCamera, ...]
     poses_source: Source
     noise_source: str  # source of the poses' noise
     warnings: tuple[str, ...]
     planned: dict[str, tuple[Int64, Float]] = field(default_factory=dict)
-    """Positions to which cameras were sent: stamps [P] and [P, 3] m, world."""
+    """Positions to which cameras were sent: stamps [K] and [K, 3] m, world."""
+    people: tuple[str, ...] = ("",)
+    """Names of the P people; the only one may have none."""
+    weights: tuple[float, ...] = (1.0,)
+    """Weights of the P people."""
 
     @property
     def moves(self) -> bool:
@@ -73,16 +80,15 @@ class LoggedFlight:
         return not all(camera.static for camera in self.cameras)
 
     def scored_actor(self, t_ns: Int64) -> tuple[Float, Source]:
-        """Return the actor's positions [T, 3] to score against.
+        """Return the positions [P, T, 3] of the people to score against.
 
         These are the true hips if they are known all the time.
         """
         if self.hips is not None:
-            true_hips = points_at(self.hips, t_ns)[:, 0]
+            true_hips = points_at(self.hips, t_ns)[:, :, 0]
             if np.isfinite(true_hips).all():
-                return true_hips, "truth"
-        axes = [np.interp(t_ns, self.actor_t_ns, self.actor[:, axis]) for axis in range(3)]
-        return np.stack(axes, axis=-1), self.actor_source
+                return true_hips.swapaxes(0, 1), "truth"
+        return positions_at(self.actor_t_ns, self.actor, t_ns), self.actor_source
 
 
 def load_flight(
@@ -107,15 +113,20 @@ def load_flight(
     warnings: list[str] = []
     skeleton, skeleton_source = _skeleton(folder, description, reconstructed, span_ns)
     t_ns, actor, source = _actor(folder, description, reconstructed, warnings, span_ns)
+    people = actor.shape[1]
+    logged = description.logged_people if source == "log" else []
+    if skeleton is not None:
+        skeleton = _of_people(skeleton, t_ns, actor, logged=bool(logged))
     cameras, poses_source, noise_source = _cameras(folder, description, pose_noise, span_ns)
     if noise_source == "nobody":
         warnings.append("nobody states the noise of the cameras' poses: taken as exact; state --pose-noise")
     hips = _hips(skeleton) if skeleton is not None and skeleton_source == "truth" else None
     spans = {f"the poses of {c.name}": c.trajectory.t_ns[[0, -1]] for c in cameras if not c.static}
     if hips is not None:
-        spans["the truth"] = hips.t_ns[np.flatnonzero(np.isfinite(hips.position[:, 0, 0, 0]))[[0, -1]]]
+        known = np.isfinite(hips.position[..., 0, 0]).all(axis=1)
+        spans["the truth"] = hips.t_ns[np.flatnonzero(known)[[0, -1]]]
     t_ns, actor = _cut(folder, t_ns, actor, spans)
-    missing = gaps(t_ns, _GAP_NS)
+    missing = [gap for own in np.isfinite(actor[..., 0]).T for gap in gaps(t_ns[own], _GAP_NS)]
     if missing:
         longest_s = max(last - first for first, last in missing) / 1e9
         warnings.append(
@@ -134,14 +145,16 @@ def load_flight(
         noise_source=noise_source,
         warnings=tuple(warnings),
         planned=_planned(folder, description),
+        people=tuple(description.names_of_people(people)) if people > 1 else ("",),
+        weights=tuple(person.weight for person in logged) or (1.0,) * people,
     )
 
 
 def points_at(motion: JointMotion, t_ns: Int64) -> Float:
-    """Interpolate the first person's joints [T, J, 3] at given times; NaN where not known nearby."""
+    """Interpolate the joints [T, P, J, 3] at given times; NaN where not known nearby."""
     step_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
     longest_ns = max(_LONGEST_STEP_NS, round(_STEPS * step_ns))
-    return interpolate_points(motion.t_ns, motion.position[:, 0], t_ns, max_gap_ns=longest_ns)
+    return interpolate_points(motion.t_ns, motion.position, t_ns, max_gap_ns=longest_ns)
 
 
 def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> tuple[Float, Float, Bool]:
@@ -196,23 +209,49 @@ def _skeleton(
 def _reconstruction(folder: Path, span_ns: Span | None) -> JointMotion:
     """Read the reconstructed skeleton; joints that are not `ok` are NaN."""
     table = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON, span_ns)
-    table = table[table["person"] == 0]
     motion = motion_from(table, tuple(dict.fromkeys(table["joint"])))
     if motion.status is not None:
         motion.position[motion.status != "ok"] = np.nan
     return motion
 
 
-def _hips(skeleton: JointMotion) -> JointMotion | None:
-    """Compute the middle of the hips of the first person, [T, 1, 1, 3]."""
+def _of_people(skeleton: JointMotion, t_ns: Int64, actor: Float, *, logged: bool) -> JointMotion:
+    """Return the skeletons of the P people whose hips [A, P, 3] were measured; NaN for those without one.
+
+    Logged people have the numbers of the skeletons. Others are the skeletons nearest to them, in the mean.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    people = actor.shape[1]
+    position = np.full((len(skeleton.t_ns), people, *skeleton.position.shape[2:]), np.nan)
+    hips = _hips_of(skeleton)
+    if logged or hips is None:
+        person = whose = np.arange(min(people, skeleton.position.shape[1]))
+    else:
+        there = positions_at(t_ns, actor, skeleton.t_ns).swapaxes(0, 1)
+        apart = np.linalg.norm(hips[:, None] - there[:, :, None], axis=-1)  # [T, P, Q]
+        known = np.isfinite(apart)
+        mean = np.where(known, apart, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        person, whose = linear_sum_assignment(np.where(known.any(axis=0), mean, _FAR_M))
+    position[:, person] = skeleton.position[:, whose]
+    return JointMotion(skeleton.t_ns, skeleton.joints, position)
+
+
+def _hips_of(skeleton: JointMotion) -> Float | None:
+    """Compute the middle of everybody's hips [T, P, 3]; None where the skeleton has none."""
     names = ("hip",) if "hip" in skeleton.joints else _HIPS
     if not set(names) <= set(skeleton.joints):
         return None
-    columns = [skeleton.joints.index(name) for name in names]
-    middle = skeleton.position[:, :1, columns].mean(axis=2, keepdims=True)
-    if not np.isfinite(middle).any():
+    middle: Float = skeleton.position[:, :, [skeleton.joints.index(name) for name in names]].mean(axis=2)
+    return middle
+
+
+def _hips(skeleton: JointMotion) -> JointMotion | None:
+    """Compute the middle of everybody's hips, [T, P, 1, 3]; None if somebody's are never known."""
+    middle = _hips_of(skeleton)
+    if middle is None or not np.isfinite(middle[..., 0]).all(axis=1).any():
         return None
-    return JointMotion(skeleton.t_ns, ("hip",), middle)
+    return JointMotion(skeleton.t_ns, ("hip",), middle[:, :, None])
 
 
 def _actor(
@@ -222,44 +261,53 @@ def _actor(
     warnings: list[str],
     span_ns: Span | None,
 ) -> tuple[Int64, Float, Source]:
-    """Return the planners' input of the actor: the log, or without one the reconstructed hips."""
-    logged = logged_actor(folder, description, span_ns)
-    if logged is not None and description.actor is not None:
-        if description.actor.point in ("feet", "head"):
-            warnings.append(
-                f"the actor's {description.actor.point} were logged: hips taken"
-                f" {description.actor.hip_above_m:+.2f} m above"
-            )
-        return *_measured(folder, logged.t_ns, logged.hips, "the actor's log"), "log"
+    """Return the planners' input, [A] and [A, P, 3]: the logs of the people, or the reconstructed hips."""
+    logged = logged_people(folder, description, span_ns)
+    warnings.extend(
+        f"the {entry.point} of {entry.name or 'the actor'} were logged: hips taken"
+        f" {entry.hip_above_m:+.2f} m above"
+        for entry in description.logged_people
+        if entry.point in ("feet", "head")
+    )
+    if logged:
+        t_ns = np.unique(np.concatenate([person.t_ns for person in logged]))
+        hips = np.full((len(t_ns), len(logged), 3), np.nan)
+        for k, person in enumerate(logged):
+            hips[np.searchsorted(t_ns, person.t_ns), k] = person.hips
+        return *_measured(folder, t_ns, hips, "the actor's log"), "log"
     if reconstructed is None:
         raise DataError(
             folder,
             "has no logged actor and no reconstruction to take one from",
             "run `mocap reconstruct`, or name the actor's topic under `actor:` in flight.yaml",
         )
-    hips = _hips(_reconstruction(folder, span_ns))
-    if hips is None:
+    found = _reconstruction(folder, span_ns)
+    middle = _hips_of(found)
+    if middle is None or not np.isfinite(middle[:, 0]).any():
         raise DataError(
             folder,
             "has no logged actor, and the reconstruction has no time at which both hips are ok",
             "name the actor's topic under `actor:` in flight.yaml, or mend the reconstruction",
         )
-    return *_measured(
-        folder, hips.t_ns, hips.position[:, 0, 0], "the reconstruction's hips"
-    ), "reconstruction"
+    known = np.isfinite(middle[..., 0])
+    filmed = known[known[:, 0]].mean(axis=0) >= _LEAST_SHARE
+    return *_measured(folder, found.t_ns, middle[:, filmed], "the reconstruction's hips"), "reconstruction"
 
 
 def _measured(folder: Path, t_ns: Int64, position: Float, what: str) -> tuple[Int64, Float]:
-    rows = np.isfinite(position).all(axis=1)
-    if rows.sum() < 2:
-        raise DataError(folder, f"{what} hold {int(rows.sum())} positions", "a replay needs two or more")
+    known = np.isfinite(position[..., 0])
+    fewest = int(known.sum(axis=0).min())
+    if fewest < 2:
+        raise DataError(folder, f"{what} hold {fewest} positions", "a replay needs two or more")
+    rows = known.any(axis=1)
     return t_ns[rows], position[rows]
 
 
 def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.int64]]) -> tuple[Int64, Float]:
     """Cut the actor to the time in which all else is known."""
-    first_ns = max([int(t_ns[0]), *(int(span[0]) for span in spans.values())])
-    last_ns = min([int(t_ns[-1]), *(int(span[1]) for span in spans.values())])
+    own = [t_ns[known][[0, -1]] for known in np.isfinite(actor[..., 0]).T]
+    first_ns = max(int(span[0]) for span in [*own, *spans.values()])
+    last_ns = min(int(span[1]) for span in [*own, *spans.values()])
     kept = (t_ns >= first_ns) & (t_ns <= last_ns)
     shared_s = float(np.ptp(t_ns[kept]) / 1e9) if kept.any() else 0.0
     if shared_s < _SHORTEST_S:

@@ -17,7 +17,7 @@ from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm
 from pipelines.planning.config import MOST_DRONES, Mode, PlannerConfig
 from pipelines.planning.distance_field import DistanceField, open_space, zone_edges
-from pipelines.planning.forecast import ActorFilter, Forecast, Foresight, YawZero
+from pipelines.planning.forecast import ActorFilter, Forecast, Foresight, PeopleFilter, YawZero, positions_at
 from pipelines.planning.formation import (
     TILT,
     YAW,
@@ -59,8 +59,9 @@ class Replay:
     velocity: Float  # [N, T, 3] m/s
     quaternion_xyzw: Float  # [N, T, 4] world_from_camera, aimed at the estimate
     slots: Float  # [N, T, 3] commanded: yaw (rad from east, continuous), tilt (rad), range (m)
-    actor: Float  # [T, 3] the log, interpolated
-    estimate: Float  # [T, 3] the planner's estimate of the actor
+    actor: Float  # [T, 3] the log, interpolated; of several people the weighted middle
+    estimate: Float  # [N, T, 3] the planner's estimate of whom each camera films
+    aim: Float  # [N, T, P] shares of people in the place that each camera films
     separation: dict[str, int]  # local plans by `Separation`
     safety: dict[str, int]  # local plannings by `guard.Flown`
     times: PlanningTimes
@@ -98,7 +99,8 @@ class Pilot:
         config: PlannerConfig,
         start: Start,
         *,
-        actor: ActorFilter | None = None,
+        actor: PeopleFilter | None = None,
+        weights: Sequence[float] = (1.0,),
         clock: Callable[[], float] = perf_counter,
     ) -> None:
         if not 1 <= start.drones <= MOST_DRONES:
@@ -108,7 +110,9 @@ class Pilot:
         yaw_rad = start.yaw_rad - float(self._zero.at(np.zeros(1))[0])
         self._formation_planner = arm.start(config, drones=start.drones, yaw_rad=yaw_rad)
         self._local_planner = LocalPlanner(config)
-        self._filter = actor or ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
+        self._weight = np.array(weights, dtype=np.float64)
+        people = [ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m) for _ in weights]
+        self._filter = actor or PeopleFilter(people, self._weight)
         slots = formation_slots(
             np.array([yaw_rad]), start.drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
         )
@@ -120,12 +124,12 @@ class Pilot:
         self.times = PlanningTimes([], [])
         self.separation: Counter[Separation] = Counter()
 
-    def measure(self, t_s: float, position: Float) -> None:
-        """Take in the actor's position [3] metres, world (the middle of the hips).
+    def measure(self, t_s: float, position: Float, person: int = 0) -> None:
+        """Take in the position [3] of the actor or of one of several people: the hips' middle, m, world.
 
-        Times must not go back.
+        Times of a person must not go back. Everybody must be measured before the first `replan`.
         """
-        self._filter.measure(t_s, position)
+        self._filter.measure(t_s, position, person)
 
     def replan(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
         """Replan if a plan is due.
@@ -144,16 +148,27 @@ class Pilot:
             self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.local_hz
             self._plan_locally(t_s, position, velocity, field)
 
+    @property
+    def aim(self) -> Float:
+        """Shares [N, P] of people in the place that each camera films: by weight, unless the arm chooses."""
+        by_weight = np.tile(self._weight / self._weight.sum(), (len(self._plans), 1))
+        return by_weight if self._formation.aim is None else self._formation.aim
+
     def wanted(self, t_s: float) -> tuple[Float, Float]:
-        """Return commanded slots [N, 3], yaw from east, and the actor's estimate [3] that cameras aim at."""
+        """Return commanded slots [N, 3], yaw from east, and the estimates [N, 3] that cameras aim at."""
         now = np.array([t_s])
-        return self._slots_at(now)[0], self._filter.forecast(now)[0]
+        return self._slots_at(now)[0], self._aimed(now)[:, 0]
 
     def reference(self, t_s: float) -> tuple[Float, Float, Float]:
         """Return position, velocity, acceleration [N, 3] of the latest local plans, after `replan`."""
         asked = [plan.at(np.array([t_s])) for plan in self._plans if plan is not None]
         where, speed, change = (np.concatenate(part) for part in zip(*asked, strict=True))
         return where, speed, change
+
+    def _aimed(self, t_s: Float) -> Float:
+        """Return the places [N, T, 3] that cameras film, and about which their slots are."""
+        aimed: Float = np.tensordot(self.aim, self._filter.each(t_s), 1)
+        return aimed
 
     def _slots_at(self, t_s: Float) -> Float:
         """Return commanded slots [T, N, 3], their yaws from east."""
@@ -167,15 +182,16 @@ class Pilot:
         commanded = self._formation.at(np.array([t_s]))[0]
         if config.yaw_frame == "heading":
             self._zero.follow(t_s, *self._filter.at(t_s)[1:])
-        actor = Forecast(self._filter.forecast(knots), self._zero.at(knots))
+        people = self._filter.each(knots)
+        actor = Forecast(self._filter.forecast(knots), self._zero.at(knots), people, self._weight)
         self._formation = self._formation_planner.plan(t_s, commanded, actor, field)
         self.times.central_s.append(self._clock() - started)
 
     def _plan_locally(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
         config = self._config
         times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
-        actor = self._filter.forecast(times)
-        slots = actor[:, None] + slot_offsets(self._slots_at(times))
+        aimed = self._aimed(times)
+        slots = aimed.swapaxes(0, 1) + slot_offsets(self._slots_at(times))
         for i in range(len(self._plans)):
             started = self._clock()
             made = self._local_planner.plan(
@@ -183,7 +199,7 @@ class Pilot:
                 position[i],
                 velocity[i],
                 slots=slots[:, i],
-                actor=actor,
+                actor=aimed[i],
                 others=[plan for j, plan in enumerate(self._plans) if j != i and plan is not None],
                 field=field,
                 previous=self._plans[i],
@@ -206,60 +222,74 @@ def replay(
     mode: Mode = "closed-loop",
     seed: int = 0,
     foresight: bool = False,
+    weights: Sequence[float] = (1.0,),
     clock: Callable[[], float] = perf_counter,
 ) -> Replay:
     """Fly an arm against a log.
 
     The drones start in their slots, at rest, and fly what `guard.Guard` admits. The actor is measured as
-    logged, with `actor_noise_m` added from the seed.
+    logged, with `actor_noise_m` added from the seed. Several people are one actor for most arms, their
+    weighted middle; `group` decides whom each drone films.
 
     Args:
         arm: the planner of the cameras' slots.
         actor_t_ns: [A] stamps of the log, ascending, at least two.
-        actor: [A, 3] metres, world, the middle of the hips; rows with NaN were not measured.
+        actor: [A, 3] metres, world, the middle of the hips; or [A, P, 3] of several people. Who is NaN was
+            not measured then. The replay lasts while everybody is measured.
         fields: the maps by the time from which they hold; before the first one nothing is known.
         start: the formation at the start.
         config: weights and rates, the same for all arms of a comparison.
         mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones exactly
             on their local plans.
         foresight: forecasts are the log itself (`forecast.Foresight`); such a flight uses later measurements.
+        weights: of the people.
         clock: seconds, to measure planning times.
 
     Raises:
         ValueError: times that do not ascend, fewer than two measurements, an impossible number of drones.
     """
-    rows = np.isfinite(actor).all(axis=1)
-    t_ns, measured = actor_t_ns[rows], actor[rows]
-    if len(t_ns) < 2 or (np.diff(t_ns) <= 0).any():
+    people = actor if actor.ndim == 3 else actor[:, None]
+    measured_then = np.isfinite(people.sum(axis=2))  # [A, P]
+    rows = measured_then.any(axis=1)
+    t_ns, measured, known = actor_t_ns[rows], people[rows], measured_then[rows]
+    if known.sum(axis=0).min() < 2 or (np.diff(t_ns) <= 0).any():
         raise ValueError("a replay needs two measurements of the actor or more, their stamps ascending")
-    log_s = (t_ns - t_ns[0]) / 1e9
+    first, last = int(known.argmax(axis=0).max()), len(t_ns) - int(known[::-1].argmax(axis=0).max())
+    log_s = (t_ns - t_ns[first]) / 1e9
     noise = np.random.default_rng(seed).normal(size=measured.shape)
     noisy = measured + config.actor_noise_m * noise
     maps = sorted(fields, key=lambda field: field.from_ns)
-    replay_ns = tracking_times(t_ns, config)
+    replay_ns = tracking_times(t_ns[first:last], config)
     map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")
     zones = zone_edges(config.zones)
-    known = [field.barring(zones) for field in (open_space(), *maps)]
+    fields_known = [field.barring(zones) for field in (open_space(), *maps)]
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
 
-    foreseen = Foresight(log_s, measured) if foresight else None
-    pilot = Pilot(arm, config, start, actor=foreseen, clock=clock)
-    pilot.measure(0.0, noisy[0])
+    weight = np.array(weights, dtype=np.float64)
+    foreseen = None
+    if foresight:
+        ways = [Foresight(log_s[own], measured[own, p]) for p, own in enumerate(known.T)]
+        foreseen = PeopleFilter(ways, weight)
+    pilot = Pilot(arm, config, start, actor=foreseen, weights=weights, clock=clock)
+    for row, person in np.argwhere(known[: first + 1]):
+        pilot.measure(log_s[row], noisy[row, person], person)
     first_slots, first_estimate = pilot.wanted(0.0)
     guard = pilot.guard = Guard(
         first_estimate + slot_offsets(first_slots), config, exactly=mode == "plan-only"
     )
     shape = (start.drones, len(replay_ns), 3)
-    position, velocity, slots, estimate = (np.empty(s) for s in (shape, shape, shape, shape[1:]))
-    done = 1
+    position, velocity, slots, estimate = (np.empty(shape) for _ in range(4))
+    aim = np.empty((*shape[:2], len(weight)))
+    done = first + 1
     for k, now_ns in enumerate(replay_ns):
-        t_s = float((now_ns - t_ns[0]) / 1e9)
-        for row in range(done, taken_in[k]):
-            pilot.measure(log_s[row], noisy[row])
+        t_s = float((now_ns - t_ns[first]) / 1e9)
+        for row, person in np.argwhere(known[done : taken_in[k]]):
+            pilot.measure(log_s[done + row], noisy[done + row, person], person)
         done = max(done, int(taken_in[k]))
         position[:, k], velocity[:, k] = guard.position, guard.velocity
-        pilot.replan(t_s, position[:, k], velocity[:, k], known[map_at[k]])
-        slots[:, k], estimate[k] = pilot.wanted(t_s)
+        pilot.replan(t_s, position[:, k], velocity[:, k], fields_known[map_at[k]])
+        slots[:, k], estimate[:, k] = pilot.wanted(t_s)
+        aim[:, k] = pilot.aim
         guard.advance()
     return Replay(
         t_ns=replay_ns,
@@ -267,8 +297,9 @@ def replay(
         velocity=velocity,
         quaternion_xyzw=look_at(position, estimate),
         slots=slots,
-        actor=np.stack([np.interp(replay_ns, t_ns, measured[:, axis]) for axis in range(3)], axis=-1),
+        actor=np.tensordot(weight / weight.sum(), positions_at(t_ns, measured, replay_ns), 1),
         estimate=estimate,
+        aim=aim,
         separation={kind.value: pilot.separation[kind] for kind in Separation},
         safety={kind.value: guard.counts[kind] for kind in Flown},
         times=pilot.times,

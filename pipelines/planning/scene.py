@@ -66,7 +66,7 @@ class Scene:
     yaw_rad: float  # of the first camera at the start, from east
     heading_rad: float  # of the actor's first way, from east; 0 where yaws count from east
     t_ns: Int64  # [T]
-    actor: Float  # [T, 3] reference of the scores
+    people: Float  # [P, T, 3] reference of the scores
     actor_source: Source
     fields: tuple[DistanceField, ...]  # by the time from which they hold
     flown: tuple[Float, Float, Bool]  # positions [C, T, 3], quaternions [C, T, 4], mask of logged ones [C, T]
@@ -77,6 +77,19 @@ class Scene:
     def config(self) -> PlannerConfig:
         """Planner settings."""
         return self.settings.planner
+
+    @property
+    def weights(self) -> Float:
+        """Weights [P] of the people, of sum 1."""
+        weights = np.array(self.flight.weights)
+        shares: Float = weights / weights.sum()
+        return shares
+
+    @cached_property
+    def actor(self) -> Float:
+        """Reference of the scores [T, 3]: the actor, of several people their weighted middle."""
+        middle: Float = np.tensordot(self.weights, self.people, 1)
+        return middle
 
     @property
     def t_s(self) -> Float:
@@ -117,9 +130,9 @@ class Scene:
 
     @cached_property
     def joints(self) -> Float | None:
-        """Joints [P, J, 3] of the person at the times of the pictures; None where no skeleton is known."""
-        skeleton = self.flight.skeleton
-        return None if skeleton is None else points_at(skeleton, self.t_ns[self.pictures])
+        """Joints [K, P J, 3] of all people at the times of the pictures; None where no skeleton is known."""
+        skeleton, t_ns = self.flight.skeleton, self.t_ns[self.pictures]
+        return None if skeleton is None else points_at(skeleton, t_ns).reshape(len(t_ns), -1, 3)
 
     def _first_slots(self) -> Float:
         """Compute the places [N, T, 3] of the slots of the start's formation."""
@@ -171,8 +184,11 @@ def build_scene(
     notes.append(
         f"unknown voxels of the map count as {unknown}" if fields else "no map: open space, nothing is hidden"
     )
-    t_ns = tracking_times(flight.actor_t_ns, settings.planner)
-    actor, actor_source = flight.scored_actor(t_ns)
+    own = [flight.actor_t_ns[known][[0, -1]] for known in np.isfinite(flight.actor[..., 0]).T]
+    span_ns = np.array([max(first for first, _ in own), min(last for _, last in own)])
+    t_ns = tracking_times(span_ns, settings.planner)
+    people, actor_source = flight.scored_actor(t_ns)
+    actor = np.average(people, axis=0, weights=flight.weights)
     flown = flown_poses(flight, description, t_ns)
     errors = with_pose_errors(errors or ErrorModel(), flight, t_ns, *flown[:2])
     settings = replace(settings, planner=replace(settings.planner, errors=errors))
@@ -181,7 +197,7 @@ def build_scene(
         notes.append(f"{drones} drones are replayed, the session has {len(flight.cameras)} cameras")
     heading_rad = 0.0
     if settings.planner.yaw_frame == "heading":
-        heading_rad = first_heading(flight.actor)
+        heading_rad = first_heading(np.average(flight.actor, axis=1, weights=flight.weights))
         notes.append(f"yaws count from where the actor heads, {np.degrees(heading_rad):.1f} deg at first")
     if settings.yaw_deg is not None:
         yaw_rad = float(np.radians(settings.yaw_deg)) + heading_rad
@@ -196,7 +212,7 @@ def build_scene(
         yaw_rad=yaw_rad,
         heading_rad=heading_rad,
         t_ns=t_ns,
-        actor=actor,
+        people=people,
         actor_source=actor_source,
         fields=fields,
         flown=flown,
@@ -209,7 +225,9 @@ def build_scene(
 def with_pose_errors(
     errors: ErrorModel, flight: LoggedFlight, t_ns: Int64, position: Float, quaternion_xyzw: Float
 ) -> ErrorModel:
-    """Take the errors of the poses from a flight: root mean squares over its cameras and times.
+    """Take the errors of the poses and the field of view from a flight.
+
+    Errors are root mean squares over its cameras and times; of several fields of view the narrowest counts.
 
     Args:
         errors: those of the detector are kept.
@@ -225,7 +243,13 @@ def with_pose_errors(
         for c, camera in enumerate(flight.cameras)
     ]
     meters, radians = np.sqrt(np.mean(np.square(sigma), axis=(0, 1)))
-    return replace(errors, position_sigma_m=float(meters), rotation_sigma_deg=float(np.degrees(radians)))
+    lenses = [camera.intrinsics for camera in flight.cameras]
+    return replace(
+        errors,
+        position_sigma_m=float(meters),
+        rotation_sigma_deg=float(np.degrees(radians)),
+        fov_rad=min(2.0 * np.arctan(lens.width / 2.0 / lens.fx) for lens in lenses),
+    )
 
 
 def _doubts(scene: Scene) -> list[str]:
@@ -235,7 +259,9 @@ def _doubts(scene: Scene) -> list[str]:
     if fields and not any(field.has_obstacles for field in fields):
         doubts.append("nothing in the map is occupied")
     covered = [
-        field.covers(scene.actor[rows]) for rows, field in scene.maps if any(field is one for one in fields)
+        field.covers(scene.people[:, rows]).mean(axis=0)
+        for rows, field in scene.maps
+        if any(field is one for one in fields)
     ]
     outside = float(1.0 - np.concatenate(covered).mean()) if covered else 0.0
     if outside > 0.0:
@@ -262,21 +288,23 @@ def hidden_shares(
 ) -> dict[str, float]:
     """Compute for each camera the share of moments in which an occupied voxel hid the actor from it.
 
-    Ten moments a second, while the camera's pose is known; true poses and hips where they are known. Each
-    map counts from its own time on; unknown voxels are free. The end of the sight line next to the actor is
-    left out (the default `sight_start_m`): maps contain the actor. So are cameras that never have a pose.
+    Of several people it is the mean. Ten moments a second, while the camera's pose is known; true poses and
+    hips where they are known. Each map counts from its own time on; unknown voxels are free. The end of the
+    sight line next to the actor is left out (the default `sight_start_m`): maps contain the actor. So are
+    cameras that never have a pose.
     """
     start_m = PlannerConfig().sight_start_m
     first_ns, last_ns = int(flight.actor_t_ns[0]), int(flight.actor_t_ns[-1])
     count = max(2, round((last_ns - first_ns) / 1e9 * _HIDDEN_HZ) + 1)
     t_ns = np.linspace(first_ns, last_ns, count).round().astype(np.int64)
-    actor, _ = flight.scored_actor(t_ns)
+    people, _ = flight.scored_actor(t_ns)
     position, _, known = flown_poses(flight, description, t_ns)
-    hidden = np.zeros(known.shape, dtype=np.bool_)
+    hidden = np.zeros(known.shape)
     for occupancy in sorted(maps, key=lambda one: one.from_ns):
         (later,) = np.nonzero(t_ns >= occupancy.from_ns)  # a later map replaces an earlier one
         field = _occupied_only(occupancy)
-        hidden[:, later] = ~visible(field, position[:, later], actor[later], start_m=start_m)
+        free = visible(field, position[:, later], people[:, None, later], start_m=start_m)  # [P, C, T]
+        hidden[:, later] = 1.0 - free.mean(axis=0)
     return {
         camera.name: float(hidden[c, known[c]].mean())
         for c, camera in enumerate(flight.cameras)

@@ -45,16 +45,21 @@ def score(
     config: PlannerConfig,
     *,
     near: Bool | None = None,
+    people: Float | None = None,
+    seen: Bool | None = None,
 ) -> Scores:
     """Compute the figures of one flight.
 
     Args:
         t_s: [T] seconds, ascending, at least four of them over half a second or more.
         position: [N, T, 3] metres, world, the cameras; finite.
-        actor: [T, 3] metres, world; finite.
+        actor: [T, 3] metres, world; finite. Or [N, T, 3], whom each camera films.
         maps: the distance field, or the map of each moment.
         config: limits, no-fly zones, `sight_start_m` and the ray model.
         near: [T] True while an obstacle is near (see `near_obstacle`); the same for all arms of a comparison.
+        people: [P, T, 3] metres, world, if there are several. Shares and errors are means over them, and
+            distances to the actor are those to the nearest of them.
+        seen: [P, N, T] who is seen from which camera; by default sight lines to the actor that are free.
 
     Returns:
         JSON-able: degrees and metres by name; None where there is nothing to count (no pair of drones,
@@ -69,20 +74,22 @@ def score(
     """
     slots = slot_of(position - actor)
     tilt_deg = np.degrees(slots[..., TILT])
-    seen = seen_actor(position, actor, maps, config)
+    people = actor[None] if people is None else people
+    seen = seen_actor(position, actor, maps, config)[None] if seen is None else seen
+    near_m = np.linalg.norm(position - people[:, None], axis=-1).min(axis=0)
     clearance = looked(maps, lambda field, rows: field.sample(position[:, rows])[0], axis=1)
     zone_m = zone_distances(zone_edges(config.zones), position)
     pairs = list(combinations(range(len(position)), 2))
     apart = np.array([np.linalg.norm(position[i] - position[j], axis=-1) for i, j in pairs])
     turned = np.array([wrapped(slots[j, :, YAW] - slots[i, :, YAW]) for i, j in pairs])
-    error = predicted_error(_information(position - actor, seen, config))
+    error = errors_of_views(position, people, seen, config)
     determined = np.isfinite(error)
     motion = _motion(t_s, position)
     limits = {"speed": config.speed_mps, "acceleration": config.acceleration_mps2, "jerk": config.jerk_mps3}
     violations = {
         "collision": _episodes(clearance <= 0.0),
         "clearance": _episodes(clearance < config.drone_radius_m),
-        "actor": _episodes(slots[..., RANGE] < config.actor_distance_m),
+        "actor": _episodes(near_m < config.actor_distance_m),
         "zone": _episodes(zone_m < 0.0),
         "separation": _episodes(apart < config.separation_m) if pairs else 0,
         **{name: _episodes(motion[name] > limit * _ROUNDING) for name, limit in limits.items()},
@@ -96,10 +103,10 @@ def score(
         "range_m": _spread(slots[..., RANGE]),
         "yaw_separation_deg": _spread(np.degrees(np.abs(turned))) if pairs else None,
         "occluded_share": float(1.0 - seen.mean()),
-        "blind_s": float(np.trapezoid((seen.sum(axis=0) < _FEWEST_VIEWS).astype(np.float64), t_s)),
+        "blind_s": blind_s(t_s, seen),
         "path_m": float(np.linalg.norm(np.diff(position, axis=1), axis=-1).sum(axis=1).mean()),
         "energy_kj": _energy_j(t_s, position) / 1e3,
-        "min_actor_distance_m": float(slots[..., RANGE].min()),
+        "min_actor_distance_m": float(near_m.min()),
         "min_clearance_m": float(clearance.min()) if _has_obstacles(maps) else None,
         "min_zone_distance_m": float(zone_m.min()) if config.zones else None,
         "min_separation_m": float(apart.min()) if pairs else None,
@@ -115,6 +122,12 @@ def score(
     }
 
 
+def blind_s(t_s: Float, seen: Bool) -> float:
+    """Compute for how long fewer than two cameras see a person, the mean over people: of [P, N, T] sights."""
+    blind = (seen.sum(axis=1) < _FEWEST_VIEWS).mean(axis=0)
+    return float(np.trapezoid(blind, t_s))
+
+
 def coverage(
     position: Float, looks_rad: Float, people: Float, heading_rad: Float, *, fov_rad: float
 ) -> Float:
@@ -128,8 +141,8 @@ def coverage(
     Args:
         position: [..., 3] metres, world; the camera.
         looks_rad: [...] yaw of its optical axis from east; the axis is level.
-        people: [A, 3] metres, world; the centres of the prisms' sides.
-        heading_rad: [A] yaw from east.
+        people: [..., A, 3] metres, world; the centres of the prisms' sides.
+        heading_rad: [..., A] yaw from east.
         fov_rad: level field of view.
 
     Returns:
@@ -161,12 +174,12 @@ def view_quality(covered: Float, weight: Float) -> Float:
 
 
 def _faces(people: Float, heading_rad: Float) -> tuple[Float, Float]:
-    """Return normals and centres [A, 7, 3] of the sides and the lid, whose centre is on the sides' level."""
-    yaw = heading_rad[:, None] + 2.0 * np.pi / _SIDES * np.arange(1, _SIDES + 1)
-    normal = np.zeros((len(people), _SIDES + 1, 3))
-    normal[:, :_SIDES, 0], normal[:, :_SIDES, 1] = np.cos(yaw), np.sin(yaw)
-    centre = people[:, None] + _APOTHEM_M * normal
-    normal[:, _SIDES, 2] = 1.0
+    """Return normals and centres [..., A, 7, 3] of the sides and the lid; all centres are at one height."""
+    yaw = heading_rad[..., None] + 2.0 * np.pi / _SIDES * np.arange(1, _SIDES + 1)
+    normal = np.zeros((*people.shape[:-1], _SIDES + 1, 3))
+    normal[..., :_SIDES, 0], normal[..., :_SIDES, 1] = np.cos(yaw), np.sin(yaw)
+    centre = people[..., None, :] + _APOTHEM_M * normal
+    normal[..., _SIDES, 2] = 1.0
     return normal, centre
 
 
@@ -214,7 +227,13 @@ def predicted_errors(
 ) -> Float:
     """Compute sqrt(tr S) [T] in metres of the free views, inf where they do not determine a point."""
     seen = seen_actor(position, actor, maps, config)
-    return predicted_error(_information(position - actor, seen, config))
+    error: Float = errors_of_views(position, actor[None], seen[None], config)[0]
+    return error
+
+
+def errors_of_views(position: Float, people: Float, seen: Bool, config: PlannerConfig) -> Float:
+    """Compute sqrt(tr S) [P, T] in metres of people [P, T, 3] whom cameras [N, T, 3] see [P, N, T]."""
+    return predicted_error(_information(position - people[:, None], seen, config))
 
 
 def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: DistanceField) -> Bool:
@@ -247,8 +266,8 @@ def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: Distanc
 
 
 def _information(offset: Float, seen: Bool, config: PlannerConfig) -> Float:
-    """Sum the information [T, 3, 3] of all cameras that see the actor."""
-    total: Float = (ray_information(offset, config.errors) * seen[..., None, None]).sum(axis=0)
+    """Sum the information [P, T, 3, 3] of all cameras; offsets are [P, N, T, 3]."""
+    total: Float = (ray_information(offset, config.errors) * seen[..., None, None]).sum(axis=1)
     return total
 
 

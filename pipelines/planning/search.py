@@ -458,7 +458,7 @@ def costs_in_frame(field: DistanceField, actor: Forecast, slots: Float, config: 
         costs_of_slots(
             field, position[None], slot_offsets(turned(slots, np.full(slots.shape[:-2], heading))), config
         )
-        for position, heading in zip(*actor, strict=True)
+        for position, heading in zip(actor.position, actor.heading_rad, strict=True)
     ]
     return SlotCosts(*(np.concatenate(parts) for parts in zip(*looks, strict=True)))
 

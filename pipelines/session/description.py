@@ -187,6 +187,7 @@ class ActorEntry(Entry):
     sources: list[str] = []  # the files of that log as `Description.sources` names them
     topic: str | None = None  # as the manifest states it
     point: str  # of the body: hip, head, feet, centre
+    weight: float = 1.0  # for the planners
     count: int
     dropped: dict[str, int]
 

@@ -449,6 +449,7 @@ class Actor(Guess):
     log: str
     topic: str | None = None
     point: Literal["hip", "head", "feet", "centre"] = "hip"
+    weight: float = Field(1.0, ge=0, allow_inf_nan=False)  # of several people, for the planners
 
 
 class Map(Part):
@@ -551,6 +552,8 @@ class Flight(Part):
         refuse_names_of_people(self.actors)
         if self.actor is not None and self.actors:
             raise ValueError("actor and actors: leave one of them out")
+        if self.logged_people and not any(actor.weight for actor in self.logged_people.values()):
+            raise ValueError("weight: somebody must have one above 0")
         named = [self.clock_reference] if self.clock_reference else []
         named += list(self.truth.poses) if self.truth else []
         named += self.plan.cameras if self.plan else []

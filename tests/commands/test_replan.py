@@ -15,9 +15,11 @@ from click.testing import CliRunner, Result
 from mocap_cli.main import Mocap
 from mocap_cli.replan_compare import replan_compare_command
 from pipelines.detect import DETECT
+from pipelines.formats.common.files import read_yaml
 from pipelines.ingest import ingest
 from pipelines.planning.arm_flights import fly_arm
 from pipelines.reconstruct import reconstruct
+from pipelines.session.errors import DataError
 from pipelines.session.stages import locked
 from pipelines.simulate import simulate
 from tests.commands.runner import as_if_written, content
@@ -423,7 +425,7 @@ def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:
 BAD = {
     "unknown arm": (
         ["--arms", "adaptive,clever"],
-        "there are adaptive, covariance, fixed, greedy, joint, flown",
+        "there are adaptive, covariance, fixed, greedy, group, joint, flown",
     ),
     "unknown noise": (["--pose-noise", "pink:position_m=1"], "pink"),
     "out of range": (["--radius", "0.5", "--yaws", "360", "--horizon", "600"], "horizon_knots"),
@@ -452,3 +454,53 @@ def test_bad_settings_get_one_line(mound: Path, tmp_path: Path) -> None:
         assert "planner.yaml" in line
     assert "nothing.yaml" in refused(mound, "--config", tmp_path / "nothing.yaml")
     assert f"{tmp_path}: " in refused(tmp_path)
+
+
+PARTING = """
+schema: 1
+name: Parting
+duration_s: 12
+actors:
+  anna: {start: [1, 0], motion: [walk: {distance_m: 12, speed_mps: 1.5}], estimate_sigma_m: 0.1}
+  ben: {start: [-1, 0], heading_deg: 180, motion: [walk: {distance_m: 12, speed_mps: 1.5}]}
+world: {ground: {size_m: 60}}
+drones:
+  count: 4
+  camera: {rate_hz: 5}
+  pose_noise: {white: {position_m: 0.02, rotation_deg: 0.2}}
+"""
+
+
+def test_a_group_films_both_of_two_who_part(tmp_path: Path) -> None:
+    session = session_of(tmp_path, PARTING)
+    metrics = compared(session, "--arms", "group,adaptive", "--trials", "2")
+    arms = metrics["arms"]
+    for name in ("anna", "ben"):
+        group, adaptive = (arms[arm]["by_person"][name] for arm in ("group", "adaptive"))
+        assert group["pck150"]["mean"] > adaptive["pck150"]["mean"] + 0.1
+        assert group["view_quality"] > adaptive["view_quality"]
+        assert group["blind_s"] < 1.0
+    for arm in arms.values():
+        assert not sum(arm["limit_violations"].values())
+        each = [person["pck150"]["mean"] for person in arm["by_person"].values()]
+        assert arm["reconstruction_error"]["pck150"]["mean"] == pytest.approx(np.mean(each), abs=1e-3)
+        qualities = [person["view_quality"] for person in arm["by_person"].values()]
+        assert arm["view_quality"] == pytest.approx(np.mean(qualities))
+    skeleton = pd.read_parquet(session / "replan" / "group" / "skeleton.parquet")
+    assert set(skeleton["person"]) == {0, 1}
+
+
+def test_others_film_the_middle_by_weight(tmp_path: Path) -> None:
+    """With the weight of the first alone, the formation follows her."""
+    session_of(tmp_path, PARTING)
+    manifest = tmp_path / "flight" / "flight.yaml"
+    stated: Any = read_yaml(manifest)
+    stated["actors"]["ben"]["weight"] = 0
+    manifest.write_text(json.dumps(stated), encoding="utf-8")
+    ingest(manifest, session=tmp_path / "weighed.session")
+    arm = compared(tmp_path / "weighed.session", "--arms", "fixed", "--trials", "2")["arms"]["fixed"]
+    assert arm["by_person"]["anna"]["blind_s"] < 0.5 < arm["by_person"]["ben"]["blind_s"]
+    stated["actors"]["anna"]["weight"] = 0
+    manifest.write_text(json.dumps(stated), encoding="utf-8")
+    with pytest.raises(DataError):
+        ingest(manifest, session=tmp_path / "nobody.session")

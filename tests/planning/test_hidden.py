@@ -33,7 +33,7 @@ def _flight(*positions: tuple[float, float, float]) -> LoggedFlight:
     )
     return LoggedFlight(
         actor_t_ns=t_ns,
-        actor=actor,
+        actor=actor[:, None],
         actor_source="log",
         hips=None,
         skeleton=None,
