@@ -43,9 +43,9 @@ _settings_options = grouped(
     click.option(
         "--arms",
         metavar="NAME,...",
-        help="Arms to compare: adaptive, fixed, covariance, greedy, joint; flown and planned are the logged"
-        " flight and its commands [default: adaptive, fixed, flown where cameras moved, planned where"
-        " logged].",
+        help="Arms to compare: adaptive, fixed, covariance, greedy, joint, group; flown and planned are the"
+        " logged flight and its commands [default: adaptive, fixed, group of several people, flown where"
+        " cameras moved, planned where logged].",
     ),
     click.option(
         "--drones",

@@ -294,6 +294,7 @@ def refuse_unknown(arms: Sequence[str], *, logged: bool = True) -> None:
 def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> list[str]:
     if asked is None:
         return [
+            *(["group"] if len(flight.people) > 1 else []),
             "adaptive",
             "fixed",
             *([FLOWN] if flight.moves else []),
