@@ -138,6 +138,8 @@ _WEIGHTS = (
 _ACCURACY = 1e-5  # of the solver, Pose2Sim's
 _ARMS = tuple(f"{name}_{side}" for side in "rl" for name in ("arm_flex", "arm_add", "arm_rot", "elbow_flex"))
 _FIRST_BEND = 0.6  # rad, of the elbows, where the solver begins
+_STRAIGHT = np.radians(1.0)  # from the end of an elbow's range
+_CLEARLY_LESS = 0.9  # of the squared errors of markers: equal fits differ by less
 _BENT_ENOUGH = 1.0  # rad: more of one elbow makes up for nothing of the other
 
 
@@ -315,32 +317,51 @@ def solve(
         resting.push_back(rest)
     solver = library.InverseKinematicsSolver(model, reference, resting)
     solver.setAccuracy(_ACCURACY)
-    bent_s = float(since_s[_most_bent(motion, person, kept)])
-    _assemble(solver, state, coordinates, names, bent_s)
     turns = np.array([c.getMotionType() == library.Coordinate.Rotational for c in coordinates])
-    values, errors = np.empty((len(kept), len(coordinates))), np.full((len(kept), len(names)), np.nan)
-    for row, time in enumerate(kept.tolist()):
-        state.setTime(float(since_s[row]))
-        for name, value in zip(names, weight[time].tolist(), strict=True):
-            solver.updateMarkerWeight(name, value)
-        solver.track(state)
-        values[row] = [coordinate.getValue(state) for coordinate in coordinates]
-        for column in np.flatnonzero(known[time]).tolist():
-            errors[row, column] = solver.computeCurrentMarkerError(names[column])
+    bent = _most_bent(motion, person, kept)
+
+    def followed(first: int) -> tuple[Float, Float]:
+        """Follow the pose from a time on, then from there back; coordinates [T, C] and errors [T, M] m."""
+        values, errors = np.empty((len(kept), len(coordinates))), np.full((len(kept), len(names)), np.nan)
+        for rows in (range(first, len(kept)), range(first - 1, -1, -1)):
+            if rows:
+                _assemble(solver, state, coordinates, names, float(since_s[bent]), float(since_s[first]))
+            for row in rows:
+                state.setTime(float(since_s[row]))
+                for name, value in zip(names, weight[kept[row]].tolist(), strict=True):
+                    solver.updateMarkerWeight(name, value)
+                solver.track(state)
+                values[row] = [coordinate.getValue(state) for coordinate in coordinates]
+                for column in np.flatnonzero(known[kept[row]]).tolist():
+                    errors[row, column] = solver.computeCurrentMarkerError(names[column])
+        return values, errors
+
+    values, errors = followed(0)
+    if bent > 0 and _is_arm_stuck(coordinates, values):
+        other = followed(bent)
+        if np.nanmean(other[1] ** 2) < _CLEARLY_LESS * np.nanmean(errors**2):
+            values, errors = other
     values[:, turns] = np.degrees(values[:, turns])
     return Kinematics(motion.t_ns[kept], tuple(c.getName() for c in coordinates), values, errors)
 
 
 def _assemble(
-    solver: Any, state: Any, coordinates: Sequence[Any], names: Sequence[str], bent_s: float
+    solver: Any,
+    state: Any,
+    coordinates: Sequence[Any],
+    names: Sequence[str],
+    bent_s: float,
+    first_s: float,
 ) -> None:
-    """Place the model in its pose at the first time.
+    """Place the model in its pose at a time.
 
     From the rest pose alone, the solver may turn an upper arm by half a turn. The elbow, which cannot bend
     backwards, then stays straight for all times, because each follows from the one before. So of four ways
     to turn both upper arms, the arms begin with that of the least error at a time when the elbows are bent.
     """
     by_name = {coordinate.getName(): coordinate for coordinate in coordinates}
+    for coordinate in coordinates:
+        coordinate.setValue(state, coordinate.getDefaultValue(), False)
     arms: dict[str, float] = {}
     if set(_ARMS).issubset(by_name):
         state.setTime(bent_s)
@@ -357,12 +378,21 @@ def _assemble(
             error = sum(solver.computeCurrentMarkerError(name) ** 2 for name in names)
             found.append((error, [by_name[name].getValue(state) for name in _ARMS]))
         arms = dict(zip(_ARMS, min(found)[1], strict=True))
-    state.setTime(0.0)
+    state.setTime(first_s)
     solver.assemble(state)
     for name, value in arms.items():
         by_name[name].setValue(state, value, False)
     if arms:
         solver.assemble(state)
+
+
+def _is_arm_stuck(coordinates: Sequence[Any], values: Float) -> bool:
+    """Test if an elbow is at the end of its range at most of the times, as in an arm that is turned round."""
+    return any(
+        coordinate.getName().startswith("elbow_flex")
+        and np.median(values[:, column]) < coordinate.getRangeMin() + _STRAIGHT
+        for column, coordinate in enumerate(coordinates)
+    )
 
 
 def _most_bent(motion: JointMotion, person: int, kept: Int64) -> int:

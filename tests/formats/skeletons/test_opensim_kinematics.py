@@ -124,6 +124,12 @@ class _Coordinate:
     def getName(self) -> str:  # noqa: N802  # OpenSim's name
         return self.name
 
+    def getDefaultValue(self) -> float:  # noqa: N802
+        return 0.0
+
+    def getRangeMin(self) -> float:  # noqa: N802
+        return 0.0
+
     def getValue(self, state: Any) -> float:  # noqa: N802
         value: float = state.values[self.name]
         return value
@@ -168,9 +174,20 @@ def test_both_arms_begin_turned_so_that_their_elbows_bend() -> None:
     solver = _Solver()
     solver.assemble(state)
     assert (state.values["elbow_flex_r"], state.values["elbow_flex_l"]) == (0.0, 0.3)  # from rest alone
-    opensim_kinematics._assemble(solver, state, coordinates, ["RWrist", "LWrist"], 2.0)
+    opensim_kinematics._assemble(solver, state, coordinates, ["RWrist", "LWrist"], 2.0, 0.0)
     assert (state.values["elbow_flex_r"], state.values["elbow_flex_l"]) == (0.3, 0.3)
     assert state.time_s == 0.0
+
+
+def test_an_arm_is_stuck_if_its_elbow_is_straight_at_most_times() -> None:
+    state = _State()
+    coordinates = [_Coordinate(name, state.values) for name in ("arm_rot_r", "elbow_flex_r", "elbow_flex_l")]
+    bend = np.radians([[0.0, 0.5, 60.0], [0.0, 0.0, 0.0], [0.0, 40.0, 0.0]])  # [coordinates, times]
+    assert opensim_kinematics._is_arm_stuck(coordinates, bend.T)
+    bend[2, 0] = np.radians(40.0)  # two times of three are bent
+    bend[1, 1] = np.radians(40.0)
+    assert not opensim_kinematics._is_arm_stuck(coordinates[:2], bend[:2].T + np.radians([0.0, 2.0]))
+    assert opensim_kinematics._is_arm_stuck(coordinates[:2], bend[:2].T * 0.0)
 
 
 def test_the_arms_begin_where_both_elbows_are_bent() -> None:
