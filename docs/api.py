@@ -16,16 +16,12 @@ from pipelines.reconstruct import Reconstructed, Settings, reconstruct
 from pipelines.session.errors import DataError
 
 PAGE = Path(__file__).parent / "api.md"
-OBJECTS: tuple[Callable[..., object], ...] = (
-    ingest,
-    Ingested,
-    reconstruct,
-    Settings,
-    Reconstructed,
-    export,
-    Exported,
-    DataError,
-)
+OBJECTS: dict[str, tuple[Callable[..., object], ...]] = {  # by the module from which to import them
+    "pipelines.ingest": (ingest, Ingested),
+    "pipelines.reconstruct": (reconstruct, Settings, Reconstructed),
+    "pipelines.export": (export, Exported),
+    "pipelines.session.errors": (DataError,),
+}
 
 
 def plain(annotation: object) -> str:
@@ -58,9 +54,10 @@ def page() -> str:
         "`python docs/api.py --write` makes this page from the docstrings of what\n"
         "[the notebook](notebook.md) uses. These names and signatures are part of the promise of versions.",
     ]
-    for thing in OBJECTS:
-        body = "\n".join(["```text", *head(thing), "", inspect.getdoc(thing) or "", "```"])
-        parts += [f"## `{thing.__module__}.{thing.__name__}`", body]
+    for module, things in OBJECTS.items():
+        for thing in things:
+            body = "\n".join(["```text", *head(thing), "", inspect.getdoc(thing) or "", "```"])
+            parts += [f"## `{module}.{thing.__name__}`", body]
     return "\n\n".join(parts) + "\n"
 
 
