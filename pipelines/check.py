@@ -9,7 +9,7 @@ of them have it, and a warning otherwise.
 
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from pipelines.reconstruction.background_tracks import Followed, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.loading import load_cameras, load_time_base
 from pipelines.reconstruction.observations import Camera
-from pipelines.reconstruction.segments import Segment, divided, doubts_of_flight
+from pipelines.reconstruction.segments import divided, doubts_of_flight
 from pipelines.session.description import Description, Doubt, read_description, said_doubts
 from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.memory import return_freed_arrays, return_unused
@@ -104,26 +104,22 @@ def _checked(
         _, t_ns = load_time_base(folder, description, detected, None)
         segments = divided(t_ns)
         looked_at = partial(_doubts, session, description, detected, pose_noise)
-        if len(segments) == 1:
+        if len(segments) < 2:
             return Checked(looked_at(None), list(description.warnings), pictures)
-        found = [
-            doubts for segment in segments if (doubts := _doubts_of_some(looked_at, segment)) is not None
-        ]
+        found = []
+        for segment in segments:
+            try:
+                found.append(looked_at(segment.span_ns))
+            except NoViewsError as error:  # too few cameras have pictures there
+                nothing = error
+            return_unused()
+        if not found:
+            raise nothing
         often, seldom = doubts_of_flight([[doubt.as_json() for doubt in doubts] for doubts in found])
         warnings = [
             f"{count} of {len(found)} segments: {said_doubts([doubt])[0]}" for doubt, count, _ in seldom
         ]
     return Checked(often, [*description.warnings, *warnings], pictures)
-
-
-def _doubts_of_some(looked_at: Callable[[Span], list[Doubt]], segment: Segment) -> list[Doubt] | None:
-    """Return the doubts of a segment of a long flight; None if too few cameras have pictures there."""
-    try:
-        return looked_at(segment.span_ns)
-    except NoViewsError:
-        return None
-    finally:
-        return_unused()
 
 
 def _doubts(

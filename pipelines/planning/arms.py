@@ -50,7 +50,7 @@ from pipelines.session.registries import Registry
 
 _TILTS_DEG = (-10.0, 85.0)
 _TRIANGLE = np.triu_indices(3)
-_JOINT_EVERY_S = 0.5 - 1e-6  # between two plans of `joint`: slots move little meanwhile
+_SELDOM_S = 0.5 - 1e-6  # between two plans of `joint` and `group`: slots move little meanwhile
 _ASIDE_M = 1.0  # slots of `group` are so much farther from everybody than drones have to be
 _W_HIDDEN = 0.3  # price of a hidden view, beyond that of its occupied share and of the information lost
 
@@ -247,7 +247,21 @@ class _Greedy:
         return FormationPath(_knots(t_s, through, self._lattices[0]), through, self._rates)
 
 
-class _Joint:
+class _SeldomPlanner:
+    """Planner that plans twice a second and keeps its path in between."""
+
+    _path: FormationPath | None = None
+
+    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
+        if self._path is None or t_s - self._path.knot_s[0] >= _SELDOM_S:
+            self._path = self._planned(t_s, commanded, actor, field)
+        return self._path
+
+    def _planned(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
+        raise NotImplementedError
+
+
+class _Joint(_SeldomPlanner):
     """Planner of yaw, tilt and range of every drone for the least error of all views together.
 
     Spacing is free, so that nobody has to stay behind an obstacle. All drones choose from the same slots, so
@@ -275,12 +289,6 @@ class _Joint:
         start = formations[int((off_start + np.abs(states[:, RANGE] - config.radius_m)).argmin())]
         self._team = np.repeat(start[:, None], config.horizon_knots, axis=1)  # [n, T]
         self._config, self._rates = config, np.array(config.slot_rates)
-        self._path: FormationPath | None = None
-
-    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
-        if self._path is None or t_s - self._path.knot_s[0] >= _JOINT_EVERY_S:
-            self._path = self._planned(t_s, commanded, actor, field)
-        return self._path
 
     def _planned(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
         states = self._lattice.states
@@ -299,13 +307,13 @@ class _Joint:
         return mean
 
 
-class _Group:
+class _Group(_SeldomPlanner):
     """Planner for several people: for each drone its yaw, and whom it films.
 
     A drone films one person or the weighted middle of all, from the tilt and range of the settings. All
     drones maximise the worth of their views together (`groups.Worth`): for each person, by weight, the
     information on a joint, as `greedy`, and the view quality, in units of a face seen straight from that
-    range. It plans twice a second.
+    range.
     """
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
@@ -317,12 +325,6 @@ class _Group:
         )
         self._config, self._rates = config, np.array(config.slot_rates)
         self._aims: list[Float] | None = None  # [P] of each drone
-        self._path: FormationPath | None = None
-
-    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
-        if self._path is None or t_s - self._path.knot_s[0] >= _JOINT_EVERY_S:
-            self._path = self._planned(t_s, commanded, actor, field)
-        return self._path
 
     def _planned(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
         config = self._config

@@ -21,9 +21,9 @@ from pipelines.report import content_of
 from pipelines.reporting.summary import summarise
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Doubt
-from pipelines.session.errors import DataError
+from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.progress import Silent
-from pipelines.session.tables import trajectory_from
+from pipelines.session.tables import Span, trajectory_from
 from tests.commands.runner import refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, film_at, write_flight
 
@@ -215,6 +215,22 @@ def test_a_long_flight_is_checked_in_segments(
     monkeypatch.setattr(segments, "LENGTH_S", 60.0)
     check(session)
     assert len(spans) == 4
+
+
+def test_a_long_flight_without_a_segment_that_two_cameras_see_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_segments: None
+) -> None:
+    session = ingested(write_flight(tmp_path, seconds=6.0))
+    spans = []
+
+    def load_cameras(*_: object, span_ns: Span, **__: object) -> None:
+        spans.append(span_ns)
+        raise NoViewsError("the cameras", "have no pose at any picture", "check clocks and pose logs")
+
+    monkeypatch.setattr("pipelines.check.load_cameras", load_cameras)
+    with pytest.raises(NoViewsError):
+        check(session)
+    assert len(spans) == 3
 
 
 @pytest.mark.parametrize(("limit", "most"), [("_MOST_TIMES", 20), ("_MOST_ROWS", 20 * 17)])
