@@ -8,11 +8,11 @@ three drones.
 
     python -m benchmarks.long_flights --memory 2 5 10
 
-measures instead the most memory and the processor time that `mocap reconstruct` and `mocap report` take on
-the first of these flights, of so many minutes, each in a process of its own. `--given nothing` leaves its
-noise out. `--repeat 15` repeats the flight to and fro so often, which takes less time than to simulate an
-hour; with several numbers each in turn. `--film` films the flight, and repeats what was found in its
-pictures. `--session` takes an ingested flight of so many minutes instead of flying one.
+measures instead the most memory and the processor time that `mocap reconstruct`, `check`, `report` and
+`export` take on the first of these flights, of so many minutes, each in a process of its own. `--given
+nothing` leaves its noise out. `--repeat 15` repeats the flight to and fro so often, which takes less time
+than to simulate an hour; with several numbers each in turn. `--film` films the flight, and repeats what was
+found in its pictures. `--session` takes an ingested flight of so many minutes instead of flying one.
 
     python -m benchmarks.long_flights --segments 60 300 900 --minutes 12 --first 302
 
@@ -119,21 +119,37 @@ def flown(seed: int, minutes: float, place: Path, *, stated: bool, film: bool = 
     return session
 
 
-def memory_rows(session: Path, minutes: float) -> Iterator[str]:
-    """Reconstruct by the command, and report; yield rows: minutes, command, peak MB, processor seconds.
+COMMANDS = (
+    ("reconstruct", "--workers", "1"),
+    ("check",),
+    ("report",),
+    ("export", "--to", "trc,csv,tum", "--overwrite"),
+)
+# A process of its own: a child's most memory begins with that of the process that starts it.
+_MEASURED = """
+import json, resource, subprocess, sys
+code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(json.dumps([code, used.ru_maxrss, used.ru_utime + used.ru_stime]))
+"""
 
-    The command has one process; with more of them each takes as much.
+
+def memory_rows(session: Path, minutes: float) -> Iterator[str]:
+    """Run the commands of a session; yield rows: minutes, command, peak MB, processor seconds.
+
+    Each has one process; with more of them each takes as much.
     """
-    for command in (["reconstruct", "--workers", "1"], ["report"]):
-        process = subprocess.Popen(  # noqa: S603  # our own command, with folders made here
-            [Path(sys.executable).parent / "mocap", command[0], session, *command[1:]],
-            stdout=subprocess.DEVNULL,
+    mocap = Path(sys.executable).parent / "mocap"
+    for command, *options in COMMANDS:
+        done = subprocess.run(  # noqa: S603  # our own command, with folders made here
+            [sys.executable, "-c", _MEASURED, mocap, command, session, *options],
+            stdout=subprocess.PIPE,
+            check=True,
         )
-        _, status, usage = os.wait4(process.pid, 0)
-        if status:
-            raise SystemExit(f"mocap {command[0]} ended with {os.waitstatus_to_exitcode(status)}")
-        peak_mb, took_s = usage.ru_maxrss * 1024 / 1e6, usage.ru_utime + usage.ru_stime
-        yield f"| {minutes:g} | {command[0]} | {peak_mb:.0f} | {took_s:.0f} |"
+        code, peak_kib, took_s = json.loads(done.stdout)
+        if code:
+            raise SystemExit(f"mocap {command} ended with {code}")
+        yield f"| {minutes:g} | {command} | {peak_kib * 1024 / 1e6:.0f} | {took_s:.0f} |"
 
 
 SEGMENT_COLUMNS = (
