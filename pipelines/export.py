@@ -34,12 +34,12 @@ from pipelines.session.storage import (
     sync,
     write_json,
 )
-from pipelines.session.tables import ANGLES, FRAMES, POSES, SKELETON, motion_from, read_table, trajectory_from
+from pipelines.session.tables import ANGLES, FRAMES, POSES, SKELETON, read_motion, read_table, trajectory_from
 from pipelines.session.whole_folders import working_folder
 from pipelines.sources.pictures import open_pictures
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 PICTURES_HZ = 2.0
 """Default number of pictures of a camera in a recording per second."""
@@ -202,10 +202,8 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
     for stage in ("ingest", "detect"):
         session.intact_record(stage)
     record = session.intact_record("reconstruct")
-    skeleton, motion = None, None
-    if record is not None:
-        skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
-        motion = motion_from(skeleton, tuple(dict.fromkeys(skeleton["joint"])))
+    table = folder / "reconstruct" / "skeleton.parquet"
+    motion = None if record is None else read_motion(table, SKELETON)
     cameras = {
         name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
         for name in description.cameras
@@ -218,7 +216,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         lenses={name: camera.intrinsics.intrinsics() for name, camera in description.cameras.items()},
         maps=lambda: each_map(folder) if description.map else iter(()),
         pictures=_pictures(folder, description, record, pictures_hz),
-        overlays=_overlays(folder, description, record, skeleton, pictures_hz),
+        overlays=_overlays(folder, description, record, pictures_hz),
         angles=lambda: (
             None if record is None else read_table(folder / "reconstruct" / "angles.parquet", ANGLES)
         ),
@@ -255,15 +253,9 @@ def _pictures(folder: Path, description: Description, record: StageRecord | None
     return of
 
 
-def _overlays(
-    folder: Path,
-    description: Description,
-    record: StageRecord | None,
-    skeleton: pd.DataFrame | None,
-    rate_hz: float,
-) -> Stills:
+def _overlays(folder: Path, description: Description, record: StageRecord | None, rate_hz: float) -> Stills:
     """Make the function that yields the same pictures with the skeleton drawn over them."""
-    if record is None or skeleton is None or not rate_hz:
+    if record is None or not rate_hz:
         return lambda _: ()
 
     @cache
@@ -274,6 +266,7 @@ def _overlays(
             for name, entry in description.cameras.items()
             if entry.media is not None
         }
+        skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
         return motion_from_skeleton(skeleton), read_filmed(folder, description, record, frames)
 
     def of(camera: str) -> Iterator[tuple[int, Picture]]:

@@ -25,7 +25,7 @@ from pipelines.session.tables import (
     SKELETON,
     TRUTH,
     Span,
-    motion_from,
+    read_motion,
     read_table,
     trajectory_from,
 )
@@ -201,15 +201,14 @@ def _skeleton(
 ) -> tuple[JointMotion | None, Source | None]:
     """Return the true skeleton, or else the reconstructed one."""
     if description.truth is not None and description.has_true_joints:
-        table = read_table(folder / "truth.parquet", TRUTH, span_ns)
-        return motion_from(table, tuple(description.truth.joints)), "truth"
+        joints = tuple(description.truth.joints)
+        return read_motion(folder / "truth.parquet", TRUTH, joints, span_ns), "truth"
     return (None, None) if reconstructed is None else (_reconstruction(folder, span_ns), "reconstruction")
 
 
 def _reconstruction(folder: Path, span_ns: Span | None) -> JointMotion:
     """Read the reconstructed skeleton; joints that are not `ok` are NaN."""
-    table = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON, span_ns)
-    motion = motion_from(table, tuple(dict.fromkeys(table["joint"])))
+    motion = read_motion(folder / "reconstruct" / "skeleton.parquet", SKELETON, span_ns=span_ns)
     if motion.status is not None:
         motion.position[motion.status != "ok"] = np.nan
     return motion

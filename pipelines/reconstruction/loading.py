@@ -34,8 +34,8 @@ from pipelines.session.tables import (
     Span,
     detections_from,
     most_confident,
-    motion_from,
     read_first,
+    read_motion,
     read_table,
     trajectory_from,
 )
@@ -327,5 +327,5 @@ def load_truth(
     """Load the true joints, NaN for joints without truth; None if the session has no truth (in the span)."""
     if not description.has_true_joints:
         return None
-    table = read_table(folder / "truth.parquet", TRUTH, span_ns)
-    return motion_from(table, joints) if len(table) or span_ns is None else None
+    motion = read_motion(folder / "truth.parquet", TRUTH, joints, span_ns)
+    return motion if len(motion.t_ns) or span_ns is None else None

@@ -130,9 +130,7 @@ def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], p
                 file = pq.ParquetFile(opened)
                 return file.metadata if number is None else file.read_row_group(number, columns=schema.names)
         except (OSError, pa.ArrowException) as error:
-            raise DataError(
-                path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
-            ) from error
+            raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
 
     def read(number: int) -> pd.DataFrame:
         frame: pd.DataFrame = group(number).to_pandas()
@@ -161,12 +159,13 @@ def read_table(path: Path, schema: pa.Schema, span_ns: Span | None = None) -> pd
         with path.open("rb") as file:
             opened = pq.ParquetFile(file)
             _refuse_bomb(path, opened.metadata)
-            has_times = span_ns is not None and "t_ns" in opened.schema_arrow.names
-            table = _rows_within(opened, span_ns) if span_ns and has_times else pq.read_table(file)
+            table = (
+                pq.read_table(file)
+                if span_ns is None
+                else pa.Table.from_batches(_batches_within(opened, span_ns), opened.schema_arrow)
+            )
     except (OSError, pa.ArrowException) as error:
-        raise DataError(
-            path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
-        ) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
     return _frame_of(path, table, schema)
 
 
@@ -183,9 +182,7 @@ def read_first(path: Path, schema: pa.Schema) -> pd.DataFrame:
             batches = pq.ParquetFile(file).iter_batches(1, columns=schema.names)
             first = next(iter(batches), None)
     except (OSError, pa.ArrowException) as error:
-        raise DataError(
-            path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
-        ) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
     frame: pd.DataFrame = (
         schema.empty_table() if first is None else pa.Table.from_batches([first])
     ).to_pandas()
@@ -200,7 +197,6 @@ def distinct(path: Path, name: str) -> Int64:
     """
     import pyarrow.parquet as pq
 
-    again = "run the stage that wrote it again with --force"
     try:
         with path.open("rb") as file:
             opened = pq.ParquetFile(file)
@@ -208,7 +204,7 @@ def distinct(path: Path, name: str) -> Int64:
             batches = _batches(opened, [name])
             parts = [np.unique(batch.column(0).to_numpy(zero_copy_only=False)) for batch in batches]
     except (OSError, pa.ArrowException, IndexError) as error:
-        raise DataError(path, "cannot be read as Parquet", again) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
     return np.unique(np.concatenate(parts)) if parts else np.empty(0, np.int64)
 
 
@@ -219,8 +215,7 @@ def count_rows(path: Path) -> int:
     try:
         return int(pq.read_metadata(path).num_rows)
     except (OSError, pa.ArrowException) as error:
-        again = "run the stage that wrote it again with --force"
-        raise DataError(path, "cannot be read as Parquet", again) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
 
 
 def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.DataFrame:
@@ -248,9 +243,7 @@ def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.Dat
                 kept.append(batch.filter(pa.array(chosen[place] == values)) if len(chosen) else batch[:0])
             table = pa.Table.from_batches(kept, opened.schema_arrow)
     except (OSError, pa.ArrowException) as error:
-        raise DataError(
-            path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
-        ) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
     return _frame_of(path, table, schema)
 
 
@@ -263,22 +256,36 @@ def _batches(opened: Any, columns: Sequence[str] | None = None) -> Iterator[Any]
         yield from opened.iter_batches(_ROWS_AT_ONCE, row_groups=[group], columns=columns)
 
 
-def _rows_within(file: Any, span_ns: Span) -> pa.Table:
-    """Read the rows of a Parquet file whose times lie within a span, a few at a time."""
+def _batches_within(opened: Any, span_ns: Span | None) -> Iterator[Any]:
+    """Yield the rows of a Parquet file whose times lie within a span (all without one), a few at a time."""
     import pyarrow.compute as pc
 
+    if span_ns is None or "t_ns" not in opened.schema_arrow.names:
+        yield from _batches(opened)
+        return
     first, last = (pa.scalar(t_ns, pa.int64()) for t_ns in span_ns)
-    column = file.schema_arrow.names.index("t_ns")
-    groups = []
-    for number in range(file.metadata.num_row_groups):
-        known = file.metadata.row_group(number).column(column).statistics
+    column = opened.schema_arrow.names.index("t_ns")
+    for number in range(opened.metadata.num_row_groups):
+        known = opened.metadata.row_group(number).column(column).statistics
         if known is None or not known.has_min_max or (known.max >= span_ns[0] and known.min <= span_ns[1]):
-            groups.append(number)
-    kept = []
-    for batch in file.iter_batches(_ROWS_AT_ONCE, row_groups=groups):
-        within = pc.and_(pc.greater_equal(batch["t_ns"], first), pc.less_equal(batch["t_ns"], last))
-        kept.append(batch.filter(within))
-    return pa.Table.from_batches(kept, file.schema_arrow)
+            for batch in opened.iter_batches(_ROWS_AT_ONCE, row_groups=[number]):
+                within = pc.and_(pc.greater_equal(batch["t_ns"], first), pc.less_equal(batch["t_ns"], last))
+                yield batch.filter(within)
+
+
+def _parts(path: Path, schema: pa.Schema, span_ns: Span | None) -> Iterator[pd.DataFrame]:
+    """Yield what `read_table` returns in parts; the first has the columns and no rows."""
+    import pyarrow.parquet as pq
+
+    try:
+        with path.open("rb") as file:
+            opened = pq.ParquetFile(file)
+            _refuse_bomb(path, opened.metadata)
+            yield _frame_of(path, opened.schema_arrow.empty_table(), schema)
+            for batch in _batches_within(opened, span_ns):
+                yield _frame_of(path, pa.Table.from_batches([batch], opened.schema_arrow), schema)
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
 
 
 def _frame_of(path: Path, table: pa.Table, schema: pa.Schema) -> pd.DataFrame:
@@ -293,9 +300,8 @@ def _frame_of(path: Path, table: pa.Table, schema: pa.Schema) -> pd.DataFrame:
 
 def _refuse_absurd_numbers(path: Path, frame: pd.DataFrame, names: Sequence[str]) -> None:
     """Refuse numbers that no stage writes, before they overflow in a later step; NaN is missing."""
-    again = "run the stage that wrote it again with --force"
     if list(names) == POSES.names and (np.diff(frame["t_ns"].to_numpy()) <= 0).any():
-        raise DataError(path, "holds times that do not increase", again)
+        raise DataError(path, "holds times that do not increase", _AGAIN)
     for name in names:
         if frame[name].dtype.kind in "if" and len(frame):
             values = frame[name].to_numpy()
@@ -305,7 +311,7 @@ def _refuse_absurd_numbers(path: Path, frame: pd.DataFrame, names: Sequence[str]
                 wrong &= np.isfinite(values)
             if wrong.any():
                 row = int(np.argmax(wrong))
-                raise DataError(path, f"holds {values[row]:g} as {name} in row {row}", again)
+                raise DataError(path, f"holds {values[row]:g} as {name} in row {row}", _AGAIN)
 
 
 def _refuse_bomb(path: Path, metadata: Any) -> None:
@@ -314,9 +320,10 @@ def _refuse_bomb(path: Path, metadata: Any) -> None:
     size = max(metadata.num_rows * metadata.num_columns * _CELL, sum(groups))
     if size > max(_INFLATED, _MOST_EXPANSION * path.stat().st_size):
         problem = f"holds {metadata.num_rows} rows, {size} bytes, in a file of {path.stat().st_size}"
-        raise DataError(path, problem, "run the stage that wrote it again with --force")
+        raise DataError(path, problem, _AGAIN)
 
 
+_AGAIN = "run the stage that wrote it again with --force"
 _ROWS_AT_ONCE = 1 << 16  # of a table of which only a span is kept
 _LARGEST = 1e15  # of any number; squares of much larger ones overflow
 LATEST_NS = 2**62 - 1
@@ -475,25 +482,66 @@ def motion_table(motion: JointMotion) -> pd.DataFrame:
 
 def motion_from(table: pd.DataFrame, joints: tuple[str, ...]) -> JointMotion:
     """Rebuild the motion of these joints from a table of `tables.TRUTH` or `tables.SKELETON`."""
-    joint = _index_of(table["joint"], joints)
     # Times without any of these joints are kept.
-    t_ns, row = np.unique(table["t_ns"].to_numpy(np.int64), return_inverse=True)
-    table, row, joint = table[joint >= 0], row[joint >= 0], joint[joint >= 0]
-    person = table["person"].to_numpy(np.int64)
-    shape = (len(t_ns), int(person.max(initial=0)) + 1, len(joints))
+    t_ns = np.unique(table["t_ns"].to_numpy(np.int64))
+    motion = _unknown_motion(t_ns, joints, _people_of(table), table)
+    _fill_motion(motion, table)
+    return motion
+
+
+def read_motion(
+    path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = None, span_ns: Span | None = None
+) -> JointMotion:
+    """Read the motion of these joints (None: of all) from a table of `tables.TRUTH` or `tables.SKELETON`.
+
+    It is that of `motion_from`, with one part of the table in memory at a time.
+
+    Raises:
+        DataError: see `read_table`.
+    """
+    times, people, names = [np.empty(0, np.int64)], 1, dict[str, None]()
+    for part in _parts(path, schema, span_ns):
+        times.append(np.unique(part["t_ns"].to_numpy(np.int64)))
+        people = max(people, _people_of(part))
+        names |= dict.fromkeys(part["joint"].unique())
+    motion = _unknown_motion(np.unique(np.concatenate(times)), joints or tuple(names), people, part)
+    for part in _parts(path, schema, span_ns):
+        _fill_motion(motion, part)
+    return motion
+
+
+def _people_of(table: pd.DataFrame) -> int:
+    return int(table["person"].max()) + 1 if len(table) else 1
+
+
+def _unknown_motion(t_ns: Int64, joints: tuple[str, ...], people: int, table: pd.DataFrame) -> JointMotion:
+    """Return a motion of which nothing is known, with the quantities that a table has."""
+    shape = (len(t_ns), people, len(joints))
     position = np.full((*shape, 3), np.nan)
-    position[row, person, joint] = table[_POSITION].to_numpy(np.float64)
-    status = reprojection = views = covariance = None
-    if "status" in table:
-        status = np.full(shape, "not_detected", dtype="U16")
-        status[row, person, joint] = table["status"].to_numpy(str)
-        reprojection = np.full(shape, np.nan)
-        reprojection[row, person, joint] = table["reprojection_px"].to_numpy(np.float64)
-        views = np.zeros(shape, np.int64)
-        views[row, person, joint] = table["views"].to_numpy(np.int64)
-        covariance = np.full((*shape, 6), np.nan)
-        covariance[row, person, joint] = table[list(POINT_COVARIANCE_COLUMNS)].to_numpy(np.float64)
-    return JointMotion(t_ns, joints, position, status, reprojection, views, covariance)
+    if "status" not in table:
+        return JointMotion(t_ns, joints, position)
+    status = np.full(shape, "not_detected", dtype="U16")
+    views = np.zeros(shape, np.int64)
+    return JointMotion(
+        t_ns, joints, position, status, np.full(shape, np.nan), views, np.full((*shape, 6), np.nan)
+    )
+
+
+def _fill_motion(motion: JointMotion, table: pd.DataFrame) -> None:
+    """Write the rows of a table into a motion that has their times."""
+    joint = _index_of(table["joint"], motion.joints)
+    row = np.searchsorted(motion.t_ns, table["t_ns"].to_numpy(np.int64))
+    table, row, joint = table[joint >= 0], row[joint >= 0], joint[joint >= 0]
+    cell = row, table["person"].to_numpy(np.int64), joint
+    motion.position[cell] = table[_POSITION].to_numpy(np.float64)
+    if motion.status is not None:
+        motion.status[cell] = table["status"].to_numpy(str)
+    if motion.reprojection_px is not None:
+        motion.reprojection_px[cell] = table["reprojection_px"].to_numpy(np.float64)
+    if motion.views is not None:
+        motion.views[cell] = table["views"].to_numpy(np.int64)
+    if motion.covariance is not None:
+        motion.covariance[cell] = table[list(POINT_COVARIANCE_COLUMNS)].to_numpy(np.float64)
 
 
 def _index_of(names: pd.Series[str], wanted: Sequence[str]) -> NDArray[np.intp]:

@@ -24,6 +24,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Recording, Trajectory
 
 _COLUMNS: tuple[str, ...] = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+_POSES_AT_ONCE = 10_000  # of a file that is written
 _HEADING = re.compile(r"[^\s,;\[(]+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?")  # a name, perhaps with its unit
 
 
@@ -128,15 +129,17 @@ def _joint_tracks(recording: Recording) -> dict[str, Trajectory]:
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write poses so that reading them gives the same stamps and bit-identical numbers."""
-    lines = ["# " + " ".join(_COLUMNS)]
-    for stamp, position, quaternion in zip(
-        format_seconds(trajectory.t_ns),
-        trajectory.position.tolist(),
-        trajectory.quaternion_xyzw.tolist(),
-        strict=True,
-    ):
-        lines.append(" ".join([stamp, *map(repr, position), *map(repr, quaternion)]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write("# " + " ".join(_COLUMNS) + "\n")
+        for first in range(0, len(trajectory.t_ns), _POSES_AT_ONCE):
+            some = slice(first, first + _POSES_AT_ONCE)
+            for stamp, position, quaternion in zip(
+                format_seconds(trajectory.t_ns[some]),
+                trajectory.position[some].tolist(),
+                trajectory.quaternion_xyzw[some].tolist(),
+                strict=True,
+            ):
+                file.write(" ".join([stamp, *map(repr, position), *map(repr, quaternion)]) + "\n")
 
 
 def _spaced(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Rec
 if TYPE_CHECKING:
     import pyarrow as pa
 
+_TIMES_AT_ONCE = 1000  # of a table that is written
 _MOST_EMPTY = 100  # dense cells per row above which a file is refused as scattered
 
 
@@ -130,16 +132,20 @@ def write_joints(path: Path, motion: JointMotion) -> None:
     """Write `t_ns,person,joint,x,y,z` and all other known values (covariance in m^2); NaN is blank."""
     import pandas as pd
 
-    columns = joint_columns(motion)
-    if motion.covariance is not None:
-        columns |= dict(zip(POINT_COVARIANCE_COLUMNS, motion.covariance.reshape(-1, 6).T, strict=True))
-    if motion.views is not None:
-        columns["views"] = motion.views.ravel()
-    if motion.status is not None:
-        columns["status"] = motion.status.ravel()
-    if motion.reprojection_px is not None:
-        columns["reprojection_px"] = motion.reprojection_px.ravel()
-    pd.DataFrame(columns).to_csv(path, index=False, lineterminator="\n")
+    with path.open("w", encoding="utf-8", newline="") as file:
+        for first in range(0, len(motion.t_ns), _TIMES_AT_ONCE):
+            some = slice(first, first + _TIMES_AT_ONCE)
+            columns = joint_columns(replace(motion, t_ns=motion.t_ns[some], position=motion.position[some]))
+            if motion.covariance is not None:
+                upper = motion.covariance[some].reshape(-1, 6).T
+                columns |= dict(zip(POINT_COVARIANCE_COLUMNS, upper, strict=True))
+            if motion.views is not None:
+                columns["views"] = motion.views[some].ravel()
+            if motion.status is not None:
+                columns["status"] = motion.status[some].ravel()
+            if motion.reprojection_px is not None:
+                columns["reprojection_px"] = motion.reprojection_px[some].ravel()
+            pd.DataFrame(columns).to_csv(file, index=False, header=not first, lineterminator="\n")
 
 
 class CsvExport:

@@ -31,6 +31,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
 
 _DECIMALS = 7  # of a metre: far below any measurement error, and rows stay readable
+_FRAMES_AT_ONCE = 1000  # of a file that is written
 
 
 @dataclass(frozen=True)
@@ -171,15 +172,17 @@ def write_joints(
         "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, count + 1) for axis in "XYZ"),
         "",
     ]
-    position = motion.position[:, person] / METRES[unit]
-    rows = (to_y_up(position) if axes == "y-up" else position).reshape(frames, 3 * count)
     decimals = _DECIMALS + round(math.log10(METRES[unit]))
-    for frame, (stamp, row) in enumerate(
-        zip(format_seconds(motion.t_ns), rows.tolist(), strict=True), start=1
-    ):
-        cells = ["NaN" if math.isnan(value) else f"{value:.{decimals}f}" for value in row]
-        lines.append("\t".join([str(frame), stamp, *cells]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in lines)
+        for first in range(0, frames, _FRAMES_AT_ONCE):
+            some = slice(first, first + _FRAMES_AT_ONCE)
+            position = motion.position[some, person] / METRES[unit]
+            rows = (to_y_up(position) if axes == "y-up" else position).reshape(-1, 3 * count)
+            stamps = format_seconds(motion.t_ns[some])
+            for frame, (stamp, row) in enumerate(zip(stamps, rows.tolist(), strict=True), start=first + 1):
+                cells = ["NaN" if math.isnan(value) else f"{value:.{decimals}f}" for value in row]
+                file.write("\t".join([str(frame), stamp, *cells]) + "\n")
 
 
 FORMAT = TrcFormat()
