@@ -20,7 +20,7 @@ from pipelines.follow import BACKGROUND, Following, cameras_to_follow
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import Followed, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
-from pipelines.reconstruction.loading import load_cameras, load_time_base
+from pipelines.reconstruction.loading import common_joints, load_cameras, load_time_base
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.segments import divided, doubts_of_flight
 from pipelines.session.description import Description, Doubt, read_description, said_doubts
@@ -102,7 +102,8 @@ def _checked(
         description = read_description(folder)
         detected, pictures = _detected(session, description, detector, workers, progress)
         _, t_ns = load_time_base(folder, description, detected, None)
-        segments = divided(t_ns)
+        keypoints = len(description.cameras) * len(common_joints(folder, description, detected))
+        segments = divided(t_ns, keypoints)
         looked_at = partial(_doubts, session, description, detected, pose_noise)
         if len(segments) < 2:
             return Checked(looked_at(None), list(description.warnings), pictures)

@@ -29,7 +29,7 @@ from pipelines.follow import Following, cameras_to_follow
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import STATUS
 from pipelines.keypoints.calibration import measured_for
-from pipelines.reconstruction.loading import load_time_base
+from pipelines.reconstruction.loading import common_joints, load_time_base
 from pipelines.reconstruction.results import gait_of
 from pipelines.reconstruction.segments import divided
 from pipelines.reconstruction.smoothing import smoother
@@ -107,7 +107,8 @@ def reconstruct(
             background, left_out = _finished(following, settings, workers, cluster, progress)
         measured = measured_for(detected.settings["detector"]) if detected else None
         base, t_ns = load_time_base(folder, description, detected, settings.rate_hz)
-        segments = divided(t_ns) if errors is None else []
+        keypoints = len(description.cameras) * len(common_joints(folder, description, detected))
+        segments = divided(t_ns, keypoints) if errors is None else []
         run = session.begin(
             RECONSTRUCT,
             settings=_stated(settings, detected) | stated_segments(segments),

@@ -33,6 +33,7 @@ from pipelines.reconstruction.results import camera_poses_table, gait_of
 from pipelines.reconstruction.segments import (
     APART_M,
     LENGTH_S,
+    MOST_KEYPOINTS,
     OVERLAP_S,
     Segment,
     apart_m,
@@ -197,7 +198,9 @@ def _nothing_of_segment(place: Path, order: _Order, reason: str) -> dict[str, ob
 
 def stated_segments(segments: Sequence[Segment]) -> dict[str, object]:
     """Return how a long flight is divided, for the settings that determine its result; empty for others."""
-    return {"segments": {"longest_s": LENGTH_S, "overlap_s": OVERLAP_S}} if len(segments) > 1 else {}
+    if len(segments) < 2:
+        return {}
+    return {"segments": {"longest_s": LENGTH_S, "most_keypoints": MOST_KEYPOINTS, "overlap_s": OVERLAP_S}}
 
 
 def by_segments(

@@ -31,8 +31,11 @@ if TYPE_CHECKING:
 LENGTH_S = 180.0
 """The longest segment without its overlaps; a shorter flight is a single one."""
 
-MOST_TIMES = 21_600
-"""The most times of the skeleton in a segment: memory grows with them. Cameras of 120 Hz take as many."""
+MOST_KEYPOINTS = 360_000
+"""The most keypoints in a segment, times x cameras x joints of a person: memory grows with them."""
+
+SHORTEST_S = 30.0
+"""No segment of a flight longer than this is shorter, however many keypoints it has."""
 
 OVERLAP_S = 10.0
 """Time that two neighbours share."""
@@ -78,12 +81,18 @@ class Segment:
         return Segment(self.number, self.t_ns + offset_ns, own_ns)
 
 
-def divided(t_ns: Int64) -> list[Segment]:
-    """Divide the skeleton's times [T] into segments of equal length; a short flight is one."""
+def divided(t_ns: Int64, keypoints: int) -> list[Segment]:
+    """Divide the skeleton's times [T] into segments of equal length; a short flight is one.
+
+    Args:
+        t_ns: the times.
+        keypoints: of a person at one time, in all cameras together.
+    """
     if not len(t_ns):
         return []
     lasts_s = float(t_ns[-1] - t_ns[0]) / 1e9
-    count = int(max(np.ceil(lasts_s / LENGTH_S), np.ceil(len(t_ns) / MOST_TIMES), 1))
+    by_memory = min(len(t_ns) * keypoints / MOST_KEYPOINTS, lasts_s / SHORTEST_S)
+    count = int(np.ceil(max(lasts_s / LENGTH_S, by_memory, 1.0)))
     edges = t_ns[0] + np.round(np.linspace(0.0, lasts_s, count + 1) * 1e9).astype(np.int64)
     edges[-1] = t_ns[-1] + 1
     reach_ns = round(0.5e9 * OVERLAP_S)

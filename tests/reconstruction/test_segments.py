@@ -52,15 +52,15 @@ def skeleton(t_ns: Int64, place: Float, variance: float = 1e-4, people: int = 1)
 
 
 def test_a_short_flight_is_a_single_segment() -> None:
-    (one,) = divided(times(segments.LENGTH_S))
+    (one,) = divided(times(segments.LENGTH_S), 51)
     assert one.own == slice(0, len(one.t_ns))
-    assert divided(times(0)) == []
+    assert divided(times(0), 51) == []
 
 
 @pytest.mark.parametrize("seconds", [181.0, 1234.5, 3600.0])
 def test_every_time_is_the_own_of_one_segment(seconds: float) -> None:
     t_ns = times(seconds)
-    parts = divided(t_ns)
+    parts = divided(t_ns, 51)
     assert np.array_equal(np.concatenate([part.t_ns[part.own] for part in parts]), t_ns)
     assert max(np.ptp(part.t_ns[part.own]) for part in parts) <= segments.LENGTH_S * SECOND
     for before, after in pairwise(parts):
@@ -68,11 +68,16 @@ def test_every_time_is_the_own_of_one_segment(seconds: float) -> None:
         assert np.ptp(shared) == pytest.approx(segments.OVERLAP_S * SECOND, abs=2 * STEP)
 
 
-def test_fast_cameras_have_shorter_segments_and_pauses_none() -> None:
-    t_ns = np.arange(4 * segments.MOST_TIMES, dtype=np.int64) * (SECOND // 240)
-    assert len(divided(t_ns)) == 4
+def test_many_keypoints_have_shorter_segments_down_to_a_limit_and_pauses_none() -> None:
+    hour = times(3600)
+    for keypoints in (3 * 17, 3 * 33, 8 * 33):
+        most = max(len(part.t_ns[part.own]) for part in divided(hour, keypoints))
+        assert most * keypoints <= segments.MOST_KEYPOINTS
+    fast = np.arange(600 * 240, dtype=np.int64) * (SECOND // 240)
+    assert len(divided(fast, 20 * 133)) == np.ceil(600 / segments.SHORTEST_S)
+    assert len(divided(times(segments.SHORTEST_S), 10**6)) == 1
     paused = np.concatenate([times(100), times(100) + 3000 * SECOND])
-    parts = divided(paused)
+    parts = divided(paused, 51)
     assert np.array_equal(np.concatenate([part.t_ns[part.own] for part in parts]), paused)
     assert all(len(part.t_ns) for part in parts)
 
@@ -80,7 +85,7 @@ def test_fast_cameras_have_shorter_segments_and_pauses_none() -> None:
 def test_at_a_seam_the_acceleration_is_that_of_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segments, "LENGTH_S", 20.0)
     t_ns = times(60)
-    parts = divided(t_ns)
+    parts = divided(t_ns, 51)
     assert len(parts) == 3
     away = [np.array([0.05 * k, -0.03 * k, 0.0]) for k in range(3)]  # estimates differ by constants
 
