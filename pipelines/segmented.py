@@ -60,7 +60,7 @@ from pipelines.session.people import LoggedActor
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Run, Session
 from pipelines.session.storage import jsonable, read_json, write_json
-from pipelines.session.stores import published_version
+from pipelines.session.stores import is_copy, publish_meanwhile
 from pipelines.session.tables import (
     ANGLES,
     CAMERA_POSES,
@@ -227,9 +227,11 @@ def by_segments(
     """
     folder = source.folder
     each: Each
-    if cluster is not None and published_version(folder) is None:
+    if cluster is not None:
+        if is_copy(folder.absolute()):  # workers need what was found in the pictures
+            publish_meanwhile(folder)
         each, threads = partial(cluster.each, progress=progress), 1
-    else:  # the pictures' results of a session in a store are on this machine only
+    else:
         memory = available_bytes()
         most = workers if memory is None else min(workers, max(memory // _SEGMENT_BYTES, 1))
         count = min(most, len(segments))

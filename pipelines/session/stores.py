@@ -52,6 +52,8 @@ _SPARE_BYTES = 1 << 30  # of the disk, that sources leave free
 
 T = TypeVar("T")
 
+_staged: dict[Path, "Copy"] = {}  # by its folder: the sessions that this process works on
+
 
 def url_of(place: Path | str) -> str | None:
     """Return the URL that a place is; None for a place on this machine.
@@ -153,6 +155,18 @@ def published_version(session: Path) -> str | None:
     url = (_noted(root.with_suffix(".json")) or {}).get("url")
     folder = (_noted(root / "base.json") or {}).get("folder")
     return f"{url}/{folder}" if url and folder else None
+
+
+def publish_meanwhile(session: Path) -> None:
+    """Publish what is finished of a session that is staged, so that other machines can read it.
+
+    Raises:
+        BusyError: another writer published a version since the copy was made.
+        DataError: the store cannot be written.
+    """
+    copy = _staged[session.absolute()]
+    with _own_disk(copy.folder):
+        copy.publish()
 
 
 def fetched(url: str, *, fresh: bool = False) -> Path:
@@ -435,7 +449,7 @@ class Copy:
 def staged(url: str, *, create: bool = False) -> Iterator[Copy]:
     """Work on a copy of a session of a store; at the end it is published and the copy is removed.
 
-    After an error nothing is published, and the copy stays for the same command to continue.
+    After an error nothing more is published, and the copy stays for the same command to continue.
 
     Args:
         create: allow a URL at which there is no session yet (ingest).
@@ -452,6 +466,8 @@ def staged(url: str, *, create: bool = False) -> Iterator[Copy]:
             write_json(root.with_suffix(".json"), {"url": url})
             copy = Copy(url, root)
             copy.begin(create=create)
+        _staged[copy.folder] = copy
+        stack.callback(_staged.pop, copy.folder)
         yield copy
         with _own_disk(root):
             copy.publish()

@@ -18,6 +18,10 @@ from typing import Any
 
 import pytest
 
+from pipelines.attempt import Settings
+from pipelines.reconstruct import reconstruct
+from pipelines.reconstruction import segments
+from pipelines.session.clusters import Cluster
 from pipelines.session.errors import BusyError, DataError
 from pipelines.session.stores import (
     Copy,
@@ -32,6 +36,7 @@ from pipelines.session.stores import (
     url_of,
 )
 from tests.commands.runner import content, mocap, refused, succeeds
+from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 from tests.synthetic.flights import write_flight
 
 SERVER = str(Path(sys.executable).with_name("moto_server"))
@@ -150,6 +155,43 @@ def test_a_flight_in_a_store_makes_the_same_tables_as_on_disk(bucket: str, tmp_p
     assert "Test flight" in succeeds("info", f"{bucket}/there.session")
     assert "drone1" in succeeds("info", f"{bucket}/flights/flight.yaml")
     assert not list((tmp_path / "cache" / "mocap" / "stores" / "sessions").glob("*/*.session"))
+
+
+def test_segments_of_a_session_in_a_store_go_to_workers_elsewhere(
+    bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed: Any = pytest.importorskip("distributed")
+    for name, value in {"LENGTH_S": 2.0, "OVERLAP_S": 1.0, "_BLENDED_NS": 600_000_000}.items():
+        monkeypatch.setattr(segments, name, value)
+    (tmp_path / "flight").mkdir()
+    manifest = write_spotted_flight(tmp_path / "flight", frames=130)
+    for path in sorted((tmp_path / "flight").iterdir()):
+        put(f"{bucket}/flights/{path.name}", path.read_bytes())
+    succeeds("ingest", manifest, "-o", tmp_path / "here.session")
+    succeeds("ingest", f"{bucket}/flights/flight.yaml", "-o", f"{bucket}/there.session")
+    settings = Settings(method="robust", detector=spot_detector(tmp_path))
+    reconstruct(tmp_path / "here.session", settings, workers=1)
+    elsewhere = {"XDG_CACHE_HOME": str(tmp_path / "cache-elsewhere")}
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=None, env=elsewhere
+        ) as workers,
+        distributed.Client(workers) as client,
+        staged(f"{bucket}/there.session") as copy,
+    ):
+        made = reconstruct(copy.folder, settings, cluster=Cluster.of(client))
+        assert len(made.metrics["segments"]) == 3
+        found = content(copy.folder / "reconstruct")
+    here = content(tmp_path / "here.session" / "reconstruct")
+    tables = [name for name in here if name.endswith(".parquet")]
+    assert len(tables) == 3
+    assert {name: here[name] for name in tables} == {name: found[name] for name in tables}
+    # The worker fetched two versions: without keypoints for its blocks, with them for its segments.
+    versions = list((tmp_path / "cache-elsewhere" / "mocap" / "stores" / "sources").glob("*/*/session.json"))
+    assert len(versions) == 2
+    assert not list((tmp_path / "cache-elsewhere").rglob("skeleton.parquet"))
+    with staged(f"{bucket}/there.session") as copy:
+        assert content(copy.folder / "reconstruct") == found
 
 
 def test_an_export_of_a_session_in_a_store_is_written_here(
