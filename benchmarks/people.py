@@ -1,7 +1,7 @@
 """Several people: who is found, missed and confused.
 
     python -m benchmarks.people [--seeds 10 11 12] [--method auto] [--scene NAME ...]
-    python -m benchmarks.people --films FOLDER [--scene NAME ...]
+    python -m benchmarks.people --films FOLDER [--seeds 20] [--scene NAME ...]
     python -m benchmarks.people --corpus
 
 The first is modelled: keypoints have the measured errors of the detector, and a joint behind another person's
@@ -16,10 +16,13 @@ Films and keypoints are kept in the folder, and an interrupted run goes on. The 
 of several people in the corpus, whose keypoints are kept.
 
 Seen: times at which two cameras or more see at least half of the joints of a true person. Coverage is the
-share of these at which somebody reconstructed is within 0.5 m of them. Switches, phantoms (times), MOTA,
-IDF1 and MPJPE (mm) are those of metrics.json; `first` is the MPJPE of the first person. MOTA and IDF1 count
-people whom one camera sees or none as missed, and somebody measured 0.6 m from where they are as missed and
-as a phantom. At `nobody` a body is more than 1 m from everybody.
+share of these at which somebody reconstructed is within 0.5 m of them. Detected is the share of these at
+which two cameras or more have a detection of the person: the median over its joints is within 0.25 m of the
+true ones, at the person's distance, and nobody else is nearer. `of these` is the coverage of those times.
+
+Switches, phantoms (times), MOTA, IDF1 and MPJPE (mm) are those of metrics.json; `first` is the MPJPE of the
+first person. MOTA and IDF1 count people whom one camera sees or none as missed, and somebody measured 0.6 m
+from where they are as missed and as a phantom. At `nobody` a body is more than 1 m from everybody.
 """
 
 from __future__ import annotations
@@ -30,25 +33,28 @@ import tempfile
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
 from benchmarks.corpus.stored import Flight, flights
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.session.people import true_joints_at
 from pipelines.session.registries import noise_models
-from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
+from pipelines.session.tables import KEYPOINTS, SKELETON, TRUTH, motion_from, read_table
 from pipelines.simulate import simulate
-from pipelines.simulation.flight import fly_scenario, visible_joints
+from pipelines.simulation.detector_errors import see
+from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario, visible_joints
 from pipelines.simulation.scenario import read_scenario
 
 Choice = Literal["auto", "refined", "robust"]
 
 WITHIN_M = 0.5
+DETECTED_M = 0.25
 NOBODY_M = 1.0  # the logs' errors move a body by less
 WALK = {"distance_m": 7, "speed_mps": 1.2}
 JOG = {"distance_m": 14, "speed_mps": 2.4}
@@ -99,7 +105,7 @@ SCENES: dict[str, dict[str, dict[str, Any]]] = {
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[10, 11, 12])
+    parser.add_argument("--seeds", type=int, nargs="+", help="default 10 11 12, of films 20")
     parser.add_argument("--method", choices=get_args(Choice), default="auto")
     parser.add_argument("--scene", choices=SCENES, action="append")
     parser.add_argument("--films", type=Path, metavar="FOLDER", help="film the scenes")
@@ -110,11 +116,12 @@ def main() -> None:
         _print_filmed((flight.name, of_corpus(flight), []) for flight in flights() if flight.scenario.actors)
     elif arguments.films:
         _print_filmed(
-            (scene, filmed(scene, arguments.films), alone_on_films(scene, arguments.films))
+            (scene, filmed(scene, arguments.films, seed), alone_on_films(scene, arguments.films, seed))
             for scene in scenes
+            for seed in arguments.seeds or [FILM_SEED]
         )
     else:
-        _print_modelled(scenes, arguments.seeds, arguments.method)
+        _print_modelled(scenes, arguments.seeds or [10, 11, 12], arguments.method)
 
 
 def _print_modelled(scenes: list[str], seeds: list[int], method: Choice) -> None:
@@ -145,12 +152,17 @@ def _print_modelled(scenes: list[str], seeds: list[int], method: Choice) -> None
 
 
 def _print_filmed(rows: Iterable[tuple[str, dict[str, Any], list[float]]]) -> None:
-    print("| film | found | coverage | switches | phantoms | nobody | MOTA | IDF1 | MPJPE of each | alone |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    print(
+        "| film | found | coverage | detected | of these | switches | phantoms | nobody | MOTA | IDF1"
+        " | MPJPE of each | alone |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for name, row, alone in rows:
         each, by_themselves = (" ".join(f"{mm:.0f}" for mm in those) for those in (row["each_mm"], alone))
         print(
             f"| {name} | {row['found']} of {row['people']} | {100 * row['covered'] / row['seen']:.1f} %"
+            f" | {100 * row['detected'] / row['seen']:.1f} %"
+            f" | {100 * row['covered_of_detected'] / row['detected']:.1f} %"
             f" | {row['switches']} | {row['phantoms']} | {row['nobody']} | {row['mota']:.3f}"
             f" | {row['idf1']:.3f} | {each} | {by_themselves} |",
             flush=True,
@@ -198,15 +210,17 @@ def _modelled(people: str, seed: int) -> Path:
 
 def figures(session: Path, scenario: Path, method: Choice = "auto") -> dict[str, Any]:
     """Reconstruct everybody in a session, and compare with the truth."""
-    metrics = reconstruct(session, Settings(method=method, people="auto")).metrics
+    metrics = reconstruct(session, Settings(method=method, people="auto"), force=True).metrics
     tracking, names = metrics["tracking"], metrics["people"]["names"]
-    covered, seen, nobody = coverage(session, scenario)
+    times = coverage(session, scenario)
     return {
-        "people": len(seen),
+        "people": times.seen.shape[1],
         "found": len(names),
-        "covered": covered.sum(),
-        "seen": seen.sum(),
-        "nobody": nobody,
+        "covered": int((times.covered & times.seen).sum()),
+        "seen": int(times.seen.sum()),
+        "detected": int((times.detected & times.seen).sum()),
+        "covered_of_detected": int((times.covered & times.detected & times.seen).sum()),
+        "nobody": times.nobody,
         "each_mm": [metrics["by_person"][name]["mpjpe_mm"] or np.nan for name in names],
         "mpjpe_mm": metrics["mpjpe_mm"],
         "refused": metrics["people"]["phantoms"],
@@ -217,12 +231,13 @@ def figures(session: Path, scenario: Path, method: Choice = "auto") -> dict[str,
 FILM_SEED = 20
 
 
-def filmed(scene: str, folder: Path, only: str | None = None) -> dict[str, Any]:
+def filmed(scene: str, folder: Path, seed: int, only: str | None = None) -> dict[str, Any]:
     """Film a scene, or one of its people, where the folder does not have it yet; return the figures."""
     people = SCENES[scene] if only is None else {only: SCENES[scene][only]}
-    place = folder / "_".join([*scene.split(), *([only] if only else [])])
+    number = [] if seed == FILM_SEED else [str(seed)]
+    place = folder / "_".join([*scene.split(), *number, *([only] if only else [])])
     place.mkdir(parents=True, exist_ok=True)
-    plan = scenario_of(people, FILM_SEED)
+    plan = scenario_of(people, seed)
     plan["world"]["wood"] = {"count": 10, "radius_m": 32, "clear_m": 13}
     plan["drones"]["camera"] |= {"width": 640, "height": 360, "hfov_deg": 60}
     scenario = place / "scenario.yaml"
@@ -232,9 +247,9 @@ def filmed(scene: str, folder: Path, only: str | None = None) -> dict[str, Any]:
     return figures(session, scenario)
 
 
-def alone_on_films(scene: str, folder: Path) -> list[float]:
+def alone_on_films(scene: str, folder: Path, seed: int) -> list[float]:
     """Return the MPJPE (mm) of the first two people of a scene in films of their own."""
-    return [filmed(scene, folder, only)["mpjpe_mm"] for only in list(SCENES[scene])[:2]]
+    return [filmed(scene, folder, seed, only)["mpjpe_mm"] for only in list(SCENES[scene])[:2]]
 
 
 def of_corpus(flight: Flight) -> dict[str, Any]:
@@ -268,11 +283,17 @@ def scenario_of(people: dict[str, dict[str, Any]], seed: int) -> dict[str, Any]:
     }
 
 
-def coverage(session: Path, scenario: Path) -> tuple[Int64, Int64, int]:
-    """Count, for each true person, the times seen by two cameras that are covered, and all of these.
+class Times(NamedTuple):
+    """Times [T, Q] of true people, and the number of times at which a body is at nobody."""
 
-    Also returns the number of times at which a reconstructed body is further than 1 m from everybody.
-    """
+    covered: Bool  # somebody reconstructed is within 0.5 m
+    seen: Bool  # two cameras or more see at least half of the joints
+    detected: Bool  # two cameras or more have a detection
+    nobody: int  # a reconstructed body is further than 1 m from everybody
+
+
+def coverage(session: Path, scenario: Path) -> Times:
+    """Find when each true person is reconstructed, seen and detected."""
     skeleton = read_table(session / "reconstruct" / "skeleton.parquet", SKELETON)
     skeleton = skeleton.assign(**{axis: skeleton[axis].where(skeleton["status"] == "ok") for axis in "xyz"})
     joints = tuple(skeleton["joint"].unique())
@@ -282,22 +303,44 @@ def coverage(session: Path, scenario: Path) -> tuple[Int64, Int64, int]:
     both = np.isfinite(offset[..., 0])
     mean = np.where(both[..., None], offset, 0.0).sum(axis=3) / np.maximum(both.sum(axis=3), 1)[..., None]
     distance = np.where(both.any(axis=3), np.linalg.norm(mean, axis=-1), np.inf)  # [T, P, Q]
-    near = (distance <= WITHIN_M).any(axis=1)  # [T, Q]
-    seen = seen_by_two(scenario, motion.t_ns)
     nobody = np.isfinite(motion.position[..., 0]).any(axis=2) & (distance > NOBODY_M).all(axis=2)
-    return (near & seen).sum(axis=0), seen.sum(axis=0), int(nobody.sum())
 
-
-def seen_by_two(scenario: Path, t_ns: Int64) -> Bool:
-    """Test [T, Q] when two cameras see at least half of a person's joints."""
     plan = read_scenario(scenario)
     flight = fly_scenario(plan, noise_models(str(scenario), plan.drones.pose_noise))
-    seen: Float = np.zeros((len(t_ns), len(flight.people)))
+    seen, detected = np.zeros((2, len(motion.t_ns), len(flight.people)), np.int64)
     for drone in flight.drones:
-        frame = np.abs(drone.at_frames.t_ns[None] + plan.start_ns - t_ns[:, None]).argmin(axis=1)
+        frame = np.abs(drone.at_frames.t_ns[None] + plan.start_ns - motion.t_ns[:, None]).argmin(axis=1)
         for q, person in enumerate(flight.people):
             seen[:, q] += (visible_joints(flight, drone, person)[1].mean(axis=1) >= 0.5)[frame]
-    return np.asarray(seen >= 2)
+        detected += detections_of(flight, drone, session)[frame]
+    covered: Bool = np.asarray((distance <= WITHIN_M).any(axis=1))
+    return Times(covered, seen >= 2, detected >= 2, int(nobody.sum()))
+
+
+def detections_of(flight: SimulatedFlight, drone: SimulatedDrone, session: Path) -> Bool:
+    """Test [F, Q] in which pictures of a drone a detection is the person's."""
+    path = session / "detect" / drone.name / "keypoints.parquet"
+    if not path.is_file():
+        path = session / "cameras" / drone.name / "keypoints.parquet"
+    table = read_table(path, KEYPOINTS)
+    names, rows, camera = flight.people[0].person.joints, flight.moments_of(drone), drone.at_frames
+    table = table[table["joint"].isin(names)]
+    frame, joint = table["frame"].to_numpy(), [names.index(name) for name in table["joint"]]
+    apart_m = np.empty((len(table), len(flight.people)))
+    for q, person in enumerate(flight.people):
+        true = person.joints[rows]
+        pixels = see(
+            true, camera.camera_position[:, None], camera.camera_quaternion_xyzw[:, None], drone.intrinsics
+        )
+        range_m = np.linalg.norm(true.mean(axis=1) - camera.camera_position, axis=-1)
+        apart_px = np.linalg.norm(table[["x", "y"]].to_numpy() - pixels[frame, joint], axis=-1)
+        apart_m[:, q] = apart_px / drone.intrinsics.fx * range_m[frame]
+    of_each = pd.DataFrame(apart_m).groupby([frame, table["person"].to_numpy()]).median().fillna(np.inf)
+    nearest = of_each.to_numpy().argmin(axis=1)
+    good = of_each.to_numpy().min(axis=1) <= DETECTED_M
+    found = np.zeros((len(rows), len(flight.people)), np.bool_)
+    found[of_each.index.get_level_values(0)[good], nearest[good]] = True
+    return found
 
 
 if __name__ == "__main__":

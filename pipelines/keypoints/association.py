@@ -30,6 +30,8 @@ Int64 = NDArray[np.int64]
 _NEAR = 9.0  # within 3 sigma of the logged actor counts for a track, beyond against it
 _FAR = 25.0  # beyond 5 sigma a track is not the actor at that time
 _BODY_M = 0.5  # the log's point (hip, a tag, a phone) against the middle of the joints seen
+_LEAST_SIGMA_M = 0.2  # of a log
+_MEDIAN_OF_THREE = 1.54  # median length of a vector whose three components have a standard deviation of 1
 _PACE_M_PER_S = 3.0  # a lost person is not resumed further away than a run
 _REACH_M = 1.0
 _MOST_PEOPLE = 12
@@ -102,7 +104,8 @@ def associate(
             clock error times the actor's angular speed.
         actors: [T, A, 3] m, the people who were logged, person 0 first, NaN where unknown. If no log is
             near anybody, none is used.
-        actor_sigma_m: standard deviation of the logs on each axis.
+        actor_sigma_m: standard deviation of the logs on each axis; the largest one if several people are
+            logged, whose noise is estimated from bodies that three cameras place.
         people: number of people to choose; None: those who were logged and whoever else is a person as far
             as two cameras or more can tell (`why_no_person`), at least one.
         scene: the surroundings, by which things that are no people are dropped; by default nothing is.
@@ -113,7 +116,7 @@ def associate(
     if confidence.shape[2] == 0:  # no detections at all: make room for one absent person
         xy = np.full((*xy.shape[:2], 1, *xy.shape[3:]), np.nan)
         confidence = np.zeros(xy.shape[:-1])
-    logs = None
+    logs, noise_m = None, actor_sigma_m
     logged = [] if actors is None else [actors[:, k] for k in range(actors.shape[1])]
     if logged:
         logs = np.stack([np.c_[log, np.full(len(log), actor_sigma_m)] for log in logged], axis=1)
@@ -129,6 +132,10 @@ def associate(
     if again:
         views = views._replace(confidence=np.where(kept[..., None], confidence, 0.0))
     several = bool((kept.sum(axis=-1) > 1).any())
+    if logs is not None and len(logged) > 1:
+        noise_m = _noise_of_logs_m(seen, logs[..., :3], actor_sigma_m)
+        logs[..., 3] = noise_m
+        again |= noise_m < actor_sigma_m
     if several:
         views, before = without_common_errors(time_s, views, undo_exchanges(time_s, views, seen)), views
         again |= views is not before
@@ -137,7 +144,8 @@ def associate(
         seen = undo_exchanges(time_s, views, seen) if several else seen
     xy, confidence = views.xy, views.confidence
     tracks = _tracks(seen, np.where(np.isfinite(xy).all(-1) & (confidence > 0), confidence, 0.0))
-    chains, tracks, reasons = _chains(tracks, time_s, logged, actor_sigma_m, people)
+    sigmas_m = [_own_noise_m(tracks, log, noise_m, actor_sigma_m) for log in logged]
+    chains, tracks, reasons = _chains(tracks, time_s, logged, sigmas_m, people)
     refused: Counter[str] = Counter()
     if scene is not None and scene.ground is None:
         scene = scene._replace(ground=level_of_most_seen(seen))
@@ -150,6 +158,26 @@ def associate(
     if not np.any(chosen >= 0):
         reasons.append(_nobody(seen.nearest))
     return _counted(chosen, seen, resumed, dropped, refused, doubts, tuple(reasons))
+
+
+def _noise_of_logs_m(seen: Followed, logs: Float, most_m: float) -> float:
+    """Estimate the standard deviation on each axis (m) of the logs [T, A, 3] of several people.
+
+    Bodies that three cameras or more place are right. Their median distance to the nearest log gives one
+    value for all logs, between 0.2 m and `most_m`. In a crowd a small value separates neighbours. Without
+    such a body it is `most_m`.
+    """
+    sure = np.isfinite(seen.spread) & (seen.views > 2)
+    apart = np.linalg.norm(seen.middle[sure][:, None] - logs[np.nonzero(sure)[0]], axis=-1)
+    apart = apart[np.isfinite(apart).any(axis=1)]
+    if not len(apart):
+        return most_m
+    return float(np.clip(np.median(np.nanmin(apart, axis=1)) / _MEDIAN_OF_THREE, _LEAST_SIGMA_M, most_m))
+
+
+def _own_noise_m(tracks: list[_Track], log: Float, usual_m: float, most_m: float) -> float:
+    """Return `usual_m`, or `most_m` for a log to which no track is near by `usual_m`."""
+    return usual_m if any(_likeness(track, log, usual_m) > 0 for track in tracks) else most_m
 
 
 def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
@@ -230,7 +258,7 @@ class _Chain:
 
 
 def _chains(
-    tracks: list[_Track], time_s: Float, logs: list[Float], sigma_m: float, people: int | None
+    tracks: list[_Track], time_s: Float, logs: list[Float], sigmas_m: list[float], people: int | None
 ) -> tuple[list[_Chain], list[_Track], list[str]]:
     """Chain tracks into people: those with logs together, each of the others after the one before.
 
@@ -239,13 +267,17 @@ def _chains(
     """
     tracks = sorted(tracks, key=lambda one: (-one.views.sum(), -one.confidence, one.identity))
     reasons: list[str] = []
-    nobody = [k for k, log in enumerate(logs) if not any(_likeness(t, log, sigma_m) > 0 for t in tracks)]
+    nobody = [
+        k
+        for k, (log, sigma_m) in enumerate(zip(logs, sigmas_m, strict=True))
+        if not any(_likeness(t, log, sigma_m) > 0 for t in tracks)
+    ]
     if tracks and len(nobody) == len(logs):
         reasons += [_far_from_log(tracks, log) for log in logs]
         logs = []
     elif len(logs) > 1:
         reasons += [f"nobody is seen near the log of person {k}" for k in nobody]
-    chains = [_Chain(time_s, log, sigma_m) for log in logs]
+    chains = [_Chain(time_s, log, sigma_m) for log, sigma_m in zip(logs, sigmas_m, strict=False)]
     tracks = _by_logs(tracks, chains)
     chains = chains[:people]  # all of them for None
     while len(chains) < (people or 1):

@@ -17,6 +17,10 @@ FEW_JOINTS = 3.0  # common joints at which a pair has half the weight of a compl
 _BODY_M = 0.05  # rays that pass this near are one body: joint definitions, left/right swaps, blur
 _SIZE_M = (0.03, 1.5)  # median distance of joints from their middle: 0.4 m for an adult, 0.06 for a face
 _LOGGED_POINT_M = 0.5  # the log's point (a tag, a phone, the hip) against the joints of a body
+_EXACT_LOG_M = 0.5  # largest standard deviation of a log that tells apart people who stand together
+_EXACT_POINT_M = (
+    0.3  # as _LOGGED_POINT_M: the noise of such a log is estimated from bodies and contains the point
+)
 
 
 class Nodes(NamedTuple):
@@ -247,6 +251,7 @@ def _distance_from_log(
     """Compute the median over joints of the squared, whitened distance of the logged actor from the ray."""
     c = nodes.camera[a]
     count = 0
+    point_m = _EXACT_POINT_M if log[3] <= _EXACT_LOG_M else _LOGGED_POINT_M
     for j in range(nodes.points.shape[1]):
         if math.isnan(nodes.points[a, j, 0]):
             continue
@@ -257,7 +262,7 @@ def _distance_from_log(
             range2 += sight * sight
         squares[count] = _CAP
         if depth > 0.0:
-            square = (range2 - depth * depth) / ((sigma[c] * depth) ** 2 + log[3] ** 2 + _LOGGED_POINT_M**2)
+            square = (range2 - depth * depth) / ((sigma[c] * depth) ** 2 + log[3] ** 2 + point_m**2)
             squares[count] = min(square, _CAP)
         count += 1
     return median_of(squares, count)

@@ -266,6 +266,28 @@ def test_nobody_stands_in_for_a_logged_person_whom_no_camera_sees() -> None:
     assert len(result.reasons) == 1
 
 
+def test_neighbours_whom_one_camera_sees_each_are_not_joined_if_logs_are_exact() -> None:
+    """Let the rays to two neighbours 2 m apart cross between them: by the rays they are one body.
+
+    The neighbours mirror each other about the axis of their two cameras, 14 m from these. With a noise of 1 m
+    both logs fit that body. The actor, whom three cameras place at the log, shows that logs are exact.
+    """
+    axis = 0.3 + np.pi / 3  # between cameras 0 and 1 of three
+    along, across = np.array([np.cos(axis), np.sin(axis)]), np.array([-np.sin(axis), np.cos(axis)])
+    places = [(0.0, 0.0), *((x, y) for x, y in (-5.0 * along + across, -5.0 * along - across))]
+    still = [straight(place, (0.0, 0.0)) for place in places]
+    scene = film(still, cameras=3, bias=(0.1, 0.3))
+    for person, only in ((1, 0), (2, 1)):
+        for camera in {0, 1, 2} - {only}:
+            scene = scene.hide(person, camera)
+    alone = scene.associate(3)
+    assert np.all(scene.chosen(alone, 1)[:, :2] == [1, 2])  # one body without logs
+    result = scene.associate(3, *still, sigma_m=1.0)
+    assert np.all(scene.chosen(result) == 0)
+    for person in (1, 2):
+        assert ((result.choice[..., person] >= 0).sum(axis=1) < 2).all()
+
+
 def test_logged_people_who_leave_together_come_back_as_themselves() -> None:
     """Hide two people for three seconds, in which they change sides: their logs tell them apart."""
     paths = [straight((-3.0, 0.0), (1.0, 0.0)), straight((3.0, 0.6), (-1.0, 0.0))]
