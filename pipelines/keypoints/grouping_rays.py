@@ -18,9 +18,8 @@ _BODY_M = 0.05  # rays that pass this near are one body: joint definitions, left
 _SIZE_M = (0.03, 1.5)  # median distance of joints from their middle: 0.4 m for an adult, 0.06 for a face
 _LOGGED_POINT_M = 0.5  # the log's point (a tag, a phone, the hip) against the joints of a body
 _EXACT_LOG_M = 0.5  # largest standard deviation of a log that tells apart people who stand together
-_EXACT_POINT_M = (
-    0.3  # as _LOGGED_POINT_M: the noise of such a log is estimated from bodies and contains the point
-)
+# As _LOGGED_POINT_M: the noise of such a log is estimated from bodies, and contains some of it.
+_EXACT_POINT_M = 0.3
 
 
 class Nodes(NamedTuple):
