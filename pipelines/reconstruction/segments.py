@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 LENGTH_S = 180.0
 """The longest segment without its overlaps; a shorter flight is a single one."""
 
-MOST_KEYPOINTS = 360_000
+MOST_KEYPOINTS = 280_000
 """The most keypoints in a segment, times x cameras x joints of a person: memory grows with them."""
 
 SHORTEST_S = 30.0
