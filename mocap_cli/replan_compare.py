@@ -44,8 +44,8 @@ _settings_options = grouped(
         "--arms",
         metavar="NAME,...",
         help="Arms to compare: adaptive, fixed, covariance, greedy, joint, group; flown and planned are the"
-        " logged flight and its commands [default: adaptive, fixed, group of several people, flown where"
-        " cameras moved, planned where logged].",
+        " logged flight and its commands [default: adaptive, fixed, joint of one person, group of several,"
+        " flown where cameras moved, planned where logged].",
     ),
     click.option(
         "--drones",

@@ -297,6 +297,7 @@ def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> 
             *(["group"] if len(flight.people) > 1 else []),
             "adaptive",
             "fixed",
+            *(["joint"] if len(flight.people) < 2 else []),
             *([FLOWN] if flight.moves else []),
             *([PLANNED] if flight.planned else []),
         ]

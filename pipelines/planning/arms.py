@@ -4,9 +4,9 @@ All share forecast, local planner and tracking. An arm is one object with a name
 `FormationPlanner` for a flight; a package adds one by an entry point in `mocap.planner_arms`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from pipelines.planning.formation import (
     yaw_set,
 )
 from pipelines.planning.groups import Choice, Worth, hidden_by_people, in_view, plan_in_turn
-from pipelines.planning.information import log_determinant, ray_information
+from pipelines.planning.information import log_determinant, predicted_error, ray_information
 from pipelines.planning.scores import coverage, view_quality
 from pipelines.planning.search import (
     TOO_NEAR,
@@ -36,8 +36,8 @@ from pipelines.planning.search import (
     TeamWeights,
     Views,
     best_sequence,
+    best_teams,
     cheapest_slots,
-    cheapest_team,
     cost_map,
     costs_in_frame,
     costs_of_slots,
@@ -52,7 +52,14 @@ _TILTS_DEG = (-10.0, 85.0)
 _TRIANGLE = np.triu_indices(3)
 _SELDOM_S = 0.5 - 1e-6  # between two plans of `joint` and `group`: slots move little meanwhile
 _ASIDE_M = 1.0  # slots of `group` are so much farther from everybody than drones have to be
+_ROLLED_OUT_S = 5.0  # of a plan of `joint`: what comes later is planned anew before
+_STEEPER_RAD = np.radians(20.0)  # than the tilt asked for: flown paths of `joint` avoid it
+_W_STEEP = 3.0  # price of each radian beyond that
 _W_HIDDEN = 0.3  # price of a hidden view, beyond that of its occupied share and of the information lost
+
+
+RollOut = Callable[[FormationPath], tuple[Float, Float]]
+"""Predicts the places of the drones [n, N, 3] and of the actor [N, 3], in m, at the times of N waypoints."""
 
 
 class FormationPlanner(Protocol):
@@ -68,6 +75,16 @@ class FormationPlanner(Protocol):
             commanded: [n, 3] the slots that are commanded now (yaw rad, tilt rad, range m).
             actor: forecast at the knots t_s + knot_s, t_s + 2 knot_s, ...
         """
+
+
+@runtime_checkable
+class RollingOut(Protocol):
+    """Formation planner that compares what the local planner would make of several paths.
+
+    Whoever flies the planner sets `roll_out`; without it the planner compares the slots alone.
+    """
+
+    roll_out: RollOut | None
 
 
 class Arm(Protocol):
@@ -265,7 +282,8 @@ class _Joint(_SeldomPlanner):
     """Planner of yaw, tilt and range of every drone for the least error of all views together.
 
     Spacing is free, so that nobody has to stay behind an obstacle. All drones choose from the same slots, so
-    that one look at these serves the whole team.
+    that one look at these serves the whole team. Of the teams found and the plan of `adaptive`, the one whose
+    views are best as the local planner would fly it is flown.
     """
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
@@ -283,22 +301,68 @@ class _Joint(_SeldomPlanner):
         per_yaw = len(states) // self._yaws
         first = np.arange(len(states))[:, None] + np.arange(drones) * (self._yaws // neighbour) * per_yaw
         formations = first % len(states)
-        self._views = Views(self._lattice, self._offsets, np.ascontiguousarray(information), formations)
+        off_tilt, off_range = (
+            np.abs(states[:, axis] - value) > 1e-9  # rad, m: rounding
+            for axis, value in ((TILT, config.tilt_rad), (RANGE, config.radius_m))
+        )
+        self._views = Views(
+            self._lattice,
+            self._offsets,
+            np.ascontiguousarray(information),
+            formations,
+            ~(off_tilt | off_range),
+        )
         self._weights = TeamWeights(config.w_error, config.prior_sigma_m**-2, config.soft_separation_m)
         off_start = np.abs(wrapped(states[:, YAW] - yaw_rad)) + np.abs(states[:, TILT] - config.tilt_rad)
         start = formations[int((off_start + np.abs(states[:, RANGE] - config.radius_m)).argmin())]
         self._team = np.repeat(start[:, None], config.horizon_knots, axis=1)  # [n, T]
         self._config, self._rates = config, np.array(config.slot_rates)
+        self.roll_out: RollOut | None = None
+        self._adaptive = ADAPTIVE.start(config, drones=drones, yaw_rad=yaw_rad)
+        self._as_adaptive = False
+
+    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
+        path = super().plan(t_s, commanded, actor, field)
+        if self._as_adaptive and path.knot_s[0] < t_s:  # nothing was better: plan as often as `adaptive`
+            return self._adaptive.plan(t_s, commanded, actor, field)
+        return path
 
     def _planned(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
         states = self._lattice.states
-        costs = _look(field, actor, states[:, None], self._offsets[:, None], self._config)
-        free = (costs.occluded[..., 0] == 0.0).astype(np.float64)
+        slots = _look(field, actor, states[:, None], self._offsets[:, None], self._config)
+        free = (slots.occluded[..., 0] == 0.0).astype(np.float64)
         free = (free + self._beside(free)) / 2.0  # drones are not exactly in their slots
-        price = cost_map(costs, self._config) + _W_HIDDEN * (1.0 - free)
-        self._team = cheapest_team(price, free, self._views, self._weights, commanded, self._team)
-        through = _through(commanded, states[self._team.T])
-        return FormationPath(_knots(t_s, through, self._lattice), through, self._rates)
+        price = cost_map(slots, self._config) + _W_HIDDEN * (1.0 - free)
+        teams = best_teams(price, free, self._views, self._weights, commanded, self._team)
+        paths = []
+        for team in teams:
+            through = _through(commanded, states[team.T])
+            paths.append(FormationPath(_knots(t_s, through, self._lattice), through, self._rates))
+        if self.roll_out is None:
+            self._team = teams[0]
+            return paths[0]
+        paths.append(self._adaptive.plan(t_s, commanded, actor, field))
+        costs = [self._flown(*self.roll_out(path), field) for path in paths]
+        self._team = teams[int(np.argmin(costs[:-1]))]
+        best = int(np.argmin(costs))
+        self._as_adaptive = best == len(teams)
+        return paths[best]
+
+    def _flown(self, places: Float, actor: Float, field: DistanceField) -> float:
+        """Compute the mean cost of the next seconds for drones at [n, N, 3] and the actor at [N, 3] m.
+
+        Slots alone do not show it: drones follow late, give way to obstacles and take short cuts.
+        """
+        config = self._config
+        soon = max(round(_ROLLED_OUT_S / config.waypoint_s), 1)
+        places, actor = places[:, :soon], actor[:soon]
+        seen = visible(field, places, actor, start_m=config.sight_start_m)
+        information = ray_information(places - actor, config.errors) * seen[..., None, None]
+        known = information.sum(axis=0) + np.eye(3) / config.prior_sigma_m**2
+        steep = np.maximum(slot_of(places - actor)[..., TILT] - config.tilt_rad - _STEEPER_RAD, 0.0)
+        cost = config.w_error * np.log(predicted_error(known)) + _W_HIDDEN * (~seen).sum(axis=0)
+        cost += _W_STEEP * steep.sum(axis=0)
+        return float(cost.mean())
 
     def _beside(self, values: Float) -> Float:
         """Return the mean of values [T, S] at the two neighbouring yaws."""

@@ -7,6 +7,7 @@ unless `foresight` asks for a bound.
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import look_at
-from pipelines.planning.arms import Arm
+from pipelines.planning.arms import Arm, RollingOut
 from pipelines.planning.config import MOST_DRONES, Mode, PlannerConfig
 from pipelines.planning.distance_field import DistanceField, open_space, zone_edges
 from pipelines.planning.forecast import ActorFilter, Forecast, Foresight, PeopleFilter, YawZero, positions_at
@@ -143,7 +144,7 @@ class Pilot:
         config = self._config
         if t_s >= self._next_central_s - _NOW_S:
             self._next_central_s = max(self._next_central_s, t_s) + 1.0 / config.central_hz
-            self._plan_formation(t_s, field)
+            self._plan_formation(t_s, position, velocity, field)
         if t_s >= self._next_local_s - _NOW_S:
             self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.local_hz
             self._plan_locally(t_s, position, velocity, field)
@@ -157,7 +158,7 @@ class Pilot:
     def wanted(self, t_s: float) -> tuple[Float, Float]:
         """Return commanded slots [N, 3], yaw from east, and the estimates [N, 3] that cameras aim at."""
         now = np.array([t_s])
-        return self._slots_at(now)[0], self._aimed(now)[:, 0]
+        return self._slots_at(now, self._formation)[0], self._aimed(now)[:, 0]
 
     def reference(self, t_s: float) -> tuple[Float, Float, Float]:
         """Return position, velocity, acceleration [N, 3] of the latest local plans, after `replan`."""
@@ -170,12 +171,12 @@ class Pilot:
         aimed: Float = np.tensordot(self.aim, self._filter.each(t_s), 1)
         return aimed
 
-    def _slots_at(self, t_s: Float) -> Float:
-        """Return commanded slots [T, N, 3], their yaws from east."""
-        slots = self._formation.at(t_s)
+    def _slots_at(self, t_s: Float, path: FormationPath) -> Float:
+        """Return the slots of a path, [T, N, 3], their yaws from east."""
+        slots = path.at(t_s)
         return turned(slots, self._zero.at(t_s)) if self._config.yaw_frame == "heading" else slots
 
-    def _plan_formation(self, t_s: float, field: DistanceField) -> None:
+    def _plan_formation(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
         config = self._config
         started = self._clock()
         knots = t_s + config.knot_s * np.arange(1, config.horizon_knots + 1, dtype=np.float64)
@@ -184,14 +185,42 @@ class Pilot:
             self._zero.follow(t_s, *self._filter.at(t_s)[1:])
         people = self._filter.each(knots)
         actor = Forecast(self._filter.forecast(knots), self._zero.at(knots), people, self._weight)
+        if isinstance(self._formation_planner, RollingOut):
+            self._formation_planner.roll_out = partial(
+                self._roll_out, t_s=t_s, position=position, velocity=velocity, field=field
+            )
         self._formation = self._formation_planner.plan(t_s, commanded, actor, field)
         self.times.central_s.append(self._clock() - started)
 
-    def _plan_locally(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
+    def _wanted_ahead(self, path: FormationPath, t_s: float) -> tuple[Float, Float]:
+        """Return wanted places of drones [T, N, 3] and the places [N, T, 3] that they film, at waypoints."""
         config = self._config
         times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
         aimed = self._aimed(times)
-        slots = aimed.swapaxes(0, 1) + slot_offsets(self._slots_at(times))
+        return aimed.swapaxes(0, 1) + slot_offsets(self._slots_at(times, path)), aimed
+
+    def _roll_out(
+        self, path: FormationPath, *, t_s: float, position: Float, velocity: Float, field: DistanceField
+    ) -> tuple[Float, Float]:
+        """Predict the flight along a path (`arms.RollOut`): the drones plan locally, one after the other."""
+        wanted, aimed = self._wanted_ahead(path, t_s)
+        made: list[Plan] = []
+        for i, previous in enumerate(self._plans):
+            local = self._local_planner.plan(
+                t_s,
+                position[i],
+                velocity[i],
+                slots=wanted[:, i],
+                actor=aimed[i],
+                others=made,
+                field=field,
+                previous=previous,
+            )
+            made.append(local.plan)
+        return np.stack([plan.path[1:] for plan in made]), aimed[0]
+
+    def _plan_locally(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
+        slots, aimed = self._wanted_ahead(self._formation, t_s)
         for i in range(len(self._plans)):
             started = self._clock()
             made = self._local_planner.plan(

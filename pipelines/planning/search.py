@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import (
@@ -61,6 +61,7 @@ class Views(NamedTuple):
     offsets: Float  # [S, 3] m from the actor
     information: Float  # [S, 6] 1/m^2 of a free view: xx, xy, xz, yy, yz, zz
     formations: Int64  # [S, n] states of a team of equal spacing whose first drone has each state
+    as_asked: Bool  # [S] the tilt and range of the settings
 
 
 class TeamWeights(NamedTuple):
@@ -241,7 +242,7 @@ def _is_near(views: Views, s: int, r: int, apart_m: float) -> bool:
 def _team_cost(
     price: Float, free: Float, views: Views, w: TeamWeights, commanded: Float, team: Int64
 ) -> float:
-    """Compute what `cheapest_team` minimises, of states [n, T]."""
+    """Compute what `best_teams` minimises, of states [n, T]."""
     drones, times = team.shape
     known = np.zeros(6)
     total = 0.0
@@ -319,14 +320,15 @@ def _cheapest_formation(price: Float, free: Float, views: Views, w: TeamWeights,
 
 
 @cached
-def cheapest_team(
+def best_teams(
     price: Float, free: Float, views: Views, w: TeamWeights, commanded: Float, before: Int64
 ) -> Int64:
-    """Find states [n, T] of a team that none of its drones can improve alone.
+    """Find states of a team that are worth flying: [K, n, T], the cheapest first.
 
     The cost is the sum of the slots' prices, of turning and of the logarithm of the predicted error. It is
-    descended, drone by drone, from the plan before and from the cheapest formation of equal spacing; the
-    cheaper result is taken.
+    descended, drone by drone until none can be improved alone, from the plan before, from the cheapest
+    formation of equal spacing, and from the cheapest one with the error left out. The last descent stays at
+    the tilt and range that are asked for. Both formations are results, too.
 
     Args:
         price: [T, S] cost of a drone in each state.
@@ -334,14 +336,21 @@ def cheapest_team(
         commanded: [n, 3] slots now.
         before: [n, T] the plan before.
     """
-    best, least = before, math.inf
-    for start in (before, _cheapest_formation(price, free, views, w, commanded)):
-        team = start.copy()
-        _improve_team(price, free, views, w, commanded, team)
-        cost = _team_cost(price, free, views, w, commanded, team)
-        if cost < least:
-            best, least = team, cost
-    return best
+    formation = _cheapest_formation(price, free, views, w, commanded)
+    plain = _cheapest_formation(price, free, views, TeamWeights(0.0, w.prior, w.apart_m), commanded)
+    teams = np.empty((5, *before.shape), np.int64)
+    teams[0], teams[1], teams[2] = before, formation, plain
+    teams[3], teams[4] = formation, plain
+    level = price.copy()
+    for s in range(price.shape[1]):
+        if not views.as_asked[s]:
+            level[:, s] += TOO_NEAR
+    for k in range(3):
+        _improve_team(level if k == 2 else price, free, views, w, commanded, teams[k])
+    costs = np.empty(teams.shape[0])
+    for k in range(teams.shape[0]):
+        costs[k] = _team_cost(price, free, views, w, commanded, teams[k])
+    return teams[np.argsort(costs, kind="mergesort")]
 
 
 @helper

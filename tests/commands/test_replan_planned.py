@@ -81,7 +81,7 @@ def test_what_was_commanded_is_an_arm_like_the_others(flown: Path, tmp_path: Pat
     assert list(table.columns) == ["t_ns", "camera", "x", "y", "z"]
 
     metrics = json.loads(succeeds("replan-compare", session, "--trials", "2", "--json"))
-    assert list(metrics["arms"]) == ["adaptive", "fixed", "flown", "planned"]
+    assert list(metrics["arms"]) == ["adaptive", "fixed", "joint", "flown", "planned"]
     planned = metrics["arms"]["planned"]
     assert planned["simulated"] is False
     assert planned["reconstruction_error"]["simulated"] is True

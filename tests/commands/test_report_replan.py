@@ -43,7 +43,7 @@ def test_the_report_shows_the_comparison_of_the_session(tmp_path: Path) -> None:
     # Figures that are computed from the tables agree with the metrics.
     told = re.search(r'id="figure-arms-time-desc">(.*?)</desc>', shown)
     assert told is not None
-    for arm in ("adaptive", "fixed", "flown"):
+    for arm in ("adaptive", "fixed", "joint", "flown"):
         scores = metrics["arms"][arm]
         mean, largest, least = scores["tilt_deg"]["mean"], scores["tilt_deg"]["max"], scores["range_m"]["min"]
         said = re.search(rf"\b{arm}: (.*?)(?= [a-z]+: |$)", told.group(1))

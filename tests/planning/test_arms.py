@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.planning.arms import ADAPTIVE, JOINT
+from pipelines.geometry.arrays import Float
+from pipelines.planning.arms import ADAPTIVE, JOINT, RollingOut
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.forecast import Forecast
-from pipelines.planning.formation import formation_slots, slot_offsets, wrapped, yaw_set
+from pipelines.planning.formation import FormationPath, formation_slots, slot_offsets, wrapped, yaw_set
 from pipelines.planning.search import best_sequence, cost_map, costs_of_slots, lattice
 from tests.planning.worlds import trees, wall
 
@@ -80,3 +81,29 @@ def test_a_joint_plan_is_made_twice_a_second() -> None:
     actor = Forecast(np.tile([12.0, 0.0, 1.0], (config.horizon_knots, 1)), np.zeros(config.horizon_knots))
     made = [planner.plan(t_s, commanded, actor, WALL).knot_s[0] for t_s in np.arange(0, 1.15, 0.1)]
     assert made == pytest.approx([0.0] * 5 + [0.5] * 5 + [1.0] * 2)
+
+
+@pytest.mark.parametrize("nearest", [2, 5])
+def test_a_joint_plan_is_the_one_that_measures_best_as_it_would_be_flown(nearest: int) -> None:
+    """Require the path that brings the drones nearest: errors fall with the range. The last is adaptive's."""
+    config = PlannerConfig()
+    planner = JOINT.start(config, drones=2, yaw_rad=0.0)
+    commanded = formation_slots(np.zeros(1), 2, tilt_rad=config.tilt_rad, range_m=config.radius_m)[0]
+    actor = Forecast(np.tile([12.0, 0.0, 1.0], (config.horizon_knots, 1)), np.zeros(config.horizon_knots))
+    walked = np.tile([100.0, 0.0, 1.0], (config.waypoints, 1))  # nothing is there
+    asked: list[FormationPath] = []
+
+    def roll_out(path: FormationPath) -> tuple[Float, Float]:
+        asked.append(path)
+        range_m = 7.0 if len(asked) - 1 == nearest else 9.0 + len(asked)
+        places = slot_offsets(formation_slots(np.zeros(config.waypoints), 2, tilt_rad=0.3, range_m=range_m))
+        return np.swapaxes(places, 0, 1) + walked[0], walked
+
+    assert isinstance(planner, RollingOut)
+    planner.roll_out = roll_out
+    assert planner.plan(0.0, commanded, actor, WALL) is asked[nearest]
+    assert len(asked) == 6
+    adaptive = ADAPTIVE.start(config, drones=2, yaw_rad=0.0).plan(0.0, commanded, actor, WALL)
+    np.testing.assert_array_equal(asked[5].slots, adaptive.slots)
+    later = planner.plan(0.1, commanded, actor, WALL)
+    assert later.knot_s[0] == (0.1 if nearest == 5 else 0.0)  # adaptive plans as often as alone

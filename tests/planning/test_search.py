@@ -19,7 +19,7 @@ from pipelines.planning.search import (
     TeamWeights,
     Views,
     best_sequence,
-    cheapest_team,
+    best_teams,
     lattice,
 )
 
@@ -129,7 +129,7 @@ def test_no_drone_of_a_team_has_a_cheaper_sequence(seed: int, drones: int) -> No
     information = ray_information(offsets, ErrorModel())
     formations = (np.arange(yaws)[:, None] + np.arange(drones) * (yaws // drones)) % yaws
     triangle = np.ascontiguousarray(information[:, *np.triu_indices(3)])
-    views = Views(grid, offsets, triangle, np.ascontiguousarray(formations))
+    views = Views(grid, offsets, triangle, np.ascontiguousarray(formations), np.ones(yaws, dtype=np.bool_))
     weights = TeamWeights(w_error=1.0, prior=0.25, apart_m=4.5)
     price, free = rng.random((times, yaws)), rng.integers(0, 3, (times, yaws)) / 2.0
     commanded = grid.states[formations[rng.integers(yaws)]]
@@ -146,7 +146,9 @@ def test_no_drone_of_a_team_has_a_cheaper_sequence(seed: int, drones: int) -> No
         total = total + np.log(predicted_error(known)).sum(axis=-1) + TOO_NEAR * same  # others are 10 m apart
         return np.where((ways <= RATES[0] * 3.0 + 1e-9).all(axis=(1, 2)), total, np.inf)
 
-    found = cheapest_team(price, free, views, weights, commanded, before)
+    teams = best_teams(price, free, views, weights, commanded, before)
+    assert (np.diff(costs(teams)) >= -1e-9).all()  # rounding
+    found = teams[0]
     every = np.array(list(product(range(yaws), repeat=times)))
     (least,) = costs(found[None])
     assert np.isfinite(least)
