@@ -29,7 +29,7 @@ Part = TypeVar("Part")
 Result = TypeVar("Result")
 
 _SEGMENT = 256  # times of the skeleton
-_KEPT_BYTES = 100e6  # of a half's factors, before segments are factorised twice
+_KEPT_BYTES = 40e6  # of a half's factors, before segments are factorised twice
 _WORTH = 0.1  # share of a half's factors below which none are kept
 _HELD = 1e10  # 1 / m^2, of a bone length
 
