@@ -60,7 +60,7 @@ from pipelines.session.people import LoggedActor
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Run, Session
 from pipelines.session.storage import jsonable, read_json, write_json
-from pipelines.session.stores import is_copy, publish_meanwhile
+from pipelines.session.stores import publish_meanwhile
 from pipelines.session.tables import (
     ANGLES,
     CAMERA_POSES,
@@ -228,8 +228,7 @@ def by_segments(
     folder = source.folder
     each: Each
     if cluster is not None:
-        if is_copy(folder.absolute()):  # workers need what was found in the pictures
-            publish_meanwhile(folder)
+        publish_meanwhile(folder)  # workers need what was found in the pictures
         each, threads = partial(cluster.each, progress=progress), 1
     else:
         memory = available_bytes()

@@ -158,15 +158,16 @@ def published_version(session: Path) -> str | None:
 
 
 def publish_meanwhile(session: Path) -> None:
-    """Publish what is finished of a session that is staged, so that other machines can read it.
+    """Publish what is finished of a session, so that other machines can read it, if this process staged it.
 
     Raises:
         BusyError: another writer published a version since the copy was made.
         DataError: the store cannot be written.
     """
-    copy = _staged[session.absolute()]
-    with _own_disk(copy.folder):
-        copy.publish()
+    copy = _staged.get(session.absolute())
+    if copy is not None:
+        with _own_disk(copy.folder):
+            copy.publish()
 
 
 def fetched(url: str, *, fresh: bool = False) -> Path:

@@ -13,7 +13,8 @@ from filelock import FileLock
 from rosbags.highlevel import AnyReader
 
 from pipelines.export import export, load_recording
-from pipelines.formats.skeletons import c3d, trc
+from pipelines.formats.poses import tum
+from pipelines.formats.skeletons import c3d, joints_csv, trc
 from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
@@ -70,6 +71,22 @@ def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_pa
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
     # 0.4 s of video at 5 pictures per second.
     assert counts["/drone1/image/video"] == counts["/drone1/camera_info"] == 2
+
+
+def test_files_written_in_parts_are_those_written_at_once(
+    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Write 12 frames in parts of 5, the last of them of 2."""
+    at_once, parts = tmp_path / "at_once", tmp_path / "parts"
+    export(filmed, ["trc", "csv", "tum"], at_once)
+    for module, name in (
+        (trc, "_FRAMES_AT_ONCE"),
+        (joints_csv, "_TIMES_AT_ONCE"),
+        (tum, "_POSES_AT_ONCE"),
+    ):
+        monkeypatch.setattr(module, name, 5)
+    export(filmed, ["trc", "csv", "tum"], parts)
+    assert content(parts) == content(at_once)
 
 
 @pytest.mark.parametrize("name", ["csv", "parquet", "mcap", "rerun"])

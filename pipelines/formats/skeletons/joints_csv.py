@@ -133,7 +133,7 @@ def write_joints(path: Path, motion: JointMotion) -> None:
     import pandas as pd
 
     with path.open("w", encoding="utf-8", newline="") as file:
-        for first in range(0, len(motion.t_ns), _TIMES_AT_ONCE):
+        for first in range(0, max(len(motion.t_ns), 1), _TIMES_AT_ONCE):
             some = slice(first, first + _TIMES_AT_ONCE)
             columns = joint_columns(replace(motion, t_ns=motion.t_ns[some], position=motion.position[some]))
             if motion.covariance is not None:

@@ -115,6 +115,13 @@ def test_writing_and_reading_gives_the_same(
     np.testing.assert_allclose(table["reprojection_px"], motion.reprojection_px.ravel(), rtol=1e-14)
 
 
+def test_a_motion_of_no_times_has_the_columns(tmp_path: Path) -> None:
+    joints_csv.write_joints(
+        tmp_path / "none.csv", JointMotion(np.empty(0, np.int64), ("nose",), np.empty((0, 1, 1, 3)))
+    )
+    assert (tmp_path / "none.csv").read_text() == "t_ns,person,joint,x,y,z\n"
+
+
 def test_export_writes_skeleton_and_cameras(tmp_path: Path) -> None:
     motion = JointMotion(np.array([0, 1]), ("nose",), np.zeros((2, 1, 1, 3)))
     poses = Trajectory(np.array([5]), np.ones((1, 3)), np.array([[0.0, 0, 0, 1]]))
