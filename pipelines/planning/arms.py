@@ -54,7 +54,8 @@ _SELDOM_S = 0.5 - 1e-6  # between two plans of `joint` and `group`: slots move l
 _ASIDE_M = 1.0  # slots of `group` are so much farther from everybody than drones have to be
 _ROLLED_OUT_S = 5.0  # of a plan of `joint`: what comes later is planned anew before
 _STEEPER_RAD = np.radians(20.0)  # than the tilt asked for: flown paths of `joint` avoid it
-_W_STEEP = 3.0  # price of each radian beyond that
+_NEAR_M = 2.0  # beyond the distance that drones keep from the actor: flown paths of `joint` avoid it
+_W_AVOIDED = 3.0  # price of each radian steeper, and of each metre nearer
 _W_HIDDEN = 0.3  # price of a hidden view, beyond that of its occupied share and of the information lost
 
 
@@ -359,9 +360,11 @@ class _Joint(_SeldomPlanner):
         seen = visible(field, places, actor, start_m=config.sight_start_m)
         information = ray_information(places - actor, config.errors) * seen[..., None, None]
         known = information.sum(axis=0) + np.eye(3) / config.prior_sigma_m**2
-        steep = np.maximum(slot_of(places - actor)[..., TILT] - config.tilt_rad - _STEEPER_RAD, 0.0)
+        slots = slot_of(places - actor)
+        steep = np.maximum(slots[..., TILT] - config.tilt_rad - _STEEPER_RAD, 0.0)
+        near = np.maximum(config.actor_distance_m + _NEAR_M - slots[..., RANGE], 0.0)
         cost = config.w_error * np.log(predicted_error(known)) + _W_HIDDEN * (~seen).sum(axis=0)
-        cost += _W_STEEP * steep.sum(axis=0)
+        cost += _W_AVOIDED * (steep + near).sum(axis=0)
         return float(cost.mean())
 
     def _beside(self, values: Float) -> Float:
