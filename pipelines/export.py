@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -37,9 +37,6 @@ from pipelines.session.storage import (
 from pipelines.session.tables import ANGLES, FRAMES, POSES, SKELETON, read_motion, read_table, trajectory_from
 from pipelines.session.whole_folders import working_folder
 from pipelines.sources.pictures import open_pictures
-
-if TYPE_CHECKING:
-    pass
 
 PICTURES_HZ = 2.0
 """Default number of pictures of a camera in a recording per second."""
