@@ -5,7 +5,8 @@ two people who were exchanged in one camera, as they stood behind each other for
 later picture speaks a little against it. Here all times are judged together: for every two tracks and every
 camera the times are found at which their detections should be exchanged (two states, Viterbi). An exchange is
 cheap to begin or end where the two bodies overlap in the picture or are not seen, and dear where the picture
-shows them apart.
+shows them apart, or one of them alone. Where a camera finds only one of the two, and others find both, the one
+detection is given to the other person in the same way.
 """
 
 import math
@@ -55,15 +56,18 @@ def undo_exchanges(time_s: Float, views: Views, seen: Followed) -> Followed:
         if len(tracks) < 2:
             break
         fit, there, near = _evidence(views, seen, judged, tracks)
+        elsewhere = there.sum(axis=2, keepdims=True) > there  # another camera sees the track
         for a in range(1, len(tracks)):
             for b in range(a):
                 for c in range(fit.shape[3]):
                     both = there[:, a, c] & there[:, b, c]
+                    told = both | (elsewhere[:, a, c] & elsewhere[:, b, c])
                     gain = fit[:, a, b, c] + fit[:, b, a, c] - fit[:, a, a, c] - fit[:, b, b, c]
-                    if np.maximum(gain[both], 0.0).sum() <= best:
+                    gain = np.where(told, gain, 0.0)
+                    if np.maximum(gain, 0.0).sum() <= best:
                         continue
-                    exchanged = _best_times(gain, both, near[:, a, b, c])
-                    worth = float(gain[exchanged & both].sum())
+                    exchanged = _best_times(gain, there[:, a, c] | there[:, b, c], near[:, a, b, c])
+                    worth = float(gain[exchanged].sum())
                     if worth > best:
                         best, camera, pair, times = worth, c, (tracks[a], tracks[b]), exchanged
         if camera < 0:
@@ -166,9 +170,9 @@ def _heights_apart(nodes: Nodes, a: int, b: int, scratch: Float) -> float:
     return median_of(scratch, count) / height if count else 0.0
 
 
-def _best_times(gain: Float, both: Bool, near: Float) -> Bool:
+def _best_times(gain: Float, seen: Bool, near: Float) -> Bool:
     """Find the times [N] at which an exchange is worth most (Viterbi, two states)."""
-    cost = np.where(both, np.where(near < _OVERLAP, _OVERLAPPING, _APART), _UNSEEN)
+    cost = np.where(seen, np.where(near < _OVERLAP, _OVERLAPPING, _APART), _UNSEEN)
     change = np.minimum(cost[1:], cost[:-1])
     score = np.array([0.0, gain[0]])
     came = np.zeros((len(gain), 2), np.int64)

@@ -43,6 +43,19 @@ def test_right_tracks_stay_as_they_are() -> None:
     assert np.array_equal(undo_exchanges(scene.time_s, views, seen).track, before)
 
 
+def test_a_lone_detection_is_given_back_to_the_person_whose_other_views_it_fits() -> None:
+    """Let one camera lose the second of two people, and give its detections of the first to the second."""
+    scene = film([ACTOR, BESIDE], cameras=3)
+    scene.confidence[30:90, 1][scene.who[30:90, 1] == 1] = 0.0
+    views, seen = followed(scene)
+    right = seen.track.copy()
+    first, second = (seen.track[scene.who == person][0] for person in (0, 1))
+    own = seen.track[30:90, 1]
+    assert set(own[own >= 0].tolist()) == {first}
+    own[own == first] = second
+    assert np.array_equal(undo_exchanges(scene.time_s, views, seen).track, right)
+
+
 def disagreement(scene: Scene, views: Views, person: int) -> float:
     """Compute the root mean square, in sigma of the scene, of a person's rays about their nearest points."""
     squares = []
