@@ -5,8 +5,8 @@ two people who were exchanged in one camera, as they stood behind each other for
 later picture speaks a little against it. Here all times are judged together: for every two tracks and every
 camera the times are found at which their detections should be exchanged (two states, Viterbi). An exchange is
 cheap to begin or end where the two bodies overlap in the picture or are not seen, and dear where the picture
-shows them apart, or one of them alone. Where a camera finds only one of the two, and others find both, the one
-detection is given to the other person in the same way.
+shows them apart, or one of them alone. Where a camera finds only one of the two, and others find both, the
+one detection is given to the other person in the same way.
 """
 
 import math
