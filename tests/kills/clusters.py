@@ -50,6 +50,7 @@ class Workers:
             time.sleep(0.05)
         self.address: str = json.loads(self._file.read_text(encoding="utf-8"))["address"]
         self._workers = [self._worker() for _ in range(WORKERS)]
+        self.spared_s = 0.0  # of batches, until the next worker is killed
 
     def kill(self, number: int) -> None:
         """Kill a worker and start another one in its place."""
@@ -90,6 +91,7 @@ def soak_cluster(minutes: float, *, kill_every_s: float, seed: int) -> Iterator[
     filmed = True
     with tempfile.TemporaryDirectory() as place:
         workers = Workers(Path(place))
+        workers.spared_s = _pause_s(kill_every_s, choice)
         try:
             while time.monotonic() < until_s:
                 with tempfile.TemporaryDirectory(dir=place) as folder:
@@ -121,11 +123,14 @@ def _round(
             stderr=output,
         )
         while True:
+            waiting_s = time.monotonic()
             try:
-                process.wait(kill_every_s * float(choice.uniform(0.5, 1.5)))
+                process.wait(workers.spared_s)
+                workers.spared_s = max(0.0, workers.spared_s - (time.monotonic() - waiting_s))
                 break
             except subprocess.TimeoutExpired:
                 workers.kill(int(choice.integers(WORKERS)))
+                workers.spared_s = _pause_s(kill_every_s, choice)
                 kills += 1
         output.seek(0)
         said = output.read()
@@ -136,6 +141,10 @@ def _round(
         if not trouble and differing:
             trouble = f"other bytes: {', '.join(sorted(differing)[:5])}"
     return Round(len(flights), filmed, kills, time.monotonic() - started_s, trouble)
+
+
+def _pause_s(kill_every_s: float, choice: np.random.Generator) -> float:
+    return kill_every_s * float(choice.uniform(0.5, 1.5))
 
 
 def _flight(folder: Path, filmed: bool, choice: np.random.Generator) -> Path:
