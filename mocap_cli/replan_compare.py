@@ -255,11 +255,33 @@ def _print(metrics: dict[str, Any]) -> None:
             ]
         )
     print_table(header, rows)
+    _print_people({name: metrics["arms"][name].get("by_person", {}) for name in near_first})
     say(metrics["verdict"])
     for group in metrics["equal_ranges"]:
         if len(metrics["equal_ranges"]) > 1 and group["best"] is not None:
             arms = ", ".join(group["arms"])
             say(f"of equal range ({arms}): best is {group['best']['arm']}")
+
+
+def _print_people(arms: dict[str, dict[str, Any]]) -> None:
+    """Print a table with one row for each of several people in each arm."""
+    rows: list[list[object]] = [
+        [
+            arm,
+            name,
+            100 * one["occluded_share"],
+            one["blind_s"],
+            _percent((one.get("pck150") or {}).get("mean")),
+            _with_interval(one.get("mpjpe_mm")),
+            _percent((one.get("coverage") or {}).get("mean")),
+            f"{one['view_quality']:.3f}",
+        ]
+        for arm, people in arms.items()
+        for name, one in people.items()
+    ]
+    if rows:
+        header = ["arm", "person", "hidden %", "blind s", "PCK150 %", "MPJPE mm", "covered %", "view quality"]
+        print_table(header, rows)
 
 
 def _with_interval(estimate: dict[str, Any] | None) -> str | None:
@@ -273,7 +295,7 @@ def _with_interval(estimate: dict[str, Any] | None) -> str | None:
 
 
 def _print_filmed(metrics: dict[str, Any]) -> None:
-    """Print a table with one row for each arm."""
+    """Print a table with one row for each arm, and below it one for each of several people."""
     say()
     say(f"filmed (simulated) at {metrics['rate_hz']:g} Hz, keypoints by {metrics['detector']}:")
     header = [
@@ -302,10 +324,14 @@ def _print_filmed(metrics: dict[str, Any]) -> None:
             None if arm["reprojection_px"] is None else arm["reprojection_px"]["mean"],
             _percent(arm["reconstructed_share"]),
             arm["mpjpe_mm"],
-            arm["common_mpjpe_mm"],
+            arm.get("common_mpjpe_mm"),
             _percent(arm["pck150"]),
         ]
-        for name, arm in metrics["arms"].items()
+        for of_arm, over_all in metrics["arms"].items()
+        for name, arm in (
+            (of_arm, over_all),
+            *((f"{of_arm}: {who}", own) for who, own in over_all.get("by_person", {}).items()),
+        )
     ]
     print_table(header, rows)
 

@@ -18,7 +18,7 @@ from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import Views, locate
 from pipelines.keypoints.hints import project_actor
-from pipelines.keypoints.tracking import FollowedAlone
+from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.reconstruction.refining import refined_points
 from pipelines.reporting.studies import Row, draw, estimates, results_csv
 from pipelines.session.errors import DataError
@@ -302,16 +302,18 @@ def _film(
 ) -> None:
     """Write the keypoints of a detector in the pictures of one camera: xy [T, J, 2], confidence [T, J]."""
     names = filmed.person.joints
-    follower = FollowedAlone(detector.load(threads=1), names)
-    xy = np.empty((len(filmed.t_ns), len(names), 2))
-    confidence = np.empty(xy.shape[:-1])
+    follower = FollowedPeople(detector.load(threads=1), names, only_one=True)
+    xy = np.full((len(filmed.t_ns), len(names), 2), np.nan)
+    confidence = np.zeros(xy.shape[:-1])
     for frame in range(len(filmed.t_ns)):
         halt.check()
         pose = seen_by.position[camera, frame], seen_by.quaternion_xyzw[camera, frame]
         surface = filmed.person.surface(filmed.motion.root[frame], filmed.motion.rotation[frame])
         picture = renderer.picture(*pose, [surface], frame)
         hint = project_actor(filmed.aim[frame], pose, seen_by.lens, sigma_m=_HINT_SIGMA_M, sigma_rad=0.0)
-        xy[frame], confidence[frame] = follower.step(picture, hint=hint)
+        found, sure = follower.step(picture, hint=hint)
+        if len(found):
+            xy[frame], confidence[frame] = found[0], sure[0]
         progress.advance()
     np.savez(folder / "keypoints.npz", xy=xy, confidence=confidence)
 

@@ -1,8 +1,9 @@
 """Stage `film`: rendered films of a comparison's arms, with a real detector on the pictures.
 
 Build the scenario's world and actor again; render what every camera of an arm would have seen; run the
-detector; reconstruct, and measure errors against the truth; draw the skeleton over the pictures. The pictures
-are simulated, the detector is real. `replan` is only read.
+detector; reconstruct, and measure errors against the truth; draw the skeletons over the pictures. The
+pictures are simulated, the detector is real. Which of several people a detection shows is taken from the
+truth. `replan` is only read.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +21,7 @@ from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
 from pipelines.keypoints.hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
-from pipelines.keypoints.tracking import FollowedAlone
+from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.planning.arm_flights import poses_from
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.loading import LoggedFlight, load_flight
@@ -38,11 +39,9 @@ from pipelines.session.stages import locked
 from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import REPLAN, TRUTH, motion_table, read_table, write_table
 from pipelines.session.whole_folders import SIMULATION_MARK
-from pipelines.simulation.body import Person
 from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight import Set, build_set
 from pipelines.simulation.rendering.renderer import Renderer
-from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.study.sightings import (
     Formation,
@@ -53,12 +52,13 @@ from pipelines.simulation.study.sightings import (
     views_of,
 )
 
-FILM = Stage("film", revision=3)
+FILM = Stage("film", revision=4)
 
 _SAME_M = 0.05  # tolerance between the scenario's hips and the session's truth, which is interpolated
 _HIPS = ("left_hip", "right_hip")
 _QUALITY = 20  # of the videos that are drawn on
 _INLET_HEIGHTS = 1.3  # of the person
+_SHOWN_M = 0.25  # largest median distance of a detection's joints from those of the person whom it shows
 
 
 @dataclass(frozen=True)
@@ -135,9 +135,7 @@ def film(
             arm: _arm(folder, actor, flight, plan, setting, arm, settings)
             for arm in read_json(folder / "replan" / "metrics.json")["arms"]
         }
-        progress.start(
-            "Filming", sum(arm.seen_by.position.shape[0] * len(arm.of.t_ns) for arm in arms.values())
-        )
+        progress.start("Filming", sum(arm.seen_by.position.shape[0] * len(arm.t_ns) for arm in arms.values()))
         renderer = Renderer(
             setting.world.surfaces(),
             flight.cameras[0].intrinsics,
@@ -153,23 +151,17 @@ def film(
             ]
             sightings = _read_sightings(parts)
             seed = compared.settings["seed"]  # one draw of the comparison's pose noise
-            views = views_of(arm.of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
-            elapsed_s = (arm.of.t_ns - arm.of.t_ns[0]) / 1e9
-            views, found, doubt = refined_points(views, elapsed_s, arm.of.person.joints, arm.noise)
-            points = reconstructed[name] = found.reshape(arm.of.joints.shape)
-            slots = slot_of(arm.seen_by.position - arm.of.motion.root)
-            metrics[name] = measure_arm(
-                arm.of,
-                arm.seen_by,
-                sightings,
-                views,
-                points,
-                tilt_deg=np.degrees(slots[..., TILT]),
-                range_m=slots[..., 2],
-                desired_tilt_deg=desired_deg,
-            ) | {"fallback": doubt}
+            measured = [
+                _measured(arm, of, seen, seed=seed, desired_tilt_deg=desired_deg)
+                for of, seen in zip(arm.people, sightings, strict=True)
+            ]
+            points = np.stack([own for own, _ in measured], axis=1)
+            reconstructed[name] = points.reshape(len(points), -1, 3)
+            metrics[name] = _over_people([who.name for who in setting.people], [own for _, own in measured])
             _write_arm(run.folder / name, arm, sightings, points, parts)
-        true_joints = {name: arm.of.joints for name, arm in arms.items()}
+        true_joints = {
+            name: np.concatenate([of.joints for of in arm.people], axis=1) for name, arm in arms.items()
+        }
         for name, error_mm in errors_in_common(reconstructed, true_joints).items():
             metrics[name]["common_mpjpe_mm"] = error_mm
         figures = jsonable(
@@ -182,7 +174,7 @@ def film(
             }
         )
         write_json(run.folder / "metrics.json", figures)
-        counts = {name: len(arm.of.t_ns) for name, arm in arms.items()}
+        counts = {name: len(arm.t_ns) for name, arm in arms.items()}
         record = run.publish(counts={"moments": counts, "detector": detector.title})
         for note in advice_on(detector):
             progress.note(note)
@@ -194,14 +186,19 @@ def film(
 
 @dataclass(frozen=True)
 class _Arm:
-    """The N cameras of an arm at the T moments of its pictures, and the person that they film."""
+    """The N cameras of an arm at the T moments of its pictures, and the people that they film."""
 
     names: tuple[str, ...]
-    of: Walk
-    others: list[tuple[Person, BodyMotion]]  # who is in the pictures, too
+    people: list[Walk]
+    tilt_rad: Float | None  # [N, T] above whom each camera films; None for one person
     seen_by: Formation
     actor: Float | None  # [T, 3] m, positions of the logged actor
     noise: tuple[NoiseModel, ...]
+
+    @property
+    def t_ns(self) -> Int64:
+        """Moments [T] of the pictures."""
+        return self.people[0].t_ns
 
 
 def _scenario_of(folder: Path, description: Description) -> Path:
@@ -259,17 +256,24 @@ def _arm(
         raise DataError(folder, f"{len(rows)} pictures lie in the span that is to be filmed", "widen it")
 
     moments = t_ns[rows]
-    followed, *others = setting.people
-    t_s = (moments - plan.start_ns) / 1e9
-    motion, person = followed.moving(t_s), followed.person
-    joints = person.keypoints(motion)
-    walked = Walk(moments, person, followed.look.body.height_m, motion, joints, motion.root)
+    people = []
+    for performer in setting.people:
+        motion, person = performer.moving((moments - plan.start_ns) / 1e9), performer.person
+        joints = person.keypoints(motion)
+        people.append(Walk(moments, person, performer.look.body.height_m, motion, joints, motion.root))
     seen_by = Formation(
         position.take(rows, axis=1), quaternion.take(rows, axis=1), flight.cameras[0].intrinsics
     )
+    tilt = table["tilt_rad"].to_numpy(np.float64).reshape(-1, len(cameras)).T
     hips = None if actor is None else actor.hips_at(moments)
-    beside = [(each.person, each.moving(t_s)) for each in others]
-    return _Arm(cameras, walked, beside, seen_by, hips, flight.cameras[0].noise)
+    return _Arm(
+        cameras,
+        people,
+        tilt.take(rows, axis=1) if len(people) > 1 else None,
+        seen_by,
+        hips,
+        flight.cameras[0].noise,
+    )
 
 
 def _rows(t_ns: Int64, settings: Settings) -> Int64:
@@ -289,29 +293,27 @@ def _rows(t_ns: Int64, settings: Settings) -> Int64:
 def _film_camera(
     arm: _Arm, camera: int, renderer: Renderer, detector: Detector, progress: Progress, folder: Path
 ) -> None:
-    """Write one camera's pictures and the detector's keypoints: xy [T, J, 2], confidence [T, J]."""
-    of, lens = arm.of, arm.seen_by.lens
-    follower = FollowedAlone(detector.load(threads=1), of.person.joints)
+    """Write one camera's pictures and the detector's keypoints: xy [T, P, J, 2], confidence [T, P, J]."""
+    lens = arm.seen_by.lens
+    alone = len(arm.people) == 1
+    follower = FollowedPeople(detector.load(threads=1), arm.people[0].person.joints, only_one=alone)
     found: list[tuple[Float, Float]] = []
 
     def pictures() -> Iterator[Picture]:
-        for k in range(len(of.t_ns)):
+        for k in range(len(arm.t_ns)):
             pose = arm.seen_by.position[camera, k], arm.seen_by.quaternion_xyzw[camera, k]
-            people = [
-                person.surface(motion.root[k], motion.rotation[k])
-                for person, motion in ((of.person, of.motion), *arm.others)
-            ]
-            picture = renderer.picture(*pose, people, k)
+            bodies = [of.person.surface(of.motion.root[k], of.motion.rotation[k]) for of in arm.people]
+            picture = renderer.picture(*pose, bodies, k)
             hint = None
             if arm.actor is not None and np.isfinite(arm.actor[k]).all():
                 hint = project_actor(
                     arm.actor[k], pose, lens, sigma_m=ACTOR_SIGMA_M, sigma_rad=UNKNOWN_SIGMA_RAD
                 )
-            found.append(follower.step(picture, hint=hint))
+            found.append(_whose(arm, pose, k, *follower.step(picture, hint=hint)))
             yield picture
             progress.advance()
 
-    _write_video(folder / "pictures.mp4", pictures(), of.t_ns, lens)
+    _write_video(folder / "pictures.mp4", pictures(), arm.t_ns, lens)
     xy, confidence = (np.stack(part) for part in zip(*found, strict=True))
     np.savez(folder / "keypoints.npz", xy=xy, confidence=confidence)
 
@@ -320,66 +322,150 @@ def _write_video(path: Path, pictures: Iterator[Picture], t_ns: Int64, lens: Int
     write_h264(path, pictures, t_ns - t_ns[0], width=lens.width, height=lens.height, quality=_QUALITY)
 
 
-def _read_sightings(parts: Sequence[Path]) -> Sightings:
+def _whose(
+    arm: _Arm, pose: tuple[Float, Float], moment: int, xy: Float, confidence: Float
+) -> tuple[Float, Float]:
+    """Choose the detection of each person: xy [P, J, 2] px, confidence [P, J].
+
+    Of one person it is the first. Of several it is the nearest to the true joints, if the median distance is
+    below `_SHOWN_M` at that person's distance.
+
+    Args:
+        xy: [K, J, 2] px of K detections; confidence [K, J].
+    """
+    found = np.full((len(arm.people), *xy.shape[1:]), np.nan)
+    sure = np.zeros(found.shape[:2])
+    if len(arm.people) == 1:
+        found[: len(xy)], sure[: len(xy)] = xy[:1], confidence[:1]
+        return found, sure
+    off_m = np.full((len(arm.people), len(xy)), np.inf)
+    for p, of in enumerate(arm.people):
+        off_px = np.linalg.norm(xy - see(of.joints[moment], *pose, arm.seen_by.lens), axis=-1)
+        off_px[np.isnan(off_px)] = np.inf
+        range_m = np.linalg.norm(of.motion.root[moment] - pose[0])
+        off_m[p] = np.median(off_px, axis=-1) * range_m / arm.seen_by.lens.fx
+    while off_m.min(initial=np.inf) < _SHOWN_M:
+        whose, which = np.unravel_index(off_m.argmin(), off_m.shape)
+        found[whose], sure[whose] = xy[which], confidence[which]
+        off_m[whose] = off_m[:, which] = np.inf
+    return found, sure
+
+
+def _read_sightings(parts: Sequence[Path]) -> list[Sightings]:
+    """Read what all cameras found of each person."""
     xy, confidence = [], []
     for part in parts:
         with np.load(part / "keypoints.npz") as stored:
             xy.append(stored["xy"])
             confidence.append(stored["confidence"])
-    return Sightings(np.stack(xy), np.stack(confidence))
+    found, sure = np.stack(xy), np.stack(confidence)
+    return [Sightings(found[:, :, p], sure[:, :, p]) for p in range(found.shape[2])]
+
+
+# --- measuring -----------------------------------------------------------------------------------------
+
+
+def _measured(
+    arm: _Arm, of: Walk, sightings: Sightings, *, seed: int, desired_tilt_deg: float
+) -> tuple[Float, dict[str, Any]]:
+    """Reconstruct a person [T, J, 3] and measure the arm by them."""
+    views = views_of(of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
+    elapsed_s = (of.t_ns - of.t_ns[0]) / 1e9
+    views, found, doubt = refined_points(views, elapsed_s, of.person.joints, arm.noise)
+    points = found.reshape(of.joints.shape)
+    slots = slot_of(arm.seen_by.position - of.motion.root)
+    figures = measure_arm(
+        of,
+        arm.seen_by,
+        sightings,
+        views,
+        points,
+        tilt_deg=np.degrees(slots[..., TILT] if arm.tilt_rad is None else arm.tilt_rad),
+        range_m=slots[..., 2],
+        desired_tilt_deg=desired_tilt_deg,
+    )
+    return points, figures | {"fallback": doubt}
+
+
+def _over_people(names: Sequence[str], each: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures of an arm: means over people, and with several of them those of each `by_person`."""
+    if len(each) == 1:
+        return each[0]
+    return _means(each) | {"by_person": dict(zip(names, each, strict=True))}
+
+
+def _means(each: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Average equal keys of dictionaries, in dictionaries of them as well; of texts the first one holds."""
+    found: dict[str, Any] = {}
+    for key in each[0]:
+        known = [own[key] for own in each if own[key] is not None]
+        if not known or isinstance(known[0], str):
+            found[key] = known[0] if known else None
+        else:
+            found[key] = _means(known) if isinstance(known[0], dict) else type(known[0])(np.mean(known))
+    return found
 
 
 # --- drawing -------------------------------------------------------------------------------------------
 
 
-def _write_arm(folder: Path, arm: _Arm, sightings: Sightings, points: Float, parts: Sequence[Path]) -> None:
-    """Write the skeleton of an arm, and each camera's pictures with it drawn over them."""
+def _write_arm(
+    folder: Path, arm: _Arm, sightings: Sequence[Sightings], points: Float, parts: Sequence[Path]
+) -> None:
+    """Write the skeletons [T, P, J, 3] of an arm, and each camera's pictures with them drawn over them."""
     folder.mkdir()
-    motion = JointMotion(arm.of.t_ns, arm.of.person.joints, points[:, None])
+    motion = JointMotion(arm.t_ns, arm.people[0].person.joints, points)
     write_table(folder / "skeleton.parquet", motion_table(motion), TRUTH)
     for k, part in enumerate(parts):
         _draw(arm, k, sightings, points, part / "pictures.mp4", folder)
 
 
-def _draw(arm: _Arm, camera: int, sightings: Sightings, points: Float, pictures: Path, folder: Path) -> None:
-    """Write <camera>.mp4: the skeleton over the pictures, and the person enlarged in a corner."""
-    of, lens, name = arm.of, arm.seen_by.lens, arm.names[camera]
+def _draw(
+    arm: _Arm, camera: int, sightings: Sequence[Sightings], points: Float, pictures: Path, folder: Path
+) -> None:
+    """Write <camera>.mp4: the skeletons over the pictures, the person in the middle enlarged in a corner."""
+    lens, name = arm.seen_by.lens, arm.names[camera]
     poses = arm.seen_by.position[camera], arm.seen_by.quaternion_xyzw[camera]
-    drawn_px = see(points, *poses, lens)
-    middle_px = see(of.motion.root[:, None], *poses, lens)[:, 0]
-    slots = slot_of(arm.seen_by.position[camera] - of.motion.root)
+    true = np.stack([of.joints for of in arm.people], axis=1)
+    drawn_px = see(points.reshape(len(points), -1, 3), *poses, lens).reshape(*points.shape[:3], 2)
+    middles_px = [see(of.motion.root[:, None], *poses, lens)[:, 0] for of in arm.people]
+    off_px = [np.linalg.norm(px - (lens.width / 2, lens.height / 2), axis=-1) for px in middles_px]
+    enlarged = int(np.argmin([np.nan_to_num(off, nan=lens.width).mean() for off in off_px]))
+    middle_px, nearest = middles_px[enlarged], arm.people[enlarged]
+    slots = slot_of(poses[0] - nearest.motion.root)
+    tilt_rad = slots[..., TILT] if arm.tilt_rad is None else arm.tilt_rad[camera]
 
     def drawn() -> Iterator[Picture]:
         with VideoReader(pictures) as video:
-            for k, t_ns in enumerate(of.t_ns.tolist()):
+            for k, t_ns in enumerate(arm.t_ns.tolist()):
                 picture = video.read(k)
                 if picture is None:
                     raise ValueError(f"{pictures}: picture {k} cannot be decoded")
-                found = sightings.xy[camera, k]
-                known, seen = np.isfinite(points[k, :, 0]), np.isfinite(found[:, 0])
+                found = np.stack([own.xy[camera, k] for own in sightings])
+                known, seen = np.isfinite(points[k, ..., 0]), np.isfinite(found[..., 0])
                 view = View(
                     camera=name,
                     intrinsics=lens,
-                    joints=of.person.joints,
+                    joints=nearest.person.joints,
                     frame=k,
-                    t_s=(t_ns - int(of.t_ns[0])) / 1e9,
-                    found=found[None],
-                    reprojected=drawn_px[k][None],
-                    rejected=np.zeros((1, len(known)), np.bool_),
-                    unmeasured=(seen & ~known)[None],
-                    others=np.empty((0, len(known), 2)),
+                    t_s=(t_ns - int(arm.t_ns[0])) / 1e9,
+                    found=found,
+                    reprojected=drawn_px[k],
+                    rejected=np.zeros(known.shape, np.bool_),
+                    unmeasured=seen & ~known,
+                    others=np.empty((0, known.shape[1], 2)),
                     has_pose=True,
                     picture=None,
                 )
-                error = np.linalg.norm(points[k] - of.joints[k], axis=-1)
+                error = np.linalg.norm(points[k] - true[k], axis=-1)
                 error_text = (
                     f"{1e3 * np.nanmean(error):.0f} mm off" if known.any() else "nothing reconstructed"
                 )
                 caption = (
-                    f"{name}   {view.t_s:.2f} s   tilt {np.degrees(slots[k, TILT]):.0f} deg",
+                    f"{name}   {view.t_s:.2f} s   tilt {np.degrees(tilt_rad[k]):.0f} deg",
                     f"{int(seen.sum())} joints found, {int(known.sum())} reconstructed, {error_text}",
                 )
-                side_px = _INLET_HEIGHTS * lens.fx * of.height_m / float(slots[k, 2])
+                side_px = _INLET_HEIGHTS * lens.fx * nearest.height_m / float(slots[k, 2])
                 yield with_inlet(draw_frame(picture, view, caption), middle_px[k], side_px)
 
-    _write_video(folder / f"{name}.mp4", drawn(), of.t_ns, lens)
+    _write_video(folder / f"{name}.mp4", drawn(), arm.t_ns, lens)

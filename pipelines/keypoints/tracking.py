@@ -442,34 +442,37 @@ def _detector_side(region: Region) -> float:
     return CROP_PER_HEIGHT / SIDE_PER_HEIGHT * region.side
 
 
-class FollowedAlone:
-    """Tracker of the only person in the pictures of one camera, built on `PeopleTracker`.
+class FollowedPeople:
+    """Tracker of the people in the pictures of one camera, built on `PeopleTracker`.
 
     Args:
         networks: the detector, loaded.
         joints: the J whose keypoints are wanted; those that the detector does not have are never found.
+        only_one: nobody but one person is in the pictures.
     """
 
-    def __init__(self, networks: KeypointNetworks, joints: Sequence[str]) -> None:
-        self._tracker = PeopleTracker(networks, only_one=True)
+    def __init__(self, networks: KeypointNetworks, joints: Sequence[str], *, only_one: bool) -> None:
+        self._tracker = PeopleTracker(networks, only_one=only_one)
         self._column = [networks.joints.index(name) if name in networks.joints else None for name in joints]
 
     def step(self, picture: Picture, *, hint: Hint | None) -> tuple[Float, Float]:
-        """Return the keypoints of the person with the highest presence in the next picture.
+        """Return the keypoints of the K people in the next picture, the highest presence first.
 
         Args:
             picture: [H, W, 3] BGR.
-            hint: place of the person by the log, None if unknown.
+            hint: place of the actor by the log, None if unknown.
 
         Returns:
-            Positions [J, 2] px, NaN for joints not found, and confidences [J], 0 for joints not found.
+            Positions [K, J, 2] px, NaN for joints not found, and confidences [K, J], 0 for joints not found.
         """
-        xy, confidence = np.full((len(self._column), 2), np.nan), np.zeros(len(self._column))
-        people = self._tracker.step(picture, hint=hint)
-        if people:
-            person = max(people, key=lambda seen: seen.person.presence).person
+        people = [seen.person for seen in self._tracker.step(picture, hint=hint)]
+        xy, confidence = (
+            np.full((len(people), len(self._column), 2), np.nan),
+            np.zeros((len(people), len(self._column))),
+        )
+        for i, person in enumerate(sorted(people, key=lambda person: -person.presence)):
             for j, k in enumerate(self._column):
                 if k is not None:
-                    xy[j], confidence[j] = person.xy[k], person.confidence[k]
+                    xy[i, j], confidence[i, j] = person.xy[k], person.confidence[k]
         confidence[np.isnan(xy).any(axis=-1)] = 0.0
         return xy, confidence

@@ -85,6 +85,19 @@ class ArmRow:
 
 
 @dataclass(frozen=True)
+class PersonRow:
+    """Figures of one of several people in one arm; numbers as they are printed."""
+
+    arm: str
+    person: str
+    hidden: tuple[str, str]
+    right: tuple[str, str]
+    error: tuple[str, str]
+    coverage: tuple[str, str]
+    view_quality: str
+
+
+@dataclass(frozen=True)
 class DifferenceRow:
     """Difference of one arm from another: the mean and the interval of each figure."""
 
@@ -114,6 +127,7 @@ class Replan:
     verdict: str
     setting: str  # a sentence about the comparison
     rows: tuple[ArmRow, ...]
+    people: tuple[PersonRow, ...]  # empty for one person
     differences: tuple[DifferenceRow, ...]
     level: str  # of the intervals
     notes: tuple[str, ...]
@@ -127,6 +141,7 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
     """
     metrics = content.metrics
     stated = section(metrics, "arms")
+    near_first = _by_range(metrics, stated)
     arms = tuple(
         _arm(name, table, content, origin_ns=origin_ns, colour=cameras + k)
         for k, (name, table) in enumerate(content.arms.items())
@@ -138,7 +153,13 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
         terrain=_terrain(content, arms),
         verdict=text(metrics, "verdict"),
         setting=_setting(metrics),
-        rows=tuple(_row(name, section(stated, name)) for name in _by_range(metrics, stated)),
+        rows=tuple(_row(name, section(stated, name)) for name in near_first),
+        people=tuple(
+            _person(name, person, section(by_person, person))
+            for name in near_first
+            for by_person in [section(section(stated, name), "by_person")]
+            for person in by_person
+        ),
         differences=tuple(_difference(found) for found in items(metrics, "differences")),
         level=_level(number(section(metrics, "intervals"), "level")),
         notes=tuple(str(note) for note in items(metrics, "notes")),
@@ -301,10 +322,7 @@ def _row(name: str, stated: Mapping[str, object]) -> ArmRow:
             fixed(number(tilt, "near_obstacle")),
         ),
         drones=fixed(number(stated, "drones"), 0),
-        hidden=(
-            percent(number(stated, "occluded_share")),
-            "" if (blind_s := number(stated, "blind_s")) is None else f"{fixed(blind_s)} s blind",
-        ),
+        hidden=_hidden(stated),
         range_m=ABSENT if least is None else f"{fixed(least)} to {fixed(most)}",
         path_m=fixed(number(stated, "path_m"), 0),
         energy_kj=fixed(number(stated, "energy_kj")),
@@ -316,6 +334,23 @@ def _row(name: str, stated: Mapping[str, object]) -> ArmRow:
         coverage=_estimate(section(errors, "coverage"), 100),
         violations=", ".join(broken) or "none",
     )
+
+
+def _person(arm: str, person: str, stated: Mapping[str, object]) -> PersonRow:
+    return PersonRow(
+        arm=arm,
+        person=person,
+        hidden=_hidden(stated),
+        right=_estimate(section(stated, "pck150"), 100),
+        error=_estimate(section(stated, "mpjpe_mm")),
+        coverage=_estimate(section(stated, "coverage"), 100),
+        view_quality=fixed(number(stated, "view_quality"), 3),
+    )
+
+
+def _hidden(stated: Mapping[str, object]) -> tuple[str, str]:
+    blind_s = number(stated, "blind_s")
+    return percent(number(stated, "occluded_share")), "" if blind_s is None else f"{fixed(blind_s)} s blind"
 
 
 def _difference(found: object) -> DifferenceRow:

@@ -474,6 +474,8 @@ def test_a_group_films_both_of_two_who_part(tmp_path: Path) -> None:
     session = session_of(tmp_path, PARTING)
     arms = compared(session, "--trials", "2")["arms"]
     assert list(arms) == ["group", "adaptive", "fixed", "flown"]
+    printed = compare(session, "--trials", "2").stdout.split()
+    assert (printed.count("anna"), printed.count("ben")) == (4, 4)  # a row of each in every arm
     for name in ("anna", "ben"):
         group, adaptive = (arms[arm]["by_person"][name] for arm in ("group", "adaptive"))
         assert group["pck150"]["mean"] > adaptive["pck150"]["mean"] + 0.1

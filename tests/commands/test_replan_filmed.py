@@ -7,16 +7,19 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from pipelines.film import Settings, film
 from pipelines.formats.videos.video import index_video
+from pipelines.geometry.arrays import Float
 from pipelines.ingest import ingest
 from pipelines.reconstruct import reconstruct
+from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.stages import WritableSession
 from pipelines.session.storage import read_json
+from pipelines.session.tables import TRUTH, read_motion
+from pipelines.simulation.detector_errors import see
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.surfaces import Surface
 from tests.commands.test_replan import compare, refused, session_of
@@ -109,27 +112,47 @@ def test_only_simulated_flights_are_filmed_again(tmp_path: Path) -> None:
 
 
 def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two people the first is measured; the second is in the pictures where the truth has them."""
+    """Both people are in the pictures where the truth has them, and both are measured."""
     people = (
-        "actors: {anna: {motion: [walk: {distance_m: 5}], estimate_sigma_m: 0.02},"
+        "actors: {anna: {motion: [stand: {seconds: 1}], estimate_sigma_m: 0.02},"
         " ben: {motion: [stand: {seconds: 1}], start: [1, 3]}}"
     )
     text = SHORT.replace("actor: {motion: [walk: {distance_m: 5}], estimate_sigma_m: 0.02}", people)
     session = session_of(tmp_path, text)
     assert compare(session, "--arms", "fixed", "--trials", "1").exit_code == 0
-    rendered = []
+    truth = read_motion(session / "truth.parquet", TRUTH)
+    joints = truth.position  # [T, P, J, 3]
+    lens = read_description(session).cameras["drone1"].intrinsics.intrinsics()
+    rendered, shown = [], []
 
-    def picture(
-        _: Renderer, position: object, quaternion: object, people: list[Surface], frame: int
-    ) -> object:
+    def picture(_: Renderer, position: Float, quaternion: Float, people: list[Surface], frame: int) -> object:
         rendered.append([person.vertices.mean(axis=0) for person in people])
+        shown.append([see(person, position, quaternion, lens) for person in joints[frame]])
         return np.zeros((360, 640, 3), np.uint8)
 
+    class Everybody:
+        """Detector that finds the people's true joints, Ben's first, and a body where nobody is."""
+
+        def __init__(self, *_: object, only_one: bool) -> None:
+            assert not only_one
+
+        def step(self, *_: object, **__: object) -> tuple[Float, Float]:
+            xy = np.array([*shown[-1][::-1], shown[-1][0] + 80.0])
+            return xy, np.ones(xy.shape[:-1])
+
     monkeypatch.setattr(Renderer, "picture", picture)
-    film(session, Settings(rate_hz=4.0, end_s=0.6, detector=spot_detector(tmp_path)))
-    truth = pd.read_parquet(session / "truth.parquet").groupby("person")[["x", "y", "z"]].mean()
+    monkeypatch.setattr("pipelines.film.FollowedPeople", Everybody)
+    settings = Settings(rate_hz=5.0, end_s=0.5, detector=spot_detector(tmp_path))
+    figures = film(session, settings).metrics["arms"]["fixed"]
     assert len(rendered) == 6
-    # A walk begins with a stand: within half a second nobody gets further than a step from their mean.
-    for people_seen in rendered:
-        np.testing.assert_allclose(people_seen, truth.to_numpy(), atol=1.2)
-    assert np.ptp(np.array(rendered)[:, 1], axis=0).max() < 0.05  # Ben stands
+    for people_seen in rendered:  # both stand; the middles of a body and of its joints differ
+        np.testing.assert_allclose(people_seen, joints.mean(axis=(0, 2)), atol=0.3)
+
+    anna, ben = figures["by_person"].values()
+    assert list(figures["by_person"]) == ["anna", "ben"]
+    assert anna["detected_share"] == ben["detected_share"] == 1.0
+    assert max(anna["keypoint_median_px"], ben["keypoint_median_px"]) < 0.1
+    assert max(anna["mpjpe_mm"], ben["mpjpe_mm"]) < 1.0  # exact poses and keypoints
+    assert figures["mpjpe_mm"] == pytest.approx((anna["mpjpe_mm"] + ben["mpjpe_mm"]) / 2)
+    found = read_motion(session / "film" / "fixed" / "skeleton.parquet", TRUTH, truth.joints)
+    np.testing.assert_allclose(found.position, joints[:3], atol=0.01)

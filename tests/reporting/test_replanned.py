@@ -95,6 +95,20 @@ def test_the_table_says_what_the_metrics_say(compared: Replan) -> None:
     assert difference.coverage == ("–", "")
 
 
+def test_several_people_have_rows_of_their_own() -> None:
+    content = make_comparison()
+    anna = {"occluded_share": 0.25, "blind_s": 1.5, "pck150": {"mean": 0.5}, "view_quality": 0.6249}
+    metrics: dict[str, object] = {
+        "arms": {"adaptive": {"by_person": {"anna": anna, "ben": {}}}, "fixed": {}},
+        "equal_ranges": [{"arms": ["fixed", "adaptive"]}],
+    }
+    first, second = summarise_replan(replace(content, metrics=metrics), START_NS, 2).people
+    assert (first.arm, first.person) == ("adaptive", "anna")
+    assert (first.right[0], first.view_quality) == ("50.0", "0.625")
+    assert first.hidden[1] == "1.5 s blind"
+    assert (second.person, second.error) == ("ben", ("–", ""))
+
+
 def test_metrics_that_say_nothing_leave_dashes() -> None:
     content = make_comparison()
     bare = summarise_replan(replace(content, metrics={"arms": {"adaptive": {}}}), START_NS, 2)
