@@ -48,10 +48,17 @@ ARMS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "covariance": ("covariance", {}),
     "greedy": ("greedy", {}),
     "joint, from 8 m": ("joint", {"radius_m": 8.0}),
+    "adaptive, log 1 cm off": ("adaptive", {"actor_noise_m": 0.01}),
+    "adaptive, 8 m, log 1 cm off": ("adaptive", {"radius_m": 8.0, "actor_noise_m": 0.01}),
 }
 """Arms by their names in the tables, with changes of the settings: those of equal range beside each other."""
-EQUAL: Mapping[str, str] = {"joint, 10 m only": "adaptive", "joint, from 8 m": "adaptive, 8 m"}
-"""Arms that are compared with `adaptive` at the same range."""
+EQUAL: Mapping[str, str] = {
+    "joint, 10 m only": "adaptive",
+    "joint, from 8 m": "adaptive, 8 m",
+    "adaptive, log 1 cm off": "adaptive",
+    "adaptive, 8 m, log 1 cm off": "adaptive, 8 m",
+}
+"""Arms that are compared with `adaptive` at the same range. Its own differ by chance: flights are chaotic."""
 FINE: Mapping[str, Any] = {"lattice_yaws": 32, "lattice_knots": 1, "tilts_deg": (10.0, 15.0, 20.0)}
 NEAREST_M = 8.0  # of all arms, but for those that stay at 10 m
 KNOWING: Mapping[str, tuple[str, Mapping[str, Any]]] = {

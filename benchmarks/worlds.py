@@ -1,4 +1,4 @@
-"""Replayed flights through random worlds: `python -m benchmarks.worlds [--count N] [--write FILE]`.
+"""Replayed flights through random worlds: `python -m benchmarks.worlds [--count N] [--arms ARM]`.
 
 Every world has a seed: walls down to one voxel thick, boxes, forests, hills, overhangs, and starts beside
 obstacles; 2, 3 or 5 drones; all arms. The map is made of voxels, and flights are checked against the analytic
@@ -318,10 +318,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first world (default 0)")
     parser.add_argument("--count", type=int, default=COUNT, help=f"worlds (default {COUNT})")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="arms (default all)")
     parser.add_argument("--write", type=Path, help="store the flights here, and check nothing")
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.count)
-    rows = list(flown(seeds, arguments.workers))
+    rows = list(flown(seeds, arguments.workers, arguments.arms))
     if arguments.write:
         short = [[_rounded(row[key]) for key in _KEPT] for row in rows]
         arguments.write.write_text("[\n" + ",\n".join(map(json.dumps, short)) + "\n]\n", encoding="utf-8")
@@ -333,14 +334,14 @@ def main() -> None:
     sys.exit(1 if trouble else 0)
 
 
-def flown(seeds: Iterable[int], workers: int) -> Iterable[dict[str, Any]]:
+def flown(seeds: Iterable[int], workers: int, arms: Sequence[str]) -> Iterable[dict[str, Any]]:
     """Fly some worlds; yield their flights in the order of their seeds."""
     if workers == 1:
         for seed in seeds:
-            yield from fly(seed)
+            yield from fly(seed, arms)
         return
     with ProcessPoolExecutor(workers) as pool:
-        for rows in pool.map(partial(fly), seeds):
+        for rows in pool.map(partial(fly, arms=arms), seeds):
             yield from rows
 
 

@@ -267,19 +267,22 @@ def _team_cost(
 
 @helper
 def _improve_team(
-    price: Float, free: Float, views: Views, w: TeamWeights, commanded: Float, team: Int64
+    price: Float, free: Float, views: Views, w: TeamWeights, commanded: Float, order: Int64, team: Int64
 ) -> None:
-    """Replace each drone's states by the cheapest ones, given the others', until nobody finds better ones."""
+    """Replace each drone's states by the cheapest ones, given the others', until nobody finds better ones.
+
+    Drones take turns in this `order` [n]. States of -1 are not there yet, and do not count for the others.
+    """
     drones, times = team.shape
     cost = np.empty(price.shape)
     others, known = np.zeros(6), np.zeros(6)
     for _ in range(_MOST_ROUNDS):
         changed = False
-        for i in range(drones):
+        for i in order:
             for t in range(times):
                 _start_information(others, w.prior)
                 for j in range(drones):
-                    if j != i:
+                    if j != i and team[j, t] >= 0:
                         _add_view(others, free[t, team[j, t]], views, team[j, t])
                 for s in range(price.shape[1]):
                     for k in range(6):
@@ -287,7 +290,7 @@ def _improve_team(
                     _add_view(known, free[t, s], views, s)
                     cost[t, s] = price[t, s] + w.w_error * _log_error(known)
                     for j in range(drones):
-                        if j != i and _is_near(views, s, team[j, t], w.apart_m):
+                        if j != i and team[j, t] >= 0 and _is_near(views, s, team[j, t], w.apart_m):
                             cost[t, s] += TOO_NEAR
             found = _search(cost, views.lattice, commanded[i])[0]
             for t in range(times):
@@ -327,8 +330,9 @@ def best_teams(
 
     The cost is the sum of the slots' prices, of turning and of the logarithm of the predicted error. It is
     descended, drone by drone until none can be improved alone, from the plan before, from the cheapest
-    formation of equal spacing, and from the cheapest one with the error left out. The last descent stays at
-    the tilt and range that are asked for. Both formations are results, too.
+    formation of equal spacing, and from the cheapest one with the error left out. That descent stays at the
+    tilt and range that are asked for. The last one starts from nothing: the drone with the dearest slots
+    chooses first, and the others make room. The cheapest formation is a result, too.
 
     Args:
         price: [T, S] cost of a drone in each state.
@@ -338,15 +342,21 @@ def best_teams(
     """
     formation = _cheapest_formation(price, free, views, w, commanded)
     plain = _cheapest_formation(price, free, views, TeamWeights(0.0, w.prior, w.apart_m), commanded)
-    teams = np.empty((5, *before.shape), np.int64)
-    teams[0], teams[1], teams[2] = before, formation, plain
-    teams[3], teams[4] = formation, plain
+    drones, times = before.shape
+    dear = np.zeros(drones)
+    for i in range(drones):
+        for t in range(times):
+            dear[i] += price[t, before[i, t]]
+    in_turn, dearest_first = np.arange(drones), np.argsort(-dear, kind="mergesort")
+    teams = np.empty((5, drones, times), np.int64)
+    teams[0], teams[1], teams[2], teams[3], teams[4] = before, formation, plain, formation, -1
     level = price.copy()
     for s in range(price.shape[1]):
         if not views.as_asked[s]:
             level[:, s] += TOO_NEAR
     for k in range(3):
-        _improve_team(level if k == 2 else price, free, views, w, commanded, teams[k])
+        _improve_team(level if k == 2 else price, free, views, w, commanded, in_turn, teams[k])
+    _improve_team(price, free, views, w, commanded, dearest_first, teams[4])
     costs = np.empty(teams.shape[0])
     for k in range(teams.shape[0]):
         costs[k] = _team_cost(price, free, views, w, commanded, teams[k])
