@@ -416,7 +416,7 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
 
     Args:
         position: [T, P, J, 3] m, NaN for what was not reconstructed.
-        truth: [T, Q, J, 3] m, NaN where unknown.
+        truth: [T, Q, J, 3] m, NaN where unknown; times at which it is unknown of everybody do not count.
         within_m: the largest distance.
 
     Returns:
@@ -427,6 +427,8 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
     """
     from scipy.optimize import linear_sum_assignment
 
+    known = np.isfinite(truth[..., 0]).any(axis=(1, 2))
+    position, truth = position[known], truth[known]
     offset = position[:, :, None] - truth[:, None]
     both: Bool = np.isfinite(offset[..., 0])
     mean = np.where(both[..., None], offset, 0.0).sum(axis=3) / np.maximum(both.sum(axis=3), 1)[..., None]

@@ -268,3 +268,15 @@ def test_who_was_missed_and_confused_is_counted() -> None:
     ]
     assert found["mota"] == pytest.approx(1 - 5 / 20)
     assert found["idf1"] == pytest.approx(2 * 10 / (20 + 19))
+
+
+def test_times_without_truth_do_not_count_for_tracking() -> None:
+    truth = np.zeros((6, 1, 2, 3))
+    position = truth.copy()
+    truth[2:4] = np.nan
+    found = tracking_errors(position, truth)
+    assert (found["present"], found["misses"], found["phantoms"], found["switches"]) == (4, 0, 0, 0)
+    assert (found["mota"], found["idf1"]) == (1.0, 1.0)
+    nobody = tracking_errors(position, np.full_like(truth, np.nan))
+    assert (nobody["present"], nobody["phantoms"]) == (0, 0)
+    assert np.isnan(nobody["mota"]) and np.isnan(nobody["idf1"])
