@@ -279,4 +279,5 @@ def test_times_without_truth_do_not_count_for_tracking() -> None:
     assert (found["mota"], found["idf1"]) == (1.0, 1.0)
     nobody = tracking_errors(position, np.full_like(truth, np.nan))
     assert (nobody["present"], nobody["phantoms"]) == (0, 0)
-    assert np.isnan(nobody["mota"]) and np.isnan(nobody["idf1"])
+    assert np.isnan(nobody["mota"])
+    assert np.isnan(nobody["idf1"])
