@@ -304,7 +304,8 @@ def coverage(session: Path, scenario: Path) -> Times:
     mean = np.where(both[..., None], offset, 0.0).sum(axis=3) / np.maximum(both.sum(axis=3), 1)[..., None]
     distance = np.where(both.any(axis=3), np.linalg.norm(mean, axis=-1), np.inf)  # [T, P, Q]
     nobody = np.isfinite(motion.position[..., 0]).any(axis=2) & (distance > NOBODY_M).all(axis=2)
-    nobody &= np.isfinite(truth[..., 0]).any(axis=(1, 2))[:, None]
+    known: Bool = np.asarray(np.isfinite(truth[..., 0]).any(axis=(1, 2)))
+    nobody &= known[:, None]
 
     plan = read_scenario(scenario)
     flight = fly_scenario(plan, noise_models(str(scenario), plan.drones.pose_noise))
