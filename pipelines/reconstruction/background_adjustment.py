@@ -83,7 +83,12 @@ _DRAWS = 32  # of the posterior
 _LEVEL_ROUNDS = 6
 _LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; below it MacKay's rule leaps
 _LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
-_SMALL = 0.1  # share of the constant variance, at most a usual one, below which slow errors are part of it
+_FEWEST_STANDING = 8  # pictures
+_SIGMAS_STANDING = 2.0  # of all errors: the log of a camera that stands moves by less
+_STANDS = 0.03  # px^2 of misfit that a free path may save: noise, not parallax
+_SLOW_LAG_S = 1.0  # over which slow errors of a camera that stands are read off its log
+_MOST_MEANS = 200  # of its log, to which poses are averaged
+_SMALL = 0.02  # share of the constant variance, at most a usual one, below which slow errors are part of it
 
 
 @dataclass(frozen=True)
@@ -420,7 +425,54 @@ class _Stretch:
         )
 
     def solve_with_levels(self, prior: PosePrior) -> _Solved | None:
-        """Solve, with levels of errors estimated if they are unknown; None without convergence."""
+        """Solve, with levels of errors estimated if they are unknown; None without convergence.
+
+        A camera that stands sees no parallax, whatever its log says. Inverse depths near 0 fit that with any
+        path, and the small errors of followed points then choose one. So a log that hardly moves is compared
+        with a camera that does not move at all.
+        """
+        stands = self._standing(prior)
+        free = self._solved(prior)
+        if stands is None or (free is not None and _misfit(stands) > _misfit(free) + _STANDS):
+            return free
+        return stands
+
+    def _standing(self, prior: PosePrior) -> _Solved | None:
+        """Solve for a camera that only turns; None if its log moves more than its errors do."""
+        t_s = self._times_s()
+        away = self.position - self.position.mean(axis=0)
+        if len(t_s) < _FEWEST_STANDING or np.sqrt(np.mean(away**2)) > _SIGMAS_STANDING * prior.level[0]:
+            return None
+        if prior.estimated:
+            white, rate = _levels_of_standing(t_s, self.position)
+            prior = _with_position_levels(prior, white, _unknown(SHIFT_IN_WORLD, rate))
+        place, variance = _place_of_standing(t_s, self.position, prior)
+        variance += prior.constant[2] ** 2  # nothing moves that could tell it from a shift of the place
+        origin = np.tile(place, (len(self.points.origin), 1))
+        still = replace(
+            self,
+            position=np.tile(place, (len(t_s), 1)),
+            points=Points(origin, *(array.copy() for array in self.points[1:])),
+        )
+        tight = replace(prior, constant=(*prior.constant[:2], 0.0))
+        tight = _with_position_levels(tight, EXACT, _unknown(SHIFT_IN_WORLD, EXACT))
+        found = still._solved(tight, positions_known=True)
+        if found is None:
+            return None
+        errors, covariance, draws = found.errors.copy(), found.covariance.copy(), found.draws.copy()
+        errors[:, :3] += self.position - place
+        covariance[:, range(3), range(3)] += variance
+        rng = np.random.default_rng(0)
+        draws[..., :3] += np.sqrt(variance) * rng.standard_normal((len(draws), 1, 3))
+        levels = _with_position_levels(found.prior, prior.white[0], prior.slow[0])
+        return _Solved(errors, covariance, draws, found.missed, levels)
+
+    def _times_s(self) -> Float:
+        """Return the times of the pictures [T], from the knots about them."""
+        step = self.knot_t_s[self.knot + 1] - self.knot_t_s[self.knot]
+        return np.asarray(self.knot_t_s[self.knot] + self.share * step)
+
+    def _solved(self, prior: PosePrior, *, positions_known: bool = False) -> _Solved | None:
         state = _State(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), np.zeros(9))
         settle_points(self.seen, self.points, self.position, self.rotation, _WIDE[0], _INVERSE_DEPTH, 8)
         for loss in _WIDE:
@@ -433,8 +485,10 @@ class _Stretch:
             if found is None:
                 return None
             state, factored, _ = found
-            prior = self._estimated(state, self._draws(factored, 8), prior)
-            prior = with_constant_turn(prior, state.constant[3:6], factored.corner[3:6, 3:6])
+            levels = self._estimated(state, self._draws(factored, 8), prior)
+            if positions_known:
+                levels = _with_position_levels(levels, prior.white[0], prior.slow[0])
+            prior = with_constant_turn(levels, state.constant[3:6], factored.corner[3:6, 3:6])
         found = self._solve(state, prior, rounds=_ROUNDS)
         if found is None:
             return None
@@ -575,7 +629,7 @@ def with_constant_turn(prior: PosePrior, found: Float, covariance: Float) -> Pos
     precision = np.linalg.inv(covariance)
     pull, of_data = precision @ found, precision - np.eye(3) / prior.constant[1] ** 2
     variance = prior.constant[1] ** 2
-    usual = USUAL_CONSTANT[1] ** 2 + prior.slow[1].sigma0 ** 2
+    usual = USUAL_CONSTANT[1] ** 2
     for _ in range(_LEVEL_STEPS):
         posterior = np.linalg.inv(of_data + np.eye(3) / variance)
         squares = np.sum((posterior @ pull) ** 2) + np.trace(posterior)
@@ -599,6 +653,48 @@ def _level(estimates: Float, draws: Float, sigma: float, least: float) -> float:
     else:
         variance = np.mean(estimates**2) / determined
     return max(float(np.sqrt(np.clip(variance, 0.04 * sigma**2, 6.0 * sigma**2))), least)
+
+
+# --- cameras that stand ---------------------------------------------------------------------------------
+
+
+def _misfit(solved: _Solved) -> float:
+    """Compute what a solution leaves of a sighting (px^2 if it is small), by Cauchy's loss."""
+    return float(np.mean(np.log1p((solved.missed / _PIXEL_SIGMA) ** 2)))
+
+
+def _with_position_levels(prior: PosePrior, white: float, slow: Process) -> PosePrior:
+    return replace(prior, white=(white, prior.white[1]), slow=(slow, prior.slow[1]))
+
+
+def _levels_of_standing(t_s: Float, position: Float) -> tuple[float, float]:
+    """Read the level (m) of white errors and the rate of slow ones (m per sqrt(s)) off a log that stands.
+
+    Differences of neighbours are white errors, and what they grow by over a longer time is slow.
+    """
+    period_s = float(np.median(np.diff(t_s)))
+    lag = int(np.clip(round(_SLOW_LAG_S / period_s), 2, len(t_s) // 2))
+    near, far = (float(np.mean((position[k:] - position[:-k]) ** 2)) for k in (1, lag))
+    rate2 = max(far - near, 0.0) / ((lag - 1) * period_s)
+    white = float(np.sqrt(max(near - rate2 * period_s, 0.0) / 2))
+    return max(white, _LEAST_WHITE[0]), max(float(np.sqrt(rate2)), _LEAST_RATE[0])
+
+
+def _place_of_standing(t_s: Float, position: Float, prior: PosePrior) -> tuple[Float, float]:
+    """Estimate the place [3] of a camera that stands, and its variance per axis by white and slow errors.
+
+    Each pose of the log is weighted by the covariance of these errors over time (generalised least squares).
+    """
+    parts = np.array_split(np.arange(len(t_s)), min(len(t_s), _MOST_MEANS))
+    at_s = np.array([t_s[part].mean() for part in parts])
+    means = np.array([position[part].mean(axis=0) for part in parts])
+    slow = prior.slow[0]
+    covariance = np.diag([prior.white[0] ** 2 / len(part) + EXACT**2 for part in parts])
+    covariance += slow.rate**2 * np.minimum(at_s[:, None], at_s)
+    covariance += slow.sigma0**2 * np.exp(-np.abs(at_s[:, None] - at_s) / slow.correlation_s)
+    weight = np.linalg.solve(covariance, np.ones(len(parts)))
+    variance = 1 / float(weight.sum())
+    return np.asarray(variance * weight @ means), variance
 
 
 # --- points ---------------------------------------------------------------------------------------------

@@ -76,6 +76,7 @@ _CAMERA_SIGMA_M = 0.007  # of each camera's error that no pair shows: its path i
 _REPEATED = 0.5  # correlation of the errors of comparisons of the same patch
 _LOSS = 2.0  # standard deviations at which a patch counts half
 _ROUNDS = 8
+_LEVEL_ROUNDS = 6  # of the level of constant position errors
 _FEWEST_PATCHES = 10  # of a pair of cameras, distinct and in agreement
 _AGREE = 0.5  # share of a pair's patches that must agree
 
@@ -200,6 +201,11 @@ def bind_positions(
         if not used.any():
             break
         solution, _ = _solve(_of_pairs(matches, used), prior, of_pair)
+    if used.any():
+        found = _of_pairs(matches, used)
+        for _ in range(_LEVEL_ROUNDS):
+            prior = _with_position_level(cameras, prior, solution)
+            solution, _ = _solve(found, prior, of_pair)
     return _bound(cameras, pairs, counts, used, prior, solution)
 
 
@@ -682,12 +688,9 @@ def _bound(
     columns = np.array([3 * c + k for c in group for k in range(3)], dtype=np.int64)
     joint = solution.covariance[np.ix_(columns, columns)]
     every = np.tile(np.eye(3), (len(group), 1))
-    common = of_group = np.zeros((3, 3))
+    common = np.zeros((3, 3))
     if group:
-        of_group = np.asarray(np.linalg.inv(every.T @ np.linalg.inv(joint) @ every), dtype=np.float64)
-        common = of_group.copy()
-        if any((errors := cameras[c].errors) is not None and errors.assumed for c in group):
-            common *= _share_of_assumed(position[group], prior[3 * np.array(group)])
+        common = np.asarray(np.linalg.inv(every.T @ np.linalg.inv(joint) @ every), dtype=np.float64)
     moved, left_m, reasons = list(cameras), {}, {}
     for c, camera in enumerate(cameras):
         if c not in group:
@@ -698,7 +701,7 @@ def _bound(
                 moved[c] = _narrowed(camera, wider, None, float(prior[3 * c]))
             continue
         place = slice(3 * c, 3 * c + 3)
-        own = float(np.trace(solution.covariance[place, place] - of_group)) / 3
+        own = float(np.trace(solution.covariance[place, place] - common)) / 3
         relative = own * len(group) / (len(group) - 1)
         sigma = float(
             np.sqrt(max(relative, 0.0) + (0.0 if camera.static else _CAMERA_SIGMA_M) ** 2 + EXACT**2)
@@ -736,17 +739,24 @@ def _bound(
     return GroundBinding(moved, tuple(cameras[c].name for c in group), reasons, common, entry)
 
 
-def _share_of_assumed(position: Float, prior_m: Float) -> float:
-    """Compute the share of an assumed variance that the differences [N, 3] m of N cameras let expect.
+def _with_position_level(cameras: Sequence[Camera], prior: Float, solution: _Solution) -> Float:
+    """Estimate the level of constant position errors that are only assumed, by MacKay's rule.
 
-    Args:
-        position: [N, 3] m, the errors found.
-        prior_m: [N] standard deviations assumed.
+    A wide level would let the ground turn all cameras together: it binds their attitudes to each other better
+    than to the world, and their places follow. A usual level counts as `USUAL_COUNT` more numbers.
+
+    Returns:
+        Standard deviations [6 C], no larger than before.
     """
-    differences = position - position.mean(axis=0)
-    numbers = 3 * (len(position) - 1)
-    level2 = (np.sum(differences**2) + USUAL_COUNT * USUAL_CONSTANT[0] ** 2) / (numbers + USUAL_COUNT)
-    return float(min(level2 / np.mean(prior_m**2), 1.0))
+    numbers = 3 * len(cameras)
+    assumed = np.repeat([c.errors is not None and c.errors.assumed for c in cameras], 3)
+    assumed = np.append(assumed, np.zeros(numbers, dtype=np.bool_))
+    if not assumed.any():
+        return prior
+    determined = float(np.sum(1 - np.diagonal(solution.covariance)[assumed] / prior[assumed] ** 2))
+    squares = float(np.sum(solution.errors[assumed] ** 2))
+    level2 = (squares + USUAL_COUNT * USUAL_CONSTANT[0] ** 2) / (max(determined, 0.0) + USUAL_COUNT)
+    return np.where(assumed, np.minimum(prior, np.sqrt(level2)), prior)
 
 
 def _largest_group(total: int, edges: Sequence[tuple[int, int]]) -> list[int]:

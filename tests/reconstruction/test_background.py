@@ -14,7 +14,10 @@ from pipelines.geometry.cameras import Intrinsics, row_delay_s
 from pipelines.geometry.noise import (
     ROTATION,
     SHIFT_IN_WORLD,
+    UNKNOWN_SIGMA,
+    Drift,
     GaussMarkov,
+    NoiseModel,
     PoseErrors,
     Process,
     White,
@@ -168,6 +171,38 @@ def test_a_camera_that_only_turns_gets_the_changing_part_of_its_attitudes(known:
     # The pan tells the log's error in the camera from a turn of the world, but for its own axis.
     # An unknown level is estimated from two axes: it is between the true one and the widest that is possible.
     assert 0.9 * 0.3 / np.sqrt(3) < np.degrees(sigma) < 1.1 * (0.3 if known else 1.0)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_camera_that_stands_is_where_its_log_has_it_on_average(known: bool) -> None:
+    """Give a log of white errors of 0.05 m and slow ones of 0.02 m per sqrt(s).
+
+    No parallax is seen, so what changes in the log is error. The place no longer changes, and errs by what
+    the average of the log errs by. A log that begins exactly says it as well as its first poses.
+    """
+    errors = PoseErrors(
+        (0.05, np.radians(0.2)),
+        (Process(SHIFT_IN_WORLD, 1e-5, 0.02), Process(ROTATION, 1e-5, np.radians(0.1))),
+    )
+    rng = np.random.default_rng(4)
+    position, rotation = turning(150)
+    picture, point, xy = sighted(position, rotation, rng, noise_px=0.1)
+    models: list[NoiseModel] = [
+        White(position_m=0.05, rotation_deg=0.2),
+        Drift(position_m_per_sqrt_s=0.02, rotation_deg_per_sqrt_s=0.1),
+    ]
+    t_ns = np.round(1e9 * np.arange(150) / 30).astype(np.int64)
+    at, quaternion = disturb(models, t_ns, position, quaternion_from_matrix(rotation), rng)
+    prior = PosePrior.of(errors if known else None)
+    found = adjusted(picture, point, xy, (at, matrix_from_quaternion(quaternion)), prior)
+    assert found.refused is None
+    away = found.position - position
+    assert (at - position).std(axis=0).min() > 0.04
+    assert away.std(axis=0).max() < 1e-3
+    assert found.prior.white[0] == pytest.approx(0.05, rel=0.2)
+    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3].mean())
+    assert np.abs(away).max() < 3 * sigma
+    assert sigma < 0.02 if known else sigma > UNKNOWN_SIGMA[0]  # a constant error is always possible
 
 
 @pytest.mark.parametrize(("sigma_deg", "expected_deg"), [(0.01, np.sqrt((0.8**2 + 0.3**2) / 2)), (0.9, 1.0)])
