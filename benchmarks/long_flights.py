@@ -13,6 +13,7 @@ measures instead the most memory and the processor time that `mocap reconstruct`
 nothing` leaves its noise out. `--repeat 15` repeats the flight to and fro so often, which takes less time
 than to simulate an hour; with several numbers each in turn. `--film` films the flight, and repeats what was
 found in its pictures. `--session` takes an ingested flight of so many minutes instead of flying one.
+`--compare` measures `mocap replan-compare` instead of these commands.
 
     python -m benchmarks.long_flights --segments 60 300 900 --minutes 12 --first 302
 
@@ -125,6 +126,7 @@ COMMANDS = (
     ("report",),
     ("export", "--to", "trc,csv,tum", "--overwrite"),
 )
+COMPARISON = (("replan-compare", "--arms", "adaptive,fixed,flown"),)
 # A process of its own: a child's most memory begins with that of the process that starts it.
 _MEASURED = """
 import json, resource, subprocess, sys
@@ -134,13 +136,15 @@ print(json.dumps([code, used.ru_maxrss, used.ru_utime + used.ru_stime]))
 """
 
 
-def memory_rows(session: Path, minutes: float) -> Iterator[str]:
+def memory_rows(
+    session: Path, minutes: float, commands: tuple[tuple[str, ...], ...] = COMMANDS
+) -> Iterator[str]:
     """Run the commands of a session; yield rows: minutes, command, peak MB, processor seconds.
 
     Each has one process; with more of them each takes as much.
     """
     mocap = Path(sys.executable).parent / "mocap"
-    for command, *options in COMMANDS:
+    for command, *options in commands:
         done = subprocess.run(  # noqa: S603  # our own command, with folders made here
             [sys.executable, "-c", _MEASURED, mocap, command, session, *options],
             stdout=subprocess.PIPE,
@@ -412,6 +416,7 @@ def main() -> None:
     parser.add_argument("--memory", type=float, nargs="+", metavar="MINUTES", help="measure memory instead")
     parser.add_argument("--repeat", type=int, nargs="+", default=[1], metavar="TIMES", help="with --memory")
     parser.add_argument("--film", action="store_true", help="with --memory: film it")
+    parser.add_argument("--compare", action="store_true", help="with --memory: replan-compare instead")
     parser.add_argument("--given", choices=("model", "nothing"), default="model", help="with --memory")
     parser.add_argument("--page", type=Path, metavar="SESSION", help="measure the page of an hour instead")
     parser.add_argument("--minutes", type=float, default=60.0, help="with --page and --segments")
@@ -444,7 +449,8 @@ def main() -> None:
                     session = once.with_name(f"{once.stem}-{turns}.session")
                     shutil.copytree(once, session)
                     lengthen(session, turns)
-                    for row in memory_rows(session, minutes * turns):
+                    commands = COMPARISON if arguments.compare else COMMANDS
+                    for row in memory_rows(session, minutes * turns, commands):
                         print(row, flush=True)
                     shutil.rmtree(session)
                     shutil.rmtree(session.with_name(f"{session.name}.films"), ignore_errors=True)

@@ -39,6 +39,7 @@ from pipelines.planning.scene import Scene, Settings, build_scene
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
+from pipelines.session.memory import return_freed_arrays, return_unused
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
 from pipelines.session.stage_records import Stage, StageRecord, key_of, usable_record
@@ -125,6 +126,7 @@ def replan(
     """
     settings = settings or Settings()
     progress = progress or Silent()
+    return_freed_arrays()
     refuse_unknown(settings.arms or ())
     refuse_name(name)
     with locked(folder) as session:
@@ -145,15 +147,16 @@ def replan(
         for note in scene.notes:
             progress.note(note)
         progress.start("Replaying", len(arms))
-        results, times = {}, {}
+        made = {}
         for arm in arms:
-            made = run.chunk(arm, partial(fly_and_measure, scene, errors, arm))
-            results[arm] = read_result(made)
-            times[arm] = read_json(made / "times.json")
+            made[arm] = run.chunk(arm, partial(fly_and_measure, scene, errors, arm))
             (run.folder / arm).mkdir()
-            for table in made.glob("*.parquet"):
+            for table in made[arm].glob("*.parquet"):
                 shutil.copyfile(table, run.folder / arm / table.name)
+            return_unused()
             progress.advance()
+        results = {arm: read_result(place) for arm, place in made.items()}
+        times = {arm: read_json(place / "times.json") for arm, place in made.items()}
         keypoints = f"modelled after {errors.detector}"
         metrics = jsonable({"name": name} | compare(scene, results) | {"keypoints": keypoints})
         write_table(run.folder / "actor.parquet", _actor_table(scene), ACTOR)
@@ -372,7 +375,7 @@ def read_result(folder: Path) -> ArmResult:
             facts["separation"],
             facts["safety"],
         ),
-        error_m=np.load(errors) if errors.exists() else None,
+        error_m=np.load(errors, mmap_mode="r") if errors.exists() else None,  # large in long flights
         seen_share=facts["seen_share"],
         joint_frames=facts["joint_frames"],
     )
