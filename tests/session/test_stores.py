@@ -174,7 +174,12 @@ def test_segments_of_a_session_in_a_store_go_to_workers_elsewhere(
     elsewhere = {"XDG_CACHE_HOME": str(tmp_path / "cache-elsewhere")}
     with (
         distributed.LocalCluster(
-            n_workers=1, threads_per_worker=1, dashboard_address=None, env=elsewhere
+            n_workers=1,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # its usual port may be taken
+            env=elsewhere,
         ) as workers,
         distributed.Client(workers) as client,
         staged(f"{bucket}/there.session") as copy,
