@@ -56,6 +56,28 @@ def test_a_lone_detection_is_given_back_to_the_person_whose_other_views_it_fits(
     assert np.array_equal(undo_exchanges(scene.time_s, views, seen).track, right)
 
 
+def test_lone_detections_are_given_back_under_constant_pose_errors() -> None:
+    """Give a camera's detections of one person to another one whom it does not find, for all of the time.
+
+    The people are 1.5 to 3 m apart, and poses err by 0.15 m and 0.8 deg for good. So one picture leaves
+    both of them possible. Of 40 draws 39 are mended.
+    """
+    mended = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed + 900)
+        away, heading = rng.uniform(1.5, 3.0), rng.uniform(0, 2 * np.pi)
+        x, y = away / 2 * np.cos(heading), away / 2 * np.sin(heading)
+        paths = [straight((s * x, s * y), tuple(rng.normal(0, 0.3, 2))) for s in (-1, 1)]
+        scene = film(paths, cameras=3, bias=(0.15, 0.8), seed=seed).hide(1, 1)
+        views, seen = followed(scene)
+        first, second = (seen.track[:, 0][scene.who[:, 0] == person][0] for person in (0, 1))
+        own = seen.track[:, 1]
+        own[own >= 0] = second
+        found = undo_exchanges(scene.time_s, views, seen).track[:, 1]
+        mended.append(bool((found[found >= 0] == first).all()))
+    assert sum(mended) >= 36
+
+
 def disagreement(scene: Scene, views: Views, person: int) -> float:
     """Compute the root mean square, in sigma of the scene, of a person's rays about their nearest points."""
     squares = []
