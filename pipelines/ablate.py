@@ -311,7 +311,7 @@ def _film(
         surface = filmed.person.surface(filmed.motion.root[frame], filmed.motion.rotation[frame])
         picture = renderer.picture(*pose, [surface], frame)
         hint = project_actor(filmed.aim[frame], pose, seen_by.lens, sigma_m=_HINT_SIGMA_M, sigma_rad=0.0)
-        found, sure = follower.step(picture, hint=hint)
+        found, sure = follower.step(picture, hints=[hint])
         if len(found):
             xy[frame], confidence[frame] = found[0], sure[0]
         progress.advance()

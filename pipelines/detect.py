@@ -37,7 +37,7 @@ from pipelines.session.description import (
     read_description,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.people import logged_actor
+from pipelines.session.people import logged_people
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Detections
 from pipelines.session.registries import (
@@ -175,7 +175,7 @@ def detect(
     progress.start("Detecting keypoints", pictures)
     if cluster is not None:
         _gather(cluster, run, work, blocks, chosen, people == 1, following, progress)
-    hints_at = _Hints(session.folder, description, media)
+    hints_at = _Hints(session.folder, description, media, only_one=people == 1)
     produce = partial(_produce_here, work, hints_at, chosen, people == 1, following, progress)
     folders = side_by_side(
         lambda block: run.chunk(block.name, partial(produce, block)), blocks, workers=workers, halt=work.halt
@@ -218,13 +218,14 @@ _HINTS_FROM = "hints_from"
 
 
 def hints_of(description: Description, ingested: StageRecord, cameras: Iterable[str]) -> dict[str, str]:
-    """Return the hash of all that says where the actor should be in the pictures; empty without an actor."""
-    if description.actor is None:
+    """Return the hash of all that says where logged people should be in the pictures; empty without any."""
+    logged = description.logged_people
+    if not logged:
         return {}
     entries = {name: description.cameras[name] for name in sorted(cameras)}
     made_of = [
         [
-            description.actor.point,
+            *(person.point for person in logged),
             description.pose_interpolation.model_dump(),
             ingested.outputs["actor.parquet"],
         ],
@@ -286,22 +287,27 @@ def _store_with_new_times(work: _Work, media: Mapping[str, MediaEntry], folder: 
 
 
 class _Hints:
-    """Places of the logged actor in the pictures of the cameras."""
+    """Places of the logged people in the pictures of the cameras."""
 
-    def __init__(self, folder: Path, description: Description, cameras: Iterable[str]) -> None:
+    def __init__(
+        self, folder: Path, description: Description, cameras: Iterable[str], *, only_one: bool
+    ) -> None:
         self._description = description
-        self._actor = logged_actor(folder, description)
+        logged = logged_people(folder, description)
+        self._people = logged[:1] if only_one else logged
         self._tracks = {
             name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
-            for name in (cameras if self._actor is not None else ())
+            for name in (cameras if self._people else ())
         }
 
-    def at(self, camera: str, t_ns: Int64) -> list[Hint | None]:
-        """Return the hints for a camera's pictures of these times [T]."""
-        if self._actor is None:
-            return [None] * len(t_ns)
+    def at(self, camera: str, t_ns: Int64) -> list[tuple[Hint | None, ...]]:
+        """Return the hints of all people for each of a camera's pictures of these times [T]."""
+        if not self._people:
+            return [()] * len(t_ns)
         entry, between = self._description.cameras[camera], self._description.pose_interpolation
-        return actor_hints(self._actor, camera, entry, self._tracks[camera], between, t_ns)
+        track = self._tracks[camera]
+        of_each = [actor_hints(each, camera, entry, track, between, t_ns) for each in self._people]
+        return list(zip(*of_each, strict=True))
 
 
 class _Work:
@@ -410,7 +416,7 @@ def detect_block(order: _Order) -> tuple[dict[str, bytes], dict[str, bytes] | No
         )
     description = read_description(folder)
     work = _Work(folder, description, order.every, (None, None))
-    hints = _Hints(folder, description, [order.block.camera])
+    hints = _Hints(folder, description, [order.block.camera], only_one=order.only_one)
     part = None if order.followed is None else FollowedPart(order.followed)
     with TemporaryDirectory() as place:
         detected, followed = Path(place, "detected"), Path(place, "followed")
@@ -498,7 +504,7 @@ def _produce(
     ):
         if part is not None and before:
             part.see(before[0], next(decoded))
-        for number, picture, hint in zip(numbers, decoded, hints.at(block.camera, t_ns), strict=True):
+        for number, picture, hints_here in zip(numbers, decoded, hints.at(block.camera, t_ns), strict=True):
             work.halt.check()
             progress.advance()
             if part is not None:
@@ -508,7 +514,7 @@ def _produce(
                 continue
             found += [
                 (number, seen.track, seen.person.xy, seen.person.confidence)
-                for seen in tracker.step(picture, hint=hint)
+                for seen in tracker.step(picture, hints=hints_here)
             ]
     write_table(folder / "keypoints.parquet", _table(found, networks, frame, t_ns), KEYPOINTS)
     counts = {**tracker.counts, "detections": len(found), "undecoded": undecoded}

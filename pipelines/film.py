@@ -309,7 +309,7 @@ def _film_camera(
                 hint = project_actor(
                     arm.actor[k], pose, lens, sigma_m=ACTOR_SIGMA_M, sigma_rad=UNKNOWN_SIGMA_RAD
                 )
-            found.append(_whose(arm, pose, k, *follower.step(picture, hint=hint)))
+            found.append(_whose(arm, pose, k, *follower.step(picture, hints=[hint])))
             yield picture
             progress.advance()
 

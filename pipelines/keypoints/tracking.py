@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.hints import Hint
@@ -42,8 +43,13 @@ _ONE_PICTURE = 0.9  # of the least score: enough in a single picture
 _BODY = (0.2, 0.5)  # of a region's side, across and along: the body in it; what a tile cuts there is a part
 _TALLER = 1.3  # a region's side over that of the hint: bodies differ, and arms are raised
 _SURE = 0.7  # score of the person detector: of a body that a tile cuts, below it is searched once more
-_LOST = 30  # pictures without the actor after which the place of the hint is searched less often
+_LOST = 30  # pictures without a logged person after which the place of the hint is searched less often
 _SEARCH_LOST = 5  # pictures from one such search to the next
+_NOT_THEY = 1e6  # px: further than a hint is from any region
+
+Hints = Mapping[int, Hint]  # by the number of the logged person; only those whose place is known
+
+_NOBODY: Hints = {}
 
 
 @runtime_checkable
@@ -82,19 +88,19 @@ class PeopleTracker:
     """Tracker of people through the pictures of one camera.
 
     A person is searched at the place of the joints in the last picture. The person detector runs around
-    people just lost, and around the hint if the logged actor is not followed. It runs on tiles of the whole
+    people just lost, and around the hint of each logged person who is not seen. It runs on tiles of the whole
     picture if nobody is followed, and every `search_every` pictures. Each such search takes the next few
     tiles, so that the cost of a large picture spreads over several. The first picture is searched until a
-    person is found.
+    person is found. A logged person who is not seen is searched in each of the first 30 pictures, then in
+    every fifth.
 
     With `only_one`, one person is wanted: fewer tiles are searched while somebody is followed. With a hint,
     those who cannot be the actor, by place or size, are not followed while somebody can, and the whole
-    picture is searched only while nobody can: in each of the first 30 pictures, then in every fifth. The
-    place of the hint is searched in turns, a square every `search_every` pictures, because the one who is
-    followed may be somebody who stands near.
+    picture is searched only while nobody can. The place of the hint is searched in turns, a square every
+    `search_every` pictures, because the one who is followed may be somebody who stands near.
 
     Things that are no people are dropped by their scores, where the networks say which (`TellsPeople`). The
-    only track is kept, and so is the only one that can be the actor.
+    only track is kept, and so is the only one that can be a logged person.
 
     Results depend only on the pictures and hints so far.
 
@@ -124,25 +130,28 @@ class PeopleTracker:
         self._next_number = 0
         self._next_tile = 0
         self._next_square = 0
-        self._without_actor = 0  # pictures, with hints, since somebody was seen who can be the actor
+        self._unseen_for: Counter[int] = Counter()  # pictures with a hint, since the logged person was seen
 
-    def step(self, picture: Picture, *, hint: Hint | None) -> list[TrackedPerson]:
+    def step(self, picture: Picture, *, hints: Sequence[Hint | None] = ()) -> list[TrackedPerson]:
         """Find the people in the next picture.
 
         Args:
             picture: [H, W, 3] BGR.
-            hint: place of the actor by the log, None if unknown.
+            hints: place of each logged person, None if unknown, in the same order for all pictures.
 
         Returns:
             The people seen in this picture, sorted by number.
         """
+        logged = {k: hint for k, hint in enumerate(hints) if hint is not None}
+        self._most_people = max(self._most_people, len(hints))
         self._follow(picture)
         self._merge()
-        self._drop(hint)
-        self._search(picture, hint)
-        self._drop(hint)
-        if hint is not None:
-            self._without_actor = 0 if self._follows(hint) else self._without_actor + 1
+        self._drop(logged)
+        self._search(picture, logged)
+        self._drop(logged)
+        unseen = self._unseen(logged)
+        for k in logged:
+            self._unseen_for[k] = self._unseen_for[k] + 1 if k in unseen else 0
         self.counts["frames"] += 1
         seen = sorted(self._seen(), key=lambda track: track.number)
         self.counts["without anybody"] += not seen
@@ -179,18 +188,18 @@ class PeopleTracker:
             else:
                 kept.append(track)
 
-    def _drop(self, hint: Hint | None) -> None:
+    def _drop(self, logged: Hints) -> None:
         """Drop those who are not the actor and things that are no people, if somebody better is seen."""
         seen = self._seen()
-        actors = [track for track in seen if _agrees(track.person.region, hint)]
+        actors = [track for track in seen if _can_be(track.person.region, logged)]
         if self._only_one and actors:
             self._remove([t for t in seen if t not in actors], "not the actor")
-            seen = actors
         no_people = [track for track in self._tracks if self._is_no_person(track)]
-        # Who can be the actor is replaced only by somebody else who can, and anybody by a person.
-        rivals = actors or seen
-        if rivals and all(track in no_people for track in rivals):
-            no_people.remove(max(rivals, key=_Track.mean_score))
+        # Who can be a logged person is replaced only by somebody else who can, and anybody by a person.
+        can_be = [[t for t in actors if _agrees(t.person.region, hint)] for hint in logged.values()]
+        for rivals in can_be if actors else [seen]:
+            if rivals and all(track in no_people for track in rivals):
+                no_people.remove(max(rivals, key=_Track.mean_score))
         self._remove(no_people, "no people")
 
     def _remove(self, tracks: Sequence[_Track], cause: str) -> None:
@@ -204,46 +213,49 @@ class PeopleTracker:
 
     # --- those to be found -----------------------------------------------------------------------------
 
-    def _search(self, picture: Picture, hint: Hint | None) -> None:
+    def _search(self, picture: Picture, logged: Hints) -> None:
         height, width = picture.shape[:2]
         frame = self.counts["frames"]
         parts = [
             square_about(t.person.region.centre, _detector_side(t.person.region), width, height)
             for t in self._missed()
         ]
-        if hint:
-            parts += self._squares(hint, width, height)
+        parts += self._squares(logged, width, height)
         if parts:
-            self._take_up(picture, find_in(self._networks, picture, parts), hint)
-        if hint and hint.margin_px <= _CENTRED * hint.height_px and not self._follows(hint):
-            self._take_up_one(picture, Region(hint.centre, SIDE_PER_HEIGHT * hint.height_px), hint)
+            self._take_up(picture, find_in(self._networks, picture, dict.fromkeys(parts)), logged)
+        for k in self._unseen(logged):
+            if logged[k].margin_px <= _CENTRED * logged[k].height_px:
+                region = Region(logged[k].centre, SIDE_PER_HEIGHT * logged[k].height_px)
+                self._take_up_one(picture, region, logged)
         due = frame % self._search_every == 0
         tiled = due or not self._seen()
-        if self._only_one and hint is not None:
-            tiled = tiled and not self._follows(hint) and self._is_hint_due()
+        if self._only_one and logged:
+            tiled = tiled and bool(unseen := self._unseen(logged)) and self._is_due(unseen[0])
         if tiled:
-            self._search_tiles(picture, hint)
+            self._search_tiles(picture, logged)
         self.counts["searched"] += bool(parts) or tiled
 
-    def _squares(self, hint: Hint, width: int, height: int) -> list[Tile]:
-        """List the squares about the hint that are searched in this picture."""
-        squares = squares_about(hint.centre, hint.height_px, hint.margin_px, width, height)
-        frame = self.counts["frames"]
-        actors = [track for track in self._seen() if _agrees(track.person.region, hint)]
-        if not actors:
-            return squares if self._is_hint_due() else []
-        if not self._only_one or frame % self._search_every:
-            return []
-        if all(self._is_no_person(track) for track in actors):
-            return squares
-        self._next_square = (self._next_square + 1) % len(squares)
-        return [squares[self._next_square]]
+    def _squares(self, logged: Hints, width: int, height: int) -> list[Tile]:
+        """List the squares about the hints that are searched in this picture."""
 
-    def _is_hint_due(self) -> bool:
-        """Test if the actor, who is not seen, is searched in this picture."""
-        return self._without_actor < _LOST or self.counts["frames"] % _SEARCH_LOST == 0
+        def squares(k: int) -> list[Tile]:
+            hint = logged[k]
+            return squares_about(hint.centre, hint.height_px, hint.margin_px, width, height)
 
-    def _search_tiles(self, picture: Picture, hint: Hint | None) -> None:
+        unseen = self._unseen(logged)
+        parts = [square for k in unseen if self._is_due(k) for square in squares(k)]
+        if unseen or not logged or not self._only_one or self.counts["frames"] % self._search_every:
+            return parts
+        if all(self._is_no_person(t) for t in self._seen() if _can_be(t.person.region, logged)):
+            return squares(0)
+        self._next_square = (self._next_square + 1) % len(squares(0))
+        return [squares(0)[self._next_square]]
+
+    def _is_due(self, k: int) -> bool:
+        """Test if a logged person who is not seen is searched in this picture."""
+        return self._unseen_for[k] < _LOST or (self.counts["frames"] + k) % _SEARCH_LOST == 0
+
+    def _search_tiles(self, picture: Picture, logged: Hints) -> None:
         """Search the next tiles in turn; in the first picture all of them, until a person is found."""
         cover = tiles(picture.shape[1], picture.shape[0])
         first = self.counts["frames"] == 0
@@ -256,41 +268,41 @@ class PeopleTracker:
                 count = _TILES_ALONE
             parts = [cover[(self._next_tile + i) % len(cover)] for i in range(min(count, len(cover)))]
             self._next_tile += len(parts)
-            self._take_up(picture, find_in(self._networks, picture, parts), hint)
+            self._take_up(picture, find_in(self._networks, picture, parts), logged)
             if not first or self._seen() or self._next_tile >= len(cover):
                 break
 
-    def _take_up(self, picture: Picture, found: Iterable[Candidate], hint: Hint | None) -> None:
+    def _take_up(self, picture: Picture, found: Iterable[Candidate], logged: Hints) -> None:
         """Follow the people found who are not followed already, best first."""
-        only_actor = self._only_one and hint is not None
+        only_actor = self._only_one and bool(logged)
         if only_actor:
-            found = sorted(found, key=lambda each: not _agrees(each.region, hint))
+            found = sorted(found, key=lambda each: not _can_be(each.region, logged))
         for each in found:
-            if only_actor and self._follows(hint) and not _agrees(each.region, hint):
+            if only_actor and not self._unseen(logged) and not _can_be(each.region, logged):
                 break
-            if self._is_part_of_seen(each, hint):
+            if self._is_part_of_seen(each, logged):
                 continue
             if each.cut and each.score < _SURE and self._seen():
                 # A search about the place is cheaper than the landmarks of a limb or a tree.
                 about = square_about(each.region.centre, _detector_side(each.region), *picture.shape[1::-1])
                 again = find_in(self._networks, picture, [about])
-                whole = [other for other in again if not other.cut and not self._is_part_of_seen(other, hint)]
+                whole = [one for one in again if not (one.cut or self._is_part_of_seen(one, logged))]
                 if not whole:
                     continue
                 each = whole[0]  # noqa: PLW2901  # the same body, whole
-            self._take_up_one(picture, each.region, hint)
+            self._take_up_one(picture, each.region, logged)
 
-    def _take_up_one(self, picture: Picture, region: Region, hint: Hint | None) -> None:
+    def _take_up_one(self, picture: Picture, region: Region, logged: Hints) -> None:
         """Follow the person in a region, if there is one who is not followed already."""
-        person = self._locate_new(picture, region, hint)
-        if person is None or self._is_followed(person, hint):
+        person = self._locate_new(picture, region, logged)
+        if person is None or self._is_followed(person, logged):
             return
         if (known := self._lost_at(person.region)) is not None and self._has_place_for(known):
             self.counts["found again"] += known.missing > _PATIENCE
             known.see(person)
             return
-        if not self._has_place_for(None) and _agrees(person.region, hint):
-            self._make_place(hint)
+        if not self._has_place_for(None) and _can_be(person.region, logged):
+            self._make_place(logged)
         if self._has_place_for(None):
             track = _Track(self._next_number, person)
             track.see(person)
@@ -315,9 +327,10 @@ class PeopleTracker:
         held = [other for other in self._tracks if other.missing <= _PATIENCE]
         return track in held or len(held) < self._most_people
 
-    def _make_place(self, hint: Hint | None) -> None:
-        """Drop the newest track that cannot be the actor: bystanders must not keep the actor out."""
-        others = [t for t in self._tracks if t.missing <= _PATIENCE and not _agrees(t.person.region, hint)]
+    def _make_place(self, logged: Hints) -> None:
+        """Drop the newest track that cannot be a logged person: bystanders must not keep them out."""
+        held = [track for track in self._tracks if track.missing <= _PATIENCE]
+        others = [track for track in held if not _can_be(track.person.region, logged)]
         if others:
             self._tracks.remove(max(others, key=lambda track: track.number))
             self.counts["lost"] += 1
@@ -332,24 +345,41 @@ class PeopleTracker:
         lost = [track for track in self._tracks if 0 < track.missing <= _PATIENCE]
         return [track for track in lost if len(track.scores) == _JUDGED] if self._seen() else lost
 
-    def _follows(self, hint: Hint | None) -> bool:
-        """Test if somebody is seen who can be the actor."""
-        return any(_agrees(track.person.region, hint) for track in self._seen())
+    def _unseen(self, logged: Hints) -> list[int]:
+        """List the logged people who are not seen, where each track can be one of them."""
+        regions = [track.person.region for track in self._seen()]
+        if not logged or not regions:
+            return list(logged)
+        apart_px = np.array(
+            [
+                [
+                    math.dist(region.centre, hint.centre) if _agrees(region, hint) else _NOT_THEY
+                    for region in regions
+                ]
+                for hint in logged.values()
+            ]
+        )
+        # As many as possible are seen, and of such choices the nearest.
+        chosen = zip(*linear_sum_assignment(apart_px), strict=True)
+        seen = {row for row, track in chosen if apart_px[row, track] < _NOT_THEY}
+        return [k for row, k in enumerate(logged) if row not in seen]
 
-    def _is_part_of_seen(self, candidate: Candidate, hint: Hint | None) -> bool:
-        return any(_is_part_of(candidate, track) for track in self._seen_at(candidate.region, hint))
+    def _is_part_of_seen(self, candidate: Candidate, logged: Hints) -> bool:
+        return any(_is_part_of(candidate, track) for track in self._seen_at(candidate.region, logged))
 
-    def _is_followed(self, person: Person, hint: Hint | None = None) -> bool:
+    def _is_followed(self, person: Person, logged: Hints = _NOBODY) -> bool:
         """Test if a person is followed, by place or joints: a poor second estimate is no second person."""
         return any(
             same_place(person.region, track.person.region) or _one_body(person, track.person)
-            for track in self._seen_at(person.region, hint)
+            for track in self._seen_at(person.region, logged)
         )
 
-    def _seen_at(self, region: Region, hint: Hint | None) -> list[_Track]:
-        """List those seen; if the region can be the actor's, without those too large or too far for that."""
+    def _seen_at(self, region: Region, logged: Hints) -> list[_Track]:
+        """List those seen; if the region can be a logged person's, those alone who can be one, too."""
         return [
-            track for track in self._seen() if not _agrees(region, hint) or _agrees(track.person.region, hint)
+            track
+            for track in self._seen()
+            if not _can_be(region, logged) or _can_be(track.person.region, logged)
         ]
 
     def _locate(
@@ -380,10 +410,10 @@ class PeopleTracker:
         second = iter(self._locate(picture, [person.region for person in first if person is not None]))
         return [None if person is None else next(second) for person in first]
 
-    def _locate_new(self, picture: Picture, region: Region, hint: Hint | None) -> Person | None:
+    def _locate_new(self, picture: Picture, region: Region, logged: Hints) -> Person | None:
         """Locate a person twice; None for a thing that is no person, if somebody is seen already.
 
-        Who can be the actor, and the first one, are judged by a few pictures instead.
+        Who can be a logged person, and the first one, are judged by a few pictures instead.
         """
         for _ in range(2):
             (person,) = self._locate(picture, [region])
@@ -391,7 +421,7 @@ class PeopleTracker:
                 return None
             if (
                 self._seen()
-                and not _agrees(person.region, hint)
+                and not _can_be(person.region, logged)
                 and _score(person) < _ONE_PICTURE * self._least_score
             ):
                 self.counts["no people"] += 1
@@ -425,10 +455,13 @@ def _is_part_of(candidate: Candidate, track: _Track) -> bool:
     return same_place(candidate.region, followed) or (candidate.cut and bool((apart < _BODY).all()))
 
 
-def _agrees(region: Region, hint: Hint | None) -> bool:
-    """Test if a person can be the logged actor, by place and size; False without a hint."""
-    if hint is None:
-        return False
+def _can_be(region: Region, logged: Hints) -> bool:
+    """Test if a person can be one of those logged."""
+    return any(_agrees(region, hint) for hint in logged.values())
+
+
+def _agrees(region: Region, hint: Hint) -> bool:
+    """Test if a person can be the logged one, by place and size."""
     near = math.dist(region.centre, hint.centre) <= hint.margin_px + hint.height_px / 2
     return near and region.side <= _TALLER * SIDE_PER_HEIGHT * hint.tallest_px
 
@@ -455,17 +488,17 @@ class FollowedPeople:
         self._tracker = PeopleTracker(networks, only_one=only_one)
         self._column = [networks.joints.index(name) if name in networks.joints else None for name in joints]
 
-    def step(self, picture: Picture, *, hint: Hint | None) -> tuple[Float, Float]:
+    def step(self, picture: Picture, *, hints: Sequence[Hint | None]) -> tuple[Float, Float]:
         """Return the keypoints of the K people in the next picture, the highest presence first.
 
         Args:
             picture: [H, W, 3] BGR.
-            hint: place of the actor by the log, None if unknown.
+            hints: place of each logged person, None if unknown.
 
         Returns:
             Positions [K, J, 2] px, NaN for joints not found, and confidences [K, J], 0 for joints not found.
         """
-        people = [seen.person for seen in self._tracker.step(picture, hint=hint)]
+        people = [seen.person for seen in self._tracker.step(picture, hints=hints)]
         xy, confidence = (
             np.full((len(people), len(self._column), 2), np.nan),
             np.zeros((len(people), len(self._column))),

@@ -30,7 +30,7 @@ def _run(
     tracker = PeopleTracker(networks, only_one=only_one, **options)
     pictures = list(pictures)
     hints = [None] * len(pictures) if hints is None else hints
-    seen = [tracker.step(picture, hint=hint) for picture, hint in zip(pictures, hints, strict=True)]
+    seen = [tracker.step(picture, hints=[hint]) for picture, hint in zip(pictures, hints, strict=True)]
     return seen, tracker, networks
 
 
@@ -128,7 +128,7 @@ def test_a_sure_hint_does_without_the_person_detector() -> None:
     truth = Bar(480, 270, 241)
     tracker = PeopleTracker(_Shortsighted())
 
-    (found,) = tracker.step(draw(WIDTH, HEIGHT, truth), hint=Hint((500.0, 250.0), 240.0, 60.0))
+    (found,) = tracker.step(draw(WIDTH, HEIGHT, truth), hints=[Hint((500.0, 250.0), 240.0, 60.0)])
 
     _assert_joints(found, truth)
 
@@ -149,7 +149,7 @@ def test_two_passes_are_made_from_regions_that_are_not_the_persons_own() -> None
     truth = Bar(480, 270, 121)
     networks = BarNetworks()
     hint = Hint((500.0, 255.0), 121.0, 30.0)
-    (found,) = PeopleTracker(networks).step(draw(WIDTH, HEIGHT, truth), hint=hint)
+    (found,) = PeopleTracker(networks).step(draw(WIDTH, HEIGHT, truth), hints=[hint])
 
     _assert_joints(found, truth)
     assert len(networks.located) == 2
@@ -240,7 +240,7 @@ def test_a_tree_is_dropped_after_a_few_pictures_beside_a_person() -> None:
     pictures = [draw(WIDTH, HEIGHT, tree)] * 2 + [draw(WIDTH, HEIGHT, tree, person)] * 40
     tracker = PeopleTracker(networks := _Telling(), search_every=1)
 
-    tracks = _tracks([tracker.step(picture, hint=None) for picture in pictures])
+    tracks = _tracks([tracker.step(picture, hints=[]) for picture in pictures])
 
     assert tracks[:6] == [[0], [0], [0, 1], [0, 1], [1], [1]]
     assert tracks[6:] == [[1]] * 36
@@ -286,11 +286,11 @@ def test_who_is_followed_outlasts_a_low_presence(
     picture = draw(WIDTH, HEIGHT, Bar(500, 270, 121))
     tracker = PeopleTracker(fake := networks())
     fake.presence, fake.confidence = presence, confidence
-    assert tracker.step(picture, hint=None) == []
+    assert tracker.step(picture, hints=[]) == []
     fake.presence, fake.confidence = 1.0, 0.9
-    assert _tracks([tracker.step(picture, hint=None) for _ in range(6)]) == [[0]] * 6
+    assert _tracks([tracker.step(picture, hints=[]) for _ in range(6)]) == [[0]] * 6
     fake.presence, fake.confidence = presence, confidence
-    assert bool(tracker.step(picture, hint=None)) is followed
+    assert bool(tracker.step(picture, hints=[])) is followed
 
 
 def test_a_lone_thing_is_followed_and_so_is_one_that_can_be_the_actor() -> None:
@@ -300,7 +300,7 @@ def test_a_lone_thing_is_followed_and_so_is_one_that_can_be_the_actor() -> None:
     hint = Hint((485.0, 265.0), 71.0, 30.0, 80.0)
     for picture, at, tracks in ((alone, None, [0]), (beside, hint, [0, 1])):
         tracker = PeopleTracker(_Telling(), search_every=2)
-        seen = _tracks([tracker.step(picture, hint=at) for _ in range(20)])
+        seen = _tracks([tracker.step(picture, hints=[at]) for _ in range(20)])
         assert seen[-1] == tracks
         assert not tracker.counts["lost"]
 
@@ -373,7 +373,7 @@ def test_what_is_found_depends_on_the_pictures_alone(scenes: list[tuple[int, boo
     trackers = [PeopleTracker(networks, search_every=3) for _ in range(2)]
     for x, shown in scenes:
         picture = draw(WIDTH, HEIGHT, Bar(x, 270, 121) if shown else AWAY, Bar(400, 300, 141))
-        one, other = (tracker.step(picture, hint=None) for tracker in trackers)
+        one, other = (tracker.step(picture, hints=[]) for tracker in trackers)
         assert [person.track for person in one] == [person.track for person in other]
         for a, b in zip(one, other, strict=True):
             np.testing.assert_array_equal(a.person.xy, b.person.xy)
