@@ -30,7 +30,7 @@ from pipelines.reporting.frame_drawing import draw_frame, with_inlet
 from pipelines.reporting.overlays import View
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
-from pipelines.session.people import LoggedActor, logged_actor
+from pipelines.session.people import LoggedActor, logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
 from pipelines.session.registries import Detector, advice_on, find_detector, hashes_of_models
@@ -52,7 +52,7 @@ from pipelines.simulation.study.sightings import (
     views_of,
 )
 
-FILM = Stage("film", revision=4)
+FILM = Stage("film", revision=5)
 
 _SAME_M = 0.05  # tolerance between the scenario's hips and the session's truth, which is interpolated
 _HIPS = ("left_hip", "right_hip")
@@ -130,9 +130,9 @@ def film(
             pose_noise=compared.settings["pose_noise"],
         )
         setting = _set(plan, path, flight)
-        actor = logged_actor(folder, description)
+        logged = logged_people(folder, description)
         arms = {
-            arm: _arm(folder, actor, flight, plan, setting, arm, settings)
+            arm: _arm(folder, logged, flight, plan, setting, arm, settings)
             for arm in read_json(folder / "replan" / "metrics.json")["arms"]
         }
         progress.start("Filming", sum(arm.seen_by.position.shape[0] * len(arm.t_ns) for arm in arms.values()))
@@ -192,7 +192,7 @@ class _Arm:
     people: list[Walk]
     tilt_rad: Float | None  # [N, T] above whom each camera films; None for one person
     seen_by: Formation
-    actor: Float | None  # [T, 3] m, positions of the logged actor
+    logged: list[Float]  # positions [T, 3] m of each logged person
     noise: tuple[NoiseModel, ...]
 
     @property
@@ -241,7 +241,7 @@ def _set(plan: Scenario, path: Path, flight: LoggedFlight) -> Set:
 
 def _arm(
     folder: Path,
-    actor: LoggedActor | None,
+    logged: Sequence[LoggedActor],
     flight: LoggedFlight,
     plan: Scenario,
     setting: Set,
@@ -265,7 +265,7 @@ def _arm(
         position.take(rows, axis=1), quaternion.take(rows, axis=1), flight.cameras[0].intrinsics
     )
     tilt = table["tilt_rad"].to_numpy(np.float64).reshape(-1, len(cameras)).T
-    hips = None if actor is None else actor.hips_at(moments)
+    hips = [person.hips_at(moments) for person in logged]
     return _Arm(
         cameras,
         people,
@@ -304,12 +304,11 @@ def _film_camera(
             pose = arm.seen_by.position[camera, k], arm.seen_by.quaternion_xyzw[camera, k]
             bodies = [of.person.surface(of.motion.root[k], of.motion.rotation[k]) for of in arm.people]
             picture = renderer.picture(*pose, bodies, k)
-            hint = None
-            if arm.actor is not None and np.isfinite(arm.actor[k]).all():
-                hint = project_actor(
-                    arm.actor[k], pose, lens, sigma_m=ACTOR_SIGMA_M, sigma_rad=UNKNOWN_SIGMA_RAD
-                )
-            found.append(_whose(arm, pose, k, *follower.step(picture, hints=[hint])))
+            hints = [
+                project_actor(hips[k], pose, lens, sigma_m=ACTOR_SIGMA_M, sigma_rad=UNKNOWN_SIGMA_RAD)
+                for hips in arm.logged
+            ]
+            found.append(_whose(arm, pose, k, *follower.step(picture, hints=hints)))
             yield picture
             progress.advance()
 

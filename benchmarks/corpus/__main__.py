@@ -66,7 +66,7 @@ def _make(flight: Flight, films: Path, workers: int, *, again: bool) -> bool:
     film = _film(flight, films, workers)
     session = ingest(film / "flight.yaml", films / f"{flight.name}.session").folder
     for detector in missing:
-        record = _detected(session, detector, workers)
+        record = _detected(session, detector, len(flight.scenario.people), workers)
         counts = {
             camera: {key: value for key, value in counted.items() if isinstance(value, int)}
             for camera, counted in record.counts["cameras"].items()
@@ -94,9 +94,9 @@ def _film(flight: Flight, films: Path, workers: int) -> Path:
     return simulate(scenario, films / flight.name, workers=workers).folder
 
 
-def _detected(session: Path, detector: str, workers: int) -> StageRecord:
+def _detected(session: Path, detector: str, people: int, workers: int) -> StageRecord:
     with locked(session) as writable:
-        record = detect(writable, detector=detector, workers=workers)
+        record = detect(writable, detector=detector, people=people, workers=workers)
     assert record is not None, "a film was ingested without pictures"
     return record
 

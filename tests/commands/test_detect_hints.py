@@ -169,6 +169,17 @@ def test_only_another_log_of_the_actor_has_the_keypoints_detected_anew(tmp_path:
     assert len(set(found_with)) == 3
 
 
+def test_the_logs_of_all_people_say_where_to_look(tmp_path: Path) -> None:
+    flight, detector = Flight(tmp_path), spot_detector(tmp_path)
+    flight.log_actor("hip", 1.0)
+    log = flight.settings.pop("actor")
+    flight.settings["actors"] = {"anna": log, "ben": dict(log)}
+    before = flight.detected(detector)
+    flight.settings["actors"]["ben"]["point"] = "feet"
+
+    assert flight.detected(detector).inputs["hints_from"] != before.inputs["hints_from"]
+
+
 def test_earlier_hints_are_said_until_the_keypoints_are_detected_anew(tmp_path: Path) -> None:
     flight, detector = Flight(tmp_path), spot_detector(tmp_path)
     # The actor stands in the middle of the square about the hint: row 120 of 240, 142 of the network's 320.

@@ -365,6 +365,31 @@ def test_an_actor_who_is_hidden_for_long_costs_few_searches() -> None:
     assert tracker.counts["searched"] <= 1 + 30 + 70 // 5 + 2
 
 
+def test_each_logged_person_is_searched_until_they_are_seen() -> None:
+    """Let two logged people stand where one detection could be either of them."""
+    anna, ben = Bar(420, 270, 121), Bar(560, 270, 121)
+    pictures = [draw(WIDTH, HEIGHT, anna)] + [draw(WIDTH, HEIGHT, anna, ben)] * 3
+    hints = [Hint((425.0, 265.0), 121.0, 200.0), Hint((555.0, 265.0), 121.0, 200.0)]
+    networks = BarNetworks()
+    tracker = PeopleTracker(networks, search_every=1000)
+
+    seen = [tracker.step(picture, hints=hints) for picture in pictures]
+
+    assert _tracks(seen) == [[0], [0, 1], [0, 1], [0, 1]]
+    _assert_joints(seen[1][1], ben)
+    searched = len(networks.searched)
+    tracker.step(pictures[-1], hints=hints)
+    assert len(networks.searched) == searched, "nobody is missing"
+
+
+def test_places_are_kept_for_all_logged_people() -> None:
+    people = [Bar(100 + 130 * k, 270, 121) for k in range(7)]
+    hints = [Hint((bar.x, bar.y), 121.0, 20.0) for bar in people]
+    tracker = PeopleTracker(BarNetworks(), most_people=2)
+
+    assert len(tracker.step(draw(WIDTH, HEIGHT, *people), hints=hints)) == 7
+
+
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.tuples(st.integers(60, 900), st.booleans()), min_size=2, max_size=15))
 def test_what_is_found_depends_on_the_pictures_alone(scenes: list[tuple[int, bool]]) -> None:
