@@ -66,7 +66,7 @@ from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_p
 if TYPE_CHECKING:
     import pandas as pd
 
-DETECT = Stage("detect", revision=4)
+DETECT = Stage("detect", revision=5)
 
 
 @dataclass(frozen=True)

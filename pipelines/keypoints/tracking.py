@@ -37,6 +37,8 @@ _MEMORY = 30  # pictures after which a number is not given to the same place aga
 _ONE_BODY = 0.06  # median distance of joints, in region sides: about the scatter of one body's two estimates
 _TILES_BESIDE = 8  # tiles searched in one picture while a person is followed
 _TILES_ALONE = 24  # the same while nobody is followed
+_SEARCH_EVERY = 5  # pictures from one search of the whole picture to the next
+_SEARCH_OF_ONE = 10  # the same if one person is wanted
 _TILES_OF_ONE = 4  # tiles searched in one picture while a person is followed and one is wanted
 _JUDGED = 5  # pictures whose mean score decides if a track is a person
 _ONE_PICTURE = 0.9  # of the least score: enough in a single picture
@@ -89,10 +91,10 @@ class PeopleTracker:
 
     A person is searched at the place of the joints in the last picture. The person detector runs around
     people just lost, and around the hint of each logged person who is not seen. It runs on tiles of the whole
-    picture if nobody is followed, and every `search_every` pictures. Each such search takes the next few
-    tiles, so that the cost of a large picture spreads over several. The first picture is searched until a
-    person is found. A logged person who is not seen is searched in each of the first 30 pictures, then in
-    every fifth.
+    picture if nobody is followed, and every `search_every` pictures (10 with `only_one`, else 5). Each such
+    search takes the next few tiles, so that the cost of a large picture spreads over several. The first
+    picture is searched until a person is found. A logged person who is not seen is searched in each of the
+    first 30 pictures, then in every fifth.
 
     With `only_one`, one person is wanted: fewer tiles are searched while somebody is followed. With a hint,
     those who cannot be the actor, by place or size, are not followed while somebody can, and the whole
@@ -118,14 +120,14 @@ class PeopleTracker:
         *,
         only_one: bool = False,
         most_people: int = 6,
-        search_every: int = 10,
+        search_every: int | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._networks = networks
         self._least_score = networks.person_confidence if isinstance(networks, TellsPeople) else 0.0
         self._only_one = only_one
         self._most_people = most_people
-        self._search_every = search_every
+        self._search_every = search_every or (_SEARCH_OF_ONE if only_one else _SEARCH_EVERY)
         self._tracks: list[_Track] = []
         self._next_number = 0
         self._next_tile = 0

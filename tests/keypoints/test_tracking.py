@@ -77,10 +77,10 @@ def test_somebody_small_in_4k_is_found_in_the_first_picture() -> None:
 
 
 def test_one_who_is_followed_costs_one_region_a_picture() -> None:
-    _, tracker, networks = _run(draw(WIDTH, HEIGHT, Bar(300 + k, 270, 121)) for k in range(9))
+    _, tracker, networks = _run(draw(WIDTH, HEIGHT, Bar(300 + k, 270, 121)) for k in range(5))
 
-    # Two passes when found, one in each of the eight pictures after that, and no search in them.
-    assert len(networks.located) == 2 + 8
+    # Two passes when found, one in each of the four pictures after that, and no search in them.
+    assert len(networks.located) == 2 + 4
     assert tracker.counts["searched"] == 1
 
 
@@ -311,7 +311,7 @@ def test_one_wanted_without_a_log_is_searched_with_fewer_tiles() -> None:
     searched = [len(_run(pictures, only_one=only_one)[2].searched) for only_one in (False, True)]
 
     # 960x540 has 19 tiles: the picture, 3 squares of 540 px, 15 of 270 px.
-    assert searched == [19 + 3 * 8, 4 + 3 * 4]
+    assert searched == [19 + 6 * 8, 4 + 3 * 4]
 
 
 def test_the_actor_alone_is_followed_and_the_whole_picture_not_searched() -> None:
