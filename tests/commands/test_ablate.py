@@ -172,7 +172,8 @@ class _Follower:
         assert only_one
         self.right = np.array([1.0, 0.0]) * np.arange(len(networks.joints))[:, None]
 
-    def step(self, picture: Any, *, hint: Any) -> list[TrackedPerson]:
+    def step(self, picture: Any, *, hints: Any) -> list[TrackedPerson]:
+        (hint,) = hints
         # The camera looks at the smoothed hip, and the person stands there: not only ground is seen.
         x, y = (round(value) for value in hint.centre)
         assert picture[y - 60 : y + 60, x - 60 : x + 60].std() > 5
