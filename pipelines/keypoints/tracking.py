@@ -249,9 +249,9 @@ class PeopleTracker:
         if unseen or not logged or not self._only_one or self.counts["frames"] % self._search_every:
             return parts
         if all(self._is_no_person(t) for t in self._seen() if _can_be(t.person.region, logged)):
-            return squares(0)
-        self._next_square = (self._next_square + 1) % len(squares(0))
-        return [squares(0)[self._next_square]]
+            return squares(min(logged))
+        self._next_square = (self._next_square + 1) % len(squares(min(logged)))
+        return [squares(min(logged))[self._next_square]]
 
     def _is_due(self, k: int) -> bool:
         """Test if a logged person who is not seen is searched in this picture."""
