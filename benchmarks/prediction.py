@@ -3,7 +3,8 @@
 `--bound` also flies arms that know the whole way of the actor, with the same limits, and compares each arm
 with the least error of these in every world, and with the arms of equal range. `--keep FILE` stores the
 flights of each world; worlds that are there are not flown again. `--joint` flies `joint` and `adaptive`
-alone, a third of the time.
+alone, a third of the time. `--draws N` flies every arm N times with 1 cm of noise on the actor's log and
+takes means over these flights: flights are chaotic, and one of them says little about an arm.
 
 Every arm flies through worlds of `benchmarks.worlds`. One posture of a walk, carried along by the actor, is
 measured by triangulation with modelled keypoints and white pose noise (0.02 m, 0.2 deg), 32 draws. The
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from benchmarks.results_page import markdown_table
 from benchmarks.worlds import world_of
@@ -57,6 +59,7 @@ EQUAL: Mapping[str, str] = {
     "joint, from 8 m": "adaptive, 8 m",
     "adaptive, log 1 cm off": "adaptive",
     "adaptive, 8 m, log 1 cm off": "adaptive, 8 m",
+    "joint, from 8 m, way known": "adaptive, 8 m, way known",
 }
 """Arms that are compared with `adaptive` at the same range. Its own differ by chance: flights are chaotic."""
 FINE: Mapping[str, Any] = {"lattice_yaws": 32, "lattice_knots": 1, "tilts_deg": (10.0, 15.0, 20.0)}
@@ -69,10 +72,14 @@ KNOWING: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "joint, from 8 m, way known": ("joint", {"radius_m": NEAREST_M}),
 }
 """Arms that know the whole way: yaw alone, and yaw, tilt, range and spacing together."""
-PAIRS = (*EQUAL, *EQUAL.values(), "adaptive, 8 m, way known", "joint, from 8 m, way known")
+DRAWN_M = 0.01  # noise of the log with `--draws`, standard deviation per axis
+OTHER_DRAWS = ("adaptive, log 1 cm off", "adaptive, 8 m, log 1 cm off")
+"""Arms that take other draws with `--draws`, so that their difference to `adaptive` is chance."""
+PAIRS = (*EQUAL, *EQUAL.values())
 """Arms of `--joint`."""
 NOISE = White(position_m=0.02, rotation_deg=0.2)
 TRIALS = 32
+WORSE = 1.01  # ratio of errors above which an arm counts as worse in a world
 EVERY = 2  # tracking steps from picture to picture
 _FEWEST_SECONDS = 5  # of a flight with any spread, for a correlation
 
@@ -85,10 +92,11 @@ class Flight:
     arm: str
     drones: int
     predicted: Float  # [S] of each second, NaN where nothing was determined
-    measured: Float  # [S] mean over draws and joints
+    measured: Float  # [S] mean over trials and joints
     hidden: float
     right: float  # share of all joint-frames within 150 mm
     range_m: float
+    drawn: tuple[float, ...] = ()  # mean measured errors of the flights of `--draws`
 
 
 def arms_of(*, bound: bool, pairs: bool) -> dict[str, tuple[str, Mapping[str, Any]]]:
@@ -97,8 +105,8 @@ def arms_of(*, bound: bool, pairs: bool) -> dict[str, tuple[str, Mapping[str, An
     return {name: arm for name, arm in every.items() if not pairs or name in PAIRS}
 
 
-def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]]) -> list[Flight]:
-    """Fly arms through one world and measure."""
+def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]], draws: int = 0) -> list[Flight]:
+    """Fly arms through one world and measure; with draws of the log's noise, the mean over these flights."""
     world = world_of(seed)
     field = world.field()
     walking = walk(1.0, 2.0, seed=0)
@@ -109,8 +117,9 @@ def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]]) -> list[Fl
         rotation_sigma_deg=NOISE.rotation_deg,
     )
     found = []
-    for arm, (name, changes) in arms.items():
-        config = replace(PlannerConfig(), errors=errors, **changes)
+    for arm, (name, changes), draw in _draws(arms, draws):
+        noise = {"actor_noise_m": DRAWN_M} if draws else {}
+        config = replace(PlannerConfig(), errors=errors, **{**changes, **noise})
         done = replay(
             PLANNER_ARMS.get(name),
             world.actor_t_ns,
@@ -118,6 +127,7 @@ def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]]) -> list[Fl
             [field],
             Start(world.drones, world.yaw_rad),
             config=config,
+            seed=draw,
             foresight=arm in KNOWING,
         )
         rows = slice(None, None, EVERY)
@@ -157,7 +167,40 @@ def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]]) -> list[Fl
                 float(np.linalg.norm(done.position - done.actor, axis=-1).mean()),
             )
         )
-    return found
+    return found if not draws else [_mean([f for f in found if f.arm == arm]) for arm in arms]
+
+
+def _draws(
+    arms: Mapping[str, tuple[str, Mapping[str, Any]]], draws: int
+) -> Iterator[tuple[str, tuple[str, Mapping[str, Any]], int]]:
+    """Yield the flights of each arm with the seeds of their noise; who knows the way flies once."""
+    for name, arm in arms.items():
+        first = draws if name in OTHER_DRAWS else 0
+        for draw in range(1 if name in KNOWING else max(draws, 1)):
+            yield name, arm, first + draw
+
+
+def _mean(flights: Sequence[Flight]) -> Flight:
+    """Average the flights of an arm through one world."""
+    predicted, measured = (
+        np.array([getattr(flight, key) for flight in flights]) for key in ("predicted", "measured")
+    )
+    return replace(
+        flights[0],
+        predicted=_mean_of_known(predicted),
+        measured=_mean_of_known(measured),
+        hidden=float(np.mean([flight.hidden for flight in flights])),
+        right=float(np.mean([flight.right for flight in flights])),
+        range_m=float(np.mean([flight.range_m for flight in flights])),
+        drawn=tuple(float(np.nanmean(row)) for row in measured),
+    )
+
+
+def _mean_of_known(values: Float) -> Float:
+    """Average finite values [D, S] over draws; NaN where there are none."""
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.asarray(np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan))
 
 
 def _by_second(values: Float, second: Float) -> Float:
@@ -187,14 +230,17 @@ def main() -> None:
     parser.add_argument("--bound", action="store_true", help="compare with flights that know the whole way")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="store flights here, and go on from there")
     parser.add_argument("--joint", action="store_true", help="`joint` and `adaptive` alone")
+    parser.add_argument("--draws", type=int, default=0, metavar="N", help="means of N flights with noise")
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.count)
     arms = arms_of(bound=arguments.bound, pairs=arguments.joint)
-    flights = list(_flown(seeds, arms, arguments.workers, arguments.keep))
+    flights = list(_flown(seeds, arms, arguments.workers, arguments.keep, arguments.draws))
     _print_arms(flights)
     if arguments.bound:
         _print_bound(flights)
+    if arguments.bound or arguments.joint or arguments.draws:
         _print_equal(flights)
+    if arguments.bound:
         flights = [flight for flight in flights if flight.arm not in KNOWING]
     _print_correlations(flights)
 
@@ -204,13 +250,16 @@ def _flown(
     arms: Mapping[str, tuple[str, Mapping[str, Any]]],
     workers: int,
     keep: Path | None,
+    draws: int,
 ) -> Iterator[Flight]:
     """Yield the flights through some worlds: those kept, then those flown now, which are kept as well."""
     kept = [_read(line) for line in keep.read_text().splitlines()] if keep and keep.exists() else []
+    kept = [flight for flight in kept if bool(flight.drawn) == bool(draws)]
     done = {seed for seed in seeds if set(arms) <= {flight.arm for flight in kept if flight.seed == seed}}
     yield from (flight for flight in kept if flight.seed in done and flight.arm in arms)
     with ProcessPoolExecutor(workers) as pool:
-        for flights in pool.map(partial(fly, arms=arms), [seed for seed in seeds if seed not in done]):
+        left = [seed for seed in seeds if seed not in done]
+        for flights in pool.map(partial(fly, arms=arms, draws=draws), left):
             yield from flights
             if keep:
                 with keep.open("a") as file:
@@ -229,6 +278,7 @@ def _read(line: str) -> Flight:
             **values,
             "predicted": np.array(values["predicted"], dtype=np.float64),
             "measured": np.array(values["measured"], dtype=np.float64),
+            "drawn": tuple(values.get("drawn", ())),
         }
     )
 
@@ -271,13 +321,21 @@ def _print_bound(flights: Sequence[Flight]) -> None:
 
 def _print_equal(flights: Sequence[Flight]) -> None:
     """Print arms over `adaptive` at the same range, world by world: error, hidden time, the worst world."""
-    rows = []
+    rows, worlds = [], []
     for arm, other in EQUAL.items():
         own, base = ({f.seed: f for f in flights if f.arm == name} for name in (arm, other))
+        if not own:
+            continue
         ratios = np.array([np.nanmean(own[k].measured) / np.nanmean(base[k].measured) for k in own])
         hidden = 100 * np.mean([own[k].hidden - base[k].hidden for k in own])
         right = 100 * np.mean([own[k].right - base[k].right for k in own])
-        worse = int((ratios > 1.01).sum())
+        worse = int((ratios > WORSE).sum())
+        worlds += [
+            f"{arm}, world {k}: error {ratio:.3f}, flown range {own[k].range_m - base[k].range_m:+.2f} m"
+            for k, ratio in zip(own, ratios, strict=True)
+            if ratio > WORSE
+        ]
+        beyond = sum(_is_worse_beyond_noise(own[k].drawn, base[k].drawn) for k in own)
         rows.append(
             [
                 arm,
@@ -285,12 +343,23 @@ def _print_equal(flights: Sequence[Flight]) -> None:
                 f"{ratios.mean():.3f}",
                 f"{ratios.max():.3f}",
                 f"{worse} of {len(ratios)}",
+                str(beyond) if any(len(flight.drawn) > 1 for flight in own.values()) else "-",
                 f"{hidden:+.2f}",
                 f"{right:+.2f}",
             ]
         )
-    header = ["arm", "over", "error, mean", "largest", "worse by 1 %", "hidden, points", "PCK150, points"]
-    print("\n".join(markdown_table(header, rows)))
+    header = ["arm", "over", "error, mean", "largest", "worse by 1 %", "beyond noise"]
+    header += ["hidden, points", "PCK150, points"]
+    print("\n".join([*markdown_table(header, rows), "Worse by 1 %:", *worlds]))
+
+
+def _is_worse_beyond_noise(own: Sequence[float], base: Sequence[float]) -> bool:
+    """Test if the 95 % interval over draws of own errors over base ones lies above `WORSE`."""
+    if len(own) < 2:
+        return False
+    excess = np.array(own) - WORSE * np.array(base)
+    half = stats.t.ppf(0.975, len(excess) - 1) * stats.sem(excess)
+    return bool(excess.mean() - half > 0)
 
 
 def _print_correlations(flights: Iterable[Flight]) -> None:
