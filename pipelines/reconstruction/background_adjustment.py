@@ -12,8 +12,8 @@ one, so that the normal matrix has a band: the work grows linearly with the pict
 points off the background and lost tracks.
 
 Levels of errors that nobody stated are estimated by MacKay's rule, as in `refinement.estimate`. A constant
-error is always possible, and one draw of it says little of its level. The position's stays wide; that of
-a rotation that the pictures determine is compared with the slow rotation's.
+error is always possible, and one draw of it says little of its level. The position's stays wide; those of a
+rotation that the pictures show and of a lever arm count beside usual ones.
 """
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ _SLOW_S = 10.0  # over which slow errors are counted in the level of all errors
 _UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1] / 10)
 """Start of estimated levels. White positions that are free by more confuse far and near points at first."""
 
-_USUAL_ARM_M = 0.05  # constant shift in the camera: a lever arm that is wrong
+_UNKNOWN_ARM_M, _USUAL_ARM_M = 0.05, 0.03  # constant shift in the camera: a lever arm that is wrong
+_USUAL_TURN = float(np.radians(0.15))  # constant rotation
 _LEVEL_STEPS = 20  # of the constant rotation's level; it halves its distance in each
 _DRAWS = 32  # of the posterior
 _LEVEL_ROUNDS = 6
@@ -105,7 +106,7 @@ class PosePrior:
         """Build the prior from stated pose errors; None for unknown ones."""
         if errors is None:
             slow = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]), _unknown(ROTATION, _UNKNOWN_RATE[1])
-            return cls(_UNKNOWN_WHITE, (*UNKNOWN_SIGMA, _USUAL_ARM_M), slow, estimated=True)
+            return cls(_UNKNOWN_WHITE, (*UNKNOWN_SIGMA, _UNKNOWN_ARM_M), slow, estimated=True)
         constant = dict.fromkeys((SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA), 0.0)
         changing: dict[int, list[Process]] = {SHIFT_IN_WORLD: [], ROTATION: []}
         for process in errors.processes:
@@ -255,7 +256,7 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
         replace(
             prior,
             white=_rms([p.white for p in priors]),
-            constant=(prior.constant[0], _rms([p.constant[:2] for p in priors])[1], prior.constant[2]),
+            constant=(prior.constant[0], *_rms([p.constant[1:] for p in priors])),
             slow=slow,
         ),
         points,
@@ -446,6 +447,7 @@ class _Stretch:
         if prior.estimated:
             white, rate = _levels_of_standing(t_s, self.position)
             prior = _with_position_levels(prior, white, _unknown(SHIFT_IN_WORLD, rate))
+            prior = replace(prior, constant=(*prior.constant[:2], _USUAL_ARM_M))
         place, variance = _place_of_standing(t_s, self.position, prior)
         variance += prior.constant[2] ** 2  # nothing moves that could tell it from a shift of the place
         origin = np.tile(place, (len(self.points.origin), 1))
@@ -488,7 +490,7 @@ class _Stretch:
             levels = self._estimated(state, self._draws(factored, 8), prior)
             if positions_known:
                 levels = _with_position_levels(levels, prior.white[0], prior.slow[0])
-            prior = with_constant_turn(levels, state.constant[3:6], factored.corner[3:6, 3:6])
+            prior = with_constant_levels(levels, state.constant[3:], factored.corner[3:, 3:])
         found = self._solve(state, prior, rounds=_ROUNDS)
         if found is None:
             return None
@@ -612,29 +614,36 @@ class _Stretch:
 _KINDS = (slice(0, 3), slice(3, 6))
 
 
-def with_constant_turn(prior: PosePrior, found: Float, covariance: Float) -> PosePrior:
-    """Estimate the level of the constant rotation, of which three numbers are known.
+def with_constant_levels(prior: PosePrior, found: Float, covariance: Float) -> PosePrior:
+    """Estimate the levels of the constant rotation and of the lever arm, three numbers of each.
 
-    They say little, so a usual level, and that of the slow rotation, counts as `USUAL_COUNT` more (inverse
-    gamma prior; expectation maximisation). A rotation that is known well stays what it is; one that rests on
-    a drifting path gives way to the log. One of which the pictures say nothing keeps its wide level.
+    They say little, so a usual level counts as `USUAL_COUNT` more (inverse gamma prior; expectation
+    maximisation). What is known well stays what it is. What rests on a drifting path gives way: a rotation to
+    the log, an arm to none. A rotation of which the pictures say nothing keeps its wide level. An arm's never
+    grows: a large one that they hardly show would bend the path.
 
     Args:
-        prior: levels with which the rotation was found.
-        found: [3] rad, posterior mean.
-        covariance: [3, 3] rad^2, posterior.
+        prior: levels with which the constants were found.
+        found: [6] posterior mean: rotation (rad), shift in the camera (m).
+        covariance: [6, 6], posterior.
     """
-    if 1 - np.trace(covariance) / (3 * prior.constant[1] ** 2) < _LEAST_DETERMINED:
-        return prior
+    place, turn, arm = prior.constant
+    if 1 - np.trace(covariance[:3, :3]) / (3 * turn**2) >= _LEAST_DETERMINED:
+        turn = _constant_level(found[:3], covariance[:3, :3], turn, _USUAL_TURN)
+    if arm > 0:  # a camera that stands has none
+        arm = min(arm, _constant_level(found[3:], covariance[3:, 3:], arm, _USUAL_ARM_M))
+    return replace(prior, constant=(place, turn, arm))
+
+
+def _constant_level(found: Float, covariance: Float, level: float, usual: float) -> float:
     precision = np.linalg.inv(covariance)
-    pull, of_data = precision @ found, precision - np.eye(3) / prior.constant[1] ** 2
-    variance = prior.constant[1] ** 2
-    usual = USUAL_CONSTANT[1] ** 2
+    pull, of_data = precision @ found, precision - np.eye(3) / level**2
+    variance = level**2
     for _ in range(_LEVEL_STEPS):
         posterior = np.linalg.inv(of_data + np.eye(3) / variance)
         squares = np.sum((posterior @ pull) ** 2) + np.trace(posterior)
-        variance = (USUAL_COUNT * usual + squares) / (USUAL_COUNT + 3)
-    return replace(prior, constant=(prior.constant[0], float(np.sqrt(variance)), prior.constant[2]))
+        variance = (USUAL_COUNT * usual**2 + squares) / (USUAL_COUNT + 3)
+    return float(np.sqrt(variance))
 
 
 def _parts(state: _State) -> tuple[Float, Float, Float]:
