@@ -48,7 +48,7 @@ def main() -> None:
         if arguments.flights and flight.name not in arguments.flights:
             continue
         began, spent = time.perf_counter(), time.process_time()
-        if _make(flight, arguments.films, arguments.workers, again=arguments.refollow):
+        if make(flight, arguments.films, arguments.workers, again=arguments.refollow):
             took, cpu = time.perf_counter() - began, time.process_time() - spent
             print(f"{flight.name}: {took:.0f} s, {cpu:.0f} s of the processor", flush=True)
         if not arguments.keep_films:
@@ -56,7 +56,7 @@ def main() -> None:
                 shutil.rmtree(path)
 
 
-def _make(flight: Flight, films: Path, workers: int, *, again: bool) -> bool:
+def make(flight: Flight, films: Path, workers: int = 1, *, again: bool = False) -> bool:
     """Make what is missing of a flight; return False if nothing is."""
     missing = [name for name in DETECTORS if not flight.keypoints_path(name).is_file()]
     follows = flight.with_pictures and (again or not flight.tracks_path.is_file())
