@@ -211,15 +211,20 @@ def _of_constants(prior: PosePrior, turn: Float, variance: float) -> PosePrior:
     return with_constant_levels(prior, np.append(turn, np.zeros(3)), np.diag(sigma2))
 
 
-@pytest.mark.parametrize(("sigma_deg", "expected_deg"), [(0.01, np.sqrt((0.8**2 + 0.15**2) / 2)), (0.9, 1.0)])
+@pytest.mark.parametrize(
+    ("sigma_deg", "stands", "expected_deg"),
+    [(0.01, False, np.sqrt((0.8**2 + 0.15**2) / 2)), (0.98, False, 1.0), (0.9, True, 1.0)],
+)
 def test_level_of_a_constant_rotation_that_is_known_well_or_not_at_all(
-    sigma_deg: float, expected_deg: float
+    sigma_deg: float, stands: bool, expected_deg: float
 ) -> None:
     """Three numbers of 0.8 deg beside three usual ones of 0.15 deg: sqrt((0.8^2 + 0.15^2) / 2) = 0.576 deg.
 
-    A posterior of 0.9 deg under a prior of 1 deg says nothing: the prior stays.
+    A posterior of 0.98 deg under a prior of 1 deg says nothing: the prior stays. Of a camera that stands, and
+    so sees no direction of its path, 0.9 deg says nothing either.
     """
     prior = PosePrior.of(None)
+    prior = replace(prior, constant=(*prior.constant[:2], 0.0 if stands else prior.constant[2]))
     prior = replace(prior, slow=(prior.slow[0], replace(prior.slow[1], sigma0=0.0)))
     found = _of_constants(prior, np.radians([0.8, 0.8, 0.8]), np.radians(sigma_deg) ** 2)
     assert np.degrees(found.constant[1]) == pytest.approx(expected_deg, rel=1e-3)
