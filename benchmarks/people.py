@@ -115,9 +115,9 @@ def main() -> None:
     parser.add_argument("--corpus", action="store_true", help="the corpus's flights of several people")
     arguments = parser.parse_args()
     scenes = arguments.scene or list(SCENES)
-    several = [flight for flight in flights() if flight.scenario.actors]
     if arguments.corpus:
         films = arguments.films
+        several = [flight for flight in flights() if flight.scenario.actors]
         _print_filmed(
             (flight.name, of_corpus(flight), [alone_in_corpus(flight, films)] if films else [])
             for flight in several
@@ -223,7 +223,7 @@ def figures(session: Path, scenario: Path, method: Choice = "auto") -> dict[str,
     times = coverage(session, scenario)
     return {
         "people": times.seen.shape[1],
-        "found": len(names),
+        "found": sum(metrics["by_person"][name]["mpjpe_mm"] is not None for name in names),
         "covered": int((times.covered & times.seen).sum()),
         "seen": int(times.seen.sum()),
         "detected": int((times.detected & times.seen).sum()),
