@@ -6,6 +6,10 @@ flights of each world; worlds that are there are not flown again. `--joint` flie
 alone, a third of the time. `--draws N` flies every arm N times with 1 cm of noise on the actor's log and
 takes means over these flights: flights are chaotic, and one of them says little about an arm.
 
+Arms are also compared at equal flown range: each error is scaled by what the ray model predicts for the same
+views and directions with all distances scaled, so that their mean is the range that was asked for. "By
+chance" is the number of worlds in which the noise that is left in means over draws would make an arm worse.
+
 Every arm flies through worlds of `benchmarks.worlds`. One posture of a walk, carried along by the actor, is
 measured by triangulation with modelled keypoints and white pose noise (0.02 m, 0.2 deg), 32 draws. The
 ray model predicts the error from the same noise and the detector's table. Correlations are over flights, and
@@ -35,7 +39,7 @@ from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.comparison import pck
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.replay import Start, replay
-from pipelines.planning.scores import predicted_errors, score
+from pipelines.planning.scores import errors_of_views, predicted_errors, score, seen_actor
 from pipelines.replan import detect_by_model, error_model
 from pipelines.simulation.scenario import DetectorErrors, Lens
 from pipelines.simulation.study.sightings import walk
@@ -80,6 +84,7 @@ PAIRS = (*EQUAL, *EQUAL.values())
 NOISE = White(position_m=0.02, rotation_deg=0.2)
 TRIALS = 32
 WORSE = 1.01  # ratio of errors above which an arm counts as worse in a world
+GAIN = 0.04  # of an arm for which chance is computed: about that of `joint`
 EVERY = 2  # tracking steps from picture to picture
 _FEWEST_SECONDS = 5  # of a flight with any spread, for a correlation
 
@@ -96,6 +101,7 @@ class Flight:
     hidden: float
     right: float  # share of all joint-frames within 150 mm
     range_m: float
+    to_range: float = float("nan")  # predicted error at the mean range asked for, over that as flown
     drawn: tuple[float, ...] = ()  # mean measured errors of the flights of `--draws`
 
 
@@ -150,7 +156,13 @@ def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]], draws: int
             trials=TRIALS,
             seed=seed,
         )
-        predicted = predicted_errors(done.position[:, rows], done.actor[rows], field, config)
+        place, actor = done.position[:, rows], done.actor[rows]
+        predicted = predicted_errors(place, actor, field, config)
+        away = float(np.linalg.norm(done.position - done.actor, axis=-1).mean())
+        placed = actor + (place - actor) * (config.radius_m / away)
+        seen = seen_actor(place, actor, field, config)
+        asked = errors_of_views(placed, actor[None], seen[None], config)[0]
+        finite = np.isfinite(predicted + asked)
         figures = score(done.t_s, done.position, done.actor, field, config)
         second = done.t_s[rows].astype(int)
         found.append(
@@ -158,13 +170,14 @@ def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]], draws: int
                 seed,
                 arm,
                 world.drones,
-                _by_second(np.where(np.isfinite(predicted), predicted, np.nan), second),
+                _by_second(np.where(finite, predicted, np.nan), second),
                 _by_second(
                     np.moveaxis(measured.error_m, 1, 0).reshape(len(second), -1).astype(np.float64), second
                 ),
                 float(str(figures["occluded_share"])),
                 float(pck(measured.error_m, measured.joint_frames).mean()),
-                float(np.linalg.norm(done.position - done.actor, axis=-1).mean()),
+                away,
+                float(np.exp(np.log(asked[finite] / predicted[finite]).mean())),
             )
         )
     return found if not draws else [_mean([f for f in found if f.arm == arm]) for arm in arms]
@@ -192,6 +205,7 @@ def _mean(flights: Sequence[Flight]) -> Flight:
         hidden=float(np.mean([flight.hidden for flight in flights])),
         right=float(np.mean([flight.right for flight in flights])),
         range_m=float(np.mean([flight.range_m for flight in flights])),
+        to_range=float(np.mean([flight.to_range for flight in flights])),
         drawn=tuple(float(np.nanmean(row)) for row in measured),
     )
 
@@ -321,7 +335,7 @@ def _print_bound(flights: Sequence[Flight]) -> None:
 
 def _print_equal(flights: Sequence[Flight]) -> None:
     """Print arms over `adaptive` at the same range, world by world: error, hidden time, the worst world."""
-    rows, worlds = [], []
+    rows, scaled, worlds = [], [], []
     for arm, other in EQUAL.items():
         own, base = ({f.seed: f for f in flights if f.arm == name} for name in (arm, other))
         if not own:
@@ -330,9 +344,27 @@ def _print_equal(flights: Sequence[Flight]) -> None:
         hidden = 100 * np.mean([own[k].hidden - base[k].hidden for k in own])
         right = 100 * np.mean([own[k].right - base[k].right for k in own])
         worse = int((ratios > WORSE).sum())
+        level = ratios * [own[k].to_range / base[k].to_range for k in own]
+        drawn = [(_at_range(own[k]), _at_range(base[k])) for k in own]
+        noise = np.array([_noise(*pair) for pair in drawn])
+        chance = [stats.norm.sf((WORSE - mean) / noise).sum() for mean in (1.0, 1.0 - GAIN)]
+        scaled.append(
+            [
+                arm,
+                f"{level.mean():.3f}",
+                f"{level.max():.3f}",
+                f"{(level > WORSE).sum()} of {len(level)}",
+                *(
+                    [str(sum(_is_worse_beyond_noise(*pair) for pair in drawn)), *(f"{n:.1f}" for n in chance)]
+                    if np.isfinite(noise).all()
+                    else ["-"] * 3
+                ),
+            ]
+        )
         worlds += [
-            f"{arm}, world {k}: error {ratio:.3f}, flown range {own[k].range_m - base[k].range_m:+.2f} m"
-            for k, ratio in zip(own, ratios, strict=True)
+            f"{arm}, world {k}: error {ratio:.3f}, flown range {own[k].range_m - base[k].range_m:+.2f} m, "
+            f"at equal range {same:.3f}, PCK150 {100 * (own[k].right - base[k].right):+.2f} points"
+            for k, ratio, same in zip(own, ratios, level, strict=True)
             if ratio > WORSE
         ]
         beyond = sum(_is_worse_beyond_noise(own[k].drawn, base[k].drawn) for k in own)
@@ -350,10 +382,24 @@ def _print_equal(flights: Sequence[Flight]) -> None:
         )
     header = ["arm", "over", "error, mean", "largest", "worse by 1 %", "beyond noise"]
     header += ["hidden, points", "PCK150, points"]
-    print("\n".join([*markdown_table(header, rows), "Worse by 1 %:", *worlds]))
+    print("\n".join(markdown_table(header, rows)))
+    header = ["arm", "at equal flown range: error, mean", "largest", "worse by 1 %"]
+    header += ["beyond noise", "by chance, of an equal arm", f"of one {100 * GAIN:.0f} % better"]
+    print("\n".join([*markdown_table(header, scaled), "Worse by 1 %:", *worlds]))
 
 
-def _is_worse_beyond_noise(own: Sequence[float], base: Sequence[float]) -> bool:
+def _at_range(flight: Flight) -> Float:
+    return np.array(flight.drawn) * flight.to_range
+
+
+def _noise(own: Float, base: Float) -> float:
+    """Compute the standard error over draws of own errors over base ones; NaN for fewer than two draws."""
+    if min(len(own), len(base)) < 2:
+        return float("nan")
+    return float(np.hypot(stats.sem(own), stats.sem(base)) / np.mean(base))
+
+
+def _is_worse_beyond_noise(own: Float | Sequence[float], base: Float | Sequence[float]) -> bool:
     """Test if the 95 % interval over draws of own errors over base ones lies above `WORSE`."""
     if len(own) < 2:
         return False
