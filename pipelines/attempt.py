@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.triangulation import Method, Triangulation, Views
 from pipelines.keypoints.association import Association, associate
 from pipelines.keypoints.calibration import measured_for, read_calibration
 from pipelines.keypoints.no_people import Ground, Scene, level_of
 from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
-from pipelines.reconstruction.background import refine_cameras
+from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.doubts.scene import Ground as GroundOfMap
@@ -35,6 +36,7 @@ from pipelines.reconstruction.loading import (
     load_pose_errors,
     load_truth,
     source_of_pose_noise,
+    with_reference,
 )
 from pipelines.reconstruction.observations import (
     Camera,
@@ -363,23 +365,38 @@ def clocks_of(
 ) -> tuple[FoundClocks | None, Float]:
     """Estimate unknown clock offsets; return also their prior standard deviations [C], s, for later steps.
 
-    Offsets between cameras are estimated from the rays of people. An offset that all cameras share hardly
-    changes these rays. It is estimated from the turning of the backgrounds, if no camera's start is stated.
+    A camera that turns has its clock from its background. The others are compared with these by the rays of
+    people, or with each other. An offset that all cameras share hardly changes these rays: if no camera's
+    start is stated and no background shows a clock by itself, it is estimated from all backgrounds together.
     """
-    description, clocks = flight.description, None
+    description = flight.description
     prior_s, stated = load_clock_sigma(description, cameras)
     if settings.method == "refined":  # it finds the clocks of which the manifest says that they are off
-        return None, np.where(stated, prior_s, 0.0)
+        return None, np.where(stated, with_reference(description, cameras, prior_s), 0.0)
+    none, clocks, known = np.zeros(len(cameras)), None, np.zeros(len(cameras), dtype=np.bool_)
+    if flight.followed and prior_s.any():
+        offset_s, sigma_s = clocks_of_backgrounds(
+            cameras,
+            flight.followed,
+            _stated_errors(cameras, description, settings),
+            prior_s,
+            between=description.pose_interpolation,
+        )
+        known = np.isfinite(offset_s)
+        if known.any():
+            clocks = FoundClocks(np.nan_to_num(offset_s), np.nan_to_num(sigma_s), none)
+            cameras, prior_s = shifted(cameras, clocks.offset_s), np.where(known, 0.0, prior_s)
+    prior_s = with_reference(description, cameras, prior_s)
     if prior_s.any():
         seen, views, result, _ = _triangulated(flight, cameras, settings, workers)
         robust = _robust_flight(flight, cameras, seen, views, result, prior_s, settings, workers)
-        clocks = find_clocks(robust, stated)
-        cameras, prior_s = shifted(cameras, clocks.offset_s), clocks.prior_s
-    if settings.method == "auto" and is_time_unknown(description, cameras):
+        found = find_clocks(robust, stated)
+        cameras, prior_s = shifted(cameras, found.offset_s), found.prior_s
+        clocks = found if clocks is None else clocks.with_others(found)
+    if settings.method == "auto" and not known.any() and is_time_unknown(description, cameras):
         late = common_offset(cameras, flight.followed, description.pose_interpolation)
         if late is not None:
-            zero = np.zeros(len(cameras))
-            clocks = clocks or FoundClocks(zero, zero, zero)
+            clocks = clocks or FoundClocks(none, none, none)
             clocks = replace(clocks, offset_s=clocks.offset_s + late.late_s, common_sigma_s=late.sigma_s)
     return clocks, prior_s
 
@@ -659,9 +676,16 @@ def _refine_cameras(
     description: Description,
     settings: Settings,
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
-    stated = [load_pose_errors(description, [camera], settings.pose_noise) for camera in cameras]
-    errors = [None if of is None else of[0] for of in stated]
+    errors = _stated_errors(cameras, description, settings)
     return refine_cameras(cameras, followed, errors, between=description.pose_interpolation)
+
+
+def _stated_errors(
+    cameras: Sequence[Camera], description: Description, settings: Settings
+) -> list[PoseErrors | None]:
+    """Load the errors of each camera's log that were stated; None where nobody did."""
+    stated = [load_pose_errors(description, [camera], settings.pose_noise) for camera in cameras]
+    return [None if of is None else of[0] for of in stated]
 
 
 def _poses_stored(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,16 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.noise import EXACT, ROTATION, PoseErrors, Process
 from pipelines.geometry.poses import quaternion_from_matrix, velocities
-from pipelines.reconstruction.background_adjustment import Adjusted, Background, PosePrior, SeenPoints, adjust
+from pipelines.reconstruction.background_adjustment import (
+    Adjusted,
+    Background,
+    PosePrior,
+    SeenPoints,
+    adjust,
+    clock_offset,
+)
 from pipelines.reconstruction.background_tracks import Followed, Tracks
+from pipelines.reconstruction.doubts.turning import common_offset
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Trajectory
@@ -60,6 +69,50 @@ def refine_cameras(
             reason = entries[camera.name]["reason"]
             refusals.append(f"{camera.name}: its logged poses stay, because {reason}")
     return refined, entries, refusals
+
+
+def clocks_of_backgrounds(
+    cameras: Sequence[Camera],
+    followed: Mapping[str, Followed | str],
+    errors: Sequence[PoseErrors | None],
+    clock_sigma_s: Float,
+    *,
+    between: Interpolation,
+) -> tuple[Float, Float]:
+    """Find the clock offset of each camera that turns: its log turns as its background does.
+
+    A rough search finds offsets of some tenths of a second, and the adjustment of the poses the rest.
+
+    Args:
+        cameras: all of them.
+        followed: background of each camera by its name, or the reason why none was followed.
+        errors: as for `refine_cameras`.
+        clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
+        between: rules for interpolating between logged poses.
+
+    Returns:
+        Offset [C] to add to the pictures' times and its standard deviation [C], s; NaN where the clock is
+        known or the background does not determine it.
+    """
+    found = np.full((len(cameras), 2), np.nan)
+    for c, (camera, stated) in enumerate(zip(cameras, errors, strict=True)):
+        seen = followed[camera.name]
+        if clock_sigma_s[c] == 0 or isinstance(seen, str):
+            continue
+        rough = common_offset([camera], {camera.name: seen}, between)
+        about_s = 0.0 if rough is None else rough.late_s
+        poses_at = partial(_poses_late, camera, camera.frame_t_ns[seen.rows], about_s, between)
+        prior = replace(PosePrior.of(stated), clock_s=float(clock_sigma_s[c]))
+        clock = clock_offset(background_of(camera, seen), poses_at, prior)
+        if clock is not None:
+            found[c] = about_s + clock[0], clock[1]
+    return found[:, 0], found[:, 1]
+
+
+def _poses_late(
+    camera: Camera, t_ns: Int64, about_s: float, between: Interpolation, late_s: float
+) -> tuple[Float, Float]:
+    return camera.poses_at(t_ns + round(1e9 * (about_s + late_s)), between)
 
 
 def background_of(camera: Camera, followed: Followed) -> Background:

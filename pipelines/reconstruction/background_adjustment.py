@@ -36,7 +36,12 @@ from pipelines.geometry.noise import (
     PoseErrors,
     Process,
 )
-from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.geometry.poses import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    rotation_vector_from_quaternion,
+)
 from pipelines.reconstruction.background_kernels import (
     Points,
     Sightings,
@@ -89,6 +94,10 @@ _FEWEST_STANDING = 8  # pictures
 _SIGMAS_STANDING = 2.0  # of all errors: the log of a camera that stands moves by less
 _STANDS = 0.03  # px^2 of misfit that a free path may save: noise, not parallax
 _SLOW_LAG_S = 1.0  # over which slow errors of a camera that stands are read off its log
+_CLOCK_PICTURES = 600  # in which the clock is looked for
+_CLOCK_ROUNDS, _SETTLED = 8, 0.5  # the last offset is at most this share of its standard deviation
+_LEAST_TURNING = UNKNOWN_SIGMA[1]  # of a camera, rms: followed points of one that hovers drift by as much
+_RATE_S = 0.1  # before and after a picture, over which the speed of turning is computed
 _MOST_MEANS = 200  # of its log, to which poses are averaged
 _SMALL = 0.02  # share of the constant variance, at most a usual one, below which slow errors are part of it
 
@@ -101,6 +110,7 @@ class PosePrior:
     constant: tuple[float, float, float]  # m in the world, rad, m in the camera
     slow: tuple[Process, Process]  # shift in the world and rotation
     estimated: bool = False  # the levels of white and slow errors are only the start of an estimate
+    clock_s: float = 0.0  # of the offset of the pictures' clock, 0 for a known one
 
     @classmethod
     def of(cls, errors: PoseErrors | None) -> PosePrior:
@@ -266,6 +276,44 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
     )
 
 
+def clock_offset(
+    seen: Background, poses_at: Callable[[float], tuple[Float, Float]], prior: PosePrior
+) -> tuple[float, float] | None:
+    """Find by how much pictures were taken later than their stamps: the log turns as the background then.
+
+    Args:
+        seen: the background.
+        poses_at: function that returns the logged poses, as for `adjust`, this many seconds after the stamps.
+        prior: standard deviations of the log's errors, and of the clock.
+
+    Returns:
+        Offset and its standard deviation, s. None if the camera turns too little in the middle of the flight,
+        or if no offset was found at which the next one is the same.
+    """
+    offset_s, levels = 0.0, prior
+    for again in range(_CLOCK_ROUNDS):
+        position, rotation = poses_at(offset_s)
+        posed = np.flatnonzero(np.isfinite(position[:, 0]))
+        skipped = max(len(posed) - _CLOCK_PICTURES, 0) // 2
+        rows = posed[skipped : skipped + _CLOCK_PICTURES]
+        if len(rows) < 2:
+            return None
+        stretch = _Stretch.of(seen, rows, position, rotation)
+        solved = stretch._solved(levels, level_rounds=1 if again else _LEVEL_ROUNDS)
+        if solved is None or solved.clock is None:
+            return None
+        levels = solved.prior
+        _, turned = _without(solved.errors, position[rows], rotation[rows])
+        away = rotation_vector_from_quaternion(quaternion_from_matrix(turned[:1].swapaxes(1, 2) @ turned))
+        if np.sqrt(np.var(away, axis=0).sum()) < _LEAST_TURNING:
+            return None
+        late_s, sigma_s = solved.clock
+        offset_s += late_s
+        if abs(late_s) <= _SETTLED * sigma_s:
+            return offset_s, sigma_s
+    return None
+
+
 def _without(errors: Float, position: Float, rotation: Float) -> tuple[Float, Float]:
     """Remove errors [T, 6] from logged poses: (p - e, R exp(-w))."""
     back = matrix_from_quaternion(quaternion_from_rotation_vector(-errors[:, 3:]))
@@ -291,6 +339,15 @@ def _overlapping(parts: Sequence[Int64]) -> Iterator[tuple[Int64, Float]]:
         if end < len(rows):
             weight[len(weight) - 2 * reach :] = 1 - rise
         yield longer, weight
+
+
+def _sigma_of_constants(prior: PosePrior) -> Float:
+    """Collect the standard deviations [9] of constant errors; [10] with an unknown clock.
+
+    A shift of the whole path causes no residual: the path stays where the log has it.
+    """
+    sigma = np.repeat([0.0, *prior.constant[1:]], 3)
+    return np.append(sigma, prior.clock_s) if prior.clock_s > 0 else sigma
 
 
 def _rms(levels: Sequence[tuple[float, float]]) -> tuple[float, float]:
@@ -353,6 +410,7 @@ class _Solved:
     draws: Float  # [M, T, 6] of what the errors may be more, from the posterior
     missed: Float  # [K] residuals, px
     prior: PosePrior
+    clock: tuple[float, float] | None  # its offset and standard deviation (s), if it was unknown
 
 
 @dataclass(frozen=True)
@@ -361,7 +419,7 @@ class _State:
 
     errors: Float  # [T, 6]
     knots: Float  # [N, 6] slow errors
-    constant: Float  # [9]: shift in the world, rotation, shift in the camera
+    constant: Float  # [9]: shift in the world, rotation, shift in the camera; [10] with an unknown clock (s)
 
 
 @dataclass(frozen=True)
@@ -369,8 +427,8 @@ class _Factored:
     """Normal equations of the last step, factored: of pictures and knots, and of the constant errors."""
 
     band: Float  # [n, width] Cholesky factor
-    border: Float  # [n, 9] inverse of the band's matrix times the constant errors' columns
-    corner: Float  # [9, 9] covariance of the constant errors
+    border: Float  # [n, 9 or 10] inverse of the band's matrix times the constant errors' columns
+    corner: Float  # [9, 9] or [10, 10] covariance of the constant errors
 
 
 @dataclass(frozen=True)
@@ -468,22 +526,25 @@ class _Stretch:
         rng = np.random.default_rng(0)
         draws[..., :3] += np.sqrt(variance) * rng.standard_normal((len(draws), 1, 3))
         levels = _with_position_levels(found.prior, prior.white[0], prior.slow[0])
-        return _Solved(errors, covariance, draws, found.missed, levels)
+        return _Solved(errors, covariance, draws, found.missed, levels, found.clock)
 
     def _times_s(self) -> Float:
         """Return the times of the pictures [T], from the knots about them."""
         step = self.knot_t_s[self.knot + 1] - self.knot_t_s[self.knot]
         return np.asarray(self.knot_t_s[self.knot] + self.share * step)
 
-    def _solved(self, prior: PosePrior, *, positions_known: bool = False) -> _Solved | None:
-        state = _State(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), np.zeros(9))
+    def _solved(
+        self, prior: PosePrior, *, positions_known: bool = False, level_rounds: int = _LEVEL_ROUNDS
+    ) -> _Solved | None:
+        constant = np.zeros(len(_sigma_of_constants(prior)))
+        state = _State(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), constant)
         settle_points(self.seen, self.points, self.position, self.rotation, _WIDE[0], _INVERSE_DEPTH, 8)
         for loss in _WIDE:
             found = self._solve(state, prior, rounds=2, loss=loss)
             if found is None:
                 return None
             state = found[0]
-        for _ in range(_LEVEL_ROUNDS if prior.estimated else 0):
+        for _ in range(level_rounds if prior.estimated else 0):
             found = self._solve(state, prior, rounds=2)
             if found is None:
                 return None
@@ -491,41 +552,42 @@ class _Stretch:
             levels = self._estimated(state, self._draws(factored, 8), prior)
             if positions_known:
                 levels = _with_position_levels(levels, prior.white[0], prior.slow[0])
-            prior = with_constant_levels(levels, state.constant[3:], factored.corner[3:, 3:])
+            prior = with_constant_levels(levels, state.constant[3:9], factored.corner[3:9, 3:9])
         found = self._solve(state, prior, rounds=_ROUNDS)
         if found is None:
             return None
         state, factored, missed = found
         errors = self._draws(factored, _DRAWS)[0]
-        return _Solved(state.errors, self._covariance(factored), errors, _PIXEL_SIGMA * missed, prior)
+        late = float(state.constant[-1]), float(np.sqrt(factored.corner[-1, -1]))
+        clock = late if prior.clock_s > 0 else None
+        return _Solved(state.errors, self._covariance(factored), errors, _PIXEL_SIGMA * missed, prior, clock)
 
     def _solve(
         self, state: _State, prior: PosePrior, rounds: int, loss: float = _LOSS
     ) -> tuple[_State, _Factored, Float] | None:
         """Make Gauss-Newton steps; return the estimate, the last equations, and residuals [K] in sigmas."""
-        turned = np.concatenate([np.tile(np.eye(3), (len(self.rows), 1, 1)), self.rotation], axis=2)
         ties = self._ties(prior)
-        # A shift of the whole path causes no residual: the path stays where the log has it.
-        steady = 1 / np.maximum(np.repeat([0.0, *prior.constant[1:]], 3), EXACT) ** 2
+        steady = 1 / np.maximum(_sigma_of_constants(prior), EXACT) ** 2
         kept = np.zeros((len(self.points.inverse_depth), 12))
         missed = np.full(len(self.seen.picture), np.nan)
         size = int(max(self.place[-1], self.knot_place[-1])) + 6
         for _ in range(rounds):
             at, turn = _without(state.errors, self.position, self.rotation)
-            band, force, border = np.zeros((size, self._width())), np.zeros(size), np.zeros((size, 9))
+            band, force = np.zeros((size, self._width())), np.zeros(size)
+            border = np.zeros((size, len(steady)))
             corner, pull = np.diag(steady), -steady * state.constant
             eliminate_points(
                 self.seen, self.points, at, turn, loss, _INVERSE_DEPTH, self.place, band, force, missed, kept
             )
-            add_ties(ties, turned, *_parts(state), band, force, border, corner, pull)
+            add_ties(ties, self._design(turn, prior), *_parts(state), band, force, border, corner, pull)
             if not factorise(band):
                 return None
             both = np.concatenate([border, force[:, None]], axis=1)
             solve_lower(band, both)
             solve_upper(band, both)
-            covariance = np.linalg.inv(corner - border.T @ both[:, :9])
-            shift = covariance @ (pull - border.T @ both[:, 9])
-            step = both[:, 9] - both[:, :9] @ shift
+            covariance = np.linalg.inv(corner - border.T @ both[:, :-1])
+            shift = covariance @ (pull - border.T @ both[:, -1])
+            step = both[:, -1] - both[:, :-1] @ shift
             if not (np.isfinite(step).all() and (np.diagonal(covariance) > 0).all()):
                 return None
             move_points(self.seen, self.points, at, turn, loss, kept, self.place, step)
@@ -536,7 +598,30 @@ class _Stretch:
             )
             if (np.abs(step).reshape(-1, 2, 3).max(axis=(0, 2)) < _CONVERGED).all():
                 break
-        return state, _Factored(band, both[:, :9], covariance), missed[np.isfinite(missed)]
+        return state, _Factored(band, both[:, :-1], covariance), missed[np.isfinite(missed)]
+
+    def _design(self, rotation: Float, prior: PosePrior) -> Float:
+        """Compute the derivatives [T, 6, 9 or 10] of the errors by the constant ones.
+
+        A picture that was taken later than its stamp shows a camera that has turned farther than the log's.
+        The position tells nothing of a clock: the background does not show where the whole path lies.
+
+        Args:
+            rotation: [T, 3, 3] as estimated.
+            prior: of the errors.
+        """
+        design = np.zeros((len(rotation), 6, len(_sigma_of_constants(prior))))
+        design[:, :3, :3] = design[:, 3:, 3:6] = np.eye(3)
+        design[:, :3, 6:9] = self.rotation
+        if prior.clock_s > 0:
+            t_s = self._times_s()
+            reach = max(1, round(_RATE_S / float(np.median(np.diff(t_s)))))
+            before = np.maximum(np.arange(len(t_s)) - reach, 0)
+            after = np.minimum(np.arange(len(t_s)) + reach, len(t_s) - 1)
+            turn = np.swapaxes(rotation[before], 1, 2) @ rotation[after]
+            vector = rotation_vector_from_quaternion(quaternion_from_matrix(turn))
+            design[:, 3:, 9] = -vector / (t_s[after] - t_s[before])[:, None]
+        return design
 
     def _ties(self, prior: PosePrior) -> Ties:
         """Build the prior of errors about slow and constant ones, and of slow ones over time."""
@@ -564,12 +649,12 @@ class _Stretch:
         return int(max(widest, before, after)) + 6
 
     def _draws(self, factored: _Factored, count: int) -> tuple[Float, Float, Float]:
-        """Draw deviations from the posterior: of errors [M, T, 6], knots [M, N, 6] and constants [M, 9]."""
+        """Draw deviations of errors [M, T, 6], knots [M, N, 6] and constants [M, 9 or 10] (posterior)."""
         rng = np.random.default_rng(0)
         free = rng.standard_normal((len(factored.band), count))
         solve_upper(factored.band, free)
         values, vectors = np.linalg.eigh(factored.corner)
-        constant = rng.standard_normal((count, 9)) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+        constant = rng.standard_normal((count, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
         free -= factored.border @ constant.T
         errors, knots = (
             np.moveaxis(free[place[:, None] + np.arange(6)], 2, 0) for place in (self.place, self.knot_place)
@@ -588,8 +673,9 @@ class _Stretch:
 
     def _estimated(self, state: _State, draws: tuple[Float, Float, Float], prior: PosePrior) -> PosePrior:
         """Estimate the levels of white and slow errors again by MacKay's rule."""
-        fresh = self._fresh(state)
-        spread = np.stack([self._fresh(_State(*draw)) for draw in zip(*draws, strict=True)])
+        design = self._design(_without(state.errors, self.position, self.rotation)[1], prior)
+        fresh = self._fresh(state, design)
+        spread = np.stack([self._fresh(_State(*draw), design) for draw in zip(*draws, strict=True)])
         white = [
             _level(fresh[:, of], spread[..., of], sigma, least)
             for of, sigma, least in zip(_KINDS, prior.white, _LEAST_WHITE, strict=True)
@@ -603,13 +689,11 @@ class _Stretch:
         slow = _unknown(SHIFT_IN_WORLD, rate[0]), _unknown(ROTATION, rate[1])
         return replace(prior, white=(white[0], white[1]), slow=slow)
 
-    def _fresh(self, state: _State) -> Float:
+    def _fresh(self, state: _State, design: Float) -> Float:
         """Compute the white part [T, 6] of the errors."""
         share = self.share[:, None]
         slow = (1 - share) * state.knots[self.knot] + share * state.knots[self.knot + 1]
-        steady = np.tile(state.constant[:6], (len(self.rows), 1))
-        steady[:, :3] += self.rotation @ state.constant[6:]
-        return np.asarray(state.errors - slow - steady)
+        return np.asarray(state.errors - slow - design @ state.constant)
 
 
 _KINDS = (slice(0, 3), slice(3, 6))

@@ -333,7 +333,7 @@ def _tie(band: Float, one: int, other: int, value: float) -> None:
 @cached
 def add_ties(
     ties: Ties,
-    turned: Float,
+    design: Float,
     errors: Float,
     knots: Float,
     constant: Float,
@@ -347,29 +347,24 @@ def add_ties(
 
     Args:
         ties: the prior.
-        turned: [T, 3, 6] derivatives of a position by the shift in the world and in the camera.
+        design: [T, 6, N] derivatives of the errors by the constant ones.
         errors: [T, 6] estimates, of pictures.
         knots: [N, 6].
-        constant: [9] shift in the world, rotation, shift in the camera.
+        constant: [N] shift in the world, rotation, shift in the camera, and the clock if it is unknown.
         band: as in `eliminate_points`, as is `force`.
         force: [n].
-        border: [n, 9] entries of pictures and knots with constant errors; is added to.
-        corner: [9, 9] of constant errors; is added to.
-        pull: [9] right side of these; is added to.
+        border: [n, N] entries of pictures and knots with constant errors; is added to.
+        corner: [N, N] of constant errors; is added to.
+        pull: [N] right side of these; is added to.
     """
-    row = np.zeros(9)
+    count = len(constant)
     for t in range(len(ties.place)):
         before, after = ties.knot[t], ties.knot[t] + 1
         share = ties.share[t]
         for a in range(6):
-            row[:] = 0.0
-            if a < 3:
-                for k in range(3):
-                    row[k], row[6 + k] = turned[t, a, k], turned[t, a, 3 + k]
-            else:
-                row[a] = 1.0
+            row = design[t, a]
             left = errors[t, a] - (1 - share) * knots[before, a] - share * knots[after, a]
-            for k in range(9):
+            for k in range(count):
                 left -= row[k] * constant[k]
             own, old, new = ties.place[t] + a, ties.knot_place[before] + a, ties.knot_place[after] + a
             w = ties.white[a]
@@ -382,12 +377,12 @@ def add_ties(
             force[own] -= w * left
             force[old] += (1 - share) * w * left
             force[new] += share * w * left
-            for k in range(9):
+            for k in range(count):
                 border[own, k] -= w * row[k]
                 border[old, k] += (1 - share) * w * row[k]
                 border[new, k] += share * w * row[k]
                 pull[k] += w * row[k] * left
-                for m in range(9):
+                for m in range(count):
                     corner[k, m] += w * row[k] * row[m]
     for a in range(6):
         band[ties.knot_place[0] + a, 0] += ties.start[a]

@@ -305,14 +305,23 @@ def source_of_pose_noise(
 def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> tuple[Float, Bool]:
     """Load the prior standard deviation [C] s of each clock offset, and whether somebody stated the offset.
 
-    The deviation is 0 for known clocks. Where none is known, it is 0 for the manifest's reference camera.
+    The deviation is 0 for known clocks.
     """
     clocks = [description.cameras[camera.name].clock for camera in cameras]
     sigma_s = np.array([clock.prior_sigma_s for clock in clocks])
+    return sigma_s, np.array([clock.sigma_s > 0 or clock.start == "stated" for clock in clocks])
+
+
+def with_reference(description: Description, cameras: Sequence[Camera], clock_sigma_s: Float) -> Float:
+    """Hold the clock of the manifest's reference camera where none is known: rays show differences only.
+
+    Returns the standard deviations [C] s, 0 for a clock that is held.
+    """
+    sigma_s = clock_sigma_s.copy()
     if (sigma_s > 0).all():
         names, held = [camera.name for camera in cameras], description.clock_reference
         sigma_s[names.index(held) if held in names else 0] = 0.0
-    return sigma_s, np.array([clock.sigma_s > 0 or clock.start == "stated" for clock in clocks])
+    return sigma_s
 
 
 def is_time_unknown(description: Description, cameras: Sequence[Camera]) -> bool:

@@ -174,18 +174,24 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
 
 @dataclass(frozen=True)
 class FoundClocks:
-    """Clock offsets that the keypoints determine."""
+    """Clock offsets that the backgrounds or the keypoints determine."""
 
     offset_s: Float  # [C] to add to the pictures' times
     sigma_s: Float  # [C] posterior standard deviation; the prior's where only the search found it, 0 if held
     prior_s: Float  # [C] prior standard deviation for later estimates; 0 for clocks that are held
     common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
 
+    def with_others(self, found: FoundClocks) -> FoundClocks:
+        """Add the clocks that keypoints determine beside these, of the shifted cameras."""
+        sigma_s = np.where(self.sigma_s > 0, self.sigma_s, found.sigma_s)
+        return replace(found, offset_s=self.offset_s + found.offset_s, sigma_s=sigma_s)
+
 
 def agreed_clocks(names: Sequence[str], found: Sequence[Mapping[str, Mapping[str, float]]]) -> FoundClocks:
     """Agree on the clocks that some segments found.
 
-    Most segments decide whether a clock is held. Of the offsets that were found, the median is taken, with
+    A clock that the backgrounds of some segments determine is theirs. For the others most segments decide
+    whether a clock is held. Of the offsets that were found, the median is taken, with
     the median of their standard deviations: an offset that the whole flight shares is hardly surer than that.
 
     Args:
@@ -196,7 +202,10 @@ def agreed_clocks(names: Sequence[str], found: Sequence[Mapping[str, Mapping[str
     for c, name in enumerate(names):
         own = [each[name] for each in found if name in each]
         moved = [each for each in own if each["prior_s"] > 0]
-        if 2 * len(moved) > len(own):
+        by_background = [each for each in own if each["prior_s"] == 0 < each["sigma_s"]]
+        if by_background:
+            own = by_background
+        elif 2 * len(moved) > len(own):
             prior_s[c] = max(each["prior_s"] for each in moved)
             own = moved
         if own:

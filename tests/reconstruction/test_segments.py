@@ -207,6 +207,16 @@ def test_clocks_are_those_of_most_segments() -> None:
     assert agreed.offset_s.tolist() == [0.0, 0.0]
 
 
+def test_a_clock_that_one_background_shows_is_that_of_the_flight() -> None:
+    by_background = {"a": {"offset_s": 0.31, "sigma_s": 2e-3, "prior_s": 0.0}, "": {"common_sigma_s": 0.0}}
+    held = {"a": {"offset_s": 0.0, "sigma_s": 0.0, "prior_s": 0.0}, "": {"common_sigma_s": 0.0}}
+    by_rays = {"a": {"offset_s": 0.2, "sigma_s": 0.03, "prior_s": 0.5}, "": {"common_sigma_s": 0.0}}
+    agreed = agreed_clocks(["a"], [held, by_background, by_rays])
+    assert agreed.offset_s.tolist() == [0.31]
+    assert agreed.sigma_s.tolist() == [2e-3]
+    assert agreed.prior_s.tolist() == [0.0]
+
+
 def test_doubts_and_warnings_of_segments() -> None:
     doubt = {"code": "clock", "cameras": ["a"], "what": "it is late", "evidence": {}, "remedy": "x"}
     [often], seldom = doubts_of_flight([[doubt], [], [doubt]])

@@ -8,7 +8,9 @@ import pytest
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.noise import Drift, pose_errors
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.reconstruction.background import clocks_of_backgrounds
 from pipelines.reconstruction.background_tracks import Followed, Tracks
 from pipelines.reconstruction.doubts.hypotheses import RATES
 from pipelines.reconstruction.doubts.turning import Lateness, common_offset, lateness, turns_of
@@ -28,6 +30,8 @@ class Turning:
     name: str = "drone"
     intrinsics: Intrinsics = LENS
     swings: bool = True
+    drift_deg: float = 0.0  # of the log's attitudes, per sqrt(s)
+    focal_px: float = LENS.fx
 
     def poses_at(self, t_ns: Int64, _: Interpolation) -> tuple[Float, Float]:
         """Return position [N, 3] and world_from_camera [N, 3, 3], as the log has them."""
@@ -36,7 +40,12 @@ class Turning:
         angle[:, 1] = 0.2 * self.swings * np.sin(1.9 * t_s + self.phase)
         angle[:, 0] = 0.1 * self.swings * np.sin(2.6 * t_s + 2 * self.phase)
         position = np.stack([0.5 * t_s, np.zeros_like(t_s), np.zeros_like(t_s)], axis=1)
-        return position, matrix_from_quaternion(quaternion_from_rotation_vector(angle))
+        turned = matrix_from_quaternion(quaternion_from_rotation_vector(angle))
+        at_s = np.arange(-2, 9, 0.01)
+        steps = np.random.default_rng(7).normal(0, 0.1 * np.radians(self.drift_deg), (len(at_s), 3))
+        walk = np.cumsum(steps, axis=0)
+        error = np.stack([np.interp(t_s, at_s, column) for column in walk.T], axis=1)
+        return position, turned @ matrix_from_quaternion(quaternion_from_rotation_vector(error))
 
     def followed(self) -> Followed:
         """Follow points 8 to 30 m away, to 0.3 px, at the true times of the pictures."""
@@ -44,7 +53,7 @@ class Turning:
         points = np.column_stack(
             [rng.uniform(-12, 15, 200), rng.uniform(-6, 6, 200), rng.uniform(8, 30, 200)]
         )
-        position, rotation = self.poses_at(T_NS, BETWEEN)
+        position, rotation = replace(self, drift_deg=0.0).poses_at(T_NS, BETWEEN)
         seen = np.einsum("tji,tkj->tki", rotation, points[None] - position[:, None])
         pixels = seen[..., :2] / seen[..., 2:] * LENS.fx + [LENS.cx, LENS.cy]
         pixels += rng.normal(0, 0.3, pixels.shape)
@@ -136,3 +145,33 @@ def test_clocks_that_nearly_fit_are_left_alone() -> None:
     team: list[Any] = [late(0.1, 0.1)]
     assert common_offset(team, {"drone": team[0].followed()}, BETWEEN) is None
     assert common_offset(team, {}, BETWEEN) is None
+
+
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("seconds", [0.06, -0.11, 0.74])
+def test_each_camera_that_turns_has_its_clock_from_its_background(seconds: float, stated: bool) -> None:
+    """A log that drifts: 0.1 deg in a second beside up to 22 deg a second."""
+    names = [f"drone{k}" for k in range(4)]
+    team: list[Any] = [
+        replace(late(seconds, 0.3 + 0.9 * k), name=name, drift_deg=0.1) for k, name in enumerate(names)
+    ]
+    followed: dict[str, Any] = {camera.name: camera.followed() for camera in team}
+    errors = pose_errors([Drift(rotation_deg_per_sqrt_s=0.1)]) if stated else None
+    offset_s, sigma_s = clocks_of_backgrounds(
+        team, followed, [errors] * len(team), np.full(len(team), 0.5), between=BETWEEN
+    )
+    squares = np.square((offset_s + seconds) / sigma_s)
+    assert (sigma_s < 0.01).all()
+    assert squares.mean() < 13.3 / 4  # 99 % of chi-square with four degrees of freedom
+
+
+def test_no_clock_is_found_that_is_known_or_that_nothing_shows() -> None:
+    team: list[Any] = [late(0.1, 0.1), late(0.1, 0.4), replace(late(0.1, 0.7), swings=False)]
+    team = [replace(camera, name=f"drone{k}") for k, camera in enumerate(team)]
+    followed: dict[str, Any] = {camera.name: camera.followed() for camera in team}
+    followed["drone1"] = "its video cannot be read"
+    offset_s, sigma_s = clocks_of_backgrounds(
+        team, followed, [None] * 3, np.array([0.0, 0.2, 0.2]), between=BETWEEN
+    )
+    assert np.isnan(offset_s).all()
+    assert np.isnan(sigma_s).all()
