@@ -274,6 +274,9 @@ UNKNOWN_SIGMA = (0.3, math.radians(1.0))
 USUAL_CONSTANT, USUAL_COUNT = (0.1, math.radians(0.3)), 3.0
 """Usual level (m, rad) of constant errors that nobody stated, and how many numbers that is worth."""
 
+SURVEYED_M = 0.01
+"""Usual position error of a camera whose log has one position, to the last digit: it was surveyed."""
+
 EXACT = 1e-5
 """Constant error (m and rad) that stands for none, so that the equations stay well posed."""
 

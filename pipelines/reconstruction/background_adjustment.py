@@ -30,6 +30,7 @@ from pipelines.geometry.noise import (
     ROTATION,
     SHIFT_IN_CAMERA,
     SHIFT_IN_WORLD,
+    SURVEYED_M,
     UNKNOWN_SIGMA,
     USUAL_CONSTANT,
     USUAL_COUNT,
@@ -92,6 +93,7 @@ _LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; be
 _LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
 _FEWEST_STANDING = 8  # pictures
 _SIGMAS_STANDING = 2.0  # of all errors: the log of a camera that stands moves by less
+_NEVER_MOVES_M = 1e-6  # the log of a camera whose position was surveyed, not measured in flight
 _STANDS = 0.03  # px^2 of misfit that a free path may save: noise, not parallax
 _SLOW_LAG_S = 1.0  # over which slow errors of a camera that stands are read off its log
 _CLOCK_PICTURES = 600  # in which the clock is looked for
@@ -215,6 +217,8 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
         logged poses stay and `refused` gives the reason. Pictures without a pose stay without one.
     """
     posed = np.flatnonzero(np.isfinite(position[:, 0]))
+    if prior.estimated and len(posed) and np.ptp(position[posed], axis=0).max() < _NEVER_MOVES_M:
+        prior = replace(prior, constant=(SURVEYED_M, prior.constant[1], 0.0))  # nor has it a lever arm
 
     def refused(reason: str) -> Adjusted:
         stays = prior.covariance(len(position))
@@ -506,7 +510,8 @@ class _Stretch:
         if prior.estimated:
             white, rate = _levels_of_standing(t_s, self.position)
             prior = _with_position_levels(prior, white, _unknown(SHIFT_IN_WORLD, rate))
-            prior = replace(prior, constant=(*prior.constant[:2], _USUAL_ARM_M))
+            arm = min(prior.constant[2], _USUAL_ARM_M)
+            prior = replace(prior, constant=(*prior.constant[:2], arm))
         place, variance = _place_of_standing(t_s, self.position, prior)
         variance += prior.constant[2] ** 2  # nothing moves that could tell it from a shift of the place
         origin = np.tile(place, (len(self.points.origin), 1))

@@ -14,6 +14,7 @@ from pipelines.geometry.cameras import Intrinsics, row_delay_s
 from pipelines.geometry.noise import (
     ROTATION,
     SHIFT_IN_WORLD,
+    SURVEYED_M,
     UNKNOWN_SIGMA,
     Drift,
     GaussMarkov,
@@ -203,6 +204,20 @@ def test_a_camera_that_stands_is_where_its_log_has_it_on_average(known: bool) ->
     sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3].mean())
     assert np.abs(away).max() < 3 * sigma
     assert sigma < 0.02 if known else sigma > UNKNOWN_SIGMA[0]  # a constant error is always possible
+
+
+@pytest.mark.parametrize("measured_m", [0.0, 1e-3])
+def test_a_position_that_never_changes_was_surveyed(measured_m: float) -> None:
+    """Nobody states the noise. A log that moves by a millimetre was measured, and may be off by much more."""
+    rng = np.random.default_rng(5)
+    position, rotation = turning(60)
+    picture, point, xy = sighted(position, rotation, rng, noise_px=0.1)
+    at, turned = logged(position, rotation, rng)
+    at = position + rng.normal(0, 1, position.shape) * measured_m
+    found = adjusted(picture, point, xy, (at, turned), PosePrior.of(None))
+    assert found.left is not None
+    (sigma,) = [of.sigma0 for of in found.left.processes if of.number == SHIFT_IN_WORLD and of.constant]
+    assert sigma > UNKNOWN_SIGMA[0] if measured_m else SURVEYED_M <= sigma < 1.1 * SURVEYED_M
 
 
 def _of_constants(prior: PosePrior, turn: Float, variance: float) -> PosePrior:
