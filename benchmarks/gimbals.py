@@ -60,7 +60,7 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 
 TUNED, KEPT = ("a", "b"), ("c", "d")
 LEVELS_DEG = (0.5, 1.0)
-DRAWS = 1
+DRAWS = 6
 METHODS: dict[str, dict[str, Any]] = {
     "robust": {"method": "robust"},
     "refined": {"method": "refined"},

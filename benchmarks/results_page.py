@@ -284,8 +284,9 @@ def _gimbals(numbers: Numbers) -> list[str]:
             ]
         ),
         *_words(
-            "There is no truth of the person. Distance (median) is that from the result of `robust` from "
-            "the still cameras, which errs too; the rows without attitude errors are the floor. NEES takes "
+            "Means over two paths and six draws of the errors. There is no truth of the person. Distance "
+            "(median) is that from the result of `robust` from the still cameras, which errs too; the rows "
+            "without attitude errors are the floor. NEES takes "
             "that result for exact, the second one adds its covariance. Jitter contains the person's own "
             "acceleration. The constant part of the attitudes is as good as the calibration. The docstring "
             "of `benchmarks/gimbals.py` has more."
