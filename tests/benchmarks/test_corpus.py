@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from benchmarks.accuracy import FLOOR, Case, measure_draw, nees, peak_ratio
-from benchmarks.corpus.drawn import DrawnFlight, SharedError, shared_error
+from benchmarks.corpus.drawn import DrawnFlight, SharedError, kept_in_place_of_pictures, shared_error
 from benchmarks.corpus.stored import (
     CORPUS,
     HALVES,
@@ -25,7 +25,12 @@ from benchmarks.corpus.stored import (
     write_backgrounds,
     write_keypoints,
 )
+from pipelines.detect import detect
+from pipelines.follow import Following
+from pipelines.ingest import ingest
+from pipelines.reconstruct import Settings, reconstruct
 from pipelines.session.registries import noise_models
+from pipelines.session.stages import locked
 from pipelines.simulation.scenario import Scenario
 
 _MOST_BYTES = 30 * 2**20
@@ -133,6 +138,30 @@ def test_robust_is_measured_on_a_flight(tmp_path: Path) -> None:
     assert robust.measured_share is not None
     assert robust.measured_share > 0.9
     assert robust.nees is not None
+
+
+def test_clocks_that_are_all_late_are_found_from_the_backgrounds(tmp_path: Path) -> None:
+    """None is known, so none serves as the reference. Stated deviations are some 5 ms."""
+    (flight,) = (flight for flight in flights(["tuning"]) if flight.name == "23-jog-and-crouch")
+    drawn = DrawnFlight(flight, tmp_path / "shared")
+    drawn.write_shared()
+    place = tmp_path / "draw"
+    session = drawn.session(place, 0, "model", "blazepose")
+    text = (place / "flight.yaml").read_text(encoding="utf-8")
+    late = text.replace("clock: {offset_s: 0, sigma_s: 0}", "clock: {offset_s: -0.12, sigma_s: 0.2}")
+    assert late.count("-0.12") == 3
+    (place / "flight.yaml").write_text(late, encoding="utf-8")
+    ingest(place / "flight.yaml", session)
+    with kept_in_place_of_pictures(flight, "blazepose"):
+        with locked(session) as writable:
+            detect(writable, detector="blazepose")
+            Following(writable).finish()
+        metrics = reconstruct(session, Settings(people=1, detector="blazepose")).metrics
+    assert metrics["method_used"]["clocks"] == ["drone1", "drone2", "drone3"]
+    for name, offset_s in metrics["clock_offsets_s"].items():
+        sigma_s = metrics["clock_offset_sigmas_s"][name]
+        assert 0 < sigma_s < 0.01
+        assert abs(offset_s - 0.12) < 4 * sigma_s
 
 
 def test_the_error_that_all_cameras_share_is_found(tmp_path: Path) -> None:
