@@ -116,7 +116,8 @@ def by_backgrounds(names: Sequence[str], draws: int, sigma_s: float) -> None:
             ]
         print(_background_row(flight.name, found), flush=True)
         every += found
-    print(_background_row("all", every))
+    if every:
+        print(_background_row("all", every))
 
 
 def _background_row(name: str, found: Sequence[tuple[float, float, float]]) -> str:
@@ -140,7 +141,7 @@ def clocks_of_draw(
     """Return error, standard deviation and processor time (s) of each camera's clock; NaN without one."""
 
     def stop(flight: Any, cameras: list[Camera], *_: object) -> NoReturn:
-        rng = np.random.default_rng([draw, len(cameras)])
+        rng = np.random.default_rng([draw, *drawn.flight.name.encode()])
         true_s = rng.uniform(-sigma_s, sigma_s, len(cameras))
         own_s = np.array([drone.clock_offset_s for drone in drawn.simulated.drones])
         for camera, late_s in zip(shifted(cameras, -true_s), true_s + own_s, strict=True):

@@ -102,10 +102,10 @@ def clocks_of_backgrounds(
         rough = common_offset([camera], {camera.name: seen}, between)
         about_s = 0.0 if rough is None else rough.late_s
         poses_at = partial(_poses_late, camera, camera.frame_t_ns[seen.rows], about_s, between)
-        prior = replace(PosePrior.of(stated), clock_s=float(clock_sigma_s[c]))
-        clock = clock_offset(background_of(camera, seen), poses_at, prior)
+        clock = clock_offset(background_of(camera, seen), poses_at, PosePrior.of(stated))
         if clock is not None:
-            found[c] = about_s + clock[0], clock[1]
+            share = clock_sigma_s[c] ** 2 / (clock_sigma_s[c] ** 2 + clock[1] ** 2)
+            found[c] = share * (about_s + clock[0]), np.sqrt(share) * clock[1]
     return found[:, 0], found[:, 1]
 
 

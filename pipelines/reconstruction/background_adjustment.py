@@ -97,7 +97,10 @@ _NEVER_MOVES_M = 1e-6  # the log of a camera whose position was surveyed, not me
 _STANDS = 0.03  # px^2 of misfit that a free path may save: noise, not parallax
 _SLOW_LAG_S = 1.0  # over which slow errors of a camera that stands are read off its log
 _CLOCK_PICTURES = 600  # in which the clock is looked for
-_CLOCK_ROUNDS, _SETTLED = 8, 0.5  # the last offset is at most this share of its standard deviation
+_CLOCK_ROUNDS = 8  # of which each moves the stamps
+_SETTLED = 0.5  # the last offset is at most this share of its standard deviation
+_ANY_CLOCK_S = 0.5  # standard deviation of what is left in each round
+_MOST_CLOCK_SIGMA_S = 0.03  # above it, rays of people tell a clock better
 _LEAST_TURNING = UNKNOWN_SIGMA[1]  # of a camera, rms: followed points of one that hovers drift by as much
 _RATE_S = 0.1  # before and after a picture, over which the speed of turning is computed
 _MOST_MEANS = 200  # of its log, to which poses are averaged
@@ -288,13 +291,14 @@ def clock_offset(
     Args:
         seen: the background.
         poses_at: function that returns the logged poses, as for `adjust`, this many seconds after the stamps.
-        prior: standard deviations of the log's errors, and of the clock.
+        prior: standard deviations of the log's errors.
 
     Returns:
-        Offset and its standard deviation, s. None if the camera turns too little in the middle of the flight,
-        or if no offset was found at which the next one is the same.
+        Offset and its standard deviation, s, by the background alone. None if the camera turns too little in
+        the middle of the flight or its turning does not determine the offset, if there are too few poses or
+        the adjustment fails, or if no offset was found at which the next one is the same.
     """
-    offset_s, levels = 0.0, prior
+    offset_s, before_s, levels = 0.0, 0.0, replace(prior, clock_s=_ANY_CLOCK_S)
     for again in range(_CLOCK_ROUNDS):
         position, rotation = poses_at(offset_s)
         posed = np.flatnonzero(np.isfinite(position[:, 0]))
@@ -312,9 +316,10 @@ def clock_offset(
         if np.sqrt(np.var(away, axis=0).sum()) < _LEAST_TURNING:
             return None
         late_s, sigma_s = solved.clock
-        offset_s += late_s
+        offset_s += late_s if late_s * before_s >= 0 else late_s / 2  # steps that swing to and fro
+        before_s = late_s
         if abs(late_s) <= _SETTLED * sigma_s:
-            return offset_s, sigma_s
+            return (offset_s, sigma_s) if sigma_s <= _MOST_CLOCK_SIGMA_S else None
     return None
 
 

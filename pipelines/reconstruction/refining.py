@@ -182,7 +182,10 @@ class FoundClocks:
     common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
 
     def with_others(self, found: FoundClocks) -> FoundClocks:
-        """Add the clocks that keypoints determine beside these, of the shifted cameras."""
+        """Add the offsets that keypoints show for cameras that are already shifted by these.
+
+        The standard deviations of these stay.
+        """
         sigma_s = np.where(self.sigma_s > 0, self.sigma_s, found.sigma_s)
         return replace(found, offset_s=self.offset_s + found.offset_s, sigma_s=sigma_s)
 
@@ -190,19 +193,21 @@ class FoundClocks:
 def agreed_clocks(names: Sequence[str], found: Sequence[Mapping[str, Mapping[str, float]]]) -> FoundClocks:
     """Agree on the clocks that some segments found.
 
-    A clock that the backgrounds of some segments determine is theirs. For the others most segments decide
-    whether a clock is held. Of the offsets that were found, the median is taken, with
-    the median of their standard deviations: an offset that the whole flight shares is hardly surer than that.
+    Where the backgrounds of some segments determine clocks, the other segments do not count: they compare
+    clocks with a reference that may be late itself. For clocks that no background determines, most segments
+    decide whether a clock is held. Of the offsets that were found, the median is taken, with the median of
+    their standard deviations: an offset that the whole flight shares is hardly surer than that.
 
     Args:
         names: of all C cameras.
         found: of each segment `offset_s`, `sigma_s` and `prior_s` by camera, and `common_sigma_s` of "".
     """
     offset_s, sigma_s, prior_s = np.zeros((3, len(names)))
+    found = [each for each in found if any(map(_is_by_background, each.values()))] or found
     for c, name in enumerate(names):
         own = [each[name] for each in found if name in each]
         moved = [each for each in own if each["prior_s"] > 0]
-        by_background = [each for each in own if each["prior_s"] == 0 < each["sigma_s"]]
+        by_background = list(filter(_is_by_background, own))
         if by_background:
             own = by_background
         elif 2 * len(moved) > len(own):
@@ -213,6 +218,10 @@ def agreed_clocks(names: Sequence[str], found: Sequence[Mapping[str, Mapping[str
             sigma_s[c] = np.median([each["sigma_s"] for each in own])
     common_s = float(np.median([each[""]["common_sigma_s"] for each in found])) if found else 0.0
     return FoundClocks(offset_s, sigma_s, prior_s, common_s)
+
+
+def _is_by_background(clock: Mapping[str, float]) -> bool:
+    return clock.get("prior_s") == 0 and clock["sigma_s"] > 0
 
 
 def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:

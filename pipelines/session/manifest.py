@@ -577,7 +577,7 @@ class Flight(Part):
 
     @property
     def reference_camera(self) -> str:
-        """The camera whose clock offset is held at its given value when clocks are estimated."""
+        """The camera whose clock offset is held where none is known and no background shows one."""
         return self.clock_reference or next(iter(self.cameras))
 
 

@@ -207,14 +207,18 @@ def test_clocks_are_those_of_most_segments() -> None:
     assert agreed.offset_s.tolist() == [0.0, 0.0]
 
 
-def test_a_clock_that_one_background_shows_is_that_of_the_flight() -> None:
-    by_background = {"a": {"offset_s": 0.31, "sigma_s": 2e-3, "prior_s": 0.0}, "": {"common_sigma_s": 0.0}}
-    held = {"a": {"offset_s": 0.0, "sigma_s": 0.0, "prior_s": 0.0}, "": {"common_sigma_s": 0.0}}
-    by_rays = {"a": {"offset_s": 0.2, "sigma_s": 0.03, "prior_s": 0.5}, "": {"common_sigma_s": 0.0}}
-    agreed = agreed_clocks(["a"], [held, by_background, by_rays])
-    assert agreed.offset_s.tolist() == [0.31]
-    assert agreed.sigma_s.tolist() == [2e-3]
-    assert agreed.prior_s.tolist() == [0.0]
+def test_clocks_by_backgrounds_are_not_mixed_with_clocks_by_a_reference() -> None:
+    """A background shows that a is 0.5 s late, and rays that b is 0.02 s later. Elsewhere a is held."""
+
+    def found(a_s: float, sigma_s: float, b_s: float) -> dict[str, dict[str, float]]:
+        first = {"offset_s": a_s, "sigma_s": sigma_s, "prior_s": 0.0}
+        second = {"offset_s": b_s, "sigma_s": 0.03, "prior_s": 0.5}
+        return {"a": first, "b": second, "": {"common_sigma_s": 0.0}}
+
+    agreed = agreed_clocks(["a", "b"], [found(0.0, 0.0, 0.02), found(0.5, 2e-3, 0.52), found(0.0, 0.0, 0.02)])
+    assert agreed.offset_s.tolist() == [0.5, 0.52]
+    assert agreed.sigma_s.tolist() == [2e-3, 0.03]
+    assert agreed.prior_s.tolist() == [0.0, 0.5]
 
 
 def test_doubts_and_warnings_of_segments() -> None:

@@ -175,3 +175,14 @@ def test_no_clock_is_found_that_is_known_or_that_nothing_shows() -> None:
     )
     assert np.isnan(offset_s).all()
     assert np.isnan(sigma_s).all()
+
+
+def test_a_clock_that_is_stated_well_hardly_moves() -> None:
+    """What the background says is weighted by what was stated: 5 ms beside some milliseconds."""
+    team: list[Any] = [replace(late(0.02, 0.3), drift_deg=0.3)]
+    followed: dict[str, Any] = {"drone": team[0].followed()}
+    wide, own_s = clocks_of_backgrounds(team, followed, [None], np.array([0.5]), between=BETWEEN)
+    near, stated_s = clocks_of_backgrounds(team, followed, [None], np.array([0.002]), between=BETWEEN)
+    share = 1 / (1 + (own_s / 0.002) ** 2)
+    assert near == pytest.approx(share * wide, rel=0.01)
+    assert stated_s < 0.002

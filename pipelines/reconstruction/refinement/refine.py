@@ -72,6 +72,7 @@ _UNINFORMATIVE_MEMORY = 30.0
 _SMALL_SCALE = 0.01  # standard deviation of the formation's scale that does not matter
 _UNSEEN_SCALE = 0.85  # posterior over prior sigma of the scale above which pictures do not determine it
 _SLOW_SHARE = 0.2  # of the disagreement of views: least initial level of slow errors
+_LEAST_TURN = 2e-3  # rad, of the level of attitudes that is guessed
 _TURN_SHARE = 0.6  # of the disagreement of views: the level of attitudes where positions err, too
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
 _FARTHEST = 1.8
@@ -608,8 +609,9 @@ def _measured_prior(
     known, state = learn(problem, unlearned, state, poses=False, memory=True, rounds=_LEARNING_ROUNDS)
     levels = [known]
     guessed = {kind: process.sigma0 for kind, process in enumerate(guess.processes[:2])}
-    shifts = [each.sigma0 for errors in prior for each in errors.processes if each.number != ROTATION]
-    if max(shifts, default=0.0) < 2 * SURVEYED_M:
+    shifts = [each for errors in prior for each in errors.processes if each.number != ROTATION]
+    surveyed = [each.constant and each.sigma0 < 2 * SURVEYED_M for each in shifts]
+    if surveyed and all(surveyed) and guessed[1] > _LEAST_TURN:
         guessed[1] /= _TURN_SHARE  # all of the disagreement is by attitudes
     if any(errors.assumed for errors in prior):
         found = _with_constant_levels(problem, known, state, guessed)
@@ -752,7 +754,7 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
         (max(0.8 * fast * range_m, 0.01), max(0.6 * fast, 1e-3)),
         (
             Process(SHIFT_IN_WORLD, max(0.8 * slow * range_m, 0.02), 0.03),
-            Process(ROTATION, max(_TURN_SHARE * slow, 2e-3), 2e-3),
+            Process(ROTATION, max(_TURN_SHARE * slow, _LEAST_TURN), 2e-3),
             Process(SHIFT_IN_CAMERA, max(0.4 * slow * range_m, 0.02)),
         ),
     )
