@@ -178,7 +178,7 @@ def test_no_clock_is_found_that_is_known_or_that_nothing_shows() -> None:
 
 
 def test_a_clock_that_is_stated_well_hardly_moves() -> None:
-    """What the background says is weighted by what was stated: 5 ms beside some milliseconds."""
+    """Expect the mean of 0, stated to 2 ms, and the background's offset, weighted by both variances."""
     team: list[Any] = [replace(late(0.02, 0.3), drift_deg=0.3)]
     followed: dict[str, Any] = {"drone": team[0].followed()}
     wide, own_s = clocks_of_backgrounds(team, followed, [None], np.array([0.5]), between=BETWEEN)
