@@ -488,10 +488,11 @@ def criteria(
         if not own:
             continue
         of = {flight: _of(flight, method, detector, given, found) for flight in own}
-        lines += [
-            f"- {_VERDICT[passed]} {half}: {said}"
-            for said, passed in [*_against_robust(of, found), *_motion(of), *_covariances(of)]
-        ]
+        verdicts = [*_against_robust(of, found), *_motion(of), *_covariances(of)]
+        robust = {flight: _of(flight, "robust", detector, given, found) for flight in own}
+        if method != "robust" and all(robust.values()):
+            verdicts += [(f"`robust`, {said}", passed) for said, passed in _covariances(robust)]
+        lines += [f"- {_VERDICT[passed]} {half}: {said}" for said, passed in verdicts]
         shared = {flight: _of(flight, SHARED, detector, "model", found) for flight in own}
         ratios = list(_ratios(shared, found, "mpjpe_mm").values())
         if ratios and given == "model":

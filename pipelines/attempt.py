@@ -330,6 +330,7 @@ def reconstruct_once(
         solve=solve,
     )
     people = {"people": _people_seen(description, cameras, seen.association, doubted)}
+    unseen = [description.names_of_people(k + 1)[k] for k in seen.association.unseen]
     metrics |= of_people(people["people"]["names"], own[0], own[2], truth)
     readout = _readout(cameras, seen)
     parts = background | (refined.metrics if refined else {}) | _clock_metrics(cameras, clocks, refined)
@@ -354,6 +355,7 @@ def reconstruct_once(
             *warnings,
             *(refined.warnings if refined else []),
             *seen.association.reasons,
+            *(f"nobody is seen near the log of {name}" for name in unseen),
             *_people_warnings(people["people"]),
             *_readout_warnings(readout),
         ],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -55,6 +55,7 @@ class Association:
     ]  # [C] detections by the causes of `NoPeople`, which are not used; and those kept
     phantoms: dict[str, int]  # bodies that two cameras see and that are left out, by `why_no_person`
     doubts: tuple[str, ...]  # [P] why each of the people may be nobody, by `why_no_body`; "" without a doubt
+    unseen: tuple[int, ...]  # those of several logged people near whose logs nobody is seen
     reasons: tuple[str, ...]  # messages for the user, one line each
 
 
@@ -144,8 +145,8 @@ def associate(
         seen = undo_exchanges(time_s, views, seen) if several else seen
     xy, confidence = views.xy, views.confidence
     tracks = _tracks(seen, np.where(np.isfinite(xy).all(-1) & (confidence > 0), confidence, 0.0))
-    sigmas_m = [_own_noise_m(tracks, log, noise_m, actor_sigma_m) for log in logged]
-    chains, tracks, reasons = _chains(tracks, time_s, logged, sigmas_m, people)
+    near, unseen, reasons = _near_logs(tracks, logged, noise_m, actor_sigma_m)
+    chains, tracks = _chains(tracks, time_s, near, people)
     refused: Counter[str] = Counter()
     if scene is not None and scene.ground is None:
         scene = scene._replace(ground=level_of_most_seen(seen))
@@ -157,7 +158,8 @@ def associate(
     resumed = np.array([max(0, len(chain.taken) - 1) for chain in chains], np.int64)
     if not np.any(chosen >= 0):
         reasons.append(_nobody(seen.nearest))
-    return _counted(chosen, seen, resumed, dropped, refused, doubts, tuple(reasons))
+    counted = _counted(chosen, seen, resumed, dropped, refused, doubts, tuple(reasons))
+    return replace(counted, unseen=unseen)
 
 
 def _noise_of_logs_m(seen: Followed, logs: Float, most_m: float) -> float:
@@ -175,9 +177,24 @@ def _noise_of_logs_m(seen: Followed, logs: Float, most_m: float) -> float:
     return float(np.clip(np.median(np.nanmin(apart, axis=1)) / _MEDIAN_OF_THREE, _LEAST_SIGMA_M, most_m))
 
 
-def _own_noise_m(tracks: list[_Track], log: Float, usual_m: float, most_m: float) -> float:
-    """Return `usual_m`, or `most_m` for a log to which no track is near by `usual_m`."""
-    return usual_m if any(_likeness(track, log, usual_m) > 0 for track in tracks) else most_m
+def _near_logs(
+    tracks: list[_Track], logged: list[Float], usual_m: float, most_m: float
+) -> tuple[list[tuple[Float, float]], tuple[int, ...], list[str]]:
+    """Give each log [T, 3] its standard deviation: `usual_m`, or `most_m` where no track is near by that.
+
+    Returns:
+        The logs with their standard deviations, none if no track is near any of them. Of several logs, those
+        that no track is near. Messages.
+    """
+    logs = [(log, usual_m if _is_near(tracks, log, usual_m) else most_m) for log in logged]
+    unseen = tuple(k for k, (log, sigma_m) in enumerate(logs) if not _is_near(tracks, log, sigma_m))
+    if tracks and len(unseen) == len(logs):
+        return [], (), [_far_from_log(tracks, log) for log in logged]
+    return logs, unseen if len(logs) > 1 else (), []
+
+
+def _is_near(tracks: list[_Track], log: Float, sigma_m: float) -> bool:
+    return any(_likeness(track, log, sigma_m) > 0 for track in tracks)
 
 
 def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
@@ -258,32 +275,27 @@ class _Chain:
 
 
 def _chains(
-    tracks: list[_Track], time_s: Float, logs: list[Float], sigmas_m: list[float], people: int | None
-) -> tuple[list[_Chain], list[_Track], list[str]]:
+    tracks: list[_Track], time_s: Float, logs: list[tuple[Float, float]], people: int | None
+) -> tuple[list[_Chain], list[_Track]]:
     """Chain tracks into people: those with logs together, each of the others after the one before.
 
+    Args:
+        tracks: all of them.
+        time_s: [T] of their rows.
+        logs: the hips [T, 3] m of each logged person, with their standard deviation on each axis, m.
+        people: their number; None for those with logs, or one.
+
     Returns:
-        The people (at least one), the tracks that are nobody's, and messages.
+        The people (at least one), and the tracks that are nobody's.
     """
     tracks = sorted(tracks, key=lambda one: (-one.views.sum(), -one.confidence, one.identity))
-    reasons: list[str] = []
-    nobody = [
-        k
-        for k, (log, sigma_m) in enumerate(zip(logs, sigmas_m, strict=True))
-        if not any(_likeness(t, log, sigma_m) > 0 for t in tracks)
-    ]
-    if tracks and len(nobody) == len(logs):
-        reasons += [_far_from_log(tracks, log) for log in logs]
-        logs = []
-    elif len(logs) > 1:
-        reasons += [f"nobody is seen near the log of person {k}" for k in nobody]
-    chains = [_Chain(time_s, log, sigma_m) for log, sigma_m in zip(logs, sigmas_m, strict=False)]
+    chains = [_Chain(time_s, log, sigma_m) for log, sigma_m in logs]
     tracks = _by_logs(tracks, chains)
     chains = chains[:people]  # all of them for None
     while len(chains) < (people or 1):
         chain, tracks = _next_chain(tracks, time_s)
         chains.append(chain)
-    return chains, tracks, reasons
+    return chains, tracks
 
 
 def _next_chain(tracks: list[_Track], time_s: Float) -> tuple[_Chain, list[_Track]]:
@@ -422,5 +434,6 @@ def _counted(
         no_people=dropped,
         phantoms=dict(sorted(phantoms.items())),
         doubts=doubts,
+        unseen=(),
         reasons=reasons,
     )

@@ -49,12 +49,12 @@ def refine_cameras(
         between: rules for interpolating between logged poses.
 
     Returns:
-        The cameras, with the errors that remain; the entry of each in metrics.json; a line for each camera
-        that keeps its logged poses.
+        The cameras, with the errors that remain. The entry of each in metrics.json. A warning for each camera
+        that keeps its logged poses, or whose log may be frozen.
     """
     refined: list[Camera] = []
     entries: dict[str, Any] = {}
-    refusals: list[str] = []
+    warnings: list[str] = []
     for camera, stated in zip(cameras, errors, strict=True):
         seen = followed[camera.name]
         if isinstance(seen, str):
@@ -65,10 +65,15 @@ def refine_cameras(
             found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), PosePrior.of(stated))
             refined.append(_with_poses(camera, t_ns, found))
             entries[camera.name] = _entry(found)
+            if found.frozen:
+                warnings.append(
+                    f"{camera.name}: its logged position never changes, but its pictures do not show a camera"
+                    " that stands: is the log frozen?"
+                )
         if entries[camera.name]["reason"] is not None:
             reason = entries[camera.name]["reason"]
-            refusals.append(f"{camera.name}: its logged poses stay, because {reason}")
-    return refined, entries, refusals
+            warnings.append(f"{camera.name}: its logged poses stay, because {reason}")
+    return refined, entries, warnings
 
 
 def clocks_of_backgrounds(

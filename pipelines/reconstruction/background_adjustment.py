@@ -93,7 +93,8 @@ _LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; be
 _LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
 _FEWEST_STANDING = 8  # pictures
 _SIGMAS_STANDING = 2.0  # of all errors: the log of a camera that stands moves by less
-_NEVER_MOVES_M = 1e-6  # the log of a camera whose position was surveyed, not measured in flight
+_NEVER_MOVES_M = 1e-6  # the log of a camera that was surveyed, if its pictures fit that
+_STANDS_PX = 0.15  # median residual of a camera that only turns; virtual gimbals have 0.06 to 0.08
 _STANDS = 0.03  # px^2 of misfit that a free path may save: noise, not parallax
 _SLOW_LAG_S = 1.0  # over which slow errors of a camera that stands are read off its log
 _CLOCK_PICTURES = 600  # in which the clock is looked for
@@ -181,6 +182,8 @@ class Adjusted:
     points: int  # that were used
     reprojection_px: float  # median; NaN where refused
     refused: str | None  # reason why the logged poses stay, in one line
+    stands: bool = False  # pictures fit a camera that only turns
+    frozen: bool = False  # its logged position never changes, and pictures do not fit that
 
 
 @dataclass(frozen=True)
@@ -219,9 +222,18 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
         Adjusted poses, in stretches of some hundred pictures that overlap. If one stretch is refused, all
         logged poses stay and `refused` gives the reason. Pictures without a pose stay without one.
     """
+    posed = position[np.isfinite(position[:, 0])]
+    if not prior.estimated or not len(posed) or np.ptp(posed, axis=0).max() >= _NEVER_MOVES_M:
+        return _adjust(seen, position, rotation, prior)
+    surveyed = replace(prior, constant=(SURVEYED_M, prior.constant[1], 0.0))  # nor has it a lever arm
+    found = _adjust(seen, position, rotation, surveyed)
+    if found.stands and found.reprojection_px < _STANDS_PX:
+        return found
+    return replace(_adjust(seen, position, rotation, prior), frozen=True)
+
+
+def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
     posed = np.flatnonzero(np.isfinite(position[:, 0]))
-    if prior.estimated and len(posed) and np.ptp(position[posed], axis=0).max() < _NEVER_MOVES_M:
-        prior = replace(prior, constant=(SURVEYED_M, prior.constant[1], 0.0))  # nor has it a lever arm
 
     def refused(reason: str) -> Adjusted:
         stays = prior.covariance(len(position))
@@ -280,6 +292,7 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
         points,
         pixels,
         None,
+        all(found.stands for found in results),
     )
 
 
@@ -420,6 +433,7 @@ class _Solved:
     missed: Float  # [K] residuals, px
     prior: PosePrior
     clock: tuple[float, float] | None  # its offset and standard deviation (s), if it was unknown
+    stands: bool = False
 
 
 @dataclass(frozen=True)
@@ -536,7 +550,7 @@ class _Stretch:
         rng = np.random.default_rng(0)
         draws[..., :3] += np.sqrt(variance) * rng.standard_normal((len(draws), 1, 3))
         levels = _with_position_levels(found.prior, prior.white[0], prior.slow[0])
-        return _Solved(errors, covariance, draws, found.missed, levels, found.clock)
+        return _Solved(errors, covariance, draws, found.missed, levels, found.clock, stands=True)
 
     def _times_s(self) -> Float:
         """Return the times of the pictures [T], from the knots about them."""

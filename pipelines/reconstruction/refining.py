@@ -295,6 +295,7 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
         flight.prior,
         flight.clock_sigma_s,
         guides=np.tile(flight.guides, people),
+        placing=rigid_pairs(flight.observations.joints, people, trunk=False),
         contested=not flight.measured,
         threads=flight.threads,
     )
@@ -428,13 +429,26 @@ def white_covariance(camera: Camera, prior: PoseErrors) -> Float | None:
     return None if logged is None else WHITE_SHARE * logged
 
 
-def rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
-    """List pairs of joints [B, 2] with a nearly constant distance: bones, and the points of the head."""
+def rigid_pairs(joints: tuple[str, ...], people: int, *, trunk: bool = True) -> Int64:
+    """List pairs of joints [B, 2] with a nearly constant distance: bones, and the points of the head.
+
+    Args:
+        joints: names of one person's joints.
+        people: number of people; the joints of each follow those of the one before.
+        trunk: False to leave out the pairs of the trunk. Shoulders come nearer to the hips where a person
+            bends, and constant lengths then move the hips.
+    """
     number = {name: index for index, name in enumerate(joints)}
     head = [number[name] for name in _HEAD if name in number]
-    pairs = {(number[a], number[b]) for a, b in bones_of(joints)} | {(i, j) for i in head for j in head}
+    bones = [pair for pair in bones_of(joints) if trunk or not _is_of_trunk(*pair)]
+    pairs = {(number[a], number[b]) for a, b in bones} | {(i, j) for i in head for j in head}
     own = np.array(sorted({(min(p), max(p)) for p in pairs if p[0] != p[1]}), dtype=np.int64).reshape(-1, 2)
     return np.concatenate([own + person * len(joints) for person in range(people)])
+
+
+def _is_of_trunk(one: str, other: str) -> bool:
+    ends = {name.removeprefix("left_").removeprefix("right_") for name in (one, other)}
+    return "hip" in ends and not ends.isdisjoint(("neck", "shoulder"))
 
 
 def _numbers_at(correction: tuple[Float, Float], t_s: Float) -> Float:

@@ -206,18 +206,28 @@ def test_a_camera_that_stands_is_where_its_log_has_it_on_average(known: bool) ->
     assert sigma < 0.02 if known else sigma > UNKNOWN_SIGMA[0]  # a constant error is always possible
 
 
-@pytest.mark.parametrize("measured_m", [0.0, 1e-3])
-def test_a_position_that_never_changes_was_surveyed(measured_m: float) -> None:
-    """Nobody states the noise. A log that moves by a millimetre was measured, and may be off by much more."""
+@pytest.mark.parametrize(
+    ("measured_m", "moves_m", "surveyed"), [(0, 0, True), (1e-3, 0, False), (0, 0.3, False)]
+)
+def test_a_position_that_never_changes_was_surveyed_unless_pictures_show_that_it_moves(
+    measured_m: float, moves_m: float, surveyed: bool
+) -> None:
+    """Nobody states the noise.
+
+    A log that moves by a millimetre was measured, and may be off by much more. One that says the same
+    while the camera sways by 0.3 m, some 20 px against the nearest points, is frozen.
+    """
     rng = np.random.default_rng(5)
     position, rotation = turning(60)
-    picture, point, xy = sighted(position, rotation, rng, noise_px=0.1)
+    swaying = position + moves_m * np.sin(np.linspace(0, np.pi, 60))[:, None]
+    picture, point, xy = sighted(swaying, rotation, rng, noise_px=0.1)
     at, turned = logged(position, rotation, rng)
     at = position + rng.normal(0, 1, position.shape) * measured_m
     found = adjusted(picture, point, xy, (at, turned), PosePrior.of(None))
     assert found.left is not None
+    assert found.frozen == (moves_m > 0)
     (sigma,) = [of.sigma0 for of in found.left.processes if of.number == SHIFT_IN_WORLD and of.constant]
-    assert sigma > UNKNOWN_SIGMA[0] if measured_m else SURVEYED_M <= sigma < 1.1 * SURVEYED_M
+    assert SURVEYED_M <= sigma < 1.1 * SURVEYED_M if surveyed else sigma >= UNKNOWN_SIGMA[0]
 
 
 def _of_constants(prior: PosePrior, turn: Float, variance: float) -> PosePrior:

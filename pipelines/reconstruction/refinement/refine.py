@@ -55,6 +55,7 @@ _FEWEST_TIMES = 20
 _LOOSE_MOTION = 3.0  # times the accelerations of the prior, for the estimate of clocks and slow pose errors
 _ANYWHERE_M = 100.0  # standard deviation of a joint that no picture shows
 _FAST_MOTION = 2.0  # times the accelerations of the prior, for joints beside correlated keypoint errors
+_OUTLIER = 1.5  # stated standard deviations: a correlated keypoint that is nearer is no outlier
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
@@ -128,6 +129,7 @@ def refine(
     clock_sigma_s: Float,
     *,
     guides: Bool | None = None,
+    placing: Int64 | None = None,
     contested: bool = True,
     threads: int = 1,
 ) -> Refined:
@@ -141,6 +143,7 @@ def refine(
         prior: prior of each camera's pose errors; None without stated noise.
         clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
         guides: [J] joints whose keypoints determine the cameras where keypoint errors last; None for all.
+        placing: [B', 2] the pairs among `bones` that place the joints afterwards; None for all.
         contested: False if the prior was measured, and no other level of pose errors competes with it.
         threads: at most two are used, one for each half of the flight; the result does not depend on it.
     """
@@ -151,6 +154,7 @@ def refine(
         t_s,
         tuple(_of_joints(sighting, part) for sighting in sightings),
         _renumbered(bones, part),
+        _renumbered(bones if placing is None else placing, part),
         _without_gaps(t_s, start[:, part]),
         np.ones(int(part.sum()), dtype=np.bool_),
         threads,
@@ -192,6 +196,7 @@ class _Views:
     t_s: Float  # [T]
     sightings: tuple[Sighting, ...]
     bones: Int64  # [B, 2] of the joints that are taken
+    placing: Int64  # [B', 2] of all joints, that place them after the guides
     start: Float  # [T, J, 3] m, without gaps
     taken: Bool  # [J]
     threads: int
@@ -292,7 +297,7 @@ def _refined(views: _Views, whole: _Views, guiding: Bool, prior: _Prior, *, meas
         clock_offset_s=clock_s,
         clock_sigma_s=clock_left_s,
         levels=_levels(replace(of_all, poses=known.poses)),
-        bone_lengths_m=state.shared[len(state.shared) - len(whole.bones) :],
+        bone_lengths_m=state.shared[len(state.shared) - len(of_all.bone_sigma_m) :],
         acceleration=of_all.acceleration,
         learned=prior.learned,
         warnings=(
@@ -364,7 +369,8 @@ def _with_all_joints(
     moved = np.mean(state.position - whole.start[:, guiding], axis=1, keepdims=True)
     begin = whole.start + moved
     begin[:, guiding] = state.position
-    views = replace(whole.corrected_by(_corrections(system, slow, np.zeros(3))), start=begin)
+    views = whole.corrected_by(_corrections(system, slow, np.zeros(3)))
+    views = replace(views, start=begin, bones=whole.placing)
     stretches, start = views.stretches()
     unlearned = _unlearned(stretches, start, _white_only(system.problem, known), known.clock_sigma_s)
     first = initial_state(stretches, unlearned, start)
@@ -396,11 +402,14 @@ def _joints_without_slow_errors(problem: Problem, start: Float, known: Knowledge
     Returns the estimate, and a system of the same poses in which correlated keypoints count less again.
     """
     known = replace(known, poses=_white_only(problem, known))
-    # Beside correlated keypoints the motion is learned only at first, and kicks would be smoothed.
-    freely = _FAST_MOTION**2 if known.memory > REMEMBERED else 1.0
+    freely, bound = 1.0, BOUND
+    if known.memory > REMEMBERED:
+        # Their motion is learned only at first, and kicks would be smoothed. Residuals show only a part of
+        # lasting errors: by that part, one of two views that disagree is an outlier, by chance either one.
+        freely, bound = _FAST_MOTION**2, max(BOUND, _OUTLIER / known.pixel_scale)
     weighted = replace(known, memory=1.0, acceleration=freely * known.acceleration)
     initial = initial_state(problem, weighted, start)
-    solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
+    solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(bound,))
     return System(problem, known, solved.layout, BOUND**2), found
 
 
