@@ -4,7 +4,7 @@ The kernels have no threads and no fastmath: the same numbers give the same byte
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -23,6 +23,7 @@ DIAGONAL = math.sqrt(3.0)
 ROUNDING = 1e-4  # margin of such bounds for single precision
 BRICK = 4  # voxels along the side of one of `Sight.bricks`
 _LONGEST_LEAP = 127  # seven bits
+_SLAB_VOXELS = 1_000_000  # whose distances are computed at once
 
 
 NO_ZONES: Float = np.zeros((0, 7))
@@ -349,8 +350,6 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
     Returns:
         The field; where a map has no obstacle at all, 1 km everywhere.
     """
-    from scipy.ndimage import distance_transform_edt
-
     with np.errstate(invalid="ignore"):
         occupied = occupancy.probability >= OCCUPIED
     if unknown == "occupied":
@@ -361,11 +360,11 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
     elif occupied.all():
         distance = np.full(occupied.shape, -_NOWHERE_M, dtype=np.float32)
     else:
-        free_m = distance_transform_edt(~occupied, sampling=occupancy.resolution_m)
-        distance = (free_m - half).astype(np.float32)
-        del free_m  # the largest arrays of the program: not two at a time
-        inside_m = distance_transform_edt(occupied, sampling=occupancy.resolution_m)
-        np.copyto(distance, (half - inside_m).astype(np.float32), where=occupied)
+        distance = np.empty(occupied.shape, dtype=np.float32)
+        for part, inside_m in _distances(occupied, occupancy.resolution_m):
+            distance[part] = half - inside_m
+        for part, outside_m in _distances(~occupied, occupancy.resolution_m):
+            np.copyto(distance[part], (outside_m - half).astype(np.float32), where=~occupied[part])
     # Interpolation needs two centres along each axis; beyond the border the field is constant anyway.
     for axis in range(3):
         if distance.shape[axis] == 1:
@@ -373,6 +372,26 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
     distance = np.ascontiguousarray(distance)
     origin = np.array(occupancy.origin, dtype=np.float64)
     return DistanceField(Grid(distance, origin, float(occupancy.resolution_m)), occupancy.from_ns)
+
+
+def _distances(inside: NDArray[np.bool_], resolution_m: float) -> Iterator[tuple[slice, Float]]:
+    """Yield the exact distances (m) [., Y, Z] to the nearest voxel outside, a slab [X, Y, Z] at a time.
+
+    `scipy.ndimage.distance_transform_edt` holds four arrays of 64-bit numbers for every voxel at once.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    nearest_voxel = distance_transform_edt(
+        inside, sampling=resolution_m, return_distances=False, return_indices=True
+    )
+    thick = max(1, _SLAB_VOXELS // max(1, inside[0].size))
+    for first in range(0, len(inside), thick):
+        part = slice(first, first + thick)
+        squared = np.zeros(nearest_voxel[0, part].shape)
+        for axis, own in enumerate(np.ogrid[tuple(slice(size) for size in inside.shape)]):
+            steps = nearest_voxel[axis, part] - (own[part] if axis == 0 else own)
+            squared += (steps * resolution_m) ** 2
+        yield part, np.sqrt(squared)
 
 
 def open_space() -> DistanceField:

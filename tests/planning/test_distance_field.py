@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from pipelines.planning.config import Zone
@@ -54,6 +55,15 @@ def test_a_sphere_is_within_a_voxel() -> None:
     points = np.random.default_rng(1).uniform(-2.8, 2.8, (500, 3))
     distance, _ = field.sample(points)
     assert np.abs(distance - (np.linalg.norm(points, axis=1) - 1.5)).max() < RES * np.sqrt(3)
+
+
+def test_slabs_give_the_distances_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    occupied = np.random.default_rng(3).random((13, 7, 9)) < 0.05
+    monkeypatch.setattr("pipelines.planning.distance_field._SLAB_VOXELS", 130)
+    field = distance_field(Occupancy(occupied.astype(np.float32), np.zeros(3), RES))
+    free_m, inside_m = (distance_transform_edt(side, sampling=RES) for side in (~occupied, occupied))
+    expected = np.where(occupied, RES / 2 - inside_m, free_m - RES / 2).astype(np.float32)
+    assert np.array_equal(field.grid.distance_m, expected)
 
 
 def test_gradient_is_the_derivative_of_the_interpolated_value() -> None:
