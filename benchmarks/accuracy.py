@@ -481,7 +481,7 @@ def _quality_row(
 def criteria(
     chosen: Sequence[Flight], method: str, detector: str, given: Given, found: Mapping[Case, Outcome]
 ) -> list[str]:
-    """Test what was asked of the default method, for each half by itself."""
+    """Test what was asked of the default method, and of `robust`'s covariances, for each half by itself."""
     lines = []
     for half in HALVES:
         own = [f for f in chosen if f.half == half and f.name != SAMPLE.name]

@@ -44,7 +44,7 @@ from pipelines.simulation.study.sightings import (
 )
 from pipelines.simulation.world.scene import build_world
 
-_REVISION = 4
+_REVISION = 5
 _PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
 _HINT_SIGMA_M = 0.1  # of the detector's hint of the person's position: the camera looks exactly there
 

@@ -55,7 +55,7 @@ class Association:
     ]  # [C] detections by the causes of `NoPeople`, which are not used; and those kept
     phantoms: dict[str, int]  # bodies that two cameras see and that are left out, by `why_no_person`
     doubts: tuple[str, ...]  # [P] why each of the people may be nobody, by `why_no_body`; "" without a doubt
-    unseen: tuple[int, ...]  # those of several logged people near whose logs nobody is seen
+    unseen: tuple[int, ...]  # of several logged people, those near whose logs nobody is seen
     reasons: tuple[str, ...]  # messages for the user, one line each
 
 
@@ -183,14 +183,14 @@ def _near_logs(
     """Give each log [T, 3] its standard deviation: `usual_m`, or `most_m` where no track is near by that.
 
     Returns:
-        The logs with their standard deviations, none if no track is near any of them. Of several logs, those
-        that no track is near. Messages.
+        The logs that are used, with their standard deviations: all, or none if there are tracks and none of
+        them is near any log. The numbers of those of several logs that no track is near. Messages.
     """
     logs = [(log, usual_m if _is_near(tracks, log, usual_m) else most_m) for log in logged]
     unseen = tuple(k for k, (log, sigma_m) in enumerate(logs) if not _is_near(tracks, log, sigma_m))
     if tracks and len(unseen) == len(logs):
         return [], (), [_far_from_log(tracks, log) for log in logged]
-    return logs, unseen if len(logs) > 1 else (), []
+    return logs, (unseen if len(logs) > 1 else ()), []
 
 
 def _is_near(tracks: list[_Track], log: Float, sigma_m: float) -> bool:

@@ -93,8 +93,8 @@ _LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; be
 _LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
 _FEWEST_STANDING = 8  # pictures
 _SIGMAS_STANDING = 2.0  # of all errors: the log of a camera that stands moves by less
-_NEVER_MOVES_M = 1e-6  # the log of a camera that was surveyed, if its pictures fit that
-_STANDS_PX = 0.15  # median residual of a camera that only turns; virtual gimbals have 0.06 to 0.08
+_NEVER_MOVES_M = 1e-6  # a log that changes by less is that of a surveyed position, or frozen
+_STANDS_PX = 0.3  # largest median residual of a camera that only turns: twice what is seen of points
 _STANDS = 0.03  # px^2 of misfit that a free path may save: noise, not parallax
 _SLOW_LAG_S = 1.0  # over which slow errors of a camera that stands are read off its log
 _CLOCK_PICTURES = 600  # in which the clock is looked for
@@ -182,8 +182,8 @@ class Adjusted:
     points: int  # that were used
     reprojection_px: float  # median; NaN where refused
     refused: str | None  # reason why the logged poses stay, in one line
-    stands: bool = False  # pictures fit a camera that only turns
-    frozen: bool = False  # its logged position never changes, and pictures do not fit that
+    stands: bool = False  # a camera that only turns explains its pictures as well as a free path
+    frozen: bool = False  # its logged position never changes, and its pictures do not fit that
 
 
 @dataclass(frozen=True)
@@ -221,15 +221,18 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
     Returns:
         Adjusted poses, in stretches of some hundred pictures that overlap. If one stretch is refused, all
         logged poses stay and `refused` gives the reason. Pictures without a pose stay without one.
+
+    Where nobody stated the noise, a position that never changes was surveyed, to `SURVEYED_M`, if pictures
+    fit a camera that only turns. Otherwise the log may be `frozen`.
     """
     posed = position[np.isfinite(position[:, 0])]
     if not prior.estimated or not len(posed) or np.ptp(posed, axis=0).max() >= _NEVER_MOVES_M:
         return _adjust(seen, position, rotation, prior)
     surveyed = replace(prior, constant=(SURVEYED_M, prior.constant[1], 0.0))  # nor has it a lever arm
     found = _adjust(seen, position, rotation, surveyed)
-    if found.stands and found.reprojection_px < _STANDS_PX:
+    if found.refused is None and found.stands and found.reprojection_px < _STANDS_PX:
         return found
-    return replace(_adjust(seen, position, rotation, prior), frozen=True)
+    return replace(_adjust(seen, position, rotation, prior), frozen=found.refused is None)
 
 
 def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:

@@ -214,12 +214,13 @@ def test_a_position_that_never_changes_was_surveyed_unless_pictures_show_that_it
 ) -> None:
     """Nobody states the noise.
 
-    A log that moves by a millimetre was measured, and may be off by much more. One that says the same
-    while the camera sways by 0.3 m, some 20 px against the nearest points, is frozen.
+    A log that moves by a millimetre was measured, and may be off by much more. One that stays while the
+    camera climbs by 0.3 m and comes back is frozen: points at 10 m move by 0.3 / 10 x 760 = 23 px more than
+    far ones.
     """
     rng = np.random.default_rng(5)
     position, rotation = turning(60)
-    swaying = position + moves_m * np.sin(np.linspace(0, np.pi, 60))[:, None]
+    swaying = position + moves_m * np.sin(np.linspace(0, np.pi, 60))[:, None] * [0.0, 0.0, 1.0]
     picture, point, xy = sighted(swaying, rotation, rng, noise_px=0.1)
     at, turned = logged(position, rotation, rng)
     at = position + rng.normal(0, 1, position.shape) * measured_m

@@ -113,7 +113,7 @@ class Refined:
     clock_offset_s: Float  # [C] to add to the pictures' times
     clock_sigma_s: Float  # [C] its posterior standard deviation, 0 for known clocks
     levels: dict[str, float]
-    bone_lengths_m: Float  # [B'] of the bones with two refined joints
+    bone_lengths_m: Float  # [B'] of the bones with two refined joints that took part in the last estimate
     acceleration: Float  # [P, P] (m/s^2)^2, estimated covariance of the P refined joints' accelerations
     learned: bool  # the levels of the pose errors were estimated from the pictures
     warnings: tuple[str, ...]
@@ -143,7 +143,8 @@ def refine(
         prior: prior of each camera's pose errors; None without stated noise.
         clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
         guides: [J] joints whose keypoints determine the cameras where keypoint errors last; None for all.
-        placing: [B', 2] the pairs among `bones` that place the joints afterwards; None for all.
+        placing: [B', 2] the pairs among `bones` for the estimate of all joints, after `guides` determined the
+            cameras; None for all.
         contested: False if the prior was measured, and no other level of pose errors competes with it.
         threads: at most two are used, one for each half of the flight; the result does not depend on it.
     """
@@ -196,7 +197,7 @@ class _Views:
     t_s: Float  # [T]
     sightings: tuple[Sighting, ...]
     bones: Int64  # [B, 2] of the joints that are taken
-    placing: Int64  # [B', 2] of all joints, that place them after the guides
+    placing: Int64  # [B', 2] for the estimate of all joints, after guides determined the cameras
     start: Float  # [T, J, 3] m, without gaps
     taken: Bool  # [J]
     threads: int
@@ -405,7 +406,7 @@ def _joints_without_slow_errors(problem: Problem, start: Float, known: Knowledge
     freely, bound = 1.0, BOUND
     if known.memory > REMEMBERED:
         # Their motion is learned only at first, and kicks would be smoothed. Residuals show only a part of
-        # lasting errors: by that part, one of two views that disagree is an outlier, by chance either one.
+        # correlated errors. A gate by that part would reject one of two disagreeing views, by chance.
         freely, bound = _FAST_MOTION**2, max(BOUND, _OUTLIER / known.pixel_scale)
     weighted = replace(known, memory=1.0, acceleration=freely * known.acceleration)
     initial = initial_state(problem, weighted, start)
