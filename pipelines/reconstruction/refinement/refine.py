@@ -143,8 +143,8 @@ def refine(
         prior: prior of each camera's pose errors; None without stated noise.
         clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
         guides: [J] joints whose keypoints determine the cameras where keypoint errors last; None for all.
-        placing: [B', 2] the pairs among `bones` for the estimate of all joints, after `guides` determined the
-            cameras; None for all.
+        placing: [B', 2] the pairs among `bones` for the estimate of all joints, after `guides` determined
+            cameras whose pose errors were measured; None for all.
         contested: False if the prior was measured, and no other level of pose errors competes with it.
         threads: at most two are used, one for each half of the flight; the result does not depend on it.
     """
@@ -276,8 +276,9 @@ def _refined(views: _Views, whole: _Views, guiding: Bool, prior: _Prior, *, meas
         still = _without_slow_errors(system, state)
         begin = state.position
         if views is not whole:
-            still, begin, of_all = _with_all_joints(whole, guiding, system, state, freely)
-        remembering, placed = _joints_without_slow_errors(still, begin, of_all)
+            placing = whole.placing if measured else whole.bones
+            still, begin, of_all = _with_all_joints(whole, guiding, placing, system, state, freely)
+        remembering, placed = _joints_without_slow_errors(still, begin, of_all, measured=measured)
         joints = placed.position
         covariance = _with_own(covariance, remembering, placed, guiding, measured=measured)
         state = placed
@@ -360,30 +361,34 @@ def _without_slow_errors(system: System, state: State) -> Problem:
 
 
 def _with_all_joints(
-    whole: _Views, guiding: Bool, system: System, state: State, known: Knowledge
+    whole: _Views, guiding: Bool, placing: Int64, system: System, state: State, known: Knowledge
 ) -> tuple[Problem, Float, Knowledge]:
     """Learn the motion, bones and keypoint errors of all joints with the poses that guides determined.
 
-    Returns the problem of all joints in which slow pose errors are removed, its start and its prior.
+    Returns the problem of all joints, with the bones that are `placing` and without slow pose errors, its
+    start and its prior.
     """
     slow = state._replace(white=np.zeros_like(state.white))
     moved = np.mean(state.position - whole.start[:, guiding], axis=1, keepdims=True)
     begin = whole.start + moved
     begin[:, guiding] = state.position
-    views = whole.corrected_by(_corrections(system, slow, np.zeros(3)))
-    views = replace(views, start=begin, bones=whole.placing)
+    views = replace(whole.corrected_by(_corrections(system, slow, np.zeros(3))), start=begin)
     stretches, start = views.stretches()
     unlearned = _unlearned(stretches, start, _white_only(system.problem, known), known.clock_sigma_s)
     first = initial_state(stretches, unlearned, start)
     learned, first = learn(stretches, unlearned, first, poses=False, memory=True, rounds=_ROUNDS_IN_CORRECTED)
     acceleration = shrunk(learned.acceleration, stretches.t_s, first.position)
+    lengths_m = first.shared[len(first.shared) - len(views.bones) :]
+    place = (views.bones[:, None] == placing).all(axis=2).any(axis=1)
     of_all = replace(
         learned,
         poses=known.poses,
         acceleration=limber(acceleration, _spread_of(len(known.poses))),
+        bone_sigma_m=learned.bone_sigma_m[place],
+        size_m=float(lengths_m[place].mean()),
         memory=max(learned.memory, known.memory),
     )
-    return views.problem(), begin, of_all
+    return replace(views, bones=views.bones[place]).problem(), begin, of_all
 
 
 def _white_only(problem: Problem, known: Knowledge) -> tuple[PoseErrors, ...]:
@@ -393,7 +398,9 @@ def _white_only(problem: Problem, known: Knowledge) -> tuple[PoseErrors, ...]:
     return tuple(PoseErrors((float(w[0]), float(w[1])), (), errors.logged) for errors, w in levels)
 
 
-def _joints_without_slow_errors(problem: Problem, start: Float, known: Knowledge) -> tuple[System, State]:
+def _joints_without_slow_errors(
+    problem: Problem, start: Float, known: Knowledge, *, measured: bool = False
+) -> tuple[System, State]:
     """Estimate the joints after the removal of slow pose errors, with the full weight of keypoints.
 
     Slow errors were estimated with correlated keypoints weighted less, or with a looser motion prior. That is
@@ -405,9 +412,11 @@ def _joints_without_slow_errors(problem: Problem, start: Float, known: Knowledge
     known = replace(known, poses=_white_only(problem, known))
     freely, bound = 1.0, BOUND
     if known.memory > REMEMBERED:
-        # Their motion is learned only at first, and kicks would be smoothed. Residuals show only a part of
-        # correlated errors. A gate by that part would reject one of two disagreeing views, by chance.
-        freely, bound = _FAST_MOTION**2, max(BOUND, _OUTLIER / known.pixel_scale)
+        freely = _FAST_MOTION**2  # their motion is learned only at first, and kicks would be smoothed
+        if measured:
+            # Residuals show only a part of correlated errors. A gate by that part would reject one of two
+            # disagreeing views, by chance.
+            bound = max(BOUND, _OUTLIER / known.pixel_scale)
     weighted = replace(known, memory=1.0, acceleration=freely * known.acceleration)
     initial = initial_state(problem, weighted, start)
     solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(bound,))
