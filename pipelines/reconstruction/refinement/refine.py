@@ -380,6 +380,7 @@ def _with_all_joints(
     acceleration = shrunk(learned.acceleration, stretches.t_s, first.position)
     lengths_m = first.shared[len(first.shared) - len(views.bones) :]
     place = (views.bones[:, None] == placing).all(axis=2).any(axis=1)
+    place |= not place.any()  # of some joints, no other pairs are left
     of_all = replace(
         learned,
         poses=known.poses,
