@@ -165,6 +165,7 @@ def large_map() -> list[tuple[str, float, float]]:
 
 def _field_of_hills() -> tuple[float, float]:
     """Return the processor time (s) of the field, and the peak memory of the process (GB)."""
+    assert mound().sight  # loads what is compiled
     x, y, z = np.ogrid[: MAP[0], : MAP[1], : MAP[2]]
     hills = z < 20 + 12 * np.sin(x / 40) * np.cos(y / 55)
     occupancy = Occupancy(np.where(hills, np.float32(0.9), np.float32(0.1)), np.zeros(3), 0.2)
