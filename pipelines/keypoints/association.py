@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -158,8 +158,7 @@ def associate(
     resumed = np.array([max(0, len(chain.taken) - 1) for chain in chains], np.int64)
     if not np.any(chosen >= 0):
         reasons.append(_nobody(seen.nearest))
-    counted = _counted(chosen, seen, resumed, dropped, refused, doubts, tuple(reasons))
-    return replace(counted, unseen=unseen)
+    return _counted(chosen, seen, resumed, dropped, refused, doubts, unseen, tuple(reasons))
 
 
 def _noise_of_logs_m(seen: Followed, logs: Float, most_m: float) -> float:
@@ -407,6 +406,7 @@ def _counted(
     dropped: dict[str, Int64],
     phantoms: Mapping[str, int],
     doubts: tuple[str, ...],
+    unseen: tuple[int, ...],
     reasons: tuple[str, ...],
 ) -> Association:
     """Build the result: the choice with its counts."""
@@ -434,6 +434,6 @@ def _counted(
         no_people=dropped,
         phantoms=dict(sorted(phantoms.items())),
         doubts=doubts,
-        unseen=(),
+        unseen=unseen,
         reasons=reasons,
     )

@@ -305,7 +305,7 @@ def _acceleration(before: Float, found: Moments, bodies: Float) -> Float:
 
 
 def _bodies(problem: Problem) -> Float:
-    """Mark the joints of each body, or of each part whose joints bones connect: [J, P], 1 for its joints."""
+    """Mark the joints of each body, the joints that bones connect: [J, P], 1 for its joints."""
     joints = problem.joints
     ends = problem.bones
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(joints, joints))
