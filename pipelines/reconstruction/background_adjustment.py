@@ -180,7 +180,7 @@ class Adjusted:
     left: PoseErrors | None  # errors that remain; None where refused
     prior: PosePrior  # with levels as estimated
     points: int  # that were used
-    reprojection_px: float  # median; NaN where refused
+    reprojection_px: float  # median; NaN where there is no solution
     refused: str | None  # reason why the logged poses stay, in one line
     stands: bool = False  # a camera that only turns explains its pictures as well as a free path
     frozen: bool = False  # its logged position never changes, and its pictures do not fit that
@@ -232,15 +232,15 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
     found = _adjust(seen, position, rotation, surveyed)
     if found.refused is None and found.stands and found.reprojection_px < _STANDS_PX:
         return found
-    return replace(_adjust(seen, position, rotation, prior), frozen=found.refused is None)
+    return replace(_adjust(seen, position, rotation, prior), frozen=bool(np.isfinite(found.reprojection_px)))
 
 
 def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
     posed = np.flatnonzero(np.isfinite(position[:, 0]))
 
-    def refused(reason: str) -> Adjusted:
+    def refused(reason: str, reprojection_px: float = np.nan) -> Adjusted:
         stays = prior.covariance(len(position))
-        return Adjusted(position, rotation, stays, None, prior, 0, np.nan, reason)
+        return Adjusted(position, rotation, stays, None, prior, 0, reprojection_px, reason)
 
     if not len(posed):
         return refused("none of its pictures has a pose")
@@ -270,11 +270,11 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
     covariance[posed[:, None], range(3), range(3)] += prior.constant[0] ** 2
     pixels = float(np.median(np.concatenate([found.missed for found in results])))
     if pixels > _WORST_PX:
-        return refused(f"the background moves by {pixels:.1f} px against itself")
+        return refused(f"the background moves by {pixels:.1f} px against itself", pixels)
     level = np.repeat(prior.level, 3)
     surprise = max(float((np.sqrt(np.mean(found.errors**2, axis=0)) / level).max()) for found in results)
     if surprise > _SIGMAS:
-        return refused(f"its poses would be {surprise:.0f} standard deviations from the log")
+        return refused(f"its poses would be {surprise:.0f} standard deviations from the log", pixels)
     priors = [found.prior for found in results]
     slow = _rms_slow(priors) if prior.estimated else prior.slow
     return Adjusted(
