@@ -20,8 +20,9 @@ Per flight and method, means over the draws (times: medians):
 - NEES (3 is right), and the share of joint-frames within their 95 % ellipsoids;
 - processor seconds of the call on the first draw, detection and following excluded; fallbacks.
 
-To save time, methods share the clocks that the first of them found by keypoints, and mistakes are searched
-for in the call alone whose time is taken: errors do not depend on either. Two processes, each flight in one.
+To save time, methods share the clocks that the first of them found by keypoints, and so do all draws of the
+shared error with the true poses, whose cameras stand alike to each other. Mistakes are searched for in the
+call alone whose time is taken: errors do not depend on it. Two processes, each flight in one.
 
 Results are kept in build/accuracy by the hash of the code and of the flight's files, so an interrupted run
 goes on, and a changed program measures anew. `--write` writes docs/results.md.
@@ -230,10 +231,12 @@ def _outcomes_of(code: str, shared: Path, groups: Sequence[Sequence[Case]]) -> d
     place = WORK / f"{code}-{_files_hash(flight, first.detector)}"
     place.mkdir(parents=True, exist_ok=True)
     drawn = DrawnFlight(flight, shared / flight.name)
+    of_true_poses: dict[bytes, FoundClocks] = {}
     paths = {case: place / f"{_name_of(case)}.json" for group in groups for case in group}
     for group in groups:
         missing = [case for case in group if not paths[case].is_file()]
-        for case, outcome in measure_draw(drawn, missing) if missing else ():
+        clocks = of_true_poses if group[0].method in _POSES else {}
+        for case, outcome in measure_draw(drawn, missing, clocks) if missing else ():
             partial_path = paths[case].with_suffix(f".{os.getpid()}")
             partial_path.write_text(json.dumps(asdict(outcome)), encoding="utf-8")
             partial_path.replace(paths[case])
@@ -252,11 +255,15 @@ def _files_hash(flight: Flight, detector: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def measure_draw(drawn: DrawnFlight, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
-    """Make the session of one draw, reconstruct it by each method, and compare with the truth."""
+def measure_draw(
+    drawn: DrawnFlight, cases: Sequence[Case], clocks: dict[bytes, FoundClocks]
+) -> Iterator[tuple[Case, Outcome]]:
+    """Make the session of one draw, reconstruct it by each method, and compare with the truth.
+
+    Clocks of keypoints are found once for each state of knowledge, and put into `clocks`.
+    """
     drawn.write_shared()
     flight, first = drawn.flight, cases[0]
-    clocks: dict[bytes, FoundClocks] = {}
 
     def find_once(robust: RobustFlight, stated: Bool) -> FoundClocks:
         unknown = robust.clock_sigma_s.tobytes()  # less of them where backgrounds tell some clocks

@@ -1,4 +1,4 @@
-"""Solvers of joint-frames: their noise, the choice between them, and two ways to weigh inliers again.
+"""Solvers of joint-frames: their noise, the choice between them, and what they add to a triangulation.
 
 - By the full logged 6x6 pose covariances. Triangulation uses one standard deviation for a position and one
   for a rotation; its gates and its choice of views need no more. Logs contain more: satellite positioning
@@ -102,7 +102,8 @@ def solver_for(
     """Choose the solver from views to points; for `refined` and `auto`, the solver of their start.
 
     For calibrated cameras, `robust` has its own loss. For poses with errors, it has a gate that knows the
-    common error of a picture's joints, and weights from logged covariances.
+    common error of a picture's joints, and weights from logged covariances. Where nobody stated the poses'
+    errors, its covariances are wider than residuals alone say.
     """
     if method in ("robust", "auto") and are_calibrated(cameras, observations):
         return partial(triangulate_heavy_tailed, threads=threads)
@@ -114,6 +115,8 @@ def solver_for(
         pixel_sigma=np.full(len(cameras), pixel_sigma),
         threads=threads,
     )
+    if observations.pose_sigma is None:
+        return partial(triangulate_widened, solve=in_pictures)
     if observations.pose_covariance is None:
         return in_pictures
     return partial(triangulate_weighted, solve=in_pictures, pose_covariance=observations.pose_covariance)
@@ -146,6 +149,20 @@ def noise_text(views: Views) -> str:
     pixels = float(np.median(views.pixel_sigma))
     rotation_deg = np.degrees(rotation_rad)
     return f"noise taken for poses {position_m:.3g} m and {rotation_deg:.3g} deg, pixels {pixels:.3g}"
+
+
+# --- nothing stated about the poses ---------------------------------------------------------------------
+
+_UNSEEN = 1.3
+"""Covariance over what residuals say of it. A lasting error of a pose is a single draw, and residuals do not
+show how it moves joints along their viewing rays. The mean NEES of the rendered flights for tuning becomes 3
+with it (docs/decisions/0012-auto.md)."""
+
+
+def triangulate_widened(views: Views, *, solve: Callable[[Views], Triangulation]) -> Triangulation:
+    """Triangulate, and widen covariances for lasting pose errors that nobody stated and residuals hide."""
+    found = solve(views)
+    return replace(found, covariance=_UNSEEN * found.covariance)
 
 
 # --- full pose covariances -----------------------------------------------------------------------------

@@ -128,7 +128,7 @@ def test_robust_is_measured_on_a_flight(tmp_path: Path) -> None:
     found = {}
     for method in ("robust", FLOOR):
         drawn = DrawnFlight(flight, tmp_path / "shared")
-        ((case, outcome),) = measure_draw(drawn, [Case(flight.name, method, "blazepose")])
+        ((case, outcome),) = measure_draw(drawn, [Case(flight.name, method, "blazepose")], {})
         found[case.method] = outcome
     robust, floor = found["robust"], found[FLOOR]
     assert robust.error is None

@@ -10,8 +10,8 @@ import pytest
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import ROTATION, errors_of_level
-from pipelines.geometry.triangulation import STATUS, Views, triangulate
-from pipelines.reconstruction.solving import triangulate_weighted
+from pipelines.geometry.triangulation import STATUS, Views, estimate_noise, triangulate
+from pipelines.reconstruction.solving import triangulate_weighted, triangulate_widened
 from tests.geometry.rings import ring, turned, with_pixel_noise
 
 OK = STATUS.index("ok")
@@ -84,6 +84,30 @@ def test_what_a_log_knows_of_its_axes_makes_points_better_and_covariances_true()
     predicted = np.sqrt(np.trace(weighted.covariance[first], axis1=1, axis2=2).mean() / 3)
     assert rms == pytest.approx(predicted, rel=4 / np.sqrt(2 * 2 * len(first)))
     assert rms < 0.9 * rms_before
+
+
+def test_covariances_hold_where_nobody_stated_errors_that_last() -> None:
+    """Draw flights with 0.05 m and 0.3 deg that last, 0.02 m and 0.2 deg that are new: their mean NEES is 3.
+
+    By residuals alone it is 3.7.
+    """
+    frames, flights = 10, 300
+    lasting, new = ([m] * 3 + [np.radians(deg)] * 3 for m, deg in ((0.05, 0.3), (0.02, 0.2)))
+    truth, exact = ring(frames, 3)
+    mean, inside = np.empty(flights), np.empty(flights)
+    for flight in range(flights):
+        rng = np.random.default_rng(flight)
+        error = lasting * rng.standard_normal((1, 3, 6)) + new * rng.standard_normal((frames, 3, 6))
+        position, rotation = exact.position + error[..., :3], turned(exact.rotation, error[..., 3:])
+        views = with_pixel_noise(replace(exact, position=position, rotation=rotation), rng)
+        views = replace(views, pixel_sigma=estimate_noise(views))
+        found = triangulate_widened(views, solve=partial(triangulate, method="robust"))
+        off = (found.points - truth)[found.status == OK]
+        information = np.linalg.inv(found.covariance[found.status == OK])
+        squared = np.einsum("ni,nij,nj->n", off, information, off)
+        mean[flight], inside[flight] = squared.mean(), (squared < 7.815).mean()  # 95 % of chi-square
+    assert mean.mean() == pytest.approx(3, abs=3 * mean.std() / np.sqrt(flights))
+    assert inside.mean() > 0.9
 
 
 def test_a_level_alone_becomes_half_new_and_half_lasting_errors() -> None:
