@@ -251,7 +251,7 @@ def estimate_noise(views: Views, *, threads: int = 1) -> Float:
 
     def explain(seen: Views, method: Method, sigma: Float) -> Float:
         result = triangulate(replace(seen, pixel_sigma=sigma), method=method, threads=threads)
-        return _explaining_sigma(sample, result)
+        return shown_sigma(sample, result, views.pixel_sigma)
 
     table, count = _pair_table(cameras)
     pair = table[cameras, np.arange(len(chosen)) % count[cameras]]
@@ -264,10 +264,16 @@ def estimate_noise(views: Views, *, threads: int = 1) -> Float:
     return sigma
 
 
-def _explaining_sigma(views: Views, result: Triangulation) -> Float:
-    """Compute the pixel noise per axis [C] with which the inliers' residuals have their expected median."""
+def shown_sigma(views: Views, result: Triangulation, least_px: Float) -> Float:
+    """Compute the pixel noise per axis [C] with which the inliers' residuals have their expected median.
+
+    Args:
+        views: the views, with the stated noise.
+        result: their triangulation.
+        least_px: [C] the least that is returned.
+    """
     seen = np.where(result.inlier, views.weight, np.nan)
-    variance = views.pixel_sigma**2 + seen**2 * _pose_variance_px(views, result.points)  # of confidence 1
+    variance = views.pixel_sigma**2 + seen**2 * pose_variance_px(views, result.points)  # of confidence 1
     whitened = np.nansum((seen * result.residual_px) ** 2 / variance, axis=1)
     freedom = 2.0 * result.views - 3.0
     ok = (freedom > 0) & np.isfinite(whitened)  # wrong poses put points into a camera's own plane
@@ -278,11 +284,11 @@ def _explaining_sigma(views: Views, result: Triangulation) -> Float:
     typical = np.array(
         [np.median(of[np.isfinite(of)]) if np.isfinite(of).any() else 0.0 for of in variance.T]
     )
-    sigma: Float = np.sqrt(views.pixel_sigma**2 + max(factor - 1.0, 0.0) * typical)
-    return sigma
+    shown: Float = np.sqrt(np.maximum(views.pixel_sigma**2 + (factor - 1.0) * typical, least_px**2))
+    return shown
 
 
-def _pose_variance_px(views: Views, points: Float) -> Float:
+def pose_variance_px(views: Views, points: Float) -> Float:
     """Compute the variance of every image point [N, C] from pose noise, px^2, near the optical axis."""
     position, rotation = views.position[views.pose_index], views.rotation[views.pose_index]
     depth = np.einsum("nci,nci->nc", rotation[..., 2], points[:, None] - position)

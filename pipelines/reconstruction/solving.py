@@ -29,7 +29,9 @@ from pipelines.geometry.triangulation import (
     Triangulation,
     Views,
     estimate_noise,
+    pose_variance_px,
     reprojection_px,
+    shown_sigma,
     triangulate,
     triangulate_pictures,
 )
@@ -117,9 +119,11 @@ def solver_for(
     )
     if observations.pose_sigma is None:
         return partial(triangulate_widened, solve=in_pictures)
-    if observations.pose_covariance is None:
-        return in_pictures
-    return partial(triangulate_weighted, solve=in_pictures, pose_covariance=observations.pose_covariance)
+    if observations.pose_covariance is not None:
+        in_pictures = partial(
+            triangulate_weighted, solve=in_pictures, pose_covariance=observations.pose_covariance
+        )
+    return partial(triangulate_narrowed, solve=in_pictures)
 
 
 def are_calibrated(cameras: Sequence[Camera], observations: Observations) -> bool:
@@ -163,6 +167,31 @@ def triangulate_widened(views: Views, *, solve: Callable[[Views], Triangulation]
     """Triangulate, and widen covariances for lasting pose errors that nobody stated and residuals hide."""
     found = solve(views)
     return replace(found, covariance=_UNSEEN * found.covariance)
+
+
+# --- poses' errors stated --------------------------------------------------------------------------------
+
+_LEAST_PX = 1.0  # no detector is better
+
+
+def triangulate_narrowed(views: Views, *, solve: Callable[[Views], Triangulation]) -> Triangulation:
+    """Triangulate, and narrow covariances where residuals are smaller than the stated pixel noise.
+
+    Gates and weights need noise that is large enough. The poses' part is left as stated: errors that last are
+    few draws, and small residuals may be luck.
+    """
+    found = solve(views)
+    shown = shown_sigma(views, found, np.full(len(views.pixel_sigma), _LEAST_PX))
+    if not (shown < views.pixel_sigma).any():
+        return found
+    by_pose = np.where(found.inlier, pose_variance_px(views, found.points), 0.0)
+    weight = np.where(found.inlier, views.weight, 0.0)
+    taken, seen = (
+        (weight**2 / (sigma**2 + weight**2 * by_pose)).sum(axis=1)
+        for sigma in (views.pixel_sigma, np.minimum(shown, views.pixel_sigma))
+    )
+    share = np.divide(taken, seen, out=np.ones_like(taken), where=seen > 0)
+    return replace(found, covariance=share[:, None, None] * found.covariance)
 
 
 # --- full pose covariances -----------------------------------------------------------------------------

@@ -11,7 +11,11 @@ import pytest
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import ROTATION, errors_of_level
 from pipelines.geometry.triangulation import STATUS, Views, estimate_noise, triangulate
-from pipelines.reconstruction.solving import triangulate_weighted, triangulate_widened
+from pipelines.reconstruction.solving import (
+    triangulate_narrowed,
+    triangulate_weighted,
+    triangulate_widened,
+)
 from tests.geometry.rings import ring, turned, with_pixel_noise
 
 OK = STATUS.index("ok")
@@ -86,13 +90,27 @@ def test_what_a_log_knows_of_its_axes_makes_points_better_and_covariances_true()
     assert rms < 0.9 * rms_before
 
 
+def test_covariances_are_those_of_the_detector_that_was_better_than_assumed() -> None:
+    """State 6 px of pixel noise instead of 2, and the true noise of the poses, new in every frame."""
+    frames = 700
+    truth, exact = ring(frames, 3)
+    covariance = np.tile(np.diag([0.02**2] * 3 + [np.radians(0.1) ** 2] * 3), (frames, 3, 1, 1))
+    views = with_pixel_noise(disturbed(exact, covariance, np.random.default_rng(4)), np.random.default_rng(5))
+    views = replace(views, pixel_sigma=3 * views.pixel_sigma)
+    found = triangulate_narrowed(views, solve=partial(triangulate, method="robust"))
+    first = np.arange(0, len(truth), 17)[found.status[::17] == OK]  # a joint of every frame
+    off = found.points[first] - truth[first]
+    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance[first]), off)
+    assert squared.mean() == pytest.approx(3, abs=4 * np.sqrt(6 / len(first)))
+
+
 def test_covariances_hold_where_nobody_stated_errors_that_last() -> None:
     """Draw flights with 0.05 m and 0.3 deg that last, 0.02 m and 0.2 deg that are new: their mean NEES is 3.
 
     By residuals alone it is 3.7.
     """
     frames, flights = 10, 300
-    lasting, new = ([m] * 3 + [np.radians(deg)] * 3 for m, deg in ((0.05, 0.3), (0.02, 0.2)))
+    lasting, new = (np.array([m] * 3 + [np.radians(deg)] * 3) for m, deg in ((0.05, 0.3), (0.02, 0.2)))
     truth, exact = ring(frames, 3)
     mean, inside = np.empty(flights), np.empty(flights)
     for flight in range(flights):
