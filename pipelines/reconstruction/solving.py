@@ -1,4 +1,7 @@
-"""Solvers of joint-frames: their noise, the choice between them, and what they add to a triangulation.
+"""Solvers of joint-frames: their noise, the choice between them, and how they mend covariances and weights.
+
+Covariances are wider where nobody stated the poses' errors, and narrower where the detector is better than
+assumed. Inliers are weighted again in two ways:
 
 - By the full logged 6x6 pose covariances. Triangulation uses one standard deviation for a position and one
   for a rotation; its gates and its choice of views need no more. Logs contain more: satellite positioning
