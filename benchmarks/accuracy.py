@@ -20,9 +20,9 @@ Per flight and method, means over the draws (times: medians):
 - NEES (3 is right), and the share of joint-frames within their 95 % ellipsoids;
 - processor seconds of the call on the first draw, detection and following excluded; fallbacks.
 
-To save time, methods share the clocks that the first of them found by keypoints, and so do all draws of the
-shared error with the true poses, whose cameras stand alike to each other. Mistakes are searched for in the
-call alone whose time is taken: errors do not depend on it. Two processes, each flight in one.
+To save time, methods share the clocks that the first of them found by keypoints, and mistakes are searched
+for in the call alone whose time is taken: errors do not depend on either. All draws of the shared error share
+the clocks of the true poses, too: all their cameras move alike. Two processes, each flight in one.
 
 Results are kept in build/accuracy by the hash of the code and of the flight's files, so an interrupted run
 goes on, and a changed program measures anew. `--write` writes docs/results.md.

@@ -7,9 +7,10 @@ alone, a third of the time. `--draws N` flies every arm N times with 1 cm of noi
 takes means over these flights: flights are chaotic, and one of them says little about an arm.
 
 Two arms are compared on common joint-frames, as in `replan-compare`: those that both measured. They are also
-compared at equal flown range: each error is scaled by what the ray model predicts for the same views and
-directions with all distances scaled, so that their mean is the range that was asked for. "By chance" is the
-number of worlds in which the noise that is left in means over draws would make an arm worse.
+compared at equal flown range: each error is scaled by what the ray model predicts at these moments for the
+same views and directions with all distances scaled, so that the flight's mean is the range that was asked
+for. "By chance" is the number of worlds in which the noise that is left in means over draws would make an arm
+worse.
 
 Every arm flies through worlds of `benchmarks.worlds`. One posture of a walk, carried along by the actor, is
 measured by triangulation with modelled keypoints and white pose noise (0.02 m, 0.2 deg), 32 draws. The
@@ -85,7 +86,6 @@ PAIRS = (*EQUAL, *EQUAL.values())
 NOISE = White(position_m=0.02, rotation_deg=0.2)
 TRIALS = 32
 WORSE = 1.01  # ratio of errors above which an arm counts as worse in a world
-GAIN = 0.04  # of an arm for which chance is computed: about that of `joint`
 EVERY = 2  # tracking steps from picture to picture
 _FEWEST_SECONDS = 5  # of a flight with any spread, for a correlation
 
@@ -102,9 +102,9 @@ class Flight:
     hidden: float
     right: float  # share of all joint-frames within 150 mm
     range_m: float
-    to_range: float = float("nan")  # predicted error at the mean range asked for, over that as flown
     draws: int = 0  # as asked for with `--draws`
-    compared: tuple[tuple[float, float], ...] = ()  # MPJPE and that of the arm in `EQUAL`, mm, draw by draw
+    compared: tuple[tuple[float, float, float], ...] = ()
+    """Draw by draw: MPJPE, that of the arm in `EQUAL` (mm), and the ratio of both factors to equal range."""
 
 
 def arms_of(*, bound: bool, pairs: bool) -> dict[str, tuple[str, Mapping[str, Any]]]:
@@ -125,7 +125,7 @@ def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]], draws: int
         rotation_sigma_deg=NOISE.rotation_deg,
     )
     found: dict[str, list[Flight]] = {arm: [] for arm in arms}
-    error_m: dict[str, list[Float32]] = {arm: [] for arm in arms}
+    measurements: dict[str, list[tuple[Float32, Float]]] = {arm: [] for arm in arms}
     for arm, (name, changes), draw in _draws(arms, draws):
         noise = {"actor_noise_m": DRAWN_M} if draws else {}
         config = replace(PlannerConfig(), errors=errors, **{**changes, **noise})
@@ -168,7 +168,9 @@ def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]], draws: int
         finite = np.isfinite(predicted + asked)
         figures = score(done.t_s, done.position, done.actor, field, config)
         second = done.t_s[rows].astype(int)
-        error_m[arm].append(measured.error_m)
+        to_range = np.full(len(predicted), np.nan)
+        to_range[finite] = np.log(asked[finite] / predicted[finite])
+        measurements[arm].append((measured.error_m, to_range))
         found[arm].append(
             Flight(
                 seed,
@@ -181,24 +183,31 @@ def fly(seed: int, arms: Mapping[str, tuple[str, Mapping[str, Any]]], draws: int
                 float(str(figures["occluded_share"])),
                 float(pck(measured.error_m, measured.joint_frames).mean()),
                 away,
-                float(np.exp(np.log(asked[finite] / predicted[finite]).mean())),
                 draws,
             )
         )
     return [
-        replace(_mean(own), compared=_compared(error_m[arm], error_m.get(EQUAL.get(arm, ""), [])))
+        replace(_mean(own), compared=_compared(measurements[arm], measurements.get(EQUAL.get(arm, ""), [])))
         for arm, own in found.items()
     ]
 
 
-def _compared(own: Sequence[Float32], other: Sequence[Float32]) -> tuple[tuple[float, float], ...]:
-    """Compute the MPJPE in mm of two arms on common joint-frames, draw by draw; empty without another arm."""
-    pairs = []
-    for errors in zip(own, other, strict=False):
-        shared = common_frames(dict(zip(("own", "other"), errors, strict=True)))
-        one, base = (float(mpjpe_mm(each, shared).mean()) for each in errors)
-        pairs.append((one, base))
-    return tuple(pairs)
+def _compared(
+    own: Sequence[tuple[Float32, Float]], other: Sequence[tuple[Float32, Float]]
+) -> tuple[tuple[float, float, float], ...]:
+    """Compare two arms on common joint-frames, draw by draw: `Flight.compared`; empty without another arm.
+
+    Args:
+        own: by draw, errors [trials, T, J] m and the logarithm [T] of the factor to the range asked for.
+        other: the same of the other arm.
+    """
+    compared = []
+    for (mine, mine_to_range), (theirs, their_to_range) in zip(own, other, strict=bool(other)):
+        shared = common_frames({"own": mine, "other": theirs})
+        one, base = (float(mpjpe_mm(each, shared).mean()) for each in (mine, theirs))
+        factor = (mine_to_range - their_to_range)[shared.any(axis=(0, 2))]
+        compared.append((one, base, float(np.exp(np.nanmean(factor)))))
+    return tuple(compared)
 
 
 def _draws(
@@ -223,7 +232,6 @@ def _mean(flights: Sequence[Flight]) -> Flight:
         hidden=float(np.mean([flight.hidden for flight in flights])),
         right=float(np.mean([flight.right for flight in flights])),
         range_m=float(np.mean([flight.range_m for flight in flights])),
-        to_range=float(np.mean([flight.to_range for flight in flights])),
     )
 
 
@@ -284,7 +292,10 @@ def _flown(
     draws: int,
 ) -> Iterator[Flight]:
     """Yield the flights through some worlds: those kept, then those flown now, which are kept as well."""
-    kept = [_read(line) for line in keep.read_text().splitlines()] if keep and keep.exists() else []
+    try:
+        kept = [_read(line) for line in keep.read_text().splitlines()] if keep and keep.exists() else []
+    except (KeyError, TypeError) as error:
+        raise SystemExit(f"{keep}: flights of another version of this command, delete it") from error
     kept = [flight for flight in kept if flight.draws == draws]
     done = {seed for seed in seeds if set(arms) <= {flight.arm for flight in kept if flight.seed == seed}}
     yield from (flight for flight in kept if flight.seed in done and flight.arm in arms)
@@ -357,17 +368,17 @@ def _print_equal(flights: Sequence[Flight]) -> None:
         own, base = ({f.seed: f for f in flights if f.arm == name} for name in (arm, other))
         if not own:
             continue
-        pairs = [np.array(flight.compared).T for flight in own.values()]
+        flown = [np.array(flight.compared).T for flight in own.values()]
+        pairs = [(mine, others) for mine, others, _ in flown]
         ratios = np.array([mine.mean() / others.mean() for mine, others in pairs])
         hidden = 100 * np.mean([own[k].hidden - base[k].hidden for k in own])
         right = 100 * np.mean([own[k].right - base[k].right for k in own])
         worse = int((ratios > WORSE).sum())
-        to_range = np.array([own[k].to_range / base[k].to_range for k in own])
-        level = ratios * to_range
-        leveled = [(mine * scale, others) for (mine, others), scale in zip(pairs, to_range, strict=True)]
+        leveled = [(mine * to_range, others) for mine, others, to_range in flown]
+        level = np.array([mine.mean() / others.mean() for mine, others in leveled])
         noise = np.array([_noise(*pair) for pair in leveled])
         beyond = sum(_is_worse_beyond_noise(*pair) for pair in leveled)
-        chance = [stats.norm.sf((WORSE - mean) / noise).sum() for mean in (1.0, 1.0 - GAIN)]
+        chance = [stats.norm.sf((WORSE - mean) / noise).sum() for mean in (1.0, level.mean())]
         by_noise = [f"{beyond}", *(f"{number:.1f}" for number in chance)]
         if not np.isfinite(noise).all():
             by_noise = ["-"] * len(by_noise)
@@ -403,7 +414,7 @@ def _print_equal(flights: Sequence[Flight]) -> None:
     header += ["hidden, points", "PCK150, points"]
     print("\n".join(markdown_table(header, rows)))
     header = ["arm", "the same at equal flown range, mean", "largest", "worse by 1 %"]
-    header += ["beyond noise", "by chance, of an equal arm", f"of one {100 * GAIN:.0f} % better"]
+    header += ["beyond noise", "by chance, of an equal arm", "of one with this mean in every world"]
     print("\n".join([*markdown_table(header, scaled), "Worse by 1 %:", *worlds]))
 
 

@@ -63,6 +63,7 @@ _MAX_PAIRS = 28  # all of 8 views; above, enough that with half the views bad on
 _BLOCK = 4096  # joint-frames that a thread takes at once
 _NOISE_SAMPLE = 20_000  # joint-frames; a median over them is accurate to one per cent
 _NOISE_ROUNDS = 2
+_MIN_PIXEL_SIGMA = 1.0  # px; no detector of people is better
 _START_WIDTH = (
     2.0  # a constant pose error gives few different pairs: undoubled, 2 % of draws at n = 3 lost all
 )
@@ -251,7 +252,7 @@ def estimate_noise(views: Views, *, threads: int = 1) -> Float:
 
     def explain(seen: Views, method: Method, sigma: Float) -> Float:
         result = triangulate(replace(seen, pixel_sigma=sigma), method=method, threads=threads)
-        return shown_sigma(sample, result, views.pixel_sigma)
+        return residual_sigma(sample, result, views.pixel_sigma)
 
     table, count = _pair_table(cameras)
     pair = table[cameras, np.arange(len(chosen)) % count[cameras]]
@@ -264,7 +265,7 @@ def estimate_noise(views: Views, *, threads: int = 1) -> Float:
     return sigma
 
 
-def shown_sigma(views: Views, result: Triangulation, least_px: Float) -> Float:
+def residual_sigma(views: Views, result: Triangulation, least_px: Float) -> Float:
     """Compute the pixel noise per axis [C] with which the inliers' residuals have their expected median.
 
     Args:
@@ -284,8 +285,8 @@ def shown_sigma(views: Views, result: Triangulation, least_px: Float) -> Float:
     typical = np.array(
         [np.median(of[np.isfinite(of)]) if np.isfinite(of).any() else 0.0 for of in variance.T]
     )
-    shown: Float = np.sqrt(np.maximum(views.pixel_sigma**2 + (factor - 1.0) * typical, least_px**2))
-    return shown
+    sigma: Float = np.sqrt(np.maximum(views.pixel_sigma**2 + (factor - 1.0) * typical, least_px**2))
+    return sigma
 
 
 def pose_variance_px(views: Views, points: Float) -> Float:
@@ -374,6 +375,26 @@ def triangulate_pictures(
     own = replace(views, rays=views.rays[rows], weight=views.weight[rows], pose_index=views.pose_index[rows])
     residual_px[rows] = np.where(gross[rows], reprojection_px(own, found.points[rows]), residual_px[rows])
     return replace(found, status=status, residual_px=residual_px)
+
+
+def detector_sigma(views: Views, found: Triangulation, *, picture: Int64, pixel_sigma: Float) -> Float:
+    """Estimate the pixel noise per axis [C] of the detector alone, from joints relative to their picture.
+
+    The median residual of each picture is taken off first, and with it nearly all of the pose's error.
+
+    Args:
+        views: the observations.
+        found: their triangulation.
+        picture: [N], see `triangulate_pictures`.
+        pixel_sigma: [C] px, what is assumed of the detector; returned where no picture can be judged.
+
+    Returns:
+        At least `_MIN_PIXEL_SIGMA`.
+    """
+    moved, _ = _moved(replace(views, pixel_sigma=pixel_sigma), picture, found.points)
+    moved = replace(moved, weight=np.where(found.inlier, moved.weight, 0.0))
+    agreed = triangulate(moved, method="robust")
+    return residual_sigma(moved, agreed, np.full(len(pixel_sigma), _MIN_PIXEL_SIGMA))
 
 
 def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float, threads: int) -> Bool:

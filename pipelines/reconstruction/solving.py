@@ -1,7 +1,7 @@
-"""Solvers of joint-frames: their noise, the choice between them, and how they mend covariances and weights.
+"""Solvers of joint-frames: their noise, the choice between them, and how they scale covariances and weights.
 
-Covariances are wider where nobody stated the poses' errors, and narrower where the detector is better than
-assumed. Inliers are weighted again in two ways:
+Covariances are wider where nothing is known of the poses' errors, and narrower where the detector is better
+than assumed. Inliers are weighted again in two ways:
 
 - By the full logged 6x6 pose covariances. Triangulation uses one standard deviation for a position and one
   for a rotation; its gates and its choice of views need no more. Logs contain more: satellite positioning
@@ -31,10 +31,10 @@ from pipelines.geometry.triangulation import (
     Method,
     Triangulation,
     Views,
+    detector_sigma,
     estimate_noise,
     pose_variance_px,
     reprojection_px,
-    shown_sigma,
     triangulate,
     triangulate_pictures,
 )
@@ -107,26 +107,22 @@ def solver_for(
     """Choose the solver from views to points; for `refined` and `auto`, the solver of their start.
 
     For calibrated cameras, `robust` has its own loss. For poses with errors, it has a gate that knows the
-    common error of a picture's joints, and weights from logged covariances. Where nobody stated the poses'
-    errors, its covariances are wider than residuals alone say.
+    common error of a picture's joints, and weights from logged covariances. Its covariances are wider than
+    residuals say where nothing is known of the poses' errors, and else have the detector's own noise.
     """
     if method in ("robust", "auto") and are_calibrated(cameras, observations):
         return partial(triangulate_heavy_tailed, threads=threads)
     if method in ("dlt", "midpoint"):
         return partial(triangulate, method=method, threads=threads)
-    in_pictures = partial(
-        triangulate_pictures,
-        picture=pictures_of(observations),
-        pixel_sigma=np.full(len(cameras), pixel_sigma),
-        threads=threads,
-    )
+    picture, of_detector = pictures_of(observations), np.full(len(cameras), pixel_sigma)
+    in_pictures = partial(triangulate_pictures, picture=picture, pixel_sigma=of_detector, threads=threads)
     if observations.pose_sigma is None:
         return partial(triangulate_widened, solve=in_pictures)
     if observations.pose_covariance is not None:
         in_pictures = partial(
             triangulate_weighted, solve=in_pictures, pose_covariance=observations.pose_covariance
         )
-    return partial(triangulate_narrowed, solve=in_pictures)
+    return partial(triangulate_narrowed, solve=in_pictures, picture=picture, pixel_sigma=of_detector)
 
 
 def are_calibrated(cameras: Sequence[Camera], observations: Observations) -> bool:
@@ -158,43 +154,49 @@ def noise_text(views: Views) -> str:
     return f"noise taken for poses {position_m:.3g} m and {rotation_deg:.3g} deg, pixels {pixels:.3g}"
 
 
-# --- nothing stated about the poses ---------------------------------------------------------------------
+# --- nothing known of the poses' errors -----------------------------------------------------------------
 
-_UNSEEN = 1.3
-"""Covariance over what residuals say of it. A lasting error of a pose is a single draw, and residuals do not
+_UNKNOWN_POSES = 1.3
+"""Covariance over what residuals say of it. A constant error of a pose is a single draw, and residuals do not
 show how it moves joints along their viewing rays. The mean NEES of the rendered flights for tuning becomes 3
 with it (docs/decisions/0012-auto.md)."""
 
 
 def triangulate_widened(views: Views, *, solve: Callable[[Views], Triangulation]) -> Triangulation:
-    """Triangulate, and widen covariances for lasting pose errors that nobody stated and residuals hide."""
+    """Triangulate, and widen covariances by `_UNKNOWN_POSES`."""
     found = solve(views)
-    return replace(found, covariance=_UNSEEN * found.covariance)
+    return replace(found, covariance=_UNKNOWN_POSES * found.covariance)
 
 
-# --- poses' errors stated --------------------------------------------------------------------------------
-
-_LEAST_PX = 1.0  # no detector is better
+# --- poses' errors known --------------------------------------------------------------------------------
 
 
-def triangulate_narrowed(views: Views, *, solve: Callable[[Views], Triangulation]) -> Triangulation:
-    """Triangulate, and narrow covariances where residuals are smaller than the stated pixel noise.
+def triangulate_narrowed(
+    views: Views, *, solve: Callable[[Views], Triangulation], picture: Int64, pixel_sigma: Float
+) -> Triangulation:
+    """Triangulate, and narrow covariances where the detector is better than assumed.
 
-    Gates and weights need noise that is large enough. The poses' part is left as stated: errors that last are
-    few draws, and small residuals may be luck.
+    Gates and weights need noise that is large enough, covariances the true one. It is estimated from joints
+    relative to their picture, since small common residuals of constant pose errors may be luck. The poses'
+    part of the covariances stays.
+
+    Args:
+        views: the views; `pixel_sigma` is that of the detector and of what the stated noise does not explain.
+        solve: `robust` with the options for these views.
+        picture: [N], see `triangulate_pictures`.
+        pixel_sigma: [C] px, what is assumed of the detector alone.
     """
     found = solve(views)
-    shown = shown_sigma(views, found, np.full(len(views.pixel_sigma), _LEAST_PX))
-    if not (shown < views.pixel_sigma).any():
-        return found
+    own = np.minimum(detector_sigma(views, found, picture=picture, pixel_sigma=pixel_sigma), pixel_sigma)
+    variance = views.pixel_sigma**2
     by_pose = np.where(found.inlier, pose_variance_px(views, found.points), 0.0)
     weight = np.where(found.inlier, views.weight, 0.0)
-    taken, seen = (
-        (weight**2 / (sigma**2 + weight**2 * by_pose)).sum(axis=1)
-        for sigma in (views.pixel_sigma, np.minimum(shown, views.pixel_sigma))
+    assumed, estimated = (
+        (weight**2 / (pixels + weight**2 * by_pose)).sum(axis=1)
+        for pixels in (variance, variance - pixel_sigma**2 + own**2)
     )
-    share = np.divide(taken, seen, out=np.ones_like(taken), where=seen > 0)
-    return replace(found, covariance=share[:, None, None] * found.covariance)
+    ratio = np.divide(assumed, estimated, out=np.ones_like(assumed), where=estimated > 0)
+    return replace(found, covariance=ratio[:, None, None] * found.covariance)
 
 
 # --- full pose covariances -----------------------------------------------------------------------------

@@ -69,6 +69,7 @@ def side_by_side(work: Callable[[T], R], parts: Iterable[T], *, workers: int, ha
         work: called with one part; it checks `halt` from time to time.
         parts: the arguments of `work`.
         halt: set when one part fails or the user interrupts; the exception is raised when all have stopped.
+            A single worker stops by the exception itself.
     """
     if workers == 1:
         return [work(part) for part in parts]

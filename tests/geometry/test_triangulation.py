@@ -16,7 +16,7 @@ from pipelines.geometry.triangulation import (
     _pair_table,
     estimate_noise,
     locate,
-    shown_sigma,
+    residual_sigma,
     triangulate,
 )
 from tests.geometry.rings import (
@@ -356,7 +356,7 @@ def test_points_without_end_leave_the_stated_noise() -> None:
     result = triangulate(views, method="robust")
     residual_px = np.full_like(result.residual_px, np.inf)  # as in a camera's own plane
 
-    found = shown_sigma(views, replace(result, residual_px=residual_px), views.pixel_sigma)
+    found = residual_sigma(views, replace(result, residual_px=residual_px), views.pixel_sigma)
 
     assert found == pytest.approx(2.0)
 
