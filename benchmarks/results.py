@@ -59,7 +59,10 @@ def main() -> None:
     if not arguments.page:
         if not arguments.only and not arguments.resume:
             shutil.rmtree(ROOT / PLACE, ignore_errors=True)
-        _store(_stored() | _rounded(measured([arguments.only] if arguments.only else list(SECTIONS))))
+        found = _rounded(measured([arguments.only] if arguments.only else list(SECTIONS)))
+        if arguments.only:
+            del found["cpu_minutes"]  # of this section alone
+        _store(_stored() | found)
     page = render(_stored())
     (DOCS / "results.md").write_text(page, encoding="utf-8")
     for old in {path.name for path in (DOCS / "figures").iterdir()} - set(figures_of(page)):
