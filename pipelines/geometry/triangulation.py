@@ -391,8 +391,15 @@ def detector_sigma(views: Views, found: Triangulation, *, picture: Int64, pixel_
     Returns:
         At least `_MIN_PIXEL_SIGMA`.
     """
-    moved, _ = _moved(replace(views, pixel_sigma=pixel_sigma), picture, found.points)
-    moved = replace(moved, weight=np.where(found.inlier, moved.weight, 0.0))
+    chosen = picture % max(1, -(-len(picture) // _NOISE_SAMPLE)) == 0
+    sample = replace(
+        views,
+        rays=views.rays[chosen],
+        weight=np.where(found.inlier[chosen], views.weight[chosen], 0.0),
+        pose_index=views.pose_index[chosen],
+        pixel_sigma=pixel_sigma,
+    )
+    moved, _ = _moved(sample, picture[chosen], found.points[chosen])
     agreed = triangulate(moved, method="robust")
     return residual_sigma(moved, agreed, np.full(len(pixel_sigma), _MIN_PIXEL_SIGMA))
 
