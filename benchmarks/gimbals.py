@@ -385,7 +385,10 @@ def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, 
 
 
 def entries_of(found: dict[tuple[str, Log, bool], dict[str, Figures]]) -> list[dict[str, Any]]:
-    """Take the mean of each figure over paths and draws, by level, whether noise is given, and method."""
+    """Take the mean of each figure over paths and draws, by level, whether noise is given, and method.
+
+    `constant_error_deg` is the standard error of the constant part's mean, 0 for a single flight.
+    """
     groups: dict[tuple[float, bool, str], list[Figures]] = {}
     for (_, log, given), by_method in found.items():
         for method, figures in by_method.items():
@@ -393,6 +396,11 @@ def entries_of(found: dict[tuple[str, Log, bool], dict[str, Figures]]) -> list[d
     return [
         {"level_deg": level, "noise_given": not without, "method": method}
         | {field.name: float(np.mean([getattr(of, field.name) for of in own])) for field in fields(Figures)}
+        | {
+            "constant_error_deg": float(
+                np.std([of.constant_deg for of in own]) / np.sqrt(max(len(own) - 1, 1))
+            )
+        }
         for (level, without, method), own in sorted(groups.items(), key=lambda group: group[0][:2])
     ]
 

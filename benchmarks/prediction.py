@@ -398,6 +398,7 @@ def _print_equal(flights: Sequence[Flight]) -> None:
             if max(ratio, same) > WORSE
         ]
         beyond = sum(_is_worse_beyond_noise(*pair) for pair in pairs)
+        single = np.concatenate([mine / others > WORSE for mine, others in pairs])
         rows.append(
             [
                 arm,
@@ -406,12 +407,13 @@ def _print_equal(flights: Sequence[Flight]) -> None:
                 f"{ratios.max():.3f}",
                 f"{worse} of {len(ratios)}",
                 str(beyond) if all(mine.size > 1 for mine, _ in pairs) else "-",
+                f"{single.sum()} of {single.size}",
                 f"{hidden:+.2f}",
                 f"{right:+.2f}",
             ]
         )
     header = ["arm", "over", "MPJPE on common joint-frames, mean", "largest", "worse by 1 %", "beyond noise"]
-    header += ["hidden, points", "PCK150, points"]
+    header += ["single flights", "hidden, points", "PCK150, points"]
     print("\n".join(markdown_table(header, rows)))
     header = ["arm", "the same at equal flown range, mean", "largest", "worse by 1 %"]
     header += ["beyond noise", "by chance, of an equal arm", "of one with this mean in every world"]

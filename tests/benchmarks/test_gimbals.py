@@ -57,6 +57,7 @@ def test_entries_are_means_by_level_noise_and_method() -> None:
         (0.0, False, 3.0),
         (0.5, True, 2.0),
     ]
+    assert [entry["constant_error_deg"] for entry in entries] == [0.0, 1.0]
 
 
 def test_errors_of_attitudes_part_into_a_constant_and_a_changing_one(tmp_path: Path) -> None:
