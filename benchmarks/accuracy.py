@@ -231,11 +231,11 @@ def _outcomes_of(code: str, shared: Path, groups: Sequence[Sequence[Case]]) -> d
     place = WORK / f"{code}-{_files_hash(flight, first.detector)}"
     place.mkdir(parents=True, exist_ok=True)
     drawn = DrawnFlight(flight, shared / flight.name)
-    of_true_poses: dict[bytes, FoundClocks] = {}
+    clocks_of_true_poses: dict[bytes, FoundClocks] = {}
     paths = {case: place / f"{_name_of(case)}.json" for group in groups for case in group}
     for group in groups:
         missing = [case for case in group if not paths[case].is_file()]
-        clocks = of_true_poses if group[0].method in _POSES else {}
+        clocks = clocks_of_true_poses if group[0].method in _POSES else {}
         for case, outcome in measure_draw(drawn, missing, clocks) if missing else ():
             partial_path = paths[case].with_suffix(f".{os.getpid()}")
             partial_path.write_text(json.dumps(asdict(outcome)), encoding="utf-8")

@@ -63,7 +63,7 @@ _MAX_PAIRS = 28  # all of 8 views; above, enough that with half the views bad on
 _BLOCK = 4096  # joint-frames that a thread takes at once
 _NOISE_SAMPLE = 20_000  # joint-frames; a median over them is accurate to one per cent
 _NOISE_ROUNDS = 2
-_MIN_PIXEL_SIGMA = 1.0  # px; no detector of people is better
+_MIN_PIXEL_SIGMA = 1.0  # px of a detector; few redundant views may show less by chance
 _START_WIDTH = (
     2.0  # a constant pose error gives few different pairs: undoubled, 2 % of draws at n = 3 lost all
 )
@@ -380,12 +380,12 @@ def triangulate_pictures(
 def detector_sigma(views: Views, found: Triangulation, *, picture: Int64, pixel_sigma: Float) -> Float:
     """Estimate the pixel noise per axis [C] of the detector alone, from joints relative to their picture.
 
-    The median residual of each picture is taken off first, and with it nearly all of the pose's error.
+    The median residual of each picture is taken off first. Nearly all of the pose's error goes with it.
 
     Args:
         views: the observations.
         found: their triangulation.
-        picture: [N], see `triangulate_pictures`.
+        picture: [N], as for `triangulate_pictures`.
         pixel_sigma: [C] px, what is assumed of the detector; returned where no picture can be judged.
 
     Returns:

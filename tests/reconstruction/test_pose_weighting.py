@@ -110,10 +110,11 @@ def test_covariances_are_those_of_a_detector_that_is_better_than_assumed() -> No
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_constant_pose_errors_that_happen_to_agree_narrow_no_covariances(seed: int) -> None:
-    """Estimate the detector's noise: 2 px, also where residuals are smaller than the stated pose noise.
+def test_constant_pose_errors_do_not_change_the_detectors_noise(seed: int) -> None:
+    """Estimate 2 px for any draw of constant pose errors.
 
-    Taking the median of 17 joints off loses 1/17 of the variance or a little more.
+    The median of 17 joints has pi / 2 / 17 of their variance: taking it off changes sigma by 5 % at most. The
+    median over 1700 joint-frames has a standard error of 1 %.
     """
     rng = np.random.default_rng(seed)
     _, exact = ring(100, 3)
@@ -131,18 +132,18 @@ def test_constant_pose_errors_that_happen_to_agree_narrow_no_covariances(seed: i
     np.testing.assert_allclose(sigma, 2.0, rtol=0.08)
 
 
-def test_covariances_hold_where_nobody_stated_errors_that_last() -> None:
-    """Draw flights with 0.05 m and 0.3 deg that last, 0.02 m and 0.2 deg that are new: their mean NEES is 3.
+def test_covariances_hold_where_nobody_stated_constant_errors() -> None:
+    """Draw flights with constant errors of 0.05 m and 0.3 deg, and white ones of 0.02 m and 0.2 deg.
 
-    By residuals alone it is 3.7.
+    The mean NEES is 3. By residuals alone it is 3.7.
     """
     frames, flights = 10, 300
-    lasting, new = (np.array([m] * 3 + [np.radians(deg)] * 3) for m, deg in ((0.05, 0.3), (0.02, 0.2)))
+    constant, white = (np.array([m] * 3 + [np.radians(deg)] * 3) for m, deg in ((0.05, 0.3), (0.02, 0.2)))
     truth, exact = ring(frames, 3)
     mean, inside = np.empty(flights), np.empty(flights)
     for flight in range(flights):
         rng = np.random.default_rng(flight)
-        error = lasting * rng.standard_normal((1, 3, 6)) + new * rng.standard_normal((frames, 3, 6))
+        error = constant * rng.standard_normal((1, 3, 6)) + white * rng.standard_normal((frames, 3, 6))
         position, rotation = exact.position + error[..., :3], turned(exact.rotation, error[..., 3:])
         views = with_pixel_noise(replace(exact, position=position, rotation=rotation), rng)
         views = replace(views, pixel_sigma=estimate_noise(views))
