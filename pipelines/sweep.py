@@ -229,10 +229,10 @@ def _verdict(rows: Sequence[dict[str, Any]], best: dict[str, Any]) -> str:
         f" 150 mm, {own['path_m']:.0f} m and {own['energy_kj']:.0f} kJ of all drones (simulated)"
     ]
     if best["alike"]:
-        words.append(f"noise does not tell apart {'; '.join(_said(rows[k]) for k in best['alike'])}")
+        words.append(f"Noise does not tell apart {'; '.join(_said(rows[k]) for k in best['alike'])}")
     least = min((row for row in rows if row["tradeoff"]), key=lambda row: float(row["path_m"]))
     if least is not own:
-        words.append(f"shortest is {_said(least)}: {least['path_m']:.0f} m, {least['capped_mm']:.1f} mm")
+        words.append(f"Shortest is {_said(least)}: {least['path_m']:.0f} m, {least['capped_mm']:.1f} mm")
     return ". ".join(words)
 
 
