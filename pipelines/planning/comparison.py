@@ -445,11 +445,11 @@ def _unequal(arms: Mapping[str, Mapping[str, Any]]) -> list[str]:
     counts = {name: arm["drones"] for name, arm in arms.items()}
     if len(set(counts.values())) > 1:
         said = ", ".join(f"{name} {count}" for name, count in counts.items())
-        found.append(f"The arms have different numbers of drones ({said}): more views measure better")
+        found.append(f"the arms have different numbers of drones ({said}): more views measure better")
     ranges = {name: arm["range_m"]["mean"] for name, arm in arms.items()}
     if max(ranges.values()) - min(ranges.values()) > _ALIKE_RANGE_M:
         said = ", ".join(f"{name} {mean:.1f} m" for name, mean in ranges.items())
-        found.append(f"The arms film from different mean ranges ({said}): part of a difference may be that")
+        found.append(f"the arms film from different mean ranges ({said}): part of a difference may be that")
     return found
 
 
@@ -466,7 +466,8 @@ def _verdict(
     else:
         conclusion = f"{next(iter(arms))} flew alone: there is nothing to compare it with"
     named = [] if best is None else [_about_best(best, arms)]
-    return ". ".join([*broken, *named, conclusion, *_unequal(arms)])
+    unequal = [f"{said[0].upper()}{said[1:]}" for said in _unequal(arms)]
+    return ". ".join([*broken, *named, conclusion, *unequal])
 
 
 def _warnings(results: Mapping[str, ArmResult]) -> list[str]:

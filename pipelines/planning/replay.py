@@ -112,6 +112,7 @@ class Pilot:
         self._formation_planner = arm.start(config, drones=start.drones, yaw_rad=yaw_rad)
         self._local_planner = LocalPlanner(config)
         self._weight = np.array(weights, dtype=np.float64)
+        self._by_weight = np.tile(self._weight / self._weight.sum(), (start.drones, 1))
         people = [ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m) for _ in weights]
         self._filter = actor or PeopleFilter(people, self._weight)
         slots = formation_slots(
@@ -152,8 +153,7 @@ class Pilot:
     @property
     def aim(self) -> Float:
         """Shares [N, P] of people in the place that each camera films: by weight, unless the arm chooses."""
-        by_weight = np.tile(self._weight / self._weight.sum(), (len(self._plans), 1))
-        return by_weight if self._formation.aim is None else self._formation.aim
+        return self._by_weight if self._formation.aim is None else self._formation.aim
 
     def wanted(self, t_s: float) -> tuple[Float, Float]:
         """Return commanded slots [N, 3], yaw from east, and the estimates [N, 3] that cameras aim at."""
@@ -168,8 +168,9 @@ class Pilot:
 
     def _aimed(self, t_s: Float) -> Float:
         """Return the places [N, T, 3] that cameras film, and about which their slots are."""
-        aimed: Float = np.tensordot(self.aim, self._filter.each(t_s), 1)
-        return aimed
+        people = self._filter.each(t_s)
+        aimed: Float = self.aim @ people.reshape(len(people), -1)
+        return aimed.reshape(-1, *people.shape[1:])
 
     def _slots_at(self, t_s: Float, path: FormationPath) -> Float:
         """Return the slots of a path, [T, N, 3], their yaws from east."""
@@ -312,9 +313,10 @@ def replay(
     done = first + 1
     for k, now_ns in enumerate(replay_ns):
         t_s = float((now_ns - t_ns[first]) / 1e9)
-        for row, person in np.argwhere(known[done : taken_in[k]]):
-            pilot.measure(log_s[done + row], noisy[done + row, person], person)
-        done = max(done, int(taken_in[k]))
+        if taken_in[k] > done:
+            for row, person in np.argwhere(known[done : taken_in[k]]):
+                pilot.measure(log_s[done + row], noisy[done + row, person], person)
+            done = int(taken_in[k])
         position[:, k], velocity[:, k] = guard.position, guard.velocity
         pilot.replan(t_s, position[:, k], velocity[:, k], fields_known[map_at[k]])
         slots[:, k], estimate[:, k] = pilot.wanted(t_s)
