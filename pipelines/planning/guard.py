@@ -173,7 +173,7 @@ class Guard:
         def follow(kind: Flown, followed: Plan) -> _Motion:
             exactly = self._exactly and followed is plan
             states, stopped = self._rolled_out(t_s, here, followed, self._ticks, exactly)
-            ahead, _ = self._rolled_out(t_s, here, followed, self._ticks_ahead, exactly)
+            ahead, _ = self._rolled_out(t_s, here, followed, self._ticks_ahead, exactly, stops=False)
             return self._measured(kind, followed, states, stopped, ahead, around)
 
         place, wanted_m = here[POSITION], wanted_clearance_m(self._config, field.grid)
@@ -196,10 +196,14 @@ class Guard:
         yield self._measured(Flown.BRAKED, braked, committed, len(committed) - 1, committed, around)
 
     def _rolled_out(
-        self, t_s: float, here: Float, plan: Plan, ticks: int, exactly: bool
+        self, t_s: float, here: Float, plan: Plan, ticks: int, exactly: bool, *, stops: bool = True
     ) -> tuple[Float, int]:
-        """Return states [K + 1, 4, 3] of a drone that follows a plan and stops, and the row of the stop."""
-        states = np.empty((ticks + self._states.shape[1] - self._ticks, 4, 3))
+        """Return states [K + 1, 4, 3] of a drone that follows a plan and then stops, and the row of the stop.
+
+        Without `stops` they end where the drone leaves the plan.
+        """
+        stopping = self._states.shape[1] - self._ticks if stops else 1
+        states = np.empty((ticks + stopping, 4, 3))
         states[0] = here
         after_s = t_s - plan.start_s
         stopped = roll_out(
