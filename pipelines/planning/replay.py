@@ -110,6 +110,8 @@ class Pilot:
         self._zero = YawZero(config, start.heading_rad)
         yaw_rad = start.yaw_rad - float(self._zero.at(np.zeros(1))[0])
         self._formation_planner = arm.start(config, drones=start.drones, yaw_rad=yaw_rad)
+        planner = self._formation_planner
+        self._rolling_out = planner if isinstance(planner, RollingOut) else None
         self._local_planner = LocalPlanner(config)
         self._weight = np.array(weights, dtype=np.float64)
         self._by_weight = np.tile(self._weight / self._weight.sum(), (start.drones, 1))
@@ -186,8 +188,8 @@ class Pilot:
             self._zero.follow(t_s, *self._filter.at(t_s)[1:])
         people = self._filter.each(knots)
         actor = Forecast(self._filter.forecast(knots), self._zero.at(knots), people, self._weight)
-        if isinstance(self._formation_planner, RollingOut):
-            self._formation_planner.roll_out = partial(
+        if self._rolling_out is not None:
+            self._rolling_out.roll_out = partial(
                 self._roll_out, t_s=t_s, position=position, velocity=velocity, field=field
             )
         self._formation = self._formation_planner.plan(t_s, commanded, actor, field)
