@@ -361,8 +361,10 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
         distance = np.full(occupied.shape, -_NOWHERE_M, dtype=np.float32)
     else:
         distance = np.empty(occupied.shape, dtype=np.float32)
-        for part, inside_m in _distances(occupied, occupancy.resolution_m):
-            distance[part] = half - inside_m
+        box = _box_around(occupied)
+        within = distance[box]  # what it leaves out is free, and filled below
+        for part, inside_m in _distances(occupied[box], occupancy.resolution_m):
+            within[part] = half - inside_m
         for part, outside_m in _distances(~occupied, occupancy.resolution_m):
             np.copyto(distance[part], (outside_m - half).astype(np.float32), where=~occupied[part])
     # Interpolation needs two centres along each axis; beyond the border the field is constant anyway.
@@ -372,6 +374,16 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
     distance = np.ascontiguousarray(distance)
     origin = np.array(occupancy.origin, dtype=np.float64)
     return DistanceField(Grid(distance, origin, float(occupancy.resolution_m)), occupancy.from_ns)
+
+
+def _box_around(occupied: NDArray[np.bool_]) -> tuple[slice, ...]:
+    """Bound the occupied voxels and one free voxel on each side: none beyond is nearest to any of them."""
+    found = []
+    for axis in range(occupied.ndim):
+        others = tuple(other for other in range(occupied.ndim) if other != axis)
+        (along,) = np.nonzero(occupied.any(axis=others))
+        found.append(slice(max(int(along[0]) - 1, 0), int(along[-1]) + 2))
+    return tuple(found)
 
 
 def _distances(inside: NDArray[np.bool_], resolution_m: float) -> Iterator[tuple[slice, Float]]:

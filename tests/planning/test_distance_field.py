@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from pipelines.geometry.arrays import Bool, Float32
 from pipelines.planning.config import Zone
 from pipelines.planning.distance_field import (
     distance_field,
@@ -57,13 +58,29 @@ def test_a_sphere_is_within_a_voxel() -> None:
     assert np.abs(distance - (np.linalg.norm(points, axis=1) - 1.5)).max() < RES * np.sqrt(3)
 
 
+def expected_distances(occupied: Bool) -> Float32:
+    """Compute the distances of a whole map at once, with scipy."""
+    free_m, inside_m = (distance_transform_edt(side, sampling=RES) for side in (~occupied, occupied))
+    return np.where(occupied, RES / 2 - inside_m, free_m - RES / 2).astype(np.float32)
+
+
 def test_slabs_give_the_distances_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     occupied = np.random.default_rng(3).random((13, 7, 9)) < 0.05
     monkeypatch.setattr("pipelines.planning.distance_field._SLAB_VOXELS", 130)
     field = distance_field(Occupancy(occupied.astype(np.float32), np.zeros(3), RES))
-    free_m, inside_m = (distance_transform_edt(side, sampling=RES) for side in (~occupied, occupied))
-    expected = np.where(occupied, RES / 2 - inside_m, free_m - RES / 2).astype(np.float32)
-    assert np.array_equal(field.grid.distance_m, expected)
+    assert np.array_equal(field.grid.distance_m, expected_distances(occupied))
+
+
+@given(st.lists(st.tuples(st.integers(0, 8), st.integers(1, 9)), min_size=3, max_size=3))
+def test_a_block_anywhere_has_the_distances_of_the_whole(ends: list[tuple[int, int]]) -> None:
+    """Only the box around what is occupied is searched for its nearest free voxels: at borders, too."""
+    occupied = np.zeros((9, 9, 9), dtype=np.bool_)
+    occupied[tuple(slice(first, first + length) for first, length in ends)] = True
+    occupied[4, 4, 4] = False
+    if not occupied.any():
+        return
+    field = distance_field(Occupancy(occupied.astype(np.float32), np.zeros(3), RES))
+    assert np.array_equal(field.grid.distance_m, expected_distances(occupied))
 
 
 def test_gradient_is_the_derivative_of_the_interpolated_value() -> None:
