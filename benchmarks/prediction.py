@@ -3,9 +3,9 @@
 `--bound` also flies arms that know the whole way of the actor, with the same limits, and compares each arm
 with the least error of these in every world. `joint` is compared with `adaptive` as both are handed out,
 where it may come nearer (8 m instead of 10), and at equal range. `--keep FILE` stores the flights of each
-world; worlds that are there are not flown again. `--joint` flies `joint` and `adaptive` alone, a third of the
-time. `--draws N` flies every arm N times with 1 cm of noise on the actor's log and takes means over these
-flights: flights are chaotic, and one of them says little about an arm.
+world; worlds that are there are not flown again. `--joint` flies `joint` and `adaptive` alone. `--draws N`
+flies every arm N times with 1 cm of noise on the actor's log and takes means over these flights: flights are
+chaotic, and one of them says little about an arm.
 
 Two arms are compared on common joint-frames, as in `replan-compare`: those that both measured. They are also
 compared at equal flown range: each error is scaled by what the ray model predicts at these moments for the

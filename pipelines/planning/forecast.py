@@ -155,9 +155,7 @@ class PeopleFilter:
 
     def each(self, t_s: Float) -> Float:
         """Forecast every person, [P, T, 3]."""
-        if len(self._filters) == 1:
-            return self._filters[0].forecast(t_s)[None]  # as usual, and asked for at every step
-        return np.stack([each.forecast(t_s) for each in self._filters])
+        return np.array([each.forecast(t_s) for each in self._filters])
 
 
 def positions_at(t_ns: Int64, people: Float, at_ns: Int64) -> Float:

@@ -73,7 +73,7 @@ def test_slabs_give_the_distances_of_the_whole(monkeypatch: pytest.MonkeyPatch) 
 
 @given(st.lists(st.tuples(st.integers(0, 8), st.integers(1, 9)), min_size=3, max_size=3))
 def test_a_block_anywhere_has_the_distances_of_the_whole(ends: list[tuple[int, int]]) -> None:
-    """Only the box around what is occupied is searched for its nearest free voxels: at borders, too."""
+    """Distances inside come from the box around what is occupied, which may touch the border of the map."""
     occupied = np.zeros((9, 9, 9), dtype=np.bool_)
     occupied[tuple(slice(first, first + length) for first, length in ends)] = True
     occupied[4, 4, 4] = False
