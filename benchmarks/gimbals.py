@@ -107,6 +107,7 @@ class Figures:
     jitter_mm: float
     changing_deg: float
     constant_deg: float
+    roll_deg: float  # the constant part about the optical axis alone
     nees: float
     nees_both: float
     share_percent: float
@@ -327,12 +328,13 @@ def _figures(session: Path, reference: pd.DataFrame, true: dict[str, Float], tak
     apart = ours.position - theirs.position
     both = np.isfinite(apart).all(axis=-1)
     second = np.diff(ours.position, 2, axis=0)
-    changing, constant = _attitude_errors_deg(session, true)
+    changing, constant, roll = _attitude_errors_deg(session, true)
     return Figures(
         distance_mm=1e3 * float(np.median(np.linalg.norm(apart[both], axis=-1))),
         jitter_mm=1e3 * float(np.nanmedian(np.linalg.norm(second, axis=-1))) / np.sqrt(3),
         changing_deg=changing,
         constant_deg=constant,
+        roll_deg=roll,
         nees=_nees(apart[both], ours.covariance[both]),
         nees_both=_nees(apart[both], ours.covariance[both] + theirs.covariance[both]),
         share_percent=100 * float(both.sum() / np.isfinite(theirs.position).all(axis=-1).sum()),
@@ -358,14 +360,16 @@ def _nees(apart: Float, covariance: Float) -> float:
     return float(np.mean(np.einsum("ni,nij,nj->n", apart, np.linalg.inv(covariance), apart)))
 
 
-def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, float]:
+def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, float, float]:
     """Compute the changing and the constant part of the attitude errors: RMS per axis over the cameras.
+
+    The third value is the RMS of the constant part about the optical axes.
 
     Attitudes are those that the method used: its own, or the logged ones. A log's constant error turns the
     camera. Attitudes relative to the background have one that turns the world, which would change along the
     camera's axes as it pans. The constant part is the one that leaves less.
     """
-    changing, constant = [], []
+    changing, constant, roll = [], [], []
     own = session / "reconstruct" / "cameras.parquet"
     estimated = pd.read_parquet(own) if own.exists() else pd.DataFrame({"camera": []})
     for name, attitude in true.items():
@@ -378,7 +382,12 @@ def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, 
         error = min(errors, key=lambda each: float(each.var(axis=0).sum()))
         changing.append(error - error.mean(axis=0))
         constant.append(error.mean(axis=0))
-    return float(np.sqrt(np.mean(np.square(changing)))), float(np.sqrt(np.mean(np.square(constant))))
+        roll.append(true_inverse.apply(error.mean(axis=0))[2] if error is errors[1] else constant[-1][2])
+    return _rms(changing), _rms(constant), _rms(roll)
+
+
+def _rms(values: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 # --- the table -------------------------------------------------------------------------------------------

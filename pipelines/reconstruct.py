@@ -47,7 +47,7 @@ from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 
 __all__ = ["RECONSTRUCT", "Reconstructed", "Settings", "reconstruct"]
 
-RECONSTRUCT = Stage("reconstruct", revision=25)
+RECONSTRUCT = Stage("reconstruct", revision=26)
 _LONGEST_FILL_S = 10.0
 
 

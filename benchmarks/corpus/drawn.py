@@ -79,12 +79,12 @@ class SharedError:
 def shared_error(flight: SimulatedFlight) -> SharedError:
     """Find the rigid motion that brings the true cameras nearest to the logged ones, weighted by their noise.
 
-    No picture tells of it: it moves cameras, people and ground alike.
+    Only poses at the film count. No picture tells of the motion: it moves cameras, people and ground alike.
     """
     about = flight.people[0].joints.mean(axis=(0, 1))
     normal, right = np.zeros((6, 6)), np.zeros(6)
     for drone in flight.drones:
-        logged, true = drone.log.camera, drone.at_log
+        logged, true, filmed_ns = drone.log.camera, drone.at_log, drone.at_frames.t_ns
         away = true.camera_position - about
         back = multiply(logged.quaternion_xyzw, conjugate(true.camera_quaternion_xyzw))
         error = np.hstack([logged.position - true.camera_position, rotation_vector_from_quaternion(back)])
@@ -92,6 +92,7 @@ def shared_error(flight: SimulatedFlight) -> SharedError:
         design[:, :3, 3:] = -cross_matrix(away)
         assert logged.covariance is not None, "every flight of the corpus has noise"
         weight = 1 / np.maximum(np.diagonal(logged.covariance, axis1=1, axis2=2), EXACT**2)
+        weight[(true.t_ns < filmed_ns[0]) | (true.t_ns > filmed_ns[-1])] = 0
         normal += np.einsum("tki,tk,tkj->ij", design, weight, design)
         right += np.einsum("tki,tk,tk->i", design, weight, error)
     found = np.linalg.solve(normal, right)

@@ -54,7 +54,7 @@ _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
 _LOOSE_MOTION = 3.0  # times the accelerations of the prior, for the estimate of clocks and slow pose errors
 _ANYWHERE_M = 100.0  # standard deviation of a joint that no picture shows
-_FAST_MOTION = 2.0  # times the accelerations of the prior, for joints beside correlated keypoint errors
+_FAST_MOTION = 2.0  # times the accelerations of the prior, where they were learned in uncorrected poses
 _OUTLIER = 1.5  # stated standard deviations: a correlated keypoint that is nearer is no outlier
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
@@ -413,11 +413,12 @@ def _joints_without_slow_errors(
     known = replace(known, poses=_white_only(problem, known))
     freely, bound = 1.0, BOUND
     if known.memory > REMEMBERED:
-        freely = _FAST_MOTION**2  # their motion is learned only at first, and kicks would be smoothed
         if measured:
             # Residuals show only a part of correlated errors. A gate by that part would reject one of two
             # disagreeing views, by chance.
             bound = max(BOUND, _OUTLIER / known.pixel_scale)
+        else:
+            freely = _FAST_MOTION**2  # kicks would be smoothed
     weighted = replace(known, memory=1.0, acceleration=freely * known.acceleration)
     initial = initial_state(problem, weighted, start)
     solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(bound,))
