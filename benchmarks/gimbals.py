@@ -107,7 +107,7 @@ class Figures:
     jitter_mm: float
     changing_deg: float
     constant_deg: float
-    roll_deg: float  # the constant part about the optical axis alone
+    roll_deg: float  # of it about the optical axis
     nees: float
     nees_both: float
     share_percent: float
@@ -363,7 +363,7 @@ def _nees(apart: Float, covariance: Float) -> float:
 def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, float, float]:
     """Compute the changing and the constant part of the attitude errors: RMS per axis over the cameras.
 
-    The third value is the RMS of the constant part about the optical axes.
+    The third value is the RMS over the cameras of the mean error about the optical axis.
 
     Attitudes are those that the method used: its own, or the logged ones. A log's constant error turns the
     camera. Attitudes relative to the background have one that turns the world, which would change along the
@@ -382,7 +382,7 @@ def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, 
         error = min(errors, key=lambda each: float(each.var(axis=0).sum()))
         changing.append(error - error.mean(axis=0))
         constant.append(error.mean(axis=0))
-        roll.append(true_inverse.apply(error.mean(axis=0))[2] if error is errors[1] else constant[-1][2])
+        roll.append(errors[0].mean(axis=0)[2])
     return _rms(changing), _rms(constant), _rms(roll)
 
 

@@ -322,6 +322,7 @@ def gimbal_table(entries: Sequence[Mapping[str, Any]]) -> list[str]:
         "changing_deg": ("attitudes, changing deg", 3),
         "constant_deg": ("constant deg", 2),
         "constant_error_deg": ("standard error", 2),
+        "roll_deg": ("about the optical axis", 2),
         "nees": ("NEES", 1),
         "nees_both": ("NEES, both", 1),
         "share_percent": ("measured %", 1),
