@@ -115,7 +115,7 @@ def _estimates(scene: Scene) -> Float:
         for row, person in np.argwhere(known[taken : until[k]]):
             actor.measure(log_s[taken + row], flight.actor[taken + row, person], person)
         taken = int(until[k])
-        found[k] = actor.forecast(np.array([t_s]))[0]
+        found[k] = actor.middle(actor.each(np.array([t_s])))[0]
     return found
 
 

@@ -148,10 +148,10 @@ class PeopleFilter:
         middle, moving = (np.tensordot(self._weight, np.stack(part), 1) for part in (position, velocity))
         return middle, moving, np.tensordot(self._weight**2, np.stack(covariance), 1)
 
-    def forecast(self, t_s: Float) -> Float:
-        """Forecast the middle [T, 3]; see `ActorFilter.forecast`."""
-        middle: Float = np.tensordot(self._weight, self.each(t_s), 1)
-        return middle
+    def middle(self, people: Float) -> Float:
+        """Return the weighted middle [T, 3] of people [P, T, 3]."""
+        middle: Float = self._weight @ people.reshape(len(people), -1)
+        return middle.reshape(people.shape[1:])
 
     def each(self, t_s: Float) -> Float:
         """Forecast every person, [P, T, 3]."""

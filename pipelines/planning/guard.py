@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.compilation import cached
+from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, Grid, barred, zone_distances
 from pipelines.planning.forecast import ActorFilter, PeopleFilter
@@ -105,9 +105,12 @@ class Guard:
         """Velocities of the drones [N, 3] m/s."""
         return self._now(VELOCITY)
 
-    def advance(self) -> None:
-        """Fly one period."""
-        self._age = np.minimum(self._age + 1, self._states.shape[1] - 1)
+    def fly(self, periods: int) -> tuple[Float, Float]:
+        """Fly for some periods: positions [N, P, 3] m and velocities [N, P, 3] m/s at the start of each."""
+        drones, last = np.arange(len(self._age))[:, None], self._states.shape[1] - 1
+        flown = self._states[drones, np.minimum(self._age[:, None] + np.arange(periods), last)]
+        self._age = np.minimum(self._age + periods, last)
+        return flown[:, :, POSITION], flown[:, :, VELOCITY]
 
     def committed(self) -> list[Float]:
         """Return the motion of each drone from now on, [K, 4, 3], which ends at rest."""
@@ -122,9 +125,11 @@ class Guard:
         """
         after_s = self._flying.period_s * np.arange(self._states.shape[1], dtype=np.float64)
         around = _Around(field, self._others(drone), actor.each(t_s + after_s))
-        least = self._least(self._states[drone, self._age[drone], POSITION], around)
+        place = self._states[drone, self._age[drone], POSITION]
+        now = _distances_now(around.field.grid, place, around.others, around.people)
+        least = self._least(now, around)
         tried = []
-        for motion in self._motions(drone, t_s, plan, around):
+        for motion in self._motions(drone, t_s, plan, around, now[0]):
             tried.append(motion)
             if _shortfall(motion, least) == _NONE:
                 break
@@ -140,21 +145,16 @@ class Guard:
 
     def _others(self, drone: int) -> Float:
         """Return the committed positions [M, K + 1, 3] of the other drones from now on."""
-        drones, rows = np.arange(len(self._age)), np.arange(self._states.shape[1])
-        ahead = np.minimum(self._age[:, None] + rows, rows[-1])
-        return np.asarray(np.delete(self._states[drones[:, None], ahead, POSITION], drone, axis=0))
+        others, rows = np.arange(len(self._age)) != drone, np.arange(self._states.shape[1])
+        ahead = np.minimum(self._age[others, None] + rows, rows[-1])
+        return np.asarray(self._states[others.nonzero()[0][:, None], ahead, POSITION])
 
-    def _least(self, place: Float, around: _Around) -> tuple[float, float, float]:
+    def _least(self, now: tuple[float, float, float], around: _Around) -> tuple[float, float, float]:
         """Return the distances to map, drones and actor that must be kept.
 
         They are the configured ones, or the present ones if these are smaller.
         """
         config = self._config
-        now = (
-            float(around.field.sample(place)[0]),
-            float(np.linalg.norm(around.others[:, 0] - place, axis=-1).min(initial=np.inf)),
-            float(np.linalg.norm(around.people[:, 0] - place, axis=-1).min()),
-        )
         # The actor's estimate errs by about the log's noise.
         stated = (
             wanted_clearance_m(config, around.field.grid),
@@ -166,8 +166,10 @@ class Guard:
         )
         return map_m, drones_m, actor_m
 
-    def _motions(self, drone: int, t_s: float, plan: Plan, around: _Around) -> Iterator[_Motion]:
-        """Yield motions from the best to the last resort."""
+    def _motions(
+        self, drone: int, t_s: float, plan: Plan, around: _Around, clearance_m: float
+    ) -> Iterator[_Motion]:
+        """Yield motions from the best to the last resort, from a place of this clearance."""
         here, field = self._states[drone, self._age[drone]], around.field
 
         def follow(kind: Flown, followed: Plan) -> _Motion:
@@ -177,7 +179,7 @@ class Guard:
             return self._measured(kind, followed, states, stopped, ahead, around)
 
         place, wanted_m = here[POSITION], wanted_clearance_m(self._config, field.grid)
-        if float(field.sample(place)[0]) < wanted_m - _INSIDE_M:
+        if clearance_m < wanted_m - _INSIDE_M:
             goal = nearest_free(field, place, wanted_m + _DEEPER_M)
             if goal is not None:
                 way = goal - place
@@ -240,17 +242,16 @@ class Guard:
         A drone at rest cannot keep away from an actor who walks: for the actor the plan counts, not the stop.
         The actor may walk on as forecast, or stop where they are.
         """
-        apart = np.linalg.norm(around.others - states[:, POSITION], axis=-1).min(initial=np.inf)
-        rows = slice(0, self._ticks_ahead + 1)
-        place, people = ahead[rows, POSITION], around.people[:, rows]
-        return _Motion(
-            kind,
-            plan,
+        distances = least_distances(
+            around.field.grid,
             states,
-            least_clearance(around.field.grid, states, stopped, self._flying.period_s),
-            float(apart),
-            float(np.linalg.norm([people - place, people[:, :1] - place], axis=-1).min()),
+            stopped,
+            around.others,
+            ahead[: self._ticks_ahead + 1],
+            around.people,
+            self._flying.period_s,
         )
+        return _Motion(kind, plan, states, *distances)
 
     def _steered(self, t_s: float, here: Float, velocity: Float) -> Plan:
         """Return a plan that takes up a velocity [3] m/s with a constant acceleration."""
@@ -325,8 +326,8 @@ def _out_of_zones(field: DistanceField, point: Float, wanted_m: float) -> Float 
     return place if field.sample(place)[0] >= wanted_m else None
 
 
-@cached
-def least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> float:
+@helper
+def _least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> float:
     """Compute the least distance to obstacles along a motion [K + 1, 4, 3] up to a row.
 
     It is sampled every 0.05 s or every half voxel, whichever is finer, on straight lines between two rows.
@@ -343,6 +344,52 @@ def least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> fl
             u = piece / pieces
             least = min(least, barred(grid, x + u * dx, y + u * dy, z + u * dz)[0])
     return float(least)
+
+
+@helper
+def _apart(a: Float, b: Float) -> float:
+    """Compute the distance of two points [3]."""
+    dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return math.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@cached
+def least_distances(
+    grid: Grid, states: Float, stopped: int, others: Float, ahead: Float, people: Float, period_s: float
+) -> tuple[float, float, float]:
+    """Compute the least distances of a motion to obstacles and drones, and of its plan to people.
+
+    People may walk on as forecast, or stop where they are. Without drones or people the distance is inf.
+
+    Args:
+        grid: obstacles and zones.
+        states: [K + 1, 4, 3] the motion, at rest from row `stopped` on.
+        stopped: that row.
+        others: [M, K + 1, 3] positions of the other drones.
+        ahead: [A, 4, 3] the motion along the plan, without the stop.
+        people: [P, A or more, 3] positions of people.
+        period_s: time between rows.
+    """
+    drones_m = people_m = math.inf
+    for k in range(states.shape[0]):
+        for other in range(others.shape[0]):
+            drones_m = min(drones_m, _apart(others[other, k], states[k, 0]))
+    for k in range(ahead.shape[0]):
+        for person in range(people.shape[0]):
+            people_m = min(people_m, _apart(people[person, k], ahead[k, 0]))
+            people_m = min(people_m, _apart(people[person, 0], ahead[k, 0]))
+    return _least_clearance(grid, states, stopped, period_s), drones_m, people_m
+
+
+@cached
+def _distances_now(grid: Grid, place: Float, others: Float, people: Float) -> tuple[float, float, float]:
+    """Compute the distances of a place [3] to obstacles, and to the first rows of drones and people."""
+    drones_m = people_m = math.inf
+    for other in range(others.shape[0]):
+        drones_m = min(drones_m, _apart(others[other, 0], place))
+    for person in range(people.shape[0]):
+        people_m = min(people_m, _apart(people[person, 0], place))
+    return barred(grid, place[0], place[1], place[2])[0], drones_m, people_m
 
 
 _NONE = (0.0, 0.0, 0.0)

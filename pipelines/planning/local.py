@@ -454,12 +454,26 @@ def closest_approach(path: Float, others: Float) -> float:
 
     `path` is [N + 1, 3]. The distance is inf without other drones.
     """
-    apart = path - others
-    start, way = apart[:, :-1], np.diff(apart, axis=1)
-    square = np.sum(way**2, axis=-1)
-    u = np.clip(-np.sum(start * way, axis=-1) / np.maximum(square, 1e-12), 0.0, 1.0)
-    distance = np.linalg.norm(start + u[..., None] * way, axis=-1)
-    return float(distance.min(initial=np.inf))
+    return _closest_approach(np.ascontiguousarray(path), np.ascontiguousarray(others))
+
+
+@cached
+def _closest_approach(path: Float, others: Float) -> float:
+    least = math.inf
+    start, way = np.empty(3), np.empty(3)
+    for other in range(others.shape[0]):
+        for k in range(path.shape[0] - 1):
+            square, along, apart = 0.0, 0.0, 0.0
+            for axis in range(3):
+                start[axis] = path[k, axis] - others[other, k, axis]
+                way[axis] = path[k + 1, axis] - others[other, k + 1, axis] - start[axis]
+                square += way[axis] * way[axis]
+                along += start[axis] * way[axis]
+            u = min(max(-along / max(square, 1e-12), 0.0), 1.0)
+            for axis in range(3):
+                apart += (start[axis] + u * way[axis]) ** 2
+            least = min(least, math.sqrt(apart))
+    return least
 
 
 def _with_start(position: Float, velocity: Float, waypoints: Float, step_s: float) -> Float:

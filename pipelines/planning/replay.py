@@ -157,10 +157,13 @@ class Pilot:
         """Shares [N, P] of people in the place that each camera films: by weight, unless the arm chooses."""
         return self._by_weight if self._formation.aim is None else self._formation.aim
 
-    def wanted(self, t_s: float) -> tuple[Float, Float]:
-        """Return commanded slots [N, 3], yaw from east, and the estimates [N, 3] that cameras aim at."""
-        now = np.array([t_s])
-        return self._slots_at(now, self._formation)[0], self._aimed(now)[:, 0]
+    def due_s(self) -> float:
+        """Return the time from which `replan` makes the next plan."""
+        return min(self._next_central_s, self._next_local_s) - _NOW_S
+
+    def wanted(self, t_s: Float) -> tuple[Float, Float]:
+        """Return commanded slots [T, N, 3], yaw from east, and the places [N, T, 3] that cameras aim at."""
+        return self._slots_at(t_s, self._formation), self._aimed(t_s)
 
     def reference(self, t_s: float) -> tuple[Float, Float, Float]:
         """Return position, velocity, acceleration [N, 3] of the latest local plans, after `replan`."""
@@ -187,7 +190,7 @@ class Pilot:
         if config.yaw_frame == "heading":
             self._zero.follow(t_s, *self._filter.at(t_s)[1:])
         people = self._filter.each(knots)
-        actor = Forecast(self._filter.forecast(knots), self._zero.at(knots), people, self._weight)
+        actor = Forecast(self._filter.middle(people), self._zero.at(knots), people, self._weight)
         if self._rolling_out is not None:
             self._rolling_out.roll_out = partial(
                 self._roll_out, t_s=t_s, position=position, velocity=velocity, field=field
@@ -305,25 +308,28 @@ def replay(
     pilot = Pilot(arm, config, start, actor=foreseen, weights=weights, clock=clock)
     for row, person in np.argwhere(known[: first + 1]):
         pilot.measure(log_s[row], noisy[row, person], person)
-    first_slots, first_estimate = pilot.wanted(0.0)
+    first_slots, first_estimate = pilot.wanted(np.zeros(1))
     guard = pilot.guard = Guard(
-        first_estimate + slot_offsets(first_slots), config, exactly=mode == "plan-only"
+        first_estimate[:, 0] + slot_offsets(first_slots[0]), config, exactly=mode == "plan-only"
     )
     shape = (start.drones, len(replay_ns), 3)
     position, velocity, slots, estimate = (np.empty(shape) for _ in range(4))
     aim = np.empty((*shape[:2], len(weight)))
-    done = first + 1
-    for k, now_ns in enumerate(replay_ns):
-        t_s = float((now_ns - t_ns[first]) / 1e9)
+    done, k = first + 1, 0
+    times_s = (replay_ns - t_ns[first]) / 1e9
+    while k < len(times_s):
         if taken_in[k] > done:
             for row, person in np.argwhere(known[done : taken_in[k]]):
                 pilot.measure(log_s[done + row], noisy[done + row, person], person)
             done = int(taken_in[k])
-        position[:, k], velocity[:, k] = guard.position, guard.velocity
-        pilot.replan(t_s, position[:, k], velocity[:, k], fields_known[map_at[k]])
-        slots[:, k], estimate[:, k] = pilot.wanted(t_s)
-        aim[:, k] = pilot.aim
-        guard.advance()
+        pilot.replan(float(times_s[k]), guard.position, guard.velocity, fields_known[map_at[k]])
+        measured_next = int(np.searchsorted(taken_in, done, side="right"))
+        planned_next = int(np.searchsorted(times_s, pilot.due_s()))
+        until = slice(k, max(min(measured_next, planned_next), k + 1))  # nothing new before
+        wanted, estimate[:, until] = pilot.wanted(times_s[until])
+        slots[:, until], aim[:, until] = wanted.swapaxes(0, 1), pilot.aim[:, None]
+        position[:, until], velocity[:, until] = guard.fly(until.stop - k)
+        k = until.stop
     return Replay(
         t_ns=replay_ns,
         position=position,

@@ -94,10 +94,11 @@ def _look_at_slots(
     offsets: Float,
     eps_obs_m: float,
     start_m: float,
+    reached: Bool,
     obstacle: Float,
     share: Float,
 ) -> None:
-    """Compute the results of `_slot_costs`, into arrays of zeros.
+    """Compute the results of `_slot_costs`, into arrays of zeros, for the states that are reached [T, S].
 
     The distances at the two ends show that most sight lines are free. One look at the actor serves all lines,
     and the obstacle cost needs the camera's distance anyway.
@@ -125,6 +126,8 @@ def _look_at_slots(
         # Neighbouring sight lines follow each other, so that their look-ups hit the cache.
         for i in range(cameras):
             for s in range(states):
+                if not reached[t, s]:
+                    continue
                 rule, count = rules[s, i], counts[s, i]
                 x, y, z = offsets[s, i]
                 is_occupied, leap = look(sight, ax + x * per_m, ay + y * per_m, az + z * per_m)
@@ -145,8 +148,8 @@ def _slot_costs(
 ) -> tuple[Float, Float]:
     """Compute obstacle cost and occupied share of the sight line, [T, S, n] each; see `costs_of_slots`."""
     shape = (actor.shape[0], offsets.shape[0], offsets.shape[1])
-    obstacle, share = np.zeros(shape), np.zeros(shape)
-    _look_at_slots(grid, sight, actor, offsets, eps_obs_m, start_m, obstacle, share)
+    obstacle, share, reached = np.zeros(shape), np.zeros(shape), np.ones(shape[:2], np.bool_)
+    _look_at_slots(grid, sight, actor, offsets, eps_obs_m, start_m, reached, obstacle, share)
     return obstacle, share
 
 
@@ -166,6 +169,38 @@ def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
 
 
 @helper
+def _first_step(lattice: Lattice, start: Float) -> tuple[Bool, Float]:
+    """Test which states [S] can follow slots anywhere between the states; return the time to each, too.
+
+    The time [S] s is the sum over the coordinates.
+    """
+    states = lattice.states.shape[0]
+    reach_s, way_s = np.zeros(states), np.zeros(states)
+    for s in range(states):
+        for axis in range(3):
+            way = abs(lattice.states[s, axis] - start[axis])
+            if axis == YAW:
+                way = abs(_wrapped(way))
+            reach_s[s] = max(reach_s[s], way / lattice.rates[axis])
+            way_s[s] += way / lattice.rates[axis]
+    return reach_s <= max(lattice.knot_s, reach_s.min()) + _REACHED_S, way_s
+
+
+@helper
+def _reached(lattice: Lattice, start: Float, times: int) -> Bool:
+    """Test which states a sequence can be in at each time, [T, S]."""
+    reached = np.zeros((times, lattice.states.shape[0]), np.bool_)
+    reached[0] = _first_step(lattice, start)[0]
+    for t in range(times - 1):
+        for s in range(reached.shape[1]):
+            if reached[t, s]:
+                for k in range(lattice.neighbours.shape[1]):
+                    if lattice.neighbours[s, k] >= 0:
+                        reached[t + 1, lattice.neighbours[s, k]] = True
+    return reached
+
+
+@helper
 def _search(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
     """Find the cheapest sequence; see `best_sequence`."""
     times, states = cost.shape
@@ -181,21 +216,12 @@ def _search(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
                     following[t, s] = j
             value[t, s] = cost[t, s] + best
 
-    # The first step starts anywhere between the states.
-    reach_s, way_s = np.zeros(states), np.zeros(states)
-    for s in range(states):
-        for axis in range(3):
-            way = abs(lattice.states[s, axis] - start[axis])
-            if axis == YAW:
-                way = abs(_wrapped(way))
-            reach_s[s] = max(reach_s[s], way / lattice.rates[axis])
-            way_s[s] += way / lattice.rates[axis]
-    within_s = max(lattice.knot_s, reach_s.min()) + _REACHED_S
+    within, way_s = _first_step(lattice, start)
     sequence = np.zeros(times, np.int64)
     total = nearest = math.inf
     for s in range(states):
         through = value[0, s] + lattice.w_turn / 2.0 * way_s[s]
-        if reach_s[s] <= within_s and (through < total or (through == total and way_s[s] < nearest)):
+        if within[s] and (through < total or (through == total and way_s[s] < nearest)):
             total, nearest = through, way_s[s]
             sequence[0] = s
     for t in range(times - 1):
@@ -404,7 +430,10 @@ def cheapest_slots(
     """
     shape = (actor.shape[0], formations.slots.shape[0], formations.slots.shape[1])
     obstacle, share = np.zeros(shape), np.zeros(shape)
-    _look_at_slots(grid, sight, actor, formations.offsets, w.eps_obs_m, w.sight_start_m, obstacle, share)
+    reached = _reached(formations.lattice, commanded[0], shape[0])
+    _look_at_slots(
+        grid, sight, actor, formations.offsets, w.eps_obs_m, w.sight_start_m, reached, obstacle, share
+    )
     sequence, _ = _search(_weigh(obstacle, share, w.w_obs, w.w_occ), formations.lattice, commanded[0])
     through = np.empty((shape[0] + 1, shape[2], 3))
     for i in range(shape[2]):

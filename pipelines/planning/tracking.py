@@ -114,29 +114,36 @@ def _shorten(vector: Float, longest: float) -> bool:
     length = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     if length <= longest:
         return False
-    vector *= longest / length
+    share = longest / length
+    for axis in range(3):
+        vector[axis] *= share
     return True
 
 
 @helper
-def _fly(wanted: Float, flying: Flying, state: Float, following: Float) -> bool:
+def _fly(wanted: Float, flying: Flying, state: Float, following: Float, free: Float) -> bool:
     """Fly one period at `wanted` [3], shortened to the limits.
 
-    The drone accelerates by `wanted` or as near to it as the limits allow. Return True if `wanted` was
-    shortened.
+    The drone accelerates by `wanted` or as near to it as the limits allow. `free` [3] is overwritten. Return
+    True if `wanted` was shortened.
     """
     shortened = _shorten(wanted, flying.acceleration_mps2)
-    faster = state[VELOCITY] + wanted * _LOOKAHEAD_S
-    if _shorten(faster, flying.speed_mps):
+    for axis in range(3):
+        free[axis] = state[VELOCITY, axis] + wanted[axis] * _LOOKAHEAD_S
+    if _shorten(free, flying.speed_mps):
         shortened = True
-        wanted[:] = (faster - state[VELOCITY]) / _LOOKAHEAD_S
+        for axis in range(3):
+            wanted[axis] = (free[axis] - state[VELOCITY, axis]) / _LOOKAHEAD_S
         _shorten(wanted, flying.acceleration_mps2)
-    change = wanted - state[ACCELERATION]
-    _shorten(change, flying.jerk_mps3 * flying.period_s)
-    a, dt = state[ACCELERATION] + change, flying.period_s
-    following[POSITION] = state[POSITION] + state[VELOCITY] * dt + a * (dt * dt / 2.0)
-    following[VELOCITY] = state[VELOCITY] + a * dt
-    following[ACCELERATION] = a
+    for axis in range(3):
+        free[axis] = wanted[axis] - state[ACCELERATION, axis]
+    _shorten(free, flying.jerk_mps3 * flying.period_s)
+    dt = flying.period_s
+    for axis in range(3):
+        a, v = state[ACCELERATION, axis] + free[axis], state[VELOCITY, axis]
+        following[POSITION, axis] = state[POSITION, axis] + v * dt + a * (dt * dt / 2.0)
+        following[VELOCITY, axis] = v + a * dt
+        following[ACCELERATION, axis] = a
     return shortened
 
 
@@ -165,7 +172,7 @@ def roll_out(
     Returns:
         The row at which the drone stands still; all that follow are like it.
     """
-    x, v, a, wanted = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    x, v, a, wanted, free = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     braking = min(_BRAKING_PER_S, 0.5 * flying.jerk_mps3 / flying.acceleration_mps2)
     last = states.shape[0] - 1
     for k in range(last):
@@ -187,13 +194,19 @@ def roll_out(
                     + flying.k_velocity * (v[axis] - state[VELOCITY, axis])
                     + flying.k_integral * following[INTEGRAL, axis]
                 )
-            if _fly(wanted, flying, state, following):  # anti-windup: the integral stops while a limit holds
+            if _fly(
+                wanted, flying, state, following, free
+            ):  # anti-windup: the integral stops while a limit holds
                 following[INTEGRAL] = state[INTEGRAL]
             continue
-        wanted[:] = -braking * state[VELOCITY]
-        _fly(wanted, flying, state, following)
-        following[INTEGRAL] = 0.0
-        if np.sum(following[VELOCITY] ** 2) < _STOPPED_MPS**2:
+        square = 0.0
+        for axis in range(3):
+            wanted[axis] = -braking * state[VELOCITY, axis]
+        _fly(wanted, flying, state, following, free)
+        for axis in range(3):
+            following[INTEGRAL, axis] = 0.0
+            square += following[VELOCITY, axis] ** 2
+        if square < _STOPPED_MPS**2:
             following[VELOCITY] = 0.0
             following[ACCELERATION] = 0.0
             for rest in range(k + 2, last + 1):

@@ -22,7 +22,7 @@ from pipelines.planning.distance_field import (
     zone_edges,
 )
 from pipelines.planning.forecast import ActorFilter
-from pipelines.planning.guard import Flown, Guard, least_clearance, nearest_free, wanted_clearance_m
+from pipelines.planning.guard import Flown, Guard, least_distances, nearest_free, wanted_clearance_m
 from pipelines.planning.replay import Start, replay
 from pipelines.planning.scores import score
 from pipelines.planning.tracking import Plan
@@ -60,6 +60,7 @@ def someone_at(*places: tuple[float, Float]) -> ActorFilter:
 
 
 FAR_AWAY = someone_at((0.0, np.array([500.0, 0.0, 0.0])))
+NOBODY = np.empty((0, 1, 3))
 
 
 def free_places(field: DistanceField, count: int, rng: np.random.Generator) -> Float:
@@ -93,13 +94,14 @@ def test_drones_can_always_stop_in_free_space_whatever_plans_ask_for(
             )
         for drone, states in enumerate(guard.committed()):
             assert (states[-1, 1:3] == 0).all()
-            assert least_clearance(field.grid, states, len(states) - 1, 0.02) >= wanted_m
+            distances = least_distances(field.grid, states, len(states) - 1, NOBODY, states[:1], NOBODY, 0.02)
+            assert distances[0] >= wanted_m
             motion.append((drone, states[0, 0]))
         ways = np.stack([states[:, 0] for states in guard.committed()])
         apart = np.linalg.norm(ways[:, None] - ways[None], axis=-1)
         assert apart[~np.eye(drones, dtype=bool)].min(initial=np.inf) >= CONFIG.separation_m - 1e-5
         for _ in range(TICKS):
-            guard.advance()
+            guard.fly(1)
             flown.append(guard.position)
     path = np.stack(flown, axis=1)  # [N, T, 3]
     finely = np.concatenate(
@@ -108,6 +110,36 @@ def test_drones_can_always_stop_in_free_space_whatever_plans_ask_for(
     assert field.sample(finely)[0].min() >= wanted_m
     assert guard.counts[Flown.UNSAFE] == 0
     assert guard.counts.total() == 25 * drones
+
+
+def test_least_distances_are_those_of_all_rows() -> None:
+    rng = np.random.default_rng(7)
+    states, others, people = (
+        rng.normal(size=(9, 4, 3)),
+        rng.normal(size=(2, 9, 3)),
+        rng.normal(size=(3, 9, 3)),
+    )
+    ahead = states[:5] + 0.1
+    grid = open_space().grid
+    found = least_distances(grid, states, 8, others, ahead, people, 0.02)
+    drones_m = np.linalg.norm(others - states[:, 0], axis=-1).min()
+    walking, stopped = people[:, :5] - ahead[:, 0], people[:, :1] - ahead[:, 0]
+    people_m = np.linalg.norm(np.concatenate([walking, stopped]), axis=-1).min()
+    np.testing.assert_allclose(found[1:], (drones_m, people_m), rtol=1e-14)
+    assert least_distances(grid, states, 8, NOBODY, ahead, NOBODY, 0.02)[1:] == (np.inf, np.inf)
+
+
+def test_periods_are_flown_at_once_as_one_by_one() -> None:
+    field, path = open_space(), np.linspace(0.0, 20.0, 21)[:, None] * [1.0, 0.5, 0.2]
+    together, single = (Guard(np.zeros((1, 3)), CONFIG) for _ in range(2))
+    for guard in (together, single):
+        guard.admit(0, 0.0, Plan(0.0, path, guard.velocity[0], 0.5), FAR_AWAY, field)
+    many = 2000  # far beyond the stop
+    one_by_one = [single.fly(1) for _ in range(many)]
+    for part, parts in zip(together.fly(many), zip(*one_by_one, strict=True), strict=True):
+        np.testing.assert_array_equal(part, np.concatenate(parts, axis=1))
+    np.testing.assert_array_equal(together.position, single.position)
+    assert (together.velocity == 0).all()
 
 
 @pytest.mark.parametrize(("thick_m", "side_m"), [(0.25, 0.25), (0.5, 0.5), (1.0, 0.25)])
@@ -124,7 +156,7 @@ def test_a_slot_behind_a_wall_is_reached_over_it(thick_m: float, side_m: float) 
         guard.admit(0, 0.2 * turn, Plan(0.2 * turn, straight, guard.velocity[0], 0.5), FAR_AWAY, field)
         for _ in range(TICKS):
             path.append(guard.position[0])
-            guard.advance()
+            guard.fly(1)
     assert field.sample(np.array(path))[0].min() >= CONFIG.drone_radius_m
     assert guard.counts[Flown.CLIMBED] > 0
     assert np.array(path)[:, 2].max() > 8.0 + CONFIG.drone_radius_m
@@ -156,7 +188,7 @@ def test_who_starts_too_near_leaves_by_the_shortest_way(depth_m: float) -> None:
     for turn in range(15):
         guard.admit(0, 0.2 * turn, Plan(0.2 * turn, ahead, guard.velocity[0], 0.5), FAR_AWAY, field)
         for _ in range(TICKS):
-            guard.advance()
+            guard.fly(1)
             path.append(guard.position[0])
     flown = np.array(path)
     assert guard.counts[Flown.LEFT] > 0
@@ -197,7 +229,7 @@ def test_a_drone_in_the_way_of_somebody_who_walks_gives_way() -> None:
         for k in range(TICKS):
             away = guard.position[0] - (hips + np.array([1.5 * 0.02 * k, 0.0, 0.0]))
             nearest = min(nearest, float(np.linalg.norm(away)))
-            guard.advance()
+            guard.fly(1)
     assert nearest >= config.actor_distance_m
     assert guard.counts[Flown.GAVE_WAY] + guard.counts[Flown.CLIMBED] > 0
 
