@@ -288,8 +288,8 @@ def _gimbals(numbers: Numbers) -> list[str]:
             "(median) is that from the result of `robust` from the still cameras, which errs too; the rows "
             "without attitude errors are the floor. NEES takes "
             "that result for exact, the second one adds its covariance. Jitter contains the person's own "
-            "acceleration. The constant part of the attitudes is as good as the calibration. The docstring "
-            "of `benchmarks/gimbals.py` has more."
+            "acceleration. The constant part of the attitudes is as good as the calibration; the part of it "
+            "about the optical axis is shown by itself. The docstring of `benchmarks/gimbals.py` has more."
         ),
     ]
     for title, entries in numbers.get("gimbals", {}).items():
@@ -306,7 +306,8 @@ def _accuracy(numbers: Numbers) -> list[str]:
         *_words(
             "Rendered pictures and real detectors. Flights with odd numbers, and the sample, were tuned "
             "on; even ones are kept aside. `benchmarks/corpus/README.md` describes each of them, the "
-            "docstring of `benchmarks/accuracy.py` the figures."
+            "docstring of `benchmarks/accuracy.py` the figures. Times are those of a slow processor "
+            "beside other work; on a usual one they were a third."
         ),
     ]
     for detector, own in numbers["accuracy"].items():
