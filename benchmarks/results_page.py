@@ -306,8 +306,8 @@ def _accuracy(numbers: Numbers) -> list[str]:
         *_words(
             "Rendered pictures and real detectors. Flights with odd numbers, and the sample, were tuned "
             "on; even ones are kept aside. `benchmarks/corpus/README.md` describes each of them, the "
-            "docstring of `benchmarks/accuracy.py` the figures. Times are those of a slow processor "
-            "beside other work; on a usual one they were a third."
+            "docstring of `benchmarks/accuracy.py` the figures. Times depend on the processor: "
+            "these are of a slow one, beside other work."
         ),
     ]
     for detector, own in numbers["accuracy"].items():

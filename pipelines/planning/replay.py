@@ -157,8 +157,9 @@ class Pilot:
         """Shares [N, P] of people in the place that each camera films: by weight, unless the arm chooses."""
         return self._by_weight if self._formation.aim is None else self._formation.aim
 
+    @property
     def due_s(self) -> float:
-        """Return the time from which `replan` makes the next plan."""
+        """Time from which `replan` makes the next plan."""
         return min(self._next_central_s, self._next_local_s) - _NOW_S
 
     def wanted(self, t_s: Float) -> tuple[Float, Float]:
@@ -324,7 +325,7 @@ def replay(
             done = int(taken_in[k])
         pilot.replan(float(times_s[k]), guard.position, guard.velocity, fields_known[map_at[k]])
         measured_next = int(np.searchsorted(taken_in, done, side="right"))
-        planned_next = int(np.searchsorted(times_s, pilot.due_s()))
+        planned_next = int(np.searchsorted(times_s, pilot.due_s))
         until = slice(k, max(min(measured_next, planned_next), k + 1))  # nothing new before
         wanted, estimate[:, until] = pilot.wanted(times_s[until])
         slots[:, until], aim[:, until] = wanted.swapaxes(0, 1), pilot.aim[:, None]

@@ -121,26 +121,26 @@ def _shorten(vector: Float, longest: float) -> bool:
 
 
 @helper
-def _fly(wanted: Float, flying: Flying, state: Float, following: Float, free: Float) -> bool:
+def _fly(wanted: Float, flying: Flying, state: Float, following: Float, scratch: Float) -> bool:
     """Fly one period at `wanted` [3], shortened to the limits.
 
-    The drone accelerates by `wanted` or as near to it as the limits allow. `free` [3] is overwritten. Return
-    True if `wanted` was shortened.
+    The drone accelerates by `wanted` or as near to it as the limits allow. `scratch` [3] is overwritten.
+    Return True if `wanted` was shortened.
     """
     shortened = _shorten(wanted, flying.acceleration_mps2)
     for axis in range(3):
-        free[axis] = state[VELOCITY, axis] + wanted[axis] * _LOOKAHEAD_S
-    if _shorten(free, flying.speed_mps):
+        scratch[axis] = state[VELOCITY, axis] + wanted[axis] * _LOOKAHEAD_S
+    if _shorten(scratch, flying.speed_mps):
         shortened = True
         for axis in range(3):
-            wanted[axis] = (free[axis] - state[VELOCITY, axis]) / _LOOKAHEAD_S
+            wanted[axis] = (scratch[axis] - state[VELOCITY, axis]) / _LOOKAHEAD_S
         _shorten(wanted, flying.acceleration_mps2)
     for axis in range(3):
-        free[axis] = wanted[axis] - state[ACCELERATION, axis]
-    _shorten(free, flying.jerk_mps3 * flying.period_s)
+        scratch[axis] = wanted[axis] - state[ACCELERATION, axis]
+    _shorten(scratch, flying.jerk_mps3 * flying.period_s)
     dt = flying.period_s
     for axis in range(3):
-        a, v = state[ACCELERATION, axis] + free[axis], state[VELOCITY, axis]
+        a, v = state[ACCELERATION, axis] + scratch[axis], state[VELOCITY, axis]
         following[POSITION, axis] = state[POSITION, axis] + v * dt + a * (dt * dt / 2.0)
         following[VELOCITY, axis] = v + a * dt
         following[ACCELERATION, axis] = a
@@ -172,7 +172,7 @@ def roll_out(
     Returns:
         The row at which the drone stands still; all that follow are like it.
     """
-    x, v, a, wanted, free = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    x, v, a, wanted, scratch = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     braking = min(_BRAKING_PER_S, 0.5 * flying.jerk_mps3 / flying.acceleration_mps2)
     last = states.shape[0] - 1
     for k in range(last):
@@ -194,15 +194,14 @@ def roll_out(
                     + flying.k_velocity * (v[axis] - state[VELOCITY, axis])
                     + flying.k_integral * following[INTEGRAL, axis]
                 )
-            if _fly(
-                wanted, flying, state, following, free
-            ):  # anti-windup: the integral stops while a limit holds
+            # Anti-windup: the integral stops while a limit holds.
+            if _fly(wanted, flying, state, following, scratch):
                 following[INTEGRAL] = state[INTEGRAL]
             continue
         square = 0.0
         for axis in range(3):
             wanted[axis] = -braking * state[VELOCITY, axis]
-        _fly(wanted, flying, state, following, free)
+        _fly(wanted, flying, state, following, scratch)
         for axis in range(3):
             following[INTEGRAL, axis] = 0.0
             square += following[VELOCITY, axis] ** 2
