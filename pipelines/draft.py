@@ -45,7 +45,6 @@ from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
 from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
 from pipelines.formats.poses.kitti import times_of
-from pipelines.formats.skeletons.amc import skeleton_of
 from pipelines.formats.videos.frame_times import read_frame_times
 from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
 from pipelines.formats.videos.picture_motion import followed_points
@@ -81,18 +80,15 @@ _FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
 _KEYS: dict[str, OwnLog] = {
     "dji": "dji",
     "dji_record": "dji",
-    "dji_video": "dji",
     "picture_tags": "dji",
     "ulog": "ulog",
     "ardupilot": "ardupilot",
     "tlog": "tlog",
     "gopro": "gopro",
-    "klv": "klv",
-    "parrot": "parrot",
 }
 """The key in a manifest for each format of a drone's own log."""
 
-_ANGLE_KEYS: dict[OwnLog, AngleLog] = {"dji": "dji", "gopro": "gopro", "parrot": "parrot"}
+_ANGLE_KEYS: dict[OwnLog, AngleLog] = {"dji": "dji", "gopro": "gopro"}
 """The key in a gimbal for each key of a log whose angles are of use without its positions."""
 
 _OTHER_KINDS: dict[str, TopicKind] = {
@@ -173,12 +169,12 @@ def draft(
 _CLOCKS: dict[str, Literal["whole seconds", "none"]] = {SHARED_SECONDS: "whole seconds", UNTIMED: "none"}
 """Clocks of sequences of pictures by the codec of their index."""
 
-_BESIDE: dict[str, Callable[[Path], Path]] = {"kitti": times_of, "amc": skeleton_of}
+_BESIDE: dict[str, Callable[[Path], Path]] = {"kitti": times_of}
 """Functions that find the file that belongs to one of a format, by the format's name."""
 
 
 def _read_beside(findings: Findings) -> list[Path]:
-    """List the files that were read with others: the times of a trajectory, the skeleton of a motion."""
+    """List the files that were read with others: the times of a trajectory."""
     return [_BESIDE[found.format](found.path) for found in findings.all() if found.format in _BESIDE]
 
 

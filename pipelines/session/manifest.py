@@ -191,7 +191,7 @@ class StaticPose(Part):
     camera: str | None = None
 
 
-OwnLog = Literal["dji", "ulog", "ardupilot", "tlog", "gopro", "klv", "parrot"]
+OwnLog = Literal["dji", "ulog", "ardupilot", "tlog", "gopro"]
 """The key of a drone's own log in a pose."""
 
 
@@ -209,13 +209,11 @@ class PoseSource(Guess):
     tum: str | None = None
     csv: str | None = None
     static: StaticPose | None = None
-    dji: str | None = None  # subtitles beside a video, a flight record as CSV, pictures, or a video
+    dji: str | None = None  # subtitles beside a video, a flight record as CSV, or pictures
     ulog: str | None = None  # PX4
     ardupilot: str | None = None  # DataFlash .bin
     tlog: str | None = None  # of a ground station
     gopro: str | None = None  # video with a track of GPMF
-    klv: str | None = None  # of MISB, alone or in a video
-    parrot: str | None = None  # video with Parrot's track
     position: Literal["local", "global", "gps"] | None = None  # which of a drone's own estimates
     instance: int | None = Field(None, ge=0, le=255)
     time: Literal["gps", "boot"] | None = None
@@ -304,7 +302,7 @@ class FixedAngles(Part):
     roll_deg: float = Field(0.0, ge=-180, le=180)
 
 
-AngleLog = Literal["dji", "gopro", "parrot"]
+AngleLog = Literal["dji", "gopro"]
 """The key of a log in a gimbal, whose angles of the camera are used without its positions."""
 
 
@@ -317,9 +315,8 @@ class Gimbal(Guess):
     log: str | None = None
     topic: str | None = None
     fixed: FixedAngles | None = None
-    dji: str | None = None  # video, flight record or subtitles
+    dji: str | None = None  # flight record or subtitles
     gopro: str | None = None  # video with a track of GPMF
-    parrot: str | None = None  # video with Parrot's track
     yaw_deg: float | None = Field(None, ge=-360, le=360)  # heading of the first picture, where none is logged
     relative_to: RelativeTo | None = None
     order: Literal["ypr", "rpy", "pry"] = "ypr"

@@ -53,7 +53,7 @@ _BEGINNINGS = (
 )
 
 # Endings of other binary files.
-_BINARY = {".tlog", ".laz", ".las", ".mp4", ".mov", ".m4v", ".avi", ".lrv", ".ts", ".mts", ".klv", ".c3d"}
+_BINARY = {".tlog", ".laz", ".las", ".mp4", ".mov", ".m4v", ".avi", ".lrv", ".ts", ".mts", ".c3d"}
 
 # Kinds that are known by their first bytes but not read, and the step that makes them usable.
 _UNREAD = (
@@ -83,13 +83,15 @@ _UNREAD = (
     (re.compile(rb"Kaydara FBX"), "an FBX scene", "export its motion as BVH"),
     (re.compile(rb"(?s)\s*(?:<\?xml.*?\?>\s*)?<calibration\b.*<camera "), "a Qualisys calibration (XML)",
      "convert it to TOML with Pose2Sim's calibration step"),
-    (re.compile(rb"(?s)(#[^\n]*\n)*\s*:version\b.{,4000}:root"), "the skeleton of Acclaim motion (ASF)",
-     "name the .amc that it belongs to"),
+    (re.compile(rb"(?s)(#[^\n]*\n)*\s*:(?:version\b.{,4000}:root|FULLY-SPECIFIED)"),
+     "Acclaim motion (ASF/AMC)", "convert it to BVH or C3D"),
     (re.compile(rb"(?:\xef\xbb\xbf)?\[Script Info\]"), "subtitles as ASS, which Autel's drones write",
      "write their positions as a CSV of poses"),
-    (re.compile(rb"(?s).{,400}<kml\b|.{,400}<TrainingCenterDatabase\b|.{8}\.FIT"),
-     "a track of a watch or a map program (KML, TCX or FIT)", "export it as GPX"),
-    (re.compile(rb"\$G[A-Z]{4},"), "a receiver's log (NMEA)", "convert it to GPX (GPSBabel does)"),
+    (re.compile(rb"(?s).{,400}<kml\b|.{,400}<gpx\b|.{,400}<TrainingCenterDatabase\b|.{8}\.FIT"),
+     "a track of a watch or a map program (GPX, KML, TCX or FIT)",
+     "write latitude, longitude and altitude as sensor_msgs/NavSatFix into a log"),
+    (re.compile(rb"\$G[A-Z]{4},"), "a receiver's log (NMEA)",
+     "write its places as sensor_msgs/NavSatFix into a log"),
     (re.compile(rb"# Camera list|# Image list|# 3D point list"), "one file of a COLMAP model",
      "name the folder that holds it"),
     (re.compile(rb"(?s).{,200}rosbag2_bagfile_information:"), "the metadata of a ROS 2 bag",

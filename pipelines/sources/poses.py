@@ -799,14 +799,14 @@ def _at_pictures(since_ns: Int64, frames: CameraFrames) -> Int64:
 
 
 def _reader(kind: str, path: Path) -> Format:
-    """Return the format of a drone's own log; DJI's comes as subtitles, flight record, pictures or video."""
-    several = ("dji_record", "dji_binary", "dji_video", "picture_tags") if kind == "dji" else ()
+    """Return the format of a drone's own log; DJI's comes as subtitles, flight record or pictures."""
+    several = ("dji_record", "dji_binary", "picture_tags") if kind == "dji" else ()
     found = next((found for name in several if (found := FORMATS.get(name)).recognises(path)), None)
     is_other = several and found is None and path.exists() and path.suffix.lower() != ".srt"
     if is_other and not parse_subtitles(read_head(path)).texts:
         raise DataError(
             path,
-            "holds no subtitles, flight record (CSV), telemetry track (djmd) or tagged pictures of DJI's",
+            "holds no subtitles, flight record (CSV) or tagged pictures of DJI's",
             "`mocap info` says what it is",
         )
     return found or FORMATS.get(kind)

@@ -14,10 +14,8 @@ from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM
 from pipelines.session.storage import read_json, write_json
 from tests.commands.runner import refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, spot_detector, write_spotted_flight
-from tests.synthetic.drone_logs import drone_of
 from tests.synthetic.flights import write_flight
 from tests.synthetic.logged_flights import write_logged_flight
-from tests.synthetic.video_tracks import parrot_messages, write_track
 
 NAME = "A short one"
 STALE = "out of date"  # a key of a stage
@@ -58,17 +56,6 @@ def test_yaml_is_what_its_keys_say(tmp_path: Path) -> None:
         line = refused("info", planner)
         assert "planner.yaml: " in line
         assert all(key in line for key in ("YAML", "`cameras:`", "`drones:`", "`w_obs:`"))
-
-
-def test_when_a_video_began_is_printed_with_its_milliseconds(tmp_path: Path) -> None:
-    truth = drone_of(write_flight(tmp_path / "f", cameras=1, seconds=0.2, clean=True), 0)
-    (_, empty), *messages = parrot_messages(truth)
-    late = [(t_ns + 123_000_000, message) for t_ns, message in messages]
-    path = write_track(tmp_path / "P.MP4", [(0, empty), *late], codec="bin_data", pictures=5)
-    shown = dict(line.split(maxsplit=1) for line in succeeds("info", path).splitlines() if line[:1] == " ")
-    assert float(shown["video_began_s"]) == pytest.approx(truth.t_ns[0] / 1e9 - 0.123, abs=1e-3)
-    west, east = map(float, shown["longitude_deg"].split(", "))
-    assert [west, east] == pytest.approx(sorted(truth.longitude_deg[[0, -1]]), abs=1e-7)  # 0.01 m
 
 
 def test_a_simulated_flight_and_its_summary(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
@@ -65,23 +64,3 @@ def test_a_kitti_trajectory_gives_the_poses_of_its_camera(tmp_path: Path) -> Non
     np.testing.assert_allclose(poses[0][["x", "y", "z"]], poses[1][["x", "y", "z"]], rtol=0, atol=1e-9)
     both = [Rotation.from_quat(each[["qx", "qy", "qz", "qw"]].to_numpy()) for each in poses]
     assert (both[0] * both[1].inv()).magnitude().max() < 1e-9
-
-
-def test_a_watch_s_gpx_is_the_actor(tmp_path: Path) -> None:
-    """A track that goes 0.001 deg of latitude to the north: 111.2 m at 47.5 deg north, by WGS84."""
-    flight = write_flight(tmp_path, cameras=2, clean=True)
-    points = [
-        f'<trkpt lat="{47.5 + 0.001 * k:.6f}" lon="8.25"><ele>400</ele>'
-        f"<time>{datetime.fromtimestamp(int(t_ns) / 1e9, UTC).isoformat()}</time></trkpt>"
-        for k, t_ns in enumerate(flight.t_ns[[0, -1]])
-    ]
-    head = '<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>'
-    (tmp_path / "watch.gpx").write_text(f"{head}{''.join(points)}</trkseg></trk></gpx>")
-    flight.settings["actor"] = {"log": "watch.gpx", "topic": "/track"}
-    flight.settings["world"]["origin"] = {"latitude_deg": 47.5, "longitude_deg": 8.25, "altitude_m": 400}
-    flight.save()
-    succeeds("ingest", flight.manifest)
-    actor = pd.read_parquet(flight.manifest.with_suffix(".session") / "actor.parquet")
-    north = actor["y"].iloc[-1] - actor["y"].iloc[0]
-    assert abs(north - 111.18) < 0.01  # the meridian's radius there, 6370.1 km, times 0.001 deg
-    assert abs(actor["x"]).max() < 0.01

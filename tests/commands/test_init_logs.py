@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,6 @@ from ruamel.yaml import YAML
 from pipelines.draft import Drafted, draft
 from pipelines.ingest import ingest
 from tests.commands.runner import refused, succeeds
-from tests.formats.skeletons.test_amc import write as write_motion
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
     drone_of,
@@ -33,7 +30,7 @@ from tests.synthetic.flights import LENS, START_NS, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap
 from tests.synthetic.map_logs import grid_entry
-from tests.synthetic.video_tracks import gopro_turns, write_djmd, write_gopro, write_klv, write_parrot
+from tests.synthetic.video_tracks import gopro_turns, write_gopro
 from tests.synthetic.videos import SIZE, even_ticks, write_video
 
 FRAMES = 30
@@ -184,33 +181,21 @@ def write_lens(folder: Path) -> None:
     (folder / "lenses.toml").write_text(text, encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    ("name", "write", "key", "sigma_s"),
-    [
-        ("DJI_1.MP4", write_djmd, "dji", 1),  # its clock is the time of creation
-        ("GOPR1.MP4", write_gopro, "gopro", 0.2),  # a packet of a second has but its own time
-        ("a1.ts", write_klv, "klv", 0),
-        ("P1.MP4", partial(write_parrot, version=4), "parrot", 0),
-    ],
-)
-def test_a_video_begins_when_the_telemetry_in_it_says(
-    tmp_path: Path, name: str, write: Any, key: str, sigma_s: float
-) -> None:
+def test_a_video_begins_when_the_telemetry_in_it_says(tmp_path: Path) -> None:
     truth = drone_of(write_flight(tmp_path / "x", cameras=1, seconds=1.1, clean=True), 0)
     shutil.rmtree(tmp_path / "x")
-    write(tmp_path / name, truth, pictures=33)
+    write_gopro(tmp_path / "GOPR1.MP4", truth, pictures=33)
     write_lens(tmp_path)
     result, stated = drafted(tmp_path)
     (camera,) = stated["cameras"].values()
-    assert camera["pose"][key] == name
+    assert camera["pose"]["gopro"] == "GOPR1.MP4"
     assert float(camera["frame_times"]["start"]) == pytest.approx(START_NS / 1e9, abs=1e-6)
-    assert camera["frame_times"].get("assumed", False) is bool(sigma_s)
-    assert camera.get("clock", {}).get("sigma_s", 0) == sigma_s
-    if key == "gopro":
-        assert len(result.missing) == 1
-        assert "gimbal: {fixed:" in refused("ingest", result.path)
-        text = result.path.read_text(encoding="utf-8").replace("# gimbal: {fixed", "gimbal: {fixed")
-        result.path.write_text(text, encoding="utf-8")
+    assert camera["frame_times"]["assumed"] is True
+    assert camera["clock"]["sigma_s"] == 0.2  # a packet of a second has but its own time
+    assert len(result.missing) == 1
+    assert "gimbal: {fixed:" in refused("ingest", result.path)
+    text = result.path.read_text(encoding="utf-8").replace("# gimbal: {fixed", "gimbal: {fixed")
+    result.path.write_text(text, encoding="utf-8")
     assert frames_with_poses(result.path) == 33
 
 
@@ -238,31 +223,6 @@ def test_a_gopros_turns_are_drafted_without_a_heading(tmp_path: Path, places: bo
     assert ("yaw_deg" if places else "gimbal:") in said
     _uncommented(result.path, "gimbal: {gopro: GX010001.MP4, yaw_deg: 90}")
     assert frames_with_poses(result.path) == 33
-
-
-def test_a_djis_angles_without_a_fix_are_drafted_for_the_positions_of_another_log(tmp_path: Path) -> None:
-    truth = drone_of(write_flight(tmp_path / "x", cameras=1, seconds=1.1, clean=True), 0)
-    shutil.rmtree(tmp_path / "x")
-    nowhere = replace(truth, latitude_deg=truth.latitude_deg * 0, longitude_deg=truth.longitude_deg * 0)
-    write_djmd(tmp_path / "DJI_1.MP4", nowhere, pictures=33)
-    write_srt(tmp_path / "DJI_1.SRT", truth, gimbal=False)
-    write_lens(tmp_path)
-    result, stated = drafted(tmp_path)
-    (camera,) = stated["cameras"].values()
-    assert camera["pose"]["dji"] == "DJI_1.SRT"
-    assert camera["gimbal"] == {"dji": "DJI_1.MP4"}
-    assert result.missing == []
-    assert frames_with_poses(result.path) == 33
-
-
-def test_telemetry_that_cannot_be_read_is_named_beside_its_video(tmp_path: Path) -> None:
-    truth = drone_of(write_flight(tmp_path / "x", cameras=1, seconds=0.2, clean=True), 0)
-    shutil.rmtree(tmp_path / "x")
-    path = write_djmd(tmp_path / "DJI_1.MP4", truth, "dvtm_wm999.proto", pictures=6)
-    result, _ = drafted(tmp_path)
-    assert "dvtm_wm999" in result.left_out[path]
-    assert "name the .SRT" in result.left_out[path]
-    assert len(result.missing) == 2  # poses, intrinsics
 
 
 def test_two_of_px4s_namespaces_are_two_drones(tmp_path: Path) -> None:
@@ -300,11 +260,9 @@ def test_files_that_are_read_with_others_are_not_left_out(tmp_path: Path) -> Non
     rows = [f"1 0 0 {k} 0 1 0 0 0 0 1 0" for k in range(FRAMES)]
     (tmp_path / "drone1.txt").write_text("\n".join(rows), encoding="utf-8")
     (tmp_path / "times.txt").write_text("\n".join(str(k / 30) for k in range(FRAMES)), encoding="utf-8")
-    write_motion(tmp_path)
     result, stated = drafted(tmp_path)
     assert result.left_out == {}
     assert stated["cameras"]["drone1"]["pose"]["tum"] == "drone1.txt"
-    assert "10_04.amc" in result.text
 
 
 def test_a_map_in_the_frame_of_the_poses_is_drafted(tmp_path: Path) -> None:

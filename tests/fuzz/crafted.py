@@ -15,7 +15,6 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 
 import lz4.frame
@@ -569,44 +568,7 @@ def _toml() -> Iterator[_Input]:
 
 @_kind("XML")
 def _xml() -> Iterator[_Input]:
-    entities = '<!ENTITY a0 "xxxxxxxxxx">' + "".join(
-        f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 10)
-    )
     head = '<?xml version="1.0"?>'
-    gpx = '<gpx version="1.1" creator="a"><trk><trkseg>'
-    point = '<trkpt lat="1" lon="2"><ele>3</ele><time>2024-01-01T00:00:0%dZ</time></trkpt>'
-    points = point % 1 + point % 2
-    close = "</trkseg></trk></gpx>"
-    yield (
-        "entities of entities, GPX",
-        "gpx",
-        "a.gpx",
-        (f"{head}<!DOCTYPE gpx [{entities}]>{gpx}<name>&a9;</name>{points}{close}"),
-    )
-    yield (
-        "an external entity, GPX",
-        "gpx",
-        "a.gpx",
-        (f'{head}<!DOCTYPE gpx [<!ENTITY a SYSTEM "file:///dev/zero">]>{gpx}<name>&a;</name>{points}{close}'),
-    )
-    yield "nested 200,000 deep, GPX", "gpx", "a.gpx", head + gpx + "<a>" * 200_000
-    yield "an attribute of 20 MB, GPX", "gpx", "a.gpx", f'{head}{gpx}<a b="{"x" * 20 * MB}"/>{points}{close}'
-    yield (
-        "100,000 attributes, GPX",
-        "gpx",
-        "a.gpx",
-        (f"{head}{gpx}<a {' '.join(f'a{k}=' + chr(34) * 2 for k in range(100_000))}/>{points}{close}"),
-    )
-    huge = points.replace('lat="1"', 'lat="1e308"')
-    yield "1e308 degrees, GPX", "gpx", "a.gpx", head + gpx + huge + close
-    digits = points.replace("<ele>3", "<ele>" + "9" * 100_000)
-    yield "a height of 100,000 digits, GPX", "gpx", "a.gpx", head + gpx + digits + close
-    yield (
-        "300,000 segments, GPX",
-        "gpx",
-        "a.gpx",
-        f"{head}{gpx}{'</trkseg><trkseg>' * 300_000}{points}{close}",
-    )
     cv = f"{head}<opencv_storage><camera_matrix>"
     yield "nested 50,000 deep, OpenCV", "opencv", "calib.xml", cv + "<a>" * 50_000
     matrix = '<?xml version="1.0"?><opencv_storage><camera_matrix type_id="opencv-matrix">'
@@ -809,33 +771,6 @@ def _skeletons() -> Iterator[_Input]:
         "<bbBBhbB7BB4B", 2, 1, 65, 65, 500, 4, 7, *[255] * 7, 0, 0, 0, 0, 0
     )
     yield "C3D: an array of 255^7", "c3d", "a.c3d", bytes(dimensions)
-
-    def acclaim(bones: int, lines: int) -> Writer:
-        def write(folder: Path) -> None:
-            data = "".join(
-                f"begin\nid {k}\nname b{k}\ndirection 0 1 0\nlength 1\naxis 0 0 0 XYZ\n"
-                "dof rx\nlimits (-1 1)\nend\n"
-                for k in range(1, bones + 1)
-            )
-            chain = "".join(
-                f"{a} {b}\n" for a, b in pairwise(["root", *(f"b{k}" for k in range(1, bones + 1))])
-            )
-            (folder / "10.asf").write_text(
-                ":version 1.10\n:name a\n:units\nmass 1\nlength 0.45\nangle deg\n:root\n"
-                "order TX TY TZ RX RY RZ\naxis XYZ\nposition 0 0 0\norientation 0 0 0\n"
-                f":bonedata\n{data}:hierarchy\nbegin\n{chain}end\n",
-                encoding="utf-8",
-            )
-            frame = "root 0 0 0 0 0 0\n" + "".join(f"b{k} 0\n" for k in range(1, bones + 1))
-            (folder / "10_04.amc").write_text(
-                ":FULLY-SPECIFIED\n:DEGREES\n" + "".join(f"{k + 1}\n{frame}" for k in range(lines)),
-                encoding="utf-8",
-            )
-
-        return write
-
-    yield "AMC: 20,000 bones in a chain", "amc", "10_04.amc", acclaim(20_000, 1)
-    yield "AMC: 100,000 frames", "amc", "10_04.amc", acclaim(1, 100_000)
 
 
 # --- tables of sessions ----------------------------------------
@@ -1286,11 +1221,6 @@ def _telemetry() -> Iterator[_Input]:
     yield "MAVLink: 1,000,000 empty packets", "tlog", "a.tlog", packet * 1_000_000
     yield "MAVLink: 20 MB of marks", "tlog", "a.tlog", packet + b"\xfe" * (20 * MB)
     yield "MAVLink: 20 MB of version 2 marks", "tlog", "a.tlog", packet + b"\xfd\x00" * (10 * MB)
-    key = bytes.fromhex("060e2b34020b01010e01030101000000")
-    yield "KLV: a length of 2^64", "klv", "a.klv", key + b"\x88" + b"\xff" * 8 + bytes(100)
-    yield "KLV: a length of 127 bytes", "klv", "a.klv", key + b"\xff" + b"\xff" * 127 + bytes(100)
-    yield "KLV: 500,000 empty packets", "klv", "a.klv", (key + b"\0") * 500_000
-    yield "KLV: a tag of 1,000,000 bytes", "klv", "a.klv", key + b"\x83\x0f\x42\x40" + b"\xff" * 10**6
     place = "[latitude: 1.0] [longitude: 2.0] [rel_alt: 1.0 abs_alt: 2.0]"
     cue = "{k}\n00:00:00,{a:03d} --> 00:00:00,{b:03d}\n" + place + "\n\n"
     cues = "".join(cue.format(k=k, a=k % 1000, b=k % 1000 + 1) for k in range(200_000))
@@ -1319,29 +1249,8 @@ def _telemetry() -> Iterator[_Input]:
 
 @_kind("telemetry in videos")
 def _tracks() -> Iterator[_Input]:
-    def nested(depth: int) -> bytes:
-        content = b"\x08\x01"
-        for _ in range(depth):
-            content = video_tracks.proto(3, content)
-        return content
-
-    def djmd(*added: bytes) -> Writer:
-        def write(folder: Path) -> None:
-            sound = video_tracks.djmd_messages(_drone(folder))
-            later = [(sound[-1][0] + (k + 1) * 10**8, content) for k, content in enumerate(added)]
-            video_tracks.write_track(folder / "a.mp4", [*sound, *later], codec="bin_data")
-
-        return write
-
-    yield "DJI: fields nested 5,000 deep", "dji_video", "a.mp4", djmd(nested(5000))
-    yield "DJI: a length of 2^63", "dji_video", "a.mp4", djmd(b"\x0a" + b"\xff" * 9 + b"\x7f")
-    yield "DJI: 2,000,000 fields", "dji_video", "a.mp4", djmd(b"\x08\x01" * 2_000_000)
-    yield "DJI: 50,000 empty packets", "dji_video", "a.mp4", djmd(*[b"\x08\x01"] * 50_000)
-
     def gpmf(content: bytes) -> Writer:
-        return lambda folder: video_tracks.write_track(
-            folder / "a.mp4", [(0, content), (10**9, content)], codec="bin_data"
-        )
+        return lambda folder: video_tracks.write_track(folder / "a.mp4", [(0, content), (10**9, content)])
 
     def item(key: bytes, kind: bytes, size: int, count: int, data: bytes) -> bytes:
         return key + kind + struct.pack(">BH", size, count) + data + bytes(-len(data) % 4)

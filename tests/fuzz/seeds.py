@@ -25,10 +25,9 @@ from tests.formats.drone_logs import test_dji_records
 from tests.formats.exported import flown, recording, walking
 from tests.formats.keypoint_files import test_coco_results, test_mmpose
 from tests.formats.log_entries import entries
-from tests.formats.logs import test_gpx
 from tests.formats.maps import test_grid_npz, test_las, test_octomap, test_pcd, test_ply, test_ros_map
 from tests.formats.poses import test_kitti, test_pose_csv
-from tests.formats.skeletons import test_amc, test_bvh, test_c3d, test_trc
+from tests.formats.skeletons import test_bvh, test_c3d, test_trc
 from tests.formats.videos import test_picture_folder
 from tests.synthetic import drone_logs, logs, map_logs, video_tracks, videos
 from tests.synthetic.flights import write_flight
@@ -38,7 +37,7 @@ Writer = Callable[[Path], object]
 """Writer into an empty folder. A single entry is then read itself; of several entries, the folder is read."""
 
 
-HEADS = frozenset({"map.yaml", "flight.yaml", "10_04.amc", "00.txt"})
+HEADS = frozenset({"map.yaml", "flight.yaml", "00.txt"})
 """Files that name others beside them, or need them."""
 
 TREE = test_octomap.at([7] * 13, [3.5, None, -2.0, [3.5, None] * 4, *[None] * 4])
@@ -127,14 +126,8 @@ def _turned_gopro(folder: Path) -> None:
     video_tracks.write_gopro(folder / "a.mp4", truth, turned=turns)
 
 
-def _gpx(folder: Path) -> None:
-    points = [test_gpx.point(k) for k in range(4)]
-    test_gpx.write(folder, test_gpx.track(*points), test_gpx.track(*points))
-
-
 SEEDS: dict[str, Writer] = {
     "alphapose": _keypoints("alphapose"),
-    "amc": test_amc.write,
     "anipose": _text("calib.toml", test_anipose_toml.CAMERA),
     "ardupilot": lambda folder: drone_logs.write_dataflash(folder / "a.bin", _truth(folder)),
     "bvh": _text("a.bvh", test_bvh.TEXT),
@@ -150,21 +143,15 @@ SEEDS: dict[str, Writer] = {
     "dji": lambda folder: drone_logs.write_srt(folder / "a.SRT", _truth(folder)),
     "dji_binary": _text("FLY022.DAT", bytes(16) + b"BUILD" + bytes(221) + b"DJI_LOG_V3" + bytes(100)),
     "dji_record": lambda folder: test_dji_records.airdata(folder / "a.csv"),
-    "dji_video": lambda folder: video_tracks.write_djmd(folder / "a.mp4", _truth(folder)),
     "flight": lambda folder: write_flight(folder, seconds=0.2),
     "flight from logs": _logged_flight,
     "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),
     "gopro": lambda folder: video_tracks.write_gopro(folder / "a.mp4", _truth(folder)),
     "gopro with attitudes": _turned_gopro,
     "gopro without telemetry": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
-    "gpx": _gpx,
     "joints_csv": lambda folder: joints_csv.write_joints(folder / "joints.csv", walking(4)),
     "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),
     "kitti": test_kitti.write,
-    "klv": lambda folder: video_tracks.write_klv(folder / "a.klv", _truth(folder)),
-    "parrot": lambda folder: video_tracks.write_parrot(folder / "p.mp4", _truth(folder)),
-    "parrot, protobuf": lambda folder: video_tracks.write_parrot(folder / "p.mp4", _truth(folder), 4),
-    "klv in a video": lambda folder: video_tracks.write_klv(folder / "a.ts", _truth(folder), pictures=5),
     "las": lambda folder: test_las.write(folder / "a.las"),
     "las, compressed": lambda folder: test_las.write(folder / "a.laz"),
     "map log": _map_log,

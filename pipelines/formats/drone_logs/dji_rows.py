@@ -81,7 +81,7 @@ def telemetry_of_rows(
     )
 
 
-def attitudes_of_rows(path: Path, found: DjiRows, video_began_ns: int | None = None) -> Attitudes:
+def attitudes_of_rows(path: Path, found: DjiRows) -> Attitudes:
     """Build the attitudes of the camera, whatever the rows say of positions.
 
     Raises:
@@ -93,7 +93,7 @@ def attitudes_of_rows(path: Path, found: DjiRows, video_began_ns: int | None = N
     )
     if camera is None:
         raise DataError(path, "holds no gimbal angles", "name the log and topic that do, or fixed angles")
-    return Attitudes(replace(camera, dropped=dropped), found.clock, video_began_ns=video_began_ns)
+    return Attitudes(replace(camera, dropped=dropped), found.clock)
 
 
 def choose_height(

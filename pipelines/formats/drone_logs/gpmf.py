@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.formats.common.files import first_bytes
 from pipelines.formats.common.rows import NORM_TOLERANCE
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
@@ -37,7 +38,6 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     position_track,
     turned_as_stated,
 )
-from pipelines.formats.drone_logs.video_tracks import has_track, track_packets
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
@@ -95,7 +95,10 @@ class GoProFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if a video has a track of GPMF whose first packet begins with a device."""
-        return has_track(path, _begins_with_a_device)
+        try:
+            return path.is_file() and next(_packets(path), None) is not None
+        except (DataError, OSError):
+            return False
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe the streams by their rows, the positions, and the clock."""
@@ -287,13 +290,45 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
 # --- track ---------------------------------------------------------------------------------------------
 
 
-def _begins_with_a_device(content: bytes) -> bool:
-    return content.startswith(b"DEVC")
+def _packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
+    """Yield start and length of each packet of the first track of GPMF in video time, ns, and its bytes.
+
+    Raises:
+        DataError: FFmpeg cannot read the file.
+    """
+    if first_bytes(path, 8)[4:] != b"ftyp":
+        return
+
+    import av
+    from av.stream import Discard
+
+    try:
+        # Named format and protocol, as for pictures: a playlist must not make FFmpeg open other files.
+        with av.open(f"file:{path.absolute()}", format="mov", metadata_errors="replace") as container:
+            for track in [stream for stream in container.streams if stream.type == "data"]:
+                for stream in container.streams:
+                    stream.discard = Discard.default if stream is track else Discard.all
+                container.seek(0)
+                found = False
+                for packet in container.demux(track):
+                    content, step = bytes(packet), track.time_base
+                    if packet.pts is None or step is None or not content:
+                        continue
+                    if not found and not content.startswith(b"DEVC"):
+                        break
+                    found = True
+                    start, length = (round(n * step * 10**9) for n in (packet.pts, packet.duration or 0))
+                    yield start, length, content
+                if found:
+                    return
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        problem = f"cannot be read ({str(error)[:100]})"
+        raise DataError(path, problem, "copy it from the camera again") from error
 
 
 def _read(path: Path) -> _Track:
     track = _Track()
-    for start_ns, length_ns, content in track_packets(path, _begins_with_a_device):
+    for start_ns, length_ns, content in _packets(path):
         for key, _, _, device in _items(content, track):
             if key == "DEVC":
                 for inner, _, _, stream in _items(device, track):

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 
 from pipelines.formats.common.rows import describe_times
-from pipelines.formats.drone_logs.video_tracks import made_ns
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import VideoIndex
@@ -32,7 +31,8 @@ if TYPE_CHECKING:
 _SHORTEST_S = 1e-5  # of a frame: the fastest cameras take 100,000 in a second
 _LATEST_S = 4 * 10**9  # the year 2096, counted from the epoch; int64 ns hold 292 years
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_NO_DATE_BEFORE = timedelta(days=365 * 15)  # 1985: there were no drones
+# MP4 counts from 1904 and a clock that was never set from 1970: such dates are none.
+_NO_DATE_BEFORE = timedelta(days=365)
 _MOST_KEY_FRAMES = 3  # seeks that are tried before a frame counts as undecodable
 _MOST_PIXELS = 1 << 27  # 16384 x 8192; a larger size in a header is damage and would exhaust the memory
 _BLACK = 16  # brightness, of 255
@@ -102,9 +102,9 @@ def index_video(path: Path) -> VideoIndex:
 # Telemetry by the names of tracks (as their writers call them) or of codecs, with the way to read it.
 _TELEMETRY = (
     (re.compile(r"GoPro MET"), "GoPro's telemetry (GPMF), read as `gopro`"),
-    (re.compile(r"(?i)djmd|(DJI|CAM|HAL) meta"), "DJI's telemetry (djmd), read as `dji_video`"),
-    (re.compile(r"(?i)parrot"), "Parrot's telemetry, read as `parrot` if its records are P2 or P3"),
-    (re.compile(r"klv"), "MISB KLV, read as `klv`"),
+    (re.compile(r"(?i)djmd|(DJI|CAM|HAL) meta"), "DJI's telemetry (djmd), not read"),
+    (re.compile(r"(?i)parrot"), "Parrot's telemetry, not read"),
+    (re.compile(r"klv"), "MISB KLV, not read"),
 )
 
 
@@ -136,7 +136,15 @@ def created_ns(path: Path) -> int | None:
     container, stream = open_container(path)
     with container:
         texts = [{**container.metadata}.get("creation_time"), {**stream.metadata}.get("creation_time")]
-    return made_ns(texts)
+    for text in filter(None, texts):
+        try:
+            made = datetime.fromisoformat(text)
+        except ValueError:
+            continue
+        elapsed = (made if made.tzinfo else made.replace(tzinfo=UTC)) - _EPOCH
+        if elapsed > _NO_DATE_BEFORE:
+            return elapsed // timedelta(microseconds=1) * 1000
+    return None
 
 
 def frames(

@@ -58,7 +58,7 @@ PACKETS = [
 
 
 def read(monkeypatch: pytest.MonkeyPatch, packets: list[tuple[int, int, bytes]], **choice: str) -> Telemetry:
-    monkeypatch.setattr(gpmf, "track_packets", lambda *_: iter(packets))
+    monkeypatch.setattr(gpmf, "_packets", lambda *_: iter(packets))
     return READER.read_telemetry(Path("a.mp4"), TelemetryChoice(**choice))  # type: ignore[arg-type]
 
 
@@ -237,7 +237,7 @@ def test_turns_that_contradict_gravity_are_refused(tmp_path: Path) -> None:
             )
         )
     ]
-    path = write_track(tmp_path / "a.mp4", packets, codec="bin_data", last_s=1)
+    path = write_track(tmp_path / "a.mp4", packets, last_s=1)
     with refuses(path, "GRAV"):
         READER.read_attitudes(path)
 
