@@ -130,7 +130,7 @@ class _Timed(Cluster):
 
 def _timed(work: Callable[[T], R], part: T) -> tuple[R, str, float]:
     """Call a function; return also the worker's name and the processor seconds."""
-    import distributed  # noqa: PLC0415  # on the worker
+    import distributed  # on the worker
 
     started_s = time.process_time()
     result = work(part)

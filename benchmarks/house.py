@@ -1,253 +1,417 @@
-"""Measures the house: its lines, modules, imports, parameters, docstrings and the phrases its tests ask for.
+"""Measures the house against the aims of its upkeep, and fails where one is missed.
 
-python -m benchmarks.house            # prints the table
-python -m benchmarks.house --write    # and puts it into CONTRIBUTING.md
-python -m benchmarks.house --worst    # and names what makes each figure what it is
-python -m benchmarks.house --beside evo rosbags FOLDER ...    # lines by kind, beside other packages
+python -m benchmarks.house                      # the table; exit status 1 where a number is missed
+python -m benchmarks.house --worst              # and the offenders behind each number
+python -m benchmarks.house --worst planning     # those of one room or folder only
+python -m benchmarks.house --session S --times build/tests.xml --count
 """
 
 import argparse
 import ast
-import importlib.util
+import contextlib
+import dataclasses
+import importlib
+import json
+import os
 import re
-import statistics
+import subprocess
 import sys
 import tokenize
+import typing
+import xml.etree.ElementTree as ET
+from collections import Counter, defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("mocap_cli", "pipelines")
-PAGE = ROOT / "CONTRIBUTING.md"
-BEGIN, END = "<!-- python -m benchmarks.house --write -->", "<!-- end -->"
-OPENERS = {"What", "Where", "How", "Whether", "Who", "That", "Which", "When"}
-Function = ast.FunctionDef | ast.AsyncFunctionDef
+TIMES = ROOT / "build" / "tests.xml"
+SAMPLE = ROOT / "demo" / "mound_walk.session"
+CONSTANTS_ARE = """\
+A constant is a number in capitals at the top of a module of pipelines/ or mocap_cli/, or a field of a frozen
+table (a frozen dataclass whose fields all have numbers as defaults). Its reason is the comment directly above
+it, or the one behind it: a sentence with a capital letter first, at least four words, and a full stop at the
+end. A heading `# --- tuning ---` is no reason. In pipelines/formats, constants on consecutive lines
+share the comment above the first: a standard fixes them together."""
 
 
-def parsed(folder: str) -> dict[Path, ast.Module]:
-    """Parse all modules of a folder."""
-    return {path: ast.parse(path.read_text()) for path in sorted((ROOT / folder).rglob("*.py"))}
+@dataclass(frozen=True)
+class Module:
+    """A parsed file."""
+
+    path: Path
+    text: str
+    tree: ast.Module
+
+    @property
+    def lines(self) -> int:
+        return len(self.text.splitlines())
+
+    @property
+    def place(self) -> str:
+        return self.path.relative_to(ROOT).as_posix()
+
+    @property
+    def room(self) -> str:
+        """The folder below pipelines/, tests/ or benchmarks/; a file there stands for itself."""
+        return "/".join(self.path.relative_to(ROOT).parts[:2])
+
+    @property
+    def name(self) -> str:
+        parts = self.path.relative_to(ROOT).with_suffix("").parts
+        return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
-    """Find the docstrings of a module, its classes and its functions."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | Function) and ast.get_docstring(node) is not None:
-            first = node.body[0]
-            assert isinstance(first, ast.Expr)
-            assert isinstance(first.value, ast.Constant)
-            yield first.value
+@dataclass(frozen=True)
+class Row:
+    """One number with its aim; `value` None where it was not measured."""
+
+    subject: str
+    value: float | None
+    most: float | None = None
+    shown: str = ""
+    offenders: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        if self.most is None:
+            return ""
+        if self.value is None:
+            return "not measured"
+        return "met" if self.value <= self.most else "MISSED"
 
 
-def code_lines(path: Path, tree: ast.Module) -> int:
-    """Count the lines of a module that hold code: no blank lines, comments or docstrings."""
-    documented = {
-        line for text in docstrings(tree) for line in range(text.lineno, (text.end_lineno or text.lineno) + 1)
-    }
-    ignored = {
-        tokenize.COMMENT,
-        tokenize.NL,
-        tokenize.NEWLINE,
-        tokenize.INDENT,
-        tokenize.DEDENT,
-        tokenize.ENCODING,
-        tokenize.ENDMARKER,
-    }
-    with path.open("rb") as file:
+def modules_of(folder: str) -> list[Module]:
+    """Parse all modules of a folder of the repository."""
+    found = []
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        found.append(Module(path, text, ast.parse(text)))
+    return found
+
+
+def code_lines(module: Module) -> int:
+    """Count the lines that hold code: no blank lines, comments or docstrings."""
+    documented: set[int] = set()
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and (
+            ast.get_docstring(node) is not None
+        ):
+            text = node.body[0]
+            documented.update(range(text.lineno, (text.end_lineno or text.lineno) + 1))
+    other = {"COMMENT", "NL", "NEWLINE", "INDENT", "DEDENT", "ENCODING", "ENDMARKER"}
+    with module.path.open("rb") as file:
         held = {
             line
             for token in tokenize.tokenize(file.readline)
-            if token.type not in ignored
+            if tokenize.tok_name[token.type] not in other
             for line in range(token.start[0], token.end[0] + 1)
         }
     return len(held - documented)
 
 
-def statements(tree: ast.Module) -> int:
-    """Count the statements of a module, docstrings among them."""
-    return sum(isinstance(node, ast.stmt) for node in ast.walk(tree))
-
-
-def lines_by_kind(folder: Path) -> str:
-    """Count the lines of a package by kind, and its statements; return a row of the table of decision 10.
-
-    Tests within the package are left out. Words and formatting decide how many lines a statement has.
-    """
-    lines = code = documented = blank = stated = modules = 0
-    for path in sorted(folder.rglob("*.py")):
-        if "tests" in path.relative_to(folder).parts:
-            continue
-        text = path.read_text(encoding="utf-8")
-        tree = ast.parse(text)
-        within = {n for d in docstrings(tree) for n in range(d.lineno, (d.end_lineno or d.lineno) + 1)}
-        modules += path.name != "__init__.py"
-        lines += len(text.splitlines())
-        code += code_lines(path, tree)
-        documented += len(within)
-        blank += sum(not line.strip() for n, line in enumerate(text.splitlines(), 1) if n not in within)
-        stated += statements(tree)
-    kinds = (lines, code, documented, blank, lines - code - documented - blank, stated)
-    thousands = " | ".join(f"{count / 1000:.1f}" for count in kinds)
-    return f"| {folder.name} | {modules} | {thousands} | {lines / stated:.2f} |"
-
-
-def folder_of(package: str) -> Path:
-    """Find the folder of an installed package, or take a path as it is."""
-    if Path(package).is_dir():
-        return Path(package)
-    found = importlib.util.find_spec(package)
-    if found is None or not found.submodule_search_locations:
-        sys.exit(f"{package}: neither a folder nor an installed package")
-    return Path(found.submodule_search_locations[0])
-
-
-def name_of(path: Path) -> str:
-    """Name a module as an import does."""
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-def imported(tree: ast.Module, modules: set[str]) -> set[str]:
-    """Find the modules of the project that a module imports, inside functions as well."""
-    found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                found.add(inner if inner in modules else node.module)
-        elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-    return found & modules
-
-
-def longest_chains(graph: dict[str, set[str]]) -> dict[str, list[str]]:
-    """Find the longest chain of imports below each module; one met again in its own chain ends it."""
+def longest_chain(modules: list[Module]) -> list[str]:
+    """Find the longest chain of imports, also of those in functions; one met again in its chain ends it."""
+    names = {module.name for module in modules}
+    graph: dict[str, set[str]] = {}
+    for module in modules:
+        found: set[str] = set()
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                inner = {f"{node.module}.{alias.name}" for alias in node.names}
+                found |= {name if name in names else node.module for name in inner}
+            elif isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+        graph[module.name] = (found & names) - {module.name}
     best: dict[str, list[str]] = {}
-    open_modules: set[str] = set()
+    above: set[str] = set()
 
-    def below(module: str) -> list[str]:
-        if module in best:
-            return best[module]
-        open_modules.add(module)
-        chains = [below(other) for other in sorted(graph[module]) if other not in open_modules]
-        open_modules.discard(module)
-        best[module] = [module, *max(chains, key=len, default=[])]
-        return best[module]
+    def below(name: str) -> list[str]:
+        if name not in best:
+            above.add(name)
+            chains = [below(other) for other in sorted(graph[name]) if other not in above]
+            above.discard(name)
+            best[name] = [name, *max(chains, key=len, default=[])]
+        return best[name]
 
-    return {module: below(module) for module in sorted(graph)}
-
-
-def parameters(node: Function) -> int:
-    """Count the parameters of a function, without `self` and `cls`."""
-    names = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-    return len([name for name in names if name.arg not in ("self", "cls")])
+    return max((below(name) for name in sorted(graph)), key=len)
 
 
-def is_phrase(text: str) -> bool:
-    """Recognise English: two words beside each other, as no path, key, code or number has."""
-    named = re.sub(r"\\?\.(?=\w)", "/", text)  # flight.session and poses\.parquet are names of files
-    plain = re.sub(r"\\.|[.*?+^$()\[\]{}|]", " ", named)
-    return bool(re.search(r"(?<![\w./:=-])[A-Za-z]{2,},? [a-z]{2,}(?![\w/:=])", plain))
+def is_number(node: ast.expr | None) -> bool:
+    """Recognise a number: a literal, a term of numbers and names, or a function of numbers."""
+    if isinstance(node, ast.Constant):
+        return isinstance(node.value, int | float) and not isinstance(node.value, bool)
+    if isinstance(node, ast.UnaryOp):
+        return is_number(node.operand)
+    if isinstance(node, ast.BinOp):
+        sides = (node.left, node.right)
+        return any(map(is_number, sides)) and all(
+            is_number(side) or isinstance(side, ast.Name | ast.Attribute) for side in sides
+        )
+    if isinstance(node, ast.Call):
+        return bool(node.args) and all(map(is_number, node.args))
+    return False
 
 
-def strings(node: ast.AST) -> Iterator[str]:
-    """Find the literal strings below a node."""
-    for inner in ast.walk(node):
-        if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
-            yield inner.value
+def is_frozen_table(node: ast.ClassDef) -> bool:
+    """Recognise a frozen dataclass all of whose fields (two or more) have numbers as defaults."""
+    frozen = any("frozen=True" in ast.unparse(decorator) for decorator in node.decorator_list)
+    stated = [inner for inner in node.body if isinstance(inner, ast.AnnAssign)]
+    return frozen and len(stated) > 1 and all(is_number(inner.value) for inner in stated)
 
 
-def phrase_assertions(tree: ast.Module) -> list[int]:
-    """Find the lines of a test module that assert an English phrase: `assert` or `match=`.
+def constants(tree: ast.Module) -> Iterator[tuple[str, ast.stmt]]:
+    """Find the numbers in capitals at the top of a module, and those in its frozen tables."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef) and is_frozen_table(node):
+            for inner in node.body:
+                if isinstance(inner, ast.AnnAssign) and isinstance(inner.target, ast.Name):
+                    yield f"{node.name}.{inner.target.id}", inner
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            name = targets[0].id if isinstance(targets[0], ast.Name) else ""
+            if re.fullmatch(r"_*[A-Z][A-Z0-9_]*", name) and is_number(node.value):
+                yield name, node
 
-    The message of an `assert`, after its comma, is for the reader and does not count.
-    """
-    found = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Assert):
-            if any(map(is_phrase, strings(node.test))):
-                found.append(node.lineno)
-        elif (
-            isinstance(node, ast.keyword) and node.arg == "match" and any(map(is_phrase, strings(node.value)))
-        ):
-            found.append(node.value.lineno)
-    return sorted(found)
+
+def is_sentence(text: str) -> bool:
+    """Recognise a sentence: a capital letter first, at least four words, a full stop at the end."""
+    return bool(re.match(r"[A-Z]", text)) and len(text.split()) >= 4 and text.endswith(".")
+
+
+def constants_without_reason(module: Module) -> tuple[list[str], int]:
+    """Find the constants of a module whose reason is missing or a fragment; count all."""
+    lines = module.text.splitlines()
+    comments = {
+        token.start[0]: token.string.lstrip("#: ")
+        for token in tokenize.generate_tokens(iter(f"{line}\n" for line in lines).__next__)
+        if token.type == tokenize.COMMENT
+    }
+    alone = {number for number in comments if lines[number - 1].lstrip().startswith("#")}
+    missing: list[str] = []
+    reasoned: set[int] = set()  # last lines of constants whose comment above is a sentence
+    count = 0
+    for name, node in constants(module.tree):
+        count += 1
+        first = node.lineno
+        while first - 1 in alone and not comments[first - 1].startswith("---"):
+            first -= 1
+        above = " ".join(comments[number] for number in range(first, node.lineno))
+        end = node.end_lineno or node.lineno
+        shared = module.room == "pipelines/formats" and not above and node.lineno - 1 in reasoned
+        if is_sentence(above) or shared:
+            reasoned.add(end)
+        elif not is_sentence(comments.get(end, "")):
+            missing.append(
+                f"{module.place}:{node.lineno} {name}  # {above or comments.get(end, '')}".rstrip(" #")
+            )
+    return missing, count
+
+
+def duplicate_classes(modules: list[Module]) -> list[str]:
+    """Find names of classes of pipelines/ that stand for two things or more; `_Track` and `Track` are one."""
+    places: dict[str, list[str]] = defaultdict(list)
+    for module in modules:
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.ClassDef):
+                places[node.name.lstrip("_")].append(f"{module.place}:{node.lineno}")
+    return [f"{name}: {', '.join(found)}" for name, found in sorted(places.items()) if len(found) > 1]
+
+
+def command_options(name: str) -> tuple[str, ...]:
+    """Return the options of a command of `mocap`, without --help."""
+    import click
+
+    main = importlib.import_module("mocap_cli.main")
+    group = next(value for value in vars(main).values() if isinstance(value, click.Group))
+    command = group.get_command(click.Context(group), name)
+    assert command is not None
+    return tuple(p.opts[0] for p in command.params if isinstance(p, click.Option))
+
+
+def manifest_keys() -> tuple[str, ...]:
+    """Return the keys of flight.yaml, with the model that has each; options that a format declares count."""
+    from importlib.metadata import entry_points
+
+    from pydantic import BaseModel
+
+    from pipelines.session import manifest
+    from pipelines.session.yaml_files import Part
+
+    for entry in entry_points(group="mocap.formats"):
+        entry.load()
+
+    def named(annotation: Any) -> Iterator[type[BaseModel]]:
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            yield annotation
+        for argument in typing.get_args(annotation):
+            yield from named(argument)
+
+    def subclasses(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+        for child in model.__subclasses__():
+            yield from (child, *subclasses(child))
+
+    waiting: list[type[BaseModel]] = [manifest.Flight]
+    waiting += [model for model in subclasses(Part) if model.__module__.startswith("pipelines.formats")]
+    models: list[type[BaseModel]] = []
+    while waiting:
+        model = waiting.pop()
+        if model not in models:
+            models.append(model)
+            for field in model.model_fields.values():
+                waiting += named(field.annotation)
+    return tuple(
+        f"{model.__name__}.{field.alias or key}"
+        for model in models
+        for key, field in model.model_fields.items()
+    )
+
+
+def planner_settings() -> tuple[str, ...]:
+    """Return the settings of the planner that PLANNER.yaml may state."""
+    from pipelines.planning.config import PlannerConfig
+
+    return tuple(field.name for field in dataclasses.fields(PlannerConfig))
+
+
+def leaves(value: object) -> int:
+    """Count the values of a JSON document."""
+    if isinstance(value, dict):
+        return sum(map(leaves, value.values()))
+    return sum(map(leaves, value)) if isinstance(value, list) else 1
+
+
+def files_of_keypoint() -> tuple[str, ...]:
+    """Return the files that the walk of a keypoint in docs/architecture.md names."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    walk = re.search(r"^#+ A keypoint.*?(?=^#|\Z)", text, flags=re.MULTILINE | re.DOTALL)
+    return tuple(sorted(set(re.findall(r"`([\w/]+\.py)`", walk.group()))) if walk else ())
+
+
+def minutes(junit: Path) -> float | None:
+    """Add up the minutes of all tests in a JUnit file of pytest, which are those of the processors."""
+    if not junit.exists():
+        return None
+    return sum(float(case.get("time", 0)) for case in ET.parse(junit).iter("testcase")) / 60  # noqa: S314
+
+
+def collected_tests() -> int:
+    """Have pytest collect the tests, and count them."""
+    command = [sys.executable, "-m", "pytest", "-q", "--collect-only", "tests"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S603
+    found = re.search(r"^(\d+) tests collected", done.stdout, flags=re.MULTILINE)
+    return int(found.group(1)) if found else 0
+
+
+def by_room(modules: list[Module]) -> tuple[str, ...]:
+    """Add up lines and modules of each room."""
+    lines: Counter[str] = Counter()
+    count: Counter[str] = Counter()
+    for module in modules:
+        lines[module.room] += module.lines
+        count[module.room] += 1
+    return tuple(f"{n:6d} lines {count[room]:4d} modules  {room}" for room, n in lines.most_common())
+
+
+def largest(modules: list[Module]) -> tuple[str, ...]:
+    """Name the modules from the largest to the smallest."""
+    return tuple(f"{m.lines:6d} {m.place}" for m in sorted(modules, key=lambda m: -m.lines))
+
+
+def rows_of(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure all that the table has."""
+    house, cli = modules_of("pipelines"), modules_of("mocap_cli")
+    benchmarks, tests = modules_of("benchmarks"), modules_of("tests")
+    lines = sum(module.lines for module in house)
+    code = sum(map(code_lines, house))
+    yield Row("`pipelines/`, lines of Python (code)", lines, 66_000, f"{lines} ({code})", by_room(house))
+    yield Row("modules of `pipelines/`, `__init__` among them", len(house), 200, "", largest(house)[::-1])
+    chain = longest_chain(house + cli)
+    yield Row("depth of the imports, from `mocap_cli`", len(chain), 11, "", tuple(chain))
+
+    lines = sum(module.lines for module in benchmarks)
+    yield Row("benchmarks, lines", lines, 4_000, "", largest(benchmarks))
+    commands = tuple(m.place for m in benchmarks if "__main__" in m.text)
+    yield Row("benchmarks, commands", len(commands), 8, "", commands)
+    importing = [
+        m.place for m in tests if re.search(r"^\s*(from|import) benchmarks", m.text, flags=re.MULTILINE)
+    ]
+    yield Row("tests that import benchmarks", len(importing), 0, "", tuple(importing))
+
+    lines = sum(module.lines for module in tests)
+    yield Row("tests, lines", lines, 36_000, "", (*by_room(tests), *largest(tests)))
+    if options.count:
+        yield Row("tests, count", collected_tests())
+    yield Row(f"`make test`, processor minutes ({options.times.name})", minutes(options.times), 9)
+
+    pages = sorted((ROOT / "docs").rglob("*.md")) + [
+        ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")
+    ]
+    words = {
+        page.relative_to(ROOT).as_posix(): len(page.read_text(encoding="utf-8").split())
+        for page in pages
+        if page.exists()
+    }
+    longest = tuple(f"{n:6d} {page}" for page, n in sorted(words.items(), key=lambda item: -item[1]))
+    yield Row("docs, README, CONTRIBUTING, CHANGELOG: words", sum(words.values()), 24_000, "", longest)
+    yield Row("docs, README, CONTRIBUTING, CHANGELOG: pages", len(words), 15)
+
+    for command, most in (("reconstruct", 14), ("replan-compare", 12)):
+        names = command_options(command)
+        yield Row(f"options of `{command}`", len(names), most, "", names)
+    for subject, measured, most in (
+        ("keys of flight.yaml", manifest_keys, 90),
+        ("settings of the planner", planner_settings, 20),
+        ("files that a keypoint passes (docs/architecture.md)", files_of_keypoint, 20),
+    ):
+        found: tuple[str, ...] | None = None
+        with contextlib.suppress(ImportError, AttributeError, FileNotFoundError):
+            found = measured()
+        yield Row(subject, None if found is None else len(found), most, "", found or ())
+    metrics = options.session / "reconstruct" / "metrics.json"
+    values = leaves(json.loads(metrics.read_text())) if metrics.exists() else None
+    yield Row(f"values of reconstruct/metrics.json in {options.session.name}", values, 300)
+
+    doubled = duplicate_classes(house)
+    yield Row("class names used for two things or more", len(doubled), 15, "", tuple(doubled))
+    missing: list[str] = []
+    count = 0
+    for module in house + cli:
+        found_missing, constants_here = constants_without_reason(module)
+        missing += found_missing
+        count += constants_here
+    subject = "constants whose reason is a fragment or missing"
+    bare = sum("  #" not in line for line in missing)
+    shown = f"{len(missing)} of {count} ({bare} without any)"
+    yield Row(subject, len(missing), 0, shown, tuple(missing))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure the house.")
-    parser.add_argument("--write", action="store_true", help="Put the table into CONTRIBUTING.md.")
-    parser.add_argument("--worst", action="store_true", help="Name what makes each figure what it is.")
+    parser = argparse.ArgumentParser(description="Measure the house.", epilog=CONSTANTS_ARE)
     parser.add_argument(
-        "--beside", nargs="+", metavar="PACKAGE", help="Print lines by kind of these as well."
+        "--worst", nargs="?", const="", metavar="PART", help="Name offenders [in PART of paths]."
     )
+    parser.add_argument("--session", type=Path, default=SAMPLE, help="Session with the sample's metrics.")
+    parser.add_argument("--times", type=Path, default=TIMES, help="JUnit file of `make test`.")
+    parser.add_argument("--count", action="store_true", help="Collect and count the tests, in 20 s.")
     options = parser.parse_args()
-    if options.beside:
-        print("| package | modules | k lines | code | docstrings | blank | comments | k statements |", end="")
-        print(" lines a statement |\n|" + " --- |" * 9)
-        for folder in (ROOT / "pipelines", *map(folder_of, options.beside)):
-            print(lines_by_kind(folder))
-        return
+    os.environ.setdefault("NUMBA_DISABLE_JIT", "1")  # nothing is computed here
 
-    house = {path: tree for package in PACKAGES for path, tree in parsed(package).items()}
-    rooms = {path: tree for path, tree in house.items() if path.is_relative_to(ROOT / "pipelines")}
-    modules = {path: tree for path, tree in rooms.items() if path.name != "__init__.py"}
-    lines = {path: len(path.read_text().splitlines()) for path in rooms}
-    names = {name_of(path) for path in house}
-    chains = longest_chains(
-        {name_of(path): imported(tree, names) - {name_of(path)} for path, tree in house.items()}
-    )
-    chain = max(chains.values(), key=len)
-    functions = [
-        (parameters(node), f"{name_of(path)}.{node.name}")
-        for path, tree in house.items()
-        for node in ast.walk(tree)
-        if isinstance(node, Function)
-    ]
-    docs = [
-        (text.value, f"{path.relative_to(ROOT)}:{text.lineno}")
-        for path, tree in house.items()
-        for text in docstrings(tree)
-    ]
-    openers = [where for text, where in docs if str(text).split(maxsplit=1)[0].strip(",.:") in OPENERS]
-    phrases = [
-        f"{path.relative_to(ROOT)}:{line}"
-        for path, tree in parsed("tests").items()
-        for line in phrase_assertions(tree)
-    ]
-    rows = {
-        "lines of Python in `pipelines/` (without blank lines, comments and docstrings)": (
-            f"{sum(lines.values()) / 1000:.1f} k "
-            f"({sum(code_lines(path, tree) for path, tree in rooms.items()) / 1000:.1f} k)"
-        ),
-        "lines for a statement": f"{sum(lines.values()) / sum(map(statements, rooms.values())):.2f}",
-        "modules without `__init__`; median lines": (
-            f"{len(modules)}; {statistics.median(lines[path] for path in modules):.0f}"
-        ),
-        "depth of the import graph, with `mocap_cli`": f"{len(chain)}",
-        "most parameters of a function": f"{max(functions)[0]}",
-        "docstrings that open with What, Where, How, Whether, Who, That, Which or When": (
-            f"{len(openers)} of {len(docs)}"
-        ),
-        "test assertions on English phrases": f"{len(phrases)}",
-    }
-    table = "\n".join(["| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows.items())])
-    print(table)
-    if options.worst:
-        rooms_of = sorted({".".join(name.split(".")[:2]) for name in chains})
-        print("\nlongest chains of imports:")
-        for room in rooms_of:
-            longest = max((c for n, c in chains.items() if n == room or n.startswith(f"{room}.")), key=len)
-            print(f"{len(longest):3d} {room}: {' > '.join(longest)}")
-        print("\nmost parameters:", *(f"{n:3d} {name}" for n, name in sorted(functions)[:-31:-1]), sep="\n  ")
-        print("\ndocstrings:", *openers, sep="\n  ")
-        print("\nphrases:", *phrases, sep="\n  ")
-    if options.write:
-        page = PAGE.read_text()
-        if BEGIN not in page:
-            sys.exit(f"{PAGE}: has no line {BEGIN}")
-        before, rest = page.split(BEGIN, 1)
-        PAGE.write_text(f"{before}{BEGIN}\n{table}\n{END}{rest.split(END, 1)[1]}")
+    rows = list(rows_of(options))
+    print("| | measured | at most | |\n| --- | --- | --- | --- |")
+    for row in rows:
+        shown = row.shown or (
+            "" if row.value is None else f"{row.value:.4g}" if row.value % 1 else f"{row.value:.0f}"
+        )
+        print(f"| {row.subject} | {shown} | {'' if row.most is None else f'{row.most:g}'} | {row.verdict} |")
+    print(f"\n{CONSTANTS_ARE}")
+    if options.worst is not None:
+        for row in rows:
+            offenders = [line for line in row.offenders if options.worst in line]
+            if offenders:
+                print(f"\n{row.subject}:", *offenders, sep="\n  ")
+    sys.exit(any(row.verdict == "MISSED" for row in rows))
 
 
 if __name__ == "__main__":

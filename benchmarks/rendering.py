@@ -164,7 +164,7 @@ def capsule(
 
 
 def save(picture: NDArray[np.uint8], path: Path) -> None:
-    import cv2  # noqa: PLC0415
+    import cv2
 
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), picture)
