@@ -189,4 +189,6 @@ def _numbers(option: str, text: str, number: Callable[[str], Any]) -> list[Any]:
     try:
         return [number(word) for word in _words(text)]
     except ValueError:
-        raise DataError(option, f"{text!r} is no list of numbers", "write them like 2,3,4") from None
+        raise DataError(
+            option, f"{text!r} is no list of numbers", "write them like 2,3,4", code="bad-value"
+        ) from None

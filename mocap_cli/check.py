@@ -49,7 +49,7 @@ def check_command(
     say_warnings(result.warnings, shown.quiet)
     if strict and result.doubts:
         first = result.doubts[0]
-        raise DataError(path, f"is doubted: {first.what} ({first.code})", first.remedy)
+        raise DataError(path, f"is doubted: {first.what} ({first.code})", first.remedy, code="doubted")
     if shown.as_json:
         return {"path": str(path), "doubts": [doubt.as_json() for doubt in result.doubts]}
     for doubt in result.doubts:

@@ -28,7 +28,7 @@ class Mocap(click.Group):
         try:
             return super().invoke(ctx)
         except MocapError as error:
-            say(f"mocap: {one_line(str(error))}", err=True)
+            print_error(error)
             ctx.exit(1)
         except click.UsageError as error:
             if error.ctx is not None and error.message == error.ctx.get_help():
@@ -38,6 +38,11 @@ class Mocap(click.Group):
         except KeyboardInterrupt:
             say("mocap: interrupted; nothing is lost, the same command continues", err=True)
             ctx.exit(_INTERRUPTED)
+
+
+def print_error(error: MocapError) -> None:
+    """Print an error as one line on stderr."""
+    say(f"mocap: {one_line(str(error))}", err=True)
 
 
 class _Lazy(Mocap):

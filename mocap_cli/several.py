@@ -32,7 +32,7 @@ def expanded(paths: Iterable[str | Path]) -> list[Path]:
             continue
         matches = sorted(glob.glob(text, recursive=True))  # noqa: PTH207  # Path's knows no absolute pattern
         if not matches:
-            raise DataError(text, "matches nothing", "check the pattern")
+            raise DataError(text, "matches nothing", "check the pattern", code="no-such-file")
         found.update(dict.fromkeys(map(Path, matches)))
     return list(found)
 
@@ -42,7 +42,7 @@ def _matching(pattern: str) -> list[str]:
 
     found = matching(url_of(pattern) or pattern)
     if not found:
-        raise DataError(pattern, "matches nothing", "check the pattern")
+        raise DataError(pattern, "matches nothing", "check the pattern", code="no-such-file")
     return found
 
 
@@ -83,7 +83,12 @@ def _here(stack: ExitStack, argument: str, suffix: str, options: dict[str, Any])
             output = output or (place.with_suffix(suffix) if argument == "flight" else None)
     if output is not None and is_url(output):
         if argument != "flight":
-            raise DataError(output, "is a URL, and must be a path here", "write it here, and copy it there")
+            raise DataError(
+                output,
+                "is a URL, and must be a path here",
+                "write it here, and copy it there",
+                code="url-refused",
+            )
         own["output"] = stack.enter_context(session_here(output, create=True, quiet=quiet))
     return options | own
 

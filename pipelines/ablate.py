@@ -158,7 +158,12 @@ def _parts(
 def _refuse_nothing(folder: Path, summary: Mapping[str, Any]) -> None:
     """Refuse an empty study, which would look like success."""
     if not any(cell["metrics"]["mpjpe_mm"] for cell in summary["cells"]):
-        raise DataError(folder, "nothing was reconstructed by all methods", "film longer, or at lower tilts")
+        raise DataError(
+            folder,
+            "nothing was reconstructed by all methods",
+            "film longer, or at lower tilts",
+            code="nothing-reconstructed",
+        )
 
 
 # --- one condition -------------------------------------------------------------------------------------

@@ -734,7 +734,9 @@ def refuse_doubted(folder: Path, doubts: Sequence[Mapping[str, Any]], *, strict:
         first = doubts[0]
         more = f", the first of {len(doubts)} doubts" if len(doubts) > 1 else ""
         remedy = "; ".join(said_remedy(str(first["remedy"])))
-        raise DataError(folder, f"is doubted: {first['what']} ({first['code']}){more}", remedy)
+        raise DataError(
+            folder, f"is doubted: {first['what']} ({first['code']}){more}", remedy, code="doubted"
+        )
 
 
 def unused_cameras(cameras: list[Camera], result: Triangulation) -> list[str]:

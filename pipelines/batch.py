@@ -129,7 +129,9 @@ def batch(
     settings, progress = settings or Settings(), progress or Silent()
     unknown = [stage for stage in settings.stages if stage not in STAGES]
     if unknown:
-        raise DataError(f"--stages {unknown[0]}", "no such stage", f"there are {', '.join(STAGES)}")
+        raise DataError(
+            f"--stages {unknown[0]}", "no such stage", f"there are {', '.join(STAGES)}", code="no-such-name"
+        )
     need("distributed", "batch")
     flights = list({path.resolve(): path for path in flights}.values())
     folder = output or Path(_FOLDER)
@@ -340,7 +342,10 @@ def _refuse_foreign(folder: Path, overwrite: bool) -> None:
         raise as_data_error(error, table) from error
     if not first.startswith(",".join(COLUMNS[:4])):
         raise DataError(
-            table, "is not the summary of a batch", "choose another --output, or give --overwrite"
+            table,
+            "is not the summary of a batch",
+            "choose another --output, or give --overwrite",
+            code="exists",
         )
 
 

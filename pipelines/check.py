@@ -98,7 +98,9 @@ def _checked(
 ) -> Checked:
     with locked(folder) as session:
         if session.intact_record("ingest") is None:
-            raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
+            raise DataError(
+                folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
+            )
         description = read_description(folder)
         detected, pictures = _detected(session, description, detector, workers, progress)
         _, t_ns = load_time_base(folder, description, detected, None)

@@ -146,7 +146,9 @@ def detect(
     }
     ingested = session.intact_record("ingest")
     if ingested is None:
-        raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
+        raise DataError(
+            session.folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
+        )
     work = _Work(session.folder, description, every, (start_s, end_s))
     looked_at = _looked_at(work, chosen, media)
     kept = None if force else _kept(session, settings, looked_at)
@@ -171,6 +173,7 @@ def detect(
             session.folder,
             f"no picture lies {_span_words(start_s, end_s)}",
             "look at `mocap info`, or leave it out",
+            code="no-overlap",
         )
     progress.start("Detecting keypoints", pictures)
     if cluster is not None:
@@ -201,6 +204,7 @@ def _refuse_nobody(folder: Path, counts: Mapping[str, Mapping[str, int]], pictur
         folder,
         "nobody was found in any picture" + (f": {lost} of {pictures} cannot be decoded" if lost else ""),
         "look at the pictures, or give keypoints",
+        code="nobody-found",
     )
 
 
@@ -413,6 +417,7 @@ def detect_block(order: _Order) -> tuple[dict[str, bytes], dict[str, bytes] | No
             order.detector.name,
             "has other model files on a machine of the Dask cluster, or none",
             "every machine needs the same ones (see `mocap models`)",
+            code="wrong-model",
         )
     description = read_description(folder)
     work = _Work(folder, description, order.every, (None, None))

@@ -149,7 +149,9 @@ def _shape(format_: Export, unit: str | None, axes: str | None) -> tuple[str, st
         return None
     for wanted, there, what in ((unit, format_.units, "unit"), (axes, format_.axes, "axes")):
         if wanted is not None and wanted not in there:
-            raise DataError(format_.name, f"has no {what} {wanted}", f"there are {', '.join(there)}")
+            raise DataError(
+                format_.name, f"has no {what} {wanted}", f"there are {', '.join(there)}", code="no-such-name"
+            )
     return unit or format_.units[0], axes or format_.axes[0]
 
 
@@ -178,10 +180,13 @@ def _zero(format_: Export, time: str | None) -> str | None:
                 format_.name,
                 "has no choice of time",
                 "leave --time out, or export the others by themselves",
+                code="no-such-name",
             )
         return None
     if time is not None and time not in format_.times:
-        raise DataError(format_.name, f"has no time {time}", f"there are {', '.join(format_.times)}")
+        raise DataError(
+            format_.name, f"has no time {time}", f"there are {', '.join(format_.times)}", code="no-such-name"
+        )
     return time or format_.times[0]
 
 
@@ -335,7 +340,10 @@ def _move(made: Mapping[Path, dict[str, Any]], target: Path, overwrite: bool) ->
         own = there is not None and there == ours.get(path.name, {}).get("sha256")
         if place.exists() and there != facts["sha256"] and not own and not overwrite:
             raise DataError(
-                place, "exists and was not exported so", "choose another --output, or add --overwrite"
+                place,
+                "exists and was not exported so",
+                "choose another --output, or add --overwrite",
+                code="exists",
             )
         (unchanged if there == facts["sha256"] else written).append((path, place))
     for path, _ in written:

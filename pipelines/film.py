@@ -214,6 +214,7 @@ def _scenario_of(folder: Path, description: Description) -> Path:
         folder,
         "has no scenario.yaml of a simulated flight beside it",
         "name it with --scenario SCENARIO.yaml",
+        code="no-such-file",
     )
 
 
@@ -253,7 +254,12 @@ def _arm(
     t_ns = table["t_ns"].to_numpy(np.int64)[:: len(cameras)]
     rows = _rows(t_ns, settings)
     if len(rows) < 2:
-        raise DataError(folder, f"{len(rows)} pictures lie in the span that is to be filmed", "widen it")
+        raise DataError(
+            folder,
+            f"{len(rows)} pictures lie in the span that is to be filmed",
+            "widen it",
+            code="no-overlap",
+        )
 
     moments = t_ns[rows]
     people = []

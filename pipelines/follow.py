@@ -170,6 +170,7 @@ class Following:
                 "--refine-cameras",
                 "no moving camera has pictures to look at",
                 "state their `video`, or leave it out",
+                code="no-pictures",
             )
         refuse_changed_pictures(session.folder, self._description, names)
         self._seen = {name: self._looked_at(name, every, span_s) for name in names}

@@ -460,6 +460,7 @@ class _FlightReader:
                 f"{self._flight_path}: map.log {log}",
                 f"has its first map at {from_ns / 1e9:.3f} s, after the pictures ({span_words(first, last)})",
                 "check its clock, or take `stamps: receive`",
+                code="no-overlap",
             )
 
     @property
@@ -531,9 +532,10 @@ def _refuse_unsound(flight_path: Path, description: Description) -> None:
             flight_path,
             f"is not whole, and --strict was given ({'; '.join(lost)})",
             "copy what is damaged again, or ingest without --strict",
+            code="losses",
         )
     for doubt in description.doubts:
-        raise DataError(flight_path, f"is doubted: {doubt.what} ({doubt.code})", doubt.remedy)
+        raise DataError(flight_path, f"is doubted: {doubt.what} ({doubt.code})", doubt.remedy, code="doubted")
 
 
 def _refuse_ways_out(flight: Flight, path: Path) -> None:
@@ -544,6 +546,7 @@ def _refuse_ways_out(flight: Flight, path: Path) -> None:
             path,
             f"leads out of its folder ({', '.join(ways_out)})",
             "write such paths in full, from the root on, or put the files beside the manifest",
+            code="outside-folder",
         )
 
 
@@ -560,6 +563,7 @@ def _refuse_other_flight(target: Path, flight: Flight, overwrite: bool) -> None:
             target,
             f"holds the flight {held!r}, not {flight.name!r}",
             "choose another place with --output, or replace it with --overwrite",
+            code="exists",
         )
 
 
@@ -592,6 +596,7 @@ def _check_overlap(flight_path: Path, entries: Mapping[str, CameraEntry]) -> Non
                 f"cameras.{', '.join(odd)}: frames ({_span_of(odd, entries)}) overlap in time with no other"
                 f" camera's ({_span_of(rest, entries)})",
                 "check frame_times.start and clock.offset_s",
+                code="no-overlap",
             )
         reached_ns = max(reached_ns, frames.last_t_ns)
 

@@ -82,7 +82,12 @@ def write_overlays(
             session.intact_record(stage)
         record = session.intact_record("reconstruct")
         if record is None:
-            raise DataError(folder, "holds no skeleton to draw", "run `mocap reconstruct` first")
+            raise DataError(
+                folder,
+                "holds no skeleton to draw",
+                "run `mocap reconstruct` first",
+                code="nothing-reconstructed",
+            )
         description = read_description(folder)
         wanted = _with_pictures(folder, description, cameras)
         _refuse_foreign(folder, force)
@@ -144,7 +149,9 @@ def _videos(folder: Path, record: StageRecord) -> list[Path]:
 def _refuse_foreign(folder: Path, force: bool) -> None:
     target = folder / "overlay"
     if target.exists() and not (target / "stage.json").is_file() and not force:
-        raise DataError(target, "is in the way, and no overlay of mocap's", "move it away, or use --force")
+        raise DataError(
+            target, "is in the way, and no overlay of mocap's", "move it away, or use --force", code="exists"
+        )
 
 
 # --- which cameras, and which of their pictures --------------------------------------------------------
@@ -155,14 +162,22 @@ def _with_pictures(folder: Path, description: Description, cameras: Sequence[str
     filmed = [name for name, entry in description.cameras.items() if entry.media is not None]
     for name in cameras or ():
         if name not in description.cameras:
-            raise DataError(name, "no such camera", f"there are {', '.join(description.cameras)}")
+            raise DataError(
+                name, "no such camera", f"there are {', '.join(description.cameras)}", code="no-such-name"
+            )
         if name not in filmed:
             raise DataError(
-                name, "has no pictures to draw on", "state its `video` in flight.yaml, or leave it out"
+                name,
+                "has no pictures to draw on",
+                "state its `video` in flight.yaml, or leave it out",
+                code="no-pictures",
             )
     if not filmed:
         raise DataError(
-            folder, "has no pictures to draw on", "state the cameras' `video` in flight.yaml, and ingest it"
+            folder,
+            "has no pictures to draw on",
+            "state the cameras' `video` in flight.yaml, and ingest it",
+            code="no-pictures",
         )
     return [name for name in filmed if cameras is None or name in cameras]
 
@@ -184,6 +199,7 @@ def _still_there(
             gone[0][1].resolve(),
             f"the pictures of {gone[0][0]} are not there any more",
             "put them back, or ingest them from where they are now",
+            code="no-such-file",
         )
     for name, path in gone:
         progress.note(f"{name}: no overlay, its pictures are not there any more ({path.resolve()})")
@@ -226,7 +242,12 @@ def _films(
         size = _picture_size(folder, description, camera, rows)
         films.append(_Film(camera, rows, _apart(pts_ns - pts_ns[0]), size))
     if not films:
-        raise DataError(folder, "has no picture in that span", "look at `mocap info`, or leave the span out")
+        raise DataError(
+            folder,
+            "has no picture in that span",
+            "look at `mocap info`, or leave the span out",
+            code="no-overlap",
+        )
     return films
 
 

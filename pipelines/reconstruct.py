@@ -97,7 +97,9 @@ def reconstruct(
     with locked(folder) as session:
         ingested = session.intact_record("ingest")
         if ingested is None:
-            raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
+            raise DataError(
+                folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
+            )
         description = read_description(folder)
         settings = replace(settings, people=settings.people or ("auto" if description.actors else 1))
         following, left_out = _following(session, description, settings, force)
@@ -207,6 +209,7 @@ def _detected(
             session.folder,
             "every camera came with keypoints: no picture is looked at",
             "leave --start and --end out",
+            code="no-pictures",
         )
     if detected is None and settings.every > 1:
         progress.note("every camera came with keypoints: --every says nothing about them")
@@ -247,6 +250,7 @@ def _check_fill(fill_s: float | None) -> None:
             "--fill",
             f"{fill_s:g} s is not between 0 and {_LONGEST_FILL_S:g} s",
             "a longer gap is no measurement: leave it open",
+            code="bad-value",
         )
 
 
@@ -306,4 +310,5 @@ def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> 
         folder,
         "; ".join([f"no joint could be reconstructed ({gates}; {noise_text(attempt.views)})", *reasons]),
         *(remedies or ["check calibration, clocks and poses, or state another pose noise with --pose-noise"]),
+        code="nothing-reconstructed",
     )

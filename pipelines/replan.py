@@ -196,9 +196,10 @@ def refuse_name(name: str | None) -> None:
             f"--name {name!r}",
             "cannot be a folder",
             "take letters, digits, points, - and _, without an ending",
+            code="not-a-folder",
         )
     if name.casefold() in {arm.casefold() for arm in (*PLANNER_ARMS.names(), *LOGGED)}:
-        raise DataError(f"--name {name}", "is the name of an arm", "take another one")
+        raise DataError(f"--name {name}", "is the name of an arm", "take another one", code="bad-option")
 
 
 def _keep_by_name(
@@ -242,7 +243,9 @@ def inputs_of(session: WritableSession) -> tuple[Description, StageRecord | None
     """
     ingested = session.intact_record("ingest")
     if ingested is None:
-        raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
+        raise DataError(
+            session.folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
+        )
     description = read_description(session.folder)
     inputs = dict(ingested.outputs)
     needs_it = description.actor is None or not description.has_true_joints
@@ -291,7 +294,9 @@ def refuse_unknown(arms: Sequence[str], *, logged: bool = True) -> None:
     known = [*PLANNER_ARMS.names(), *(LOGGED if logged else ())]
     for arm in arms:
         if arm not in known:
-            raise DataError(f"--arms {arm}", "no such planner arm", f"there are {', '.join(known)}")
+            raise DataError(
+                f"--arms {arm}", "no such planner arm", f"there are {', '.join(known)}", code="no-such-name"
+            )
 
 
 def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> list[str]:

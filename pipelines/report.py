@@ -136,7 +136,7 @@ def compare_sessions(
     resolved = [folder.resolve() for folder in folders]
     for folder, place in zip(folders, resolved, strict=True):
         if resolved.count(place) > 1:
-            raise DataError(folder, "is stated twice", "state every session once")
+            raise DataError(folder, "is stated twice", "state every session once", code="stated-twice")
     contents = {label: content_of(folder) for label, folder in zip(_labels(resolved), folders, strict=True)}
     page = output or resolved[0].parent / "comparison" / "index.html"
     html, _ = render_comparison(contents)
@@ -223,14 +223,16 @@ def read_study(folder: Path) -> StudyContent:
     """
     remedy = "name a folder that `mocap ablate ... -o FOLDER` wrote"
     if not (folder / STUDY_MARK).is_file():
-        raise DataError(folder, f"holds no study (no {STUDY_MARK})", remedy)
+        raise DataError(folder, f"holds no study (no {STUDY_MARK})", remedy, code="wrong-kind")
     summary = read_json(folder / STUDY_MARK, remedy)
     try:
         command = command_of(summary["settings"], folder.resolve().name)
         study = StudyContent(summary, command, sha256_of(folder / STUDY_MARK))
         summarise_studies([study])
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise DataError(folder / STUDY_MARK, "is not the summary of a study", remedy) from error
+        raise DataError(
+            folder / STUDY_MARK, "is not the summary of a study", remedy, code="wrong-kind"
+        ) from error
     return study
 
 
@@ -246,7 +248,7 @@ def _labels(resolved: Sequence[Path]) -> list[str]:
 def _refuse_foreign(page: Path) -> None:
     """Refuse to replace a file that is no comparison; such pages name their generator near the beginning."""
     if page.is_dir():
-        raise DataError(page, "is a folder", "name a file with --output")
+        raise DataError(page, "is a folder", "name a file with --output", code="not-a-folder")
     if not page.exists():
         return
     with page.open("rb") as file:
@@ -255,6 +257,7 @@ def _refuse_foreign(page: Path) -> None:
                 page,
                 "is there and is no earlier comparison",
                 "choose another place with --output, or write over it with --overwrite",
+                code="exists",
             )
 
 
@@ -262,7 +265,9 @@ def _finished_stages(session: Session) -> dict[str, StageRecord]:
     names = ("ingest", "detect", "reconstruct", "replan", "sweep")
     records = {name: session.intact_record(name) for name in names}
     if records["ingest"] is None:
-        raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
+        raise DataError(
+            session.folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
+        )
     return {name: record for name, record in records.items() if record is not None}
 
 

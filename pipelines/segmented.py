@@ -487,4 +487,5 @@ def _refuse_nothing_of_segments(folder: Path, flight: _Joined, doubts: Sequence[
         folder,
         "; ".join([f"no joint could be reconstructed ({gates})", *reasons[:3]]),
         *(remedies or ["check calibration, clocks and poses, or state another pose noise with --pose-noise"]),
+        code="nothing-reconstructed",
     )

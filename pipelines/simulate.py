@@ -133,6 +133,7 @@ def _refuse_to_lose_others(folder: Path) -> None:
             folder,
             f"holds more than an earlier flight ({len(others)} entries, the first {others[0]})",
             "move that away, choose another place with --output, or replace all of it with --overwrite",
+            code="exists",
         )
 
 
@@ -166,7 +167,9 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
     if formation.planner not in PLANNER_ARMS.names():
         known = ", ".join([_RING, *PLANNER_ARMS.names()])
         place = f"{path}: drones.formation.planner"
-        raise DataError(place, f"no such planner {formation.planner!r}", f"there are {known}")
+        raise DataError(
+            place, f"no such planner {formation.planner!r}", f"there are {known}", code="no-such-name"
+        )
     if formation.yaw_rate_deg_per_s or formation.variation:
         raise DataError(
             f"{path}: drones.formation",

@@ -39,7 +39,7 @@ def survey(path: Path) -> list[Survey]:
         DataError: the path is missing, damaged, or of no known kind.
     """
     if not path.exists():
-        raise DataError(path, "does not exist", "check the path")
+        raise DataError(path, "does not exist", "check the path", code="no-such-file")
     refuse_special(path)
     if (path / "session.json").is_file():
         return [Survey(path, "session", _of_session(path))]
@@ -55,7 +55,7 @@ def survey(path: Path) -> list[Survey]:
     if path.suffix in {".yaml", ".yml"} and path.is_file():
         return [_of_yaml(path)]
     like = describe_unknown(path)
-    raise DataError(path, like.problem, like.remedy or EXPECTED)
+    raise DataError(path, like.problem, like.remedy or EXPECTED, code="wrong-kind")
 
 
 # --- what mocap writes ---------------------------------------------------------------------------------
@@ -118,11 +118,15 @@ def _described(
 ) -> dict[str, Any]:
     schema = summary.get("schema")
     if isinstance(schema, int) and schema > SCHEMA:
-        raise DataError(file, f"has schema {schema}, newer than {SCHEMA}", "update mocap to read it")
+        raise DataError(
+            file, f"has schema {schema}, newer than {SCHEMA}", "update mocap to read it", code="newer-schema"
+        )
     try:
         return reader(summary)
     except (KeyError, TypeError, AttributeError):
-        raise DataError(file, "lacks what it should hold", "make the folder again") from None
+        raise DataError(
+            file, "lacks what it should hold", "make the folder again", code="wrong-kind"
+        ) from None
 
 
 def _of_simulation(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -166,6 +170,7 @@ def _of_yaml(path: Path) -> Survey:
             like.problem,
             like.remedy
             or "flight manifests have `cameras:`, scenarios `drones:`, planner settings keys like `w_obs:`",
+            code="wrong-kind",
         )
     return Survey(path, title, kinds[title][1](path))
 

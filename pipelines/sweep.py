@@ -108,7 +108,12 @@ def sweep(
             return Swept(folder, run.record, read_json(folder / "sweep" / "metrics.json"), skipped=True)
         flight = load_flight(folder, description, reconstructed, pose_noise=settings.pose_noise)
         if flight.skeleton is None:
-            raise DataError(folder, "has no skeleton to measure", "run `mocap reconstruct` first")
+            raise DataError(
+                folder,
+                "has no skeleton to measure",
+                "run `mocap reconstruct` first",
+                code="nothing-reconstructed",
+            )
         errors = detector_errors(session)
         maps = load_maps(folder) if description.map else []
         model = error_model(errors, flight.skeleton.joints)
@@ -120,7 +125,12 @@ def sweep(
             own = _scene_of(scene, cell)
             result = read_result(run.chunk(cell.name, partial(fly_and_measure, own, errors, cell.arm)))
             if result.error_m is None:
-                raise DataError(folder, "has no skeleton to measure", "run `mocap reconstruct` first")
+                raise DataError(
+                    folder,
+                    "has no skeleton to measure",
+                    "run `mocap reconstruct` first",
+                    code="nothing-reconstructed",
+                )
             capped.append(capped_mm(result.error_m, result.joint_frames))
             rows.append(_row(own, cell, measure_alone(own, cell.arm, result), capped[-1]))
             progress.advance()

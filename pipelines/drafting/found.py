@@ -272,7 +272,7 @@ class Search:
         bases: list[Path] = []
         for path in paths:
             if not path.exists():
-                raise DataError(path, "does not exist", "check the path")
+                raise DataError(path, "does not exist", "check the path", code="no-such-file")
             found = list(self._under(path))
             alone = not path.is_dir() or [thing for thing, _ in found] == [path]
             bases.append(path.parent if alone else path)

@@ -233,7 +233,7 @@ class _Network:
             try:
                 self._interpreter: Interpreter = Interpreter(str(path), num_threads=threads)
             except ValueError as error:
-                raise DataError(path, f"is no readable model ({error})") from None
+                raise DataError(path, f"is no readable model ({error})", code="damaged") from None
             self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]["index"]
         tensors = {tensor["name"]: tensor["index"] for tensor in self._interpreter.get_output_details()}

@@ -157,7 +157,7 @@ def read_calibration(path: Path) -> Calibration:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(path, f"cannot be read ({error})", remedy) from None
+        raise DataError(path, f"cannot be read ({error})", remedy, code="damaged") from None
     comments = [line.removeprefix("# ") for line in lines if line.startswith("#")]
     rows = list(csv.reader(line for line in lines if not line.startswith("#")))
     try:
@@ -171,7 +171,7 @@ def read_calibration(path: Path) -> Calibration:
         if ANY_JOINT not in knots or any(not _is_usable(own) for own in knots.values()):
             raise ValueError(f"its numbers do not rise, or there is no group {ANY_JOINT}")
     except (IndexError, ValueError) as error:
-        raise DataError(path, f"is no calibration ({error})", remedy) from None
+        raise DataError(path, f"is no calibration ({error})", remedy, code="wrong-kind") from None
     return Calibration(made_by, good, knots)
 
 

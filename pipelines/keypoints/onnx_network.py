@@ -147,7 +147,7 @@ def _runtime() -> Any:
 def _session(path: Path, provider: str, threads: int) -> Any:
     runtime = _runtime()
     if not path.is_file():
-        raise DataError(path, "does not exist", "give the path of an ONNX model")
+        raise DataError(path, "does not exist", "give the path of an ONNX model", code="no-such-file")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -158,15 +158,23 @@ def _session(path: Path, provider: str, threads: int) -> Any:
             f"--provider {provider}",
             "is not in this ONNX Runtime",
             f"there are {', '.join(sorted(there))}; other builds of it, such as onnxruntime-gpu, have others",
+            code="missing-library",
         )
     wanted = there[provider]
     given = [(wanted, _PROVIDER_OPTIONS.get(provider, {}))]
     try:
         session = runtime.InferenceSession(str(path), options, providers=given)
     except Exception as error:  # ONNX Runtime's exceptions share no other base
-        raise DataError(path, f"is no model that ONNX Runtime can run ({_line(error)})") from None
+        raise DataError(
+            path, f"is no model that ONNX Runtime can run ({_line(error)})", code="wrong-kind"
+        ) from None
     if session.get_providers()[0] != wanted:
-        raise DataError(f"--provider {provider}", "could not be started", "leave it out: the CPU runs it")
+        raise DataError(
+            f"--provider {provider}",
+            "could not be started",
+            "leave it out: the CPU runs it",
+            code="bad-option",
+        )
     return session
 
 
@@ -185,6 +193,7 @@ def _layout(path: Path, shape: Sequence[object], stated: Layout | None) -> Layou
         path,
         f"its input {_written(shape)} " + ("could be either layout" if sure else "has no axis of 3 colours"),
         "state layout=nchw or layout=nhwc" if sure else "it must be [N,3,H,W] or [N,H,W,3]",
+        code="wrong-model",
     )
 
 

@@ -88,9 +88,14 @@ def parse_options(argument: str) -> OnnxOptions:
     for part in parts[first:]:
         name, _, value = part.partition("=")
         if name in given:
-            raise DataError(f"onnx:{argument}", f"states {name} twice", "state it once")
+            raise DataError(f"onnx:{argument}", f"states {name} twice", "state it once", code="stated-twice")
         if name not in _READERS:
-            raise DataError(f"onnx:{argument}", f"no option {name!r}", f"there are {', '.join(_READERS)}")
+            raise DataError(
+                f"onnx:{argument}",
+                f"no option {name!r}",
+                f"there are {', '.join(_READERS)}",
+                code="no-such-name",
+            )
         given[name] = value
     read: dict[str, Any] = {name: _READERS[name](f"{name}={value}", value) for name, value in given.items()}
     colours, people_colours = read.get("colours", "rgb"), read.get("people_colours", "bgr")
@@ -116,7 +121,7 @@ def _colours(order: Literal["rgb", "bgr"], mean: Three, std: Three) -> Colours:
 def _one_of(*choices: str) -> Callable[[str, str], str]:
     def read(place: str, value: str) -> str:
         if value not in choices:
-            raise DataError(place, "no such choice", f"there are {', '.join(choices)}")
+            raise DataError(place, "no such choice", f"there are {', '.join(choices)}", code="no-such-name")
         return value
 
     return read
@@ -134,14 +139,14 @@ def _three(place: str, value: str) -> Three:
     except ValueError:
         raise DataError(place, "is not three numbers", "write 123.675/116.28/103.53") from None
     if not all(math.isfinite(number) for number in (red, green, blue)):
-        raise DataError(place, "is not finite", "write 123.675/116.28/103.53")
+        raise DataError(place, "is not finite", "write 123.675/116.28/103.53", code="bad-value")
     return red, green, blue
 
 
 def _divisors(place: str, value: str) -> Three:
     numbers = _three(place, value)
     if not all(number > 0 for number in numbers):
-        raise DataError(place, "must be above 0", "write 255/255/255 for values of 0..1")
+        raise DataError(place, "must be above 0", "write 255/255/255 for values of 0..1", code="bad-value")
     return numbers
 
 
@@ -471,7 +476,7 @@ class OnnxFamily:
         options = parse_options(argument)
         for path in (options.model, options.people):
             if path is not None and not path.is_file():
-                raise DataError(path, "does not exist", "give the path of an ONNX model")
+                raise DataError(path, "does not exist", "give the path of an ONNX model", code="no-such-file")
         people = None if options.people is None else options.people.absolute()
         # Other processes, with other working directories, may run it.
         return OnnxDetector(replace(options, model=options.model.absolute(), people=people))

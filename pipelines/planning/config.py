@@ -218,7 +218,7 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
     if problems:
         unknown = not set(values) <= set(known)
         remedy = f"there are {', '.join(known)}" if unknown else "correct it (docs/planner.md)"
-        raise DataError(source, "; ".join(problems), remedy)
+        raise DataError(source, "; ".join(problems), remedy, code="bad-value")
     try:
         return PlannerConfig(**taken)  # type: ignore[arg-type]  # checked one by one above
     except ValueError as error:

@@ -279,6 +279,7 @@ def _actor(
             folder,
             "has no logged actor and no reconstruction to take one from",
             "run `mocap reconstruct`, or name the actor's topic under `actor:` in flight.yaml",
+            code="no-actor",
         )
     found = _reconstruction(folder, span_ns)
     middle = _hips_of(found)
@@ -287,6 +288,7 @@ def _actor(
             folder,
             "has no logged actor, and the reconstruction has no time at which both hips are ok",
             "name the actor's topic under `actor:` in flight.yaml, or mend the reconstruction",
+            code="no-actor",
         )
     known = np.isfinite(middle[..., 0])
     filmed = known[known[:, 0]].mean(axis=0) >= _LEAST_SHARE
@@ -315,6 +317,7 @@ def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.in
             f"{', '.join(['the actor', *spans])} are known together for {shared_s:.2f} s, less than"
             f" {_SHORTEST_S:g} s",
             "check the clocks of the logs",
+            code="no-overlap",
         )
     return t_ns[kept], actor[kept]
 
@@ -331,7 +334,7 @@ def _cameras(
         own_ns = None if entry.poses.static else span_ns
         logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES, own_ns))
         if not len(logged.t_ns):
-            raise DataError(folder, f"{name} has no poses in this span")
+            raise DataError(folder, f"{name} has no poses in this span", code="no-poses")
         noise, stated_by = _noise(name, entry, logged, pose_noise)
         stating.add(stated_by)
         cameras.append(

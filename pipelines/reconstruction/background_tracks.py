@@ -88,7 +88,9 @@ class _LazyPictures(Sequence[Bytes]):
             return _LazyPictures(self._paths[index])
         picture = cv2.imdecode(np.frombuffer(self._paths[index].read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
         if picture is None:
-            raise DataError(self._paths[index], "cannot be decoded", "run `mocap reconstruct --force`")
+            raise DataError(
+                self._paths[index], "cannot be decoded", "run `mocap reconstruct --force`", code="damaged"
+            )
         return np.asarray(picture, dtype=np.uint8)
 
 

@@ -185,14 +185,14 @@ def smoother(text: str | None) -> Smoother | None:
         raise DataError(_PLACE, f"{text!r} names {len(parts)} filters", "choose one")
     name, parameters = parts[0]
     if name not in _SMOOTHERS:
-        raise DataError(_PLACE, f"no such filter: {name}", remedy)
+        raise DataError(_PLACE, f"no such filter: {name}", remedy, code="no-such-name")
     known = [field.name for field in fields(_SMOOTHERS[name])]  # type: ignore[arg-type]
     unknown = sorted(set(parameters) - set(known))
     if unknown:
         raise DataError(_PLACE, f"{name} has no {', '.join(unknown)}", f"it has {', '.join(known)}")
     for key, value in parameters.items():
         if key != "model" and not isinstance(value, float):
-            raise DataError(_PLACE, f"{key} is {value!r} instead of a number", remedy)
+            raise DataError(_PLACE, f"{key} is {value!r} instead of a number", remedy, code="bad-value")
     try:
         return _SMOOTHERS[name](**parameters)
     except ValueError as error:

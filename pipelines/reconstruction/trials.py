@@ -42,14 +42,19 @@ def disturbances(text: str | None, trials: int) -> list[NoiseModel] | None:
     place = "--disturb-poses"
     if text is None:
         if trials != 1:
-            raise DataError("--trials", "are draws of --disturb-poses, which is not there", "state it too")
+            raise DataError(
+                "--trials",
+                "are draws of --disturb-poses, which is not there",
+                "state it too",
+                code="bad-option",
+            )
         return None
     models = parsed_noise_models(place, text)
     one = np.ones(1)  # any elapsed time, speed and turn rate
     if not sum_sigma(models, one, one, one).any():
         raise DataError(place, f"{text!r} disturbs nothing", "state at least one size above 0")
     if trials < 1:
-        raise DataError("--trials", f"{trials} is no number of trials", "state 1 or more")
+        raise DataError("--trials", f"{trials} is no number of trials", "state 1 or more", code="bad-option")
     return models
 
 

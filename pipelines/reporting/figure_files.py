@@ -88,13 +88,16 @@ def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
     if overwrite or not folder.exists():
         return
     if not folder.is_dir():
-        raise DataError(folder, "is a file, not a folder", "name another place with --figures")
+        raise DataError(
+            folder, "is a file, not a folder", "name another place with --figures", code="not-a-folder"
+        )
     foreign = sorted({path.name for path in folder.iterdir()} - _ours(folder))
     if foreign:
         raise DataError(
             folder,
             f"holds other files than figures ({len(foreign)}, the first {foreign[0]})",
             "name another folder with --figures, or replace it with --overwrite",
+            code="exists",
         )
 
 

@@ -133,7 +133,9 @@ class Processes:
             for future in as_completed(list(numbers)):
                 yield numbers.pop(future), future.result()
         except BrokenProcessPool as error:
-            raise DataError("a process of mocap", "was killed, perhaps for lack of memory") from error
+            raise DataError(
+                "a process of mocap", "was killed, perhaps for lack of memory", code="worker-lost"
+            ) from error
         finally:
             for process in list((pool._processes or {}).values()):  # a part takes a minute
                 process.terminate()
@@ -163,7 +165,12 @@ def result_of(future: Any, what: Path | str) -> Any:
         MocapError: the task raised it, or the cluster could not run the task.
     """
     if future.cancelled():
-        raise DataError(what, "the Dask cluster went away", "give the same command again, which continues")
+        raise DataError(
+            what,
+            "the Dask cluster went away",
+            "give the same command again, which continues",
+            code="worker-lost",
+        )
     error = future.exception()
     if error is None:
         return future.result()
@@ -173,7 +180,10 @@ def result_of(future: Any, what: Path | str) -> Any:
         raise DataError(what, "every worker that took it died, perhaps for lack of memory") from error
     line = " ".join(f"{type(error).__name__}: {error}".split())
     raise DataError(
-        what, f"the Dask worker could not run it ({line})", "every machine needs this version of mocap"
+        what,
+        f"the Dask worker could not run it ({line})",
+        "every machine needs this version of mocap",
+        code="worker-lost",
     ) from error
 
 
@@ -195,6 +205,7 @@ def connected(scheduler: str) -> Iterator[Any]:
             f"--scheduler {scheduler}",
             "no Dask scheduler answers there",
             "start one with `dask scheduler`, or leave it out to use this machine",
+            code="no-scheduler",
         ) from error
     with client:
         yield client
@@ -244,6 +255,7 @@ class SharedSession:
                 "--scheduler",
                 f"a Dask worker has mocap {version('mocap-pipeline')}, not {self.code}",
                 "install the same version on every machine",
+                code="worker-lost",
             )
         folder = fetched(self.place) if url_of(self.place) else Path(self.place)
         if _ingested(folder) != self.ingested:
@@ -251,6 +263,7 @@ class SharedSession:
                 self.place,
                 "is not this session on a machine of the Dask cluster",
                 "every machine needs the same folders under the same paths",
+                code="worker-lost",
             )
         return folder
 

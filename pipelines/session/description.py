@@ -393,7 +393,10 @@ def read_description(session: Path) -> Description:
     document = read_json(path, "ingest the flight again with --force")
     if isinstance(document.get("schema"), int) and document["schema"] > SCHEMA:
         raise DataError(
-            path, f"has schema {document['schema']}, this version reads up to {SCHEMA}", "update mocap"
+            path,
+            f"has schema {document['schema']}, this version reads up to {SCHEMA}",
+            "update mocap",
+            code="newer-schema",
         )
     try:
         return Description.model_validate(document)
@@ -404,4 +407,5 @@ def read_description(session: Path) -> Description:
             path,
             f"is damaged ({place + ': ' if place else ''}{first['msg']})",
             "ingest the flight again with --force",
+            code="damaged",
         ) from None

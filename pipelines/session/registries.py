@@ -317,7 +317,12 @@ class Registry(Generic[T]):
             DataError: no such name; the message lists the existing ones.
         """
         if name not in self._entries:
-            raise DataError(name, f"no such {self.noun}", f"there are {', '.join(self.names()) or 'none'}")
+            raise DataError(
+                name,
+                f"no such {self.noun}",
+                f"there are {', '.join(self.names()) or 'none'}",
+                code="no-such-name",
+            )
         loaded: T = self._entries[name].load()
         return loaded
 
@@ -390,7 +395,10 @@ def recognise(path: Path, protocol: type[F], noun: str) -> F:
     """
     if not path.exists():
         raise DataError(
-            path, "does not exist", "check the path; paths are relative to the file that names them"
+            path,
+            "does not exist",
+            "check the path; paths are relative to the file that names them",
+            code="no-such-file",
         )
     refuse_special(path)
     candidates = [f for f in FORMATS.all() if isinstance(f, protocol)]
@@ -403,6 +411,7 @@ def recognise(path: Path, protocol: type[F], noun: str) -> F:
         path,
         f"could be {' or '.join(sorted(f.name for f in matches))}",
         "say which with `format:`",
+        code="ambiguous",
     )
 
 
@@ -411,9 +420,14 @@ def _unrecognised(path: Path, noun: str, known: list[str]) -> DataError:
     others = [f.title for f in FORMATS.all() if f.recognises(path)]
     remedy = f"a {noun} is expected here: {', '.join(known)}"
     if others:
-        return DataError(path, f"is no {noun} but {' or '.join(others)}", remedy)
+        return DataError(path, f"is no {noun} but {' or '.join(others)}", remedy, code="wrong-kind")
     like = describe_unknown(path)
-    return DataError(path, f"{like.problem} and no {noun}", "; ".join(filter(None, [like.remedy, remedy])))
+    return DataError(
+        path,
+        f"{like.problem} and no {noun}",
+        "; ".join(filter(None, [like.remedy, remedy])),
+        code="wrong-kind",
+    )
 
 
 def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[NoiseModel]:
@@ -463,7 +477,9 @@ def need(module: str, extra: str) -> Any:
             warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's wrappers deprecate themselves
             return import_module(module)
     except ImportError as error:
-        raise DataError(module, "is not installed", f"run `{install_command(extra)}`") from error
+        raise DataError(
+            module, "is not installed", f"run `{install_command(extra)}`", code="missing-library"
+        ) from error
 
 
 def install_command(extra: str) -> str:

@@ -135,7 +135,7 @@ def get_skeleton(name: str) -> Skeleton:
         DataError: no such name; the message lists the existing ones.
     """
     if name not in SKELETONS:
-        raise DataError(name, "no such skeleton", f"there are {', '.join(SKELETONS)}")
+        raise DataError(name, "no such skeleton", f"there are {', '.join(SKELETONS)}", code="no-such-name")
     return SKELETONS[name]
 
 

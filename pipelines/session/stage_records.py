@@ -41,6 +41,8 @@ COMMANDS = {
 class NewerSchemaError(DataError):
     """Error for a file that a later version of this program wrote."""
 
+    code = "newer-schema"
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -145,7 +147,7 @@ def refuse_newer(path: Path, document: Mapping[str, Any], remedy: str) -> None:
     """Refuse, with a DataError, a file of a later version or without a version."""
     schema = document.get("schema")
     if not isinstance(schema, int):
-        raise DataError(path, f"states no schema number (schema: {schema!r})", remedy)
+        raise DataError(path, f"states no schema number (schema: {schema!r})", remedy, code="damaged")
     if schema > SCHEMA:
         raise NewerSchemaError(
             path, f"has schema {schema}, this version reads up to {SCHEMA}", "update mocap to read it"

@@ -97,12 +97,15 @@ class Session:
         for name, expected in record.outputs.items():
             path = self.folder / name
             if not path.is_file():
-                raise DataError(path, f"is gone although `{command}` wrote it", f"run `{command}` again")
+                raise DataError(
+                    path, f"is gone although `{command}` wrote it", f"run `{command}` again", code="changed"
+                )
             if sha256_of(path) != expected:
                 raise DataError(
                     path,
                     f"is not what `{command}` wrote (other SHA-256): it was changed since",
                     f"run `{command}` again, which makes it anew",
+                    code="changed",
                 )
         return record
 
@@ -285,6 +288,7 @@ def names_of(paths: Sequence[Path]) -> list[str]:
                 path,
                 f"would be called {name}, as {named[name]} is",
                 "leave --output out, or rename one of them",
+                code="exists",
             )
         named[name] = path
     return list(named)
@@ -355,7 +359,9 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
 def _check_session(folder: Path) -> None:
     path = folder / "session.json"
     if not path.is_file():
-        raise DataError(folder, "is not a session", "make one with `mocap ingest FLIGHT.yaml`")
+        raise DataError(
+            folder, "is not a session", "make one with `mocap ingest FLIGHT.yaml`", code="not-a-session"
+        )
     remedy = "run `mocap ingest` again"
     refuse_newer(path, read_json(path, remedy), remedy)
 
@@ -364,7 +370,9 @@ def _check_target(folder: Path, *, overwrite: bool) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise DataError(folder, "is a file, not a folder", "choose another place with --output")
+        raise DataError(
+            folder, "is a file, not a folder", "choose another place with --output", code="not-a-folder"
+        )
     marks = ("ingest/stage.json", "ingest.new/stage.json")
     if overwrite or any((folder / mark).is_file() for mark in marks):
         return
@@ -374,6 +382,7 @@ def _check_target(folder: Path, *, overwrite: bool) -> None:
             folder,
             f"is not a session and not empty ({len(foreign)} entries, the first {foreign[0]})",
             "choose another place with --output, or write into it with --overwrite",
+            code="not-a-session",
         )
 
 

@@ -30,11 +30,27 @@ _REMEDIES = {
     errno.EROFS: "choose another place with --output",
 }
 
+_CODES = {
+    errno.ENOENT: "no-such-file",
+    errno.ENOTDIR: "not-a-folder",
+    errno.EISDIR: "not-a-folder",
+    errno.ENOSPC: "disk-full",
+    errno.EDQUOT: "disk-full",
+    errno.EACCES: "no-permission",
+    errno.EPERM: "no-permission",
+    errno.EROFS: "no-permission",
+}
+
 
 def as_data_error(error: OSError, path: Path) -> DataError:
     """Make a one-line error of an operating system's error; `path` is used if the error names no file."""
     remedy = _REMEDIES.get(error.errno or 0, "mend that and run the command again")
-    return DataError(error.filename or path, error.strerror or str(error), remedy)
+    return DataError(error.filename or path, error.strerror or str(error), remedy, code=code_of(error))
+
+
+def code_of(error: OSError) -> str:
+    """Return the code of a DataError for an operating system's error."""
+    return _CODES.get(error.errno or 0, "unreadable")
 
 
 def refuse_camera_names(names: Collection[str]) -> None:
@@ -83,7 +99,10 @@ def refuse_special(path: Path) -> None:
     """
     if is_special(path):
         raise DataError(
-            path, "is a pipe, a socket or a device", "write what comes out of it to a file, and name that"
+            path,
+            "is a pipe, a socket or a device",
+            "write what comes out of it to a file, and name that",
+            code="special-file",
         )
 
 
@@ -231,7 +250,7 @@ def read_json(path: Path, remedy: str = "run the stage that wrote it again with 
     except OSError as error:
         raise as_data_error(error, path) from error
     except (ValueError, RecursionError) as error:
-        raise DataError(path, f"is damaged ({error})", remedy) from error
+        raise DataError(path, f"is damaged ({error})", remedy, code="damaged") from error
     if not isinstance(document, dict):
         raise DataError(path, f"holds a {type(document).__name__} where an object belongs", remedy)
     return document

@@ -73,6 +73,7 @@ def url_of(place: Path | str) -> str | None:
             f"{scheme}://...",
             "is a URL with credentials in it",
             "leave them out of it, and set them where the store's own tools look for them",
+            code="url-with-secret",
         )
     return f"{scheme}:///{rest}" if scheme == "file" else f"{scheme}://{rest}"
 
@@ -241,6 +242,7 @@ def _make_room(folder: Path, size: int, url: str) -> None:
                 url,
                 f"has {size / 1e9:.3g} GB, and the disk of {folder.parent} has {free / 1e9:.3g} GB free",
                 "free some space, or set XDG_CACHE_HOME to another disk",
+                code="too-large",
             )
         oldest = notes.pop(0)
         remove_tree(oldest)
@@ -285,7 +287,12 @@ class Copy:
         for _ in range(_ATTEMPTS):
             self._base = _told(self.url, self._newest)
             if not self._base.number and not create:
-                raise DataError(self.url, "is not a session", "make one with `mocap ingest -o` and this URL")
+                raise DataError(
+                    self.url,
+                    "is not a session",
+                    "make one with `mocap ingest -o` and this URL",
+                    code="not-a-session",
+                )
             noted = _noted(self._root / "base.json") or {}
             if noted.get("folder", "") == self._base.folder and (self.folder.exists() or create):
                 return
@@ -372,7 +379,12 @@ class Copy:
             try:
                 document = json.loads(self._store.cat_file(f"{self._path}/{name}"))
                 if document["schema"] > _SCHEMA:
-                    raise DataError(f"{self.url}/{name}", "is of a newer version", "use a newer mocap")
+                    raise DataError(
+                        f"{self.url}/{name}",
+                        "is of a newer version",
+                        "use a newer mocap",
+                        code="newer-schema",
+                    )
                 inside = all(".." not in PurePosixPath(file).parts for file in document["files"])
                 if not inside or not _VERSION.fullmatch(document["folder"]):
                     raise ValueError(name)
@@ -380,7 +392,9 @@ class Copy:
             except FileNotFoundError:  # removed by a writer since it was listed
                 continue
             except (ValueError, KeyError, TypeError) as error:
-                raise DataError(f"{self.url}/{name}", "is damaged", "put back what mocap wrote") from error
+                raise DataError(
+                    f"{self.url}/{name}", "is damaged", "put back what mocap wrote", code="damaged"
+                ) from error
         raise BusyError(f"{self.url} is being replaced by other writers; run the command again")
 
     def _fetch(self) -> None:
@@ -401,6 +415,7 @@ class Copy:
                     f"{self.url}/{self._base.folder}/{name}",
                     "is not what mocap wrote (other SHA-256)",
                     "put back what it wrote, or ingest again with another URL",
+                    code="changed",
                 )
         sync_tree(new)
         with suppress(OSError):
@@ -536,10 +551,15 @@ def _opened(url: str) -> tuple[Any, str]:
     try:
         store, path = url_to_fs(url, use_listings_cache=False, **options)
     except ImportError as error:
-        raise DataError(url, f"needs a library for {scheme}://", "install s3fs, gcsfs or adlfs") from error
+        raise DataError(
+            url, f"needs a library for {scheme}://", "install s3fs, gcsfs or adlfs", code="missing-library"
+        ) from error
     except ValueError as error:
         raise DataError(
-            url, f"{scheme}:// is nothing that fsspec reads", "give a path, or s3:// or gs://"
+            url,
+            f"{scheme}:// is nothing that fsspec reads",
+            "give a path, or s3:// or gs://",
+            code="missing-library",
         ) from error
     return store, path
 
@@ -561,17 +581,19 @@ def _told(url: str, call: Callable[[], T], missing: type[Exception] | None = Non
         if isinstance(error, FileNotFoundError | NotADirectoryError):
             if missing is not None:
                 raise missing(url) from None
-            raise DataError(url, "does not exist", "check the URL") from None
+            raise DataError(url, "does not exist", "check the URL", code="no-such-file") from None
         if names & _REFUSED:
             raise DataError(
                 url,
                 "the store refuses these credentials, or there are none",
                 "set them where the store's own tools look for them (of S3: AWS_PROFILE, ~/.aws)",
+                code="store-refused",
             ) from None
         raise DataError(
             url,
             f"the store does not answer as it should ({type(error).__name__})",
             "check the network and the store's address, and run the command again, which continues",
+            code="store-unreachable",
         ) from None
 
 

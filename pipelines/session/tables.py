@@ -130,7 +130,7 @@ def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], p
                 file = pq.ParquetFile(opened)
                 return file.metadata if number is None else file.read_row_group(number, columns=schema.names)
         except (OSError, pa.ArrowException) as error:
-            raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
+            raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
 
     def read(number: int) -> pd.DataFrame:
         frame: pd.DataFrame = group(number).to_pandas()
@@ -165,7 +165,7 @@ def read_table(path: Path, schema: pa.Schema, span_ns: Span | None = None) -> pd
                 else pa.Table.from_batches(_batches_within(opened, span_ns), opened.schema_arrow)
             )
     except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
     return _frame_of(path, table, schema)
 
 
@@ -182,7 +182,7 @@ def read_first(path: Path, schema: pa.Schema) -> pd.DataFrame:
             batches = pq.ParquetFile(file).iter_batches(1, columns=schema.names)
             first = next(iter(batches), None)
     except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
     frame: pd.DataFrame = (
         schema.empty_table() if first is None else pa.Table.from_batches([first])
     ).to_pandas()
@@ -204,7 +204,7 @@ def distinct(path: Path, name: str) -> Int64:
             batches = _batches(opened, [name])
             parts = [np.unique(batch.column(0).to_numpy(zero_copy_only=False)) for batch in batches]
     except (OSError, pa.ArrowException, IndexError) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
     return np.unique(np.concatenate(parts)) if parts else np.empty(0, np.int64)
 
 
@@ -215,7 +215,7 @@ def count_rows(path: Path) -> int:
     try:
         return int(pq.read_metadata(path).num_rows)
     except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
 
 
 def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.DataFrame:
@@ -243,7 +243,7 @@ def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.Dat
                 kept.append(batch.filter(pa.array(chosen[place] == values)) if len(chosen) else batch[:0])
             table = pa.Table.from_batches(kept, opened.schema_arrow)
     except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
     return _frame_of(path, table, schema)
 
 
@@ -285,14 +285,19 @@ def _parts(path: Path, schema: pa.Schema, span_ns: Span | None) -> Iterator[pd.D
             for batch in _batches_within(opened, span_ns):
                 yield _frame_of(path, pa.Table.from_batches([batch], opened.schema_arrow), schema)
     except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN) from error
+        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
 
 
 def _frame_of(path: Path, table: pa.Table, schema: pa.Schema) -> pd.DataFrame:
     """Check the columns and numbers of a table that was read."""
     missing = [name for name in schema.names if name not in table.column_names]
     if missing:
-        raise DataError(path, f"lacks the columns {', '.join(missing)}", "run the stage again with --force")
+        raise DataError(
+            path,
+            f"lacks the columns {', '.join(missing)}",
+            "run the stage again with --force",
+            code="missing-column",
+        )
     frame: pd.DataFrame = table.to_pandas()
     _refuse_absurd_numbers(path, frame, schema.names)
     return frame

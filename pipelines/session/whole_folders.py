@@ -188,7 +188,12 @@ def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
     if not (target / mark).is_file():
         for parent in target.parents:
             if (parent / "session.json").is_file():
-                raise DataError(target, "is a part of a session", f"name another folder with {option}")
+                raise DataError(
+                    target,
+                    "is a part of a session",
+                    f"name another folder with {option}",
+                    code="not-a-session",
+                )
 
 
 def is_made(target: Path, key: str, *, mark: str) -> bool:
@@ -216,12 +221,15 @@ def _check(target: Path, mark: str, overwrite: bool) -> None:
     if overwrite or not target.exists() or (target / mark).is_file():
         return
     if not target.is_dir():
-        raise DataError(target, "is a file, not a folder", "choose another place with --output")
+        raise DataError(
+            target, "is a file, not a folder", "choose another place with --output", code="not-a-folder"
+        )
     if entries := sorted(path.name for path in target.iterdir()):
         raise DataError(
             target,
             f"holds something else ({len(entries)} entries, the first {entries[0]})",
             "choose another place with --output, or replace it with --overwrite",
+            code="exists",
         )
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
 from pipelines.session.errors import DataError
-from pipelines.session.storage import plain_text, refuse_special
+from pipelines.session.storage import code_of, plain_text, refuse_special
 
 _LARGEST_FILE = 1_000_000  # bytes; a real one has a few thousand
 _LATEST_NS = 2**62  # differences of two such times fit int64
@@ -81,30 +81,35 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
     how = f" ({made})" if made else ""
     raw = _read_yaml(path, noun, how)
     if not isinstance(raw, Mapping):
-        raise DataError(path, f"is no {noun}", f"it must be {shape}{how}")
+        raise DataError(path, f"is no {noun}", f"it must be {shape}{how}", code="wrong-kind")
     if isinstance(raw.get("schema"), int) and raw["schema"] > newest:
         raise DataError(
-            path, f"has schema {raw['schema']}, newer than {newest}", "use a newer version of mocap"
+            path,
+            f"has schema {raw['schema']}, newer than {newest}",
+            "use a newer version of mocap",
+            code="newer-schema",
         )
     try:
         return model.model_validate(raw)
     except ValidationError as error:
         problems = [_describe(problem, model) for problem in error.errors()]
-        raise DataError(path, "; ".join(dict.fromkeys(problems))) from None
+        raise DataError(path, "; ".join(dict.fromkeys(problems)), code="bad-value") from None
 
 
 def _read_yaml(path: Path, noun: str, how: str) -> object:
     refuse_special(path)
     try:
         if path.stat().st_size > _LARGEST_FILE:
-            raise DataError(path, f"is larger than {_LARGEST_FILE} bytes", f"this is no {noun}")
+            raise DataError(
+                path, f"is larger than {_LARGEST_FILE} bytes", f"this is no {noun}", code="too-large"
+            )
         text = plain_text(path.read_bytes(), errors="strict")
     except OSError as error:
         raise DataError(
-            path, f"cannot be read ({error.strerror})", f"give the path of a {noun}{how}"
+            path, f"cannot be read ({error.strerror})", f"give the path of a {noun}{how}", code=code_of(error)
         ) from None
     except UnicodeDecodeError:
-        raise DataError(path, "is no UTF-8 text", f"give the path of a {noun}{how}") from None
+        raise DataError(path, "is no UTF-8 text", f"give the path of a {noun}{how}", code="damaged") from None
     return plain_yaml(path, text)
 
 
@@ -176,7 +181,9 @@ def plain_yaml(path: Path, text: str) -> object:
 
     marks = sum(map(text.count, "\n,:[{-?&*"))
     if marks > _MOST_MARKS:
-        raise DataError(path, f"holds about {marks} values", f"at most {_MOST_MARKS} are read")
+        raise DataError(
+            path, f"holds about {marks} values", f"at most {_MOST_MARKS} are read", code="too-large"
+        )
     remedy = "mend it, or copy the file again if it was cut off"
     parser = YAML(typ="safe", pure=True)
     parser.Constructor = Constructor
@@ -185,10 +192,10 @@ def plain_yaml(path: Path, text: str) -> object:
     except MarkedYAMLError as error:
         line = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
         problem = " ".join(str(error.problem or error.context).split())
-        raise DataError(path, f"is no valid YAML{line} ({problem})", remedy) from None
+        raise DataError(path, f"is no valid YAML{line} ({problem})", remedy, code="damaged") from None
     except (YAMLError, ValueError, RecursionError) as error:
         problem = " ".join(str(error).split())[:200]
-        raise DataError(path, f"is no valid YAML ({problem})", remedy) from None
+        raise DataError(path, f"is no valid YAML ({problem})", remedy, code="damaged") from None
     _refuse_impossible_values(path, value)
     return value
 

@@ -98,16 +98,23 @@ def read_errors(path: Path) -> ErrorTable:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(path, f"cannot be read: {error}", "make it again") from error
+        raise DataError(path, f"cannot be read: {error}", "make it again", code="damaged") from error
     rows = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
     if not rows or tuple(rows[0]) != COLUMNS:
-        raise DataError(path, "is no table of detector errors", f"its header must be {','.join(COLUMNS)}")
+        raise DataError(
+            path,
+            "is no table of detector errors",
+            f"its header must be {','.join(COLUMNS)}",
+            code="wrong-kind",
+        )
     by_joint: dict[str, list[list[float]]] = {}
     for row in rows[1:]:
         by_joint.setdefault(row[1] if len(row) > 1 else "", []).append(_numbers(path, row))
     tables = {joint: np.array(sorted(values)) for joint, values in by_joint.items()}
     if not tables or any((np.diff(table[:, 0]) <= 0).any() for table in tables.values()):
-        raise DataError(path, "has no rows, or a tilt twice for one joint", "give every tilt once")
+        raise DataError(
+            path, "has no rows, or a tilt twice for one joint", "give every tilt once", code="bad-value"
+        )
     return ErrorTable(tables)
 
 

@@ -458,6 +458,7 @@ def _drone(
             "duration_s",
             f"{name} takes no picture within {scenario.duration_s:g} s at {lens_spec.rate_hz:g} Hz",
             "film longer, or more often",
+            code="no-pictures",
         )
     at_log = sample_log(paths, index, drones.odometry_hz, span_s, np.random.default_rng([seed, _LOG, index]))
     offsets = drones.clock_offsets_s

@@ -131,12 +131,14 @@ class FlightCameras:
                 self._manifest,
                 f"cameras.{name}: nothing says when its frames were taken",
                 "write frame_times: {start: SECONDS, fps: 30}",
+                code="clock-unknown",
             )
         if video is not None and video.codec == UNTIMED:
             raise DataError(
                 self._manifest,
                 f"cameras.{name}: its pictures have no times in EXIF that rise from one to the next",
                 "write frame_times: {start: SECONDS, fps: 30}, or give a csv",
+                code="clock-unknown",
             )
         if video is not None and video.codec == SHARED_SECONDS and camera.clock is None:
             self._note(
@@ -157,7 +159,10 @@ class FlightCameras:
     def _listed_frames(self, camera: Camera, detections: Detections | None) -> int:
         if detections is None or camera.keypoints is None:
             raise DataError(
-                self._manifest, "a camera without video and keypoints has no frames", "give it one of them"
+                self._manifest,
+                "a camera without video and keypoints has no frames",
+                "give it one of them",
+                code="no-pictures",
             )
         count = int(detections.frames_listed[-1]) + 1
         if count > _MOST_FRAMES:
@@ -175,7 +180,12 @@ class FlightCameras:
             return CameraFrames(stamps.frame, stamps.t_ns, since_start, dropped=stamps.dropped)
         t_ns, known = times_of_frames(stamps, pictures.pts_ns)
         if not known.any():
-            raise DataError(path, "has a time for none of the pictures", "check that they belong together")
+            raise DataError(
+                path,
+                "has a time for none of the pictures",
+                "check that they belong together",
+                code="clock-unknown",
+            )
         lost = Counter(pictures.dropped) + Counter(stamps.dropped)
         lost["without a time"] += int((~known).sum())
         return replace(
@@ -199,6 +209,7 @@ class FlightCameras:
                 path or self._manifest,
                 "does not say when it was made",
                 f"write frame_times: {{start: SECONDS}} for camera {name}",
+                code="clock-unknown",
             )
         if camera.clock is None and path is not None and not path.is_dir():
             self._note(
@@ -284,7 +295,10 @@ class FlightCameras:
             calibrated = self._files.camera(name, source.path, source.camera)
             if calibrated.intrinsics is None:
                 raise DataError(
-                    located(self._base, source.path), "holds poses but no intrinsics", "name one with both"
+                    located(self._base, source.path),
+                    "holds poses but no intrinsics",
+                    "name one with both",
+                    code="no-intrinsics",
                 )
             intrinsics = calibrated.intrinsics
             if not calibrated.size_stated:
@@ -358,7 +372,10 @@ def _with_size(intrinsics: Intrinsics, size: tuple[int, int] | None, source: Pat
     """
     if size is None:
         raise DataError(
-            source, "states no picture size, and no video does", "add the size to the calibration"
+            source,
+            "states no picture size, and no video does",
+            "add the size to the calibration",
+            code="wrong-size",
         )
     offset = np.abs(np.divide((2 * intrinsics.cx + 1, 2 * intrinsics.cy + 1), size) - 1)
     if offset.max() > _FARTHEST_CENTRE:
@@ -367,6 +384,7 @@ def _with_size(intrinsics: Intrinsics, size: tuple[int, int] | None, source: Pat
             f"has its principal point at {intrinsics.cx:.0f}, {intrinsics.cy:.0f} px, which is not the middle"
             f" of pictures of {size[0]} x {size[1]} px",
             "give the calibration of these pictures, or the size of its own",
+            code="wrong-size",
         )
     return replace(intrinsics, width=size[0], height=size[1])
 
@@ -410,4 +428,5 @@ def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: De
             f" keypoints lie outside (those from x = {left:.0f}, y = {top:.0f} to x = {right:.0f},"
             f" y = {bottom:.0f})",
             "give the calibration of these pictures, or their size with keypoints: {image_size: [W, H]}",
+            code="wrong-size",
         )

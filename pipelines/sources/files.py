@@ -37,7 +37,9 @@ class FlightFiles:
         if source.format:
             reader = FORMATS.get(source.format)
             if not isinstance(reader, KeypointFormat):
-                raise DataError(path, f"{source.format} is no keypoint format", "leave `format:` out")
+                raise DataError(
+                    path, f"{source.format} is no keypoint format", "leave `format:` out", code="wrong-kind"
+                )
         else:
             reader = recognise(path, KeypointFormat, "keypoint file")
         detections = reader.read_keypoints(path, skeleton=source.skeleton, first_frame=source.first_frame)
@@ -70,6 +72,7 @@ class FlightFiles:
                 located(self._base, path),
                 f"holds no camera {camera or name!r} (there are {listed})",
                 "say which with {path: ..., camera: ...}",
+                code="no-such-name",
             )
         return cameras[camera or name]
 
@@ -83,12 +86,15 @@ class FlightFiles:
         named = FORMATS.get(source.format) if source.format else None
         reader = named or recognise(path, JointFormat, "file of true joints")
         if not isinstance(reader, JointFormat):
-            raise DataError(path, f"{source.format} holds no joints", "leave `format:` out")
+            raise DataError(
+                path, f"{source.format} holds no joints", "leave `format:` out", code="wrong-kind"
+            )
         if source.axes is None and self._flight.world.frame == "ned":
             raise DataError(
                 path,
                 "has joints of unknown axes in a NED world",
                 "say truth: {joints: {axes: ned}} or z-up, y-up",
+                code="axes-unknown",
             )
         is_ned = source.axes == "ned"
         motion = reader.read_joints(path, unit=source.unit, axes="z-up" if is_ned else source.axes)
@@ -97,7 +103,9 @@ class FlightFiles:
         motion = _without_far_joints(motion)
         if not np.isfinite(motion.position).any():
             lost = f" ({losses(motion.dropped)})" if motion.dropped else ""
-            raise DataError(path, f"holds no position of a joint{lost}", "check what wrote it")
+            raise DataError(
+                path, f"holds no position of a joint{lost}", "check what wrote it", code="no-positions"
+            )
         return replace(motion, t_ns=motion.t_ns + round(source.offset_s * 1e9))
 
 

@@ -83,6 +83,7 @@ def refuse_written(flight: Flight, base: Path, stamps: Mapping[str, str]) -> Non
                 named(base, path),
                 "was written to while it was being read",
                 "run `mocap ingest` again when it is complete",
+                code="changed",
             )
 
 

@@ -268,7 +268,9 @@ class FlightLogs:
                     )
                 first = first or sample
         if first is None:
-            raise DataError(source, f"{name} is empty", "name another topic, or give the intrinsics")
+            raise DataError(
+                source, f"{name} is empty", "name another topic, or give the intrinsics", code="empty"
+            )
         return first
 
     def frames(self, log: str, topic: str | None) -> Frames:
@@ -282,7 +284,9 @@ class FlightLogs:
             taken_ns, received_ns = picture_stamps(opened.recording, name, opened.source)
             t_ns = later_times(taken_ns, received_ns, opened.settings.stamps)
             if not len(t_ns):
-                raise DataError(opened.source, f"{name} holds no picture", "name another topic")
+                raise DataError(
+                    opened.source, f"{name} holds no picture", "name another topic", code="no-pictures"
+                )
             lost = opened.lost + Counter({"picture without a later stamp": len(taken_ns) - len(t_ns)})
             return Frames(name, opened.world_times(t_ns), dict(lost))
 

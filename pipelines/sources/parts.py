@@ -168,6 +168,7 @@ def _poses_entry(
                 f"has a pose for none of the {without_pose} frames of camera {name}: frames span {frames},"
                 f" poses {poses} at {_rate(trajectory.t_ns) or 0:.3g} Hz",
                 "check clocks and units, or raise --max-pose-gap",
+                code="no-poses",
             )
         if without_pose:
             note(
@@ -370,4 +371,5 @@ def refuse_no_overlap(source: Path | str, t_ns: Int64, entries: Mapping[str, Cam
             source,
             f"spans {span_words(t_ns[0], t_ns[-1])}, the pictures {span_words(first, last)}",
             "check its time base: stamps are world times",
+            code="no-overlap",
         )

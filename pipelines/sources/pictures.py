@@ -77,6 +77,7 @@ def refuse_changed_pictures(session: Path, description: Description, cameras: It
                     path,
                     f"does not hold the pictures of {camera} that were ingested (other SHA-256)",
                     "run `mocap ingest` again, or put back the file that was ingested",
+                    code="changed",
                 )
 
 

@@ -156,7 +156,12 @@ class FlightPoses:
             path = located(self._base, pose.static.path)
             calibrated = self._files.camera(name, pose.static.path, pose.static.camera)
             if calibrated.position is None or calibrated.quaternion_xyzw is None:
-                raise DataError(path, "holds intrinsics but no camera pose", "name a file with extrinsics")
+                raise DataError(
+                    path,
+                    "holds intrinsics but no camera pose",
+                    "name a file with extrinsics",
+                    code="no-poses",
+                )
             still = Trajectory(
                 t_ns=np.zeros(1, dtype=np.int64),
                 position=calibrated.position[None],
@@ -189,10 +194,12 @@ class FlightPoses:
         kitti = FORMATS.get("kitti")
         reader = kitti if kitti.recognises(path) else FORMATS.get(kind)
         if not isinstance(reader, TrajectoryFormat):
-            raise DataError(path, f"the format {kind} reads no trajectories")
+            raise DataError(path, f"the format {kind} reads no trajectories", code="wrong-kind")
         trajectory = reader.read_trajectory(path)
         if not len(trajectory.t_ns):
-            raise DataError(path, f"holds no usable pose ({losses(trajectory.dropped)})", "mend the log")
+            raise DataError(
+                path, f"holds no usable pose ({losses(trajectory.dropped)})", "mend the log", code="no-poses"
+            )
         return trajectory
 
     def _mounted(self, name: str, mount: Mount | None) -> tuple[Float, Float]:
@@ -220,6 +227,7 @@ class FlightPoses:
                 self._manifest,
                 f"cameras.{name}: its gimbal's angles and the poses of its body share no time",
                 "check the clocks of the two logs",
+                code="no-overlap",
             )
         covariance = body.covariance
         if covariance is not None:
@@ -377,6 +385,7 @@ class FlightPoses:
                     f"{self._manifest}: map.crs",
                     "places the map on Earth, and nothing says where the world's origin is",
                     "write world.origin (latitude_deg, longitude_deg, altitude_m) or world.crs",
+                    code="place-unknown",
                 )
             if stated is not None and own is not None:
                 self._compare_crs(source, grid, stated, own, origin.place)
@@ -479,7 +488,7 @@ class FlightPoses:
                 path = self._one_file(stated)
                 reader = _reader(kind, path)
                 if not isinstance(reader, TelemetryFormat):
-                    raise DataError(path, f"the format {kind} reads no telemetry")
+                    raise DataError(path, f"the format {kind} reads no telemetry", code="wrong-kind")
                 self._telemetry[key] = _positions_of(reader, path, choice)
         return self._telemetry[key]
 
@@ -512,7 +521,7 @@ class FlightPoses:
         """Read the trigger times of pictures from a drone's own log, at world times."""
         reader, path = FORMATS.get(kind), self._one_file(stated)
         if not isinstance(reader, TriggerFormat):
-            raise DataError(path, f"the format {kind} reads no triggers")
+            raise DataError(path, f"the format {kind} reads no triggers", code="wrong-kind")
         t_ns = reader.picture_times(path, TelemetryChoice())
         return self._world_times(stated, t_ns, int(t_ns[0]))
 
@@ -598,6 +607,7 @@ class FlightPoses:
                 self._manifest,
                 f"{name}: {log} says where it was on Earth, and no camera does",
                 "write world: {origin: {latitude_deg: ..., longitude_deg: ..., altitude_m: ...}}",
+                code="place-unknown",
             )
         values, _ = self._in_world(name, track)
         still = np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
@@ -664,6 +674,7 @@ class FlightPoses:
                 self._manifest,
                 f"cameras.{name}.gimbal: {camera.pose.telemetry_source} holds no gimbal angles",
                 "name the log and topic that do, or fixed angles",
+                code="no-attitude",
             )
         moved = self._at_world_times(camera.pose, telemetry, own)
         place = f"{self._manifest}: cameras.{name}.gimbal"
@@ -686,16 +697,22 @@ class FlightPoses:
         if telemetry.body is None and gimbal is None:
             own = self._own_angles(camera.pose)
             remedy = f"add {own} with the heading of its first picture" if own else _ADD_ANGLES
-            raise DataError(place, f"{stated} says where the drone was but not how it was turned", remedy)
+            raise DataError(
+                place,
+                f"{stated} says where the drone was but not how it was turned",
+                remedy,
+                code="no-attitude",
+            )
         if telemetry.body is None and gimbal is not None and gimbal.relative_to != "world":
             raise DataError(
                 place,
                 f"its gimbal's angles are relative to the {gimbal.relative_to}, but {stated} does not say how"
                 " the body turned",
                 "give angles relative to the world",
+                code="no-attitude",
             )
         if gimbal is None and camera.mount is None:
-            raise DataError(place, f"{stated} holds no gimbal angles", _ADD_MOUNT)
+            raise DataError(place, f"{stated} holds no gimbal angles", _ADD_MOUNT, code="no-attitude")
 
     def _complete(
         self,
@@ -714,6 +731,7 @@ class FlightPoses:
                 f"cameras.{name}: its positions and attitudes share no time (or are further apart than"
                 f" {self._max_gap_ns / 1e9:g} s)",
                 "check the clocks of the two logs, or raise --max-pose-gap",
+                code="no-overlap",
             )
         for cause, count in (
             ("attitude without a position", np.count_nonzero(~placed)),
@@ -808,6 +826,7 @@ def _reader(kind: str, path: Path) -> Format:
             path,
             "holds no subtitles, flight record (CSV) or tagged pictures of DJI's",
             "`mocap info` says what it is",
+            code="wrong-kind",
         )
     return found or FORMATS.get(kind)
 

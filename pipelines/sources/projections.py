@@ -58,6 +58,7 @@ class Projection:
                 place,
                 f"{name!r} is no projected or geographic CRS",
                 "write one like EPSG:32632 (UTM 32 north)",
+                code="place-unknown",
             )
         authority = crs.to_authority(min_confidence=100)
         self.name = ":".join(authority) if authority else crs.name
@@ -132,7 +133,9 @@ class Projection:
         found[~np.isfinite(found).all(axis=1)] = np.nan  # pyproj says inf outside the CRS
         if len(found) and np.isnan(found[:, 0]).all():
             x, y = position[0, :2].tolist()
-            raise DataError(source, f"its x {x:.0f}, y {y:.0f} lies outside {self.name}", _NO_PLACE)
+            raise DataError(
+                source, f"its x {x:.0f}, y {y:.0f} lies outside {self.name}", _NO_PLACE, code="place-unknown"
+            )
         return found
 
     def _turn(self, source: Path | str, position: Float, origin: Place) -> Float:

@@ -129,6 +129,7 @@ def refuse_projected(source: Path | str, position: Float, origin: Place, crs: st
             source,
             f"lies about x {x_m:.0f} m, y {y_m:.0f} m (UTM or another map projection), {away}",
             "state the CRS, world: {crs: EPSG:32632} or map: {crs: ...}; or give metres from that origin",
+            code="place-unknown",
         )
 
 

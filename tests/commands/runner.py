@@ -15,12 +15,23 @@ from io import BytesIO, TextIOWrapper
 from pathlib import Path
 from unittest.mock import patch
 
-from mocap_cli.main import run
+from mocap_cli.main import print_error, run
+from pipelines.session.errors import CODES, MocapError
 
 MOCAP = str(Path(sys.executable).with_name("mocap"))
 
 
-def mocap(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+class Done(subprocess.CompletedProcess[str]):
+    """Result of a command that ran in this process.
+
+    Attributes:
+        code: of the error that ended it; None without one.
+    """
+
+    code: str | None = None
+
+
+def mocap(*arguments: str | Path) -> Done:
     """Run the command to its end, in this process; an exception without an error line fails the test."""
     given = [MOCAP, *map(str, arguments)]
     # Encoded like the streams of a process, so that text that cannot be written is found here as well.
@@ -28,13 +39,26 @@ def mocap(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     out = TextIOWrapper(printed, "utf-8", write_through=True)
     err = TextIOWrapper(told, "utf-8", "backslashreplace", write_through=True)
     status: int | str | None = 0
-    with patch.object(sys, "argv", given), redirect_stdout(out), redirect_stderr(err):
+    errors: list[MocapError] = []
+
+    def keep_and_print(error: MocapError) -> None:
+        errors.append(error)
+        print_error(error)
+
+    with (
+        patch.object(sys, "argv", given),
+        patch("mocap_cli.main.print_error", keep_and_print),
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
         try:
             run()
         except SystemExit as ended:
             status = ended.code
     assert isinstance(status, int), status
-    return subprocess.CompletedProcess(given, status, printed.getvalue().decode(), told.getvalue().decode())
+    done = Done(given, status, printed.getvalue().decode(), told.getvalue().decode())
+    done.code = errors[0].code if errors else None
+    return done
 
 
 def mocap_process(*arguments: str | Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
@@ -51,9 +75,12 @@ def succeeds(*arguments: str | Path) -> str:
     return done.stdout
 
 
-def refused(*arguments: str | Path) -> str:
-    """Run a command that must refuse its input in one line and exit 1; return that line."""
-    return refusal(mocap(*arguments))
+def refused(*arguments: str | Path, code: str | None = None) -> str:
+    """Run a command that must refuse its input in one line and exit 1, with this code; return that line."""
+    done = mocap(*arguments)
+    line = refusal(done)
+    assert code is None or (code in CODES and done.code == code), (done.code, line)
+    return line
 
 
 def refusal(done: subprocess.CompletedProcess[str]) -> str:

@@ -19,6 +19,7 @@ from pipelines.formats.common.files import read_text
 from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
+from pipelines.session.storage import code_of
 
 _BINARY_MODELS = (
     "SIMPLE_PINHOLE",
@@ -132,13 +133,15 @@ def _named(source: Path, images: list[_Image]) -> Iterator[tuple[str, _Image]]:
     names = [path.name if shared[path.name] == 1 else str(path) for path in paths]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
-        raise DataError(source, f"two images are called {twice[0]}", "rename one")
+        raise DataError(source, f"two images are called {twice[0]}", "rename one", code="stated-twice")
     return zip(names, images, strict=True)
 
 
 def _posed(source: Path, image: _Image, cameras: dict[int, Intrinsics]) -> CalibratedCamera:
     if image.camera not in cameras:
-        raise DataError(source, f"image {image.name} uses camera {image.camera}, which does not exist")
+        raise DataError(
+            source, f"image {image.name} uses camera {image.camera}, which does not exist", code="damaged"
+        )
     w, x, y, z, *translation = image.wxyz_xyz
     pose = invert_pose(source, image.name, np.array([x, y, z, w]), np.array(translation))
     return CalibratedCamera(cameras[image.camera], *pose)
@@ -215,7 +218,9 @@ class _Bytes:
         try:
             self._content = path.read_bytes()
         except OSError as error:
-            raise DataError(path, f"cannot be read ({error.strerror})", "check its permissions") from error
+            raise DataError(
+                path, f"cannot be read ({error.strerror})", "check its permissions", code=code_of(error)
+            ) from error
         self._at = 0
 
     def take(self, layout: str) -> tuple[float, ...]:

@@ -55,7 +55,12 @@ def _lens(path: Path, name: str, block: object) -> Intrinsics:
         key for key in ("camera_model", "distortion_model", "intrinsics", "resolution") if key not in keys
     ]
     if missing:
-        raise DataError(path, f"camera {name} lacks {', '.join(missing)}", "write the calibration again")
+        raise DataError(
+            path,
+            f"camera {name} lacks {', '.join(missing)}",
+            "write the calibration again",
+            code="missing-column",
+        )
     projection, distortion = (str(keys[key])[:40] for key in ("camera_model", "distortion_model"))
     if projection != "pinhole":
         raise DataError(
@@ -74,6 +79,7 @@ def _lens(path: Path, name: str, block: object) -> Intrinsics:
             f"camera {name} has {counts[0]} intrinsics and {counts[1]} distortion coefficients"
             f" instead of 4 and {_DISTORTIONS[distortion]} (pinhole, {distortion})",
             "write the calibration again",
+            code="damaged",
         )
     fu, fv, pu, pv = focal
     return intrinsics(

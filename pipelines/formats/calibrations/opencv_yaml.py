@@ -125,7 +125,7 @@ class Storage:
         ) as error:  # SystemError is how the binding reports a failed constructor
             raise DataError(path, "OpenCV cannot parse it", "it may be truncated; write it again") from error
         if not whole:
-            raise DataError(path, "is empty", "write the calibration again")
+            raise DataError(path, "is empty", "write the calibration again", code="empty")
 
     def text(self, key: str) -> str:
         """Return a string; empty if there is none."""

@@ -58,7 +58,9 @@ def _read_yaml(path: Path) -> dict[str, CalibratedCamera]:
     wanted = ("image_width", "image_height", "camera_matrix", "distortion_coefficients")
     missing = [key for key in wanted if key not in keys]
     if missing:
-        raise DataError(path, f"lacks {', '.join(missing)}", "write the calibration again")
+        raise DataError(
+            path, f"lacks {', '.join(missing)}", "write the calibration again", code="missing-column"
+        )
     return _camera(
         path,
         str(keys.get("camera_name") or ""),
@@ -96,7 +98,9 @@ def _read_ini(path: Path) -> dict[str, CalibratedCamera]:
             blocks.setdefault(key, []).append(text.split())
     missing = [key for key in ("width", "height", "camera matrix", "distortion") if key not in blocks]
     if missing:
-        raise DataError(path, f"lacks {', '.join(missing)}", "write the calibration again")
+        raise DataError(
+            path, f"lacks {', '.join(missing)}", "write the calibration again", code="missing-column"
+        )
     size = [_rows(path, key, blocks[key]).ravel() for key in ("width", "height")]
     return _camera(
         path,
@@ -112,7 +116,9 @@ def _rows(path: Path, key: str, rows: list[list[str]]) -> Float:
     try:
         return np.array([[float(cell) for cell in row] for row in rows])
     except ValueError as error:  # a word among the numbers, or rows of unequal length
-        raise DataError(path, f"{key} is no table of numbers", "write the calibration again") from error
+        raise DataError(
+            path, f"{key} is no table of numbers", "write the calibration again", code="bad-value"
+        ) from error
 
 
 def _camera(

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error, is_special, plain_text, refuse_special
+from pipelines.session.storage import as_data_error, code_of, is_special, plain_text, refuse_special
 from pipelines.session.yaml_files import plain_yaml
 
 HEAD_BYTES = 64 * 1024
@@ -94,7 +94,7 @@ def numbers(source: Path, name: str, value: object) -> Float:
     if not isinstance(value, list) or not all(
         isinstance(cell, int | float) and not isinstance(cell, bool) for cell in value
     ):
-        raise DataError(source, f"{name} is no list of numbers", "write it again")
+        raise DataError(source, f"{name} is no list of numbers", "write it again", code="bad-value")
     return np.array(value, dtype=np.float64)
 
 
@@ -114,7 +114,10 @@ def read_text(path: Path) -> str:
         return plain_text(path.read_bytes(), errors="strict")
     except OSError as error:
         raise DataError(
-            path, f"cannot be read ({error.strerror})", "check the path and its permissions"
+            path,
+            f"cannot be read ({error.strerror})",
+            "check the path and its permissions",
+            code=code_of(error),
         ) from error
     except UnicodeDecodeError as error:
         raise DataError(path, f"is not UTF-8 text (byte {error.start})", "save it as UTF-8") from error

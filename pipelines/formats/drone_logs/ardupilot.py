@@ -189,7 +189,9 @@ class ArduPilotFormat:
                 return np.unique(gps_ns - _leap_ns(gps_ns))
             if rows is not None:
                 return pictures_on_gps_time(path, rows.t_ns(), _gps_time(log), choice)
-        raise DataError(path, "holds no CAM or TRIG message", "take the times of frames otherwise")
+        raise DataError(
+            path, "holds no CAM or TRIG message", "take the times of frames otherwise", code="wrong-kind"
+        )
 
 
 # --- content of a log ----------------------------------------------------------------------------------
@@ -212,13 +214,19 @@ def _position(
             log.path,
             f"has no instance {instance} of a {wanted}",
             f"write position: {others[0]}" if others else "leave `instance` out",
+            code="no-such-name",
         )
     if choice.position is not None and choice.position not in found:
         raise DataError(
-            log.path, f"has no {choice.position} position", f"there is {', '.join(found) or 'none'}"
+            log.path,
+            f"has no {choice.position} position",
+            f"there is {', '.join(found) or 'none'}",
+            code="no-positions",
         )
     if not found:
-        raise DataError(log.path, "has no POS, XKF1, NKF1 or GPS message", "log them (LOG_BITMASK)")
+        raise DataError(
+            log.path, "has no POS, XKF1, NKF1 or GPS message", "log them (LOG_BITMASK)", code="no-positions"
+        )
     kind: str = choice.position or next(iter(found))
     rows = found[kind]
     of_several = f" (instance {instance})" if instance else ""
@@ -364,7 +372,9 @@ def _index(path: Path) -> Any:
     try:
         with path.open("rb") as file:
             if file.read(len(_START)) != _START:
-                raise DataError(path, "is no ArduPilot log", "give the .bin that the autopilot wrote")
+                raise DataError(
+                    path, "is no ArduPilot log", "give the .bin that the autopilot wrote", code="wrong-kind"
+                )
         refuse_marks(path, _START[:2])
         refuse_marks(path, _START, most=_MOST_DEFINITIONS)
     except OSError as error:

@@ -363,6 +363,7 @@ def _read(path: Path) -> _Record:
             path,
             "has no heading that names times, latitude, longitude, and heights or angles",
             "export the flight record with these columns",
+            code="missing-column",
         )
     values: dict[str, list[float]] = {name: [] for name in heading.numbers}
     clocks: list[str] = []
@@ -390,7 +391,9 @@ def _read(path: Path) -> _Record:
     except OSError as error:
         raise as_data_error(error, path) from error
     if not clocks:
-        raise DataError(path, f"holds no rows ({damaged} damaged)", "export the flight record again")
+        raise DataError(
+            path, f"holds no rows ({damaged} damaged)", "export the flight record again", code="empty"
+        )
     blank = np.full(len(clocks), np.nan)
     names = (*_NUMBERS, *_LENGTHS, "elapsed", "altitude")
     columns = {

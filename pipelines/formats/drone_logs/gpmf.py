@@ -181,7 +181,7 @@ class GoProFormat:
         in_enu = attitude_in_enu(turned, relative_to="world", axes="ned")
         camera = attitude_track(name, at_ns, in_enu, dropped)
         if camera is None:
-            raise DataError(path, f"{name} holds no usable attitude", _OTHER_ANGLES)
+            raise DataError(path, f"{name} holds no usable attitude", _OTHER_ANGLES, code="no-attitude")
         fit = _gps_fit(path, track)
         return Attitudes(
             replace(camera, t_ns=camera.t_ns if fit is None else fit.other_ns(camera.t_ns), dropped=dropped),
@@ -221,7 +221,7 @@ def _orientations(path: Path, track: _Track) -> tuple[Int64, Float, Float]:
     if lost := int(np.count_nonzero(~usable)):
         track.dropped["orientation of the camera that is none"] += lost
     if not usable.any():
-        raise DataError(path, "holds no usable orientation of the camera", _OTHER_ANGLES)
+        raise DataError(path, "holds no usable orientation of the camera", _OTHER_ANGLES, code="no-attitude")
     of_camera, of_picture = (
         each[usable] / norm[usable, None] for each, norm in zip((of_camera, of_picture), norms, strict=True)
     )
@@ -239,7 +239,9 @@ def _gravity(path: Path, track: _Track, at_ns: Int64, from_camera: Float) -> tup
     length = np.linalg.norm(there, axis=1)
     known = np.nan_to_num(length) > 0.5
     if not known.any():
-        raise DataError(path, "its orientations and its gravity share no time", _OTHER_ANGLES)
+        raise DataError(
+            path, "its orientations and its gravity share no time", _OTHER_ANGLES, code="no-overlap"
+        )
     down = rotate(from_camera[known], there[known] / length[known, None])
     mean = down.mean(axis=0)
     mean /= max(float(np.linalg.norm(mean)), 1e-9)
@@ -335,7 +337,9 @@ def _read(path: Path) -> _Track:
                     if inner == "STRM":
                         _take_stream(track, start_ns, length_ns, stream)
     if not track.rows:
-        raise DataError(path, "has no track of GoPro's telemetry", "name another log of poses")
+        raise DataError(
+            path, "has no track of GoPro's telemetry", "name another log of poses", code="wrong-kind"
+        )
     return track
 
 

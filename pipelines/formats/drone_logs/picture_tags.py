@@ -55,6 +55,7 @@ class PictureTags:
                 path,
                 "has pictures that say where they were taken but not when (no DateTimeOriginal in EXIF)",
                 "name another log of poses, or restore the pictures as the drone wrote them",
+                code="clock-unknown",
             )
         notes = ["its clock is the drone's local time, taken as UTC"]
         notes += [SHARED] if shared else []
@@ -83,7 +84,9 @@ def _columns(path: Path) -> tuple[Int64, bool, dict[str, Float]]:
     """Return times and columns of all pictures, and True if some share a second (`picture_times`)."""
     files = picture_files(path)
     if not files:
-        raise DataError(path, "is no folder of pictures", "name the folder that holds them")
+        raise DataError(
+            path, "is no folder of pictures", "name the folder that holds them", code="wrong-kind"
+        )
     tags = [read_tags(file) for file in files]
     t_ns, shared = picture_times(tags)
     columns = {name: np.array([each.values.get(name, np.nan) for each in tags]) for name in NAMES}

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.storage import plain_text
+from pipelines.session.storage import code_of, plain_text
 
 _TIMECODE = r"(\d+):([0-5]\d):([0-6]\d)[,.](\d{3})"  # a Matrice 300 ends its 60th second at :60
 _BLOCK = re.compile(rf"(?m)^{_TIMECODE} --> {_TIMECODE}[ \t]*$")
@@ -70,11 +70,16 @@ def read_subtitles(path: Path) -> Subtitles:
     try:
         text = plain_text(path.read_bytes())
     except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+        raise DataError(
+            path, f"cannot be read ({error.strerror})", "check the path", code=code_of(error)
+        ) from error
     subtitles = parse_subtitles(text)
     if not subtitles.texts:
         raise DataError(
-            path, "holds no subtitles" if text.strip() else "is empty", "copy it from the drone again"
+            path,
+            "holds no subtitles" if text.strip() else "is empty",
+            "copy it from the drone again",
+            code="empty",
         )
     return subtitles
 

@@ -19,6 +19,7 @@ from pipelines.geometry.poses import (
     multiply,
 )
 from pipelines.session.errors import DataError, NoPositionsError
+from pipelines.session.storage import code_of
 from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry, TelemetryChoice
 
 _UNEVEN_S = 0.5  # scatter of GPS times beyond what late messages explain
@@ -209,7 +210,12 @@ def on_gps_time(
         DataError: GPS time is asked for, and there is none.
     """
     if wanted == "gps" and fit is None:
-        raise DataError(source, "holds no GPS time", "leave time: gps out; its stamps count from boot")
+        raise DataError(
+            source,
+            "holds no GPS time",
+            "leave time: gps out; its stamps count from boot",
+            code="clock-unknown",
+        )
     if fit is None:
         notes.append("holds no GPS time: its stamps count from boot")
         return None
@@ -254,9 +260,9 @@ _SMALLEST_MESSAGE = 8  # bytes
 def damaged(path: Path, error: Exception) -> DataError:
     """Make the error of a log that its parser cannot read, by any kind of exception."""
     if isinstance(error, OSError):
-        return DataError(path, f"cannot be read ({error.strerror})", "check the path")
+        return DataError(path, f"cannot be read ({error.strerror})", "check the path", code=code_of(error))
     problem = " ".join(str(error).split())[:100] or type(error).__name__
-    return DataError(path, f"is damaged ({problem})", "download it from the autopilot again")
+    return DataError(path, f"is damaged ({problem})", "download it from the autopilot again", code="damaged")
 
 
 def describe_fit(fit: ClockFit) -> str:

@@ -151,7 +151,7 @@ class TlogFormat:
         stamps_us, numbers = columns["time_usec"][timed].astype(np.int64), np.unique(number[timed])
         drones_own = "take the times of frames from the drone's own log (.bin, .ulg) or otherwise"
         if not len(stamps_us):
-            raise DataError(path, "states no time for any of its pictures", drones_own)
+            raise DataError(path, "states no time for any of its pictures", drones_own, code="clock-unknown")
         if (lost := int(numbers[-1] - numbers[0]) + 1 - len(numbers)) > 0:
             problem = f"lacks {lost} of the pictures between {numbers[0]} and {numbers[-1]}"
             raise DataError(path, f"{problem}: their packets did not arrive", drones_own)
@@ -362,7 +362,12 @@ def _read(path: Path) -> _Packets:
     except (OSError, ValueError) as error:  # ValueError: an empty file cannot be mapped
         raise damaged(path, error) from error
     if not found.counts:
-        raise DataError(path, "holds no packet of MAVLink", "give the .tlog that the ground station wrote")
+        raise DataError(
+            path,
+            "holds no packet of MAVLink",
+            "give the .tlog that the ground station wrote",
+            code="wrong-kind",
+        )
     return found
 
 

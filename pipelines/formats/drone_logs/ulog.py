@@ -177,12 +177,18 @@ def _position(
         listed = [topic for names in _POSITIONS.values() for topic in _there(topics, names)]
         raise _no_instance(path, choice.instance, "a position", listed)
     if choice.position is not None and choice.position not in found:
-        raise DataError(path, f"has no {choice.position} position", f"there is {', '.join(found) or 'none'}")
+        raise DataError(
+            path,
+            f"has no {choice.position} position",
+            f"there is {', '.join(found) or 'none'}",
+            code="no-positions",
+        )
     if not found:
         raise DataError(
             path,
             "has no vehicle_local_position, vehicle_global_position or GPS",
             "log them (SDLOG_PROFILE), or give the poses from elsewhere",
+            code="no-positions",
         )
     kind = choice.position or _likeliest(found)
     topic = found[kind]
@@ -374,7 +380,9 @@ def _there(topics: Sequence[Topic], names: Sequence[str]) -> list[Topic]:
 
 def _no_instance(path: Path | str, instance: int, what: str, there: Sequence[Topic]) -> DataError:
     listed = ", ".join(f"{topic.name} {topic.instance}" for topic in there)
-    return DataError(path, f"has no instance {instance} of {what}", f"there are {listed}")
+    return DataError(
+        path, f"has no instance {instance} of {what}", f"there are {listed}", code="no-such-name"
+    )
 
 
 def _far_off(t_ns: Int64, among: Bool) -> Bool:
@@ -474,7 +482,9 @@ def _definitions(path: Path) -> list[tuple[str, list[tuple[str, int]]]]:
     found: list[tuple[str, list[tuple[str, int]]]] = []
     with path.open("rb") as file:
         if file.read(16)[: len(MAGIC)] != MAGIC:
-            raise DataError(path, "is no PX4 log", "give the .ulg that the autopilot wrote")
+            raise DataError(
+                path, "is no PX4 log", "give the .ulg that the autopilot wrote", code="wrong-kind"
+            )
         while len(head := file.read(3)) == 3:
             size, kind = struct.unpack("<HB", head)
             body = file.read(size)

@@ -15,6 +15,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections
 from pipelines.session.skeletons import SKELETONS, Skeleton, get_skeleton, skeleton_with
+from pipelines.session.storage import code_of
 
 _SAMPLED_FILES = 8
 _FRAME_LIMIT = 2**62  # keeps frame numbers and their differences inside int64
@@ -36,9 +37,9 @@ def load_json(path: Path) -> object:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise DataError(path, f"cannot be opened ({error.strerror})") from error
+        raise DataError(path, f"cannot be opened ({error.strerror})", code=code_of(error)) from error
     if not content.strip():
-        raise DataError(path, "is empty", "export the keypoints again")
+        raise DataError(path, "is empty", "export the keypoints again", code="empty")
     try:
         parsed: object = json.loads(content)
     except (ValueError, RecursionError) as error:

@@ -173,7 +173,9 @@ class ChunkedPart(LogPart):
         """
         self._records_left -= 1
         if self._records_left < 0:
-            raise DataError(self.path, "inflates to more messages than it has bytes", RECORD_AGAIN)
+            raise DataError(
+                self.path, "inflates to more messages than it has bytes", RECORD_AGAIN, code="too-large"
+            )
 
     @abstractmethod
     def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:

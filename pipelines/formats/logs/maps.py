@@ -149,6 +149,7 @@ class Losses:
             self._source,
             f"holds no map ({causes or 'it is empty'})",
             "name another topic, or leave `map:` out",
+            code="empty",
         )
 
 
@@ -253,9 +254,13 @@ def _made(message: Message, about: MapTopic) -> Occupancy | None:
         make = {OCTOMAP: _octomap, GRID_MAP: _elevations}.get(message.topic.type, _plan)
         return replace(make(message.value, about, pose), from_ns=t_ns)
     except AttributeError as error:
-        raise DataError(about.source, f"lacks the field {error.name!r}", _RECORD_AGAIN) from error
+        raise DataError(
+            about.source, f"lacks the field {error.name!r}", _RECORD_AGAIN, code="missing-column"
+        ) from error
     except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(about.source, f"cannot be read ({str(error)[:100]})", _RECORD_AGAIN) from error
+        raise DataError(
+            about.source, f"cannot be read ({str(error)[:100]})", _RECORD_AGAIN, code="damaged"
+        ) from error
 
 
 def _made_again(
@@ -410,7 +415,12 @@ def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
             points = cloud_points(message.value, about.source)
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
             lost.damaged(
-                DataError(about.source, f"a cloud cannot be read ({str(error)[:100]})", _RECORD_AGAIN)
+                DataError(
+                    about.source,
+                    f"a cloud cannot be read ({str(error)[:100]})",
+                    _RECORD_AGAIN,
+                    code="damaged",
+                )
             )
             continue
         except DataError as fault:
@@ -463,7 +473,10 @@ def cloud_points(value: Any, source: str) -> Float:
     data = bytes_of(value.data)
     if row_bytes < width * stride or len(data) < row_bytes * height:
         raise DataError(
-            source, f"a cloud breaks off: {len(data)} bytes for {width} x {height} points", _RECORD_AGAIN
+            source,
+            f"a cloud breaks off: {len(data)} bytes for {width} x {height} points",
+            _RECORD_AGAIN,
+            code="damaged",
         )
     # Rows may be padded, and values may be unaligned, so they are copied.
     rows = np.ascontiguousarray(data[: row_bytes * height].reshape(height, row_bytes)[:, : width * stride])

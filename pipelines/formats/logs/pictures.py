@@ -92,7 +92,7 @@ def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int6
     header_ns, receive_ns = array("q"), array("q")
     for sample in all_samples(recording.messages([topic]), source):
         if not isinstance(sample, PictureSample):
-            raise DataError(source, f"{topic} holds no pictures", "name another topic")
+            raise DataError(source, f"{topic} holds no pictures", "name another topic", code="no-pictures")
         header_ns.append(sample.stamp_ns)
         receive_ns.append(sample.receive_ns)
     return np.array(header_ns, np.int64), np.array(receive_ns, np.int64)
@@ -186,7 +186,7 @@ def read_triggers(recording: Log, source: str, topic: str) -> tuple[Int64, int]:
     t_ns = np.unique(np.frombuffer(stated, dtype=np.int64))
     t_ns = t_ns[t_ns > 0]
     if not len(t_ns):
-        raise DataError(source, f"{topic} states no time", "name another topic")
+        raise DataError(source, f"{topic} states no time", "name another topic", code="clock-unknown")
     return t_ns, messages - len(t_ns)
 
 

@@ -254,6 +254,7 @@ def read_preset(
             source,
             f"has no {' or '.join(wanted)} position of {prefix}/{driver.names[0]}",
             f"there is {', '.join(others)}" if others else "record its topics",
+            code="no-positions",
         )
     kind, place = next(iter(places.items()))
     dropped: dict[str, int] = {}

@@ -77,6 +77,7 @@ def read_px4(
             source,
             "holds messages of px4_msgs that cannot be decoded" if recording.dropped else "holds no message",
             "record as MCAP, which holds the definitions of the messages",
+            code="damaged",
         )
     notes: list[str] = []
     fit = _fit(np.concatenate(sent), np.concatenate(received), notes)

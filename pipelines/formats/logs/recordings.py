@@ -23,6 +23,7 @@ from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Message, Topic
 from pipelines.session.registries import Log
+from pipelines.session.storage import code_of
 
 # Causes of losses, as sessions and `mocap info` state them.
 UNDEFINED = "messages without a usable definition"
@@ -310,7 +311,9 @@ def open_file(path: Path) -> tuple[IO[bytes], int]:
             raise DataError(path, "is empty (0 bytes)", "copy it again from the drone")
         return path.open("rb"), size
     except OSError as error:
-        raise DataError(path, f"cannot be opened ({error.strerror})", "check the path") from None
+        raise DataError(
+            path, f"cannot be opened ({error.strerror})", "check the path", code=code_of(error)
+        ) from None
 
 
 def open_parts(

@@ -169,7 +169,9 @@ class _Bag(ChunkedPart):
         head = self.bytes_at(0, 16)
         match = _MAGIC.match(head)
         if not match:
-            raise DataError(self.path, "is no ROS 1 bag (the first line is not `#ROSBAG V2.0`)")
+            raise DataError(
+                self.path, "is no ROS 1 bag (the first line is not `#ROSBAG V2.0`)", code="wrong-kind"
+            )
         if (version := b".".join(match.groups()).decode()) != "2.0":
             raise DataError(self.path, f"is a bag of version {version}", "convert it with `rosbag fix`")
         try:

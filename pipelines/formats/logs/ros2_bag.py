@@ -157,7 +157,9 @@ def _open_compressed(path: Path) -> LogPart:
                     while part_of := content.read(_COPIED):
                         target.write(part_of)
                         if target.tell() > most:
-                            raise DataError(path, f"inflates to more than {most} bytes", RECORD_AGAIN)
+                            raise DataError(
+                                path, f"inflates to more than {most} bytes", RECORD_AGAIN, code="too-large"
+                            )
             except (ZstdError, EOFError):
                 whole = False
         # The folder is deleted while the part is open, which keeps its file by the handle.
@@ -262,7 +264,10 @@ class Sqlite3Part(LogPart):
         except _UNREADABLE as error:
             self.close()
             raise DataError(
-                path, f"cannot be read by sqlite3 ({error})", "try `sqlite3 FILE .recover`, or copy it again"
+                path,
+                f"cannot be read by sqlite3 ({error})",
+                "try `sqlite3 FILE .recover`, or copy it again",
+                code="damaged",
             ) from None
         except BaseException:
             self.close()

@@ -207,7 +207,7 @@ def poses_one_by_one(samples: Iterable[Sample], source: Source) -> LoggedRows:
     frames: Edge | None = None
     for sample in samples:
         if not isinstance(sample, PoseSample):
-            raise DataError(source, "holds no poses", "name a topic of poses")
+            raise DataError(source, "holds no poses", "name a topic of poses", code="no-poses")
         edge = (sample.target, sample.source)
         if frames is not None and edge != frames:
             raise DataError(
@@ -278,7 +278,9 @@ def attitudes_of(
     gathered, of_angles = _Samples(), False
     for sample in samples:
         if not isinstance(sample, AngleSample):
-            raise DataError(source, "holds no gimbal angles", "name a topic of angles or quaternions")
+            raise DataError(
+                source, "holds no gimbal angles", "name a topic of angles or quaternions", code="no-attitude"
+            )
         of_angles = sample.angles is not None
         gathered.add(sample, sample.angles or sample.quaternion_xyzw or ())
     rows = gathered.rows(3 if of_angles else 4)

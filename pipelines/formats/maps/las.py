@@ -153,7 +153,9 @@ def _opened(path: Path) -> Iterator[_Cloud]:
         return
     if not laspy.LazBackend.detect_available():
         remedy = f"run `{install_command('las')}`"
-        raise DataError(path, "is compressed (LAZ), and lazrs is not installed", remedy)
+        raise DataError(
+            path, "is compressed (LAZ), and lazrs is not installed", remedy, code="missing-library"
+        )
     pipe, silent = subprocess.PIPE, subprocess.DEVNULL
     with subprocess.Popen(_decoder(path), stdin=silent, stdout=pipe, stderr=silent) as process:  # noqa: S603
         assert process.stdout is not None  # noqa: S101
@@ -177,7 +179,12 @@ def _received(path: Path, pipe: IO[bytes], process: subprocess.Popen[bytes]) -> 
     line = pipe.readline()
     if not line.endswith(b"\n"):
         status = process.wait()
-        raise DataError(path, f"cannot be decompressed (the decompressor ended with status {status})", _COPY)
+        raise DataError(
+            path,
+            f"cannot be decompressed (the decompressor ended with status {status})",
+            _COPY,
+            code="damaged",
+        )
     stated = json.loads(line)
     if "problem" in stated:
         raise DataError(path, stated["problem"], _COPY)
@@ -240,7 +247,7 @@ def _refuse_impossible_records(path: Path) -> None:
     size = path.stat().st_size
     first_point = int.from_bytes(head[96:100], "little")
     if len(head) < 227 or first_point > size:
-        raise DataError(path, f"is cut off within its header ({size} bytes)", _COPY)
+        raise DataError(path, f"is cut off within its header ({size} bytes)", _COPY, code="damaged")
     if first_point < 227:
         raise DataError(path, f"has points from byte {first_point} on, within its header", _COPY)
     if sum(counts) * _RECORD > size:

@@ -213,7 +213,9 @@ def full_leaves(source: Path | str, payload: Bytes, record_bytes: int) -> Leaves
     log_odds = np.ascontiguousarray(records[node, :4]).view("<f4")[:, 0]
     if not np.isfinite(log_odds).all():
         bad = int((~np.isfinite(log_odds)).sum())
-        raise DataError(source, f"{bad} leaves have log odds that are not finite", _COPY_AGAIN)
+        raise DataError(
+            source, f"{bad} leaves have log odds that are not finite", _COPY_AGAIN, code="bad-value"
+        )
     return Leaves(key, depth, log_odds, nodes=used)
 
 
@@ -225,7 +227,7 @@ def _read(path: Path) -> tuple[_Header, Leaves]:
     if header.nodes is not None and header.nodes != leaves.nodes:
         raise DataError(path, f"has {leaves.nodes} nodes where its header states {header.nodes}", _COPY_AGAIN)
     if not len(leaves.depth):
-        raise DataError(path, "is an empty map: nothing in it is known", "leave `map:` out")
+        raise DataError(path, "is an empty map: nothing in it is known", "leave `map:` out", code="empty")
     return header, leaves
 
 
@@ -236,7 +238,9 @@ def _split(path: Path, content: bytes) -> tuple[_Header, Bytes]:
             _LEGACY.size :
         ]
     if not content.startswith((_BINARY, _FULL)):
-        raise DataError(path, "is no OctoMap file", f"its first line must be {_BINARY.decode()!r}")
+        raise DataError(
+            path, "is no OctoMap file", f"its first line must be {_BINARY.decode()!r}", code="wrong-kind"
+        )
     lines, payload = split_header(path, content, "data")
     values = {words[0]: words[1] for words in lines if len(words) == 2}
     try:
@@ -245,7 +249,9 @@ def _split(path: Path, content: bytes) -> tuple[_Header, Bytes]:
     except KeyError as error:
         raise DataError(path, "its header states no res", _COPY_AGAIN) from error
     except ValueError as error:
-        raise DataError(path, f"its header cannot be read ({str(error)[:100]})", _COPY_AGAIN) from error
+        raise DataError(
+            path, f"its header cannot be read ({str(error)[:100]})", _COPY_AGAIN, code="damaged"
+        ) from error
     kind = "bt" if content.startswith(_BINARY) else "ot"
     return _Header(kind, values.get("id", "OcTree"), resolution_m, nodes), payload
 
@@ -258,12 +264,16 @@ def _check_walk(source: Path | str, used: int, unit_bytes: int, payload_bytes: i
     from pipelines.formats.maps.octree import BREAKS_OFF, TOO_DEEP
 
     if used == BREAKS_OFF:
-        raise DataError(source, f"its tree breaks off after {payload_bytes} bytes", _COPY_AGAIN)
+        raise DataError(
+            source, f"its tree breaks off after {payload_bytes} bytes", _COPY_AGAIN, code="damaged"
+        )
     if used == TOO_DEEP:
-        raise DataError(source, f"its tree is damaged: deeper than {DEPTH} levels", _COPY_AGAIN)
+        raise DataError(
+            source, f"its tree is damaged: deeper than {DEPTH} levels", _COPY_AGAIN, code="damaged"
+        )
     if used * unit_bytes != payload_bytes:
         extra = payload_bytes - used * unit_bytes
-        raise DataError(source, f"has {extra} bytes beyond its tree", _COPY_AGAIN)
+        raise DataError(source, f"has {extra} bytes beyond its tree", _COPY_AGAIN, code="damaged")
 
 
 def _log_odds(probability: float) -> float:

@@ -94,7 +94,7 @@ def _read(path: Path) -> tuple[_Header, Float]:
     header = _header(path, lines)
     place = {name: header.fields.index(name) for name in ("x", "y", "z")}
     if any(header.counts[k] != 1 for k in place.values()):
-        raise DataError(path, "has more than one x, y or z in a point", _EXPORT_AGAIN)
+        raise DataError(path, "has more than one x, y or z in a point", _EXPORT_AGAIN, code="bad-value")
     if header.data == "ascii":
         first = [sum(header.counts[:k]) for k in place.values()]
         return header, written_points(path, body, 0, header.points, (first[0], first[1], first[2]))
@@ -127,7 +127,9 @@ def _header(path: Path, lines: list[list[str]]) -> _Header:
         points = int(words.get("POINTS", [str(width * height)])[0])
         data = words["DATA"][0].lower()
     except (KeyError, IndexError, ValueError) as error:
-        raise DataError(path, f"its header cannot be read ({str(error)[:100]})", _EXPORT_AGAIN) from error
+        raise DataError(
+            path, f"its header cannot be read ({str(error)[:100]})", _EXPORT_AGAIN, code="damaged"
+        ) from error
     if not len(fields) == len(sizes) == len(types) == len(counts):
         raise DataError(path, "FIELDS, SIZE, TYPE and COUNT are not equally long", _EXPORT_AGAIN)
     for field, size, kind, count in zip(fields, sizes, types, counts, strict=True):
@@ -166,18 +168,26 @@ def _decompressed(path: Path, body: Bytes, header: _Header) -> Bytes:
     packed_size, size = _SIZES.unpack(body[: _SIZES.size].tobytes())
     packed = body[_SIZES.size :][:packed_size]
     if len(packed) < packed_size:
-        raise DataError(path, f"breaks off: {len(packed)} of {packed_size} bytes are there", "copy it again")
+        raise DataError(
+            path,
+            f"breaks off: {len(packed)} of {packed_size} bytes are there",
+            "copy it again",
+            code="damaged",
+        )
     if size != header.points * header.stride or size > MOST_EXPANSION * packed_size:
         raise DataError(
             path,
             f"states {size} bytes for {header.points} points of {header.stride} bytes in {packed_size} bytes",
             _EXPORT_AGAIN,
+            code="damaged",
         )
     from pipelines.formats.maps.lzf import decompress
 
     values = np.zeros(size, dtype=np.uint8)
     if decompress(packed, values) != size:
-        raise DataError(path, "its compressed points are damaged", "copy it again or export it again")
+        raise DataError(
+            path, "its compressed points are damaged", "copy it again or export it again", code="damaged"
+        )
     return values
 
 

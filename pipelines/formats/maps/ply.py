@@ -117,16 +117,26 @@ def _header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Element]]:
                 elements[-1].properties[name] = "list"
             case ["property", kind, name] if elements and kind in _TYPES:
                 if name in elements[-1].properties:
-                    raise DataError(path, f"names the property {name[:40]} twice", _EXPORT_AGAIN)
+                    raise DataError(
+                        path, f"names the property {name[:40]} twice", _EXPORT_AGAIN, code="stated-twice"
+                    )
                 elements[-1].properties[name] = _TYPES[kind]
             case ["ply"] | ["end_header"] | ["comment", *_] | ["obj_info", *_]:
                 pass
             case _:
                 raise DataError(
-                    path, f"its header cannot be read (line {' '.join(words)[:60]!r})", _EXPORT_AGAIN
+                    path,
+                    f"its header cannot be read (line {' '.join(words)[:60]!r})",
+                    _EXPORT_AGAIN,
+                    code="damaged",
                 )
     if lines[0] != ["ply"] or not encoding:
-        raise DataError(path, "is no PLY file of version 1.0", "its first lines must be `ply` and `format`")
+        raise DataError(
+            path,
+            "is no PLY file of version 1.0",
+            "its first lines must be `ply` and `format`",
+            code="wrong-kind",
+        )
     return encoding, elements
 
 
@@ -141,7 +151,7 @@ def _vertex(path: Path, elements: list[_Element]) -> tuple[list[_Element], _Elem
         stated = " ".join(element.properties)[:100]
         raise DataError(path, f"its vertices have {stated or 'nothing'}", "x, y, z and no lists are needed")
     if not element.count:
-        raise DataError(path, "has 0 vertices", _EXPORT_AGAIN)
+        raise DataError(path, "has 0 vertices", _EXPORT_AGAIN, code="empty")
     return elements[:k], element
 
 

@@ -124,7 +124,9 @@ def _read_plan(path: Path) -> _Plan:
         if key not in values
     ]
     if missing:
-        raise DataError(path, f"lacks {', '.join(missing)}", "map_server's files have them all")
+        raise DataError(
+            path, f"lacks {', '.join(missing)}", "map_server's files have them all", code="missing-column"
+        )
     origin = numbers(path, "origin", values["origin"])
     resolution, occupied, free = numbers(
         path,
@@ -133,9 +135,14 @@ def _read_plan(path: Path) -> _Plan:
     ).tolist()
     mode, image = values.get("mode", "trinary"), values["image"]
     if len(origin) != 3 or not np.abs(origin).max() < 1e9:  # also true for NaN
-        raise DataError(path, f"origin is {origin.tolist()} instead of x, y, yaw", _MEND)
+        raise DataError(path, f"origin is {origin.tolist()} instead of x, y, yaw", _MEND, code="bad-value")
     if not 0 <= free <= occupied <= 1:
-        raise DataError(path, f"free_thresh {free:g} and occupied_thresh {occupied:g} are not 0..1", _MEND)
+        raise DataError(
+            path,
+            f"free_thresh {free:g} and occupied_thresh {occupied:g} are not 0..1",
+            _MEND,
+            code="bad-value",
+        )
     if mode not in _MODES:
         raise DataError(path, f"mode is {str(mode)[:40]!r}", f"known are {', '.join(_MODES)}")
     if values["negate"] not in (0, 1):
@@ -163,7 +170,10 @@ def _find_image(path: Path, image: str) -> Path:
         return next(candidate for candidate in candidates if candidate.is_file())
     except (StopIteration, OSError, ValueError):  # OSError, ValueError: too long or invalid a name
         raise DataError(
-            path, f"its picture {image[:200]} is not there", "put it beside the YAML file"
+            path,
+            f"its picture {image[:200]} is not there",
+            "put it beside the YAML file",
+            code="no-such-file",
         ) from None
 
 
@@ -183,7 +193,9 @@ def _probabilities(path: Path, plan: _Plan) -> Float32:
         if plan.mode == "scale":
             probability = np.where(opaque, probability, np.nan)
     if np.isnan(probability).all():
-        raise DataError(path, "is an empty map: every pixel is unknown", "check mode and thresholds")
+        raise DataError(
+            path, "is an empty map: every pixel is unknown", "check mode and thresholds", code="empty"
+        )
     return np.ascontiguousarray(probability[::-1].T, dtype=np.float32)
 
 
@@ -195,7 +207,7 @@ def _picture(image: Path) -> tuple[Float, Bool]:
         return shade, np.ones(shade.shape, dtype=bool)
     if head.startswith(_PNG):
         return _read_png(image)
-    raise DataError(image, "is no PGM or PNG picture", "convert it to one of them")
+    raise DataError(image, "is no PGM or PNG picture", "convert it to one of them", code="wrong-kind")
 
 
 def _read_pgm(image: Path) -> Float:
@@ -204,7 +216,7 @@ def _read_pgm(image: Path) -> Float:
     head = re.match(rb"P[25](?:(?:\s|#[^\n]*\n)+(\d{1,9})){3}\s", content)
     words = re.sub(rb"#[^\n]*\n", b" ", head[0]).split() if head else []
     if not head or len(words) != 4:
-        raise DataError(image, "is a PGM whose header cannot be read", "save it again")
+        raise DataError(image, "is a PGM whose header cannot be read", "save it again", code="damaged")
     width, height, most = (int(word) for word in words[1:])
     if not 0 < most < 1 << 16:
         raise DataError(image, f"is a PGM of values up to {most}", "save it again with 255")
@@ -219,10 +231,15 @@ def _read_pgm(image: Path) -> Float:
         try:
             values = np.array([int(word) for word in body.split()[: width * height]], dtype=np.float64)
         except (ValueError, OverflowError) as error:
-            raise DataError(image, f"is damaged ({str(error)[:100]})", "save it again") from error
+            raise DataError(
+                image, f"is damaged ({str(error)[:100]})", "save it again", code="damaged"
+            ) from error
     if len(values) < width * height:
         raise DataError(
-            image, f"breaks off: {len(values)} of {width * height} pixels are there", "copy it again"
+            image,
+            f"breaks off: {len(values)} of {width * height} pixels are there",
+            "copy it again",
+            code="damaged",
         )
     shade: Float = values.reshape(height, width) / most
     if shade.min() < 0 or shade.max() > 1:
@@ -235,17 +252,22 @@ def _read_png(image: Path) -> tuple[Float, Bool]:
 
     content = read_bytes(image)
     if len(content) < _PNG_HEADER:
-        raise DataError(image, "is a PNG that breaks off", "copy it again")
+        raise DataError(image, "is a PNG that breaks off", "copy it again", code="damaged")
     width, height, bits, kind = struct.unpack_from(">IIBB", content, 16)
     _check_pixels(image, width, height)
     if width * height * bits * _PNG_CHANNELS.get(kind, 1) > 8 * _DEFLATE_MOST * len(content):
-        raise DataError(image, f"does not hold the {width} x {height} pixels that it states", "copy it again")
+        raise DataError(
+            image,
+            f"does not hold the {width} x {height} pixels that it states",
+            "copy it again",
+            code="damaged",
+        )
     try:
         decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise DataError(image, f"is damaged ({error.err})", "save it again") from error
+        raise DataError(image, f"is damaged ({error.err})", "save it again", code="damaged") from error
     if decoded is None:
-        raise DataError(image, "is a damaged PNG", "save it again")
+        raise DataError(image, "is a damaged PNG", "save it again", code="damaged")
     values = np.asarray(decoded).astype(np.float64) / np.iinfo(decoded.dtype).max
     if values.ndim == 2:
         return values, np.ones(values.shape, dtype=bool)

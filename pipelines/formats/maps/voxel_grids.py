@@ -176,7 +176,7 @@ def written_points(path: Path, body: Bytes, skipped: int, count: int, columns: t
         points = np.loadtxt(rows[:count], dtype=np.float64, comments=None, usecols=columns, ndmin=2)
     except (ValueError, OverflowError) as error:  # the latter for columns of an absurd number
         raise DataError(
-            path, f"a row of points is damaged ({str(error)[:100]})", "export it again"
+            path, f"a row of points is damaged ({str(error)[:100]})", "export it again", code="damaged"
         ) from error
     return points
 
@@ -185,7 +185,10 @@ def check_count(path: Path, stated: int, there: int) -> None:
     """Refuse a cloud with fewer points than its header states (DataError)."""
     if stated > there:
         raise DataError(
-            path, f"breaks off: {there} of {stated} points are there", "copy it again or export it again"
+            path,
+            f"breaks off: {there} of {stated} points are there",
+            "copy it again or export it again",
+            code="damaged",
         )
 
 

@@ -104,7 +104,10 @@ def times_of(path: Path) -> Path:
     found = next((place for place in places if place.is_file()), None)
     if found is None:
         raise DataError(
-            path, "is a KITTI trajectory without times", "put KITTI's times.txt beside it, or save it as TUM"
+            path,
+            "is a KITTI trajectory without times",
+            "put KITTI's times.txt beside it, or save it as TUM",
+            code="clock-unknown",
         )
     return found
 

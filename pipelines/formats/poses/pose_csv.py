@@ -56,12 +56,16 @@ class PoseCsvFormat:
                 path,
                 "has no header that names the time, x y z and qx qy qz qw",
                 "name the columns t_ns,x,y,z,qx,qy,qz,qw (or t in seconds)",
+                code="missing-column",
             )
         heading, columns = found
         missing = [name for name in COVARIANCE_COLUMNS if name not in columns]
         if 0 < len(missing) < len(COVARIANCE_COLUMNS):
             raise DataError(
-                path, f"lacks the covariance columns {', '.join(missing)}", "give all 21 of them or none"
+                path,
+                f"lacks the covariance columns {', '.join(missing)}",
+                "give all 21 of them or none",
+                code="missing-column",
             )
         table = rows_below(path, heading, text, {}, columns)
         t_ns, readable = parse_stamps(

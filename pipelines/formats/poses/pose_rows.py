@@ -112,7 +112,9 @@ def clean_poses(
     keep = kept_rows(t_ns, causes, dropped)
     if not keep.any():
         counts = ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it has no rows"
-        raise DataError(source, f"holds no usable pose ({counts})", "check how it was written")
+        raise DataError(
+            source, f"holds no usable pose ({counts})", "check how it was written", code="no-poses"
+        )
     return Trajectory(
         t_ns=t_ns[keep],
         position=position[keep],

@@ -129,6 +129,7 @@ def _likely_unit(path: Path, bones: list[_Bone], axes: str) -> float:
         path,
         f"states no unit, and its rest pose of {tall:.3g} is an adult's in none",
         "say truth: {joints: {path: FILE, unit: cm}}",
+        code="unit-unknown",
     )
 
 
@@ -144,9 +145,16 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
             channels; frames that are missing, too many, cut off or not finite; a bone that moves too far.
     """
     if unit not in METRES:
-        raise DataError(path, f"the unit {unit!r} is none of {', '.join(METRES)}", "state one of them")
+        raise DataError(
+            path,
+            f"the unit {unit!r} is none of {', '.join(METRES)}",
+            "state one of them",
+            code="unit-unknown",
+        )
     if axes not in AXES:
-        raise DataError(path, f"the axes {axes!r} are none of {', '.join(AXES)}", "state one of them")
+        raise DataError(
+            path, f"the axes {axes!r} are none of {', '.join(AXES)}", "state one of them", code="axes-unknown"
+        )
     contents = _read(path)
     metres, order = METRES[unit], _IN_WORLD[axes]
     turned = [*order, 3]  # a rotation's axis is turned like any other vector
@@ -248,9 +256,9 @@ def _read(path: Path) -> _Contents:
     text = read_text(path)
     head, marker, tail = text.partition("\nMOTION")
     if not head.lstrip().startswith("HIERARCHY"):
-        raise DataError(path, "is no BVH file", "its first word must be HIERARCHY")
+        raise DataError(path, "is no BVH file", "its first word must be HIERARCHY", code="wrong-kind")
     if not marker:
-        raise DataError(path, "ends before its line MOTION", _EXPORT_AGAIN)
+        raise DataError(path, "ends before its line MOTION", _EXPORT_AGAIN, code="damaged")
     bones = _bones(path, head.split("\n"))
     channels = sum(len(bone.channels) for bone in bones)
     first_line = head.count("\n") + 2
@@ -286,7 +294,9 @@ def _bones(path: Path, lines: list[str]) -> list[_Bone]:
                 if name in names:
                     raise DataError(path, f"line {number}: a second bone is called {name}", "rename one")
                 if len(bones) >= _MOST_BONES:
-                    raise DataError(path, f"has more than {_MOST_BONES} bones", _EXPORT_AGAIN)
+                    raise DataError(
+                        path, f"has more than {_MOST_BONES} bones", _EXPORT_AGAIN, code="too-large"
+                    )
                 names.add(name)
                 bones.append(_Bone(name, -1 if above is None else above, np.zeros(3), [], channels))
                 coming = len(bones) - 1
@@ -363,7 +373,10 @@ def _stated(path: Path, line: str, key: str, number: int) -> float:
         except (ValueError, IndexError):
             pass
     raise DataError(
-        path, f"line {number} must be `{key}` and a number, it is {line.strip()[:60]!r}", _EXPORT_AGAIN
+        path,
+        f"line {number} must be `{key}` and a number, it is {line.strip()[:60]!r}",
+        _EXPORT_AGAIN,
+        code="bad-value",
     )
 
 
@@ -390,7 +403,9 @@ def _numbers(path: Path, body: str, channels: int, frames: float, first_line: in
 
 def _first_bad_frame(path: Path, body: str, channels: int, first_line: int) -> DataError:
     if not channels or not body.strip():
-        return DataError(path, "holds no frames" if channels else "has no channels", _EXPORT_AGAIN)
+        return DataError(
+            path, "holds no frames" if channels else "has no channels", _EXPORT_AGAIN, code="empty"
+        )
     lines = body.split("\n")
     last = max(k for k, line in enumerate(lines) if line.strip())
     for k, line in enumerate(lines):
@@ -411,7 +426,7 @@ def _first_bad_frame(path: Path, body: str, channels: int, first_line: int) -> D
                     f"line {first_line + k}: {word[:40]!r} is no finite number below {_LARGEST:g}",
                     _EXPORT_AGAIN,
                 )
-    return DataError(path, "holds numbers that cannot be read", _EXPORT_AGAIN)
+    return DataError(path, "holds numbers that cannot be read", _EXPORT_AGAIN, code="damaged")
 
 
 FORMAT = BvhFormat()

@@ -90,7 +90,9 @@ def _open(path: Path) -> Any:
     try:
         return ezc3d.c3d(str(path))
     except (OSError, ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
-        raise DataError(path, f"is no readable C3D ({str(error)[:120]})", _EXPORT_AGAIN) from error
+        raise DataError(
+            path, f"is no readable C3D ({str(error)[:120]})", _EXPORT_AGAIN, code="damaged"
+        ) from error
 
 
 def _check_layout(path: Path) -> None:
@@ -110,7 +112,7 @@ def _check_layout(path: Path) -> None:
     except OSError as error:
         raise as_data_error(error, path) from error
     if len(head) < _BLOCK or head[1] != _MAGIC or len(section) < 4:
-        raise DataError(path, "is no readable C3D (it ends in its header)", _EXPORT_AGAIN)
+        raise DataError(path, "is no readable C3D (it ends in its header)", _EXPORT_AGAIN, code="damaged")
     processor = section[3]
     order = ">" if processor == _MIPS else "<"
     points, analogs, first, last = struct.unpack_from(f"{order}4H", head, 2)
@@ -121,10 +123,15 @@ def _check_layout(path: Path) -> None:
     needed = (start - 1) * _BLOCK + frames * (4 * points + analogs) * (4 if is_float else 2)
     if size < needed:
         raise DataError(
-            path, f"is no readable C3D (it holds {size} of the {needed} bytes of its header)", _EXPORT_AGAIN
+            path,
+            f"is no readable C3D (it holds {size} of the {needed} bytes of its header)",
+            _EXPORT_AGAIN,
+            code="damaged",
         )
     if not _is_chain(section, order):
-        raise DataError(path, "is no readable C3D (its parameters are damaged)", _EXPORT_AGAIN)
+        raise DataError(
+            path, "is no readable C3D (its parameters are damaged)", _EXPORT_AGAIN, code="damaged"
+        )
 
 
 def _is_chain(section: bytes, order: str) -> bool:
@@ -206,7 +213,9 @@ def _beyond(path: Path, contents: Any, read: int, frames: int) -> Float:
     start = (int(first) - 1) * _BLOCK + read * points * 16
     values = np.fromfile(path, "<f4", count=(frames - read) * points * 4, offset=start)
     if len(values) < (frames - read) * points * 4:
-        raise DataError(path, f"breaks off before the last of its {frames} frames", _EXPORT_AGAIN)
+        raise DataError(
+            path, f"breaks off before the last of its {frames} frames", _EXPORT_AGAIN, code="damaged"
+        )
     rows = values.reshape(frames - read, points, 4).astype(np.float64)
     return np.where(rows[..., 3:] < 0, np.nan, rows[..., :3])
 

@@ -41,11 +41,17 @@ def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float
     """
     if unit not in METRES:
         raise DataError(
-            source, f"the unit {unit!r} is none of {', '.join(METRES)}", "state `unit: mm` or alike"
+            source,
+            f"the unit {unit!r} is none of {', '.join(METRES)}",
+            "state `unit: mm` or alike",
+            code="unit-unknown",
         )
     if axes not in AXES:
         raise DataError(
-            source, f"the axes {axes!r} are none of {', '.join(AXES)}", "state `axes: y-up` or z-up"
+            source,
+            f"the axes {axes!r} are none of {', '.join(AXES)}",
+            "state `axes: y-up` or z-up",
+            code="axes-unknown",
         )
     seen = np.isfinite(position).all(axis=-1, keepdims=True)
     turned = position[..., [2, 0, 1]] if axes == "y-up" else position

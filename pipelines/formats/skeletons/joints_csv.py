@@ -55,13 +55,18 @@ class JointsCsvFormat:
         heading = _find_heading(text)
         if heading is None:
             raise DataError(
-                path, "has no header that names the time, joint and x y z", "begin with t_ns,joint,x,y,z"
+                path,
+                "has no header that names the time, joint and x y z",
+                "begin with t_ns,joint,x,y,z",
+                code="missing-column",
             )
         names = heading.names
         words = {name: column for name, column in names.items() if name in ("joint", "person")}
         table = rows_below(path, heading, text, words, {axis: names[axis] for axis in "xyz"})
         if table.truncated:
-            raise DataError(path, "its last line broke off", "copy the file again, or delete that line")
+            raise DataError(
+                path, "its last line broke off", "copy the file again, or delete that line", code="damaged"
+            )
         stamps, readable = parse_stamps(
             path, table.text["stamp"], heading.unit, unit_stated=heading.unit_stated
         )
@@ -122,6 +127,7 @@ def _dense(path: Path, stamps: Int64, people: Int64, names: pa.ChunkedArray, pos
             f"{len(twice)} joints are stated more than once at one time, first {joints[j]} of person "
             f"{persons[p]} at {t_ns[t]} ns",
             "leave one row for each",
+            code="stated-twice",
         )
     dense = np.full((cells, 3), np.nan)
     dense[flat] = position

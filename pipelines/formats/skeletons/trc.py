@@ -90,7 +90,10 @@ def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
     lines = text.split("\n")
     if len(lines) < 5 or not lines[0].startswith("PathFileType") or not lines[3].startswith("Frame#"):
         raise DataError(
-            path, "has no TRC header (five lines from PathFileType to X1 Y1 Z1)", "export it again"
+            path,
+            "has no TRC header (five lines from PathFileType to X1 Y1 Z1)",
+            "export it again",
+            code="missing-column",
         )
     markers = tuple(cell.strip() for cell in lines[3].split("\t")[2:] if cell.strip())
     columns = len(lines[4].split())
@@ -100,7 +103,9 @@ def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
         )
     twice = sorted(marker for marker, count in Counter(markers).items() if count > 1)
     if twice:
-        raise DataError(path, f"names the marker {twice[0]} more than once", "rename one")
+        raise DataError(
+            path, f"names the marker {twice[0]} more than once", "rename one", code="stated-twice"
+        )
     keys = zip(lines[1].split("\t"), lines[2].split("\t"), strict=False)
     return _Header({key.strip(): value.strip() for key, value in keys}, markers), lines[5:], 6
 
@@ -117,7 +122,10 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
             cells.pop()  # many writers end their lines with a tab
         if len(cells) != 3 * markers + 2:
             raise DataError(
-                path, f"line {number} has {len(cells)} cells instead of {3 * markers + 2}", "export it again"
+                path,
+                f"line {number} has {len(cells)} cells instead of {3 * markers + 2}",
+                "export it again",
+                code="bad-value",
             )
         try:
             values.append([float(cell) if cell.strip() else np.nan for cell in cells[2:]])
@@ -125,7 +133,7 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
             raise DataError(path, f"line {number}: {error}", "export it again") from error
         times.append(cells[1])
     if not times:
-        raise DataError(path, "holds no frames", "export it again")
+        raise DataError(path, "holds no frames", "export it again", code="empty")
     return times, np.array(values).reshape(len(times), markers, 3)
 
 

@@ -128,7 +128,10 @@ def _read_csv(path: Path) -> FrameStamps:
     found = _find_heading(text)
     if found is None:
         raise DataError(
-            path, "has no header that names the time", "begin it with the line frame,t_ns (or t in seconds)"
+            path,
+            "has no header that names the time",
+            "begin it with the line frame,t_ns (or t in seconds)",
+            code="missing-column",
         )
     heading, column = found
     if heading.columns == 1:
@@ -161,7 +164,10 @@ def _read_subtitles(path: Path) -> FrameStamps:
     start_ns = subtitles.start_ns()
     if start_ns is None:
         raise DataError(
-            path, f"its {len(media_ns)} subtitles show no clock time", "state frame_times: {start: SECONDS}"
+            path,
+            f"its {len(media_ns)} subtitles show no clock time",
+            "state frame_times: {start: SECONDS}",
+            code="clock-unknown",
         )
     if subtitles.are_slow:  # with whole seconds: not the time of each frame
         raise DataError(
@@ -207,7 +213,9 @@ def _clean(
     kept = order[keep]
     if not len(kept):
         counts = ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it has no rows"
-        raise DataError(path, f"holds no usable frame time ({counts})", "check how it was written")
+        raise DataError(
+            path, f"holds no usable frame time ({counts})", "check how it was written", code="clock-unknown"
+        )
     return FrameStamps(frame[kept], t_ns[kept], None if media_ns is None else media_ns[kept], dropped)
 
 

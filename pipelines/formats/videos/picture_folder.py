@@ -58,7 +58,12 @@ class PictureFolder:
             first = pictures.read(0)
             times, shared = taken_ns(path)
         if first is None:
-            raise DataError(path, "has a first picture that cannot be decoded", "take it out of the folder")
+            raise DataError(
+                path,
+                "has a first picture that cannot be decoded",
+                "take it out of the folder",
+                code="damaged",
+            )
         stamps = times if times is not None else np.arange(len(pictures.files), dtype=np.int64) * 10**9
         return VideoIndex(
             pts_ns=stamps - stamps[0],
@@ -86,7 +91,9 @@ class FolderPictures:
     def __init__(self, path: Path) -> None:
         self.files = picture_files(path)
         if not self.files:
-            raise DataError(path, "is no folder of pictures", "name the folder that holds them")
+            raise DataError(
+                path, "is no folder of pictures", "name the folder that holds them", code="wrong-kind"
+            )
         self._size: tuple[int, ...] | None = None
 
     def __enter__(self) -> Self:

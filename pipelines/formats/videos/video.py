@@ -22,6 +22,7 @@ from pipelines.formats.common.rows import describe_times
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import VideoIndex
+from pipelines.session.storage import code_of
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame
@@ -489,6 +490,7 @@ def _unreadable(path: Path, kind: str, problem: str) -> DataError:
             path,
             "has no table of its frames (moov): the recording was not closed, or the file is cut off",
             "copy it again, or repair it with a whole recording of the same camera",
+            code="damaged",
         )
     return DataError(path, problem, "check that it is a video, and copy it again")
 
@@ -499,12 +501,17 @@ def _kind(path: Path) -> str:
         size = path.stat().st_size
         kind = container_format(path)
     except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+        raise DataError(
+            path, f"cannot be read ({error.strerror})", "check the path", code=code_of(error)
+        ) from error
     if not size:
-        raise DataError(path, "is empty", "copy it from the camera again")
+        raise DataError(path, "is empty", "copy it from the camera again", code="empty")
     if kind is None:
         raise DataError(
-            path, "is no video container that is known here", "known are MP4, MOV, MKV, WebM, AVI, MPEG-TS"
+            path,
+            "is no video container that is known here",
+            "known are MP4, MOV, MKV, WebM, AVI, MPEG-TS",
+            code="wrong-kind",
         )
     return kind
 

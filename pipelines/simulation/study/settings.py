@@ -92,12 +92,17 @@ def settings_for(
         DataError: an unknown name, a value given twice, or a number out of range.
     """
     if noise and levels is not None:
-        raise DataError("--noise", "cannot be given together with --levels", "leave one of them out")
+        raise DataError(
+            "--noise", "cannot be given together with --levels", "leave one of them out", code="bad-option"
+        )
     if detector is not None:
         find_detector(detector)
         if keypoints is not None:
             raise DataError(
-                "--detector", "cannot be given together with --keypoints", "leave one of them out"
+                "--detector",
+                "cannot be given together with --keypoints",
+                "leave one of them out",
+                code="bad-option",
             )
     tilts_deg = tilts_deg or ((0.0, 15.0, 30.0, 45.0, 60.0) if study == "tilt" else (_TILT_DEG,))
     drones = drones or ((2, 3, 4, 5) if study == "robots" else (2,))
@@ -113,12 +118,18 @@ def settings_for(
     for name, values in (("--tilts", tilts_deg), ("--robots", drones), ("--noise", noise)):
         _check_once(name, values)
     if seconds * rate_hz < 2:
-        raise DataError("--seconds", f"{seconds:g} s at {rate_hz:g} Hz are not two pictures", "film longer")
+        raise DataError(
+            "--seconds",
+            f"{seconds:g} s at {rate_hz:g} Hz are not two pictures",
+            "film longer",
+            code="bad-option",
+        )
     if "auto" in methods and seconds * rate_hz < _FEWEST_TIMES:
         raise DataError(
             "--seconds",
             f"{seconds:g} s at {rate_hz:g} Hz are too few pictures for auto ({_FEWEST_TIMES})",
             "film longer, or leave it out of --methods",
+            code="bad-option",
         )
     asked = [Noise(text, text) for text in noise] or _levels(study, levels, seconds)
     for each in asked:
@@ -222,10 +233,12 @@ def _check_names(option: str, given: Sequence[str], known: Sequence[str]) -> Non
 
 def _check_once(option: str, given: Sequence[object]) -> None:
     if len(set(given)) < len(given):
-        raise DataError(option, "says something twice", "name each once")
+        raise DataError(option, "says something twice", "name each once", code="stated-twice")
 
 
 def _check_range(option: str, given: Sequence[float], least: float, most: float) -> None:
     for number in given:
         if not least <= number <= most:  # NaN, too
-            raise DataError(option, f"{number:g} is not between {least:g} and {most:g}", "change it")
+            raise DataError(
+                option, f"{number:g} is not between {least:g} and {most:g}", "change it", code="bad-value"
+            )

@@ -1,0 +1,32 @@
+"""Expectation of errors by their codes, never by their words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pipelines.session.errors import CODES, DataError
+
+
+@contextmanager
+def refused(
+    code: str, source: Path | str | None = None, *names: object
+) -> Iterator[pytest.ExceptionInfo[DataError]]:
+    """Expect a DataError.
+
+    Args:
+        code: its code, one of `CODES`.
+        source: the file, folder or setting at fault; None if any will do.
+        names: numbers, keys, files and codes that its line must hold, each as text.
+    """
+    assert code in CODES, f"{code} is not in pipelines/session/errors.py"
+    with pytest.raises(DataError) as caught:
+        yield caught
+    error = caught.value
+    assert error.code == code, f"{error.code}: {error}"
+    assert source is None or str(error.source) == str(source), error
+    missing = [str(name) for name in names if str(name) not in str(error)]
+    assert not missing, f"{error} holds no {missing}"
