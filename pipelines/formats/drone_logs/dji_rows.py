@@ -92,7 +92,12 @@ def attitudes_of_rows(path: Path, found: DjiRows) -> Attitudes:
         found.names[1], found.t_ns[found.timed], found.gimbal[found.timed], dropped, rows=found.rows
     )
     if camera is None:
-        raise DataError(path, "holds no gimbal angles", "name the log and topic that do, or fixed angles")
+        raise DataError(
+            path,
+            "holds no gimbal angles",
+            "name the log and topic that do, or fixed angles",
+            code="no-attitude",
+        )
     return Attitudes(replace(camera, dropped=dropped), found.clock)
 
 
@@ -122,6 +127,7 @@ def choose_height(
             path,
             "holds no height",
             "state it, in metres above the take-off: pose: {dji: ..., altitude: 30}",
+            code="no-positions",
         )
     if stated is not None and stated not in there:
         raise DataError(
