@@ -93,7 +93,7 @@ def _tlog(folder: Path) -> None:
 def _colmap(kind: str) -> Writer:
     def write(folder: Path) -> None:
         every = dict(enumerate(test_colmap.PARAMETERS.items(), start=1))
-        made = test_colmap.model(every, {f"{name} a.jpg": k for k, (name, _) in every.items()})
+        made = test_colmap.model(every, {f"{name}_a.jpg": k for k, (name, _) in every.items()})
         getattr(made, f"write_{kind}")(str(folder))
 
     return write

@@ -52,11 +52,7 @@ class AniposeToml:
         return {**summary, "not calibrated": left_out} if left_out else summary
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
-        """Read every calibrated camera.
-
-        Raises:
-            DataError: not TOML, no calibrated camera, two of one name, or numbers that are no camera.
-        """
+        """Read every calibrated camera."""
         cameras: dict[str, CalibratedCamera] = {}
         for key, table in _tables(path).items():
             if not _is_calibrated(table):

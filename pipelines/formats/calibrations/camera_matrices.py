@@ -36,9 +36,6 @@ def intrinsics(
         matrix: [3, 3], last row 0 0 1, without skew.
         distortion: OpenCV's order; all zero, or none, is no distortion (unless fisheye: then equidistant).
         fisheye: True if the coefficients are those of cv2.fisheye.
-
-    Raises:
-        DataError: the numbers describe no camera, or one with skew, thin prism or tilt.
     """
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or len(size) != 2:
         raise DataError(source, f"camera {camera} has no 3 x 3 matrix of numbers and size of two")
@@ -87,11 +84,7 @@ def build_intrinsics(
 
 
 def invert_pose(source: Path, camera: str, quaternion_xyzw: Float, translation: Float) -> tuple[Float, Float]:
-    """Return position [3] and quaternion [4] of world_from_camera, given camera_from_world.
-
-    Raises:
-        DataError: not finite, absurdly large, or a quaternion of length zero.
-    """
+    """Return position [3] and quaternion [4] of world_from_camera, given camera_from_world."""
     from scipy.spatial.transform import Rotation
 
     numbers = np.concatenate([quaternion_xyzw, translation])
@@ -113,11 +106,7 @@ def invert_rodrigues(source: Path, camera: str, rotation: Float, translation: Fl
 
 
 def invert_matrix(source: Path, camera: str, rotation: Float, translation: Float) -> tuple[Float, Float]:
-    """Apply `invert_pose` to a rotation matrix [3, 3].
-
-    Raises:
-        DataError: the matrix is not a rotation to within 1e-3 (files carry few decimals).
-    """
+    """Apply `invert_pose` to a rotation matrix [3, 3]."""
     from scipy.spatial.transform import Rotation
 
     is_rotation = (

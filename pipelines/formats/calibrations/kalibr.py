@@ -37,12 +37,7 @@ class KalibrFormat:
         return describe_cameras(self.read_calibration(path))
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
-        """Read every camera of the chain.
-
-        Raises:
-            DataError: no valid YAML, no camera, missing keys, a projection other than pinhole, a
-                distortion other than radtan, equidistant or none, or numbers that are no camera.
-        """
+        """Read every camera of the chain."""
         chain = {name: block for name, block in read_yaml(path).items() if re.fullmatch(r"cam\d+", name)}
         if not chain:
             raise DataError(path, "holds no camera cam0, cam1, ...", "give Kalibr's camchain.yaml")

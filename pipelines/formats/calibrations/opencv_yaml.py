@@ -57,11 +57,7 @@ class OpencvStorage:
         return describe_cameras(self.read_calibration(path))
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
-        """Read the one camera.
-
-        Raises:
-            DataError: FileStorage cannot parse it, keys are missing, or the numbers are no camera.
-        """
+        """Read the one camera."""
         storage = Storage(path)
         name = storage.text("camera_name") or "camera"
         size = storage.vector("image_size") or [storage.number(_WIDTH), storage.number(_HEIGHT)]

@@ -42,12 +42,7 @@ class OrbSlamSettings:
         return describe_cameras(self.read_calibration(path))
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
-        """Read every camera.
-
-        Raises:
-            DataError: OpenCV cannot parse it, it is rectified or of another projection, or its numbers are
-                no camera.
-        """
+        """Read every camera."""
         storage = Storage(path)
         projection = storage.text("Camera.type")
         if projection.lower() not in _PROJECTIONS:

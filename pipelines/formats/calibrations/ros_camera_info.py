@@ -44,12 +44,7 @@ class RosCameraInfo:
         return describe_cameras(self.read_calibration(path))
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
-        """Read the one camera.
-
-        Raises:
-            DataError: no valid file, missing keys, a distortion model other than plumb_bob,
-                rational_polynomial or equidistant (fisheye), or numbers that are no camera.
-        """
+        """Read the one camera."""
         return _read_yaml(path) if path.suffix.lower() in _YAML else _read_ini(path)
 
 

@@ -28,9 +28,6 @@ def people_of(recording: Recording, folder: Path, suffix: str) -> tuple[JointMot
     """Return a recording's motion, and a file for each person with at least one known joint.
 
     The file is `<name>.trc`, or `<name>_<person>.trc` if there are several people (for the suffix `.trc`).
-
-    Raises:
-        DataError: no joint of any person is known.
     """
     motion = recording.motion
     if motion is None or np.isnan(motion.position).all():
@@ -81,9 +78,6 @@ def write_tables(
     """Write a recording's tables: `<name>` with the joints, `<name>_<camera>` with a camera's poses.
 
     A note says if there are no joints.
-
-    Raises:
-        DataError: it has neither joints nor camera poses.
     """
     name = safe_file_name(recording.name)
     paths: list[Path] = []

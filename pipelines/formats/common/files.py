@@ -18,11 +18,7 @@ _LARGEST_YAML = 1 << 20  # characters; the parser is slow, and calibrations are 
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read the whole file.
-
-    Raises:
-        DataError: missing or unreadable.
-    """
+    """Read the whole file."""
     refuse_special(path)
     try:
         return path.read_bytes()
@@ -48,9 +44,6 @@ def split_header(path: Path, content: bytes, last: str) -> tuple[list[list[str]]
     """Split a file's content into the words of each header line and the bytes below the header.
 
     `last` is the first word of the header's last line.
-
-    Raises:
-        DataError: no such line within the first 64 KiB.
     """
     lines: list[list[str]] = []
     start = 0
@@ -70,9 +63,6 @@ def read_yaml(path: Path) -> dict[str, object]:
     """Read the mapping at the top of a YAML file, built of plain types only.
 
     The first line `%YAML:1.0` of old OpenCV and Kalibr files, which is no YAML, is skipped.
-
-    Raises:
-        DataError: unreadable, larger than a megabyte, no valid YAML, or no mapping of names.
     """
     text = read_text(path)
     if len(text) > _LARGEST_YAML:
@@ -86,11 +76,7 @@ def read_yaml(path: Path) -> dict[str, object]:
 
 
 def numbers(source: Path, name: str, value: object) -> Float:
-    """Return a list of numbers as an array [N]; `name` is for the message if it is none.
-
-    Raises:
-        DataError: not a list, or an element is not a number.
-    """
+    """Return a list of numbers as an array [N]; `name` is for the message if it is none."""
     if not isinstance(value, list) or not all(
         isinstance(cell, int | float) and not isinstance(cell, bool) for cell in value
     ):
@@ -104,11 +90,7 @@ def leads_out(stated: str) -> bool:
 
 
 def read_text(path: Path) -> str:
-    r"""Read the whole file as UTF-8, or as UTF-16 that begins with its mark, lines ending in "\n".
-
-    Raises:
-        DataError: missing, unreadable, or not text.
-    """
+    r"""Read the whole file as UTF-8, or as UTF-16 that begins with its mark, lines ending in "\n"."""
     refuse_special(path)
     try:
         return plain_text(path.read_bytes(), errors="strict")

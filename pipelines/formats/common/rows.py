@@ -72,10 +72,6 @@ def parse_table(
         text: columns to keep as text, name to index.
         numbers: columns to read as numbers, name to index. Blank, "nan" and the like become NaN.
         first_line: the number of the body's first line in the file, for messages.
-
-    Raises:
-        DataError: another line has the wrong number of cells, a cell that is not a number, or the commas of
-            its numbers are decimal or separate thousands.
     """
     import pyarrow as pa
 
@@ -109,10 +105,7 @@ def parse_table(
 
 
 def _refuse_thousands(path: Path, body: str, delimiter: str) -> None:
-    """Refuse numbers with commas of which each may be decimal or separate thousands, as in 1,234.
-
-    A comma is decimal behind a leading zero, and before more or fewer than three digits.
-    """
+    """Refuse numbers with commas of which each may be decimal or separate thousands, as in 1,234."""
     cells = rf"(?:^|{delimiter})[ \"]*(?=[^{delimiter}\n]*,)(?:{{}})[ \"]*(?={delimiter}|\r?$)"
     undated = _DATE.sub("", body) if "-" in body else body
     found = re.search(cells.format(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+"), undated, re.MULTILINE)
@@ -188,9 +181,6 @@ def parse_stamps(
     text is no finite number that int64 nanoseconds can hold. If the file does not state its unit, stamps that
     would lie after the year 2262 are read in the unit in which they do not (EuRoC's `#timestamp`: ns).
     Dates with times by ISO 8601 are read whatever the unit; without a zone they are UTC.
-
-    Raises:
-        DataError: most stamps are too large for the stated unit (after the year 2262), so the unit is wrong.
     """
     import pyarrow as pa
     import pyarrow.compute as pc

@@ -107,10 +107,7 @@ class _Rows:
 
     @property
     def clock(self) -> tuple[str, int] | None:
-        """Field with the time since boot, and its unit in ns; None without one.
-
-        Until 2014 the field was TimeMS; in GPS messages it was T, as their TimeMS was that of the GPS week.
-        """
+        """Field with the time since boot, and its unit in ns; None without one."""
         units = (("TimeUS", 1000), ("T" if "Week" in self else "TimeMS", 1_000_000))
         return next((unit for unit in units if unit[0] in self), None)
 
@@ -161,9 +158,6 @@ class ArduPilotFormat:
 
         The position is POS (`global`), else that of the estimator XKF1 or NKF1 (`local`, metres from ORGN),
         else GPS.
-
-        Raises:
-            DataError: no DataFlash log, pymavlink is missing, or no position in it.
         """
         log = _Log(path)
         dropped: dict[str, int] = {}
@@ -175,11 +169,7 @@ class ArduPilotFormat:
         return on_one_clock(path, position, body, gimbal, fit=fit, notes=notes, dropped=dropped)
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
-        """Read the times of pictures: CAM (by the camera's feedback if it has one), else TRIG.
-
-        Raises:
-            DataError: no DataFlash log, pymavlink is missing, or nothing was triggered.
-        """
+        """Read the times of pictures: CAM (by the camera's feedback if it has one), else TRIG."""
         log = _Log(path)
         for name in ("CAM", "TRIG"):
             rows = log.first([name], choice.instance or 0, "I")
@@ -265,10 +255,7 @@ def _body(log: _Log, dropped: MutableMapping[str, int]) -> AttitudeTrack | None:
 def _mount(
     log: _Log, body: AttitudeTrack | None, dropped: MutableMapping[str, int], notes: list[str]
 ) -> AttitudeTrack | None:
-    """Read MNT: roll and pitch against the horizon, yaw from north if it is logged, else from the nose.
-
-    Of several mounts the first is taken: `instance` means an estimator or a receiver, not a mount.
-    """
+    """Read MNT: roll and pitch against the horizon, yaw from north if it is logged, else from the nose."""
     every = log.rows("MNT")
     if every is None or "TimeUS" not in every or "Pitch" not in every:
         return None
@@ -318,11 +305,7 @@ def _leap_ns(gps_ns: Int64) -> Int64:
 
 
 class _Log:
-    """Messages of a log, found once, read by name.
-
-    Raises:
-        DataError: pymavlink is missing, or cannot read the file.
-    """
+    """Messages of a log, found once, read by name."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

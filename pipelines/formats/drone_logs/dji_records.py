@@ -129,19 +129,12 @@ class DjiRecordFormat:
         """Read positions, and the angles of body and gimbal if the record has them.
 
         A position that is repeated until the next measurement is replaced by linear interpolation.
-
-        Raises:
-            DataError: no flight record, no position, or no height while the user states none.
         """
         record = _read(path)
         return telemetry_of_rows(path, record.rows, choice, record.notes)
 
     def read_attitudes(self, path: Path) -> Attitudes:
-        """Read the gimbal's angles, also where the drone had no position.
-
-        Raises:
-            DataError: no flight record, or no angles in it.
-        """
+        """Read the gimbal's angles, also where the drone had no position."""
         record = _read(path)
         found = attitudes_of_rows(path, record.rows)
         return replace(found, notes=tuple(f"{path}: {note}" for note in record.notes))
@@ -235,10 +228,7 @@ class _Record:
 
     @cached_property
     def times(self) -> tuple[Int64, Bool]:
-        """Times [N] in ns, and True where they are known [N].
-
-        A clock of whole seconds places the record's own seconds: the middle of its ticks does.
-        """
+        """Times [N] in ns, and True where they are known [N]."""
         shown = self.clock_ns != 0
         if self.fine or not any_finite(self.columns["elapsed"]):
             return self.clock_ns, shown
@@ -349,13 +339,7 @@ def _clock_columns(names: Sequence[tuple[str, str]], zone: str) -> tuple[int, ..
 
 
 def _read(path: Path) -> _Record:
-    """Read the columns of a record.
-
-    Rows with too few cells, or with something else where a number should be, are dropped and counted.
-
-    Raises:
-        DataError: it cannot be read, is no flight record, or has no rows.
-    """
+    """Read the columns of a record."""
     refuse_special(path)
     heading = _find_heading(read_head(path))
     if heading is None:

@@ -42,11 +42,7 @@ class DjiRows:
 def telemetry_of_rows(
     path: Path, found: DjiRows, choice: TelemetryChoice, notes: Sequence[str] = ()
 ) -> Telemetry:
-    """Build positions and attitudes; a repeated position is replaced by linear interpolation.
-
-    Raises:
-        DataError: no position in any row, or no height while the user states none.
-    """
+    """Build positions and attitudes; a repeated position is replaced by linear interpolation."""
     columns, dropped = found.columns, dict(found.dropped)
     height, which, note_on_height = choose_height(path, columns, choice)
     track = position_track(
@@ -82,11 +78,7 @@ def telemetry_of_rows(
 
 
 def attitudes_of_rows(path: Path, found: DjiRows) -> Attitudes:
-    """Build the attitudes of the camera, whatever the rows say of positions.
-
-    Raises:
-        DataError: no row has angles of the gimbal.
-    """
+    """Build the attitudes of the camera, whatever the rows say of positions."""
     dropped = dict(found.dropped)
     camera = angles_track(
         found.names[1], found.t_ns[found.timed], found.gimbal[found.timed], dropped, rows=found.rows
@@ -111,9 +103,6 @@ def choose_height(
         columns: [N] m: `relative` to the take-off, `absolute`, and `altitude` without a reference, which is
             used for each of the two that has no column of its own. NaN where there is none.
         choice: the user's choice.
-
-    Raises:
-        DataError: no height at all, or not the one that the user asks for.
     """
     stated, unnamed = choice.altitude, columns["altitude"]
     if isinstance(stated, int | float):

@@ -102,19 +102,12 @@ class DjiSrtFormat:
         """Read positions, and the angles of body and gimbal if the subtitles have them.
 
         A position that is repeated until the next measurement is replaced by linear interpolation.
-
-        Raises:
-            DataError: no subtitles, no position in any, or no height while the user states none.
         """
         subtitles = read_subtitles(path)
         return telemetry_of_rows(path, _rows(subtitles), choice, [_note_on_clock(subtitles)])
 
     def read_attitudes(self, path: Path) -> Attitudes:
-        """Read the gimbal's angles, also where the drone had no position.
-
-        Raises:
-            DataError: no subtitles, or no angles in any.
-        """
+        """Read the gimbal's angles, also where the drone had no position."""
         subtitles = read_subtitles(path)
         found = attitudes_of_rows(path, _rows(subtitles))
         return replace(found, notes=(f"{path}: {_note_on_clock(subtitles)}",))

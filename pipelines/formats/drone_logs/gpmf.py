@@ -127,11 +127,7 @@ class GoProFormat:
         return facts
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Read a Karma's position and attitude, else the camera's GPS; stamps are UTC where that is logged.
-
-        Raises:
-            DataError: no track of GPMF, or no position in it.
-        """
+        """Read a Karma's position and attitude, else the camera's GPS; in UTC where that is logged."""
         track = _read(path)
         dropped: dict[str, int] = dict(track.dropped)
         notes: list[str] = []
@@ -162,11 +158,7 @@ class GoProFormat:
         return replace(telemetry, video_began=(0, 0.0) if fit is None else (_on(fit, 0), _PACKET_S))
 
     def read_attitudes(self, path: Path) -> Attitudes:
-        """Read how the camera turned, level by gravity, with the first picture looking north.
-
-        Raises:
-            DataError: no track of GPMF, no orientations or no gravity in it, or the two do not agree.
-        """
+        """Read how the camera turned, level by gravity, with the first picture looking north."""
         track = _read(path)
         at_ns, from_camera, from_picture = _orientations(path, track)
         dropped: dict[str, int] = dict(track.dropped)
@@ -199,10 +191,7 @@ _OTHER_ANGLES = "name gimbal angles of another log, or fixed ones"
 
 
 def _orientations(path: Path, track: _Track) -> tuple[Int64, Float, Float]:
-    """Return video times [N], and the axes of the first picture from those of camera and picture [N, 4].
-
-    Rows that are no unit quaternions are dropped and counted.
-    """
+    """Return video times [N], and the axes of the first picture from those of camera and picture [N, 4]."""
     found = track.stream("CORI", 4)
     if found is None:
         known = ", ".join(sorted(set(track.rows) & set(_KNOWN))) or "none that is known"
@@ -293,11 +282,7 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
 
 
 def _packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """Yield start and length of each packet of the first track of GPMF in video time, ns, and its bytes.
-
-    Raises:
-        DataError: FFmpeg cannot read the file.
-    """
+    """Yield start and length of each packet of the first track of GPMF in video time, ns, and its bytes."""
     if first_bytes(path, 8)[4:] != b"ftyp":
         return
 

@@ -44,11 +44,7 @@ class PictureTags:
         }
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Read position, and the angles of body and gimbal, of each picture.
-
-        Raises:
-            DataError: no pictures, no time or position in any, or no height while the user states none.
-        """
+        """Read position, and the angles of body and gimbal, of each picture."""
         t_ns, shared, columns = _columns(path)
         if not t_ns.any():
             raise DataError(

@@ -62,11 +62,7 @@ class Subtitles:
 
 
 def read_subtitles(path: Path) -> Subtitles:
-    """Read all subtitles of a file; bytes that are not UTF-8 become a sign that no number contains.
-
-    Raises:
-        DataError: the file cannot be read, or holds no subtitles.
-    """
+    """Read all subtitles of a file; bytes that are not UTF-8 become a sign that no number contains."""
     try:
         text = plain_text(path.read_bytes())
     except OSError as error:

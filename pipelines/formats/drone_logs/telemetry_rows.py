@@ -43,9 +43,6 @@ def position_track(
 
     The causes of `unusable` come first, then "not finite", "not on Earth" (latitude beyond 90, longitude
     beyond 360), "no fix (0, 0)", "duplicate stamp" and "stamp out of order" as in `clean_poses`.
-
-    Raises:
-        DataError: no row is left.
     """
     causes: dict[str, Bool] = dict(unusable or {})
     with np.errstate(invalid="ignore"):
@@ -204,11 +201,7 @@ def on_one_clock(
 def on_gps_time(
     source: Path, fit: ClockFit | None, wanted: Literal["gps", "boot"] | None, notes: list[str]
 ) -> ClockFit | None:
-    """Return the fit to GPS time if it exists and the user did not ask for time since boot; else None.
-
-    Raises:
-        DataError: GPS time is asked for, and there is none.
-    """
+    """Return the fit to GPS time if it exists and the user did not ask for time since boot; else None."""
     if wanted == "gps" and fit is None:
         raise DataError(
             source,
@@ -238,10 +231,6 @@ def refuse_marks(path: Path, *marks: bytes, most: int | None = None) -> None:
         path: the log.
         marks: bytes with which messages begin.
         most: number that no recorder exceeds; by default 100,000, or one for eight bytes if that is more.
-
-    Raises:
-        DataError: there are more.
-        OSError: the file cannot be read.
     """
     size = path.stat().st_size
     if size < _FEW_MARKS:

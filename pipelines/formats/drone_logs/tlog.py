@@ -106,9 +106,6 @@ class TlogFormat:
 
         The position is GLOBAL_POSITION_INT (`global`), else LOCAL_POSITION_NED (`local`), else GPS_RAW_INT.
         Times are UTC by SYSTEM_TIME; without it, those of the station.
-
-        Raises:
-            DataError: no such log, pymavlink is missing, several vehicles, or no position.
         """
         log = _read(path)
         system = _vehicle(path, log, choice.instance, _POSITIONS)
@@ -135,11 +132,6 @@ class TlogFormat:
 
         Stamps since boot are turned to UTC as those of `read_telemetry`, also to the station's clock; stamps
         that are UTC already stay. Pictures are assigned to stamps in order, so none may be lost between them.
-
-        Raises:
-            DataError: no such log, pymavlink is missing, several vehicles, no picture, by their numbers some
-                were lost on the radio link, they are in UTC where time since boot is asked for, or some are
-                in UTC and the others cannot be turned to it.
         """
         log = _read(path)
         system = _vehicle(path, log, choice.instance, _PICTURES)
@@ -170,11 +162,7 @@ class TlogFormat:
 
 
 def _vehicle(path: Path, log: _Packets, stated: int | None, messages: frozenset[int]) -> int:
-    """Return the system's number that is stated, or the only one that sent any of the messages.
-
-    Raises:
-        DataError: no system sent one, not the stated one, or several did.
-    """
+    """Return the system's number that is stated, or the only one that sent any of the messages."""
     vehicles = log.vehicles(messages)
     listed = ", ".join(map(str, vehicles)) or "none"
     names = " or ".join(sorted(log.dialect.mavlink_map[message].msgname for message in messages))
@@ -330,11 +318,7 @@ class _Packets:
 
 
 def _read(path: Path) -> _Packets:
-    """Read all packets.
-
-    Raises:
-        DataError: pymavlink is missing, the file cannot be read, or holds no packet.
-    """
+    """Read all packets."""
     found = _Packets(need("pymavlink.dialects.v20.ardupilotmega", "drones"))
     last: dict[tuple[int, int], int] = {}
     try:
@@ -374,11 +358,7 @@ def _read(path: Path) -> _Packets:
 def _packets(
     content: mmap.mmap, definitions: Mapping[int, Any], dropped: MutableMapping[str, int]
 ) -> Iterator[_Packet]:
-    """Yield the packets whose checksum is right; stretches without any are counted.
-
-    Raises:
-        ValueError: by far the most beginnings are of no packet.
-    """
+    """Yield the packets whose checksum is right; stretches without any are counted."""
     place, in_order, right, wrong = 0, True, 0, 0
     while place + _STAMP < len(content):
         packet = _packet(content, place, definitions)

@@ -115,9 +115,6 @@ class UlogFormat:
 
         The position is the estimator's local one (`local`) if the estimator ever marks it valid, else its
         global one, else that of GPS. A local position that is never valid is the last choice, with a note.
-
-        Raises:
-            DataError: no ULog, pyulog is missing, or no position in it.
         """
         topics = topics_of(open_ulog(path, _WANTED))
         notes: list[str] = []
@@ -125,11 +122,7 @@ class UlogFormat:
         return telemetry_of(path, topics, choice, fit, notes)
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
-        """Read the times of pictures: by the camera's feedback, else by the trigger.
-
-        Raises:
-            DataError: no ULog, pyulog is missing, or nothing was triggered.
-        """
+        """Read the times of pictures: by the camera's feedback, else by the trigger."""
         topics = topics_of(open_ulog(path, {"camera_capture", "camera_trigger", *_GPS}))
         for name in ("camera_capture", "camera_trigger"):
             if found := [topic for topic in topics if topic.name == name and len(topic)]:
@@ -145,11 +138,7 @@ class UlogFormat:
 def telemetry_of(
     path: Path | str, topics: Sequence[Topic], choice: TelemetryChoice, fit: ClockFit | None, notes: list[str]
 ) -> Telemetry:
-    """Make the telemetry of PX4's topics, of a .ulg or of px4_msgs; stamps are converted by `fit`.
-
-    Raises:
-        DataError: no position among them, or not the one that the user asks for.
-    """
+    """Make the telemetry of PX4's topics, of a .ulg or of px4_msgs; stamps are converted by `fit`."""
     dropped: dict[str, int] = {}
     body = _body(topics, choice.instance, dropped, notes)
     position = _position(path, topics, choice, dropped, notes)
@@ -357,13 +346,7 @@ def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:
 def _instance(
     path: Path | str, topics: Sequence[Topic], names: Sequence[str], choice: TelemetryChoice, *, wanted: bool
 ) -> Topic | None:
-    """Return the topic of the chosen instance, the first by default; None if there is none.
-
-    vehicle_* is the estimate that the autopilot flew by, estimator_* that of each single estimator.
-
-    Raises:
-        DataError: the user asks for this kind, and it has no such instance.
-    """
+    """Return the topic of the chosen instance, the first by default; None if there is none."""
     of_kind = _there(topics, names)
     if not of_kind or choice.instance is None:
         return of_kind[0] if of_kind else None
@@ -426,11 +409,7 @@ class Topic:
 
 
 def open_ulog(path: Path, wanted: Collection[str] | None) -> Any:
-    """Open a log with some topics, or all of them.
-
-    Raises:
-        DataError: pyulog is missing, or cannot read the file.
-    """
+    """Open a log with some topics, or all of them."""
     core = need("pyulog", "drones")
     _refuse_bombs(path)
     try:
@@ -449,11 +428,7 @@ def topics_of(log: Any) -> list[Topic]:
 
 
 def _refuse_bombs(path: Path) -> None:
-    """Refuse definitions that expand without end: nested arrays may mean billions of fields.
-
-    Raises:
-        DataError: no ULog, or a definition beyond reason.
-    """
+    """Refuse definitions that expand without end: nested arrays may mean billions of fields."""
     try:
         formats = dict(_definitions(path))
     except OSError as error:

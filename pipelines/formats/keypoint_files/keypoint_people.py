@@ -29,11 +29,7 @@ _LEAST_SHARE = 0.25  # of a folder's files that are JSON; one JSON among logs is
 
 
 def load_json(path: Path) -> object:
-    """Read a JSON file; NaN and Infinity are accepted, as Python writes them.
-
-    Raises:
-        DataError: it cannot be opened, is empty, is not JSON, or is nested too deeply.
-    """
+    """Read a JSON file; NaN and Infinity are accepted, as Python writes them."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -103,11 +99,7 @@ def is_alphapose_entry(entry: dict[str, object]) -> bool:
 
 
 def objects(content: object, where: object, what: str) -> Iterator[tuple[str, dict[str, object]]]:
-    """Yield each entry of a list of JSON objects, with its name for messages.
-
-    Raises:
-        DataError: not a list, or an entry is not an object.
-    """
+    """Yield each entry of a list of JSON objects, with its name for messages."""
     if not isinstance(content, list):
         raise DataError(str(where), f"the {what} are not a list", "check the file's format")
     for index, entry in enumerate(content):
@@ -118,11 +110,7 @@ def objects(content: object, where: object, what: str) -> Iterator[tuple[str, di
 
 
 def numbers(values: object, where: str) -> Float:
-    """Convert a JSON array of numbers; null is NaN.
-
-    Raises:
-        DataError: it is ragged or holds something else.
-    """
+    """Convert a JSON array of numbers; null is NaN."""
     try:
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -166,12 +154,7 @@ class KeypointFile:
         return _described(self.read_keypoints(path, skeleton=None, first_frame=0))
 
     def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
-        """Read every person; pixels and scores as the file has them, cleaned by `Gathering.detections`.
-
-        Raises:
-            DataError: no readable file, another layout, no keypoints, or a number of keypoints that differs
-                from `skeleton`.
-        """
+        """Read every person; pixels and scores as the file has them, cleaned by `Gathering.detections`."""
         people = Gathering(path)
         self.gather(people)
         people.leave_out_face_and_hands()
@@ -201,9 +184,6 @@ class Gathering:
         """Yield the content of the file, or of every JSON file of the folder, one at a time.
 
         In a folder, files that cannot be read are skipped and counted.
-
-        Raises:
-            DataError: the file cannot be read, or no file of the folder can.
         """
         if not self.path.is_dir():
             yield self.path, load_json(self.path)
@@ -225,9 +205,6 @@ class Gathering:
 
         `where` names the entry for messages. `file` is stated if each of several files counts frames by
         itself.
-
-        Raises:
-            DataError: it has no number, or another picture has the same number (two cameras in one file?).
         """
         frame = frame_number(name)
         if frame is None:
@@ -251,9 +228,6 @@ class Gathering:
             frame: result of `frame_of`.
             rank: position within the frame, if the file groups people by frame; else the next one.
             own_id: the tracker's id of the person.
-
-        Raises:
-            DataError: the number of keypoints differs from the people before.
         """
         if self._rows and len(rows) != len(self._rows[0]):
             problem = f"holds {len(rows)} keypoints where the people before hold {len(self._rows[0])}"
@@ -270,11 +244,7 @@ class Gathering:
         return np.stack(self._rows)
 
     def count(self) -> int:
-        """Return the number of keypoints of each person.
-
-        Raises:
-            DataError: there are no people.
-        """
+        """Return the number of keypoints of each person."""
         if not self._rows:
             causes = [f"{number} x {cause}" for cause, number in sorted(self.dropped.items()) if number]
             causes += [f"{len(self._listed)} x frame without people"] if self._listed else []
@@ -302,9 +272,6 @@ class Gathering:
         confidence is 0: detectors write this for "not found", with any position. A confidence that is not
         finite or below 0 becomes 0. All of this except "not found" is counted in `dropped`. A confidence
         above 1 becomes 1, counted in `adjusted`.
-
-        Raises:
-            DataError: no joint of any person is left.
         """
         frame = np.array(self._frame, dtype=np.int64) - first_frame
         listed = np.array(sorted(self._listed), dtype=np.int64) - first_frame
@@ -359,10 +326,7 @@ class Gathering:
         return repeats
 
     def _person_numbers(self, kept: Bool) -> Int64:
-        """Number the kept people by the detector's own ids, or by their positions within the frame.
-
-        The positions count if somebody has no id, or if several people of a frame share the only id.
-        """
+        """Number the kept people by the detector's own ids, or by their positions within the frame."""
         rows = np.flatnonzero(kept)
         own = [own_id for row in rows if (own_id := self._own_id[row]) is not None]
         crowded = len({self._frame[row] for row in rows}) < len(rows)
@@ -371,11 +335,7 @@ class Gathering:
 
 
 def _choose_skeleton(people: Gathering, stated: str | None) -> Skeleton:
-    """Choose the skeleton: the user's, the one with the file's joint names, or the likeliest of this size.
-
-    Raises:
-        DataError: the user's skeleton is unknown or has another number of joints, or no skeleton fits.
-    """
+    """Choose the skeleton: the user's, the one with the file's joint names, or the likeliest of this size."""
     path, count, names = people.path, people.count(), people.joint_names
     known = ", ".join(f"{s.name} ({len(s.joints)})" for s in SKELETONS.values())
     if stated is not None:

@@ -125,22 +125,14 @@ class ChunkedPart(LogPart):
 
     @abstractmethod
     def walk(self) -> tuple[int, bool]:
-        """Find chunks, index and channels; return the end of the last complete record, and True if closed.
-
-        Raises:
-            DataError: the file is not of this format, or of an unknown version.
-        """
+        """Find chunks, index and channels; return the end of the last complete record, and True if closed."""
 
     @abstractmethod
     def look(self, content: memoryview) -> Content:
         """Find the records of a chunk."""
 
     def take_chunk(self, chunk: Chunk) -> None:
-        """Add the next chunk of the file.
-
-        Raises:
-            DataError: there are more chunks without an index than any recorder writes. Each must be inflated.
-        """
+        """Add the next chunk of the file."""
         self._bare += bool(self.chunks) and not self.chunks[-1].index
         if self._bare > max(_BARE_CHUNKS, self.file_size // _BARE_SIZE):
             raise DataError(
@@ -151,11 +143,7 @@ class ChunkedPart(LogPart):
         self.chunks.append(chunk)
 
     def take_index(self, rows: Int64) -> None:
-        """Add an index [n, 3] of channel, stamp and place to the last chunk.
-
-        Raises:
-            DataError: there are more empty ones than any recorder writes.
-        """
+        """Add an index [n, 3] of channel, stamp and place to the last chunk."""
         self._empty += not len(rows)
         if self._empty > max(_EMPTY_INDICES, self.file_size // _EMPTY_SIZE):
             raise DataError(
@@ -166,11 +154,7 @@ class ChunkedPart(LogPart):
         self.chunks[-1].index.append(rows)
 
     def count_record(self) -> None:
-        """Count a record that was found in a chunk.
-
-        Raises:
-            DataError: there are more than any recorder can have put into a file of this size.
-        """
+        """Count a record that was found in a chunk."""
         self._records_left -= 1
         if self._records_left < 0:
             raise DataError(

@@ -61,10 +61,6 @@ def read_commands(recording: Log, source: str, topic: str, stamps: Stamps) -> Tr
 
     Setpoints without a position or relative to the body are dropped and counted, and so are empty
     plans. The rotation is the identity and has no meaning.
-
-    Raises:
-        DataError: a message cannot be read, the points of a plan have no increasing times, a plan moves
-            several bodies, or nothing is usable.
     """
     way, dropped = _Way(), Counter[str]()
     for message in recording.messages([topic]):

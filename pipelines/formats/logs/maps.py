@@ -90,22 +90,14 @@ class _Change:
 
 
 def read_maps(read: Callable[[], Iterator[Message]], type_: str, about: MapTopic) -> LoggedMaps:
-    """Read the maps of a topic, in the world's axes and by the log's times; `read` begins anew at each call.
-
-    Raises:
-        DataError: no map is usable, or one is too large.
-    """
+    """Read the maps of a topic, in the world's axes, by the log's times; each `read()` begins anew."""
     if type_ in _CLOUDS:
         return _accumulated(read(), about)
     return _changing(read, about)
 
 
 def frame_of(message: Message, source: str) -> str:
-    """Return the frame of a map, without the leading slash of ROS 1.
-
-    Raises:
-        DataError: the message has no readable frame.
-    """
+    """Return the frame of a map, without the leading slash of ROS 1."""
     try:
         return str(_header(message.value).frame_id).lstrip("/")
     except AttributeError as error:
@@ -162,11 +154,7 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def _time_of(message: Message, about: MapTopic) -> int:
-    """Return the stamp to use.
-
-    Raises:
-        DataError: the message lies in another frame than those before it.
-    """
+    """Return the stamp to use."""
     if (frame := frame_of(message, about.source)) != about.frame:
         raise DataError(
             about.source, f"lies in frame {frame!r}, the messages before in {about.frame!r}", _RECORD_AGAIN
@@ -325,12 +313,7 @@ def _plan(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
 
 
 def _elevations(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
-    """Return the ground of an elevation map: occupied from its lowest height up to that of each cell.
-
-    Rows count along -x and columns along -y from the corner with the largest x and y, in a buffer that
-    begins at the start indices (grid_map_core, "Conventions & Definitions"). Cells of NaN stay unknown, as
-    does everything above the ground. The orientation in the message is not used, by grid_map itself neither.
-    """
+    """Return the ground of an elevation map: occupied from its lowest height up to that of each cell."""
     source, info = about.source, value.info
     cell_m = check_resolution(source, float(info.resolution))
     side = cell_m if about.resolution_m is None else check_resolution(source, about.resolution_m)
@@ -361,11 +344,7 @@ def _elevations(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
 
 
 def _layer(value: Any, source: str) -> Float:
-    """Return the elevation layer of a GridMap [rows, columns], as it lies in the buffer.
-
-    Raises:
-        DataError: no such layer and several others, or fewer numbers than the message states.
-    """
+    """Return the elevation layer of a GridMap [rows, columns], as it lies in the buffer."""
     names = [str(name) for name in value.layers]
     chosen = _ELEVATION if _ELEVATION in names else names[0] if len(names) == 1 else None
     if chosen is None or len(names) != len(value.data):
@@ -400,11 +379,7 @@ def _origin(stated: Any, source: str) -> Pose:
 
 
 def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
-    """Accumulate the clouds of a topic to maps, in the world's axes and by the log's times.
-
-    Raises:
-        DataError: no point is usable, or their box is too large.
-    """
+    """Accumulate the clouds of a topic to maps, in the world's axes and by the log's times."""
     lost = Losses(about.source)
     voxels = VoxelSet(about.source, about.resolution_m)
     clouds = 0
@@ -447,11 +422,7 @@ def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
 
 
 def cloud_points(value: Any, source: str) -> Float:
-    """Return the points [N, 3] of a PointCloud2 or PointCloud in its own frame; NaN stays NaN.
-
-    Raises:
-        DataError: no x, y, z of float32 or float64, or fewer bytes than the message states.
-    """
+    """Return the points [N, 3] of a PointCloud2 or PointCloud in its own frame; NaN stays NaN."""
     if hasattr(value, "points"):  # the PointCloud of ROS 1
         return np.array([(at.x, at.y, at.z) for at in value.points], dtype=np.float64).reshape(-1, 3)
     width, height, stride = int(value.width), int(value.height), int(value.point_step)

@@ -78,20 +78,12 @@ class McapLog:
         return facts | ({"checksum": "right"} if right else {"damage": f"a {OTHER_CHECKSUM}: copy it again"})
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
-        """Open one file, or the parts of a split one.
-
-        Raises:
-            DataError: no file can be read as MCAP, or all are without content.
-        """
+        """Open one file, or the parts of a split one."""
         return OpenLog(*open_parts(paths, open_mcap))
 
 
 def open_mcap(path: Path) -> McapPart:
-    """Open one file as a part of a recording.
-
-    Raises:
-        DataError: the file is no MCAP, or damaged without any readable message.
-    """
+    """Open one file as a part of a recording."""
     return McapPart(path, *open_file(path))
 
 
@@ -274,11 +266,7 @@ class CheckedHash:
 
 
 def checksum_is_right(path: Path) -> bool | None:
-    """Return True if the data section has the stated checksum; reads it all. None if none is stated.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return True if the data section has the stated checksum; reads it all. None if none is stated."""
     stated = stated_checksum(path)
     if stated is None:
         return None
@@ -291,11 +279,7 @@ def checksum_is_right(path: Path) -> bool | None:
 
 
 def stated_checksum(path: Path) -> StatedChecksum | None:
-    """Return the checksum that a file states; None if it has none, is no MCAP, or has lost its end.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return the checksum that a file states; None if it has none, is no MCAP, or has lost its end."""
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             return None

@@ -76,9 +76,6 @@ def decoder(schema: Schema) -> Decoder:
     in the file, the types of ROS 1 Noetic or of the newest ROS 2 that rosbags knows are used. Messages of
     a ROS 2 bag in compression mode `message` are decompressed. json: namespaces, with the binary fields
     of the schema as bytes. protobuf: messages of the protobuf library.
-
-    Raises:
-        ValueError: messages of this schema cannot be decoded; the text gives the reason.
     """
     found = _decoder_or_reason(schema)
     if isinstance(found, str):
@@ -133,11 +130,7 @@ def _inflate_message(data: memoryview | bytes) -> memoryview | bytes:
 
 @lru_cache(maxsize=256)
 def typestore(schema: Schema) -> Typestore:
-    """Return a store that knows the type of a channel and all its nested types.
-
-    Raises:
-        ValueError: the type is unknown, or its definition cannot be used.
-    """
+    """Return a store that knows the type of a channel and all its nested types."""
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
     if not _TYPE_NAME.fullmatch(schema.type):
@@ -444,9 +437,6 @@ def inflate(data: memoryview | bytes, compression: str, size: int) -> tuple[memo
         data: one compressed frame, perhaps cut off.
         compression: none (or empty), bz2, lz4 or zstd.
         size: largest length of the result.
-
-    Raises:
-        ValueError: an unknown compression, or bytes that are not in this compression.
     """
     if compression in {"", "none"}:
         return data[:size], len(data) <= size

@@ -61,10 +61,6 @@ def samples(message: Message, source: Source) -> Iterator[Sample]:
 
     A CameraInfo's K is of the full sensor; region of interest and binning are applied, so that the
     intrinsics are those of the pictures beside it.
-
-    Raises:
-        DataError: the type is not read, a field is missing or no number, a camera is not calibrated
-            (K is zero) or has an unknown distortion model, or a path's poses have no stamps.
     """
     known = _READERS.get(message.topic.type)
     if known is None:

@@ -83,9 +83,6 @@ def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int6
     """Return header stamps [N] (0 without one) and stamps of receipt [N] of a topic's pictures.
 
     The order is that of receipt. If the messages have one layout, only the beginning of each is read.
-
-    Raises:
-        DataError: the topic holds something else.
     """
     if (at_once := stamps_at_once(recording, topic)) is not None:
         return at_once
@@ -168,9 +165,6 @@ def read_triggers(recording: Log, source: str, topic: str) -> tuple[Int64, int]:
     """Read the times at which pictures were triggered, increasing, and count messages without a new time.
 
     The time is the message's own stamp: that of its header, or CamIMUStamp's frame_stamp.
-
-    Raises:
-        DataError: a message cannot be read, or none states a time.
     """
     stated = array("q")
     messages = 0

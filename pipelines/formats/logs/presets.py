@@ -212,11 +212,7 @@ def _shared(one: str, other: str) -> int:
 
 
 def px4_names(recording: Log, source: str, namespace: str | None) -> dict[str, str]:
-    """List the topics of one PX4 drone that have messages, by PX4's name of each (vehicle_attitude).
-
-    Raises:
-        DataError: no such topics, or several drones.
-    """
+    """List the topics of one PX4 drone that have messages, by PX4's name of each (vehicle_attitude)."""
     prefix = _prefix(source, "px4", namespace, [topic.name for topic in recording.topics])
     with_messages = {topic.name for topic in recording.topics if topic.count}
     there = {name for parts in parts_of("px4", prefix, with_messages) for name in parts}
@@ -235,9 +231,6 @@ def read_preset(
 
     A namespace is needed if the log holds several drones. The autopilot's own topics, `px4`, have a reader of
     their own, `px4_topics`.
-
-    Raises:
-        DataError: no such topics, several drones, or nothing usable.
     """
     driver = DRIVERS[preset]
     prefix = _prefix(source, preset, namespace, [topic.name for topic in recording.topics])
@@ -291,9 +284,6 @@ def read_pair(
     """Read a topic of positions (`FIXES`, PointStamped) and one of attitudes (Imu, QuaternionStamped).
 
     Axes are those of attitudes, and of positions in metres.
-
-    Raises:
-        DataError: no such topics, or nothing usable in them.
     """
     counts = {topic.name: topic.count for topic in recording.topics}
     for name in (position, attitude):
@@ -324,11 +314,7 @@ def read_positions(
     dropped: dict[str, int],
     height: Height = "ellipsoid",
 ) -> PositionTrack:
-    """Read a topic of positions alone; unusable rows are counted in `dropped`.
-
-    Raises:
-        DataError: nothing usable in it.
-    """
+    """Read a topic of positions alone; unusable rows are counted in `dropped`."""
     if _type_of(recording, topic) not in FIXES:
         rows = _read(recording, source, topic, _point_of)
         return position_track(source, topic, rows.times(stamps), rows.values(), dropped, on_earth=False)
@@ -439,12 +425,7 @@ def _type_of(recording: Log, topic: str) -> str:
 
 
 def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequence[float]]) -> _Rows:
-    """Read the numbers of every message of a topic.
-
-    Raises:
-        DataError: the topic is empty or of another kind, a message lacks a field, or a field is not a
-            number.
-    """
+    """Read the numbers of every message of a topic."""
     rows = _Rows()
     for message in recording.messages([topic]):
         value = message.value
@@ -491,10 +472,7 @@ def _point_of(value: Any) -> Sequence[float]:
 
 
 def _fix_of(value: Any) -> Sequence[float]:
-    """Return latitude, longitude, altitude, status, and horizontal and vertical variance (0 if unknown).
-
-    Foxglove's LocationFix has no status.
-    """
+    """Return latitude, longitude, altitude, status, and horizontal and vertical variance (0 if unknown)."""
     status = value.status.status if hasattr(value, "status") else 0
     stated = np.asarray(getattr(value, "position_covariance", ()), dtype=np.float64)
     covariance = stated.reshape(3, 3) if stated.size else np.zeros((3, 3))

@@ -55,9 +55,6 @@ def read_px4(
         names: the topics of one drone, by PX4's name of each (vehicle_attitude).
         choice: what the user asks for.
         stamps: which stamps are the times.
-
-    Raises:
-        DataError: no position, or a message that cannot be read.
     """
     topics: list[Topic] = []
     sent: list[Int64] = []

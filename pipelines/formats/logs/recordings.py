@@ -95,9 +95,6 @@ class LogPart(ABC):
         Yields:
             Rows of the table, increasing, and their messages [n, length]. Unreadable rows are passed to
             `lose`.
-
-        Raises:
-            UnlikeError: their records or lengths differ, or one is not at the index's position.
         """
 
     def read_heads(self, rows: Int64, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
@@ -116,11 +113,7 @@ class LogPart(ABC):
                 yield batch[list(which)], np.array(sizes, np.int64), joined_heads(heads, length)
 
     def take(self, table: MessageTable) -> None:
-        """Keep the table of found messages, without those of undefined channels, which are counted.
-
-        Raises:
-            DataError: the channels have more types than any log.
-        """
+        """Keep the table of found messages, without those of undefined channels, which are counted."""
         types = len({channel.schema for channel in self.channels.values()})
         if types > _MOST_TYPES:
             raise DataError(
@@ -210,9 +203,6 @@ class OpenLog:
         """Yield the messages of a topic as arrays: stamps of receipt [n] and bytes [n, length].
 
         In the order of the files; a stable sort by the stamps gives that of `messages`.
-
-        Raises:
-            UnlikeError: the messages of a file are not of one channel and one length.
         """
         for part, channels in self._channels_of(topic):
             if len(channels) > 1:
@@ -300,11 +290,7 @@ def joined_heads(heads: Sequence[bytes], length: int) -> NDArray[np.uint8]:
 
 
 def open_file(path: Path) -> tuple[IO[bytes], int]:
-    """Open a file; return it with its size.
-
-    Raises:
-        DataError: missing, not a file, not allowed, or empty.
-    """
+    """Open a file; return it with its size."""
     try:
         size = path.stat().st_size
         if not size:
@@ -319,11 +305,7 @@ def open_file(path: Path) -> tuple[IO[bytes], int]:
 def open_parts(
     paths: Sequence[Path], open_part: Callable[[Path], LogPart]
 ) -> tuple[list[LogPart], Counter[str]]:
-    """Open the files of a recording; count those that cannot be read.
-
-    Raises:
-        DataError: none can be read; the reason is that of the first one.
-    """
+    """Open the files of a recording; count those that cannot be read."""
     parts: list[LogPart] = []
     refusals: list[DataError] = []
     for path in paths:
@@ -341,11 +323,7 @@ def open_parts(
 
 
 def require_content(part: LogPart) -> None:
-    """Refuse a damaged file without any readable message; an undamaged file may be empty.
-
-    Raises:
-        DataError: there are losses and no message.
-    """
+    """Refuse a damaged file without any readable message; an undamaged file may be empty."""
     if part.lost and not len(part.table.stamp_ns):
         causes = ", ".join(f"{cause}: {count}" for cause, count in sorted(part.lost.items()))
         part.close()

@@ -55,11 +55,7 @@ class Ros1Bag:
             return describe_log(log)
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
-        """Open one bag, or several as one recording.
-
-        Raises:
-            DataError: no file can be read as a bag, or all are without content.
-        """
+        """Open one bag, or several as one recording."""
         return OpenLog(*open_parts(paths, _open_part))
 
 

@@ -102,11 +102,7 @@ class Ros2Bag:
         return facts
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
-        """Open a bag's folder, or its files.
-
-        Raises:
-            DataError: no file can be read, or all are without content.
-        """
+        """Open a bag's folder, or its files."""
         contents = [_contents(path) for path in paths]
         parts, lost = open_parts([file for c in contents for file in c.files], _open_part)
         lost = sum((c.lost for c in contents), lost)
@@ -224,10 +220,7 @@ def _storage_files(folder: Path) -> list[Path]:
 
 
 def _is_one_bag(files: Sequence[Path]) -> bool:
-    """Return True if files are named like parts of one bag: NAME_0, NAME_1, ... or FOLDER_n, or one file.
-
-    The logs of several drones in one folder, each a file, must not pass for one recording.
-    """
+    """Return True if files are named like parts of one bag: NAME_0, NAME_1, ... or FOLDER_n, or one file."""
     if len(files) == 1:
         return True
     numbered = [_numbered(file) for file in files]
@@ -418,10 +411,7 @@ class Sqlite3Part(LogPart):
         return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0], rows[:, 3])
 
     def _take_joined(self, query: str, numbers: array[int], most: int) -> bool:
-        """Append rows like `_take_rows`, in half its time, up to any damage; return True if that was all.
-
-        sqlite joins each column of many rows to one text, which is less work than an object for each number.
-        """
+        """Append rows like `_take_rows`, in half its time, up to any damage; return True if that was all."""
         columns = (
             "count(*), group_concat(place), group_concat(topic), group_concat(stamp), group_concat(size)"
         )

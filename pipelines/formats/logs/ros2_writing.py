@@ -26,11 +26,7 @@ _BYTES = {"bool": "bool", "byte": "uint8", "char": "uint8", "octet": "uint8"}
 
 
 class Ros2Recording:
-    """Log that is being written; a context manager. The same messages give the same bytes.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Log that is being written; a context manager. The same messages give the same bytes."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")

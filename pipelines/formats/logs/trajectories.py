@@ -97,11 +97,7 @@ class LoggedRows:
         return np.where(self.header_ns == 0, self.receive_ns, self.header_ns)
 
     def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
-        """Return the poses, cleaned, with covariances whose rotation is in the body's axes.
-
-        Raises:
-            DataError: none is usable.
-        """
+        """Return the poses, cleaned, with covariances whose rotation is in the body's axes."""
         covariance = self.covariance
         if covariance is not None and not covariance.any():
             covariance = None  # zero throughout means unknown
@@ -186,9 +182,6 @@ def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gath
 
     Args:
         stamps: which stamp is the time of a pose. A pose without a header stamp (0) takes that of receipt.
-
-    Raises:
-        DataError: no usable pose, messages that are no poses, or poses of several bodies.
     """
     place = f"{source} {topic}"
     rows = poses_at_once(recording, topic)
@@ -198,11 +191,7 @@ def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gath
 
 
 def poses_one_by_one(samples: Iterable[Sample], source: Source) -> LoggedRows:
-    """Gather the poses of one body.
-
-    Raises:
-        DataError: samples that are no poses, or poses of several bodies.
-    """
+    """Gather the poses of one body."""
     gathered = _Samples()
     frames: Edge | None = None
     for sample in samples:
@@ -271,9 +260,6 @@ def attitudes_of(
         stamps: as in `poses_of`.
         order: order of the angles in the log (`attitude_from_angles`); ignored for quaternions.
         units: of the angles.
-
-    Raises:
-        DataError: no usable attitude, or samples that are no angles.
     """
     gathered, of_angles = _Samples(), False
     for sample in samples:
@@ -299,11 +285,7 @@ def attitudes_of(
 
 
 def transforms_in(recording: Log, source: str, topic: str | None = None) -> TransformLog:
-    """Read every transform of a log, or of one topic; those of topics named `...static` always hold.
-
-    Raises:
-        DataError: messages that cannot be read, or are no transforms.
-    """
+    """Read every transform of a log, or of one topic; those of topics named `...static` always hold."""
     every = [candidate.name for candidate in recording.topics if kind_of(candidate) == "transforms"]
     names = every if topic is None else [topic]
     static = [name for name in names if name.endswith("static")]
@@ -318,11 +300,7 @@ def transforms_in(recording: Log, source: str, topic: str | None = None) -> Tran
 def transforms_of(
     samples: Iterable[Sample], source: Source, *, static: Iterable[Sample] = ()
 ) -> TransformLog:
-    """Collect every transform of a log, between any frames, cleaned when used; those of `static` always hold.
-
-    Raises:
-        DataError: samples that are no transforms.
-    """
+    """Collect every transform of a log, cleaned when used; those of `static` always hold."""
     return TransformLog(_by_edge(samples, source), _by_edge(static, source))
 
 
@@ -346,10 +324,6 @@ def chained(
         child: the frame whose poses are wanted.
         stamps: as in `poses_of`.
         max_gap_ns: a moving transform is unknown between stamps further apart than this.
-
-    Raises:
-        DataError: an unknown frame, frames that nothing connects, or no time at which all the
-            transforms on the route are known.
     """
     parent, child = parent.lstrip("/"), child.lstrip("/")
     every = {**transforms.static, **transforms.moving}
@@ -429,9 +403,6 @@ def place_of_frame(
         stamps: which stamps of the transforms are used.
         max_gap_ns: the longest gap between two transforms that is interpolated.
         note: receives the result in words.
-
-    Raises:
-        DataError: nothing connects the frame with the log's world.
     """
     known = [parent.lstrip("/")] if parent is not None else [*poses_in] or list(_FIXED_FRAMES)
     if not frame or frame in known:

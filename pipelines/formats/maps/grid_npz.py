@@ -37,11 +37,7 @@ class GridNpz:
         return describe_stored(path)
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
-        """Read the grid as it is.
-
-        Raises:
-            DataError: damaged, another layout, too large, or `resolution_m` differs from its own.
-        """
+        """Read the grid as it is."""
         occupancy = read_grid(path)
         if resolution_m is not None and not math.isclose(resolution_m, occupancy.resolution_m, rel_tol=1e-6):
             raise DataError(

@@ -71,9 +71,6 @@ class LasFormat:
         """Read points as voxels: occupied (1.0) with a point in it, else unknown; 0.2 m unless stated.
 
         The file is read twice, first for the box of the points, so that memory grows with the voxels only.
-
-        Raises:
-            DataError: laspy is missing or cannot read it, no point is left, or the box is too large.
         """
         side = check_resolution(path, DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
         box = _Box()
@@ -171,11 +168,7 @@ def _decoder(path: Path) -> list[str]:
 
 
 def _received(path: Path, pipe: IO[bytes], process: subprocess.Popen[bytes]) -> _Cloud:
-    """Return the file as the process that decodes it describes it.
-
-    Raises:
-        DataError: it refuses the file, or ended before it had read the header.
-    """
+    """Return the file as the process that decodes it describes it."""
     line = pipe.readline()
     if not line.endswith(b"\n"):
         status = process.wait()

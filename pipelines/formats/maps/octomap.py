@@ -117,12 +117,7 @@ class OctomapFormat:
         }
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
-        """Read the whole tree into a grid of its box.
-
-        Raises:
-            DataError: no OctoMap, cut off or damaged, another kind of tree, nothing known in it,
-                `resolution_m` is not its own times a power of two, or too many voxels.
-        """
+        """Read the whole tree into a grid of its box."""
         header, leaves = _read(path)
         return occupancy_from(path, leaves, header.resolution_m, resolution_m)
 
@@ -136,9 +131,6 @@ def occupancy_from(
         leaves: at least one.
         finest_m: the side of the tree's finest voxel.
         resolution_m: the side of the grid's voxels, `finest_m` times a power of two; None for the finest.
-
-    Raises:
-        DataError: `resolution_m` is no such multiple, or the grid is too large.
     """
     from pipelines.formats.maps.octree import fill
 
@@ -160,9 +152,6 @@ def leaves_of(source: Path | str, payload: Bytes, *, is_binary: bool, tree: str)
 
     `payload` are the bytes that follow the header in a file, in the layout of a .bt (`is_binary`, one for all
     kinds of trees) or a .ot.
-
-    Raises:
-        DataError: as in `binary_leaves` and `full_leaves`, or nodes of an unknown kind.
     """
     if is_binary:
         return binary_leaves(source, payload)
@@ -176,11 +165,7 @@ def leaves_of(source: Path | str, payload: Bytes, *, is_binary: bool, tree: str)
 
 
 def binary_leaves(source: Path | str, payload: Bytes) -> Leaves:
-    """Find the leaves of a .bt's data, also as in octomap_msgs/Octomap.
-
-    Raises:
-        DataError: cut off, damaged, or bytes beyond the tree.
-    """
+    """Find the leaves of a .bt's data, also as in octomap_msgs/Octomap."""
     from pipelines.formats.maps.octree import walk_binary
 
     words = payload[: len(payload) // 2 * 2].view("<u2")
@@ -196,11 +181,7 @@ def binary_leaves(source: Path | str, payload: Bytes) -> Leaves:
 
 
 def full_leaves(source: Path | str, payload: Bytes, record_bytes: int) -> Leaves:
-    """Find the leaves of a .ot's data, also as in octomap_msgs/Octomap.
-
-    Raises:
-        DataError: cut off, damaged, bytes beyond the tree, or log odds that are not finite.
-    """
+    """Find the leaves of a .ot's data, also as in octomap_msgs/Octomap."""
     from pipelines.formats.maps.octree import walk_full
 
     records = payload[: len(payload) // record_bytes * record_bytes].reshape(-1, record_bytes)
@@ -319,12 +300,7 @@ data
 
 
 def write_octomap(path: Path, occupancy: Occupancy) -> None:
-    """Write a map as a pruned .bt: at least 0.5 is occupied, below is free, NaN is left out.
-
-    Raises:
-        ValueError: the origin is not a multiple of the resolution, or nothing in the map is known.
-        DataError: the map is more than 32768 voxels from the world's origin.
-    """
+    """Write a map as a pruned .bt: at least 0.5 is occupied, below is free, NaN is left out."""
     from pipelines.formats.maps.octree import FREE, INNER, OCCUPIED, UNKNOWN, nodes_of, write_depth_first
 
     side_m = float(occupancy.resolution_m)

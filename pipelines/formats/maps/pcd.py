@@ -81,11 +81,7 @@ class PcdFormat:
         return {**summary, **describe_points(path, points)}
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
-        """Read points as voxels: occupied (1.0) with a point in it, else unknown; 0.2 m unless stated.
-
-        Raises:
-            DataError: no PCD, cut off, no fields x, y, z, no finite point, or a box that is too large.
-        """
+        """Read points as voxels: occupied (1.0) with a point in it, else unknown; 0.2 m unless stated."""
         return occupancy_of(path, _read(path)[1], resolution_m)
 
 

@@ -76,12 +76,7 @@ class PlyFormat:
         }
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
-        """Read vertices as voxels: occupied (1.0) with a vertex in it, else unknown; 0.2 m unless stated.
-
-        Raises:
-            DataError: no PLY, cut off, no vertices with x, y, z, lists before or in them, no finite
-                vertex, or a box that is too large.
-        """
+        """Read vertices as voxels: occupied (1.0) with a vertex in it, else unknown; 0.2 m unless stated."""
         return occupancy_of(path, _read(path)[2], resolution_m)
 
 

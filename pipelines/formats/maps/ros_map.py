@@ -101,12 +101,7 @@ class RosMap:
         )
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
-        """Read, turn and extrude the plan; the grid's axes are the world's.
-
-        Raises:
-            DataError: keys are missing or invalid, the picture is missing, damaged or no PGM or PNG, or
-                the grid is too large.
-        """
+        """Read, turn and extrude the plan; the grid's axes are the world's."""
         plan = _read_plan(path)
         side = plan.resolution_m if resolution_m is None else check_resolution(path, resolution_m)
         pixels = _probabilities(path, plan)

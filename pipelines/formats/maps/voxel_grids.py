@@ -29,9 +29,6 @@ def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) 
     """Make the voxels of points [N, 3] m; corners are whole multiples of the resolution (default 0.2 m).
 
     Points that are not finite are left out and counted.
-
-    Raises:
-        DataError: no finite point, an impossible resolution, or a box that is too large.
     """
     side = check_resolution(source, DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
     finite, dropped = _finite(source, points)
@@ -43,11 +40,7 @@ def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) 
 
 
 class VoxelSet:
-    """Voxels of many clouds, each with the earliest time of a point in it; memory grows with the voxels only.
-
-    Raises:
-        DataError: an impossible resolution (default 0.2 m).
-    """
+    """Voxels of many clouds, each with the earliest time of a point in it."""
 
     def __init__(self, source: str, resolution_m: float | None) -> None:
         self._source = source
@@ -58,11 +51,7 @@ class VoxelSet:
         self.dropped: Counter[str] = Counter()
 
     def add(self, points: Float, t_ns: int) -> None:
-        """Add the points [N, 3] of one time; points that are not finite or too far are dropped and counted.
-
-        Raises:
-            DataError: the box of all voxels is too large.
-        """
+        """Add the points [N, 3] of one time; those that are not finite or too far are counted."""
         usable = np.isfinite(points).all(axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
             place = np.floor(points / self._side)
@@ -107,11 +96,7 @@ class VoxelSet:
 
 
 def describe_points(source: Path | str, points: Float) -> dict[str, object]:
-    """Describe points, their box and centre, and their map at 0.2 m (without building it).
-
-    Raises:
-        DataError: no finite point.
-    """
+    """Describe points, their box and centre, and their map at 0.2 m (without building it)."""
     finite, dropped = _finite(source, points)
     side = DEFAULT_RESOLUTION_M
     low, shape = _box(finite, side)
@@ -137,9 +122,6 @@ def packed_points(
     """Extract points [N, 3] from binary records of `stride` bytes; more may follow the last.
 
     `columns` gives numpy type and offset within a record for each of x, y and z.
-
-    Raises:
-        DataError: the file ends before the last record.
     """
     check_count(path, count, len(body) // stride)
     names = ("x", "y", "z")
@@ -165,9 +147,6 @@ def written_points(path: Path, body: Bytes, skipped: int, count: int, columns: t
     """Parse points [N, 3] from rows of text, behind `skipped` rows of other elements.
 
     `columns` are the indices of x, y and z in a row, `count` is the number of points in the header.
-
-    Raises:
-        DataError: fewer rows, or a cell that is missing or no number.
     """
     lines = (line.strip() for line in body.tobytes().decode("latin-1").split("\n"))
     rows = [line for line in lines if line][skipped:]
@@ -230,9 +209,6 @@ def placed(
     probability met in it: a wall may grow by a voxel, but never vanishes. A turn is rounded to the nearest of
     these if no voxel moves by more than half its side, because counting in voxels rounds by as much anyway.
     `resolution_m` is another side for the voxels, for a grid of one layer.
-
-    Raises:
-        DataError: the grid is tilted, or too large once it is turned.
     """
     position, quaternion = world_from_grid
     rotation = matrix_from_quaternion(quaternion)
@@ -267,9 +243,6 @@ def extruded(
         world_from_plan: the pose of its origin.
         side_m: of the voxels.
         height_m: height of the cells, rounded up to whole voxels.
-
-    Raises:
-        DataError: the plan is tilted, or the grid too large.
     """
     position, quaternion = world_from_plan
     rotation = matrix_from_quaternion(quaternion)

@@ -47,12 +47,7 @@ class KittiFormat:
         return describe_trajectory(self.read_trajectory(path))
 
     def read_trajectory(self, path: Path) -> Trajectory:
-        """Read every pose, and its time from the file of times.
-
-        Raises:
-            DataError: no file of times, another number of times than poses, a line with another number of
-                columns than the first, or no usable row.
-        """
+        """Read every pose, and its time from the file of times."""
         text = " ".join(read_text(path).split(" ")).strip()
         columns = 16 if len(text.split("\n", 1)[0].split()) == 16 else 12
         table = parse_table(

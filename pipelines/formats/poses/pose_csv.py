@@ -41,12 +41,7 @@ class PoseCsvFormat:
         return describe_trajectory(self.read_trajectory(path))
 
     def read_trajectory(self, path: Path) -> Trajectory:
-        """Read every pose; `clean_poses` documents which rows are dropped.
-
-        Raises:
-            DataError: not text, no such header, some covariance columns but not all, a line with another
-                number of columns, stamps too large for their unit, or no usable row.
-        """
+        """Read every pose; `clean_poses` documents which rows are dropped."""
         from pipelines.session.tables import COVARIANCE_COLUMNS
 
         text = read_text(path)

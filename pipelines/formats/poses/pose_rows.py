@@ -88,9 +88,6 @@ def clean_poses(
         quaternion_xyzw: [N, 4].
         covariance: [N, 6, 6], if there is one.
         truncated: number of rows left out before.
-
-    Raises:
-        DataError: no row is left.
     """
     if covariance is not None:
         blank: Bool = np.asarray(np.isnan(covariance).all(axis=(1, 2)))

@@ -52,9 +52,6 @@ class TumFormat:
         """Read every pose in the order of columns that the header states, else in TUM's.
 
         `clean_poses` documents which rows are dropped.
-
-        Raises:
-            DataError: not text, a line without eight numbers, stamps not in seconds, or no usable row.
         """
         body, columns, unit = _take_header(_spaced(read_text(path)))
         table = parse_table(
@@ -89,11 +86,7 @@ class TumExport:
     title = "trajectories of the cameras and of every joint, for evo"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write the cameras that have poses and the joints that are known at any time.
-
-        Raises:
-            DataError: there are no such cameras or joints.
-        """
+        """Write the cameras that have poses and the joints that are known at any time."""
         paths: list[Path] = []
         for what, trajectory in {**tracks_of(recording), **_joint_tracks(recording)}.items():
             path = folder / f"{safe_file_name(recording.name)}_{safe_file_name(what)}.tum"
@@ -151,15 +144,7 @@ def _spaced(text: str) -> str:
 
 
 def _take_header(text: str) -> tuple[str, tuple[str, ...], int]:
-    """Read the order of the columns from the lines above the first numbers.
-
-    Args:
-        text: spaced lines.
-
-    Returns:
-        The text, with any heading line turned into a comment, the names of the columns in their order (TUM's
-        if no line states another), and the unit of the stamps.
-    """
+    """Read the order of the columns from the lines above the first numbers."""
     start, order = 0, _COLUMNS
     for line in text.split("\n", 100)[:100]:
         headings = _HEADING.findall(line.removeprefix("#"))

@@ -43,11 +43,7 @@ class GlbExport:
     title = "the moving skeleton and the cameras as glTF, for Blender and the web"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write the skeleton of every person, and the cameras while it lasts.
-
-        Raises:
-            DataError: there are no joints, or so many moments that a GLB cannot hold them.
-        """
+        """Write the skeleton of every person, and the cameras while it lasts."""
         motion = recording.motion
         if motion is None or np.isnan(motion.position).all():
             raise DataError(recording.name, "holds no joints to export", "run `mocap reconstruct` first")

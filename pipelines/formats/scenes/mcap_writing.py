@@ -64,11 +64,7 @@ class McapExport:
     title = "a log of ROS 2 messages to look at in Foxglove: skeleton, cameras, map, pictures"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write all parts of the recording; drop and count rows from before 1970.
-
-        Raises:
-            DataError: there are neither joints nor camera poses, or times that ROS cannot represent.
-        """
+        """Write all parts of the recording; drop and count rows from before 1970."""
         tracks = {name: _countable(recording, name, track) for name, track in recording.tracks.items()}
         tracks = {name: track for name, track in tracks.items() if len(track.t_ns)}
         motion = recording.motion

@@ -52,11 +52,7 @@ class RerunExport:
     title = "a recording to look at in Rerun: skeleton, cameras, map, pictures (extra rerun)"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write all parts of the recording.
-
-        Raises:
-            DataError: rerun-sdk is not installed, or there are neither joints nor camera poses.
-        """
+        """Write all parts of the recording."""
         motion, tracks = recording.motion, recording.tracks
         if motion is None and not tracks:
             raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")

@@ -39,11 +39,7 @@ class AnglesExport:
     times = ("zero", "epoch")
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write both files; a person without any angle gets no STO.
-
-        Raises:
-            DataError: no angle of any person is known.
-        """
+        """Write both files; a person without any angle gets no STO."""
         table = recording.angles()
         if table is None or not len(table) or table["value_deg"].isna().all():
             raise DataError(

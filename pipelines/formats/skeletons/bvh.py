@@ -95,9 +95,6 @@ class BvhFormat:
 
         Without a unit it is that of m, cm, mm, inch and CMU's in which the rest pose is as tall as an adult
         (1.2 to 2.3 m): no two of them can be.
-
-        Raises:
-            DataError: no unit fits, or the file is faulty.
         """
         contents = _read(path)
         axes = axes or "y-up"
@@ -139,10 +136,6 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
     Some exports have bones above the first moving one, each with a single child (a `Reference` or scene
     root). They are merged into it, and its motion is then the root's. If a bone further down has moving
     position channels, it is put at their mean, if it is never further than 5 cm from it.
-
-    Raises:
-        DataError: an unknown unit or unknown axes; an unfinished hierarchy, names that occur twice, unknown
-            channels; frames that are missing, too many, cut off or not finite; a bone that moves too far.
     """
     if unit not in METRES:
         raise DataError(

@@ -63,11 +63,7 @@ class BvhExport:
     axes = ("y-up", "z-up")
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write every person to whom a rig can be fitted; a note gives the reason for each other one.
-
-        Raises:
-            DataError: no rig can be fitted, or the times are too scattered for a rate.
-        """
+        """Write every person to whom a rig can be fitted; a note gives the reason for each other one."""
         motion, files = people_of(recording, folder, ".bvh")
         even = at_even_times("bvh", motion, recording.progress)
         written, refused = [], None
@@ -216,11 +212,7 @@ class Rigged:
 
 
 def fit_rig(source: str, motion: JointMotion, person: int) -> Rigged:
-    """Fit a rig to one person's joints at a constant rate; `source` is the name for messages.
-
-    Raises:
-        DataError: hips and neck are never known at the same time.
-    """
+    """Fit a rig to one person's joints at a constant rate; `source` is the name for messages."""
     joints, position = with_derived(motion.joints, motion.position[:, person])
     middle = take_joints(position, joints, ("left_hip", "right_hip")).mean(axis=1)
     place = {joint: position[:, k] for k, joint in enumerate(joints)} | {"hip": middle}

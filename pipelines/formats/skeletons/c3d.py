@@ -75,12 +75,7 @@ class C3dFormat:
         return {**known, **describe_motion(_motion(path, contents, unit=None, axes=None))}
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
-        """Read every frame; a point with a negative residual is NaN.
-
-        Raises:
-            DataError: ezc3d is not installed, or the file is no C3D, is damaged or cut off, has no
-                points, no rate, or an unknown unit.
-        """
+        """Read every frame; a point with a negative residual is NaN."""
         return _motion(path, _open(path), unit=unit, axes=axes)
 
 
@@ -96,10 +91,7 @@ def _open(path: Path) -> Any:
 
 
 def _check_layout(path: Path) -> None:
-    """Refuse a file that is shorter than its header states, or whose parameters overlap.
-
-    ezc3d would search such a file for minutes, or crash.
-    """
+    """Refuse a file that is shorter than its header states, or whose parameters overlap."""
     try:
         with path.open("rb") as file:
             head = file.read(_BLOCK)
@@ -135,11 +127,7 @@ def _check_layout(path: Path) -> None:
 
 
 def _is_chain(section: bytes, order: str) -> bool:
-    """Return True if the parameters follow each other within their section, with consistent lengths.
-
-    A record is the length of its name (negative: locked), a group's number (negative: the group itself), the
-    name, and the distance to the next record. A parameter then has its type, its dimensions and its values.
-    """
+    """Return True if the parameters follow each other within their section, with consistent lengths."""
     at, groups = 4, set()
     wanted: set[int] = set()
     try:
@@ -284,11 +272,7 @@ class C3dExport:
     axes = ("z-up", "y-up")
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write every person with at least one known joint.
-
-        Raises:
-            DataError: no such person, ezc3d is not installed, or the times are too scattered for a rate.
-        """
+        """Write every person with at least one known joint."""
         motion, files = people_of(recording, folder, ".c3d")
         need("ezc3d", "c3d")
         even = at_even_times("c3d", motion, recording.progress)

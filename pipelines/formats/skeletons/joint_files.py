@@ -35,9 +35,6 @@ def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float
     """Convert positions [..., 3]; a point with a coordinate that is not finite is missing (all NaN).
 
     y-up files (OpenSim, TRC) turn into world = (z, x, y), a rotation: x forward becomes y, y up becomes z.
-
-    Raises:
-        DataError: an unknown unit or unknown axes.
     """
     if unit not in METRES:
         raise DataError(
@@ -91,9 +88,6 @@ def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenM
     frames stay as they are. If any is further off, all positions are interpolated linearly between neighbours
     (never across a missing one), and the covariances are those of the nearest sample. Both are noted, unless
     the stamps differ by rounding alone.
-
-    Raises:
-        DataError: the times are too scattered for a rate.
     """
     t_ns = motion.t_ns
     if len(t_ns) == 1:

@@ -45,12 +45,7 @@ class JointsCsvFormat:
         return describe_motion(self.read_joints(path, unit=None, axes=None))
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
-        """Read every joint.
-
-        Raises:
-            DataError: not text, no such header, a malformed or truncated line, a time or person that is no
-                number, a joint that occurs twice at one time, or rows too scattered for a dense table.
-        """
+        """Read every joint."""
         text = read_text(path)
         heading = _find_heading(text)
         if heading is None:
@@ -161,11 +156,7 @@ class CsvExport:
     title = "long tables of the skeleton and of each camera's poses, as text"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write all tables of the recording.
-
-        Raises:
-            DataError: there are neither joints nor camera poses.
-        """
+        """Write all tables of the recording."""
         return write_tables(recording, folder, ".csv", write_joints, pose_csv.write_trajectory)
 
 

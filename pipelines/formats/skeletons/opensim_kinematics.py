@@ -176,12 +176,7 @@ class OpenSimExport:
         MODELS.fetch(source)
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write every person with at least one known joint.
-
-        Raises:
-            DataError: no such person, OpenSim or the model is missing, the skeleton has no marker set, or too
-                few joints of a person were measured.
-        """
+        """Write every person with at least one known joint."""
         motion, files = people_of(recording, folder, ".osim")
         library = _opensim()
         markers, settings = _set_of(motion)
@@ -353,12 +348,7 @@ def _assemble(
     bent_s: float,
     first_s: float,
 ) -> None:
-    """Place the model in its pose at a time.
-
-    From the rest pose alone, the solver may turn an upper arm by half a turn. The elbow, which cannot bend
-    backwards, then stays straight for all times, because each follows from the one before. So of four ways
-    to turn both upper arms, the arms begin with that of the least error at a time when the elbows are bent.
-    """
+    """Place the model in its pose at a time."""
     by_name = {coordinate.getName(): coordinate for coordinate in coordinates}
     for coordinate in coordinates:
         coordinate.setValue(state, coordinate.getDefaultValue(), False)

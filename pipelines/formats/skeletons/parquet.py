@@ -21,11 +21,7 @@ class ParquetExport:
     title = "the same tables, typed and small, for pandas"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write all tables of the recording.
-
-        Raises:
-            DataError: there are neither joints nor camera poses.
-        """
+        """Write all tables of the recording."""
         return write_tables(recording, folder, ".parquet", write_joints, write_poses)
 
 

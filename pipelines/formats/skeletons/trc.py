@@ -65,12 +65,7 @@ class TrcFormat:
         }
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
-        """Read every row; blank cells and NaN are missing.
-
-        Raises:
-            DataError: no TRC header, an unknown unit, a row with another number of cells or
-                cells that are no numbers, times that do not increase, or no rows.
-        """
+        """Read every row; blank cells and NaN are missing."""
         header, rows, first_line = _split(path, read_text(path))
         if unit is None:
             unit = metric_unit(header.keys.get("Units", ""))
@@ -152,11 +147,7 @@ class TrcExport:
     times = ("zero", "epoch")
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write every person with at least one known joint.
-
-        Raises:
-            DataError: there is no such person.
-        """
+        """Write every person with at least one known joint."""
         motion, files = people_of(recording, folder, ".trc")
         motion = replace(motion, t_ns=motion.t_ns - recording.zero_ns)
         for person, path in files.items():

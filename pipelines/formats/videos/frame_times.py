@@ -82,10 +82,6 @@ def read_frame_times(path: Path) -> FrameStamps:
     no number, no clock in the subtitle), "no frame number" (blank, negative, not whole), "duplicate
     frame" (the first stays), "time not increasing" (of rows sorted by frame, each time must be above the
     largest before it).
-
-    Raises:
-        DataError: not text, no header, stamps too large for their unit, subtitles without clock times or
-            fewer than two a second, or no usable row.
     """
     return _read_subtitles(path) if path.suffix.lower() == ".srt" else _read_csv(path)
 
@@ -184,10 +180,7 @@ def _plain_seconds(t_ns: int) -> str:
 
 
 def _slots(media_ns: Int64) -> Int64:
-    """Compute frame numbers from the subtitles' own times, one or more for each step.
-
-    Steps are rounded one by one, because 33, 33, 34 ms do not add up to multiples of their median.
-    """
+    """Compute frame numbers from the subtitles' own times, one or more for each step."""
     steps = np.diff(np.maximum.accumulate(media_ns))  # a subtitle that goes back repeats its frame
     typical = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     counts = np.where(steps > 0, np.maximum(np.rint(steps / typical), 1), 0)

@@ -49,11 +49,7 @@ class PictureFolder:
         }
 
     def index(self, path: Path) -> VideoIndex:
-        """Read the time of every picture; without rising times, the stamps count pictures as seconds.
-
-        Raises:
-            DataError: no pictures, or the first cannot be decoded.
-        """
+        """Read the time of every picture; without rising times, the stamps count pictures as seconds."""
         with FolderPictures(path) as pictures:
             first = pictures.read(0)
             times, shared = taken_ns(path)

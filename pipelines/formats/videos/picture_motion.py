@@ -26,9 +26,6 @@ def followed_points(path: Path, intrinsics: Intrinsics, pts_ns: Int64) -> Follow
     Tracking is from picture to picture, with pyramids (Lucas and Kanade 1981; Bouguet 2000). A stretch that
     misses a picture, or loses all but a few corners, is dropped. `pts_ns` [F] are the strictly increasing
     stamps of the pictures to use, from the first on.
-
-    Raises:
-        DataError: the video cannot be read.
     """
     begins: list[Float] = []
     ends: list[Float] = []

@@ -91,10 +91,6 @@ def index_video(path: Path) -> VideoIndex:
     nanosecond once. Counted in `dropped`: "cut off" (frames in the table after the end of the file; also the
     last ones shown later than the first lost one, as their numbers are unknown), "no stamp", "duplicate
     stamp".
-
-    Raises:
-        DataError: missing or no video that can be decoded; without its table (an MP4 that was never closed)
-            or stamps; or a picture size beyond the limit.
     """
     with VideoReader(path) as reader:
         return reader.index
@@ -110,11 +106,7 @@ _TELEMETRY = (
 
 
 def data_tracks(path: Path) -> list[str]:
-    """Name the tracks beside pictures and sound: telemetry by its kind, others by the name in the file.
-
-    Raises:
-        DataError: the file cannot be opened as a video.
-    """
+    """Name the tracks beside pictures and sound: telemetry by its kind, others by the name in the file."""
     container, _ = open_container(path)
     with container:
         names = [
@@ -130,9 +122,6 @@ def created_ns(path: Path) -> int | None:
 
     MP4 and MOV hold whole seconds of UTC by definition. But some cameras write local time, and some the time
     at which they closed the file.
-
-    Raises:
-        DataError: the file cannot be opened as a video.
     """
     container, stream = open_container(path)
     with container:
@@ -162,9 +151,6 @@ def black_bars(path: Path) -> tuple[int, int, int, int]:
     Their brightness is on average below 16 of 255, which leaves room for a codec's noise, in each of five
     pictures from all over the video. It is that of all channels as the eye weighs them: codecs halve the
     resolution of colours, so these bleed into a bar.
-
-    Raises:
-        DataError: as in `index_video`.
     """
     with VideoReader(path) as reader:
         last = reader.index.count - 1
@@ -186,9 +172,6 @@ class VideoReader:
 
     Pictures are BGR, turned as in players and OpenCV, so that their size is that of the index. `missing`
     holds the numbers of the undecodable frames found so far.
-
-    Raises:
-        DataError: as in `index_video`.
     """
 
     index: VideoIndex
@@ -223,11 +206,7 @@ class VideoReader:
         self._container.close()
 
     def read(self, number: int) -> Picture | None:
-        """Read one frame; None if it cannot be decoded.
-
-        Raises:
-            DataError: no such frame, or it has another size than the first.
-        """
+        """Read one frame; None if it cannot be decoded."""
         return next((picture for _, picture in self.frames(number, number + 1)), None)
 
     def frames(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[tuple[int, Picture]]:
@@ -235,9 +214,6 @@ class VideoReader:
 
         Frames that cannot be decoded are skipped; the others keep their numbers. Several iterations may
         alternate.
-
-        Raises:
-            DataError: no such frames, or a picture of another size than the first.
         """
         count = self.index.count
         last = count if stop is None else stop
@@ -412,11 +388,7 @@ def _is_variable(ticks: Int64) -> bool:
 def _numbered(
     container: InputContainer, stream: VideoStream, ticks: Int64, *, sought: bool
 ) -> Iterator[tuple[int, VideoFrame]]:
-    """Yield numbers and frames in the order of showing; undecodable frames are skipped.
-
-    After a seek they begin with the first key frame: earlier ones may depend on pictures that were not
-    decoded.
-    """
+    """Yield numbers and frames in the order of showing; undecodable frames are skipped."""
     from av.error import FFmpegError
 
     first = None if sought else int(ticks[0])
@@ -441,12 +413,7 @@ def _numbered(
 
 
 def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
-    """Open a container and its largest video stream, ready to decode; cover pictures are ignored.
-
-    Raises:
-        DataError: missing, empty, no known container, without its table or a video stream, a codec that
-            cannot be decoded, or a picture size beyond the limit.
-    """
+    """Open a container and its largest video stream, ready to decode; cover pictures are ignored."""
     import av
     from av.error import FFmpegError
     from av.stream import Disposition
@@ -517,11 +484,7 @@ def _kind(path: Path) -> str:
 
 
 def container_format(path: Path) -> str | None:
-    """Return FFmpeg's name of the container by a file's first bytes; None for an unknown one.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return FFmpeg's name of the container by a file's first bytes; None for an unknown one."""
     with path.open("rb") as file:
         head = file.read(2 * _PACKET_M2TS)
     if head[4:8] in _MP4_BOXES:

@@ -114,9 +114,6 @@ def join_videos(path: Path, parts: Sequence[Path]) -> None:
     """Join parts that were encoded alike to one video; their stamps continue from part to part.
 
     The coded pictures are copied, so nothing is lost.
-
-    Raises:
-        ValueError: there are no parts.
     """
     import av
 

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.formats.calibrations import colmap
 from pipelines.geometry.cameras import project
-from pipelines.session.errors import DataError
 from pipelines.session.registries import CalibrationFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
@@ -54,7 +53,7 @@ def pose(index: int) -> pycolmap.Rigid3d:
 @pytest.fixture(params=["text", "binary"])
 def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     every = dict(enumerate(PARAMETERS.items(), start=1))
-    reconstruction = model(every, {f"{name} a.jpg": k for k, (name, _) in every.items()})
+    reconstruction = model(every, {f"{name}_a.jpg": k for k, (name, _) in every.items()})
     getattr(reconstruction, f"write_{request.param}")(str(tmp_path))
     return tmp_path
 
@@ -62,9 +61,9 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 def test_every_model_and_pose_as_pycolmap_has_it(folder: Path) -> None:
     assert READER.recognises(folder)
     cameras = READER.read_calibration(folder)
-    assert sorted(cameras) == sorted(f"{name} a" for name in PARAMETERS)
+    assert sorted(cameras) == sorted(f"{name}_a" for name in PARAMETERS)
     for index, (name, parameters) in enumerate(PARAMETERS.items(), start=1):
-        camera = cameras[f"{name} a"]
+        camera = cameras[f"{name}_a"]
         theirs = pycolmap.Camera(model=name, width=640, height=480, params=parameters)
         assert camera.intrinsics is not None
         # Both compute in float64. COLMAP counts from the corner of the first pixel, we from its centre.
@@ -115,94 +114,59 @@ def test_images_that_share_a_name_keep_their_folder(tmp_path: Path) -> None:
 
 
 def test_an_unsupported_model_is_refused_by_name(tmp_path: Path) -> None:
-    images = {"a.jpg": 1}
-    reconstruction = model({1: ("FOV", [700.0, 700, 320, 240, 0.9])}, images)
-    for suffix, write in ((".txt", reconstruction.write_text), (".bin", reconstruction.write_binary)):
-        write(str(tmp_path))
-        with refuses(tmp_path / f"cameras{suffix}", "FOV", "SIMPLE_PINHOLE"):
-            READER.read_calibration(tmp_path)
+    model({1: ("FOV", [700.0, 700, 320, 240, 0.9])}, {"a.jpg": 1}).write_binary(str(tmp_path))
+    with refuses(tmp_path, "FOV", "SIMPLE_PINHOLE"):
+        READER.read_calibration(tmp_path)
 
 
-def test_every_truncation_of_a_binary_model_is_an_error(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_binary_model_that_is_cut_off_or_states_wrong_counts_is_refused(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(colmap, "READING_TIMEOUT_S", 2.0)  # pycolmap reads on for ever in some of them
     model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, {"a.jpg": 1, "b.jpg": 1}).write_binary(str(tmp_path))
-    for name in ("cameras.bin", "images.bin"):
-        whole = (tmp_path / name).read_bytes()
-        for size in range(len(whole)):
-            (tmp_path / name).write_bytes(whole[:size])
-            with refuses(tmp_path / name, size):
-                READER.read_calibration(tmp_path)
-        (tmp_path / name).write_bytes(whole)
-
-
-def test_counts_beyond_the_file_are_refused(tmp_path: Path) -> None:
-    model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, {"a.jpg": 1}).write_binary(str(tmp_path))
-    path = tmp_path / "images.bin"
-    whole = path.read_bytes()
-    path.write_bytes(struct.pack("<Q", 2**62) + whole[8:])
-    with refuses(path, path.stat().st_size):
-        READER.read_calibration(tmp_path)
-    points = len(whole) - 8 - 24  # one image with one point: its count is before the last 24 bytes
-    path.write_bytes(whole[:points] + struct.pack("<Q", 2**63) + whole[points + 8 :])
-    with refuses(path, path.stat().st_size):
-        READER.read_calibration(tmp_path)
+    whole = (tmp_path / name).read_bytes()
+    for content in (whole[: len(whole) - 5], struct.pack("<Q", 2**62) + whole[8:]):
+        (tmp_path / name).write_bytes(content)
+        with refuses(tmp_path):
+            READER.read_calibration(tmp_path)
+    assert capfd.readouterr() == ("", "")
 
 
 CAMERAS = "# comment\n1 PINHOLE 640 480 700 710 320 240\n"
-IMAGES = "# comment\n1 1 0 0 0 0 0 5 1 a.jpg\n\n2 1 0 0 0 0 0 6 1 b.jpg\n1.5 2.5 -1\n"
+IMAGES = "# comment\n1 1 0 0 0 0 0 5 1 a.jpg\n\n2 1 0 0 0 0 0 6 1 b.jpg\n\n"
 
 
 def write(folder: Path, cameras: str = CAMERAS, images: str = IMAGES) -> Path:
     (folder / "cameras.txt").write_text(cameras)
     (folder / "images.txt").write_text(images)
+    (folder / "points3D.txt").write_text("")
     return folder
 
 
-def test_text_with_blank_point_lines(tmp_path: Path) -> None:
-    cameras = READER.read_calibration(write(tmp_path))
-    assert list(cameras) == ["a", "b"]
-    assert cameras["b"].position is not None
-    assert cameras["b"].position.tolist() == [0, 0, -6]
-
-
 @pytest.mark.parametrize(
-    ("cameras", "images", "problem"),
+    ("cameras", "images"),
     [
-        (CAMERAS, "", "no image with a pose"),
-        (CAMERAS, IMAGES.replace("\n\n", "\n"), "line 3 is not the points of image a.jpg"),
-        (CAMERAS, IMAGES.replace(" 1 a.jpg", " 9 a.jpg"), "uses camera 9"),
-        (CAMERAS, IMAGES.replace("1 1 0 0 0 0 0 5", "1 0 0 0 0 0 0 5"), "are no pose"),
-        (CAMERAS, IMAGES.replace("0 0 5 1 a", "0 nan 5 1 a"), "are no pose"),
-        (CAMERAS, IMAGES.replace("1 1 0 0 0 0 0 5", "1 1e200 0 0 0 0 0 5"), "are no pose"),
-        (CAMERAS, IMAGES.replace("a.jpg", "/"), "an image without a name"),
-        (CAMERAS, IMAGES.replace("1 1 0 0 0 0 0 5 1 a.jpg", "1 1 0 0"), "line 2 is not an image"),
-        (CAMERAS, IMAGES.replace(" a.jpg", ""), "an image without a name"),
-        (CAMERAS, IMAGES.replace("b.jpg", "a.jpg"), "two images are called a"),
-        (CAMERAS.replace(" 320 240", " 320"), IMAGES, "line 2 is not a PINHOLE with 4 parameters"),
-        (CAMERAS.replace("700", "x"), IMAGES, "line 2 is not a camera"),
-        (CAMERAS.replace("700", "-700"), IMAGES, "focal lengths"),
-        (CAMERAS.replace("700", "nan"), IMAGES, "focal lengths"),
-        (CAMERAS.replace("PINHOLE", "EUCM"), IMAGES, "model EUCM"),
+        (CAMERAS, ""),
+        (CAMERAS, IMAGES.replace("\n\n", "\n")),  # without the lines of points
+        (CAMERAS, IMAGES.replace(" 1 a.jpg", " 9 a.jpg")),
+        (CAMERAS, IMAGES.replace("1 1 0 0 0 0 0 5", "1 0 0 0 0 0 0 5")),
+        (CAMERAS, IMAGES.replace("a.jpg", "/")),
+        (CAMERAS, IMAGES.replace("b.jpg", "a.jpg")),
+        (CAMERAS.replace(" 320 240", " 320"), IMAGES),
+        (CAMERAS.replace("700", "-700"), IMAGES),
     ],
 )
-def test_faulty_content_is_refused(tmp_path: Path, cameras: str, images: str, problem: str) -> None:
-    with pytest.raises(DataError, match=problem):
-        READER.read_calibration(write(tmp_path, cameras, images))
-
-
-def test_an_unknown_model_number_is_refused(tmp_path: Path) -> None:
-    model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, {"a.jpg": 1}).write_binary(str(tmp_path))
-    path = tmp_path / "cameras.bin"
-    whole = path.read_bytes()
-    path.write_bytes(whole[:12] + struct.pack("<i", 999) + whole[16:])
-    with refuses(path, 999):
+def test_faulty_text_is_refused(tmp_path: Path, cameras: str, images: str) -> None:
+    with refuses(write(tmp_path, cameras, images)):
         READER.read_calibration(tmp_path)
 
 
-def test_a_folder_without_a_model(tmp_path: Path) -> None:
+def test_a_folder_without_a_whole_model(tmp_path: Path) -> None:
     assert not READER.recognises(tmp_path)
     assert not READER.recognises(tmp_path / "absent")
     (tmp_path / "cameras.txt").write_text(CAMERAS)
     (tmp_path / "images.bin").write_bytes(b"")
     assert not READER.recognises(tmp_path)
-    with refuses(tmp_path, "COLMAP"):
+    with refuses(tmp_path, "points3D"):
         READER.read_calibration(tmp_path)
