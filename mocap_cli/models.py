@@ -23,7 +23,7 @@ def models_command(context: click.Context, as_json: bool) -> None:
 
     MPJPE is that of the sample flight with true poses. ms is processor time for one person in one picture,
     on one thread of a machine with other work. The same machine takes about half of it when idle
-    (docs/detector.md).
+    (docs/results.md).
     """
     if context.invoked_subcommand is None:
         _list(as_json)

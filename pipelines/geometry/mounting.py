@@ -1,4 +1,4 @@
-"""Pose of a camera on the drone: fixed mounts, gimbals and lever arms (docs/frames.md has an example).
+"""Pose of a camera on the drone: fixed mounts, gimbals and lever arms (docs/flight.md has an example).
 
 The body is FLU (x forward, y left, z up), the camera OpenCV (x right, y down, z forward), the world ENU.
 A gimbal's frame is FLU too: its x axis is the direction of the camera's view.

@@ -15,7 +15,7 @@ has the standard deviation pixel_sigma / w, which is the same as multiplying its
 
 Two views agree by their epipolar distance alone. If only two of three or more views agree and another
 pair agrees on a different place, it is not possible to know which pair is right, and the joint is
-`rejected`. On the walk of docs/benchmarks.md this costs 0.1 % of the joint-frames and reduces the mean error
+`rejected`. On the walk of docs/results.md this costs 0.1 % of the joint-frames and reduces the mean error
 from 13.6 to 13.0 mm.
 
 A gate in pixels would reject good views as soon as poses are noisy: 1 deg is 26 px at f = 1500. State
@@ -26,7 +26,7 @@ itself wrong by 100 px passes it. But a pose error moves all joints of a person 
 gross error of one joint does not. `triangulate_pictures` therefore moves each picture by the median of its
 joints' residuals, which removes the pose error, and finds the views with gross errors by `robust` with exact
 poses. These are left out; all others are triangulated with the stated pose noise. The benefit is measured in
-docs/decisions/0007-gross-errors.md.
+docs/estimate.md.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def estimate_noise(views: Views, *, threads: int = 1) -> Float:
     from the inliers that `robust` finds with it.
 
     One factor, not one per camera: under constant pose errors a camera's residuals are a single draw, and
-    weighting by them costs 3 to 7 % (docs/benchmarks.md).
+    weighting by them costs 3 to 7 % (docs/results.md).
 
     Use it as `replace(views, pixel_sigma=estimate_noise(views))` if poses come from a log, even one that
     states its noise: if that is right, little changes. For still, calibrated cameras, state the detector's

@@ -59,7 +59,7 @@ class Zone:
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """Settings of every arm; docs/measurements-planner.md measures the defaults.
+    """Settings of every arm; docs/results.md measures the defaults.
 
     Raises:
         ValueError: an impossible value; the message names it.

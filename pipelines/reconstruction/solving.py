@@ -11,7 +11,7 @@ than assumed. Inliers are weighted again in two ways:
   by a normal amount: least squares is right for them, and weighting views by their own residuals costs 11 %
   at five cameras. With calibrated poses and no stated noise, a view that disagrees shows a wrong joint, and
   the size of its residual has no meaning: its weight should fall with its residual
-  (docs/decisions/0002-loss-of-still-cameras.md).
+  (docs/estimate.md).
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def noise_text(views: Views) -> str:
 _UNKNOWN_POSES = 1.3
 """Covariance over what residuals say of it. A constant error of a pose is a single draw, and residuals do not
 show how it moves joints along their viewing rays. The mean NEES of the rendered flights for tuning becomes 3
-with it (docs/decisions/0012-auto.md)."""
+with it (docs/estimate.md)."""
 
 
 def triangulate_widened(views: Views, *, solve: Callable[[Views], Triangulation]) -> Triangulation:
@@ -266,7 +266,7 @@ def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int
 
 # --- heavy-tailed loss ---------------------------------------------------------------------------------
 
-_ROUNDS = 12  # the effect of more rounds: docs/decisions/0002-loss-of-still-cameras.md
+_ROUNDS = 12  # the effect of more rounds: docs/estimate.md
 
 
 def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:

@@ -399,7 +399,7 @@ def _angles(summary: Summary, angles: pd.DataFrame) -> Plate | None:
         f"{fixed(float(own['value_deg'].max()), 0)}°"
         for name, (_, own) in series.items()
     )
-    caption = f"{SIDE_COLOURS} Bands: 95 %, from the stated standard deviations. Signs as in docs/angles.md."
+    caption = f"{SIDE_COLOURS} Bands: 95 %, from the stated standard deviations. Signs as in docs/outputs.md."
     if len(centres) < len(times):
         caption += f" Each point is the median of {bins[1] - bins[0]:.2g} s."
     numbers = {"": table(t_s=centres, **columns)}

@@ -204,7 +204,7 @@ class Detector(FetchesModels, Protocol):
 
 @dataclass(frozen=True)
 class Measured:
-    """Accuracy and time of a detector, measured as docs/detector.md describes."""
+    """Accuracy and time of a detector, measured as docs/results.md describes."""
 
     sample_mpjpe_mm: float  # of the sample flight with true poses
     person_ms: float  # processor time for one person in one picture, on one thread of a busy machine

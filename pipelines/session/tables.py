@@ -35,17 +35,25 @@ COVARIANCE_COLUMNS = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
 """Upper triangle of a pose covariance: position in world, rotation vector in camera."""
 
 FRAMES = pa.schema([_FRAME, _T_NS, ("pts_ns", pa.int64())])
+"""cameras/<camera>/frames.parquet: the pictures in world time, and their stamps in the video."""
 POSES = pa.schema([_T_NS, *_POSE])
+"""cameras/<camera>/poses.parquet: world_from_camera at the log's rate; `c00` to `c55` if the log has
+covariances (upper triangle; position in world in m, rotation vector in camera in rad), `body_qx` to `body_qw`
+if a gimbal turns the camera."""
 BODY_COLUMNS = ("body_qx", "body_qy", "body_qz", "body_qw")
 POSES_WITH_COVARIANCE = pa.schema([*POSES, *[(name, pa.float64()) for name in COVARIANCE_COLUMNS]])
 KEYPOINTS = pa.schema([_FRAME, _T_NS, _PERSON, _JOINT, *_XY, ("confidence", pa.float64())])
+"""cameras/<camera>/keypoints.parquet: imported keypoints, px; detect/<camera>/keypoints.parquet has those of
+our detector."""
 TRACKS = pa.schema([_FRAME, ("point", pa.int32()), ("x", pa.float32()), ("y", pa.float32())])
 """background/<camera>/tracks.parquet: points of the background in the pictures, px, sorted by frame."""
 
 ACTOR = pa.schema([_T_NS, _PERSON, *_XYZ])
+"""actor.parquet: the logged point of each person."""
 TRUTH = pa.schema([_T_NS, _PERSON, _JOINT, *_XYZ])
+"""truth.parquet: the true joints."""
 CAMERA_POSES = pa.schema([_T_NS, _CAMERA, *_POSE])
-"""truth_poses.parquet: the true pose of every camera."""
+"""truth_poses.parquet: the true world_from_camera; reconstruct/cameras.parquet has the corrected one."""
 
 PLAN = pa.schema([_T_NS, _CAMERA, *_XYZ])
 """plan.parquet: the setpoints of the on-board planner for every drone."""
@@ -59,6 +67,7 @@ SKELETON = pa.schema(
         _STATUS,
     ]
 )
+"""reconstruct/skeleton.parquet: every joint of every person at every time, sorted by time, person, joint."""
 
 ANGLES = pa.schema(
     [
@@ -67,15 +76,15 @@ ANGLES = pa.schema(
         _STATUS,
     ]
 )
-"""reconstruct/angles.parquet, sorted by time, then person: every angle of `geometry.joint_angles.ANGLES`, NaN
-unless its status is ok or filled."""
+"""reconstruct/angles.parquet: every joint angle, sorted by time, then person; NaN unless its status is ok or
+filled."""
 GAIT = pa.schema(
     [
         *(_T_NS, _PERSON, ("side", pa.string()), ("event", pa.string())),
         *(*_XYZ, *((name, pa.float64()) for name in ("step_s", "step_m", "speed_mps"))),
     ]
 )
-"""reconstruct/gait.parquet: heel strikes and toe-offs of people who walk; see `geometry.gait.GaitEvents`."""
+"""reconstruct/gait.parquet: heel strikes and toe-offs of people who walk, with the place of heel or toe."""
 
 _SLOT = ("formation_yaw_rad", "slot_yaw_rad", "slot_tilt_rad", "slot_range_m", "tilt_rad")
 REPLAN = pa.schema(
@@ -86,11 +95,11 @@ REPLAN = pa.schema(
         ("predicted_error_m", pa.float64()),
     ]
 )
-"""replan/<arm>/trajectories.parquet, sorted by time, then camera: the pose (world_from_camera), the commanded
+"""replan/<arm>/trajectories.parquet: the pose (world_from_camera), the commanded
 slot (yaw continuous, NaN for the flown trajectories), the tilt above the actor, `visible` (True if nothing
 blocks the sight line), and the predicted error of all cameras together (NaN where not determined)."""
 SEEN = pa.schema([_T_NS, _CAMERA, _JOINT, *_XY, _STATUS])
-"""replan/<arm>/seen.parquet, once a second: the position of each known joint in the arm's pictures (exact px,
+"""replan/<arm>/seen.parquet: once a second, the position of each known joint in the arm's pictures (exact px,
 NaN outside) and its status: `seen`, `hidden` by the surroundings, or `outside` the picture."""
 COST_MAP = pa.schema([_T_NS, ("yaw_rad", pa.float64()), ("cost", pa.float64())])
 """replan/cost_map.parquet: the cost of a formation at a time, by the yaw of its first camera."""

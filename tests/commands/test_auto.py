@@ -81,7 +81,7 @@ def test_every_method_is_served_by_the_clocks_that_were_found(tmp_path: Path, me
 
 
 def test_calibrated_still_cameras_are_left_to_robust(tmp_path: Path) -> None:
-    """Check the choice that the real recording supports (docs/decisions/0012-auto.md)."""
+    """Check the choice that the real recording supports (docs/estimate.md)."""
     flight = write_flight(tmp_path, seconds=1.5, static=True, pose_noise={})
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)

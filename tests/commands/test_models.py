@@ -38,21 +38,6 @@ def test_what_is_missing_is_listed_with_the_command_that_gets_it(empty_cache: Pa
     }
 
 
-def test_accuracy_and_time_are_those_of_the_documentation(empty_cache: Path) -> None:
-    """Compare with the table of docs/detector.md, which `python -m benchmarks.detectors` printed."""
-    page = (Path(__file__).parents[2] / "docs" / "detector.md").read_text(encoding="utf-8")
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
-    first = next(index for index, row in enumerate(rows) if row[0].startswith("blazepose"))
-    documented = {row[0]: (float(row[1]), float(row[-1])) for row in rows[first : first + 2]}
-    detectors = [d for d in json.loads(succeeds("models", "--json"))["detectors"] if d["name"] in documented]
-    assert {d["name"]: (d["sample_mpjpe_mm"], d["person_ms"]) for d in detectors} == documented
-    assert len(documented) == 2
-    listed = [line.split() for line in succeeds("models").splitlines() if line.startswith("blazepose")]
-    assert {(name, float(mm), float(ms)) for name, mm, ms, *_ in listed} == {
-        (name, *figures) for name, figures in documented.items()
-    }
-
-
 def test_list_is_the_same_as_no_subcommand(empty_cache: Path) -> None:
     assert succeeds("models", "list") == succeeds("models")
     assert succeeds("models", "list", "--json") == succeeds("models", "--json")

@@ -67,7 +67,7 @@ def test_disturbed_poses_err_as_their_model_says(clean: tuple[SyntheticFlight, P
     low, high = trials["intervals"]["mpjpe_mm"]
     assert min(errors) <= low <= trials["mean"]["mpjpe_mm"] <= high <= max(errors)
     # Two rays at a right angle, 15 deg up, each off by 0.1 m per axis: RMS = 0.1 sqrt(2.51) = 158 mm (the
-    # trace of docs/studies.md). Four draws of three numbers scatter by 1 / sqrt(2 x 12) = 20 %.
+    # trace of docs/results.md). Four draws of three numbers scatter by 1 / sqrt(2 x 12) = 20 %.
     rms = np.sqrt(np.mean([each["e_recon_per_joint_frame_m2"] for each in trials["each"]]))
     assert rms == pytest.approx(0.158, rel=0.6)
     # The first trial is stored, and a warning of the stage says so.

@@ -113,7 +113,7 @@ def test_refined_finds_the_clock_of_a_moving_camera(offset_s: float, tmp_path: P
     succeeds("ingest", flight.manifest, "-o", session)
     refined = json.loads(succeeds("reconstruct", session, "--method", "refined", "--json"))
     assert refined["refinement"]["fallback"] is None
-    # Known to 1.7 ms, of the table in docs/measurements-refined.md: three of those.
+    # Known to 1.7 ms, of the table in docs/results.md: three of those.
     assert abs(refined["clock_offsets_s"]["drone2"] - offset_s) < 0.005
 
 

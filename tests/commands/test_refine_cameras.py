@@ -43,7 +43,7 @@ def test_without_pictures_it_is_refused_in_a_line(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_background_of_the_sample_flight_halves_the_errors_of_attitudes(tmp_path: Path) -> None:
-    """Use rendered pictures with known poses, 4 s of 12; results for all of both are in docs/decisions."""
+    """Use rendered pictures with known poses, 4 s of 12; results for all of both are in docs/results.md."""
     session = tmp_path / "sample.session"
     succeeds("ingest", SAMPLE / "flight.yaml", "-o", session)
     entry = read_description(session).cameras["drone2"]

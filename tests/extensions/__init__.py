@@ -1,1 +1,1 @@
-"""Extensions of docs/extending.md, added from outside the package."""
+"""Extensions of examples/extension, added from outside the package."""

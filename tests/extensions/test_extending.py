@@ -1,11 +1,12 @@
-"""The modules of docs/extending.md as a separate package, found only by its entry points."""
+"""The package of examples/extension beside mocap, found only by its entry points."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
+import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -14,31 +15,25 @@ import pytest
 
 from tests.commands.runner import MOCAP
 
-_PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
+_PACKAGE = Path(__file__).parents[2] / "examples" / "extension"
 _SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
-_MODULE = re.compile(r'```python title="([\w/]+\.py)"\n(.*?)```', re.DOTALL)
-_GROUP = re.compile(r'\[project\.entry-points\."(.+)"\]\n(\w+) = "(.+)"')
 
 
 @pytest.fixture(scope="module")
 def outside(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a folder for the path, with the page's modules and the metadata that pip would write."""
+    """Make a folder for the path, with the package's modules and the metadata that pip would write."""
     folder = tmp_path_factory.mktemp("site")
-    text = _PAGE.read_text(encoding="utf-8")
-    modules = _MODULE.findall(text)
-    assert len(modules) == 5
-    for name, source in modules:
-        path = folder / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(source, encoding="utf-8")
-    (folder / "outside" / "__init__.py").touch()
+    shutil.copytree(_PACKAGE / "outside", folder / "outside")
     metadata = folder / "outside-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: outside\nVersion: 1.0\n")
-    groups = _GROUP.findall(text)
-    assert len(groups) == 5
+    groups = tomllib.loads((_PACKAGE / "pyproject.toml").read_text())["project"]["entry-points"]
     (metadata / "entry_points.txt").write_text(
-        "".join(f"[{group}]\n{name} = {target}\n" for group, name, target in groups)
+        "".join(
+            f"[{group}]\n{name} = {target}\n"
+            for group, entries in groups.items()
+            for name, target in entries.items()
+        )
     )
     return folder
 

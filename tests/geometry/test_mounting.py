@@ -1,4 +1,4 @@
-"""Mounts and gimbals against the worked example of docs/frames.md, axis by axis, and by their algebra."""
+"""Mounts and gimbals against the worked example of docs/flight.md, axis by axis, and by their algebra."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ EAST, NORTH, _ = np.eye(3)
 RIGHT_OF_PICTURE, BOTTOM_OF_PICTURE, AXIS = np.eye(3)
 angles_deg = hnp.arrays(np.float64, (3,), elements=st.floats(-180, 180))
 
-PAPER = (Path(__file__).resolve().parents[2] / "docs" / "frames.md").read_text(encoding="utf-8")
+PAPER = (Path(__file__).resolve().parents[2] / "docs" / "flight.md").read_text(encoding="utf-8")
 LEVER_ARM = np.array([0.10, 0.0, -0.05])
 HEADING_NORTH = quaternion_from_rotation_vector(np.radians([0, 0, 90]))
 LEVEL: Pose = (np.array([[10.0, 20.0, 30.0]]), HEADING_NORTH[None])

@@ -50,11 +50,11 @@ from benchmarks.mistakes import (
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import compose, invert
 from pipelines.reconstruction.doubts import remedies
-from pipelines.reconstruction.doubts.diagnosis import CODES, diagnose
+from pipelines.reconstruction.doubts.diagnosis import diagnose
 from pipelines.reconstruction.doubts.scene import scene_of
 from pipelines.reconstruction.doubts.score import _LIMBS, _TORSO, _shape, score
 from pipelines.reconstruction.doubts.turning import Lateness
-from pipelines.session.description import read_description
+from pipelines.session.description import DOUBT_CODES, read_description
 from tests.commands.runner import refused, succeeds
 
 THREE = next(flight for flight in FLIGHTS if flight.name == "kick3")
@@ -70,7 +70,7 @@ def doubts_of(manifest: Path) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = json.loads(succeeds("check", manifest, "--json"))["doubts"]
     for doubt in found:
         assert set(doubt) == {"code", "cameras", "what", "evidence", "remedy"}
-        assert doubt["code"] in CODES
+        assert doubt["code"] in DOUBT_CODES
         assert all(isinstance(value, int | float) for value in doubt["evidence"].values())
     return found
 

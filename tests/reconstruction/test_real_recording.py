@@ -105,7 +105,7 @@ def test_letterboxed_videos_get_the_intrinsics_of_their_pictures(tmp_path: Path)
 def test_videos_alone_come_near_the_peers_skeleton(tmp_path: Path) -> None:
     """The peer used OpenPose's keypoints; here the larger BlazePose looks at every fifth picture: 38 mm.
 
-    The two networks place hips and nose 54 to 61 mm apart, all other joints less (docs/detector.md).
+    The two networks place hips and nose 54 to 61 mm apart, all other joints less (docs/results.md).
     """
     fetch_networks("blazepose-heavy")
     manifest, session = manifest_of(tmp_path), tmp_path / "videos.session"

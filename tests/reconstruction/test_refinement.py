@@ -316,7 +316,7 @@ def test_white_noise_is_averaged_over_time(stated: bool) -> None:
 def test_covariances_of_white_noise_are_calibrated() -> None:
     """Test 12 flights of 2 s: NEES is 3 +- 0.27, since a flight's mean has a standard deviation of 0.95.
 
-    400 flights have this deviation around their mean of 3.01 (docs/measurements-refined.md). The share of
+    400 flights have this deviation around their mean of 3.01 (docs/results.md). The share of
     95 % ellipsoids varies by 7 % from flight to flight there, so by 2 % in the mean. Tolerances are four
     of these.
     """
@@ -373,7 +373,7 @@ def test_a_rigid_formation_says_that_body_errors_cannot_be_observed(stated: bool
 @pytest.mark.slow
 @pytest.mark.parametrize(("share", "most_mm"), [(0.0, 6.0), (0.05, 8.0)], ids=["2 px", "outliers"])
 def test_it_is_ahead_of_the_best_peer_at_true_poses(share: float, most_mm: float) -> None:
-    # Temporal optimisation with bone lengths has 6.5 and 14.2 mm of such a walk (docs/benchmarks.md).
+    # Temporal optimisation with bone lengths has 6.5 and 14.2 mm of such a walk (docs/results.md).
     flight = formation(300, 5, [], 0, bad_share=share)
     position, _, fallback = refined(flight, [])
     assert fallback is None

@@ -1,7 +1,7 @@
 """ArduPilot's DataFlash logs (.bin), by pymavlink (extra `drones`): estimates, GPS, mounts and pictures.
 
 pymavlink finds the messages, also behind damaged bytes. Their numbers are then read in one step for each
-name. ArduPilot's world is NED, its body FRD, and its stamps count microseconds since boot (docs/drones.md).
+name. ArduPilot's world is NED, its body FRD, and its stamps count microseconds since boot (docs/formats.md).
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ Flight Reader (`CUSTOM.updateTime [local],OSD.flyTime [s],OSD.latitude,...,GIMBA
 one of the drone's own record (`Clock:offsetTime,IMU_ATTI(0):Latitude,...,IMU_ATTI(0):yaw:C`). The reference
 of its gimbal's yaw is not public, so that is left out.
 
-Angles are those of an FRD body and gimbal in NED (docs/drones.md).
+Angles are those of an FRD body and gimbal in NED (docs/formats.md).
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ Generations have only the form of subtitles in common. All of these are read:
   or `H 85.80m` as height above take-off, and `F.PRY (...)`, `G.PRY (...)` as the angles of body and gimbal;
 - `GPS(36.6146,-6.1120,0.0M)`: latitude, longitude, height (Matrice 300): the M tells them apart.
 
-Angles are those of an FRD body and gimbal in NED (docs/drones.md).
+Angles are those of an FRD body and gimbal in NED (docs/formats.md).
 """
 
 import re

@@ -1,6 +1,6 @@
 """Reader of PX4's .ulg logs, by pyulog (extra `drones`): estimates, GPS, gimbal and camera triggers.
 
-PX4's world is NED, its body FRD, and its stamps count microseconds since boot (docs/drones.md). Definitions
+PX4's world is NED, its body FRD, and its stamps count microseconds since boot (docs/formats.md). Definitions
 are checked before pyulog expands them: damaged or malicious ones mean billions of fields.
 """
 

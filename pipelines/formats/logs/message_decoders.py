@@ -2,7 +2,7 @@
 
 Messages of one topic usually differ in numbers only: their texts are equal, and so every field stands at
 one position. `find_layout` finds these positions. A thousand messages are then one array, which is read
-several times as fast as single messages (docs/decisions/0009-log-readers.md).
+several times as fast as single messages (docs/architecture.md).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Topics of known drivers that hold position, attitude and gimbal, with their units and axes.
 
-From the drivers' sources (docs/drones.md):
+From the drivers' sources (docs/formats.md):
 
 `dji_osdk` (dji_sdk, dji_osdk_ros since 3.3): attitude is FLU in ENU; gps_position is NavSatFix;
 local_position is metres east, north, up of a reference set in flight; gimbal_angle is degrees in NED,

@@ -64,28 +64,6 @@ from pipelines.session.log_doubts import doubts_of_logs
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
 
-CODES = (
-    "videos_swapped",
-    "mirrored",
-    "convention",
-    "axes",
-    "unit",
-    "mount",
-    "gimbal",
-    "intrinsics",
-    "keypoints_size",
-    "clock",
-    "frame_rate",
-    "origin",
-    "pose",
-    "body",
-    "ground",
-    "actor",
-    "residual",
-    "noise",
-)
-"""The codes of doubts."""
-
 MARGIN = 3.0
 """By how much a mistake must score better than the description to be named."""
 

@@ -1,0 +1,293 @@
+"""Write the reference tables of the pages from the code.
+
+    python docs/made.py            # names the tables that are not current, and exits 1
+    python docs/made.py --write    # writes them
+
+A table stands between `<!-- made: NAME -->` and `<!-- end -->`. Keys and settings come from the models with
+their docstrings or comments, formats and exports from the registries, columns and codes of doubts from
+`session`.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+
+from pipelines.planning.config import PlannerConfig
+from pipelines.session import registries, tables
+from pipelines.session.description import DOUBT_CODES
+from pipelines.session.manifest import Flight
+
+DOCS = Path(__file__).parent
+_MARKED = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_KINDS = (  # what a format reads, and the part of flight.yaml that names such files
+    ("open_log", "log"),
+    ("read_telemetry", "drone's own log"),
+    ("index", "video"),
+    ("read_trajectory", "poses"),
+    ("read_calibration", "calibration"),
+    ("read_keypoints", "keypoints"),
+    ("read_map", "map"),
+    ("read_joints", "true joints"),
+    ("", "times of pictures"),
+)
+
+
+def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """Write a table in Markdown."""
+    lines = [header, ("---",) * len(header), *rows]
+    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+
+
+def meanings(thing: type) -> dict[str, str]:
+    """Find the meaning of each field: the docstring or comment beside it, of the class or of one above it."""
+    found: dict[str, str] = {}
+    for each in reversed(thing.__mro__):
+        if each.__module__.startswith("pipelines."):
+            found |= _meanings_of(each)
+    return found
+
+
+def _meanings_of(thing: type) -> dict[str, str]:
+    source = textwrap.dedent(inspect.getsource(thing))
+    lines = source.splitlines()
+    body = next(node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef))
+    found = {}
+    for node, following in zip(body.body, [*body.body[1:], None], strict=True):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            beside = lines[(node.end_lineno or 0) - 1][node.end_col_offset or 0 :].partition("#")[2]
+            above = [line.strip() for line in _comment_above(lines[: node.lineno - 1])]
+            found[node.target.id] = _text_of(following) or beside.strip() or " ".join(above)
+    return found
+
+
+def _comment_above(lines: list[str]) -> list[str]:
+    comment: list[str] = []
+    while lines and lines[-1].strip().startswith("# ") and "---" not in lines[-1]:
+        comment.insert(0, lines[-1].strip().removeprefix("# "))
+        lines = lines[:-1]
+    return comment
+
+
+def _text_of(node: ast.stmt | None) -> str:
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        return " ".join(str(node.value.value).split())
+    return ""
+
+
+# --- flight.yaml ---------------------------------------------------------------------------------------
+
+
+def flight() -> str:
+    """List the keys of flight.yaml, part by part."""
+    parts: list[tuple[str, type[BaseModel]]] = [("", Flight)]
+    sections: dict[type[BaseModel], str] = {}
+    for place, model in parts:
+        rows, nested = _rows_of(model, place, "")
+        parts += [part for part in nested if part[1] not in dict.fromkeys(each for _, each in parts)]
+        title = f"### {place}" if place else "### The flight"
+        sections[model] = f"{title}\n\n{_first_line(model)}\n\n{table(('key', 'value', 'meaning'), rows)}"
+    return "\n" + "\n".join(sections.values()) + "\n"
+
+
+def _rows_of(
+    model: type[BaseModel], place: str, before: str
+) -> tuple[list[tuple[str, ...]], list[tuple[str, type[BaseModel]]]]:
+    """Write the rows of a model's keys, and return the parts that have a table of their own."""
+    rows: list[tuple[str, ...]] = []
+    nested: list[tuple[str, type[BaseModel]]] = []
+    own = meanings(model)
+    for name, field in model.model_fields.items():
+        key = field.alias or name
+        if key == "assumed":
+            continue
+        inner, many = _part_of(field.annotation)
+        path = f"{place}.{key}" if place else key
+        meaning = field.description or own[name] or (_first_line(inner) if inner else "")
+        if inner is not None and not many and len(inner.model_fields) <= _FEW:
+            inside, deeper = _rows_of(inner, path, f"{before}{key}.")
+            rows += inside
+            nested += deeper
+            continue
+        if inner is not None:
+            nested.append((f"{path}.NAME" if many else path, inner))
+        rows.append((f"`{before}{key}`", _value(name, field.annotation, field.default, inner), meaning))
+    return rows, nested
+
+
+_FEW = 3  # keys of a part that stand among those of the part around it
+
+
+def _first_line(model: type[BaseModel]) -> str:
+    return (inspect.getdoc(model) or "").split("\n\n")[0].replace("\n", " ")
+
+
+def _part_of(annotation: Any) -> tuple[type[BaseModel] | None, bool]:
+    """Find the model in an annotation, and if several of it stand there by name."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation, False
+    for argument in get_args(annotation):
+        inner, _ = _part_of(argument)
+        if inner is not None:
+            return inner, get_origin(annotation) is dict
+    return None, False
+
+
+def _value(name: str, annotation: Any, default: Any, inner: type[BaseModel] | None) -> str:
+    """Say what may stand there, and what counts if nothing does."""
+    if inner is not None or isinstance(default, BaseModel):
+        return ""
+    kinds = ["seconds"] if name.endswith("_ns") else list(dict.fromkeys(_kinds(annotation)))
+    shown = "" if default in (None, "", [], {}) or repr(default) == "PydanticUndefined" else _plain(default)
+    return ", ".join(kinds) + (f"; default {shown}" if shown else "")
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list):
+        return " ".join(map(_plain, value))
+    return f"{value:g}" if isinstance(value, float) else str(value).lower()
+
+
+def _kinds(annotation: Any) -> Iterator[str]:
+    """Name what an annotation allows: words, or kinds of values."""
+    origin = get_origin(annotation)
+    if origin is Literal:
+        yield from (f"`{word}`" for word in get_args(annotation))
+    elif origin in (Union, UnionType):
+        for argument in get_args(annotation):
+            yield from _kinds(argument)
+    elif origin is Annotated:
+        yield from _kinds(get_args(annotation)[0])
+    else:
+        names = {
+            str: "text",
+            float: "number",
+            int: "number",
+            Fraction: "number",
+            list: "list",
+            dict: "mapping",
+        }
+        kind = "true, false" if annotation is bool else names.get(origin or annotation, "")
+        yield from [kind] if kind else []
+
+
+_KIND_OF_TYPE: dict[object, str] = {
+    bool: "true, false",
+    str: "text",
+    int: "number",
+    float: "number",
+    Fraction: "number",
+    list: "list",
+    dict: "mapping",
+}
+
+
+# --- other tables --------------------------------------------------------------------------------------
+
+
+def noise() -> str:
+    """List the models of pose noise with their parameters."""
+    rows = []
+    for name, model in zip(registries.NOISE_MODELS.names(), registries.NOISE_MODELS.all(), strict=True):
+        parameters = ", ".join(f"`{field.name}`" for field in dataclasses.fields(model))
+        rows.append((f"`{name}`", parameters, (inspect.getdoc(model) or "").split("\n")[0]))
+    return table(("model", "parameters", "is"), rows)
+
+
+def formats() -> str:
+    """List the formats that are read."""
+    rows = []
+    for order, (method, kind) in enumerate(_KINDS):
+        for each in registries.FORMATS.all():
+            if (not method or hasattr(each, method)) and each.name not in [name for _, name, *_ in rows]:
+                names = ", ".join(suffix or "folder" for suffix in each.suffixes)
+                rows.append((order, each.name, kind, each.title, names))
+    cells = [(kind, f"`{name}`", title, names) for _, name, kind, title, names in sorted(rows)]
+    return table(("kind", "`format:`", "is", "usual names"), cells)
+
+
+def exports() -> str:
+    """List the formats that are written, with their choices."""
+    rows = []
+    for export in registries.EXPORTS.all():
+        choice = export if isinstance(export, registries.ChoiceOfAxes) else None
+        units, axes = (choice.units, choice.axes) if choice else ((), ())
+        rows.append((f"`{export.name}`", export.title, ", ".join(units), ", ".join(axes)))
+    return table(("`--to`", "is", "unit", "axes"), rows)
+
+
+def columns() -> str:
+    """List the tables of a session with their columns."""
+    body = ast.parse(inspect.getsource(tables)).body
+    rows = []
+    for node, following in pairwise(body):
+        file, colon, meaning = _text_of(following).partition(": ")
+        if isinstance(node, ast.Assign) and colon and file.endswith(".parquet"):
+            names = getattr(tables, ast.unparse(node.targets[0])).names
+            rows.append((f"`{file}`", ", ".join(f"`{name}`" for name in names), meaning))
+    return table(("file", "columns", "holds"), rows)
+
+
+def codes() -> str:
+    """List the codes of doubts."""
+    rows = [
+        (f"`{code}`", meaning, ", ".join(f"`{key}`" for key in keys.split(", ") if key))
+        for code, (meaning, keys) in DOUBT_CODES.items()
+    ]
+    return table(("code", "means", "change"), rows)
+
+
+def planner() -> str:
+    """List the settings of the planner."""
+    own = meanings(PlannerConfig)
+    rows = []
+    for field in dataclasses.fields(PlannerConfig):
+        if field.name != "errors":  # taken from the session
+            default = field.default if isinstance(field.default, tuple) else (field.default,)
+            shown = " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in default)
+            rows.append((f"`{field.name}`", shown or "none", own[field.name]))
+    return table(("key", "default", "meaning"), rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "flight": flight,
+    "noise": noise,
+    "formats": formats,
+    "exports": exports,
+    "tables": columns,
+    "codes": codes,
+    "planner": planner,
+}
+
+
+def current(page: str) -> str:
+    """Return a page with its tables as the code has them now."""
+    return _MARKED.sub(lambda found: found[1] + TABLES[found[2]]() + found[3], page)
+
+
+def stale() -> dict[Path, str]:
+    """Return the pages whose tables are not current, as they ought to be."""
+    pages = {path: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}
+    return {path: made for path, text in pages.items() if (made := current(text)) != text}
+
+
+if __name__ == "__main__":
+    found = stale()
+    for path, text in found.items():
+        if "--write" in sys.argv:
+            path.write_text(text, encoding="utf-8", newline="\n")
+        else:
+            sys.stdout.write(f"{path}: not current\n")
+    sys.exit("--write" not in sys.argv and bool(found))

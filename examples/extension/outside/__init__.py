@@ -1,0 +1,1 @@
+"""Extensions of mocap in a package of its own: `pip install examples/extension`."""
