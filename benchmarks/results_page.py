@@ -142,8 +142,8 @@ def _head(numbers: Numbers) -> list[str]:
         "",
         *_words(
             f"It takes about {numbers['cpu_minutes']} minutes of processor time and runs the commands above "
-            "each table, in quick versions: shorter walks and fewer trials than [studies](studies.md) and "
-            "[the planner's measurements](measurements-planner.md). Processors round differently, and closed "
+            "each table, in quick versions: shorter walks and fewer trials than the studies and "
+            "whole comparisons of planners. Processors round differently, and closed "
             "loops of planners amplify that: on another processor the figures of the arms changed, those of "
             "filmed ones by up to 8 %."
         ),
@@ -186,7 +186,7 @@ def _studies(numbers: Numbers) -> list[str]:
         *_words(
             "A walk of 20 s, 5 trials, keypoints of the modelled detector; in brackets 95 % of bootstrap "
             "means over trials. Pose noise per axis: low 0.1 m / 0.5 deg, medium 0.3 m / 1 deg, high 0.5 m / "
-            "2 deg. [Studies](studies.md) has 75 s, 10 trials, and what the tables say."
+            "2 deg. Whole studies walk 75 s with 10 trials."
         ),
     ]
     wanted = {METRICS[key] for key in _STUDY_TABLES if key in METRICS}
@@ -252,7 +252,7 @@ def _filming(numbers: Numbers) -> list[str]:
             "cameras would have seen them, BlazePose looks at the pictures, and `auto` reconstructs from "
             "poses with one draw of 0.02 m and 0.2 deg. In E2 somebody walks towards a mound that the fixed "
             "formation climbs; in E3 they jog a slalom with a dead stop, and play soccer. Clips of 5 s; "
-            "[measurements](measurements-planner.md#filmed-with-the-real-detector) explains the columns."
+            "The columns are those of `metrics.json`."
         ),
         *_code([command for own in FILMED.values() for command in own]),
         *markdown_table([*header, "root-relative mm"], rows),
