@@ -8,29 +8,35 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mocap_cli.options import (
+    RenamedOptions,
     Shown,
     any_place,
-    every_option,
     force_option,
     grouped,
     output_options,
     overwrite_option,
-    provider_option,
+    pictures_option,
     scheduler_option,
-    with_provider,
 )
 from mocap_cli.several import expanded
 from mocap_cli.terminal import one_line, print_json, say, watching
 
 if TYPE_CHECKING:
+    from mocap_cli.options import ChosenPictures
     from pipelines.batch import Settings
 
+GONE = {
+    "--every": "write --pictures ::N",
+    "--provider": "write --detector onnx:MODEL.onnx,provider=NAME",
+}
 
-def _settings(stages: str, detector: str, provider: str | None, **others: Any) -> Settings:
+
+def _settings(stages: str, pictures: ChosenPictures, **others: Any) -> Settings:
     from pipelines.batch import Settings
 
     names = tuple(name.strip() for name in stages.split(",") if name.strip())
-    return Settings(stages=names, detector=with_provider(detector, provider), **others)
+    start_s, end_s = pictures.start_s, pictures.end_s
+    return Settings(stages=names, every=pictures.every, start_s=start_s, end_s=end_s, **others)
 
 
 _settings_options = grouped(
@@ -48,17 +54,18 @@ _settings_options = grouped(
         type=click.Choice(["auto", "refined", "robust", "midpoint", "dlt"]),
         default="auto",
         show_default=True,
-        help="Method of `mocap reconstruct`; the next three options are that command's, too.",
+        help="Method of `mocap reconstruct`; the next two options are that command's, too.",
     ),
     click.option(
         "--detector", default="blazepose", show_default=True, help="Detector for cameras without keypoints."
     ),
-    provider_option,
-    every_option,
+    pictures_option,
 )
 
 
-@click.command("batch", short_help="Run all stages over many flights, on Dask.")
+@click.command(
+    "batch", cls=RenamedOptions, gone=GONE, short_help="Run all stages over many flights, on Dask."
+)
 @click.argument("flights", nargs=-1, required=True, metavar="FLIGHT.yaml...")
 @click.option(
     "-o",

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -78,34 +78,71 @@ json_option = click.option(
 )
 
 
-every_option = click.option(
-    "--every",
-    type=click.IntRange(1, 1000),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Run the detector on every N-th picture only.",
+class RenamedOptions(click.Command):
+    """Command that refuses options which no longer exist and names what replaces them.
+
+    Args:
+        gone: by an option's former name the text that says what to write instead.
+    """
+
+    def __init__(self, *arguments: Any, gone: Mapping[str, str], **values: Any) -> None:
+        super().__init__(*arguments, **values)
+        self._gone = gone
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments, or raise a usage error."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            instead = self._gone.get(error.option_name)
+            if instead is None:
+                raise
+            raise click.UsageError(f"{error.option_name} does not exist any more: {instead}.", ctx) from None
+
+
+@dataclass(frozen=True)
+class ChosenPictures:
+    """The pictures that the detector looks at."""
+
+    start_s: float | None = None  # since the flight's first picture
+    end_s: float | None = None
+    every: int = 1
+
+
+class _Pictures(click.ParamType[ChosenPictures]):
+    """`[START]:[END][:N]`: seconds since the flight's first picture, and every N-th picture."""
+
+    name = "pictures"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> ChosenPictures:
+        """Convert the value, or raise a usage error."""
+        if isinstance(value, ChosenPictures):
+            return value
+        parts = str(value).split(":")
+        try:
+            start_s, end_s = (float(part) if part else None for part in parts[:2])
+            every = int(parts[2]) if len(parts) > 2 and parts[2] else 1
+        except ValueError:
+            parts = []
+        if not 2 <= len(parts) <= 3:
+            self.fail(f"{value!r} is not like 2:10 (seconds) or ::5 (every fifth).", param, ctx)
+        if not 1 <= every <= 1000:
+            self.fail(f"{every} is not from 1 to 1000.", param, ctx)
+        if any(end is not None and not 0 <= end <= 1e9 for end in (start_s, end_s)):
+            self.fail(f"{value!r} has a time that is not from 0 to 1e9 s.", param, ctx)
+        if start_s is not None and end_s is not None and start_s >= end_s:
+            self.fail(f"{end_s:g} s is not after {start_s:g} s.", param, ctx)
+        return ChosenPictures(start_s, end_s, every)
+
+
+pictures_option = click.option(
+    "--pictures",
+    type=_Pictures(),
+    default=ChosenPictures(),
+    metavar="[START]:[END][:N]",
+    help="Pictures that the detector looks at: from START up to END, in seconds since the flight's first"
+    " picture, and of these every N-th, as in 2:10, ::5 or 2:10:5 [default: all].",
 )
-
-
-provider_option = click.option(
-    "--provider",
-    metavar="NAME",
-    help="ONNX Runtime's execution provider that runs the models of --detector onnx:..., such as cuda"
-    " [default: cpu].",
-)
-
-
-def with_provider(detector: str, provider: str | None) -> str:
-    """Add the provider to the detector's options, where one was asked for."""
-    if provider is None:
-        return detector
-    if ":" not in detector:
-        raise click.BadParameter(
-            f"{detector} is not run by ONNX Runtime: leave it out, or write --detector onnx:MODEL.onnx",
-            param_hint="--provider",
-        )
-    return f"{detector},provider={provider}"
 
 
 def scheduler_option(help_text: str) -> Option:
@@ -153,19 +190,27 @@ class Shown:
 
     as_json: bool
     quiet: bool
-    verbose: int
+    verbose: bool
 
     @property
     def level(self) -> int:
-        """Both of -q and -v: -1 is quiet, 0 is normal, 1 and above is more."""
-        return -1 if self.quiet else self.verbose
+        """Both of -q and -v: -1 is quiet, 0 is normal, 1 is more."""
+        return -1 if self.quiet else int(self.verbose)
+
+
+def _shown(as_json: bool, quiet: bool | None) -> Shown:
+    return Shown(as_json, quiet is True, quiet is False)
 
 
 output_options = grouped(
     "shown",
-    Shown,
+    _shown,
     json_option,
-    click.option("-q", "--quiet", is_flag=True, help="Print only the place of the result, and errors."),
-    click.option("-v", "--verbose", count=True, help="Print more."),
+    click.option(
+        "-q/-v",
+        "--quiet/--verbose",
+        default=None,
+        help="Print only the place of the result, and errors; or print more than usual.",
+    ),
 )
 """--json, -q and -v; the command takes `shown: Shown`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,21 +13,34 @@ import click
 
 from mocap_cli.options import (
     FiniteRange,
+    RenamedOptions,
     Shown,
-    every_option,
     force_option,
     grouped,
     output_options,
-    provider_option,
+    pictures_option,
     scheduler_option,
-    seed_option,
-    with_provider,
 )
 from mocap_cli.several import each
 from mocap_cli.terminal import print_table, say, say_warnings, watching
 
 if TYPE_CHECKING:
+    from mocap_cli.options import ChosenPictures
     from pipelines.reconstruct import Reconstructed, Settings
+
+GONE = {
+    "--refine-cameras": "--method auto does it",
+    "--pixel-noise": "it is estimated from the keypoints",
+    "--min-confidence": "keypoints below 0.3 are not used",
+    "--trials": 'write --disturb-poses "MODEL x20"',
+    "--seed": 'write --disturb-poses "MODEL seed=3"',
+    "--provider": "write --detector onnx:MODEL.onnx,provider=NAME",
+    "--fill": 'write --smooth "fill:max_s=0.2"',
+    "--every": "write --pictures ::N",
+    "--start": "write --pictures START:END",
+    "--end": "write --pictures START:END",
+    "--overlay": "write `mocap export SESSION --to overlay` or --to overlay:left_knee",
+}
 
 
 class People(click.ParamType["int | str"]):
@@ -43,14 +57,24 @@ class People(click.ParamType["int | str"]):
         return int(value)
 
 
-def _settings(
-    start_s: float | None, end_s: float | None, detector: str, provider: str | None, **others: Any
-) -> Settings:
+def _settings(pictures: ChosenPictures, smooth: str | None, **others: Any) -> Settings:
     from pipelines.reconstruct import Settings
 
-    if start_s is not None and end_s is not None and start_s >= end_s:
-        raise click.BadParameter(f"{end_s:g} is not after --start {start_s:g}", param_hint="--end")
-    return Settings(detector=with_provider(detector, provider), start_s=start_s, end_s=end_s, **others)
+    fill = re.fullmatch(r"\s*fill:max_s=([0-9.eE-]+)\s*(?:\+(.*))?", smooth or "")
+    fill_s = None
+    if fill is not None:
+        try:
+            fill_s, smooth = float(fill[1]), fill[2]
+        except ValueError:
+            raise click.BadParameter(f"{fill[1]!r} is no number", param_hint="--smooth") from None
+    return Settings(
+        every=pictures.every,
+        start_s=pictures.start_s,
+        end_s=pictures.end_s,
+        fill_s=fill_s,
+        smooth=smooth,
+        **others,
+    )
 
 
 _settings_options = grouped(
@@ -83,62 +107,25 @@ _settings_options = grouped(
         " `actors:`, else 1].",
     ),
     click.option(
-        "--min-confidence",
-        type=FiniteRange(0, 1),
-        default=0.3,
-        show_default=True,
-        help="Keypoints below this are not used.",
-    ),
-    click.option(
-        "--pixel-noise",
-        "pixel_sigma",
-        type=FiniteRange(0.01, 10_000),
-        default=3.0,
-        show_default=True,
-        metavar="PX",
-        help="Standard deviation of a good keypoint; raised where views disagree by more.",
-    ),
-    click.option(
         "--pose-noise",
         metavar="MODEL",
-        help="What is known of the camera poses' errors, instead of what flight.yaml says; for example"
+        help="Known errors of the camera poses, instead of those that flight.yaml states; for example"
         ' "white:position_m=0.3,rotation_deg=1 + drift:position_m_per_sqrt_s=0.05".',
     ),
     click.option(
-        "--refine-cameras",
-        type=click.Choice(["background"]),
-        help="Correct the poses of moving cameras by the background of their pictures before triangulation."
-        " auto does it unasked.",
-    ),
-    click.option(
         "--disturb-poses",
-        metavar="MODEL",
-        help="Add such errors to every logged pose, to measure their effect. The methods do not know them;"
-        " --pose-noise states them.",
-    ),
-    click.option(
-        "--trials",
-        type=click.IntRange(1, 1000),
-        default=1,
-        show_default=True,
-        metavar="N",
-        help="Draws of --disturb-poses. metrics.json has the figures of each, their mean, spread and"
-        " interval; the skeleton is that of the first.",
-    ),
-    seed_option("Seed of --disturb-poses."),
-    click.option(
-        "--fill",
-        "fill_s",
-        type=FiniteRange(0, min_open=True),
-        metavar="SECONDS",
-        help="Interpolate a joint across gaps of at most this length; its status there is `filled`. Without"
-        " this, gaps stay open.",
+        metavar='"MODEL [xN] [seed=N]"',
+        help="Add errors to every logged pose, to measure their effect. The methods do not know them;"
+        ' --pose-noise states them. "white:position_m=0.3 x20 seed=3" makes 20 draws: metrics.json has the'
+        " figures of each, their mean, spread and interval; the skeleton is that of the first.",
     ),
     click.option(
         "--smooth",
         metavar="FILTER",
         help='"butterworth:cutoff_hz=6,order=4" (forwards and backwards, no lag) or "rts" (Kalman smoother'
-        ' that weighs covariances; "rts:model=jerk"). Never across gaps.',
+        ' that weighs covariances; "rts:model=jerk"). Never across gaps. "fill:max_s=0.2", alone or before'
+        ' another as in "fill:max_s=0.2 + rts", interpolates a joint across gaps of at most this length; its'
+        " status there is `filled`.",
     ),
     click.option(
         "--detector",
@@ -146,67 +133,15 @@ _settings_options = grouped(
         show_default=True,
         help="Detector for cameras with pictures and without keypoints (see `mocap models`).",
     ),
-    provider_option,
-    every_option,
-    click.option(
-        "--start",
-        "start_s",
-        type=FiniteRange(0, 1e9),
-        metavar="SECONDS",
-        help="First time at which the detector looks at pictures, since the flight's first picture.",
-    ),
-    click.option(
-        "--end",
-        "end_s",
-        type=FiniteRange(0, 1e9),
-        metavar="SECONDS",
-        help="Time from which it looks at no pictures, counted alike.",
-    ),
+    pictures_option,
 )
 
 
-class _Reconstruct(click.Command):
-    """Command whose `--overlay` needs no value, also right before a session."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments, with `skeleton` after a bare --overlay."""
-        end = args.index("--") if "--" in args else len(args)
-        for k in range(end - 1, -1, -1):
-            if args[k] == "--overlay" and (k + 1 == end or not args[k + 1].startswith("angle:")):
-                args = [*args[:k], "--overlay=skeleton", *args[k + 1 :]]
-        return super().parse_args(ctx, args)
-
-
-class Shows(click.ParamType[str]):
-    """Content of an overlay: `skeleton`, or `angle:` and an angle."""
-
-    name = "overlay"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the full name of an angle, or an empty text for the skeleton; or raise a usage error."""
-        from pipelines.overlay import angle_named
-
-        if value in ("", "skeleton"):
-            return ""
-        kind, _, name = str(value).partition(":")
-        try:
-            return angle_named(name if kind == "angle" else str(value))
-        except ValueError as error:
-            self.fail(f"{error}.", param, ctx)
-
-
-@click.command("reconstruct", cls=_Reconstruct, short_help="Detect, triangulate, measure the errors.")
+@click.command(
+    "reconstruct", cls=RenamedOptions, gone=GONE, short_help="Detect, triangulate, measure the errors."
+)
 @each("session", "SESSION")
 @_settings_options
-@click.option(
-    "--overlay",
-    "overlays",
-    type=Shows(),
-    multiple=True,
-    metavar="[angle:NAME]",
-    help="Draw the skeleton over every picture: SESSION/overlay/CAMERA.mp4. angle:left_knee writes that joint"
-    " angle beside it, with its standard deviation; repeat it for several.",
-)
 @click.option(
     "--workers",
     type=click.IntRange(1, 256),
@@ -221,7 +156,6 @@ class Shows(click.ParamType[str]):
 def reconstruct_command(
     session: Path,
     settings: Settings,
-    overlays: tuple[str, ...],
     strict: bool,
     workers: int,
     scheduler: str | None,
@@ -229,14 +163,11 @@ def reconstruct_command(
     shown: Shown,
 ) -> dict[str, Any] | None:
     """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
-    from pipelines.overlay import refuse_overlays, write_overlays
     from pipelines.precompile import precompile_for
     from pipelines.reconstruct import reconstruct
     from pipelines.session.clusters import Cluster, connected
     from pipelines.session.stages import open_session
 
-    if overlays:
-        refuse_overlays(session, force=force)
     open_session(session)  # a wrong session is refused before anything is compiled
     with watching(shown.level) as progress, ExitStack() as stack:
         cluster = Cluster.of(stack.enter_context(connected(scheduler))) if scheduler else None
@@ -250,20 +181,12 @@ def reconstruct_command(
             force=force,
             progress=progress,
         )
-        angles = list(dict.fromkeys(filter(None, overlays)))
-        videos = (
-            write_overlays(session, angles=angles, workers=workers, force=force, progress=progress)
-            if overlays
-            else []
-        )
     say_warnings(result.record.warnings, shown.quiet)
     if shown.as_json:
         return result.metrics
     if not shown.quiet:
-        _print(result, every_joint=shown.verbose > 0)
+        _print(result, every_joint=shown.verbose)
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
-    for video in videos:
-        say(f"written: {video}")
     return None
 
 
@@ -281,7 +204,7 @@ def _print(result: Reconstructed, *, every_joint: bool) -> None:
     _print_summary(metrics)
     if every_joint:
         say()
-        _print_joints(metrics)
+        _print_joints(result)
 
 
 _ERRORS = {
@@ -346,12 +269,19 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return sum(there) / len(there) if there else None
 
 
-def _print_joints(metrics: dict[str, Any]) -> None:
+def _print_joints(result: Reconstructed) -> None:
+    from pipelines.session.tables import JOINT_ERRORS, figures_by_joint, read_table
+
+    metrics = result.metrics
+    per_joint = figures_by_joint(
+        read_table(result.folder / "reconstruct" / "joint_errors.parquet", JOINT_ERRORS)
+    )
+    overall = metrics | {"reprojection_px_median": metrics["reprojection_px"]["median"]}
     has_truth = metrics["mpjpe_mm"] is not None
     header = ["joint", "ok %", "reproj px"] + (["MPJPE mm", "root mm", "PA mm"] if has_truth else [])
     rows = []
-    for name, joint in [*metrics["per_joint"].items(), ("all", metrics)]:
-        row = [name, 100 * joint["reconstructed_share"], joint["reprojection_px"]["median"]]
+    for name, joint in [*per_joint.items(), ("all", overall)]:
+        row = [name, 100 * joint["reconstructed_share"], joint["reprojection_px_median"]]
         if has_truth:
             row += [joint.get("mpjpe_mm"), joint.get("root_mpjpe_mm"), joint.get("pa_mpjpe_mm")]
         rows.append(row)

@@ -106,9 +106,7 @@ class Settings:
     fill_s: float | None = None  # the longest gap that is filled
     smooth: str | None = None  # as `smoothing.smoother` reads it
     refine_cameras: Literal["background"] | None = None  # before the triangulation; `auto` does it unasked
-    disturb_poses: str | None = None  # errors added to the logged poses, in the form of `--pose-noise`
-    trials: int = 1  # draws of these errors
-    seed: int = 0  # of these draws
+    disturb_poses: str | None = None  # errors added to the logged poses, as `PoseDisturbance.parse` reads it
 
     @property
     def asks_background(self) -> bool:

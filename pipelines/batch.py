@@ -53,6 +53,8 @@ class Settings:
     method: Method | Literal["refined", "auto"] = "auto"
     detector: str = "blazepose"
     every: int = 1
+    start_s: float | None = None
+    end_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -219,7 +221,13 @@ def _run(stage: str, job: Job) -> bool:
             return ingest(job.flight, job.session, force=job.force).skipped
         case "reconstruct":
             chosen = job.settings
-            settings = ReconstructSettings(chosen.method, detector=chosen.detector, every=chosen.every)
+            settings = ReconstructSettings(
+                chosen.method,
+                detector=chosen.detector,
+                every=chosen.every,
+                start_s=chosen.start_s,
+                end_s=chosen.end_s,
+            )
             cluster = Cluster.of_task() if job.shared else None
             return reconstruct(
                 job.session, settings, workers=job.threads, cluster=cluster, force=job.force

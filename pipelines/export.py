@@ -5,24 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipelines.formats.common.exporting import thinned
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.reporting.content import estimated_clocks
-from pipelines.reporting.frame_drawing import caption_of, draw_frame
+from pipelines.reporting.frame_drawing import Label, blank_frame, caption_of, draw_frame
 from pipelines.reporting.motion import Motion, motion_from_skeleton
-from pipelines.reporting.overlays import FilmedCamera, read_filmed, refined_poses, status_at, views_of
+from pipelines.reporting.overlays import (
+    FilmedCamera,
+    angles_at,
+    read_filmed,
+    refined_poses,
+    status_at,
+    views_of,
+)
 from pipelines.session.description import Description, Doubt, read_description, said_doubts
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Recording
-from pipelines.session.registries import EXPORTS, ChoiceOfAxes, ChoiceOfTime, Export
+from pipelines.session.registries import ChoiceOfAxes, ChoiceOfTime, Export, find_export
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import open_session, session_name
 from pipelines.session.storage import (
@@ -34,13 +41,19 @@ from pipelines.session.storage import (
     sync,
     write_json,
 )
+from pipelines.session.stores import is_there
 from pipelines.session.tables import ANGLES, FRAMES, POSES, SKELETON, read_motion, read_table, trajectory_from
 from pipelines.session.whole_folders import working_folder
-from pipelines.sources.pictures import open_pictures
+from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PICTURES_HZ = 2.0
 """Default number of pictures of a camera in a recording per second."""
 
+# So many views are reprojected at once: a few MB, however long the flight.
+_FRAMES_AT_ONCE = 300
 _RECORD = "export.json"
 _WORK = ".writing"
 _SCHEMA = 1
@@ -87,7 +100,7 @@ def export(
         BusyError: another process exports to the same folder.
     """
     progress = progress or Silent()
-    exports = [EXPORTS.get(name) for name in dict.fromkeys(name.lower() for name in formats)]
+    exports = [find_export(name) for name in dict.fromkeys(formats)]
     shapes = {format_.name: _shape(format_, unit, axes) for format_ in exports}
     _refuse_idle_choice(shapes, unit, axes)
     zeros = {format_.name: _zero(format_, time) for format_ in exports}
@@ -210,7 +223,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
         for name in description.cameras
     }
-    return Recording(
+    recording = Recording(
         description.flight,
         motion,
         cameras,
@@ -218,7 +231,6 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         lenses={name: camera.intrinsics.intrinsics() for name, camera in description.cameras.items()},
         maps=lambda: each_map(folder) if description.map else iter(()),
         pictures=_pictures(folder, description, record, pictures_hz),
-        overlays=_overlays(folder, description, record, pictures_hz),
         angles=lambda: (
             None if record is None else read_table(folder / "reconstruct" / "angles.parquet", ANGLES)
         ),
@@ -226,6 +238,10 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         zero_ns=description.start_ns,
         people=() if motion is None else tuple(description.names_of_people(motion.position.shape[1])),
     )
+    if record is None:
+        return recording
+    drawn = _Overlays(folder, description, record)
+    return replace(recording, overlays=partial(drawn.stills, rate_hz=pictures_hz), film=drawn.film)
 
 
 def _doubts(folder: Path, description: Description, record: StageRecord | None) -> list[Doubt]:
@@ -255,37 +271,118 @@ def _pictures(folder: Path, description: Description, record: StageRecord | None
     return of
 
 
-def _overlays(folder: Path, description: Description, record: StageRecord | None, rate_hz: float) -> Stills:
-    """Make the function that yields the same pictures with the skeleton drawn over them."""
-    if record is None or not rate_hz:
-        return lambda _: ()
+@dataclass(frozen=True)
+class _Overlays:
+    """Pictures of a session with its skeleton drawn into them."""
 
-    @cache
-    def drawn() -> tuple[Motion, dict[str, FilmedCamera]]:
-        """Load the motion and the cameras when the first picture is requested."""
+    folder: Path
+    description: Description
+    record: StageRecord  # of the reconstruction
+
+    @cached_property
+    def _drawn(self) -> tuple[Motion, dict[str, FilmedCamera]]:
+        """The motion and the cameras, loaded when the first picture is requested."""
         frames = {
-            name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
-            for name, entry in description.cameras.items()
+            name: read_table(self.folder / "cameras" / name / "frames.parquet", FRAMES)
+            for name, entry in self.description.cameras.items()
             if entry.media is not None
         }
-        skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
-        return motion_from_skeleton(skeleton), read_filmed(folder, description, record, frames)
+        skeleton = read_table(self.folder / "reconstruct" / "skeleton.parquet", SKELETON)
+        filmed = read_filmed(self.folder, self.description, self.record, frames)
+        return motion_from_skeleton(skeleton), filmed
 
-    def of(camera: str) -> Iterator[tuple[int, Picture]]:
-        if description.cameras[camera].media is None:
+    def stills(self, camera: str, rate_hz: float) -> Iterator[tuple[int, Picture]]:
+        """Yield the pictures of a camera that can be decoded, at a rate; none at a rate of 0."""
+        if not rate_hz or self.description.cameras[camera].media is None:
             return
-        motion, cameras = drawn()
+        motion, cameras = self._drawn
         filmed = cameras[camera]
         rows = thinned(filmed.frame_t_ns, rate_hz)
         status = status_at(motion, filmed.frame_t_ns[rows])
-        views = views_of(filmed, rows, motion, status, description.start_ns)
+        views = views_of(filmed, rows, motion, status, self.description.start_ns)
         place = {row: k for k, row in enumerate(rows.tolist())}
-        for row, picture in _stills(folder, description, camera, filmed.frame, rows):
+        for row, picture in _stills(self.folder, self.description, camera, filmed.frame, rows):
             view, of_joints = views[place[row]], status[place[row]]
-            caption = caption_of(view, of_joints, str(record.settings["method"]))
+            caption = caption_of(view, of_joints, str(self.record.settings["method"]))
             yield int(filmed.frame_t_ns[row]), draw_frame(picture, view, caption)
 
-    return of
+    def film(
+        self, camera: str, angles: Sequence[str], progress: Progress
+    ) -> tuple[Int64, Iterator[Picture]] | None:
+        """Return the times of all pictures of a camera, and these; None without pictures.
+
+        Pictures that cannot be decoded are grey, with a text. They are counted in a note.
+
+        Raises:
+            DataError: the pictures are not those that were ingested.
+        """
+        media = self.description.cameras[camera].media
+        if media is None:
+            return None
+        if gone := [path for path in media.paths if not is_there(self.folder, path)]:
+            place = (self.folder / gone[0]).resolve()
+            progress.note(f"{camera}: no overlay, its pictures are not there any more ({place})")
+            return None
+        refuse_changed_pictures(self.folder, self.description, [camera])
+        t_ns = self._drawn[1][camera].frame_t_ns
+        return t_ns, self._film(camera, angles, progress)
+
+    def _film(self, camera: str, angles: Sequence[str], progress: Progress) -> Iterator[Picture]:
+        motion, cameras = self._drawn
+        filmed, method = cameras[camera], str(self.record.settings["method"])
+        table = read_table(self.folder / "reconstruct" / "angles.parquet", ANGLES) if angles else None
+        size, undecoded = (filmed.intrinsics.height, filmed.intrinsics.width), 0
+        count = len(filmed.frame)
+        progress.start(f"Drawing {camera}", count)
+        with open_pictures(self.folder, self.description, camera) as source:
+            for first in range(0, count, _FRAMES_AT_ONCE):
+                rows = np.arange(first, min(first + _FRAMES_AT_ONCE, count))
+                t_ns = filmed.frame_t_ns[rows]
+                status = status_at(motion, t_ns)
+                views = views_of(filmed, rows, motion, status, self.description.start_ns)
+                labels = _labels(motion, table, angles, t_ns)
+                for view, of_joints, own in zip(views, status, labels, strict=True):
+                    picture = source.read(view.frame)
+                    if picture is None:
+                        undecoded += 1
+                        picture = blank_frame(size[1], size[0], f"frame {view.frame} cannot be decoded")
+                    size = picture.shape[0], picture.shape[1]
+                    yield draw_frame(picture, view, caption_of(view, of_joints, method), own)
+                    progress.advance()
+        if undecoded:
+            progress.note(f"{camera}: {undecoded} of {count} pictures cannot be decoded and are grey")
+
+
+def _labels(
+    motion: Motion, table: pd.DataFrame | None, angles: Sequence[str], t_ns: Int64
+) -> list[list[Label]]:
+    """Write every angle of every person at [N] times, beside its joint."""
+    if table is None:
+        return [[] for _ in t_ns]
+    values = [angles_at(motion, table, name, t_ns) for name in angles]
+    return [
+        [
+            (person, _joint_of(name), _angle_text(name, *value[k, person].tolist()))
+            for name, value in zip(angles, values, strict=True)
+            for person in range(motion.position.shape[1])
+        ]
+        for k in range(len(t_ns))
+    ]
+
+
+def _joint_of(name: str) -> str:
+    """Return the joint beside which an angle of `ANGLES` is written; of the trunk it is `hip`."""
+    joint = name.rpartition("_")[0]
+    return {"trunk": "hip", "left_forearm": "left_wrist", "right_forearm": "right_wrist"}.get(joint, joint)
+
+
+def _angle_text(name: str, value_deg: float, sigma_deg: float) -> str:
+    """Write an angle in ASCII, which is all that OpenCV's letters have."""
+    words = name.replace("_", " ")
+    if not np.isfinite(value_deg):
+        return f"{words}: undetermined"
+    spread = f" +/- {sigma_deg:.0f}" if np.isfinite(sigma_deg) else ""
+    return f"{words} {round(value_deg)}{spread} deg"  # round: no minus before 0
 
 
 def _stills(

@@ -167,7 +167,7 @@ class Following:
         names = cameras_to_follow(self._description)
         if not names:
             raise DataError(
-                "--refine-cameras",
+                "the backgrounds",
                 "no moving camera has pictures to look at",
                 "state their `video`, or leave it out",
                 code="no-pictures",

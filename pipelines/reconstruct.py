@@ -26,15 +26,14 @@ from pipelines.attempt import (
 )
 from pipelines.detect import detect, hints_from, hints_of
 from pipelines.follow import Following, cameras_to_follow
-from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import STATUS
 from pipelines.keypoints.calibration import measured_for
 from pipelines.reconstruction.loading import common_joints, load_time_base
-from pipelines.reconstruction.results import gait_of
+from pipelines.reconstruction.results import gait_of, write_figures
 from pipelines.reconstruction.segments import divided
 from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import noise_text
-from pipelines.reconstruction.trials import disturbances, disturbed, summary_of_trials
+from pipelines.reconstruction.trials import PoseDisturbance, disturbed, summary_of_trials
 from pipelines.segmented import by_segments, stated_segments
 from pipelines.session.clusters import Cluster
 from pipelines.session.description import Description, Doubt, read_description, said_assumptions, said_doubts
@@ -43,11 +42,11 @@ from pipelines.session.memory import Waiting, return_freed_arrays
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, WritableSession, locked
-from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
+from pipelines.session.storage import jsonable, read_json, sha256_of
 
 __all__ = ["RECONSTRUCT", "Reconstructed", "Settings", "reconstruct"]
 
-RECONSTRUCT = Stage("reconstruct", revision=26)
+RECONSTRUCT = Stage("reconstruct", revision=27)
 _LONGEST_FILL_S = 10.0
 
 
@@ -90,7 +89,7 @@ def reconstruct(
     """
     settings = settings or Settings()
     progress = progress or Silent()
-    errors = disturbances(settings.disturb_poses, settings.trials)
+    disturbance = PoseDisturbance.parse(settings.disturb_poses) if settings.disturb_poses else None
     smoother(settings.smooth)
     _check_fill(settings.fill_s)
     return_freed_arrays()
@@ -110,7 +109,7 @@ def reconstruct(
         measured = measured_for(detected.settings["detector"]) if detected else None
         base, t_ns = load_time_base(folder, description, detected, settings.rate_hz)
         keypoints = len(description.cameras) * len(common_joints(folder, description, detected))
-        segments = divided(t_ns, keypoints) if errors is None else []
+        segments = divided(t_ns, keypoints) if disturbance is None else []
         run = session.begin(
             RECONSTRUCT,
             settings=_stated(settings, detected) | stated_segments(segments),
@@ -126,7 +125,7 @@ def reconstruct(
         if len(segments) > 1:
             outcome = by_segments(run, source, segments, base, workers, cluster, strict, progress)
         else:
-            outcome = _at_once(run.folder, source, errors, workers, strict, progress)
+            outcome = _at_once(run.folder, source, disturbance, workers, strict, progress)
         record = run.publish(
             counts=outcome.counts,
             warnings=[
@@ -143,26 +142,27 @@ def reconstruct(
 def _at_once(
     place: Path,
     source: Source,
-    errors: Sequence[NoiseModel] | None,
+    disturbance: PoseDisturbance | None,
     workers: int,
     strict: bool,
     progress: Progress,
 ) -> Outcome:
     """Reconstruct a flight as a whole, with so many trials of pose errors, and write it into a folder."""
     folder, settings = source.folder, source.settings
-    progress.start("Reconstructing", 1 + 3 * settings.trials)
+    trials = 1 if disturbance is None else disturbance.trials
+    progress.start("Reconstructing", 1 + 3 * trials)
     loaded = source.load(Waiting(place))
     cameras, warnings = loaded.cameras, list(loaded.warnings)
     progress.advance()
     attempts = (
         reconstruct_once(
             loaded.flight,
-            disturbed(cameras, errors, settings.seed, trial) if errors else cameras,
+            disturbed(cameras, disturbance.models, disturbance.seed, trial) if disturbance else cameras,
             settings,
             workers,
             progress,
         )
-        for trial in range(settings.trials)
+        for trial in range(trials)
     )
     stored = next(attempts)
     doubts = source.doubts(loaded, stored)
@@ -170,13 +170,13 @@ def _at_once(
     gait, walks = gait_of(stored.observations, stored.result)
     metrics = stored.metrics | {"gait": walks, "doubts": [doubt.as_json() for doubt in doubts]}
     refuse_doubted(folder, metrics["doubts"], strict=strict)
-    if settings.disturb_poses is not None:
+    if disturbance is not None:
         every = [metrics, *(attempt.metrics for attempt in attempts)]
-        metrics = metrics | {"trials": summary_of_trials(every, settings.disturb_poses, settings.seed)}
-        warnings.append(_disturbance_warning(settings))
+        metrics = metrics | {"trials": summary_of_trials(every, disturbance.text, disturbance.seed)}
+        warnings.append(_disturbance_warning(disturbance))
     metrics = jsonable(metrics)
     write_attempt(place, stored, gait)
-    write_json(place / "metrics.json", metrics)
+    metrics = write_figures(place, metrics)
     warnings += [*stored.warnings, *unused_cameras(cameras, stored.result)]
     return Outcome(metrics, doubts, counts_of(metrics, stored, loaded.swaps), warnings)
 
@@ -208,11 +208,11 @@ def _detected(
         raise DataError(
             session.folder,
             "every camera came with keypoints: no picture is looked at",
-            "leave --start and --end out",
+            "leave the span out of --pictures",
             code="no-pictures",
         )
     if detected is None and settings.every > 1:
-        progress.note("every camera came with keypoints: --every says nothing about them")
+        progress.note("every camera came with keypoints: --pictures says nothing about them")
     return detected
 
 
@@ -247,27 +247,25 @@ def _hint_warnings(
 def _check_fill(fill_s: float | None) -> None:
     if fill_s is not None and not 0 < fill_s <= _LONGEST_FILL_S:
         raise DataError(
-            "--fill",
-            f"{fill_s:g} s is not between 0 and {_LONGEST_FILL_S:g} s",
+            "--smooth",
+            f"max_s: {fill_s:g} s is not between 0 and {_LONGEST_FILL_S:g} s",
             "a longer gap is no measurement: leave it open",
             code="bad-value",
         )
 
 
-def _disturbance_warning(settings: Settings) -> str:
-    draws = "a single draw" if settings.trials == 1 else f"trial 0 of {settings.trials}"
+def _disturbance_warning(disturbance: PoseDisturbance) -> str:
+    draws = "a single draw" if disturbance.trials == 1 else f"trial 0 of {disturbance.trials}"
     return (
-        f"the poses were disturbed by {settings.disturb_poses}: the skeleton and the figures without `trials`"
-        f" are those of {draws} (seed {settings.seed}), not the flight's"
+        f"the poses were disturbed by {disturbance.text}: the skeleton and the figures without `trials`"
+        f" are those of {draws} (seed {disturbance.seed}), not the flight's"
     )
 
 
 def _note_replaced(run: Run, progress: Progress) -> None:
-    """Report the changed settings of a replaced reconstruction, and the stages removed with it."""
+    """Report the changed settings of a replaced reconstruction."""
     for name, (before, now) in run.replaces.items():
         progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
-    for name in run.outdated:
-        progress.note(f"removed {name}/: it showed the reconstruction before")
 
 
 def _following(

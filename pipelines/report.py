@@ -44,6 +44,7 @@ from pipelines.session.tables import (
     CAMERA_POSES,
     COST_MAP,
     FRAMES,
+    JOINT_ERRORS,
     KEYPOINTS,
     POSES,
     REPLAN,
@@ -426,6 +427,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         true_poses=_by_camera(shown, "truth_poses.parquet", records["ingest"]),
         hidden=_load_hidden(folder, description, records, maps),
         angles=_load_angles(shown, records.get("reconstruct")),
+        joint_errors=_load_joint_errors(folder, records.get("reconstruct")),
         made_by=versions_of(folder),
         outdated=tuple(outdated(records, description.recorded)),
     )
@@ -466,6 +468,12 @@ def _load_angles(shown: _Shown, record: StageRecord | None) -> pd.DataFrame | No
     """Read the joint angles; None of a reconstruction without them."""
     name = "reconstruct/angles.parquet"
     return shown.table(name, ANGLES) if record is not None and name in record.outputs else None
+
+
+def _load_joint_errors(folder: Path, record: StageRecord | None) -> pd.DataFrame | None:
+    """Read the figures of single joints; None of a reconstruction without them."""
+    name = "reconstruct/joint_errors.parquet"
+    return read_table(folder / name, JOINT_ERRORS) if record is not None and name in record.outputs else None
 
 
 def _by_camera(shown: _Shown, name: str, record: StageRecord | None) -> dict[str, pd.DataFrame]:

@@ -29,7 +29,7 @@ from pipelines.detect import cameras_to_detect
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.reconstruction.loading import common_joints
 from pipelines.reconstruction.refining import FoundClocks, agreed_clocks, shifted
-from pipelines.reconstruction.results import camera_poses_table, gait_of
+from pipelines.reconstruction.results import camera_poses_table, gait_of, write_figures
 from pipelines.reconstruction.segments import (
     APART_M,
     LENGTH_S,
@@ -264,9 +264,8 @@ def by_segments(
             name: float(np.hypot(sigma, clocks[1])) for name, (_, sigma) in clocks[0].items()
         }
     refuse_doubted(folder, metrics["doubts"], strict=strict)
-    metrics = jsonable(metrics)
     flight.write(run.folder)
-    write_json(run.folder / "metrics.json", metrics)
+    metrics = write_figures(run.folder, jsonable(metrics))
     return Outcome(metrics, doubts, flight.counts, flight.warnings)
 
 

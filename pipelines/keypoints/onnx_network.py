@@ -155,7 +155,7 @@ def _session(path: Path, provider: str, threads: int) -> Any:
     there = {provider_name(full): full for full in runtime.get_available_providers()}
     if provider not in there:
         raise DataError(
-            f"--provider {provider}",
+            f"--detector ...,provider={provider}",
             "is not in this ONNX Runtime",
             f"there are {', '.join(sorted(there))}; other builds of it, such as onnxruntime-gpu, have others",
             code="missing-library",
@@ -170,7 +170,7 @@ def _session(path: Path, provider: str, threads: int) -> Any:
         ) from None
     if session.get_providers()[0] != wanted:
         raise DataError(
-            f"--provider {provider}",
+            f"--detector ...,provider={provider}",
             "could not be started",
             "leave it out: the CPU runs it",
             code="bad-option",

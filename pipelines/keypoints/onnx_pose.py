@@ -47,7 +47,7 @@ skeleton=NAME: which joints [by their number]; of more joints the first are take
 heatmap=udp|msra: how a heatmap model was trained: ViTPose udp, plain HRNet and FastPose msra [udp]
 mean=R/G/B, std=R/G/B, colours=rgb|bgr: what it wants, of values 0..255 [ImageNet's, rgb]
 size=WxH, layout=nchw|nhwc: of its input, where the graph leaves them open
-provider=NAME: ONNX Runtime's execution provider that runs it, such as cuda; --provider says the same [cpu]"""
+provider=NAME: ONNX Runtime's execution provider that runs it, such as cuda [cpu]"""
 
 Three = tuple[float, float, float]
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from pipelines.reconstruction.observations import Camera, Observations
 from pipelines.session.description import Interpolation
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.skeletons import bones_of
+from pipelines.session.storage import write_json
+from pipelines.session.tables import BONES, JOINT_ERRORS, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,7 +82,7 @@ def assess(
     truth: Float | None,
     solve: Callable[[Views], Triangulation],
 ) -> dict[str, Any]:
-    """Compute every figure of metrics.json.
+    """Compute every figure of metrics.json and of the tables of joints and bones.
 
     Args:
         observations: the triangulated observations.
@@ -338,6 +341,53 @@ def _summary(used: Mapping[str, Any], clocks_s: Mapping[str, tuple[float, float]
 
 
 # --- tables --------------------------------------------------------------------------------------------
+
+
+def write_figures(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Write metrics.json, and what it would say of each joint and bone as tables beside it.
+
+    Args:
+        folder: the folder of the stage.
+        figures: those of `assess` and more, JSON-able.
+
+    Returns:
+        The content of metrics.json.
+    """
+    shape, intervals_of = figures["shape"], figures["intervals"]
+    write_table(
+        folder / "joint_errors.parquet",
+        joint_errors_table(figures["per_joint"], intervals_of["per_joint"]),
+        JOINT_ERRORS,
+    )
+    write_table(folder / "bones.parquet", _bones_table(shape["bones"]), BONES)
+    stored = {name: value for name, value in figures.items() if name != "per_joint"}
+    stored["intervals"] = {name: value for name, value in intervals_of.items() if name != "per_joint"}
+    stored["shape"] = {name: value for name, value in shape.items() if name != "bones"}
+    write_json(folder / "metrics.json", stored)
+    return stored
+
+
+def joint_errors_table(
+    per_joint: Mapping[str, Mapping[str, Any]], intervals_of: Mapping[str, Mapping[str, Any]]
+) -> pd.DataFrame:
+    """Build the rows of `tables.JOINT_ERRORS`: one for each joint and figure."""
+    import pandas as pd
+
+    rows = []
+    for joint, figures in per_joint.items():
+        plain = {name: value for name, value in figures.items() if not isinstance(value, Mapping)}
+        plain |= {f"reprojection_px_{kind}": value for kind, value in figures["reprojection_px"].items()}
+        plain |= {f"status_{status}": count for status, count in figures["status_counts"].items()}
+        for name, value in plain.items():
+            low, high = intervals_of.get(joint, {}).get(name) or (None, None)
+            rows.append((joint, name, value, low, high))
+    return pd.DataFrame(rows, columns=JOINT_ERRORS.names)
+
+
+def _bones_table(bones: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    import pandas as pd
+
+    return pd.DataFrame([{"bone": name, **of} for name, of in bones.items()], columns=BONES.names)
 
 
 def skeleton_table(observations: Observations, result: Triangulation) -> pd.DataFrame:

@@ -1,11 +1,12 @@
-"""Trials: repeated reconstructions with extra pose errors, their draws and their summary.
+"""Trials: repeated reconstructions with added pose errors, their draws and their summary.
 
 The random draws of trial k and camera i do not depend on other options, so that two noise models, or two
 methods, are compared on the same draws.
 """
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,9 @@ from pipelines.session.registries import parsed_noise_models
 
 STORED = 0
 """Number of the trial with the stored skeleton."""
+
+# More trials would take days and change no interval.
+MAX_TRIALS = 1000
 
 _FIGURES = (
     "mpjpe_mm",
@@ -33,29 +37,41 @@ _FIGURES = (
 )
 
 
-def disturbances(text: str | None, trials: int) -> list[NoiseModel] | None:
-    """Parse the requested pose errors; None for none.
+_DRAWS = re.compile(r"(?P<text>.*?)(\s+x(?P<trials>[0-9]+))?(\s+seed=(?P<seed>[0-9]+))?\s*", re.DOTALL)
 
-    Raises:
-        DataError: they cannot be parsed, all sizes are 0, or the number of trials does not fit.
-    """
-    place = "--disturb-poses"
-    if text is None:
-        if trials != 1:
+
+@dataclass(frozen=True)
+class PoseDisturbance:
+    """Errors that are added to the logged poses in several trials."""
+
+    text: str  # the noise models, as users write them
+    models: list[NoiseModel]
+    trials: int
+    seed: int
+
+    @classmethod
+    def parse(cls, text: str) -> "PoseDisturbance":
+        """Parse `MODELS [xTRIALS] [seed=SEED]`; without them there is one trial, and the seed is 0.
+
+        Raises:
+            DataError: it cannot be parsed, all sizes are 0, or there are no trials or too many.
+        """
+        place = "--disturb-poses"
+        found = _DRAWS.fullmatch(text)
+        words = {} if found is None else found.groupdict()
+        models = parsed_noise_models(place, words["text"])
+        one = np.ones(1)  # any elapsed time, speed and turn rate
+        if not sum_sigma(models, one, one, one).any():
             raise DataError(
-                "--trials",
-                "are draws of --disturb-poses, which is not there",
-                "state it too",
-                code="bad-option",
+                place, f"{text!r} disturbs nothing", "state at least one size above 0", code="bad-value"
             )
-        return None
-    models = parsed_noise_models(place, text)
-    one = np.ones(1)  # any elapsed time, speed and turn rate
-    if not sum_sigma(models, one, one, one).any():
-        raise DataError(place, f"{text!r} disturbs nothing", "state at least one size above 0")
-    if trials < 1:
-        raise DataError("--trials", f"{trials} is no number of trials", "state 1 or more", code="bad-option")
-    return models
+        trials, seed = int(words["trials"] or 1), int(words["seed"] or 0)
+        if not 1 <= trials <= MAX_TRIALS or seed >= 2**32:
+            problem = f"x{trials} seed={seed} is out of range"
+            raise DataError(
+                place, problem, f"state x1 to x{MAX_TRIALS}, and a seed below 2^32", code="bad-value"
+            )
+        return cls(words["text"], models, trials, seed)
 
 
 def disturbed(cameras: Sequence[Camera], models: Sequence[NoiseModel], seed: int, trial: int) -> list[Camera]:

@@ -56,6 +56,7 @@ class SessionContent:
     made_by: dict[str, dict[str, str]] = field(default_factory=dict)  # stage: program or library, and version
     outdated: tuple[str, ...] = ()  # stages whose inputs have changed since
     angles: pd.DataFrame | None = None  # tables.ANGLES, where the reconstruction has them
+    joint_errors: pd.DataFrame | None = None  # tables.JOINT_ERRORS, likewise
     studies: tuple[StudyContent, ...] = ()  # that stand beside the flight
     every: int = 1  # times of the skeleton of which one was loaded, with what was recorded about it
 

@@ -100,12 +100,6 @@ def caption_of(view: View, status: NDArray[np.int8], method: str) -> tuple[str, 
     return f"{view.camera}   frame {view.frame}   {view.t_s:.3f} s", f"{method}: {', '.join(words)}"
 
 
-def padded_to_even(picture: Picture) -> Picture:
-    """Repeat the last column and row of a picture where their number is odd, as 4:2:0 needs it."""
-    height, width = picture.shape[:2]
-    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
 # --- marks ---------------------------------------------------------------------------------------------
 
 

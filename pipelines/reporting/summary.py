@@ -24,7 +24,7 @@ from pipelines.reporting.wording import ABSENT, THIN, fixed, percent, quantity, 
 from pipelines.session.camera_poses import logged_covariance
 from pipelines.session.description import CameraEntry, ClockEntry, Description
 from pipelines.session.people import true_joints_at
-from pipelines.session.tables import motion_from, trajectory_from
+from pipelines.session.tables import figures_by_joint, motion_from, trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -149,7 +149,7 @@ def summarise(content: SessionContent) -> Summary:
         share=counts.get("ok", 0) / total if total else None,
         counts=counts,
         inside_95=share_inside_95(motion, truth) if motion is not None and truth is not None else None,
-        joints=tuple(_joint_rows(motion, error, metrics)) if motion is not None else (),
+        joints=tuple(_joint_rows(motion, error, content.joint_errors)) if motion is not None else (),
         bones=tuple(watched_bones(motion)) if motion is not None else (),
         metrics=metrics,
     )
@@ -198,25 +198,25 @@ def _camera_row(name: str, entry: CameraEntry, origin_ns: int) -> CameraRow:
     )
 
 
-def _joint_rows(motion: Motion, error: Float | None, metrics: dict[str, object]) -> list[JointRow]:
-    per_joint = section(metrics, "per_joint")
+def _joint_rows(motion: Motion, error: Float | None, stored: pd.DataFrame | None) -> list[JointRow]:
+    per_joint = {} if stored is None else figures_by_joint(stored)
     sigma = 1000 * motion.sigma_m
     rows = []
     for j, name in enumerate(motion.joints):
-        stated = section(per_joint, name)
+        stated = per_joint.get(name, {})
         status = motion.status[..., j]
         measured = motion.measured[..., j]
         counted = np.bincount(status[status >= 0], minlength=len(STATUS))
         computed = _mean(error[..., j]) if error is not None else None
-        mpjpe = number(stated, "mpjpe_mm")
-        reprojection = number(section(stated, "reprojection_px"), "median")
+        mpjpe = stated.get("mpjpe_mm")
+        reprojection = stated.get("reprojection_px_median")
         seen = finite_median(motion.reprojection_px[..., j][measured])
         rows.append(
             JointRow(
                 name=name,
                 share=float(measured.sum() / max(counted.sum(), 1)),
                 mpjpe_mm=computed if mpjpe is None else mpjpe,
-                root_mpjpe_mm=number(stated, "root_mpjpe_mm"),
+                root_mpjpe_mm=stated.get("root_mpjpe_mm"),
                 reprojection_px=seen if reprojection is None else reprojection,
                 sigma_mm=finite_median(sigma[..., j][measured]),
                 counts={word: int(n) for word, n in zip(STATUS, counted, strict=True)},

@@ -6,7 +6,7 @@ quaternions xyzw, transforms named target_from_source, missing is NaN and never 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -125,6 +125,10 @@ class Recording:
     """Pictures of a camera in order, at the rate that was asked for: world time, [height, width, 3] BGR."""
     overlays: Callable[[str], Iterable[tuple[int, NDArray[np.uint8]]]] = field(default=lambda _: ())
     """The same pictures with the skeleton drawn into them."""
+    film: Callable[[str, Sequence[str], Progress], tuple[Int64, Iterator[NDArray[np.uint8]]] | None] = field(
+        default=lambda *_: None
+    )
+    """World times of all pictures of a camera, and these with skeleton and named angles; None without any."""
     angles: Callable[[], pd.DataFrame | None] = field(default=lambda: None)
     """Rows of `tables.ANGLES`, sorted by time, then person; None without a reconstruction."""
     doubts: Callable[[], Sequence[str]] = tuple

@@ -274,6 +274,14 @@ class Export(Protocol):
 
 
 @runtime_checkable
+class ExportFamily(Export, Protocol):
+    """An export with an argument after a colon: `--to NAME:ARGUMENT`."""
+
+    def configured(self, argument: str) -> Export:
+        """Return the export for an argument. A DataError says what is wrong with the argument."""
+
+
+@runtime_checkable
 class ChoiceOfAxes(Export, Protocol):
     """An export that obeys `recording.unit` and `recording.axes`; others write metres with z up."""
 
@@ -354,6 +362,21 @@ def find_detector(text: str) -> Detector:
     if colon:
         raise DataError(text, f"{name} takes nothing behind its name", f"write {name}")
     return found
+
+
+def find_export(text: str) -> Export:
+    """Find the export of a user's text: a registered name, for some with a colon and an argument.
+
+    Raises:
+        DataError: no such name, an argument where none is taken, or a bad one.
+    """
+    name, colon, argument = text.partition(":")
+    found = EXPORTS.get(name.lower())
+    if not colon:
+        return found
+    if not isinstance(found, ExportFamily):
+        raise DataError(text, f"{name} takes nothing behind its name", f"write {name}")
+    return found.configured(argument)
 
 
 def find_models(text: str) -> FetchesModels:

@@ -59,9 +59,6 @@ _AT_ROOT = {
 }
 """Names that a stage publishes beside its own folder instead of inside it; only that stage writes them."""
 
-_SHOWN_BY = {"reconstruct": ("overlay",)}
-"""Stages that only show another stage's result; they are removed when that result is replaced."""
-
 _LOCK = ".lock"
 _LEFT_BY_KILLED_INGEST = {".lock", ".lock.pid", ".partial", "ingest.new", "run.json", "run.json.new"}
 
@@ -171,7 +168,6 @@ class Run:
         finished: True if nothing is to be done; `record` then describes the existing result.
         replaces: settings that differ from those of the stage's earlier run: name to (before, now). A setting
             that was or is absent is None.
-        outdated: stages that showed the replaced result and were removed with it.
     """
 
     def __init__(
@@ -201,7 +197,6 @@ class Run:
             for name in names
             if old.get(name) != self._settings.get(name)
         }
-        self.outdated: list[str] = []
 
     @property
     def record(self) -> StageRecord:
@@ -248,7 +243,6 @@ class Run:
         self._stopwatch.note(self._session, self._stage.name)
         write_json(self.folder / "stage.json", {"schema": SCHEMA, **asdict(self._record)})
         sync(self._session)
-        self.outdated = _outdated(self._session, self._record)
         _roll_forward(self._session, self._stage.name)
         return self._record
 
@@ -439,25 +433,12 @@ def _roll_forward(folder: Path, stage: str) -> None:
         if not is_in_place:
             _move(folder / entry, old / entry)
             _move(new / entry, folder / entry)
-    for shown in _outdated(folder, record):
-        _move(folder / shown, old / shown)
     for changed in (old, new, folder):  # else the last rename might reach the disk before the others
         sync(changed)
     _move(folder / stage, old / stage)
     new.rename(folder / stage)
     sync(folder)
     remove_tree(old)
-
-
-def _outdated(folder: Path, record: StageRecord) -> list[str]:
-    """List the stages that show a result other than this one; those of a later version are left alone."""
-    gone = []
-    for name in _SHOWN_BY.get(record.stage, ()):
-        with suppress(NewerSchemaError):
-            shown = usable_record(folder / name / "stage.json")
-            if shown is not None and shown.inputs.get(record.stage) != record.key:
-                gone.append(name)
-    return gone
 
 
 def _settle_old(folder: Path, stage: str) -> None:

@@ -7,6 +7,7 @@ found has no row, and is read back as NaN.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -85,6 +86,16 @@ GAIT = pa.schema(
     ]
 )
 """reconstruct/gait.parquet: heel strikes and toe-offs of people who walk, with the place of heel or toe."""
+
+JOINT_ERRORS = pa.schema(
+    [_JOINT, ("figure", pa.string()), *((name, pa.float64()) for name in ("value", "low", "high"))]
+)
+"""reconstruct/joint_errors.parquet: each figure of metrics.json for a single joint, and its 95 % interval."""
+
+BONES = pa.schema(
+    [("bone", pa.string()), ("median_mm", pa.float64()), ("spread_mm", pa.float64()), ("frames", pa.int64())]
+)
+"""reconstruct/bones.parquet: the reconstructed length of each bone and its spread over the flight."""
 
 _SLOT = ("formation_yaw_rad", "slot_yaw_rad", "slot_tilt_rad", "slot_range_m", "tilt_rad")
 REPLAN = pa.schema(
@@ -176,6 +187,15 @@ def read_table(path: Path, schema: pa.Schema, span_ns: Span | None = None) -> pd
     except (OSError, pa.ArrowException) as error:
         raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
     return _frame_of(path, table, schema)
+
+
+def figures_by_joint(table: pd.DataFrame) -> dict[str, dict[str, float | None]]:
+    """Return the values of a table of `JOINT_ERRORS` by joint and figure; None where nothing was measured."""
+    return {
+        str(joint): {name: None if math.isnan(value) else value for name, value in rows}
+        for joint, own in table.groupby("joint", sort=False)
+        for rows in [zip(own["figure"], own["value"], strict=True)]
+    }
 
 
 def read_first(path: Path, schema: pa.Schema) -> pd.DataFrame:

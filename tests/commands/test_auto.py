@@ -94,7 +94,7 @@ def test_backgrounds_and_ground_of_the_sample_flight_take_part(tmp_path: Path) -
     fetch_networks("blazepose")
     session = tmp_path / "sample.session"
     succeeds("ingest", SAMPLE / "flight.yaml", "-o", session)
-    span = ("--start", "6", "--end", "10", "--workers", "2")
+    span = ("--pictures", "6:10", "--workers", "2")
     unasked, _ = reconstructed(session, *span)
     used = unasked["method_used"]
     assert used["background"]["cameras"] == ["drone1", "drone2"]

@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pipelines.overlay
+import pipelines.export
 import pipelines.reporting.overlays
+from pipelines.export import export
 from pipelines.ingest import ingest
 from pipelines.keypoints.calibration import Calibration, write_calibration
-from pipelines.overlay import write_overlays
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.report import report
 from pipelines.reporting.overlays import FilmedCamera, views_of
+from pipelines.session.tables import JOINT_ERRORS, figures_by_joint, read_table
 from tests.keypoints.spotted_flights import CAMERAS, spot_detector, write_spotted_flight
 
 
@@ -29,9 +30,10 @@ def test_keypoints_of_little_worth_are_used_and_drawn(
         monkeypatch.setattr(f"{place}.measured_for", lambda _: measured)
     session = tmp_path / "flight.session"
     ingest(write_spotted_flight(tmp_path, 6), session)
-    made = reconstruct(session, Settings(detector=spot_detector(tmp_path)))
-    assert made.metrics["per_joint"]["left_wrist"]["reconstructed_share"] == 1
-    assert made.metrics["per_joint"]["left_elbow"]["reconstructed_share"] == 1
+    reconstruct(session, Settings(detector=spot_detector(tmp_path)))
+    stored = read_table(session / "reconstruct" / "joint_errors.parquet", JOINT_ERRORS)
+    for joint in ("left_wrist", "left_elbow"):
+        assert figures_by_joint(stored)[joint]["reconstructed_share"] == 1
 
     drawn: list[FilmedCamera] = []
 
@@ -39,11 +41,11 @@ def test_keypoints_of_little_worth_are_used_and_drawn(
         drawn.append(camera)
         return views_of(camera, *others)  # type: ignore[arg-type]
 
-    for module in (pipelines.overlay, pipelines.reporting.overlays):
+    for module in (pipelines.export, pipelines.reporting.overlays):
         monkeypatch.setattr(module, "views_of", watched)
         drawn.clear()
-        if module is pipelines.overlay:
-            write_overlays(session)
+        if module is pipelines.export:
+            export(session, ["overlay"])
         else:
             report(session)
         assert {camera.name for camera in drawn} == set(CAMERAS)

@@ -202,8 +202,8 @@ def exchange(session: Path) -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        ("reconstruct", "--overlay"),
-        ("reconstruct", "--refine-cameras", "background"),
+        ("export", "--to", "overlay", "-o", "exported"),
+        ("reconstruct",),
         ("report",),
         ("report", "--force", "--figures", "figures"),
         ("export", "--to", "mcap", "-o", "exported"),
@@ -287,7 +287,7 @@ def test_a_changed_table_of_ingest_is_refused_by_all_until_ingest_makes_it_anew(
     for command in (
         ("reconstruct",),
         ("reconstruct", "--force"),
-        ("reconstruct", "--method", "dlt", "--overlay"),
+        ("reconstruct", "--method", "dlt"),
         ("replan-compare",),
         ("report",),
         ("export", "--to", "tum", "-o", tmp_path / "exported"),

@@ -53,7 +53,7 @@ def flight(tmp_path: Path) -> Path:
 def test_detector_and_triangulation_agree_with_the_peers_skeleton(flight: Path) -> None:
     session = flight.with_suffix(".session")
     result: dict[str, Any] = json.loads(
-        succeeds("reconstruct", session, "--method", "robust", "--every", str(EVERY), "--json")
+        succeeds("reconstruct", session, "--method", "robust", "--pictures", f"::{EVERY}", "--json")
     )
     assert result["reconstructed_share"] > 0.95
     peer = TRC.read_joints(real_data("pose2sim_single/pose-3d/single_0-99.trc"), unit=None, axes=None)
@@ -65,8 +65,10 @@ def test_detector_and_triangulation_agree_with_the_peers_skeleton(flight: Path) 
 
     # Not the detector's again: its keypoints are kept while pictures and settings are the same.
     (flight.parent / "videos" / "cam01.mp4").unlink()
-    succeeds("reconstruct", session, "--every", str(EVERY), "--method", "dlt")
-    assert "cam01.mp4" in refused("reconstruct", session, "--method", "robust", "--every", str(2 * EVERY))
+    succeeds("reconstruct", session, "--pictures", f"::{EVERY}", "--method", "dlt")
+    assert "cam01.mp4" in refused(
+        "reconstruct", session, "--method", "robust", "--pictures", f"::{2 * EVERY}"
+    )
 
 
 @pytest.mark.slow
@@ -76,7 +78,15 @@ def test_keypoints_do_not_depend_on_workers(flight: Path) -> None:
     for workers in ("1", "2"):
         shutil.rmtree(session / "detect", ignore_errors=True)
         succeeds(
-            "reconstruct", session, "--method", "robust", "--every", "50", "--workers", workers, "--force"
+            "reconstruct",
+            session,
+            "--method",
+            "robust",
+            "--pictures",
+            "::50",
+            "--workers",
+            workers,
+            "--force",
         )
         results.append(content(session))
     assert results[0] == results[1]

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from mocap_cli.main import Mocap
-from mocap_cli.reconstruct import reconstruct_command
+from mocap_cli.reconstruct import GONE, reconstruct_command
 from tests.commands.runner import succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import write_logged_flight
@@ -56,7 +56,7 @@ def stage(session: Path) -> dict[str, Any]:
 def test_disturbed_poses_err_as_their_model_says(clean: tuple[SyntheticFlight, Path]) -> None:
     flight, session = clean
     model = "bias:position_m=0.1"
-    metrics = run(session, "--disturb-poses", model, "--trials", "4", "--seed", "3")
+    metrics = run(session, "--disturb-poses", f"{model} x4 seed=3")
     trials = metrics["trials"]
     assert trials["count"] == len(trials["each"]) == 4
     assert trials["disturb_poses"] == model
@@ -76,12 +76,11 @@ def test_disturbed_poses_err_as_their_model_says(clean: tuple[SyntheticFlight, P
     distance = np.linalg.norm(points - flight.position, axis=-1)
     assert np.nanmean(distance) * 1e3 == pytest.approx(metrics["mpjpe_mm"], rel=1e-6)
     record = stage(session)
-    assert record["settings"]["disturb_poses"] == model
-    assert record["settings"]["trials"] == 4
-    assert any("trial 0 of 4" in warning for warning in record["warnings"])
+    assert record["settings"]["disturb_poses"] == f"{model} x4 seed=3"
+    assert any(model in warning for warning in record["warnings"])
     # The same again is the same; another seed is not.
-    assert run(session, "--disturb-poses", model, "--trials", "4", "--seed", "3") == metrics
-    other = run(session, "--disturb-poses", model, "--trials", "2", "--seed", "4")
+    assert run(session, "--disturb-poses", f"{model} x4 seed=3") == metrics
+    other = run(session, "--disturb-poses", f"{model} x2 seed=4")
     assert other["trials"]["each"] != trials["each"][:2]
 
 
@@ -121,7 +120,7 @@ def test_gaps_stay_open_until_somebody_asks(clean: tuple[SyntheticFlight, Path])
     assert open_gap["status_counts"]["few_views"] == 4
     assert open_gap["filled"] is None
     assert stage(session)["counts"]["filled"] is None
-    closed = run(session, "--fill", "0.2")
+    closed = run(session, "--smooth", "fill:max_s=0.2")
     assert closed["status_counts"] == {
         "all": open_gap["status_counts"]["all"],
         "ok": open_gap["status_counts"]["ok"],
@@ -226,17 +225,33 @@ def test_intervals_are_about_their_figures(clean: tuple[SyntheticFlight, Path]) 
     ):
         low, high = intervals[name]
         assert low <= metrics[name] <= high
-    low, high = intervals["per_joint"]["nose"]["mpjpe_mm"]
-    assert low < metrics["per_joint"]["nose"]["mpjpe_mm"] < high
+    stored = pd.read_parquet(session / "reconstruct" / "joint_errors.parquet")
+    nose = stored[(stored["joint"] == "nose") & (stored["figure"] == "mpjpe_mm")]
+    assert (nose["low"] < nose["value"]).all()
+    assert (nose["value"] < nose["high"]).tolist() == [True]
+    bones = pd.read_parquet(session / "reconstruct" / "bones.parquet")
+    assert bones["median_mm"].between(50, 600).all()
+
+
+@pytest.mark.parametrize("gone", list(GONE))
+def test_an_option_that_went_names_what_replaces_it(tmp_path: Path, gone: str) -> None:
+    done = command(tmp_path, gone)
+    assert done.exit_code == 2
+    assert gone in done.stderr
+    assert GONE[gone] in done.stderr
+
+
+@pytest.mark.parametrize("text", ["5", "2:1", "a:b", "::0", "-1:", "1:2:3:4", "nan:"])
+def test_pictures_that_are_no_span_are_a_usage_error(tmp_path: Path, text: str) -> None:
+    assert command(tmp_path, "--pictures", text).exit_code == 2
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--trials", "3"), "--trials"),
         (("--disturb-poses", "white"), "--disturb-poses"),
         (("--disturb-poses", "white:position_m=0"), "disturbs nothing"),
-        (("--fill", "60"), "--fill"),
+        (("--smooth", "fill:max_s=60"), "--smooth"),
         (("--smooth", "kalman:q=1"), "no such filter"),
         (("--smooth", "butterworth:cutoff_hz=15"), "half the skeleton's rate"),
     ],

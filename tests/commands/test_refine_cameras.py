@@ -1,8 +1,7 @@
-"""`--refine-cameras background`: on the rendered pictures of the sample flight, and without pictures."""
+"""Poses corrected by the background: on the rendered pictures of the sample flight."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import cv2
@@ -25,20 +24,11 @@ from pipelines.reconstruction.background_adjustment import Background, PosePrior
 from pipelines.reconstruction.background_tracks import follow, off_people
 from pipelines.session.description import read_description
 from pipelines.session.registries import noise_models
-from tests.commands.runner import refused, succeeds
-from tests.synthetic.flights import write_flight
+from tests.commands.runner import succeeds
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
 PERSON = np.array([[440.0, 140.0, 840.0, 580.0]])  # the cameras aim at the person, who is in the middle
 SPAN_S = (6.0, 10.0)
-
-
-def test_without_pictures_it_is_refused_in_a_line(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, seconds=0.5)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    line = refused("reconstruct", session, "--method", "robust", "--refine-cameras", "background")
-    assert re.search(r"--refine-cameras\b.*`video`", line)
 
 
 @pytest.mark.slow

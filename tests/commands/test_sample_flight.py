@@ -28,7 +28,7 @@ def test_the_detector_and_true_poses_give_the_skeleton(
     tmp_path: Path, detector: str, most_mm: float, advised: int
 ) -> None:
     """Allow 45 or 36 mm at 95 %: half of it is the detector's different definition of hips and shoulders."""
-    session, said = reconstructed(tmp_path, detector, "--every", "6")
+    session, said = reconstructed(tmp_path, detector, "--pictures", "::6")
     metrics: dict[str, Any] = read_json(session / "reconstruct" / "metrics.json")
     assert metrics["mpjpe_mm"] < most_mm
     assert metrics["reconstructed_share"] > 0.95
@@ -51,7 +51,7 @@ def test_no_leg_is_taken_for_the_other(tmp_path: Path) -> None:
 
     A foot is then 0.3 to 0.6 m from truth; the detector's other errors are smaller.
     """
-    session, _ = reconstructed(tmp_path, "blazepose", "--end", "3.6")
+    session, _ = reconstructed(tmp_path, "blazepose", "--pictures", ":3.6")
     skeleton = motion_from(read_table(session / "reconstruct" / "skeleton.parquet", SKELETON), LEGS)
     truth = motion_from(read_table(session / "truth.parquet", TRUTH), LEGS)
     assert skeleton.status is not None

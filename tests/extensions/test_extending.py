@@ -101,7 +101,7 @@ def test_a_format_is_read(outside: Path, session: Path) -> None:
 
 def test_a_detector_and_a_noise_model_are_used_and_an_export_written(outside: Path, session: Path) -> None:
     noise = "sway:position_m=0.1,period_s=4"
-    options = ("--detector", "still", "--every", "30", "--pose-noise", noise, "-q", "--method", "robust")
+    options = ("--detector", "still", "--pictures", "::30", "--pose-noise", noise, "-q", "--method", "robust")
     _mocap(outside, "reconstruct", session, *options)
     found = pd.read_parquet(session / "detect" / "drone1" / "keypoints.parquet")
     assert sorted(found["joint"].unique()) == ["left_hip", "right_hip"]

@@ -76,10 +76,9 @@ def commands_on(folder: Path) -> dict[str, Command]:
     exported, simulated, studied = (folder / name for name in ("exported", "simulated", "studied"))
     detected, batched = folder / "detected.session", folder / "batched"
     detection = ("--detector", detector, "--workers", "1")
-    background = ("--method", "robust", "--refine-cameras", "background")  # most of it is detection
     return {
         "ingest": Command(["ingest", manifest, "-o", ingested], ingested),
-        "detect": Command(["reconstruct", detected, *background, *detection], detected, before=ingested),
+        "detect": Command(["reconstruct", detected, *detection], detected, before=ingested),
         "reconstruct": Command(["reconstruct", reconstructed, *detection], reconstructed, before=ingested),
         "replan-compare": Command(["replan-compare", replanned], replanned, before=reconstructed),
         "report": Command(["report", reported], reported, before=replanned),

@@ -550,7 +550,7 @@ def _detect(name: str, place: Path) -> Case:
     """Detection in blocks, which are kept in `.partial`."""
     session = place / "flown.session"
     succeeds("ingest", write_spotted_flight(place, 20), "-o", session)
-    options = ("--method", "robust", "--refine-cameras", "background", "--detector", spot_detector(place))
+    options = ("--detector", spot_detector(place))
     made = _of_session(name, session, ["reconstruct", session, *options, "--workers", "1"])
     return replace(made, whole=False)
 

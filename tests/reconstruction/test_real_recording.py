@@ -110,7 +110,7 @@ def test_videos_alone_come_near_the_peers_skeleton(tmp_path: Path) -> None:
     fetch_networks("blazepose-heavy")
     manifest, session = manifest_of(tmp_path), tmp_path / "videos.session"
     succeeds("ingest", manifest, "-o", session)
-    options = ("--detector", "blazepose-heavy", "--every", "5")
+    options = ("--detector", "blazepose-heavy", "--pictures", "::5")
     metrics: dict[str, Any] = json.loads(succeeds("reconstruct", session, "--json", *options))
     assert metrics["reconstructed_share"] > 0.98
     apart_mm = distance_to_peer_mm(pd.read_parquet(session / "reconstruct" / "skeleton.parquet"), every=5)

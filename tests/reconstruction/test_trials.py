@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.reconstruction.observations import Camera
-from pipelines.reconstruction.trials import disturbances, disturbed, summary_of_trials
+from pipelines.reconstruction.trials import PoseDisturbance, disturbed, summary_of_trials
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections, Trajectory
 
@@ -32,9 +32,7 @@ def camera(name: str) -> Camera:
 
 def moved(models: str, *, seed: int = 0, trial: int = 0, count: int = 2) -> Any:
     cameras = [camera(f"drone{k}") for k in range(count)]
-    errors = disturbances(models, 1)
-    assert errors is not None
-    after = disturbed(cameras, errors, seed, trial)
+    after = disturbed(cameras, PoseDisturbance.parse(models).models, seed, trial)
     assert all((a.sigma == b.sigma).all() for a, b in zip(after, cameras, strict=True) if a.sigma is not None)
     return np.stack([each.trajectory.position for each in after])
 
@@ -51,19 +49,30 @@ def test_each_camera_and_trial_has_its_own_chance_whatever_else_is_asked() -> No
 
 
 @pytest.mark.parametrize(
-    ("text", "trials", "said"),
+    ("text", "models", "trials", "seed"),
     [
-        (None, 5, "--trials: are draws of --disturb-poses"),
-        ("loud", 1, "does not read"),
-        ("pink:position_m=1", 1, "pink is none of"),
-        ("white:position_m=-1", 1, "position_m is -1"),
-        ("white:position_m=0 + bias:rotation_deg=0", 3, "disturbs nothing"),
-        ("white:position_m=1", 0, "0 is no number of trials"),
+        ("white:position_m=0.3", 1, 1, 0),
+        ("white:position_m=0.3,rotation_deg=1 + bias:position_m=1e+0 x20 seed=3", 2, 20, 3),
+        ("drift:position_m_per_sqrt_s=0.1 seed=7", 1, 1, 7),
+        ("white:position_m=0.3   x4 ", 1, 4, 0),
     ],
 )
-def test_nonsense_is_refused_in_a_line(text: str | None, trials: int, said: str) -> None:
-    with pytest.raises(DataError, match=said) as refused:
-        disturbances(text, trials)
+def test_trials_and_seed_stand_behind_the_models(text: str, models: int, trials: int, seed: int) -> None:
+    parsed = PoseDisturbance.parse(text)
+    assert (len(parsed.models), parsed.trials, parsed.seed) == (models, trials, seed)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("loud", "pink:position_m=1", "white:position_m=-1", "x5", "white:position_m=1 x0"),
+        *("white:position_m=0 + bias:rotation_deg=0", "white:position_m=1 x5000", "white:position_m=1 5"),
+    ],
+)
+def test_nonsense_is_refused_in_a_line(text: str) -> None:
+    with pytest.raises(DataError) as refused:
+        PoseDisturbance.parse(text)
+    assert refused.value.source == "--disturb-poses"
     assert "\n" not in str(refused.value)
 
 

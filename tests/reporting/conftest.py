@@ -249,8 +249,13 @@ def make_metrics() -> dict[str, object]:
         "pck150": 0.84,
         "reprojection_px": {"median": 4.41, "mean": 4.27},
         "reconstructed_share": float(np.mean(statuses(FRAMES) == "ok")),
-        "per_joint": {joint: {"mpjpe_mm": mpjpe, "root_mpjpe_mm": 0.0} for joint in JOINTS},
     }
+
+
+def make_joint_errors() -> pd.DataFrame:
+    mpjpe = float(np.linalg.norm(OFFSET_M) * 1000)
+    rows = [(joint, *of) for joint in JOINTS for of in (("mpjpe_mm", mpjpe), ("root_mpjpe_mm", 0.0))]
+    return pd.DataFrame(rows, columns=["joint", "figure", "value"]).assign(low=np.nan, high=np.nan)
 
 
 STAGES: dict[str, dict[str, object]] = {
@@ -281,6 +286,7 @@ def content() -> SessionContent:
         frames=make_frames(),
         keypoints=make_keypoints(),
         stages=STAGES,
+        joint_errors=make_joint_errors(),
     )
 
 

@@ -21,7 +21,6 @@ from pipelines.reporting.frame_drawing import (
     blank_frame,
     caption_of,
     draw_frame,
-    padded_to_even,
 )
 from pipelines.reporting.overlays import View
 
@@ -167,16 +166,6 @@ def test_what_a_caption_says(view: View) -> None:
     _, said = caption_of(replace(view, has_pose=False), nothing, "refined")
     missing = said.removeprefix("refined: ").split(", ")
     assert [word in part for word, part in zip(("skeleton", "pose"), missing, strict=True)] == [True, True]
-
-
-@given(st.integers(1, 9), st.integers(1, 9))
-def test_padding_repeats_the_last_row_and_column(height: int, width: int) -> None:
-    picture = np.arange(height * width * 3, dtype=np.uint8).reshape(height, width, 3)
-    padded = padded_to_even(picture)
-    assert padded.shape == (height + height % 2, width + width % 2, 3)
-    assert (padded[:height, :width] == picture).all()
-    assert (padded[-1, :width] == picture[-1]).all()
-    assert (padded[:height, -1] == picture[:, -1]).all()
 
 
 def test_ellipses_hold_95_percent(view: View) -> None:

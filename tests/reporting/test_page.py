@@ -153,9 +153,8 @@ def test_page_without_truth(content: SessionContent) -> None:
     metrics: dict[str, object] = {
         "method": "dlt",
         "reprojection_px": {"median": 4.4, "mean": 4.2},
-        "per_joint": {},
     }
-    outline = Outline(render_page(replace(content, truth=None, metrics=metrics)))
+    outline = Outline(render_page(replace(content, truth=None, metrics=metrics, joint_errors=None)))
     assert "(px)" in outline.text  # of the errors over time
     assert "from truth" not in outline.text
     assert "MPJPE" not in outline.text

@@ -28,7 +28,6 @@ from pipelines.session.storage import read_json, sha256_of, write_json
 
 INGEST = Stage("ingest", 1)
 RECONSTRUCT = Stage("reconstruct", 1)
-OVERLAY = Stage("overlay", 1)
 
 
 def ingest(folder: Path, flight: str, files: dict[str, str], **options: bool) -> Run:
@@ -58,17 +57,6 @@ def reconstruct(folder: Path, method: str, *, force: bool = False) -> Run:
             (run.folder / "deep").mkdir()
             (run.folder / "deep" / "metrics").write_text(method)
             run.publish(counts={"parts": len(parts)}, warnings=[f"used {method}"])
-        return run
-
-
-def overlay(folder: Path) -> Run:
-    """Run an overlay stage: one file that shows the reconstruction."""
-    with locked(folder) as session:
-        record = session.record("reconstruct")
-        assert record is not None
-        run = session.begin(OVERLAY, settings={}, inputs={"reconstruct": record.key})
-        (run.folder / "video").write_text(str(record.settings["method"]))
-        run.publish(counts={})
         return run
 
 
@@ -105,13 +93,11 @@ def assert_every_stage_is_whole(folder: Path) -> None:
     """Check that each stage is the old or the new one, never a mixture, without files that are not listed."""
     session = open_session(folder)
     listed = set()
-    for stage in ("ingest", "reconstruct", "overlay"):
+    for stage in ("ingest", "reconstruct"):
         record = session.record(stage)
         if record is not None:
             assert {name: sha256_of(folder / name) for name in record.outputs} == record.outputs
             listed |= {*record.outputs, f"{stage}/stage.json"}
-    shown, showing = session.record("reconstruct"), session.record("overlay")
-    assert showing is None or (shown is not None and showing.inputs == {"reconstruct": shown.key})
     published = {
         path.relative_to(folder).as_posix()
         for path in folder.rglob("*")
@@ -150,7 +136,6 @@ def prepared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     if request.param == "replacing":
         ingest(start, "old", OLD)
         reconstruct(start, "dlt")
-        overlay(start)
         shutil.copytree(start, end)
     work(end)
     return start, end
@@ -324,16 +309,6 @@ def test_a_stage_whose_successor_was_removed_by_hand_comes_back(tmp_path: Path) 
     assert contents(folder) == expected
 
 
-def test_what_shows_a_result_stays_and_goes_with_it(tmp_path: Path) -> None:
-    folder = tmp_path / "a.session"
-    work(folder)
-    overlay(folder)
-    assert reconstruct(folder, "robust", force=True).outdated == []
-    assert (folder / "overlay" / "video").read_text() == "robust"
-    assert reconstruct(folder, "dlt").outdated == ["overlay"]
-    assert not (folder / "overlay").exists()
-
-
 def test_a_copy_kept_by_the_user_stays(tmp_path: Path) -> None:
     folder = tmp_path / "a.session"
     work(folder)
@@ -448,7 +423,7 @@ def test_a_stage_whose_files_changed_is_not_read(
     work(folder)
     session = open_session(folder)
     assert session.intact_record(stage) == session.record(stage)
-    assert session.intact_record("overlay") is None
+    assert session.intact_record("report") is None
     damage(folder / name)
     with pytest.raises(DataError, match=rf"{name}: {said} .*; run `{command}` again"):
         session.intact_record(stage)
