@@ -375,7 +375,7 @@ def find_export(text: str) -> Export:
     if not colon:
         return found
     if not isinstance(found, ExportFamily):
-        raise DataError(text, f"{name} takes nothing behind its name", f"write {name}")
+        raise DataError(text, f"{name} takes nothing behind its name", f"write {name}", code="bad-option")
     return found.configured(argument)
 
 

@@ -41,7 +41,12 @@ class OverlayExport:
             DataError: there is no skeleton, or no camera has pictures.
         """
         if recording.motion is None:
-            raise DataError(recording.name, "holds no skeleton to draw", "run `mocap reconstruct` first")
+            raise DataError(
+                recording.name,
+                "holds no skeleton to draw",
+                "run `mocap reconstruct` first",
+                code="nothing-reconstructed",
+            )
         written = []
         for camera in recording.cameras:
             film = recording.film(camera, self.angles, recording.progress)
@@ -53,6 +58,7 @@ class OverlayExport:
                 recording.name,
                 "has no pictures to draw on",
                 "state the cameras' `video` in flight.yaml, and ingest it",
+                code="no-pictures",
             )
         return sorted(written)
 
@@ -62,7 +68,9 @@ def _angle_named(words: str) -> str:
     endings = ("", "_flexion", "_dorsiflexion", "_elevation", "_pronation")
     name = next((words + end for end in endings if words + end in ANGLES), None)
     if name is None:
-        raise DataError("overlay", f"there is no angle {words!r}", f"there are {', '.join(ANGLES)}")
+        raise DataError(
+            "overlay", f"there is no angle {words!r}", f"there are {', '.join(ANGLES)}", code="no-such-name"
+        )
     return name
 
 
