@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 
-.PHONY: setup demo test check lint bench results fuzz wheel docs sample lock clean
+.PHONY: setup demo test check lint house bench results fuzz wheel docs sample lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -47,26 +47,15 @@ lint: setup
 	$(BIN)/lint-imports
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir build/site
 
-bench: setup
-	$(BIN)/python -m benchmarks.triangulation
-	$(BIN)/python -m benchmarks.association
-	$(BIN)/python -m benchmarks.loss
-	$(BIN)/python -m benchmarks.ingest_log
-	$(BIN)/python -m benchmarks.log_readers
-	$(BIN)/python -m benchmarks.planning
-	$(BIN)/python -m benchmarks.arms
-	$(BIN)/python -m benchmarks.rendering
-	$(BIN)/python -m benchmarks.detection
-	$(BIN)/python -m benchmarks.no_people
-	$(BIN)/python -m benchmarks.detectors
-	$(BIN)/python -m benchmarks.detector_by_tilt
-	$(BIN)/python -m benchmarks.legs
-	$(BIN)/python -m benchmarks.refine --seeds 1 --times 150
-	$(BIN)/python -m benchmarks.refine_clocks
-	$(BIN)/python -m benchmarks.seams
-	$(BIN)/python -m benchmarks.batch
+# The size of this house against the aims of its upkeep.
+house: setup
+	$(BIN)/python -m benchmarks.house
 
-# Every table and figure of docs/results.md again, in some fifteen minutes.
+# The table of all times, beside peers.
+bench: setup
+	$(BIN)/python -m benchmarks.speed
+
+# The sample's tables of docs/results.md again, in some ten minutes.
 results: setup
 	$(BIN)/mocap models fetch blazepose
 	$(BIN)/python -m benchmarks.results

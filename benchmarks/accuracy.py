@@ -1,31 +1,19 @@
-"""Accuracy of every method on the corpus of rendered flights: `python -m benchmarks.accuracy`.
+"""Accuracy of the estimate: `python -m benchmarks.accuracy corpus|gimbals|people|detectors [--write]`.
 
-    python -m benchmarks.accuracy [--flights tuning|kept|all|NAME ...] [--methods METHOD ...] [--draws 8]
-        [--detector blazepose|blazepose-heavy] [--given model nothing] [--write]
+- corpus: all methods on 24 rendered flights and the sample, with the real detectors
+  (`benchmarks/corpus/README.md`).
+- gimbals: real pictures that move, by virtual gimbals (`benchmarks/gimbals.py`).
+- people: several people, who is found and who is confused (`benchmarks/people.py`).
+- detectors: the detectors on the sample and on a real recording, beside Pose2Sim (`benchmarks/detectors.py`).
 
-Pictures are rendered, the detector is real (`benchmarks/corpus/README.md`). For each draw the errors of the
-logs are drawn anew. flight.yaml gives their true model, or neither it nor the logs give anything. Every
-method gets the same sessions by the same call as `mocap reconstruct`. "True poses" is `robust` with them.
-"Shared error only" is `robust` with the true poses, moved and turned together by the error that all cameras
-of a draw share. No picture tells of that one: whoever knew all poses relative to each other would keep it.
-Without `--methods`, `robust` and `auto` are measured on all draws, and the parts of `auto` by themselves on
-the first one, with the model given: they would take as long as everything else.
-
-Per flight and method, means over the draws (times: medians):
-
-- MPJPE and root-relative error, mm, of the joint-frames that the method measured, with their share;
-- error of the acceleration, m/s^2;
-- peak speed of wrists and ankles over the true one: mean speed over mean true speed, over the 5 % of moments
-  at which the truth is fastest; joints that reach 1 m/s only;
-- NEES (3 is right), and the share of joint-frames within their 95 % ellipsoids;
-- processor seconds of the call on the first draw, detection and following excluded; fallbacks.
+corpus: for each draw the errors of the logs are drawn anew. flight.yaml gives their true model, or neither it
+nor the logs give anything. Every method gets the same sessions by the same call as `mocap reconstruct`. "True
+poses" is `robust` with them. "Shared error" is `robust` with the true poses, moved and turned together by the
+error that all cameras of a draw share: no picture shows that error, so no method can remove it.
 
 To save time, methods share the clocks that the first of them found by keypoints, and mistakes are searched
-for in the call alone whose time is taken: errors do not depend on either. All draws of the shared error share
-the clocks of the true poses, too: all their cameras move alike. Two processes, each flight in one.
-
-Results are kept in build/accuracy by the hash of the code and of the flight's files, so an interrupted run
-goes on, and a changed program measures anew. `--write` writes docs/results.md.
+for in the call alone whose time is taken. Results are kept in build/accuracy by the hash of the code and of
+the flight's files, so an interrupted run continues, and a changed program measures anew.
 """
 
 from __future__ import annotations
@@ -33,13 +21,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shlex
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from hashlib import sha256
 from multiprocessing import get_context
@@ -49,14 +36,16 @@ from unittest.mock import patch
 
 import cv2
 import numpy as np
+import pandas as pd
 
+from benchmarks import detectors, gimbals, people
 from benchmarks.corpus.drawn import DrawnFlight, Given, Poses, kept_in_place_of_pictures
-from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, Half, flights
-from benchmarks.results import keep_numbers
-from benchmarks.results_page import markdown_table
+from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, flights
+from benchmarks.results import fixed, keep, markdown_table
 from pipelines.detect import detect
 from pipelines.follow import Following
 from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.joint_angles import ANGLES, joint_angles
 from pipelines.geometry.metrics import measure
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.reconstruction.refining import FoundClocks, RobustFlight, find_clocks
@@ -65,6 +54,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.people import true_joints_at
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.stages import locked
+from pipelines.session.tables import ANGLES as ANGLES_TABLE
 from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
 
 ROOT = Path(__file__).parents[1]
@@ -83,8 +73,7 @@ METHODS: dict[str, dict[str, Any]] = {
 ALWAYS = ("auto", "robust")
 """Methods that are measured on all draws; the first finds the clocks, and its time is taken."""
 GIVEN: tuple[Given, ...] = ("model", "nothing")
-DRAWS = 8
-
+FLEXIONS = ("hip_flexion", "knee_flexion", "elbow_flexion")
 _FASTEST_SHARE = 0.05
 _FAST_MPS = 1.0
 _IN_95 = 7.814727903251179  # 95 % quantile of chi-square with 3 degrees of freedom
@@ -114,42 +103,43 @@ class Outcome:
     inside: float | None = None
     measured_share: float | None = None
     cpu_s: float | None = None  # of the first method of the first draw
-    fallback: str | None = None  # reason why a part of the method was not used
+    hip_flexion_deg: float | None = None  # RMSE against the angles of the true joints
+    knee_flexion_deg: float | None = None
+    elbow_flexion_deg: float | None = None
     error: str | None = None
 
 
-def main() -> None:
-    """Measure, print the tables and the criteria; write the page if asked."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `corpus`."""
     parser.add_argument("--flights", nargs="+", default=["all"], help="tuning, kept, all, or names")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, help="on all draws (default: see above)")
-    parser.add_argument("--detector", choices=DETECTORS, default=DETECTORS[0])
-    parser.add_argument("--given", nargs="+", choices=GIVEN, default=list(GIVEN))
-    parser.add_argument("--draws", type=int, default=DRAWS)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--write", action="store_true", help="write the section of docs/results.md")
-    arguments = parser.parse_args()
-    chosen = chosen_flights(arguments.flights, arguments.detector)
-    methods = arguments.methods or list(ALWAYS)
-    parts = [name for name in METHODS if not arguments.methods]
-    found = measured(
-        chosen, methods, parts, arguments.detector, arguments.given, arguments.draws, arguments.processes
+    parser.add_argument("--methods", nargs="+", choices=METHODS, help="on all draws (default: auto robust)")
+    parser.add_argument(
+        "--parts", action="store_true", help="also what `auto` consists of, on the first draw"
     )
-    lines = report(chosen, methods, arguments.detector, found)
+    parser.add_argument("--detector", choices=DETECTORS, default=DETECTORS[0])
+    parser.add_argument("--draws", type=int, default=8)
+    parser.add_argument("--processes", type=int, default=2)
+
+
+def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
+    """Measure, print a line for each flight, and yield the tables of the page."""
+    chosen = chosen_flights(options.flights, options.detector)
+    methods = options.methods or list(ALWAYS)
+    parts = list(METHODS) if options.parts else []
+    found = measured(chosen, methods, parts, options.detector, options.draws, options.processes)
+    for said in GIVEN:
+        print(f"\nPose noise, {said} given: MPJPE / root-relative mm")
+        print("\n".join(flights_table(chosen, methods, said, found)))
+        yield f"corpus-{said}", summary(chosen, methods, said, found)
+    yield "angles", angles_table(chosen, found)
     if parts:
-        lines += parts_table(chosen, parts, arguments.detector, found)
-    print("\n".join(lines))
-    if arguments.write:
-        command = shlex.join(["python", "-m", "benchmarks.accuracy", *sys.argv[1:]])
-        keep_numbers("accuracy", {arguments.detector: [f"    {command}", "", *lines]})
+        first = {case: outcome for case, outcome in found.items() if not case.draw}
+        yield "corpus-parts", summary(chosen, parts, "model", first)
 
 
 def chosen_flights(names: Sequence[str], detector: str) -> list[Flight]:
-    """Choose flights by half (tuning, kept, all) or name; say which of them are not here."""
-    halves: list[Half] = [half for half in HALVES if half in names or "all" in names]
-    chosen = [f for f in flights() if f.half in halves or f.name in names]
+    """Choose flights by half (tuning, kept, all) or name; report which of them are not here."""
+    chosen = [f for f in flights() if f.half in names or f.name in names or "all" in names]
     usable = []
     for flight in chosen:
         if flight.missing_motions:
@@ -171,7 +161,6 @@ def measured(
     methods: Sequence[str],
     parts: Sequence[str],
     detector: str,
-    given: Sequence[Given],
     draws: int,
     processes: int,
 ) -> dict[Case, Outcome]:
@@ -186,7 +175,7 @@ def measured(
             *(
                 [Case(flight.name, method, detector, said, draw) for method in dict.fromkeys(names)]
                 for draw in range(draws)
-                for said in given
+                for said in GIVEN
                 for names in [[*methods, *(parts if (said, draw) == ("model", 0) else ())]]
             ),
         ]
@@ -290,19 +279,19 @@ def measure_draw(
                 began_s = time.process_time()
                 try:
                     with nullcontext() if timed else patch("pipelines.attempt.doubts_of", _no_doubts):
-                        metrics = reconstruct(session, settings).metrics
+                        reconstruct(session, settings)
                 except DataError as error:
                     yield case, Outcome(error=str(error))
                 else:
                     took_s = time.process_time() - began_s if timed else None
-                    yield case, _outcome(session, metrics, took_s)
+                    yield case, _outcome(session, took_s)
 
 
 def _no_doubts(*_: object, **__: object) -> list[Doubt]:
     return []
 
 
-def _outcome(session: Path, metrics: Mapping[str, Any], took_s: float | None) -> Outcome:
+def _outcome(session: Path, took_s: float | None) -> Outcome:
     skeleton = read_table(session / "reconstruct" / "skeleton.parquet", SKELETON)
     skeleton = skeleton[skeleton["person"] == 0]
     joints = tuple(skeleton["joint"].iloc[: skeleton["joint"].nunique()])
@@ -310,7 +299,8 @@ def _outcome(session: Path, metrics: Mapping[str, Any], took_s: float | None) ->
     t_ns = skeleton["t_ns"].to_numpy(np.int64).reshape(shape)[:, 0]
     ok = (skeleton["status"] == "ok").to_numpy().reshape(*shape, 1)
     position = np.where(ok, skeleton[["x", "y", "z"]].to_numpy(np.float64).reshape(*shape, 3), np.nan)
-    truth = true_joints_at(motion_from(read_table(session / "truth.parquet", TRUTH), joints), t_ns)[:, 0]
+    table = read_table(session / "truth.parquet", TRUTH)
+    truth = true_joints_at(motion_from(table, joints), t_ns)[:, 0]
     errors = measure(position[:, None], truth[:, None], joints, t_ns)
     upper = skeleton[list(POINT_COVARIANCE_COLUMNS)].to_numpy(np.float64)
     covariance = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*shape, 3, 3)
@@ -326,8 +316,20 @@ def _outcome(session: Path, metrics: Mapping[str, Any], took_s: float | None) ->
         float((squared <= _IN_95).mean()),
         _number(errors["reconstructed_share"]),
         took_s,
-        _fallback(metrics),
+        **dict(_flexion_errors(session, t_ns, table)),
     )
+
+
+def _flexion_errors(session: Path, t_ns: Any, truth: pd.DataFrame) -> Iterator[tuple[str, Any]]:
+    """Yield the RMSE (deg) of each of `FLEXIONS`, both sides together; None where none is known."""
+    joints = tuple(dict.fromkeys(truth["joint"]))
+    true = joint_angles(joints, true_joints_at(motion_from(truth, joints), t_ns)[:, :1]).value_deg[:, 0]
+    stored = read_table(session / "reconstruct" / "angles.parquet", ANGLES_TABLE)
+    own = stored[stored["person"] == 0]["value_deg"].to_numpy(np.float64).reshape(-1, len(ANGLES))
+    for name in FLEXIONS:
+        columns = [index for index, angle in enumerate(ANGLES) if angle.endswith(name)]
+        error = (own[:, columns] - true[:, columns] + 180) % 360 - 180
+        yield f"{name}_deg", float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else None
 
 
 def _number(value: Any) -> float:
@@ -368,210 +370,101 @@ def peak_ratio(position: Float, truth: Float, joints: Sequence[str], t_ns: Any) 
     return float(np.mean(ratios)) if ratios else None
 
 
-def _fallback(metrics: Mapping[str, Any]) -> str | None:
-    """Collect what the method left out: its refinement, or the backgrounds of cameras."""
-    reasons = [metrics["refinement"]["fallback"]] if "refinement" in metrics else []
-    background = metrics.get("background") or {}
-    reasons += [
-        f"{name}: {entry['reason']}"
-        for name, entry in background.items()
-        if isinstance(entry, dict) and not entry.get("used", True)
-    ]
-    return "; ".join(reason for reason in reasons if reason) or None
-
-
 # --- the tables ----------------------------------------------------------------------------------------
 
 
-def report(
-    chosen: Sequence[Flight], methods: Sequence[str], detector: str, found: Mapping[Case, Outcome]
+def flights_table(
+    chosen: Sequence[Flight], methods: Sequence[str], given: Given, found: Mapping[Case, Outcome]
 ) -> list[str]:
-    """Write the tables and the criteria as lines of Markdown."""
-    given = [said for said in GIVEN if any(case.given == said for case in found if case.method not in _POSES)]
-    draws = 1 + max(case.draw for case in found)
-    lines = [f"Means over {draws} draws of the logs' errors."]
-    for said in given:
-        lines += ["", f"Pose noise: {_SAID[said]}. MPJPE / root-relative mm.", ""]
-        lines += markdown_table(
-            ["flight", "drones", *methods, "true poses", "shared error only"],
-            [_errors_row(flight, methods, detector, said, found) for flight in chosen],
-        )
-        judged = "auto" if "auto" in methods else methods[-1]
-        lines += ["", f"`{judged}`, {_SAID[said]}:", ""]
-        lines += markdown_table(
-            _QUALITY,
-            [_quality_row(flight, judged, detector, said, found) for flight in chosen],
-        )
-        lines += ["", *criteria(chosen, judged, detector, said, found)]
-    return lines
+    """Write a line for each flight: MPJPE and root-relative error of each method."""
+    rows = []
+    for flight in chosen:
+        pairs = []
+        for method in [*methods, *_POSES]:
+            own = _of(flight, method, given, found)
+            pairs.append(" / ".join(fixed(_mean(own, name)) for name in ("mpjpe_mm", "root_mpjpe_mm")))
+        rows.append([flight.name, str(flight.scenario.drones.count), *pairs])
+    return markdown_table(["flight", "drones", *methods, *_NAMES.values()], rows)
 
 
-def parts_table(
-    chosen: Sequence[Flight], parts: Sequence[str], detector: str, found: Mapping[Case, Outcome]
+def summary(
+    chosen: Sequence[Flight], methods: Sequence[str], given: Given, found: Mapping[Case, Outcome]
 ) -> list[str]:
-    """Write the table of the first draw, with `auto` beside what it is made of."""
-    first = {case: outcome for case, outcome in found.items() if not case.draw}
-    rows = [_errors_row(flight, parts, detector, "model", first) for flight in chosen]
-    said = "The parts of `auto`, on the first draw, its true model given. MPJPE / root-relative mm."
-    return [
-        "",
-        said,
-        "",
-        *markdown_table(["flight", "drones", *parts, "true poses", "shared error only"], rows),
-    ]
+    """Write a line for each half and method: medians over flights, and the largest ratio to `robust`."""
+    rows = []
+    for half in HALVES:
+        own = [flight for flight in chosen if flight.half == half and flight.name != SAMPLE.name]
+        for method in [*methods, *_POSES] if own else ():
+            of = {flight.name: _of(flight, method, given, found) for flight in own}
+            robust = {flight.name: _mean(_of(flight, "robust", given, found), "mpjpe_mm") for flight in own}
+            ratios = [_mean(outcomes, "mpjpe_mm") / robust[name] for name, outcomes in of.items()]
+            rows.append([half, _NAMES.get(method, method)])
+            for name, digits, scale in _COLUMNS:
+                values = [scale * _mean(outcomes, name) for outcomes in of.values()]
+                known = [value for value in values if not np.isnan(value)]
+                rows[-1].append(fixed(float(np.median(known)), digits) if known else "")
+            rows[-1].insert(3, fixed(float(np.nanmax(ratios)), 2))
+    header = ["half", "method", "MPJPE", "largest ratio to robust", "root-relative", "acceleration m/s^2"]
+    return markdown_table([*header, "NEES", "in 95 % %", "measured %"], rows)
 
 
-_QUALITY = (
-    "flight",
-    "acceleration m/s^2",
-    "peak speed",
-    "NEES",
-    "in 95 % %",
-    "measured %",
-    "CPU s",
-    "fell back",
+_COLUMNS = (
+    ("mpjpe_mm", 0, 1),
+    ("root_mpjpe_mm", 0, 1),
+    ("acceleration_mps2", 1, 1),
+    ("nees", 1, 1),
+    ("inside", 0, 100),
+    ("measured_share", 0, 100),
 )
-_SAID: dict[Given, str] = {"model": "its true model given", "nothing": "nothing given"}
+_NAMES = {FLOOR: "true poses", SHARED: "shared error"}
 
 
-def _of(
-    flight: Flight, method: str, detector: str, given: Given, found: Mapping[Case, Outcome]
-) -> list[tuple[Case, Outcome]]:
-    return [
-        (case, outcome)
-        for case, outcome in found.items()
-        if (case.flight, case.method, case.detector, case.given) == (flight.name, method, detector, given)
-    ]
+def angles_table(chosen: Sequence[Flight], found: Mapping[Case, Outcome]) -> list[str]:
+    """Write a line for each half and method: medians over flights of the angles' errors."""
+    rows = []
+    for half in HALVES:
+        own = [flight for flight in chosen if flight.half == half]
+        for method in ("auto", FLOOR) if own else ():
+            each = [_of(flight, method, "model", found) for flight in own]
+            medians = [
+                np.nanmedian([_mean(outcomes, f"{name}_deg") for outcomes in each]) for name in FLEXIONS
+            ]
+            rows.append([half, _NAMES.get(method, method), *(fixed(float(value), 1) for value in medians)])
+    return markdown_table(["half", "method", "hip flexion RMSE deg", "knee flexion", "elbow flexion"], rows)
 
 
-def _mean(outcomes: Sequence[tuple[Case, Outcome]], name: str) -> float:
-    values = [getattr(outcome, name) for _, outcome in outcomes]
-    known = [value for value in values if value is not None]
+def _of(flight: Flight, method: str, given: Given, found: Mapping[Case, Outcome]) -> list[Outcome]:
+    wanted = (flight.name, method, "model" if method in _POSES else given)
+    return [outcome for case, outcome in found.items() if (case.flight, case.method, case.given) == wanted]
+
+
+def _mean(outcomes: Sequence[Outcome], name: str) -> float:
+    known = [value for outcome in outcomes if (value := getattr(outcome, name)) is not None]
     return float(np.mean(known)) if known else float("nan")
 
 
-def _cell(value: float, digits: int = 0) -> str:
-    return "" if np.isnan(value) else f"{value:.{digits}f}"
+SUBJECTS: dict[str, tuple[Any, Any]] = {
+    "corpus": (add_arguments, run),
+    "gimbals": (gimbals.add_arguments, gimbals.run),
+    "people": (people.add_arguments, people.run),
+    "detectors": (detectors.add_arguments, detectors.run),
+}
 
 
-def _errors_row(
-    flight: Flight, methods: Sequence[str], detector: str, given: Given, found: Mapping[Case, Outcome]
-) -> list[str]:
-    cells = [flight.name, str(flight.scenario.drones.count)]
-    for method in [*methods, *_POSES]:
-        outcomes = _of(flight, method, detector, "model" if method in _POSES else given, found)
-        mean = [_mean(outcomes, name) for name in ("mpjpe_mm", "root_mpjpe_mm")]
-        failed = sum(outcome.error is not None for _, outcome in outcomes)
-        cells.append(" / ".join(map(_cell, mean)) if failed < len(outcomes) else "")
-    return cells
-
-
-def _quality_row(
-    flight: Flight, method: str, detector: str, given: Given, found: Mapping[Case, Outcome]
-) -> list[str]:
-    outcomes = _of(flight, method, detector, given, found)
-    return [
-        flight.name,
-        _cell(_mean(outcomes, "acceleration_mps2"), 1),
-        _cell(_mean(outcomes, "peak_ratio"), 2),
-        _cell(_mean(outcomes, "nees"), 1),
-        _cell(100 * _mean(outcomes, "inside")),
-        _cell(100 * _mean(outcomes, "measured_share")),
-        _cell(_mean(outcomes, "cpu_s"), 1),
-        str(sum(outcome.fallback is not None for _, outcome in outcomes)),
-    ]
-
-
-# --- the criteria --------------------------------------------------------------------------------------
-
-
-def criteria(
-    chosen: Sequence[Flight], method: str, detector: str, given: Given, found: Mapping[Case, Outcome]
-) -> list[str]:
-    """Test what was asked of the default method, and of `robust`'s covariances, for each half by itself."""
-    lines = []
-    for half in HALVES:
-        own = [f for f in chosen if f.half == half and f.name != SAMPLE.name]
-        if not own:
-            continue
-        of = {flight: _of(flight, method, detector, given, found) for flight in own}
-        verdicts = [*_against_robust(of, found), *_motion(of), *_covariances(of)]
-        robust = {flight: _of(flight, "robust", detector, given, found) for flight in own}
-        if method != "robust" and all(robust.values()):
-            verdicts += [(f"`robust`, {said}", passed) for said, passed in _covariances(robust)]
-        lines += [f"- {_VERDICT[passed]} {half}: {said}" for said, passed in verdicts]
-        shared = {flight: _of(flight, SHARED, detector, "model", found) for flight in own}
-        ratios = list(_ratios(shared, found, "mpjpe_mm").values())
-        if ratios and given == "model":
-            lines.append(
-                f"- {half}: if all poses were exact but for the error that the cameras share, MPJPE would be"
-                f" {np.median(ratios):.2f} of robust in the median, {max(ratios):.2f} at most"
-            )
-    sample = [flight for flight in chosen if flight.name == SAMPLE.name]
-    if sample:
-        outcomes = _of(sample[0], method, detector, given, found)
-        errors = [_mean(outcomes, name) for name in ("mpjpe_mm", "root_mpjpe_mm")]
-        wanted = _WANTED_OF_SAMPLE[detector]
-        passed = all(error <= most for error, most in zip(errors, wanted, strict=True))
-        lines.append(
-            f"- {_VERDICT[passed]} sample: {errors[0]:.1f} / {errors[1]:.1f} mm"
-            f" (at most {wanted[0]} / {wanted[1]}), {_mean(outcomes, 'cpu_s'):.1f} s of the processor"
-        )
-    return lines
-
-
-_VERDICT = {True: "pass", False: "**fail**"}
-_WANTED_OF_SAMPLE = {"blazepose": (62, 36), "blazepose-heavy": (56, 28)}
-_Outcomes = Mapping[Flight, Sequence[tuple[Case, Outcome]]]
-_Verdict = tuple[str, bool]
-
-
-def _against_robust(of: _Outcomes, found: Mapping[Case, Outcome]) -> Iterator[_Verdict]:
-    """Compare with `robust` on the same draws."""
-    for name, title, wanted in (("mpjpe_mm", "MPJPE", 0.55), ("root_mpjpe_mm", "root-relative", 0.85)):
-        ratios = _ratios(of, found, name)
-        if not ratios:
-            yield f"{title}: no results of robust to compare to", False
-            continue
-        worst = max(ratios, key=ratios.__getitem__)
-        yield f"{title} at most 1.02 of robust: {ratios[worst]:.2f} on {worst}", ratios[worst] <= 1.02
-        median = float(np.median(list(ratios.values())))
-        yield f"{title} at most {wanted} of robust in the median: {median:.2f}", median <= wanted
-
-
-def _ratios(of: _Outcomes, found: Mapping[Case, Outcome], name: str) -> dict[str, float]:
-    """Compute each flight's mean error over that of `robust` on the same draws."""
-    ratios: dict[str, float] = {}
-    for flight, outcomes in of.items():
-        pairs = []
-        for case, outcome in outcomes:
-            robust = getattr(found.get(replace(case, method="robust")), name, None)
-            mine = getattr(outcome, name)
-            if robust is not None and mine is not None:
-                pairs.append((mine, robust))
-        if pairs:
-            ratios[flight.name] = float(np.mean([p[0] for p in pairs]) / np.mean([p[1] for p in pairs]))
-    return ratios
-
-
-def _motion(of: _Outcomes) -> Iterator[_Verdict]:
-    error = float(np.median([_mean(outcomes, "acceleration_mps2") for outcomes in of.values()]))
-    yield f"error of the acceleration at most 10 m/s^2 in the median: {error:.1f}", error <= 10
-    peaks = {flight.name: _mean(outcomes, "peak_ratio") for flight, outcomes in of.items()}
-    known = {name: value for name, value in peaks.items() if not np.isnan(value)}
-    worst = max(known, key=lambda name: abs(known[name] - 1))
-    off = [name for name, value in known.items() if abs(value - 1) > 0.1]
-    yield f"peak speeds within 10 %: {known[worst]:.2f} on {worst}, {len(off)} flights off", not off
-
-
-def _covariances(of: _Outcomes) -> Iterator[_Verdict]:
-    each = np.array([_mean(outcomes, "nees") for outcomes in of.values()])
-    mean = float(each.mean())
-    yield f"mean NEES between 2 and 4.5: {mean:.2f}", 2 <= mean <= 4.5
-    good = int(((each >= 0.5) & (each <= 8)).sum())
-    yield f"NEES between 0.5 and 8 on 10 of 12 flights: {good} of {len(each)}", good >= len(each) * 10 / 12
-    inside = float(np.mean([_mean(outcomes, "inside") for outcomes in of.values()]))
-    yield f"90 % in the 95 % ellipsoids: {100 * inside:.0f} %", inside >= 0.9
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="subject", required=True)
+    for name, (add, _) in SUBJECTS.items():
+        command = commands.add_parser(name)
+        command.add_argument("--write", action="store_true", help="put the tables into docs/results.md")
+        add(command)
+    options = parser.parse_args()
+    for key, lines in SUBJECTS[options.subject][1](options):
+        print("\n".join(["", *lines]), flush=True)
+        if options.write:
+            keep(key, lines)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Accuracy on real pictures that move, by virtual gimbals: `python -m benchmarks.gimbals FOLDER`.
+"""Accuracy on real pictures that move, by virtual gimbals: `python -m benchmarks.accuracy gimbals FOLDER`.
 
 The real recording of Pose2Sim's demo has four still cameras (`MOCAP_REAL_DATA` names the folder that holds
 `pose2sim_single`; 100 pictures at 60 Hz). Each picture is undistorted and turned by a homography, as a gimbal
@@ -33,8 +33,8 @@ from __future__ import annotations
 import argparse
 import shutil
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from multiprocessing import get_context
@@ -48,9 +48,8 @@ import pandas as pd
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from benchmarks.detectors import CAMERAS, PEER, REAL
-from benchmarks.results import keep_numbers
-from benchmarks.results_page import gimbal_table
+from benchmarks.flights import CAMERAS, PEER, REAL, real_flight
+from benchmarks.results import fixed, markdown_table
 from pipelines.formats.skeletons.trc import FORMAT as TRC
 from pipelines.geometry.arrays import Float
 from pipelines.ingest import ingest
@@ -60,7 +59,6 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 
 TUNED, KEPT = ("a", "b"), ("c", "d")
 LEVELS_DEG = (0.5, 1.0)
-DRAWS = 6
 METHODS: dict[str, dict[str, Any]] = {
     "robust": {"method": "robust"},
     "refined": {"method": "refined"},
@@ -68,7 +66,6 @@ METHODS: dict[str, dict[str, Any]] = {
     "refined + background": {"method": "refined", "refine_cameras": "background"},
     "auto": {"method": "auto"},
 }
-_CALIBRATION = REAL / "calibration" / "Calib_refit.toml"
 _FPS, _SIZE = 60, (720, 960)
 _ZOOM = 0.8  # focal length of the virtual camera over the real one's
 _FOLLOWED_S = 0.3  # the person's centre is followed as slowly as that
@@ -114,39 +111,29 @@ class Figures:
     cpu_s: float
 
 
-def main() -> None:
-    """Print a table for each detector and set of paths."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("folder", type=Path, help="for films and sessions, outside the repository")
     parser.add_argument("--kept", action="store_true", help="measure on the paths that are kept aside")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=[*METHODS])
-    parser.add_argument("--detectors", nargs="+", default=["blazepose"])
-    parser.add_argument("--paths", nargs="+", help="some of the paths only")
-    parser.add_argument("--draws", type=int, default=DRAWS, help=f"of the log's errors (default {DRAWS})")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/results.md")
-    arguments = parser.parse_args()
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=["robust", "auto"])
+    parser.add_argument("--detector", default="blazepose")
+    parser.add_argument("--draws", type=int, default=6, help="of the log's errors (default 6)")
+
+
+def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
+    """Film, reconstruct, and compare with the still cameras."""
     if not REAL.is_dir():
         raise SystemExit(f"{REAL} is not here: MOCAP_REAL_DATA names the folder of pose2sim_single")
-    paths = arguments.paths or (KEPT if arguments.kept else TUNED)
-    folder = arguments.folder.resolve()
-    logs = [Log(level, draw) for level in LEVELS_DEG for draw in range(arguments.draws)]
+    paths, folder, detector = KEPT if options.kept else TUNED, options.folder.resolve(), options.detector
+    logs = [Log(level, draw) for level in LEVELS_DEG for draw in range(options.draws)]
     with get_context("spawn").Pool(2) as pool:
-        for detector in arguments.detectors:
-            prepare(folder, detector)
-            pool.map(partial(prepare_path, folder, detector, logs), paths, chunksize=1)
-            cases = [(path, Log(0.0), False) for path in paths]
-            cases += list(product(paths, logs, (True, False)))
-            one = partial(measured, folder, detector, arguments.methods)
-            found = dict(zip(cases, pool.map(one, cases, chunksize=1), strict=True))
-            entries = entries_of(found)
-            print(f"\n{detector}, paths {', '.join(paths)}; mean over paths and draws")
-            print("\n".join(gimbal_table(entries)), flush=True)
-            if arguments.write:
-                keep_numbers(
-                    "gimbals", {f"{detector}, {'kept aside' if arguments.kept else 'tuned on'}": entries}
-                )
+        prepare(folder, detector)
+        pool.map(partial(prepare_path, folder, detector, logs), paths, chunksize=1)
+        cases = [(path, Log(0.0), False) for path in paths]
+        cases += list(product(paths, logs, (True, False)))
+        one = partial(measured, folder, detector, options.methods)
+        found = dict(zip(cases, pool.map(one, cases, chunksize=1), strict=True))
+    yield "gimbals-kept" if options.kept else "gimbals-tuned", table_of(found)
 
 
 # --- films and flights -----------------------------------------------------------------------------------
@@ -156,12 +143,7 @@ def prepare(folder: Path, detector: str) -> None:
     """Reconstruct from the still cameras: the reference."""
     place = folder / "still"
     place.mkdir(parents=True, exist_ok=True)
-    cameras = [
-        f"  {name}: {{video: {REAL / 'videos' / name}.mp4, intrinsics: {_CALIBRATION},"
-        f" pose: {{static: {_CALIBRATION}}}, frame_times: {{start: 0.0, fps: {_FPS}}}}}"
-        for name in CAMERAS
-    ]
-    _write(place / "flight.yaml", "\n".join(["schema: 1", "name: Still cameras", "cameras:", *cameras]))
+    real_flight(place, "Calib_refit.toml", f"{{start: 0.0, fps: {_FPS}}}")
     session = place / f"{detector}.session"
     ingest(place / "flight.yaml", session)
     reconstruct(session, Settings(method="robust", detector=detector), workers=2)
@@ -392,27 +374,34 @@ def _rms(values: Any) -> float:
 
 # --- the table -------------------------------------------------------------------------------------------
 
+_COLUMNS = {
+    "distance_mm": ("distance mm", 1),
+    "jitter_mm": ("jitter mm", 1),
+    "changing_deg": ("attitudes, changing deg", 3),
+    "constant_deg": ("constant deg", 2),
+    "nees": ("NEES", 1),
+    "share_percent": ("measured %", 1),
+    "cpu_s": ("CPU s", 1),
+}
 
-def entries_of(found: dict[tuple[str, Log, bool], dict[str, Figures]]) -> list[dict[str, Any]]:
-    """Take the mean of each figure over paths and draws, by level, whether noise is given, and method.
 
-    `constant_error_deg` is the standard error of the constant part's mean, 0 for a single flight.
-    """
+def table_of(found: dict[tuple[str, Log, bool], dict[str, Figures]]) -> list[str]:
+    """Write the mean of each figure over paths and draws, by level, whether noise is stated, and method."""
     groups: dict[tuple[float, bool, str], list[Figures]] = {}
     for (_, log, given), by_method in found.items():
         for method, figures in by_method.items():
             groups.setdefault((log.level_deg, not given, method), []).append(figures)
-    return [
-        {"level_deg": level, "noise_given": not without, "method": method}
-        | {field.name: float(np.mean([getattr(of, field.name) for of in own])) for field in fields(Figures)}
-        | {
-            "constant_error_deg": float(
-                np.std([of.constant_deg for of in own]) / np.sqrt(max(len(own) - 1, 1))
-            )
-        }
+    rows = [
+        [
+            f"{level:g} deg" if level else "none",
+            ("no" if without else "yes") if level else "",
+            method,
+            *(
+                fixed(float(np.mean([getattr(of, key) for of in own])), digits)
+                for key, (_, digits) in _COLUMNS.items()
+            ),
+        ]
         for (level, without, method), own in sorted(groups.items(), key=lambda group: group[0][:2])
     ]
-
-
-if __name__ == "__main__":
-    main()
+    header = ["attitude errors", "stated", "method", *(name for name, _ in _COLUMNS.values())]
+    return markdown_table(header, rows)

@@ -1,29 +1,19 @@
-"""Several people: who is found, missed and confused.
+"""Several people, who is found, missed and confused: `python -m benchmarks.accuracy people`.
 
-    python -m benchmarks.people [--seeds 10 11 12] [--method auto] [--scene NAME ...]
-    python -m benchmarks.people --films FOLDER [--seeds 20] [--scene NAME ...]
-    python -m benchmarks.people --corpus [--films FOLDER]
+Three drones with GPS of 0.1 m circle the first person; keypoints have the measured errors of the detector,
+and a joint behind another person's body is hidden. Each scene is reconstructed with `--persons auto`, once
+with everybody's log and once with none. Alone is the MPJPE of the first person in a flight of the same seed
+in which nobody else is. Seeds 0 to 4 and 30 to 33 were looked at while the rules were made.
 
-The first is modelled: keypoints have the measured errors of the detector, and a joint behind another person's
-body is hidden. Three drones with GPS of 0.05 to 0.1 m circle the first person. Each scene is reconstructed
-with `--persons auto`, once with everybody's log and once with none. Alone is the MPJPE of the first person in
-a flight of the same seed in which nobody else is. Seeds 0 to 4 and 30 to 33 were looked at while the rules
-were made; the table of docs/people.md is of others.
-
-The second films the same scenes (rendered, 640x360 px, among trees), and each of the first two people by
-themselves. The real detector finds the people, and the default method reconstructs them with everybody's log.
-Films and keypoints are kept in the folder, and an interrupted run goes on. The third takes the flights of
-several people in the corpus, whose keypoints are kept; MPJPE is the mean of four draws of the logs' errors.
-With a folder, the first person is also filmed alone, from the same drones and with the same errors.
+`--films FOLDER` films the scenes instead (rendered, 640x360 px, among trees): the real detector finds the
+people. Films stay in the folder, and an interrupted run continues.
 
 Seen: times at which two cameras or more see at least half of the joints of a true person. Coverage is the
 share of these at which somebody reconstructed is within 0.5 m of them. Detected is the share of these at
 which two cameras or more have a detection of the person: the median over its joints is within 0.25 m of the
-true ones, at the person's distance, and nobody else is nearer. `of these` is the coverage of those times.
-
-Switches, phantoms (times), MOTA, IDF1 and MPJPE (mm) are those of metrics.json; `first` is the MPJPE of the
-first person. MOTA and IDF1 count people whom one camera sees or none as missed, and somebody measured 0.6 m
-from where they are as missed and as a phantom. At `nobody` a body is more than 1 m from everybody.
+true ones, at the person's distance, and nobody else is nearer.
+Switches, phantoms (times), MOTA, IDF1 and MPJPE (mm) are those of metrics.json. At `nobody` a body is more
+than 1 m from everybody.
 """
 
 from __future__ import annotations
@@ -31,18 +21,17 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterator
 from functools import cache
+from itertools import product
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from benchmarks.corpus.__main__ import make
-from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
-from benchmarks.corpus.stored import Flight, flights
-from pipelines.formats.common.files import read_yaml
+from benchmarks.flights import scenario_of, walker
+from benchmarks.results import fixed, markdown_table
 from pipelines.geometry.arrays import Bool
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
@@ -54,23 +43,9 @@ from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario, visible_joints
 from pipelines.simulation.scenario import read_scenario
 
-Choice = Literal["auto", "refined", "robust"]
-
 WITHIN_M = 0.5
 DETECTED_M = 0.25
-NOBODY_M = 1.0  # the logs' errors move a body by less
-WALK = {"distance_m": 7, "speed_mps": 1.2}
 JOG = {"distance_m": 14, "speed_mps": 2.4}
-
-
-def walker(x: float, y: float, heading_deg: float, *motion: dict[str, Any]) -> dict[str, Any]:
-    """Return a person of a scenario who starts at a place and walks, if nothing else is stated."""
-    return {
-        "start": [x, y],
-        "heading_deg": heading_deg,
-        "motion": list(motion) or [{"walk": WALK}],
-        "estimate_sigma_m": 0.2,
-    }
 
 
 def standing(x: float, y: float, heading_deg: float = 0.0) -> dict[str, Any]:
@@ -105,89 +80,77 @@ SCENES: dict[str, dict[str, dict[str, Any]]] = {
 }
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("--seeds", type=int, nargs="+", help="default 10 11 12, of films 20")
-    parser.add_argument("--method", choices=get_args(Choice), default="auto")
     parser.add_argument("--scene", choices=SCENES, action="append")
     parser.add_argument("--films", type=Path, metavar="FOLDER", help="film the scenes")
-    parser.add_argument("--corpus", action="store_true", help="the corpus's flights of several people")
-    arguments = parser.parse_args()
-    scenes = arguments.scene or list(SCENES)
-    if arguments.corpus:
-        films = arguments.films
-        several = [flight for flight in flights() if flight.scenario.actors]
-        _print_filmed(
-            (flight.name, of_corpus(flight), [alone_in_corpus(flight, films)] if films else [])
-            for flight in several
-        )
-    elif arguments.films:
-        _print_filmed(
-            (scene, filmed(scene, arguments.films, seed), alone_on_films(scene, arguments.films, seed))
-            for scene in scenes
-            for seed in arguments.seeds or [FILM_SEED]
-        )
+
+
+def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
+    """Reconstruct modelled or filmed scenes."""
+    scenes = options.scene or list(SCENES)
+    if options.films:
+        yield "people-films", filmed_table(scenes, options.films, options.seeds or [FILM_SEED])
     else:
-        _print_modelled(scenes, arguments.seeds or [10, 11, 12], arguments.method)
+        yield "people", modelled_table(scenes, options.seeds or [10, 11, 12])
 
 
-def _print_modelled(scenes: list[str], seeds: list[int], method: Choice) -> None:
-    print(
-        "| scene | logs | people | found | coverage | switches | phantoms | nobody"
-        " | MOTA | IDF1 | MPJPE | first | alone |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+def modelled_table(scenes: list[str], seeds: list[int]) -> list[str]:
+    """Write a line for each scene with and without logs: sums and means over seeds."""
+    rows = []
     for scene in scenes:
         people = SCENES[scene]
         for logs in ("all", "none"):
-            rows = [measured(people, seed, method, logs == "all") for seed in seeds]
-            found = " ".join(f"{row['found']}" for row in rows)
-            mean = {key: np.mean([row[key] for row in rows]) for key in ("mota", "idf1", "mpjpe_mm")}
-            first = f"{np.mean([row['each_mm'][0] for row in rows]):.0f}" if logs == "all" else ""
-            total = {
-                key: sum(row[key] for row in rows)
-                for key in ("covered", "seen", "switches", "phantoms", "nobody")
-            }
-            alone = np.mean([alone_mm(people, seed, method) for seed in seeds])
-            print(
-                f"| {scene} | {logs} | {len(people)} | {found}"
-                f" | {100 * total['covered'] / total['seen']:.1f} % | {total['switches']}"
-                f" | {total['phantoms']} | {total['nobody']} | {mean['mota']:.3f} | {mean['idf1']:.3f}"
-                f" | {mean['mpjpe_mm']:.0f} | {first} | {alone:.0f} |",
-                flush=True,
+            own = [measured(people, seed, logs == "all") for seed in seeds]
+            total = {key: sum(row[key] for row in own) for key in _SUMS}
+            rows.append(
+                [
+                    *(scene, logs, f"{sum(row['found'] for row in own)} of {len(people) * len(own)}"),
+                    f"{100 * total['covered'] / total['seen']:.1f}",
+                    *(str(total[key]) for key in ("switches", "phantoms")),
+                    fixed(float(np.mean([row["idf1"] for row in own])), 3),
+                    fixed(float(np.mean([row["mpjpe_mm"] for row in own]))),
+                    fixed(float(np.mean([alone_mm(people, seed) for seed in seeds]))),
+                ]
             )
+    header = ["scene", "logs", "found", "coverage %", "switches", "phantoms", "IDF1", "MPJPE"]
+    return markdown_table([*header, "first, alone"], rows)
 
 
-def _print_filmed(rows: Iterable[tuple[str, dict[str, Any], list[float]]]) -> None:
-    print(
-        "| film | found | coverage | detected | of these | switches | phantoms | nobody | MOTA | IDF1"
-        " | MPJPE of each | alone |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name, row, alone in rows:
-        each, by_themselves = (" ".join(f"{mm:.0f}" for mm in those) for those in (row["each_mm"], alone))
-        print(
-            f"| {name} | {row['found']} of {row['people']} | {100 * row['covered'] / row['seen']:.1f} %"
-            f" | {100 * row['detected'] / row['seen']:.1f} %"
-            f" | {100 * row['covered_of_detected'] / row['detected']:.1f} %"
-            f" | {row['switches']} | {row['phantoms']} | {row['nobody']} | {row['mota']:.3f}"
-            f" | {row['idf1']:.3f} | {each} | {by_themselves} |",
-            flush=True,
+def filmed_table(scenes: list[str], folder: Path, seeds: list[int]) -> list[str]:
+    """Write a line for each film."""
+    rows = []
+    for scene, seed in product(scenes, seeds):
+        row = filmed(scene, folder, seed)
+        alone = [filmed(scene, folder, seed, only)["mpjpe_mm"] for only in list(SCENES[scene])[:2]]
+        rows.append(
+            [
+                *(scene, f"{row['found']} of {row['people']}"),
+                *(f"{100 * row[key] / row['seen']:.1f}" for key in ("covered", "detected")),
+                *(str(row[key]) for key in ("switches", "phantoms")),
+                fixed(row["idf1"], 3),
+                *(" ".join(fixed(mm) for mm in those) for those in (row["each_mm"], alone)),
+            ]
         )
+    header = ["film", "found", "coverage %", "detected %", "switches", "phantoms", "IDF1", "MPJPE of each"]
+    return markdown_table([*header, "first two, alone"], rows)
+
+
+_SUMS = ("covered", "seen", "switches", "phantoms")
 
 
 @cache
-def _alone(first: str, seed: int, method: Choice) -> float:
-    return float(measured(json.loads(first), seed, method, logs=True)["mpjpe_mm"])
+def _alone(first: str, seed: int) -> float:
+    return float(measured(json.loads(first), seed, logs=True)["mpjpe_mm"])
 
 
-def alone_mm(people: dict[str, dict[str, Any]], seed: int, method: Choice) -> float:
+def alone_mm(people: dict[str, dict[str, Any]], seed: int) -> float:
     """Return the MPJPE (mm) of the first person in a flight of their own."""
-    return _alone(json.dumps(dict([next(iter(people.items()))])), seed, method)
+    return _alone(json.dumps(dict([next(iter(people.items()))])), seed)
 
 
-def measured(people: dict[str, dict[str, Any]], seed: int, method: Choice, logs: bool) -> dict[str, Any]:
+def measured(people: dict[str, dict[str, Any]], seed: int, logs: bool) -> dict[str, Any]:
     """Simulate, ingest and reconstruct a scene; return its figures."""
     place = _modelled(json.dumps(people), seed)
     manifest = place / "flight" / "flight.yaml"
@@ -199,7 +162,7 @@ def measured(people: dict[str, dict[str, Any]], seed: int, method: Choice, logs:
         manifest.write_text("".join(lines), encoding="utf-8")
     with tempfile.TemporaryDirectory(prefix="people-") as folder:
         session = ingest(manifest, Path(folder) / "flight.session").folder
-        return figures(session, place / "scenario.yaml", method)
+        return figures(session, place / "scenario.yaml")
 
 
 _FLIGHTS: list[tempfile.TemporaryDirectory[str]] = []  # until the process ends
@@ -216,9 +179,9 @@ def _modelled(people: str, seed: int) -> Path:
     return place
 
 
-def figures(session: Path, scenario: Path, method: Choice = "auto") -> dict[str, Any]:
+def figures(session: Path, scenario: Path) -> dict[str, Any]:
     """Reconstruct everybody in a session, and compare with the truth."""
-    metrics = reconstruct(session, Settings(method=method, people="auto"), force=True).metrics
+    metrics = reconstruct(session, Settings(people="auto"), force=True).metrics
     tracking, names = metrics["tracking"], metrics["people"]["names"]
     times = coverage(session, scenario)
     return {
@@ -227,17 +190,13 @@ def figures(session: Path, scenario: Path, method: Choice = "auto") -> dict[str,
         "covered": int((times.covered & times.seen).sum()),
         "seen": int(times.seen.sum()),
         "detected": int((times.detected & times.seen).sum()),
-        "covered_of_detected": int((times.covered & times.detected & times.seen).sum()),
-        "nobody": times.nobody,
         "each_mm": [metrics["by_person"][name]["mpjpe_mm"] or np.nan for name in names],
         "mpjpe_mm": metrics["mpjpe_mm"],
-        "refused": metrics["people"]["phantoms"],
-        **{key: tracking[key] for key in ("switches", "phantoms", "misses", "mota", "idf1")},
+        **{key: tracking[key] for key in ("switches", "phantoms", "idf1")},
     }
 
 
 FILM_SEED = 20
-DRAWS = 4
 
 
 def filmed(scene: str, folder: Path, seed: int, only: str | None = None) -> dict[str, Any]:
@@ -256,63 +215,12 @@ def filmed(scene: str, folder: Path, seed: int, only: str | None = None) -> dict
     return figures(session, scenario)
 
 
-def alone_on_films(scene: str, folder: Path, seed: int) -> list[float]:
-    """Return the MPJPE (mm) of the first two people of a scene in films of their own."""
-    return [filmed(scene, folder, seed, only)["mpjpe_mm"] for only in list(SCENES[scene])[:2]]
-
-
-def of_corpus(flight: Flight) -> dict[str, Any]:
-    """Reconstruct draws of a flight of the corpus; MPJPE is their mean, all else is that of the first."""
-    with tempfile.TemporaryDirectory(prefix="people-") as folder:
-        drawn = DrawnFlight(flight, Path(folder) / "shared")
-        drawn.write_shared()
-        found = []
-        for draw in range(DRAWS):
-            session = drawn.session(Path(folder) / f"draw{draw}", draw, "model", "blazepose")
-            with kept_in_place_of_pictures(flight, "blazepose"):
-                found.append(figures(session, flight.scenario_path))
-    return found[0] | {"each_mm": np.mean([row["each_mm"] for row in found], axis=0).tolist()}
-
-
-def alone_in_corpus(flight: Flight, folder: Path) -> float:
-    """Film the first person of a flight alone, unless the folder has the film; return their MPJPE (mm)."""
-    plan: dict[str, Any] = dict(read_yaml(flight.scenario_path))
-    first, person = next(iter(plan["actors"].items()))
-    alone = Flight(flight.half, folder / "alone" / f"{flight.name}_{first}")
-    alone.folder.mkdir(parents=True, exist_ok=True)
-    alone.scenario_path.write_text(json.dumps(plan | {"actors": {first: person}}), encoding="utf-8")
-    make(alone, folder)
-    return float(of_corpus(alone)["each_mm"][0])
-
-
-def scenario_of(people: dict[str, dict[str, Any]], seed: int) -> dict[str, Any]:
-    """Return the scenario of a scene."""
-    return {
-        "schema": 1,
-        "name": "People",
-        "seed": seed,
-        "duration_s": 6,
-        "actors": people,
-        "world": {"ground": {"size_m": 60}},
-        "drones": {
-            "count": 3,
-            "formation": {"radius_m": 10, "tilt_deg": 25, "yaw_deg": 40 * seed, "yaw_rate_deg_per_s": 6},
-            "camera": {"rate_hz": 15},
-            "pose_noise": {
-                "white": {"position_m": 0.02, "rotation_deg": 0.2},
-                "bias": {"position_m": 0.1, "rotation_deg": 0.3},
-            },
-        },
-    }
-
-
 class Times(NamedTuple):
-    """Times [T, Q] of true people, and the number of times at which a body is at nobody."""
+    """Times [T, Q] of true people."""
 
     covered: Bool  # somebody reconstructed is within 0.5 m
     seen: Bool  # two cameras or more see at least half of the joints
     detected: Bool  # two cameras or more have a detection
-    nobody: int  # a reconstructed body is further than 1 m from everybody
 
 
 def coverage(session: Path, scenario: Path) -> Times:
@@ -326,9 +234,6 @@ def coverage(session: Path, scenario: Path) -> Times:
     both = np.isfinite(offset[..., 0])
     mean = np.where(both[..., None], offset, 0.0).sum(axis=3) / np.maximum(both.sum(axis=3), 1)[..., None]
     distance = np.where(both.any(axis=3), np.linalg.norm(mean, axis=-1), np.inf)  # [T, P, Q]
-    nobody = np.isfinite(motion.position[..., 0]).any(axis=2) & (distance > NOBODY_M).all(axis=2)
-    known: Bool = np.asarray(np.isfinite(truth[..., 0]).any(axis=(1, 2)))
-    nobody &= known[:, None]
 
     plan = read_scenario(scenario)
     flight = fly_scenario(plan, noise_models(str(scenario), plan.drones.pose_noise))
@@ -339,7 +244,7 @@ def coverage(session: Path, scenario: Path) -> Times:
             seen[:, q] += (visible_joints(flight, drone, person)[1].mean(axis=1) >= 0.5)[frame]
         detected += detections_of(flight, drone, session)[frame]
     covered: Bool = np.asarray((distance <= WITHIN_M).any(axis=1))
-    return Times(covered, seen >= 2, detected >= 2, int(nobody.sum()))
+    return Times(covered, seen >= 2, detected >= 2)
 
 
 def detections_of(flight: SimulatedFlight, drone: SimulatedDrone, session: Path) -> Bool:
@@ -366,7 +271,3 @@ def detections_of(flight: SimulatedFlight, drone: SimulatedDrone, session: Path)
     found = np.zeros((len(rows), len(flight.people)), np.bool_)
     found[of_each.index.get_level_values(0)[good], nearest[good]] = True
     return found
-
-
-if __name__ == "__main__":
-    main()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.ingest_log import CONTAINERS, RECORDER, in_a_process, ingested, timed, write
+from tests.synthetic.recorder_logs import CONTAINERS, RECORDER, in_a_process, ingested, timed, write
 from pipelines.formats.logs.mcap_log import McapLog
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.ingest import ingest

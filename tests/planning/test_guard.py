@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.worlds import fly, world_of
+from tests.synthetic.worlds import fly, world_of
 from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import ADAPTIVE, FIXED
 from pipelines.planning.config import PlannerConfig, Zone
@@ -304,7 +304,7 @@ def test_plans_that_are_flown_exactly_do_not_pass_through_walls_either() -> None
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 5, 17, 23, 27, 32])
 def test_random_worlds_are_flown_without_touching_anything(seed: int) -> None:
-    """A slice of `benchmarks.worlds`: forest, hills, walls, and starts beside obstacles."""
+    """A slice of the worlds of `benchmarks.planner`: forest, hills, walls, and starts beside obstacles."""
     for row in fly(seed, arms=("adaptive", "joint")):
         assert row["clearance_m"] > 0, row
         assert row["ground_m"] >= CONFIG.drone_radius_m, row

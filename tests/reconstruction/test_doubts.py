@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 
-from benchmarks.mistakes import (
+from tests.synthetic.described_flights import (
     COCO_SWAPPED,
     DOWN_DEG,
     FLIGHTS,

@@ -1,24 +1,15 @@
-"""Replayed flights through random worlds: `python -m benchmarks.worlds [--count N] [--arms ARM]`.
+"""Random worlds with a flight through each: walls down to one voxel, boxes, forests, hills, overhangs.
 
-Every world has a seed: walls down to one voxel thick, boxes, forests, hills, overhangs, and starts beside
-obstacles; 2, 3 or 5 drones; all arms. The map is made of voxels, and flights are checked against the analytic
-surfaces that the voxels were made from. All simulated. The command fails if a drone touches anything, comes
-below the ground or breaks a limit. It also fails if flights that were safe before (every drone at least its
-radius from all surfaces, limits kept) have become worse by more than 5 %: by tilt, hidden time and predicted
-error, or by the predicted error alone for arms that minimise it. `worlds_before.json` holds the flights of
-commit 890a2c4, made by running this file there with `--write`; it has no `joint`.
+Drones start beside obstacles, too. The planner's map is made of voxels; flights are checked against the
+analytic surfaces that the voxels were made from.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -35,16 +26,8 @@ from pipelines.session.records import Occupancy
 
 Int64 = NDArray[np.int64]
 
-ARMS = ("fixed", "adaptive", "covariance", "greedy", "joint")
-PREDICTING = ("covariance", "greedy", "joint")
-"""Arms that give up tilt or sight where this lowers the predicted error: worse only if that error is larger.
-
-Since the flights before, the ray model takes the detector's errors by tilt, so that steep views cost less.
-"""
+ARMS = ("fixed", "adaptive", "joint")
 KINDS = ("wall", "boxes", "forest", "hills", "overhang", "beside")
-COUNT = 300
-BEFORE = Path(__file__).with_name("worlds_before.json")
-WORSE = 1.05  # largest ratio to the earlier value, for flights that were safe before
 
 _SECONDS, _HIPS_M = 12.0, 1.0
 _SIZE_M, _HIGH_M = 52.0, 16.0
@@ -54,7 +37,6 @@ _BESIDE_M = (0.1, 1.0)  # distance of an obstacle from a first slot for `beside`
 _FINE = 4  # checks against the analytic surfaces per tracking step
 _MOST_ERROR_M = 2.0  # value for an undetermined position
 _CONFIG = PlannerConfig()
-_KEPT = ("seed", "arm", "clearance_m", "ground_m", "limits", "tilt_deg", "hidden", "error_m")
 
 
 class Solid(Protocol):
@@ -312,28 +294,6 @@ def is_safe(row: dict[str, Any]) -> bool:
     return min(row["clearance_m"], row["ground_m"]) >= _CONFIG.drone_radius_m and not row["limits"]
 
 
-def main() -> None:
-    """Fly, print the tables, and exit with 1 if any check fails."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first world (default 0)")
-    parser.add_argument("--count", type=int, default=COUNT, help=f"worlds (default {COUNT})")
-    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="arms (default all)")
-    parser.add_argument("--write", type=Path, help="store the flights here, and check nothing")
-    arguments = parser.parse_args()
-    seeds = range(arguments.first, arguments.first + arguments.count)
-    rows = list(flown(seeds, arguments.workers, arguments.arms))
-    if arguments.write:
-        short = [[_rounded(row[key]) for key in _KEPT] for row in rows]
-        arguments.write.write_text("[\n" + ",\n".join(map(json.dumps, short)) + "\n]\n", encoding="utf-8")
-        return
-    before = [dict(zip(_KEPT, row, strict=True)) for row in json.loads(BEFORE.read_text(encoding="utf-8"))]
-    trouble = report(rows, before)
-    for line in trouble:
-        print(f"FAIL: {line}")
-    sys.exit(1 if trouble else 0)
-
-
 def flown(seeds: Iterable[int], workers: int, arms: Sequence[str]) -> Iterable[dict[str, Any]]:
     """Fly some worlds; yield their flights in the order of their seeds."""
     if workers == 1:
@@ -343,61 +303,3 @@ def flown(seeds: Iterable[int], workers: int, arms: Sequence[str]) -> Iterable[d
     with ProcessPoolExecutor(workers) as pool:
         for rows in pool.map(partial(fly, arms=arms), seeds):
             yield from rows
-
-
-def report(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[str]:
-    """Print the figures of the flights, and return the failed checks."""
-    old = {(row["seed"], row["arm"]): row for row in before}
-    trouble = []
-    header = ("arm", "flights", "touched", "touched before", "nearest m", "limits broken", "nearest actor m")
-    print("| " + " | ".join([*header, "tilt", "hidden", "predicted error"]) + " |")
-    print("|" + " --- |" * 10)
-    for arm in (*ARMS, "all"):
-        now = [row for row in rows if arm in (row["arm"], "all")]
-        if not now:
-            continue
-        pairs = [(row, old[key]) for row in now if (key := (row["seed"], row["arm"])) in old]
-        safe = [pair for pair in pairs if is_safe(pair[1])]
-        ratios = {key: _ratio(safe, key) for key in ("tilt_deg", "hidden", "error_m")} if pairs else {}
-        cells = [
-            arm,
-            len(now),
-            sum(row["clearance_m"] <= 0 for row in now),
-            sum(was["clearance_m"] <= 0 for _, was in pairs) if pairs else "-",
-            f"{min(row['clearance_m'] for row in now):.2f}",
-            sum(row["limits"] > 0 for row in now),
-            f"{min(row['actor_m'] for row in now):.2f}",
-            *([f"{ratio:.3f}" for ratio in ratios.values()] or ["-", "-", "-"]),
-        ]
-        print("| " + " | ".join(map(str, cells)) + " |")
-        counted = ("error_m",) if arm in (*PREDICTING, "all") else tuple(ratios)
-        trouble += [
-            f"{arm}: {key} is {ratios[key]:.3f} of before in {len(safe)} flights that were safe"
-            for key in counted
-            if ratios and ratios[key] > WORSE
-        ]
-    print("Ratios are of means over the flights that were safe before.")
-    for row in rows:
-        what = f"world {row['seed']} ({row['kind']}), {row['arm']}"
-        if row["clearance_m"] <= 0:
-            trouble.append(f"{what}: a drone touches something, {row['clearance_m']:.2f} m")
-        if row["ground_m"] <= 0:
-            trouble.append(f"{what}: a drone is below the ground")
-        if row["limits"]:
-            trouble.append(f"{what}: {row['limits']} limits broken")
-        if row["actor_m"] < _CONFIG.actor_distance_m:
-            trouble.append(f"{what}: {row['actor_m']:.2f} m from the actor")
-    return trouble
-
-
-def _ratio(pairs: list[tuple[dict[str, Any], dict[str, Any]]], key: str) -> float:
-    now, was = (float(np.mean([pair[k][key] for pair in pairs])) if pairs else 0.0 for k in (0, 1))
-    return now / was if was else float(now > 0) + 1.0
-
-
-def _rounded(value: object) -> object:
-    return round(value, 4) if isinstance(value, float) else value
-
-
-if __name__ == "__main__":
-    main()

@@ -1,32 +1,11 @@
-"""Speed and memory of reading and ingesting logs: the figures of docs/benchmarks-logs.md.
+"""Logs as a recorder on one drone writes them, of any size, and ways to read them in a process of their own.
 
-python -m benchmarks.ingest_log [--log recorder|pictures] [--megabytes 500] [--picture-kb 60] [--cold]
-    [--container ros1|ros2-sqlite3|ros2-mcap]
-
-A recorder's log of one drone has odometry at 100 Hz, an IMU at 200 Hz, a transform at 100 Hz and pictures at
-30 Hz; the other log has odometry and pictures alone. Three things are timed, each in a process of its own,
-in turns, and the best of three counts:
-
-- raw: opening the log with the library named and iterating over the bytes of every message;
-- reading: opening it with `Log` and decoding every message of odometry and pictures;
-- ingest: the whole call of `pipelines.ingest.ingest` with force, from flight.yaml to the published session:
-  hashing the log, poses and frame times from it, the tables written and synced.
-
-Each process first does the same with a log of 1 MB. So imports, and the code that rosbags generates from
-definitions, are left out; the time of that first ingest is given separately. Logs are in the page cache. With
-`--cold` they come from the disk: the system is asked to drop them before each run. The last line tells if
-every ratio of an ingest and its memory meet the goals.
-
-"thread" are processor seconds of the thread that reads: hashing has its own threads. On a machine with a free
-core their ratio equals that of wall times; on a busy machine it is more reliable.
+Odometry comes at 100 Hz, an IMU at 200 Hz, a transform at 100 Hz and pictures at 30 Hz.
 """
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
-import os
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -47,7 +26,6 @@ from tests.synthetic.logs import ROS1, ROS2
 
 POSE, PICTURE = "/drone1/odometry", "/drone1/camera/image/compressed"
 TICKS_HZ = 600
-LEAST_RATIO, MOST_MB = 0.7, 400
 Topics = Mapping[str, tuple[str, int]]
 """Type, and number of ticks between two messages, by topic."""
 
@@ -73,89 +51,22 @@ cameras:
 Reading = Callable[[Path], int]
 
 
-def main() -> None:
-    """Write the logs, time them raw, read and ingested, print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--log", choices=LOGS, default="recorder")
-    parser.add_argument("--megabytes", type=int, default=500)
-    parser.add_argument("--picture-kb", type=int, default=60)
-    parser.add_argument("--container", choices=CONTAINERS, action="append", help="by default all")
-    parser.add_argument("--cold", action="store_true", help="logs come from the disk")
-    options = parser.parse_args()
-    ratios: list[float] = []
-    peaks_mb: list[float] = []
-    print(
-        "| container | raw with | raw s (thread) | reading s | ratio | ingest s (thread) | ratio (thread) |"
-        " first | MB |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for container in options.container or CONTAINERS:
-        with tempfile.TemporaryDirectory() as folder:
-            arguments = (container, LOGS[options.log], options.picture_kb * 1000)
-            small = in_a_process(write, Path(folder) / "small", *arguments, 1)
-            large = in_a_process(write, Path(folder) / "large", *arguments, options.megabytes)
-            libraries = {"rosbags": with_rosbags}
-            if container == "ros2-mcap":
-                libraries["mcap"] = with_mcap
-            readings = {**libraries, "reading": decoded, "ingest": ingested}
-            best = best_of_three(readings, small, large, options.cold)
-        reading, whole = best["reading"], best["ingest"]
-        peaks_mb.append(whole["peak_mb"])
-        for library in libraries:
-            raw, raw_s = best[library], best[library]["seconds"]
-            ratios.append(raw_s / whole["seconds"])
-            print(
-                f"| {container} | {library} | {raw_s:.2f} ({raw['cpu_s']:.2f}) | {reading['seconds']:.2f} |"
-                f" {raw_s / reading['seconds']:.2f} | {whole['seconds']:.2f} ({whole['cpu_s']:.2f}) |"
-                f" {raw_s / whole['seconds']:.2f} ({raw['cpu_s'] / whole['cpu_s']:.2f}) |"
-                f" {whole['first_s']:.2f} | {whole['peak_mb']:.0f} |",
-                flush=True,
-            )
-    passed = min(ratios) >= LEAST_RATIO and max(peaks_mb) < MOST_MB
-    print(
-        f"\n{'PASS' if passed else 'FAIL'}: the smallest ratio of an ingest is {min(ratios):.2f} (aim"
-        f" {LEAST_RATIO}), the highest peak {max(peaks_mb):.0f} MB (below {MOST_MB})"
-    )
-
-
-def best_of_three(
-    readings: Mapping[str, Reading], small: Path, large: Path, cold: bool
-) -> dict[str, dict[str, float]]:
-    """Run each reading three times in turns and return the figures of its fastest run."""
-    runs: dict[str, list[dict[str, float]]] = {name: [] for name in readings}
-    for _ in range(3):
-        for name, reading in readings.items():
-            runs[name].append(in_a_process(timed, reading, small, large, cold))
-    return {name: min(found, key=lambda figures: figures["seconds"]) for name, found in runs.items()}
-
-
 def in_a_process(function: Callable[..., Any], *arguments: object) -> Any:
     """Call a function in a fresh process with its own peak memory."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(function, arguments)
 
 
-def timed(reading: Reading, small: Path, large: Path, cold: bool = False) -> dict[str, float]:
+def timed(reading: Reading, small: Path, large: Path) -> dict[str, float]:
     """Measure wall and thread seconds for a log, seconds for a small one before it, and peak memory."""
     start = time.perf_counter()
     reading(small)
     first_s = time.perf_counter() - start
-    if cold:
-        evict(large)
     start, cpu_start = time.perf_counter(), time.thread_time()
     count = reading(large)
     seconds, cpu_s = time.perf_counter() - start, time.thread_time() - cpu_start
     assert count > 0
     return {"seconds": seconds, "cpu_s": cpu_s, "first_s": first_s, "peak_mb": peak_mb()}
-
-
-def evict(log: Path) -> None:
-    """Ask the system to drop a log from the page cache, so that it comes from the disk."""
-    for path in log.rglob("*") if log.is_dir() else [log]:
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())  # only pages that are on the disk can be dropped
-                os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 def peak_mb() -> float:
@@ -238,7 +149,3 @@ def write(folder: Path, container: str, topics: Topics, picture_bytes: int, mega
                     written += len(data)
             tick += 1
     return path
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,432 @@
+"""The planner: safety in random worlds, predicted errors, and filming of groups.
+
+    python -m benchmarks.planner worlds [--first 0] [--count 300]       # exit 1 if a drone touches anything
+    python -m benchmarks.planner prediction [--first 1000] [--count 20] # predicted against measured errors
+    python -m benchmarks.planner filming              # published plans, needs MOCAP_REAL_DATA
+    python -m benchmarks.planner groups [--seeds 10 11 12 13 14 15]     # people who walk apart and come back
+
+Every command takes `--write`. Worlds have walls down to one voxel, boxes, forests, hills and overhangs.
+Flights are checked against the analytic surfaces that the voxels were made from. Worlds 1000 to 1999 were
+tuned on; those from 2000 on are kept aside.
+
+prediction: one posture of a walk, carried along by the actor, is measured by triangulation with modelled
+keypoints and white pose noise (0.02 m, 0.2 deg). The ray model predicts the error from the same noise. Arms
+whose "way is known" see the actor's whole way: they bound what a planner can reach.
+
+filming: the scenes of Hughes et al. 2024, four robots on a grid of 1 m, eight headings, 4 to 6 people who
+move. Their planners' solutions are scored with `view_quality`, frame by frame. Then every scene is planned
+from the same starts by the planner of the arm `group`, under the same limits. They are no logs of a flight:
+robots jump from cell to cell. groups: four drones, people who stand together, walk apart, and come back.
+`first` is `adaptive` with the weight of all others 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.flights import REAL_DATA, scenario_of, walker
+from benchmarks.results import fixed, keep, markdown_table
+from pipelines.formats.common.files import read_yaml
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.noise import White
+from pipelines.ingest import ingest
+from pipelines.planning.arm_flights import CameraPaths, measure
+from pipelines.planning.arms import PLANNER_ARMS
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.groups import Choice, Worth, plan_in_turn
+from pipelines.planning.replay import Start, replay
+from pipelines.planning.scene import Settings
+from pipelines.planning.scores import coverage, predicted_errors, score, view_quality
+from pipelines.planning.search import Lattice
+from pipelines.replan import detect_by_model, error_model, replan
+from pipelines.simulate import simulate
+from pipelines.simulation.scenario import DetectorErrors, Lens
+from pipelines.simulation.study.sightings import walk
+from tests.synthetic.worlds import ARMS, flown, world_of
+
+_CONFIG = PlannerConfig()
+Lines = list[str]
+
+
+# --- random worlds ---------------------------------------------------------------------------------------
+
+
+def worlds(options: argparse.Namespace) -> Lines:
+    """Fly all arms through random worlds; exit with 1 if any check fails."""
+    seeds = range(options.first or 0, (options.first or 0) + (options.count or 300))
+    rows = list(flown(seeds, options.workers, ARMS))
+    table, trouble = [], []
+    for arm in ARMS:
+        own = [row for row in rows if row["arm"] == arm]
+        table.append(
+            [
+                *(arm, str(len(own)), str(sum(row["clearance_m"] <= 0 for row in own))),
+                *(fixed(min(row[key] for row in own), 2) for key in ("clearance_m", "actor_m")),
+                str(sum(row["limits"] > 0 for row in own)),
+                fixed(float(np.mean([row["tilt_deg"] for row in own])), 1),
+                fixed(100 * float(np.mean([row["hidden"] for row in own])), 2),
+                fixed(1e3 * float(np.mean([row["error_m"] for row in own])), 1),
+            ]
+        )
+    for row in rows:
+        broken = {
+            "touches something": row["clearance_m"] <= 0,
+            "is below the ground": row["ground_m"] <= 0,
+            "breaks limits": row["limits"],
+            "is too near to the actor": row["actor_m"] < _CONFIG.actor_distance_m,
+        }
+        world = f"world {row['seed']} ({row['kind']}), {row['arm']}"
+        trouble += [f"FAIL: {world}: a drone {what}" for what, true in broken.items() if true]
+    header = ["arm", "flights", "touched", "nearest m", "nearest actor m", "limits broken"]
+    lines = markdown_table([*header, "tilt deg", "hidden %", "predicted mm"], table)
+    if trouble:
+        sys.exit("\n".join([*lines, *trouble]))
+    return lines
+
+
+# --- predicted and measured errors -----------------------------------------------------------------------
+
+NEAREST_M = 8.0
+FLOWN: Mapping[str, tuple[str, Mapping[str, Any], bool]] = {
+    "fixed": ("fixed", {}, False),
+    "adaptive": ("adaptive", {}, False),
+    "joint, 10 m only": ("joint", {"ranges_m": (10.0,)}, False),
+    "adaptive, 8 m": ("adaptive", {"radius_m": NEAREST_M}, False),
+    "joint": ("joint", {}, False),
+    "joint, from 8 m": ("joint", {"radius_m": NEAREST_M}, False),
+    "adaptive, 8 m, way known": ("adaptive", {"radius_m": NEAREST_M}, True),
+    "joint, from 8 m, way known": ("joint", {"radius_m": NEAREST_M}, True),
+}
+"""Arms by their names in the table: the planner's arm, changes of its settings, and if it knows the way."""
+_NOISE = White(position_m=0.02, rotation_deg=0.2)
+_EVERY = 2  # tracking steps from picture to picture
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """One arm in one world: errors in mm of each second, NaN where nothing was determined."""
+
+    predicted: Float
+    measured: Float
+    hidden: float
+    range_m: float
+
+
+def predict(seed: int) -> dict[str, Predicted]:
+    """Fly all arms through one world; predict and measure their errors."""
+    world = world_of(seed)
+    field = world.field()
+    walking = walk(1.0, 2.0, seed=0)
+    names, posture = walking.person.joints, walking.joints[0] - walking.motion.root[0]
+    errors = replace(
+        error_model(DetectorErrors(), names),
+        position_sigma_m=_NOISE.position_m,
+        rotation_sigma_deg=_NOISE.rotation_deg,
+    )
+    lens = Lens().intrinsics()
+    start = Start(world.drones, world.yaw_rad)
+    rows = slice(None, None, _EVERY)
+    found = {}
+    for arm, (name, changes, knows) in FLOWN.items():
+        config = replace(PlannerConfig(), errors=errors, **changes)
+        done = replay(
+            PLANNER_ARMS.get(name),
+            world.actor_t_ns,
+            world.actor,
+            [field],
+            start,
+            config=config,
+            foresight=knows,
+        )
+        joints, place, actor = done.actor[rows, None] + posture, done.position[:, rows], done.actor[rows]
+        measured = measure(
+            CameraPaths(
+                t_ns=done.t_ns[rows],
+                position=place,
+                quaternion_xyzw=done.quaternion_xyzw[:, rows],
+                known=np.ones((world.drones, len(joints)), dtype=np.bool_),
+                intrinsics=[lens] * world.drones,
+                noise=[[_NOISE]] * world.drones,
+                joints=joints,
+                middle=actor,
+            ),
+            field,
+            partial(detect_by_model, joints=names, errors=DetectorErrors()),
+            start_m=config.sight_start_m,
+            trials=32,
+            seed=seed,
+        )
+        predicted = predicted_errors(place, actor, field, config)
+        second = done.t_s[rows].astype(int)
+        of_each = np.moveaxis(measured.error_m, 1, 0).reshape(len(second), -1).astype(np.float64)
+        figures = score(done.t_s, done.position, done.actor, field, config)
+        found[arm] = Predicted(
+            _by_second(np.where(np.isfinite(predicted), predicted, np.nan), second),
+            _by_second(of_each, second),
+            float(str(figures["occluded_share"])),
+            float(np.linalg.norm(done.position - done.actor, axis=-1).mean()),
+        )
+    return found
+
+
+def _by_second(values: Float, second: Float) -> Float:
+    """Average finite values [T] or [T, K] of each second, in mm; NaN where there are none."""
+    own = [values[second == each] for each in np.unique(second)]
+    known = [each[np.isfinite(each)] for each in own]
+    return np.array([1e3 * each.mean() if each.size else np.nan for each in known])
+
+
+def prediction(options: argparse.Namespace) -> Lines:
+    """Compare predicted with measured errors, and each arm with the best of those that know the way."""
+    first = options.first or 1000
+    with ProcessPoolExecutor(options.workers) as pool:
+        found = list(pool.map(predict, range(first, first + (options.count or 20))))
+    knowing = [arm for arm, (_, _, knows) in FLOWN.items() if knows]
+    least = [min(float(np.nanmean(world[arm].measured)) for arm in knowing) for world in found]
+    rows = []
+    for arm in FLOWN:
+        own = [world[arm] for world in found]
+        measured = np.array([np.nanmean(one.measured) for one in own])
+        rows.append(
+            [
+                *(arm, fixed(float(np.mean([one.range_m for one in own])), 1)),
+                *(fixed(float(measured.mean()), 1),),
+                fixed(float(np.mean([np.nanmean(one.predicted) for one in own])), 1),
+                fixed(100 * float(np.mean([one.hidden for one in own])), 2),
+                fixed(float(np.mean(measured / least)), 3),
+            ]
+        )
+    means = np.array(
+        [[np.nanmean(one.predicted), np.nanmean(one.measured)] for w in found for one in w.values()]
+    )
+    header = ["arm", "range m", "measured mm", "predicted mm", "hidden %", "over the best that knows the way"]
+    return [
+        *markdown_table(header, rows),
+        "",
+        f"Correlation over {len(means)} flights: {np.corrcoef(*means.T)[0, 1]:.3f}.",
+    ]
+
+
+# --- published plans of groups ---------------------------------------------------------------------------
+
+SCENES = ("cluster", "cross_mix", "four_split")
+PLANNERS = ("formation", "greedy", "assignment", "myopic", "multipleroundsgreedy")
+HEADINGS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")
+VIEW_RAD = np.pi / 2
+SCORED_RAD = {"cluster": 2.0 * np.pi, "cross_mix": VIEW_RAD, "four_split": VIEW_RAD}
+"""Field of view of the published figures. Those of `cluster` were made without one."""
+HEIGHT_M = 5.0
+STEP_CELLS, STEP_TURNS = 2, 1
+
+
+@dataclass(frozen=True)
+class FilmedScene:
+    """People over time, and the size of the grid."""
+
+    people: Float  # [T, A, 3] m, on the ground
+    heading_rad: Float  # [T, A]
+    weight: Float  # [T, A]
+    cells: tuple[int, int]
+    fov_rad: float
+
+
+def scene_of(folder: Path, name: str) -> FilmedScene:
+    """Read a scene."""
+    document = json.loads((folder / name / f"{name}_data.json").read_text(encoding="utf-8"))
+    rows = np.array(
+        [
+            [[*each["location"][:2], each["rotation"][2], each["weight"]] for each in row]
+            for row in document["actor_positions"]
+        ]
+    )
+    scale = document["scene"]["scale"]
+    people = np.concatenate([rows[..., :2], np.zeros_like(rows[..., :1])], axis=-1)
+    return FilmedScene(
+        people, rows[..., 2], rows[..., 3], (int(scale["x"]), int(scale["y"])), SCORED_RAD[name]
+    )
+
+
+def solution_of(folder: Path, name: str, planner: str) -> Float:
+    """Read a planner's solution: x, y (m) and the number of the heading, [N, T, 3]."""
+    document = json.loads((folder / name / planner / "solution.json").read_text(encoding="utf-8"))
+    states = [[each["state"] for each in path] for _, path in document["elements"]]
+    return np.array(
+        [[[s["x"], s["y"], HEADINGS.index(s["heading"])] for s in path] for path in states], float
+    )
+
+
+def covered(scene: FilmedScene, states: Float, k: int) -> Float:
+    """Compute what cameras in states [..., 3] cover at step k, [..., A, 7]."""
+    position = np.concatenate([states[..., :2], np.full((*states.shape[:-1], 1), HEIGHT_M)], axis=-1)
+    looks = states[..., 2] * np.pi / 4
+    return coverage(position, looks, scene.people[k], scene.heading_rad[k], fov_rad=scene.fov_rad)
+
+
+def quality(scene: FilmedScene, paths: Float) -> Float:
+    """Compute the view quality [T] of paths [N, T, 3]."""
+    steps = range(len(scene.people))
+    return np.array(
+        [view_quality(covered(scene, paths[:, k], k).sum(axis=0), scene.weight[k]) for k in steps]
+    )
+
+
+def planned(scene: FilmedScene, starts: Float) -> Float:
+    """Plan paths [N, T, 3] from starts [N, 3] on the grid."""
+    grid = grid_of(scene.cells)
+    yaw, x, y = grid.states.T
+    cells = np.stack([x, y, yaw / (np.pi / 4)], axis=-1)
+    steps = len(scene.people) - 1
+    seen = np.stack([covered(scene, cells, k + 1) for k in range(steps)])
+    slots = Choice(grid, grid.states[0], np.zeros((steps, len(cells))), cells[None], seen)
+    choices = [
+        [slots._replace(start=np.array([heading * np.pi / 4, east, north]))]
+        for east, north, heading in starts
+    ]
+    paths = plan_in_turn(choices, Worth(scene.weight[0], 1.0))
+    return np.stack([np.vstack([start, cells[path]]) for start, (_, path) in zip(starts, paths, strict=True)])
+
+
+def grid_of(cells: tuple[int, int]) -> Lattice:
+    """Connect all cells and headings (states: yaw, x, y) by the steps and turns of the published planners."""
+    x, y, heading = np.meshgrid(*(np.arange(n) for n in (*cells, len(HEADINGS))), indexing="ij")
+    step, turn = range(-STEP_CELLS, STEP_CELLS + 1), range(-STEP_TURNS, STEP_TURNS + 1)
+    near = sorted(((i, j, k) for i in step for j in step for k in turn), key=lambda each: sum(map(abs, each)))
+    neighbours = np.empty((x.size, len(near)), dtype=np.int64)
+    for k, (i, j, turned) in enumerate(near):
+        east, north = x + i, y + j
+        number = (east * cells[1] + north) * len(HEADINGS) + (heading + turned) % len(HEADINGS)
+        inside = (east >= 0) & (east < cells[0]) & (north >= 0) & (north < cells[1])
+        neighbours[:, k] = np.where(inside, number, -1).ravel()
+    states = np.stack([heading * np.pi / 4, x + 1, y + 1], axis=-1).reshape(-1, 3).astype(np.float64)
+    rates = np.array([STEP_TURNS * np.pi / 4, STEP_CELLS, STEP_CELLS])
+    return Lattice(states, rates, 1.0, 0.0, neighbours, np.zeros(neighbours.shape))
+
+
+def filming(_: argparse.Namespace) -> Lines:
+    """Score published plans and ours."""
+    folder = REAL_DATA / "hughes_filming"
+    if not folder.is_dir():
+        sys.exit("MOCAP_REAL_DATA names no folder with hughes_filming")
+    rows = []
+    for name in SCENES:
+        scene = scene_of(folder, name)
+        with (folder / name / "ppa_evaluation.csv").open(encoding="utf-8") as file:
+            published = list(csv.DictReader(file))
+        for planner in PLANNERS:
+            ours = quality(scene, solution_of(folder, name, planner))
+            theirs = np.array([float(row[planner]) for row in published])
+            near = int((np.abs(ours / theirs - 1) <= 0.02).sum())
+            totals = (fixed(float(theirs.sum()), 2), fixed(float(ours.sum()), 2))
+            rows.append([name, planner, *totals, f"{near} of {len(ours)}"])
+        starts = solution_of(folder, name, "greedy")[:, 0]
+        paths = planned(replace(scene, fov_rad=VIEW_RAD), starts)
+        rows.append([name, "planned here", "", fixed(float(quality(scene, paths).sum()), 2), ""])
+    return markdown_table(["scene", "planner", "published", "here", "frames within 2 %"], rows)
+
+
+# --- groups that split -----------------------------------------------------------------------------------
+
+_WALK: dict[str, Any] = {"walk": {"distance_m": 9, "speed_mps": 1.2}}
+
+
+def splitting(number: int) -> dict[str, dict[str, Any]]:
+    """Return people of a scenario who stand together, walk apart, turn, come back and stand together."""
+    people = {}
+    for k in range(number):
+        heading_deg = 360.0 / number * k
+        east, north = (float(part(np.radians(heading_deg))) for part in (np.cos, np.sin))
+        together, back = {"stand": {"seconds": 3}}, {"turn": {"deg": 180}}
+        people[f"walker{k}"] = walker(east, north, heading_deg, together, _WALK, back, _WALK, together)
+    return people
+
+
+def compared(people: dict[str, dict[str, Any]], seed: int, arms: tuple[str, ...], *, alone: bool) -> Any:
+    """Simulate a flight and compare arms on it; return metrics.json. `alone`: others have no weight."""
+    plan = scenario_of(people, seed)
+    plan["duration_s"] = 24
+    plan["drones"] |= {"count": 4, "camera": {"rate_hz": 5}}
+    with tempfile.TemporaryDirectory(prefix="groups-") as folder:
+        scenario, manifest = Path(folder) / "scenario.yaml", Path(folder) / "flight" / "flight.yaml"
+        scenario.write_text(json.dumps(plan), encoding="utf-8")
+        simulate(scenario, manifest.parent, video=False)
+        stated: Any = read_yaml(manifest)
+        for k, actor in enumerate(stated["actors"].values()):
+            actor["weight"] = 0.0 if alone and k else 1.0
+        manifest.write_text(json.dumps(stated), encoding="utf-8")
+        session = ingest(manifest, Path(folder) / "flight.session").folder
+        return replan(session, Settings(arms=arms, trials=4)).metrics
+
+
+def groups(options: argparse.Namespace) -> Lines:
+    """Compare arms where people walk apart; means over flights."""
+    seeds = options.seeds or [10, 11, 12, 13, 14, 15]
+    rows = []
+    for number in (2, 3):
+        people = splitting(number)
+        for name, arms, alone in (
+            ("", ("group", "adaptive", "joint"), False),
+            ("first", ("adaptive",), True),
+        ):
+            found = [compared(people, seed, arms, alone=alone)["arms"] for seed in seeds]
+            for arm in arms:
+                own = [row[arm] for row in found]
+                errors = [row["reconstruction_error"] for row in own]
+                by_person = [list(row["by_person"].values()) for row in own]
+                each = np.mean([[one["pck150"]["mean"] for one in row] for row in by_person], axis=0)
+                right, measured = (
+                    100 * np.mean([error[key]["mean"] for error in errors]) for key in ("pck150", "coverage")
+                )
+                view = np.mean([[one["view_quality"] for one in row] for row in by_person])
+                rows.append(
+                    [
+                        *(str(number), name or arm, f"{right:.1f}"),
+                        " ".join(f"{100 * share:.0f}" for share in each),
+                        *(f"{measured:.1f}", f"{view:.3f}"),
+                        f"{np.mean([row['blind_s'] for row in own]):.1f}",
+                        str(sum(sum(row["limit_violations"].values()) for row in own)),
+                    ]
+                )
+    header = ["people", "arm", "within 150 mm %", "of each", "measured %", "view quality", "blind s"]
+    return markdown_table([*header, "limits violated"], rows)
+
+
+SUBJECTS: dict[str, tuple[Callable[[argparse.Namespace], Lines], str]] = {
+    "worlds": (worlds, "planner-worlds"),
+    "prediction": (prediction, "planner-prediction"),
+    "filming": (filming, "planner-filming"),
+    "groups": (groups, "planner-groups"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("subject", choices=SUBJECTS)
+    parser.add_argument("--first", type=int, help="seed of the first world")
+    parser.add_argument("--count", type=int, help="worlds")
+    parser.add_argument("--seeds", type=int, nargs="+")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/results.md")
+    options = parser.parse_args(arguments)
+    function, key = SUBJECTS[options.subject]
+    lines = function(options)
+    print("\n".join(lines))
+    if options.write:
+        keep(key, lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,396 @@
+"""Speed of all that takes time, beside peers: `python -m benchmarks.speed [--only NAME ...] [--write]`.
+
+Times are those of one thread with compiled code warm: the best of several runs, in processor time unless a
+row says otherwise. Peers run here, but for those of `refined`, which were measured once for this project on
+another machine (2,250 frames of the same kind of walk, five cameras, true poses).
+
+    triangulation  22,500 frames of 17 joints in five cameras, 2 px; also 5 % gross errors and missing views
+    association    five people among each other in five cameras, 900 frames
+    refinement     75 s of five cameras, 17 joints, 30 Hz
+    logs           a recorder's log of 200 MB: rosbags iterates over raw messages, we ingest
+    planner        a central plan of the seed's size and of the largest; 75 s of flight; a map of 25 M voxels
+    renderer       a picture of the sample's scene, 1280x720
+    sample         the commands on the sample flight, with detection in all pictures
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import yaml  # type: ignore[import-untyped]
+
+from benchmarks.flights import SAMPLE
+from benchmarks.results import keep, markdown_table
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.noise import pose_errors
+from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.geometry.triangulation import Views, estimate_noise, locate, triangulate
+from pipelines.keypoints.association import associate
+from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import distance_field
+from pipelines.planning.forecast import Forecast
+from pipelines.planning.formation import formation_slots
+from pipelines.planning.replay import Start, replay
+from pipelines.reconstruction.refinement.refine import refine
+from pipelines.session.records import Occupancy
+from pipelines.simulate import simulate
+from pipelines.simulation.detector_errors import see
+from pipelines.simulation.flying import orbit
+from tests.geometry.rings import FOCAL, ring, with_outliers, with_pixel_noise
+from tests.planning.worlds import mound, walker
+from tests.reconstruction.formations import BONES, formation, mean_mm
+from tests.synthetic import recorder_logs
+from tests.synthetic.keypoints import KeypointNoise, detect
+from tests.synthetic.walk import walk
+
+Row = tuple[str, str, str]
+"""What was timed, how fast it is, and how well, or what it is to be compared with."""
+
+
+def best_s(run: Callable[[], object], repeats: int = 5) -> float:
+    """Measure the shortest processor time (s) of several runs of one thread."""
+    times = []
+    for _ in range(repeats):
+        started = time.process_time()
+        run()
+        times.append(time.process_time() - started)
+    return min(times)
+
+
+# --- triangulation ---------------------------------------------------------------------------------------
+
+
+def triangulation() -> Iterator[Row]:
+    """Time triangulation, and numpy and pycolmap on fewer joint-frames."""
+    rng = np.random.default_rng(1)
+    truth, exact = ring(22_500, 5)
+    noisy = with_pixel_noise(exact, rng)
+    outliers, _ = with_outliers(noisy, rng, uniform=False)
+    few = slice(0, 17 * 450)
+    for name, views in (("2 px", noisy), ("outliers", outliers)):
+        seen = replace(views, pixel_sigma=estimate_noise(views))
+        for method in ("midpoint", "robust"):
+            points = locate(seen, method=method, threads=1).points
+            took_s = best_s(lambda: triangulate(seen, method=method, threads=1))  # noqa: B023
+            yield _points_row(f"triangulation, {method}, {name}", took_s, points, truth)
+        own = _part(views, few)
+        peers = {"pycolmap LO-RANSAC": pycolmap_ransac}
+        if name == "2 px":
+            peers["numpy batched SVD"] = numpy_svd
+        for peer, run in peers.items():
+            yield _points_row(
+                f"the same by {peer}, {name}", best_s(partial(run, own), 1), run(own), truth[few]
+            )
+
+
+def _points_row(what: str, took_s: float, points: Float, truth: Float) -> Row:
+    error_mm = 1e3 * float(np.nanmean(np.linalg.norm(points - truth, axis=1)))
+    return what, f"{len(truth) / took_s / 1e6:.2f} M joint-frames/s", f"{error_mm:.2f} mm"
+
+
+def projections(views: Views) -> Float:
+    """Compute projection matrices camera_from_world [F, C, 3, 4]."""
+    camera_from_world = np.swapaxes(views.rotation, -1, -2)
+    return np.concatenate([camera_from_world, -camera_from_world @ views.position[..., None]], axis=-1)
+
+
+def numpy_svd(views: Views) -> Float:
+    """Triangulate by the homogeneous linear method with numpy's batched SVD."""
+    P = projections(views)[views.pose_index]
+    rows = views.rays[..., None] * P[:, :, 2:] - P[:, :, :2]
+    X = np.linalg.svd(rows.reshape(len(rows), -1, 4))[2][:, -1]
+    points: Float = X[:, :3] / X[:, 3:]
+    return points
+
+
+def pycolmap_ransac(views: Views) -> Float:
+    """Triangulate with pycolmap's robust method and a gate of 15 px, one call per joint-frame."""
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1920, height=1080, params=[FOCAL, 960, 540])
+    options = pycolmap.EstimateTriangulationOptions()
+    options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
+    options.ransac.max_error = 15.0
+    poses = [[pycolmap.Rigid3d(p) for p in row] for row in projections(views)]
+    pixels = views.rays * FOCAL + [960, 540]
+    points = np.full((len(pixels), 3), np.nan)
+    for n, seen in enumerate(np.isfinite(pixels.sum(axis=2))):
+        row = [pose for pose, there in zip(poses[views.pose_index[n]], seen, strict=True) if there]
+        if len(row) > 1:
+            result = pycolmap.estimate_triangulation(pixels[n, seen], row, [camera] * len(row), options)
+            if result is not None:
+                points[n] = result["xyz"]
+    return points
+
+
+def _part(views: Views, rows: slice) -> Views:
+    """Select some joint-frames and their poses."""
+    instants = slice(0, int(views.pose_index[rows].max()) + 1)
+    return replace(
+        views,
+        rays=views.rays[rows],
+        weight=views.weight[rows],
+        pose_index=views.pose_index[rows],
+        position=views.position[instants],
+        rotation=views.rotation[instants],
+        pose_sigma=views.pose_sigma[instants],
+    )
+
+
+# --- several people --------------------------------------------------------------------------------------
+
+_PEOPLE, _FRAMES, _PIXEL_PX = 5, 900, 3.0
+_LENS = Intrinsics(1920, 1080, 1000.0, 1000.0, 959.5, 539.5)
+
+
+def association() -> Iterator[Row]:
+    """Time the association of five people, and their triangulation."""
+    t_s = np.arange(_FRAMES) / 30
+    people = np.stack(
+        [
+            walk(
+                t_s,
+                start=(2.5 * np.cos(k), 2.5 * np.sin(k)),
+                heading_deg=70.0 * k,
+                radius_m=2.0 + 0.4 * k,
+            )
+            for k in range(_PEOPLE)
+        ],
+        axis=1,
+    )
+    xy, confidence, position, rotation = _filmed(people, t_s)
+    sigma = np.full((_FRAMES, _PEOPLE), _PIXEL_PX / _LENS.fx)
+    found: list[Int64] = []
+
+    def choose() -> None:
+        result = associate(t_s, xy, confidence, position, rotation, sigma, people=_PEOPLE)
+        found[:] = [result.choice]
+
+    choose()
+    took_ms = 1e3 * best_s(choose, 3) / _FRAMES
+    yield "association, five people in five cameras", f"{took_ms:.2f} ms/frame", ""
+    views = _views_of(found[0], xy, confidence, position, rotation)
+    took_ms = 1e3 * best_s(lambda: triangulate(views, method="robust", threads=1), 3) / _FRAMES
+    yield "their triangulation", f"{took_ms:.2f} ms/frame", "RapidPoseTriangulation claims 1 ms"
+
+
+def _filmed(people: Float, t_s: Float) -> tuple[Float, Float, Float, Float]:
+    """Simulate detections in a random order, and the poses of the cameras, as `associate` takes them."""
+    rng = np.random.default_rng(0)
+    middle = np.tile([0.0, 0.0, 1.0], (len(t_s), 1))
+    position, quaternion = orbit(t_s, middle, cameras=_PEOPLE, range_m=14, variation=1)
+    xy = np.full((len(t_s), _PEOPLE, _PEOPLE, 17, 2), np.nan)
+    confidence = np.zeros(xy.shape[:-1])
+    for c in range(_PEOPLE):
+        order = rng.permuted(np.tile(np.arange(_PEOPLE), (len(t_s), 1)), axis=1)
+        for k in range(_PEOPLE):
+            seen = see(people[:, k], position[c], quaternion[c], _LENS)
+            pixels, sure = detect(seen, KeypointNoise(pixel_px=_PIXEL_PX), rng)
+            rows, places = np.nonzero(order == k)
+            xy[rows, c, places], confidence[rows, c, places] = undistort(pixels, _LENS), sure
+    rotation = matrix_from_quaternion(quaternion)
+    return xy, confidence, position.swapaxes(0, 1).copy(), rotation.swapaxes(0, 1).copy()
+
+
+def _views_of(choice: Int64, xy: Float, confidence: Float, position: Float, rotation: Float) -> Views:
+    """Collect the chosen views of each person, one row for each joint-frame."""
+    chosen, absent = np.clip(choice, 0, None)[:, :, :, None], (choice < 0)[:, :, :, None]
+    taken = np.where(absent[..., None], np.nan, np.take_along_axis(xy, chosen[..., None], axis=2))
+    weight = np.where(absent, 0.0, np.take_along_axis(confidence, chosen, axis=2))
+    return Views(
+        rays=np.moveaxis(taken, 1, 3).reshape(-1, _PEOPLE, 2),
+        weight=np.moveaxis(weight, 1, 3).reshape(-1, _PEOPLE),
+        pose_index=np.repeat(np.arange(_FRAMES), _PEOPLE * 17),
+        position=position,
+        rotation=rotation,
+        focal=np.full(_PEOPLE, _LENS.fx),
+        pixel_sigma=np.full(_PEOPLE, _PIXEL_PX),
+        pose_sigma=np.zeros((_FRAMES, _PEOPLE, 2)),
+    )
+
+
+# --- refinement ------------------------------------------------------------------------------------------
+
+_REFINED_PEERS = (
+    ("Pose2Sim, best cameras", 6.4, 12.7, 15.3),
+    ("aniposelib, optimised", 5.2, 7.4, 16.3),
+    ("aniposelib, with bone lengths", 3.4, 6.5, 14.2),
+)
+
+
+def refinement() -> Iterator[Row]:
+    """Time `refined` on a walk of 75 s."""
+    for name, share in (("2 px", 0.0), ("outliers", 0.05)):
+        flight = formation(2250, 5, (), 0, bad_share=share)
+        views = flight.sightings
+        prior, clocks = [pose_errors(())] * len(views), np.zeros(len(views))
+        for _ in range(2):  # the first compiles
+            started = time.process_time()
+            result = refine(flight.t_s, views, flight.start, BONES, prior, clocks, threads=1)
+            took_s = time.process_time() - started
+        errors = [mean_mm(each, flight.truth) for each in (result.position, flight.start)]
+        speed = f"{2250 * 17 / took_s / 1e3:.1f} k joint-frames/s"
+        yield f"refinement, {name}", speed, f"{errors[0]:.2f} mm; triangulated {errors[1]:.2f} mm"
+    for peer, speed_k, clean_mm, outliers_mm in _REFINED_PEERS:
+        said = f"{clean_mm} mm; outliers {outliers_mm} mm"
+        yield f"{peer} (another machine)", f"{speed_k} k joint-frames/s", said
+
+
+# --- logs ------------------------------------------------------------------------------------------------
+
+
+def logs() -> Iterator[Row]:
+    """Time the ingest of logs, and rosbags' raw iteration, each in a process of its own."""
+    for container in recorder_logs.CONTAINERS:
+        with tempfile.TemporaryDirectory(prefix="speed-") as folder:
+            small, large = (
+                recorder_logs.write(Path(folder) / str(mb), container, recorder_logs.RECORDER, 60_000, mb)
+                for mb in (1, 200)
+            )
+            raw, own = (
+                min(
+                    (recorder_logs.in_a_process(recorder_logs.timed, run, small, large) for _ in range(3)),
+                    key=lambda figures: float(figures["seconds"]),
+                )
+                for run in (recorder_logs.with_rosbags, recorder_logs.ingested)
+            )
+        said = f"rosbags, raw: {raw['seconds']:.2f} s"
+        yield f"ingest of {container}, 200 MB", f"{own['seconds']:.2f} s, {own['peak_mb']:.0f} MB", said
+
+
+# --- planner ---------------------------------------------------------------------------------------------
+
+_SIZES = ((8, 5, 2), (32, 10, 2), (72, 20, 5))
+
+
+def planner() -> Iterator[Row]:
+    """Time central plans, closed-loop flights, and the distance field of a large map."""
+    field = mound(resolution_m=0.2)
+    for arm, sizes in ((ADAPTIVE, _SIZES), (JOINT, _SIZES[1:2])):
+        for yaws, knots, drones in sizes:
+            config = replace(PlannerConfig(), yaws=yaws, horizon_knots=knots, knot_s=10.0 / knots)
+            plans = arm.start(config, drones=drones, yaw_rad=0.7)
+            slots = formation_slots(
+                np.array([0.7]), drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
+            )
+            took_ms = []
+            for k in range(201):
+                walked = 0.2 * k + 1.2 * config.knot_s * np.arange(1, knots + 1)
+                actor: Float = np.stack([walked, 0 * walked, 0 * walked + 1], axis=1)
+                started = time.thread_time()
+                plans.plan(1.0 + k, slots[0], Forecast(actor, np.zeros(knots)), field)  # each is due
+                took_ms.append(1e3 * (time.thread_time() - started))
+            size = f"{yaws} yaws, {knots} knots, {drones} drones"
+            said = "Ho et al. 2021: 1.3 ms" if drones == 5 else ""
+            yield f"plan of {arm.name}, {size}", f"{np.median(took_ms[1:]):.2f} ms", said
+    for arm in (FIXED, ADAPTIVE, JOINT):
+        for seconds in (2.0, 75.0):  # the first compiles
+            fly = partial(replay, arm, *walker(seconds), [field], Start(2, np.pi / 4), config=PlannerConfig())
+            took_s = best_s(fly, 2)
+        yield f"75 s of flight by {arm.name}", f"{took_s:.2f} s", ""
+    with get_context("spawn").Pool(1) as pool:
+        took_s, peak_gb = pool.apply(_field_of_hills)
+    yield "distance field of 25 M voxels", f"{took_s:.1f} s, {peak_gb:.2f} GB", ""
+
+
+def _field_of_hills() -> tuple[float, float]:
+    """Return the processor time (s) of the field, and the peak memory of the process (GB)."""
+    assert mound().sight  # loads what is compiled
+    x, y, z = np.ogrid[:500, :500, :100]
+    hills = z < 20 + 12 * np.sin(x / 40) * np.cos(y / 55)
+    occupancy = Occupancy(np.where(hills, np.float32(0.9), np.float32(0.1)), np.zeros(3), 0.2)
+    started = time.process_time()
+    assert len(distance_field(occupancy).sight)  # lines of sight are looked up beside distances
+    took_s = time.process_time() - started
+    return took_s, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+# --- pictures and commands -------------------------------------------------------------------------------
+
+
+def renderer() -> Iterator[Row]:
+    """Time a second of film against the same flight without video."""
+    document: Any = yaml.safe_load((SAMPLE / "scenario.yaml").read_text(encoding="utf-8"))
+    document["duration_s"] = 1
+    with tempfile.TemporaryDirectory(prefix="speed-") as folder:
+        scenario = Path(folder) / "scenario.yaml"
+        scenario.write_text(yaml.safe_dump(document), encoding="utf-8")
+        took_s = []
+        for turn, video in enumerate((True, True, False)):  # the first compiles
+            started = time.process_time()
+            simulate(scenario, Path(folder) / str(turn), video=video)
+            took_s.append(time.process_time() - started)
+        pictures = document["drones"]["count"] * document["drones"]["camera"]["rate_hz"]
+    yield "rendered picture, 1280x720, coded", f"{1e3 * (took_s[1] - took_s[2]) / pictures:.0f} ms", ""
+
+
+def sample() -> Iterator[Row]:
+    """Time the commands on the sample flight, each in a process of its own."""
+    mocap = str(Path(sys.executable).with_name("mocap"))
+    with tempfile.TemporaryDirectory(prefix="speed-") as folder:
+        session = str(Path(folder) / "sample.session")
+        for command, *options in (
+            ("ingest", str(SAMPLE / "flight.yaml"), "-o", session),
+            ("reconstruct", session, "--workers", "1"),
+            ("replan-compare", session),
+            ("report", session),
+        ):
+            before_s = _children_s()
+            asked = [mocap, command, *options]
+            quiet = subprocess.DEVNULL
+            subprocess.run(asked, check=True, stdout=quiet, stderr=quiet)  # noqa: S603
+            yield f"`mocap {command}` of the sample", f"{_children_s() - before_s:.1f} s", ""
+
+
+def _children_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+SUBJECTS: dict[str, Callable[[], Iterator[Row]]] = {
+    "triangulation": triangulation,
+    "association": association,
+    "refinement": refinement,
+    "logs": logs,
+    "planner": planner,
+    "renderer": renderer,
+    "sample": sample,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
+    parser.add_argument("--write", action="store_true", help="put the table into docs/results.md")
+    options = parser.parse_args()
+    rows = []
+    for name in options.only:
+        for row in SUBJECTS[name]():
+            print(json.dumps(row), file=sys.stderr, flush=True)
+            rows.append(list(row))
+    lines = markdown_table(["what", "speed", "result, or compared with"], rows)
+    print("\n".join(lines))
+    if options.write:
+        load = f"Load of the machine: {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores."
+        keep("speed", [*lines, "", load])
+
+
+if __name__ == "__main__":
+    main()
