@@ -1,7 +1,7 @@
 """Compilation of the numerical functions before their first use, so that no command has to wait for it.
 
 numba compiles a function for the types of its arguments. data/kernels.json lists the functions and types that
-simulation, reconstruction and replay call (`python -m benchmarks.kernels --write` makes it from a flight).
+simulation, reconstruction and replay call (`python tools/kernels.py --write` makes it from a flight).
 All others are compiled at their first use.
 
 `python -m pipelines.precompile` compiles them for every processor of a level and puts the code beside the

@@ -423,8 +423,7 @@ _CORRELATED_ELSE = 0.65
 
 It is below 1 because a detector misplaces a limb or the trunk as a whole, and least where four joints of the
 trunk take part. For the ankle it contains the offset of heel and toe from the sole. Chosen on the flights for
-tuning: about 97 % of the errors are inside two standard deviations (`python -m benchmarks.angles --flights
-tuning`).
+tuning: about 97 % of the errors are inside two standard deviations (`python -m benchmarks.accuracy corpus`).
 """
 _TIMES_AT_ONCE = 8192  # of the angles: their table is larger than the skeleton's arrays
 

@@ -15,7 +15,7 @@ from pipelines.geometry.arrays import Float, Index
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES
 
-# Order of the arrays in `data/body.npz` (`python sample_data/body_asset.py` made it, and describes them).
+# Order of the arrays in `data/body.npz` (`python tools/body_asset.py` made it, and describes them).
 SEXES = ("female", "male")
 BUILDS = ("average", "slim", "heavy")
 PARTS = ("skin", "lips", "brow", "white", "iris", "cloth")

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.synthetic.recorder_logs import CONTAINERS, RECORDER, in_a_process, ingested, timed, write
 from pipelines.formats.logs.mcap_log import McapLog
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.ingest import ingest
@@ -20,6 +19,7 @@ from pipelines.sources.logs import FlightLogs
 from pipelines.sources.world import doubts_of_stillness
 from tests.synthetic.logged_flights import write_logged_flight
 from tests.synthetic.logs import Entry, write_log
+from tests.synthetic.recorder_logs import CONTAINERS, RECORDER, in_a_process, ingested, timed, write
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.synthetic.worlds import fly, world_of
 from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import ADAPTIVE, FIXED
 from pipelines.planning.config import PlannerConfig, Zone
@@ -28,6 +27,7 @@ from pipelines.planning.scores import score
 from pipelines.planning.tracking import Plan
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import walker
+from tests.synthetic.worlds import fly, world_of
 
 CONFIG = PlannerConfig()
 TICKS = round(CONFIG.tracking_hz / CONFIG.local_hz)

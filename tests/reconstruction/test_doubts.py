@@ -15,6 +15,15 @@ import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.poses import compose, invert
+from pipelines.reconstruction.doubts import remedies
+from pipelines.reconstruction.doubts.diagnosis import diagnose
+from pipelines.reconstruction.doubts.scene import scene_of
+from pipelines.reconstruction.doubts.score import _LIMBS, _TORSO, _shape, score
+from pipelines.reconstruction.doubts.turning import Lateness
+from pipelines.session.description import DOUBT_CODES, read_description
+from tests.commands.runner import refused, succeeds
 from tests.synthetic.described_flights import (
     COCO_SWAPPED,
     DOWN_DEG,
@@ -47,15 +56,6 @@ from tests.synthetic.described_flights import (
     with_remedy,
     written,
 )
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import compose, invert
-from pipelines.reconstruction.doubts import remedies
-from pipelines.reconstruction.doubts.diagnosis import diagnose
-from pipelines.reconstruction.doubts.scene import scene_of
-from pipelines.reconstruction.doubts.score import _LIMBS, _TORSO, _shape, score
-from pipelines.reconstruction.doubts.turning import Lateness
-from pipelines.session.description import DOUBT_CODES, read_description
-from tests.commands.runner import refused, succeeds
 
 THREE = next(flight for flight in FLIGHTS if flight.name == "kick3")
 

