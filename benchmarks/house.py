@@ -9,7 +9,6 @@ python -m benchmarks.house --session S --times build/tests.xml --count
 import argparse
 import ast
 import contextlib
-import dataclasses
 import importlib
 import json
 import os
@@ -270,9 +269,9 @@ def manifest_keys() -> tuple[str, ...]:
 
 def planner_settings() -> tuple[str, ...]:
     """Return the settings of the planner that PLANNER.yaml may state."""
-    from pipelines.planning.config import PlannerConfig
+    from pipelines.planning.config import SETTINGS
 
-    return tuple(field.name for field in dataclasses.fields(PlannerConfig))
+    return SETTINGS
 
 
 def leaves(value: object) -> int:

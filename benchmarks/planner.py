@@ -43,13 +43,12 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import White
 from pipelines.ingest import ingest
 from pipelines.planning.arm_flights import CameraPaths, measure
-from pipelines.planning.arms import PLANNER_ARMS
-from pipelines.planning.config import PlannerConfig
-from pipelines.planning.groups import Choice, Worth, plan_in_turn
+from pipelines.planning.arms import PLANNER_ARMS, SlotChoice, Worth, plan_in_turn
+from pipelines.planning.config import PlannerConfig, PlannerTuning
+from pipelines.planning.formation import Lattice
 from pipelines.planning.replay import Start, replay
-from pipelines.planning.scene import Settings
+from pipelines.planning.scene import ReplanSettings
 from pipelines.planning.scores import coverage, predicted_errors, score, view_quality
-from pipelines.planning.search import Lattice
 from pipelines.replan import detect_by_model, error_model, replan
 from pipelines.simulate import simulate
 from pipelines.simulation.scenario import DetectorErrors, Lens
@@ -140,7 +139,7 @@ def predict(seed: int) -> dict[str, Predicted]:
     rows = slice(None, None, _EVERY)
     found = {}
     for arm, (name, changes, knows) in FLOWN.items():
-        config = replace(PlannerConfig(), errors=errors, **changes)
+        config = PlannerConfig(tuning=PlannerTuning(errors=errors), **changes)
         done = replay(
             PLANNER_ARMS.get(name),
             world.actor_t_ns,
@@ -164,7 +163,7 @@ def predict(seed: int) -> dict[str, Predicted]:
             ),
             field,
             partial(detect_by_model, joints=names, errors=DetectorErrors()),
-            start_m=config.sight_start_m,
+            start_m=config.tuning.sight_start_m,
             trials=32,
             seed=seed,
         )
@@ -289,7 +288,7 @@ def planned(scene: FilmedScene, starts: Float) -> Float:
     cells = np.stack([x, y, yaw / (np.pi / 4)], axis=-1)
     steps = len(scene.people) - 1
     seen = np.stack([covered(scene, cells, k + 1) for k in range(steps)])
-    slots = Choice(grid, grid.states[0], np.zeros((steps, len(cells))), cells[None], seen)
+    slots = SlotChoice(grid, grid.states[0], np.zeros((steps, len(cells))), cells[None], seen)
     choices = [
         [slots._replace(start=np.array([heading * np.pi / 4, east, north]))]
         for east, north, heading in starts
@@ -366,7 +365,7 @@ def compared(people: dict[str, dict[str, Any]], seed: int, arms: tuple[str, ...]
             actor["weight"] = 0.0 if alone and k else 1.0
         manifest.write_text(json.dumps(stated), encoding="utf-8")
         session = ingest(manifest, Path(folder) / "flight.session").folder
-        return replan(session, Settings(arms=arms, trials=4)).metrics
+        return replan(session, ReplanSettings(arms=arms, trials=4)).metrics
 
 
 def groups(options: argparse.Namespace) -> Lines:

@@ -221,14 +221,14 @@ POSE_FIGURES = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150", "reconstru
 FILMED = {
     "E2, mound": (
         "real_e2",
-        "--arms adaptive,fixed --config sample_data/planning/real_e2_planner.yaml --yaw 45"
-        " --render --render-hz 5 --render-start 23 --render-end 28",
+        "--arms adaptive,fixed --config sample_data/planning/real_e2_planner.yaml --config yaw_deg=45"
+        " --render 5,start=23,end=28",
     ),
     **{
         f"E3, {name}": (
             scenario,
             "--arms adaptive --config sample_data/planning/real_e3_planner.yaml"
-            f" --render --render-hz 10 --render-start {start} --render-end {start + 5}",
+            f" --render 10,start={start},end={start + 5}",
         )
         for name, scenario, start in (("jogging", "real_e3_jog", 4), ("soccer", "real_e3_soccer", 5))
     },

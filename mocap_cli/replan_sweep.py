@@ -14,7 +14,7 @@ from mocap_cli.terminal import print_table, say, say_warnings, watching
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipelines.planning.scene import Settings
+    from pipelines.planning.scene import ReplanSettings
     from pipelines.sweep import Over
 
 
@@ -54,13 +54,12 @@ _over_options = grouped(
 )
 
 
-def _settings(arms: str, config: Path | None, **others: Any) -> Settings:
-    from pipelines.planning.scene import Settings
-    from pipelines.replan import planner_settings
+def _settings(arms: str, config: Path | None, **others: Any) -> ReplanSettings:
+    from pipelines.replan import settings_of
 
-    return Settings(
+    return settings_of(
+        () if config is None else (str(config),),
         arms=tuple(dict.fromkeys(name.strip() for name in arms.split(","))),
-        planner=planner_settings(config, {}),
         **others,
     )
 
@@ -97,7 +96,7 @@ _settings_options = grouped(
 @force_option
 @output_options
 def replan_sweep_command(
-    session: Path, over: Over, settings: Settings, force: bool, shown: Shown
+    session: Path, over: Over, settings: ReplanSettings, force: bool, shown: Shown
 ) -> dict[str, Any] | None:
     """Fly every combination of ranges, tilts and numbers of drones against the log.
 

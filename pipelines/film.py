@@ -54,16 +54,21 @@ from pipelines.simulation.study.sightings import (
 
 FILM = Stage("film", revision=5)
 
-_SAME_M = 0.05  # tolerance between the scenario's hips and the session's truth, which is interpolated
+# The session's truth is interpolated, which moves the hips of a runner by less than this.
+MAX_HIPS_OFF_M = 0.05
+# The videos are drawn on and encoded again, so that the first encoding has to be better.
+VIDEO_QUALITY = 20
+# The enlarged square shows the person with a margin for arms.
+INLET_HEIGHTS = 1.3
+# A detection whose joints lie farther than this from a person's, in the median, shows somebody else.
+MAX_MEDIAN_OFF_M = 0.25
+
 _HIPS = ("left_hip", "right_hip")
-_QUALITY = 20  # of the videos that are drawn on
-_INLET_HEIGHTS = 1.3  # of the person
-_SHOWN_M = 0.25  # largest median distance of a detection's joints from those of the person whom it shows
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Settings that determine a film: rate, span and detector."""
+class FilmSettings:
+    """FilmSettings that determine a film: rate, span and detector."""
 
     rate_hz: float = 5.0
     start_s: float | None = None  # since the replay's first moment, which is the default
@@ -71,8 +76,39 @@ class Settings:
     detector: str = "blazepose"
 
 
+def film_settings(stated: str) -> tuple[FilmSettings, Path | None]:
+    """Read `HZ[,KEY=VALUE...]`, where a value may hold commas; return the scenario beside the settings.
+
+    Raises:
+        ValueError: an unknown key, or a number that is none or out of range.
+    """
+    rate_hz, *parts = stated.split(",")
+    values = {"rate_hz": rate_hz}
+    for part in parts:
+        key = part.partition("=")[0]
+        if key in ("start", "end", "detector", "scenario"):
+            values[key] = part.partition("=")[2]
+        elif len(values) > 1 and list(values)[-1] in ("detector", "scenario"):
+            values[list(values)[-1]] += f",{part}"
+        else:
+            raise ValueError(f"{part!r} is none of start=S, end=S, detector=NAME and scenario=FILE")
+    numbers = {}
+    for key, low, high in (("rate_hz", 0.1, 30.0), ("start", 0.0, 1e6), ("end", 0.0, 1e6)):
+        if key in values:
+            try:
+                numbers[key] = float(values[key])
+            except ValueError:
+                numbers[key] = np.nan
+            if not low <= numbers[key] <= high:
+                raise ValueError(f"{key} {values[key]!r} is no number from {low:g} to {high:g}")
+    settings = FilmSettings(
+        numbers["rate_hz"], numbers.get("start"), numbers.get("end"), values.get("detector", "blazepose")
+    )
+    return settings, Path(values["scenario"]) if "scenario" in values else None
+
+
 @dataclass(frozen=True)
-class Filmed:
+class FilmResult:
     """Result of filming."""
 
     folder: Path
@@ -83,12 +119,12 @@ class Filmed:
 
 def film(
     folder: Path,
-    settings: Settings | None = None,
+    settings: FilmSettings | None = None,
     *,
     scenario: Path | None = None,
     force: bool = False,
     progress: Progress | None = None,
-) -> Filmed:
+) -> FilmResult:
     """Film every arm of a session's comparison.
 
     Args:
@@ -101,7 +137,7 @@ def film(
             detector's files are missing.
         BusyError: another process writes the session.
     """
-    settings = settings or Settings()
+    settings = settings or FilmSettings()
     progress = progress or Silent()
     with locked(folder) as session:
         session.intact_record("ingest")
@@ -121,7 +157,7 @@ def film(
         inputs |= {f"model {name}": digest for name, digest in hashes_of_models(detector).items()}
         run = session.begin(FILM, settings=asdict(settings), inputs=inputs, force=force)
         if run.finished:
-            return Filmed(folder, run.record, read_json(folder / "film" / "metrics.json"), skipped=True)
+            return FilmResult(folder, run.record, read_json(folder / "film" / "metrics.json"), skipped=True)
 
         flight = load_flight(
             folder,
@@ -178,7 +214,7 @@ def film(
         record = run.publish(counts={"moments": counts, "detector": detector.title})
         for note in advice_on(detector):
             progress.note(note)
-    return Filmed(folder, record, figures, skipped=False)
+    return FilmResult(folder, record, figures, skipped=False)
 
 
 # --- what is filmed ------------------------------------------------------------------------------------
@@ -213,7 +249,7 @@ def _scenario_of(folder: Path, description: Description) -> Path:
     raise DataError(
         folder,
         "has no scenario.yaml of a simulated flight beside it",
-        "name it with --scenario SCENARIO.yaml",
+        "name it: --render HZ,scenario=SCENARIO.yaml",
         code="no-such-file",
     )
 
@@ -231,11 +267,11 @@ def _set(plan: Scenario, path: Path, flight: LoggedFlight) -> Set:
     joints = followed.person.keypoints(followed.moving((flight.hips.t_ns - plan.start_ns) / 1e9))
     hips = joints[:, [followed.person.joints.index(name) for name in _HIPS]].mean(axis=1)
     off_m = float(np.nanmax(np.linalg.norm(hips - flight.hips.position[:, 0, 0], axis=-1)))
-    if not off_m <= _SAME_M:
+    if not off_m <= MAX_HIPS_OFF_M:
         raise DataError(
             path,
             f"is not this flight's: its actor is {off_m:.2f} m from the session's truth",
-            "name the flight's own with --scenario",
+            "name the flight's own: --render HZ,scenario=SCENARIO.yaml",
         )
     return setting
 
@@ -247,7 +283,7 @@ def _arm(
     plan: Scenario,
     setting: Set,
     name: str,
-    settings: Settings,
+    settings: FilmSettings,
 ) -> _Arm:
     table = read_table(folder / "replan" / name / "trajectories.parquet", REPLAN)
     cameras, position, quaternion = poses_from(table)
@@ -282,7 +318,7 @@ def _arm(
     )
 
 
-def _rows(t_ns: Int64, settings: Settings) -> Int64:
+def _rows(t_ns: Int64, settings: FilmSettings) -> Int64:
     """Find the rows of the moments [T] nearest to evenly spaced ones at the wanted rate, each once."""
     since_s = (t_ns - t_ns[0]) / 1e9
     first = settings.start_s or 0.0
@@ -324,7 +360,7 @@ def _film_camera(
 
 
 def _write_video(path: Path, pictures: Iterator[Picture], t_ns: Int64, lens: Intrinsics) -> None:
-    write_h264(path, pictures, t_ns - t_ns[0], width=lens.width, height=lens.height, quality=_QUALITY)
+    write_h264(path, pictures, t_ns - t_ns[0], width=lens.width, height=lens.height, quality=VIDEO_QUALITY)
 
 
 def _whose(
@@ -333,7 +369,7 @@ def _whose(
     """Choose the detection of each person: xy [P, J, 2] px, confidence [P, J].
 
     Of one person it is the first. Of several it is the nearest to the true joints, if the median distance is
-    below `_SHOWN_M` at that person's distance.
+    below `MAX_MEDIAN_OFF_M` at that person's distance.
 
     Args:
         xy: [K, J, 2] px of K detections; confidence [K, J].
@@ -349,7 +385,7 @@ def _whose(
         off_px[np.isnan(off_px)] = np.inf
         range_m = np.linalg.norm(of.motion.root[moment] - pose[0])
         off_m[p] = np.median(off_px, axis=-1) * range_m / arm.seen_by.lens.fx
-    while off_m.min(initial=np.inf) < _SHOWN_M:
+    while off_m.min(initial=np.inf) < MAX_MEDIAN_OFF_M:
         whose, which = np.unravel_index(off_m.argmin(), off_m.shape)
         found[whose], sure[whose] = xy[which], confidence[which]
         off_m[whose] = off_m[:, which] = np.inf
@@ -470,7 +506,7 @@ def _draw(
                     f"{name}   {view.t_s:.2f} s   tilt {np.degrees(tilt_rad[k]):.0f} deg",
                     f"{int(seen.sum())} joints found, {int(known.sum())} reconstructed, {error_text}",
                 )
-                side_px = _INLET_HEIGHTS * lens.fx * nearest.height_m / float(slots[k, 2])
+                side_px = INLET_HEIGHTS * lens.fx * nearest.height_m / float(slots[k, 2])
                 yield with_inlet(draw_frame(picture, view, caption), middle_px[k], side_px)
 
     _write_video(folder / f"{name}.mp4", drawn(), arm.t_ns, lens)

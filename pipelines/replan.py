@@ -7,7 +7,6 @@ times. The stage's folder holds the last comparison, and every one by its name i
 
 from __future__ import annotations
 
-import math
 import re
 import shutil
 from collections.abc import Mapping, Sequence
@@ -33,9 +32,9 @@ from pipelines.planning.arm_flights import (
 )
 from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.comparison import ArmResult, compare
-from pipelines.planning.config import ErrorModel, PlannerConfig, planner_config
+from pipelines.planning.config import ErrorModel
 from pipelines.planning.loading import LoggedFlight, load_flight
-from pipelines.planning.scene import Scene, Settings, build_scene
+from pipelines.planning.scene import ReplanSettings, ReplayScene, build_scene, replan_settings
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
@@ -55,6 +54,7 @@ from pipelines.session.tables import (
     read_table,
     write_table,
 )
+from pipelines.session.yaml_files import plain_yaml
 from pipelines.simulation.detector_errors import (
     ANY_JOINT,
     MEDIAN_PER_SIGMA,
@@ -71,7 +71,9 @@ if TYPE_CHECKING:
 
 REPLAN_STAGE = Stage("replan", revision=6)
 
-_HEIGHT_M = 1.75  # of the person, for their size in the modelled detector's pictures
+# The detector's errors were measured by the size of a person of this height in the picture.
+PERSON_HEIGHT_M = 1.75
+
 _SKELETON = "reconstruct/skeleton.parquet"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _ENDINGS = (".json", ".parquet")  # of the tables beside the folders of comparisons
@@ -87,28 +89,31 @@ class Replanned:
     skipped: bool  # True if nothing had changed
 
 
-def planner_settings(
-    path: Path | None, changes: Mapping[str, object], *, horizon_s: float | None = None
-) -> PlannerConfig:
-    """Read planner settings of a YAML file (docs/planner.md), if there is one, and change some of them.
+def settings_of(stated: Sequence[str], **others: Any) -> ReplanSettings:
+    """Make settings of YAML files (docs/planner.md) and of texts KEY=VALUE; of a key the last one counts.
 
-    `horizon_s`, the time that the search looks ahead, is rounded up to whole knots.
+    Args:
+        stated: files and texts.
+        others: fields of `ReplanSettings` that are no keys.
 
     Raises:
-        DataError: the file cannot be read, or a setting is unknown or out of range.
+        DataError: a file cannot be read, or a setting is unknown or out of range.
     """
-    stated = {} if path is None else read_yaml(path)
-    source = "planner settings" if path is None else path
-    config = planner_config({**stated, **changes}, source)
-    if horizon_s is None:
-        return config
-    knots = math.ceil(horizon_s / config.knot_s - 1e-9)
-    return planner_config({**stated, **changes, "horizon_knots": knots}, source)
+    values: dict[str, object] = {}
+    source: Path | str = "--config"
+    for one in stated:
+        key, equals, value = one.partition("=")
+        if equals and not Path(one).exists():
+            values[key.strip()] = plain_yaml(Path(one), value)
+        else:
+            source = Path(one)
+            values |= read_yaml(source)
+    return replan_settings(values, source, **others)
 
 
 def replan(
     folder: Path,
-    settings: Settings | None = None,
+    settings: ReplanSettings | None = None,
     *,
     name: str | None = None,
     force: bool = False,
@@ -124,7 +129,7 @@ def replan(
             setting is wrong.
         BusyError: another process writes the session.
     """
-    settings = settings or Settings()
+    settings = settings or ReplanSettings()
     progress = progress or Silent()
     return_freed_arrays()
     refuse_unknown(settings.arms or ())
@@ -273,7 +278,7 @@ def error_model(errors: DetectorErrors, joints: tuple[str, ...]) -> ErrorModel:
     table = read_errors(errors_of(errors.detector))
     tilts_deg = np.unique(np.concatenate([rows[:, 0] for rows in table.rows.values()]))
     share, missed, _ = table.at(tilts_deg, joints or (ANY_JOINT,))
-    sigma_m = errors.scale * _HEIGHT_M * np.sqrt(np.mean(share**2, axis=1)) / MEDIAN_PER_SIGMA
+    sigma_m = errors.scale * PERSON_HEIGHT_M * np.sqrt(np.mean(share**2, axis=1)) / MEDIAN_PER_SIGMA
     return ErrorModel(
         tilts_deg=tuple(tilts_deg.tolist()),
         keypoint_sigma_m=tuple(sigma_m.tolist()),
@@ -281,11 +286,11 @@ def error_model(errors: DetectorErrors, joints: tuple[str, ...]) -> ErrorModel:
     )
 
 
-def settings_by_name(settings: Settings) -> dict[str, object]:
+def settings_by_name(settings: ReplanSettings) -> dict[str, object]:
     """Flatten the settings to names and values, so that a change of each planner setting can be reported."""
     stated = asdict(settings)
     planner = stated.pop("planner")
-    del planner["errors"]  # of the session
+    del planner["tuning"]  # no settings
     return stated | {f"planner.{name}": value for name, value in planner.items()}
 
 
@@ -334,14 +339,14 @@ def detect_by_model(
     errors: DetectorErrors,
 ) -> tuple[Float, Float]:
     """Simulate the detector by a model with tilt and distance (`arm_flights.Detect`)."""
-    tilt_deg, height_px = view_of(camera, target, height_m=_HEIGHT_M, focal_px=focal_px)
+    tilt_deg, height_px = view_of(camera, target, height_m=PERSON_HEIGHT_M, focal_px=focal_px)
     return detect_keypoints(pixels, free, tilt_deg, height_px, errors, rng, joints=joints)
 
 
 # --- what is stored ------------------------------------------------------------------------------------
 
 
-def fly_and_measure(scene: Scene, errors: DetectorErrors, arm: str, folder: Path) -> None:
+def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder: Path) -> None:
     """Fly one arm and measure from its cameras; write everything that the comparison needs to the folder."""
     flown = logged_arm(scene, arm) if arm in LOGGED else fly_arm(scene, PLANNER_ARMS.get(arm))
     joints = scene.flight.skeleton.joints if scene.flight.skeleton else ()
@@ -405,7 +410,7 @@ def _note_planning_times(folder: Path, times: Mapping[str, object]) -> None:
     write_json(path, runs)
 
 
-def _actor_table(scene: Scene) -> pd.DataFrame:
+def _actor_table(scene: ReplayScene) -> pd.DataFrame:
     """Make rows of `tables.ACTOR` from the actor that was used to score the arms."""
     import pandas as pd
 
@@ -414,7 +419,7 @@ def _actor_table(scene: Scene) -> pd.DataFrame:
     return table
 
 
-def _cost_table(scene: Scene) -> pd.DataFrame:
+def _cost_table(scene: ReplayScene) -> pd.DataFrame:
     import pandas as pd
 
     t_ns, yaws, cost = scene.cost_map()

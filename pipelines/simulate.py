@@ -6,7 +6,7 @@ detector's errors instead of videos; write a flight.yaml that names all of these
 
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import partial
 from importlib.resources import files
@@ -22,7 +22,7 @@ from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import join_videos, write_h264
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.planning.arms import PLANNER_ARMS
-from pipelines.planning.config import PlannerConfig
+from pipelines.planning.config import planner_config
 from pipelines.planning.distance_field import distance_field
 from pipelines.planning.replay import Pilot, Start
 from pipelines.session.errors import DataError
@@ -178,16 +178,15 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
         )
     arm = PLANNER_ARMS.get(formation.planner)
     followed = next(iter(scenario.people.values()))
-    try:
-        config = PlannerConfig(
-            radius_m=formation.radius_m,
-            tilt_deg=formation.tilt_deg,
-            actor_sigma_m=max(followed.estimate_sigma_m, _LEAST_SIGMA_M),
-            speed_mps=scenario.drones.limits.speed_mps,
-            acceleration_mps2=scenario.drones.limits.acceleration_mps2,
-        )
-    except ValueError as error:
-        raise DataError(f"{path}: drones", str(error), "take ring, or other numbers") from None
+    stated = {
+        "radius_m": formation.radius_m,
+        "tilt_deg": formation.tilt_deg,
+        "speed_mps": scenario.drones.limits.speed_mps,
+        "acceleration_mps2": scenario.drones.limits.acceleration_mps2,
+    }
+    config = planner_config(stated, f"{path}: drones")
+    sigma_m = max(followed.estimate_sigma_m, _LEAST_SIGMA_M)
+    config = replace(config, tuning=replace(config.tuning, actor_sigma_m=sigma_m))
 
     def start(world: World) -> Planner:
         spec = scenario.world.map

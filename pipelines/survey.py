@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pipelines.formats.common.files import read_yaml
-from pipelines.planning.config import PlannerConfig, planner_config
+from pipelines.planning.config import SETTINGS
+from pipelines.planning.scene import replan_settings
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight, read_flight
@@ -159,7 +160,7 @@ def _of_yaml(path: Path) -> Survey:
     kinds = {
         "flight manifest": (keys_of(Flight), _of_manifest),
         "scenario": (keys_of(Scenario), _of_scenario),
-        "planner settings": ({field.name for field in fields(PlannerConfig)}, _of_planner),
+        "planner settings": ({*SETTINGS, "yaw_deg", "mode"}, _of_planner),
     }
     known = {title: len(keys & stated.keys()) for title, (keys, _) in kinds.items()}
     title, most = max(known.items(), key=lambda each: each[1])
@@ -192,5 +193,5 @@ def _of_scenario(path: Path) -> dict[str, Any]:
 
 def _of_planner(path: Path) -> dict[str, Any]:
     stated = read_yaml(path)
-    planner_config(stated, path)
+    replan_settings(stated, path)
     return stated

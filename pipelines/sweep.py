@@ -20,7 +20,7 @@ import numpy as np
 
 from pipelines.planning.comparison import capped_mm, mean_of_trials, measure_alone
 from pipelines.planning.loading import load_flight
-from pipelines.planning.scene import Scene, Settings, build_scene
+from pipelines.planning.scene import ReplanSettings, ReplayScene, build_scene
 from pipelines.replan import (
     detector_errors,
     error_model,
@@ -82,7 +82,7 @@ class _Cell:
 
 def sweep(
     folder: Path,
-    settings: Settings,
+    settings: ReplanSettings,
     over: Over,
     *,
     force: bool = False,
@@ -155,7 +155,7 @@ def sweep(
     return Swept(folder, record, metrics, skipped=False)
 
 
-def _cells(scene: Scene, arms: Sequence[str], over: Over) -> list[_Cell]:
+def _cells(scene: ReplayScene, arms: Sequence[str], over: Over) -> list[_Cell]:
     config = scene.config
     cells = [
         _Cell(*values)
@@ -171,12 +171,14 @@ def _cells(scene: Scene, arms: Sequence[str], over: Over) -> list[_Cell]:
     return cells
 
 
-def _scene_of(scene: Scene, cell: _Cell) -> Scene:
+def _scene_of(scene: ReplayScene, cell: _Cell) -> ReplayScene:
     planner = replace(scene.config, radius_m=cell.radius_m, tilt_deg=cell.tilt_deg)
     return replace(scene, drones=cell.drones, settings=replace(scene.settings, planner=planner))
 
 
-def _row(scene: Scene, cell: _Cell, scores: dict[str, Any], capped: np.ndarray[Any, Any]) -> dict[str, Any]:
+def _row(
+    scene: ReplayScene, cell: _Cell, scores: dict[str, Any], capped: np.ndarray[Any, Any]
+) -> dict[str, Any]:
     """Return the figures of one combination; way and energy are those of all drones together."""
     errors = scores["reconstruction_error"]
     estimate = mean_of_trials(capped, scene.settings.seed)

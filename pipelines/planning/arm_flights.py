@@ -21,11 +21,10 @@ from pipelines.planning.arms import Arm
 from pipelines.planning.distance_field import DistanceField, MapsInTurn, looked, visible
 from pipelines.planning.forecast import ActorFilter, PeopleFilter
 from pipelines.planning.formation import TILT, YAW, slot_of
-from pipelines.planning.groups import hidden_by_people, sights
 from pipelines.planning.loading import planned_positions
 from pipelines.planning.replay import Start, replay
-from pipelines.planning.scene import Scene
-from pipelines.planning.scores import errors_of_views
+from pipelines.planning.scene import ReplayScene
+from pipelines.planning.scores import errors_of_views, hidden_by_people, sights
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,7 +58,7 @@ class ArmFlight:
     local_s: Sequence[float] = ()
 
 
-def logged_arm(scene: Scene, name: str) -> ArmFlight:
+def logged_arm(scene: ReplayScene, name: str) -> ArmFlight:
     """Return the flight of one of `LOGGED`.
 
     The drones of `planned` are exactly at their commanded positions. Each has its own camera. The camera
@@ -80,18 +79,18 @@ def logged_arm(scene: Scene, name: str) -> ArmFlight:
     )
 
 
-def _on_the_middle(scene: Scene, known: Bool) -> Float:
+def _on_the_middle(scene: ReplayScene, known: Bool) -> Float:
     """Return the aim [N, T, P] of cameras that film the weighted middle."""
     return np.broadcast_to(scene.weights, (*known.shape, len(scene.weights)))
 
 
-def aimed_at(scene: Scene, flown: ArmFlight) -> Float:
+def aimed_at(scene: ReplayScene, flown: ArmFlight) -> Float:
     """Compute the places [N, T, 3] that the cameras film, by the reference of the scores."""
     places: Float = np.einsum("ntp,ptx->ntx", flown.aim, scene.people)
     return places
 
 
-def seen_people(scene: Scene, flown: ArmFlight) -> Bool:
+def seen_people(scene: ReplayScene, flown: ArmFlight) -> Bool:
     """Test [P, N, T] who is seen from which camera."""
     return sights(flown.position, looks_rad(flown), scene.people, scene.maps, scene.config)
 
@@ -103,10 +102,10 @@ def looks_rad(flown: ArmFlight) -> Float:
     return yaw
 
 
-def _estimates(scene: Scene) -> Float:
+def _estimates(scene: ReplayScene) -> Float:
     """Estimate the actor's positions [T, 3] as planners do, from no later measurement."""
     flight, config = scene.flight, scene.config
-    each = [ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m) for _ in scene.people]
+    each = [ActorFilter(q=config.actor_q, sigma_m=config.tuning.actor_sigma_m) for _ in scene.people]
     actor, known = PeopleFilter(each, scene.weights), np.isfinite(flight.actor[..., 0])
     log_s = (flight.actor_t_ns - flight.actor_t_ns[0]) / 1e9
     until = np.searchsorted(flight.actor_t_ns, scene.t_ns, side="right")
@@ -119,7 +118,7 @@ def _estimates(scene: Scene) -> Float:
     return found
 
 
-def fly_arm(scene: Scene, arm: Arm, *, foresight: bool = False) -> ArmFlight:
+def fly_arm(scene: ReplayScene, arm: Arm, *, foresight: bool = False) -> ArmFlight:
     """Fly a scene again; with `foresight` the arm knows the actor's whole way, which bounds its forecast."""
     done = replay(
         arm,
@@ -147,7 +146,7 @@ def fly_arm(scene: Scene, arm: Arm, *, foresight: bool = False) -> ArmFlight:
     )
 
 
-def measure_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | None:
+def measure_arm(scene: ReplayScene, flown: ArmFlight, detect: Detect) -> Measured | None:
     """Simulate what an arm's cameras measure of everybody's skeleton; None without a skeleton.
 
     It is known which keypoints belong to whom.
@@ -174,7 +173,7 @@ def measure_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | No
             replace(paths, joints=each[p], middle=people[p], person=p, others=np.delete(people, p, axis=0)),
             scene.maps_at(paths.t_ns),
             detect,
-            start_m=scene.config.sight_start_m,
+            start_m=scene.config.tuning.sight_start_m,
             trials=scene.settings.trials,
             seed=scene.settings.seed,
         )
@@ -183,7 +182,7 @@ def measure_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | No
     return joined(found)
 
 
-def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
+def trajectories(scene: ReplayScene, flown: ArmFlight) -> pd.DataFrame:
     """Return the rows of `tables.REPLAN`."""
     import pandas as pd
 
@@ -207,7 +206,7 @@ def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
     return table
 
 
-def seen_joints(scene: Scene, flown: ArmFlight, measured: Measured) -> pd.DataFrame:
+def seen_joints(scene: ReplayScene, flown: ArmFlight, measured: Measured) -> pd.DataFrame:
     """Return the rows of `tables.SEEN`: the first person's joints once a second, as seen by each camera."""
     import pandas as pd
 

@@ -1,63 +1,67 @@
 """The arms that are compared: ways to choose the slots of the cameras.
 
 All share forecast, local planner and tracking. An arm is one object with a name that starts a
-`FormationPlanner` for a flight; a package adds one by an entry point in `mocap.planner_arms`.
+`FormationPlanner` for a flight; a package adds one by an entry point in `mocap.planner_arms`. The plan for
+several people maximises a submodular worth of all views together, so that planning in turn is a good solution
+(Hughes et al., "Multi-Robot Planning for Filming Groups of Moving Actors Leveraging Submodularity and Pixel
+Density", CDC 2024): a view of what nobody sees yet adds more than another one of the same.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, visible
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import (
     RANGE,
     TILT,
+    TOO_NEAR,
     YAW,
     FormationPath,
-    formation_slots,
-    slot_of,
-    slot_offsets,
-    wrapped,
-    yaw_set,
-)
-from pipelines.planning.groups import Choice, Worth, hidden_by_people, in_view, plan_in_turn
-from pipelines.planning.information import log_determinant, predicted_error, ray_information
-from pipelines.planning.scores import coverage, view_quality
-from pipelines.planning.search import (
-    TOO_NEAR,
     Formations,
     Lattice,
     SlotCosts,
+    TeamViews,
     TeamWeights,
-    Views,
     best_sequence,
     best_teams,
     cheapest_slots,
     cost_map,
     costs_in_frame,
     costs_of_slots,
-    error_map,
+    formation_slots,
     lattice,
+    slot_of,
+    slot_offsets,
     slot_weights,
     turn_the_shorter_way,
+    wrapped,
+    yaw_set,
+)
+from pipelines.planning.scores import (
+    coverage,
+    hidden_by_people,
+    in_view,
+    log_determinant,
+    predicted_error,
+    ray_information,
+    view_quality,
 )
 from pipelines.session.registries import Registry
 
-_TILTS_DEG = (-10.0, 85.0)
-_TRIANGLE = np.triu_indices(3)
-_SELDOM_S = 0.5 - 1e-6  # between two plans of `joint` and `group`: slots move little meanwhile
-_ASIDE_M = 1.0  # slots of `group` are so much farther from everybody than drones have to be
-_ROLLED_OUT_S = 5.0  # of a plan of `joint`: what comes later is planned anew before
-_STEEPER_RAD = np.radians(10.0)  # than the tilt asked for: flown paths of `joint` avoid it
-_NEAR_M = 2.0  # beyond the distance that drones keep from the actor: flown paths of `joint` avoid it
-_W_AVOIDED = 3.0  # price of each radian steeper, and of each metre nearer
-_W_HIDDEN = 0.3  # price of a hidden view, beyond that of its occupied share and of the information lost
+# Drones do not fly below the ground, and cameras do not look straight down.
+TILT_LIMITS_DEG = (-10.0, 85.0)
+# Times are sums of periods: a plan is due this much early.
+TIME_ROUNDING_S = 1e-6
+# More rounds of planning in turn change no path in practice.
+MAX_ROUNDS_IN_TURN = 10
 
+_TRIANGLE = np.triu_indices(3)
 
 RollOut = Callable[[FormationPath], tuple[Float, Float]]
 """Predicts the places of the drones [n, N, 3] and of the actor [N, 3], in m, at the times of N waypoints."""
@@ -104,61 +108,22 @@ class Arm(Protocol):
 
 
 @dataclass(frozen=True)
-class _FixedArm:
-    name: str = "fixed"
-    title: str = "fixed yaw"
+class PlannerArm:
+    """An arm whose planner is made from the settings, the number of drones and the first yaw."""
 
-    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
-        return _Fixed(config, drones, yaw_rad)
-
-
-@dataclass(frozen=True)
-class _SearchingArm:
     name: str
     title: str
-    predicts_error: bool = False
+    make: Callable[[PlannerConfig, int, float], FormationPlanner]
 
     def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
-        return _Formation(config, drones, yaw_rad, predicts_error=self.predicts_error)
-
-
-@dataclass(frozen=True)
-class _GreedyArm:
-    name: str = "greedy"
-    title: str = "each drone on its own, most information first"
-
-    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
-        return _Greedy(config, drones, yaw_rad)
-
-
-@dataclass(frozen=True)
-class _JointArm:
-    name: str = "joint"
-    title: str = "all drones together, any spacing"
-
-    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
-        return _Joint(config, drones, yaw_rad)
-
-
-@dataclass(frozen=True)
-class _GroupArm:
-    name: str = "group"
-    title: str = "several people, each drone films whom the others miss"
-
-    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
-        return _Group(config, drones, yaw_rad)
+        """Return a planner for a flight whose first camera starts at that yaw."""
+        return self.make(config, drones, yaw_rad)
 
 
 PLANNER_ARMS: Registry[Arm] = Registry("mocap.planner_arms", "planner arm")
-FIXED: Arm = _FixedArm()
-ADAPTIVE: Arm = _SearchingArm("adaptive", "adaptive formation")
-COVARIANCE: Arm = _SearchingArm("covariance", "adaptive formation, predicted error", predicts_error=True)
-GREEDY: Arm = _GreedyArm()
-JOINT: Arm = _JointArm()
-GROUP: Arm = _GroupArm()
 
 
-class _Fixed:
+class _FixedPlanner:
     """Planner that keeps the yaw of the start; only the local planner gives way."""
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
@@ -171,107 +136,42 @@ class _Fixed:
         return FormationPath(np.array([t_s]), self._slots, self._rates)
 
 
-class _Formation:
-    """Planner with the whole formation as one state.
+class _AdaptivePlanner:
+    """Planner of the formation's yaw (Ho et al.), at one tilt and range."""
 
-    The state is the yaw (Ho et al.), or yaw, tilt and range to predict errors.
-    """
-
-    def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float, *, predicts_error: bool) -> None:
-        tilts = np.radians(config.tilts_deg) if predicts_error else np.array([config.tilt_rad])
-        ranges = np.array(config.ranges_m) if predicts_error else np.array([config.radius_m])
-        yaws = config.lattice_yaws if predicts_error else config.yaws
-        self._every = config.lattice_knots if predicts_error else 1
-        states = _all_states(yaw_set(yaws, yaw_rad), tilts, ranges)
-        self._lattice = lattice(
-            states,
-            rates=np.array(config.slot_rates),
-            knot_s=self._every * config.knot_s,
-            w_turn=config.w_turn,
+    def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
+        yaws = yaw_set(config.tuning.yaws, yaw_rad)
+        states = _all_states(yaws, np.array([config.tilt_rad]), np.array([config.radius_m]))
+        self._slots = states[:, None] + formation_slots(
+            np.zeros(len(states)), drones, tilt_rad=0.0, range_m=0.0
         )
-        first = formation_slots(np.zeros(len(states)), drones, tilt_rad=0.0, range_m=0.0)
-        self._slots = states[:, None] + first  # [S, n, 3]
-        self._offsets = slot_offsets(self._slots)
-        self._config, self._predicts_error = config, predicts_error
-        self._formations = Formations(self._lattice, self._slots, self._offsets)
-        self._weights = slot_weights(config)
-        self._rates = np.array(config.slot_rates)
+        self._lattice = _lattice_of(states, config)
+        self._formations = Formations(self._lattice, self._slots, slot_offsets(self._slots))
+        self._config, self._rates = config, np.array(config.slot_rates)
 
     def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
         config = self._config
-        if self._predicts_error or config.yaw_frame == "heading":
-            costs = _look(field, actor.each(self._every), self._slots, self._offsets, config)
-            cost = cost_map(costs, config)
-            if self._predicts_error:  # the error does not depend on the zero of yaws
-                # Its logarithm: a gain is worth the same, however large the errors of the session are.
-                cost += config.w_error * np.log(error_map(costs, self._offsets, config))
+        if config.yaw_frame == "heading":
+            cost = cost_map(costs_in_frame(field, actor, self._slots, config), config)
             sequence, _ = best_sequence(cost, self._lattice, commanded[0])
             through = _through(commanded, self._slots[sequence])
         else:  # the same in one call: calls between small parts took most of the time
             position = np.ascontiguousarray(actor.position)
             through = cheapest_slots(
-                field.grid, field.sight, position, self._formations, self._weights, commanded
+                field.grid, field.sight, position, self._formations, slot_weights(config), commanded
             )
         return FormationPath(_knots(t_s, through, self._lattice), through, self._rates)
 
 
-class _Greedy:
-    """Planner for one drone after the other, each on its own lattice, by its gain over those before.
-
-    Bucker et al. 2020 (arXiv 2011.05437), solved sequentially, with the marginal log-det of the ray model's
-    information in place of their diversity of views.
-    """
-
-    def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
-        start = formation_slots(np.array(yaw_rad), drones, tilt_rad=config.tilt_rad, range_m=config.radius_m)
-        tilts, ranges = np.radians(config.tilts_deg), np.array(config.ranges_m)
-        self._lattices = [
-            lattice(
-                _all_states(yaw_set(config.lattice_yaws, slot[YAW]), tilts, ranges),
-                rates=np.array(config.slot_rates),
-                knot_s=config.lattice_knots * config.knot_s,
-                w_turn=config.w_turn,
-            )
-            for slot in start
-        ]
-        self._offsets = [slot_offsets(each.states) for each in self._lattices]
-        self._information = [ray_information(offsets, config.errors) for offsets in self._offsets]
-        self._config, self._rates = config, np.array(config.slot_rates)
-
-    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
-        config = self._config
-        actor = actor.each(config.lattice_knots)
-        knots = len(actor.position)
-        known = np.zeros((knots, 1, 3, 3)) + np.eye(3) / config.prior_sigma_m**2
-        taken: list[Float] = []
-        slots = np.empty((knots, len(self._lattices), 3))
-        for i, (grid, offsets, information) in enumerate(
-            zip(self._lattices, self._offsets, self._information, strict=True)
-        ):
-            costs = _look(field, actor, grid.states[:, None], offsets[:, None], config)
-            free = (costs.occluded == 0.0)[..., None]  # [T, S, 1, 1] once more below
-            gained = free[..., None].reshape(*free.shape[:2], 1, 1) * information
-            gain = log_determinant(known + gained) - log_determinant(known)
-            cost = cost_map(costs, config) - config.w_error * gain
-            for other in taken:
-                apart = np.linalg.norm(offsets - other[:, None], axis=-1)
-                cost += np.where(apart < config.soft_separation_m, TOO_NEAR, 0.0)
-            sequence, _ = best_sequence(cost, grid, commanded[i])
-            at = np.arange(knots)
-            known = known + gained[at, sequence][:, None]
-            taken.append(offsets[sequence])
-            slots[:, i] = grid.states[sequence]
-        through = _through(commanded, slots)
-        return FormationPath(_knots(t_s, through, self._lattices[0]), through, self._rates)
-
-
-class _SeldomPlanner:
+class _TeamPlanner:
     """Planner that plans twice a second and keeps its path in between."""
 
     _path: FormationPath | None = None
+    _config: PlannerConfig
 
     def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
-        if self._path is None or t_s - self._path.knot_s[0] >= _SELDOM_S:
+        period_s = self._config.tuning.team_plan_period_s - TIME_ROUNDING_S
+        if self._path is None or t_s - self._path.knot_s[0] >= period_s:
             self._path = self._planned(t_s, commanded, actor, field)
         return self._path
 
@@ -279,7 +179,7 @@ class _SeldomPlanner:
         raise NotImplementedError
 
 
-class _Joint(_SeldomPlanner):
+class _JointPlanner(_TeamPlanner):
     """Planner of yaw, tilt and range of every drone for the least error of all views together.
 
     Spacing is free, so that nobody has to stay behind an obstacle. All drones choose from the same slots, so
@@ -288,17 +188,15 @@ class _Joint(_SeldomPlanner):
     """
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
-        _, tilt_step, range_step = np.array(config.slot_rates) * config.knot_s
+        _, tilt_step, range_step = np.array(config.slot_rates) * config.tuning.knot_s
         neighbour = _in_a_turn(drones)
-        self._yaws = max(round(config.yaws / neighbour), 1) * neighbour
-        tilts = np.clip(config.tilt_rad + tilt_step * np.arange(-1, 2), *np.radians(_TILTS_DEG))
+        self._yaws = max(round(config.tuning.yaws / neighbour), 1) * neighbour
+        tilts = np.clip(config.tilt_rad + tilt_step * np.arange(-1, 2), *np.radians(TILT_LIMITS_DEG))
         ranges = _steps_through(config.radius_m, (*config.ranges_m, config.radius_m), range_step)
         states = _all_states(yaw_set(self._yaws, yaw_rad), np.unique(tilts), ranges)
-        self._lattice = lattice(
-            states, rates=np.array(config.slot_rates), knot_s=config.knot_s, w_turn=config.w_turn
-        )
+        self._lattice = _lattice_of(states, config)
         self._offsets = slot_offsets(states)
-        information = ray_information(self._offsets, config.errors)[:, *_TRIANGLE]
+        information = ray_information(self._offsets, config.tuning.errors)[:, *_TRIANGLE]
         per_yaw = len(states) // self._yaws
         first = np.arange(len(states))[:, None] + np.arange(drones) * (self._yaws // neighbour) * per_yaw
         formations = first % len(states)
@@ -306,20 +204,22 @@ class _Joint(_SeldomPlanner):
             np.abs(states[:, axis] - value) > 1e-9  # rad, m: rounding
             for axis, value in ((TILT, config.tilt_rad), (RANGE, config.radius_m))
         )
-        self._views = Views(
+        self._views = TeamViews(
             self._lattice,
             self._offsets,
             np.ascontiguousarray(information),
             formations,
             ~(off_tilt | off_range),
         )
-        self._weights = TeamWeights(config.w_error, config.prior_sigma_m**-2, config.soft_separation_m)
+        self._weights = TeamWeights(
+            config.tuning.w_error, config.tuning.prior_sigma_m**-2, config.soft_separation_m
+        )
         off_start = np.abs(wrapped(states[:, YAW] - yaw_rad)) + np.abs(states[:, TILT] - config.tilt_rad)
         start = formations[int((off_start + np.abs(states[:, RANGE] - config.radius_m)).argmin())]
         self._team = np.repeat(start[:, None], config.horizon_knots, axis=1)  # [n, T]
         self._config, self._rates = config, np.array(config.slot_rates)
         self.roll_out: RollOut | None = None
-        self._adaptive = ADAPTIVE.start(config, drones=drones, yaw_rad=yaw_rad)
+        self._adaptive = _AdaptivePlanner(config, drones, yaw_rad)
         self._as_adaptive = False
 
     def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
@@ -333,7 +233,7 @@ class _Joint(_SeldomPlanner):
         slots = _look(field, actor, states[:, None], self._offsets[:, None], self._config)
         free = (slots.occluded[..., 0] == 0.0).astype(np.float64)
         free = (free + self._beside(free)) / 2.0  # drones are not exactly in their slots
-        price = cost_map(slots, self._config) + _W_HIDDEN * (1.0 - free)
+        price = cost_map(slots, self._config) + self._config.tuning.w_hidden * (1.0 - free)
         teams = best_teams(price, free, self._views, self._weights, commanded, self._team)
         paths = []
         for team in teams:
@@ -355,16 +255,18 @@ class _Joint(_SeldomPlanner):
         Slots alone do not show it: drones follow late, give way to obstacles and take short cuts.
         """
         config = self._config
-        soon = max(round(_ROLLED_OUT_S / config.waypoint_s), 1)
+        soon = max(round(config.tuning.rolled_out_s / config.tuning.waypoint_s), 1)
         places, actor = places[:, :soon], actor[:soon]
-        seen = visible(field, places, actor, start_m=config.sight_start_m)
-        information = ray_information(places - actor, config.errors) * seen[..., None, None]
-        known = information.sum(axis=0) + np.eye(3) / config.prior_sigma_m**2
+        seen = visible(field, places, actor, start_m=config.tuning.sight_start_m)
+        information = ray_information(places - actor, config.tuning.errors) * seen[..., None, None]
+        known = information.sum(axis=0) + np.eye(3) / config.tuning.prior_sigma_m**2
         slots = slot_of(places - actor)
-        steep = np.maximum(slots[..., TILT] - config.tilt_rad - _STEEPER_RAD, 0.0)
-        near = np.maximum(config.actor_distance_m + _NEAR_M - slots[..., RANGE], 0.0)
-        cost = config.w_error * np.log(predicted_error(known)) + _W_HIDDEN * (~seen).sum(axis=0)
-        cost += _W_AVOIDED * (steep + near).sum(axis=0)
+        steep = np.maximum(slots[..., TILT] - config.tilt_rad - np.radians(config.tuning.steeper_deg), 0.0)
+        near = np.maximum(config.actor_distance_m + config.tuning.near_actor_m - slots[..., RANGE], 0.0)
+        cost = config.tuning.w_error * np.log(predicted_error(known)) + config.tuning.w_hidden * (~seen).sum(
+            axis=0
+        )
+        cost += config.tuning.w_avoided * (steep + near).sum(axis=0)
         return float(cost.mean())
 
     def _beside(self, values: Float) -> Float:
@@ -374,22 +276,158 @@ class _Joint(_SeldomPlanner):
         return mean
 
 
-class _Group(_SeldomPlanner):
+def _from_east(slots: Float, heading_rad: Float) -> Float:
+    """Return slots [..., 3] whose yaws count from headings [T] with yaws from east, [T, ..., 3]."""
+    found = np.repeat(slots[None], len(heading_rad), axis=0)
+    found[..., YAW] += heading_rad.reshape(-1, *[1] * (slots.ndim - 1))
+    return found
+
+
+def _in_a_turn(drones: int) -> int:
+    """Return how many neighbours of a formation fill a turn: so many equal parts of it hold their yaws."""
+    return 4 if drones == 2 else drones
+
+
+def _steps_through(start: float, reached: Sequence[float], step: float) -> Float:
+    """Return values by steps from a start, as far as they are within those to be reached."""
+    low, high = (round((end - start) / step) for end in (min(reached), max(reached)))
+    return start + step * np.arange(low, high + 1, dtype=np.float64)
+
+
+def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
+    """Return every combination, [S, 3]."""
+    return np.stack(np.meshgrid(yaws, tilts, ranges, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _lattice_of(states: Float, config: PlannerConfig) -> Lattice:
+    return lattice(
+        states,
+        rates=np.array(config.slot_rates),
+        knot_s=config.tuning.knot_s,
+        w_turn=config.tuning.w_turn,
+    )
+
+
+def _look(
+    field: DistanceField, actor: Forecast, slots: Float, offsets: Float, config: PlannerConfig
+) -> SlotCosts:
+    """Compute the costs of slots [S, n, 3]; `offsets` [S, n, 3] are valid if yaws count from east."""
+    if config.yaw_frame == "heading":
+        return costs_in_frame(field, actor, slots, config)
+    return costs_of_slots(field, actor.position, offsets, config)
+
+
+def _through(commanded: Float, slots: Float) -> Float:
+    """Return the commanded slots [n, 3], then slots [T, n, 3], each turn the shorter way round."""
+    through = np.concatenate([commanded[None], slots])
+    turn_the_shorter_way(through)
+    return through
+
+
+def _knots(t_s: float, through: Float, grid: Lattice) -> Float:
+    return t_s + grid.knot_s * np.arange(len(through), dtype=np.float64)
+
+
+# --- several people ---
+
+
+class SlotChoice(NamedTuple):
+    """Slots among which a drone has a path, and what it would see from them: T times, S slots, P people."""
+
+    lattice: Lattice
+    start: Float  # [3] state from which it starts
+    price: Float  # [T, S] costs of the slots
+    position: Float  # [T, S, 3] metres, world
+    covered: Float  # [T, S, P, 7] see `scores.coverage`
+    information: Float | None = None  # [T, S, P, 3, 3] 1/m^2; None where it does not count
+
+
+class Worth(NamedTuple):
+    """Worth of a team's views: view quality, and the logarithm of the information's determinant."""
+
+    weight: Float  # [P] of the people
+    quality: float  # of a unit of view quality
+    information: float = 0.0  # of a unit of the logarithm
+    prior: float = 1.0  # 1/m^2, of a joint without any camera
+    apart_m: float = 0.0  # slots of two drones are farther apart; 0 where that does not matter
+
+    def of(self, covered: Float, information: Float | None) -> Float:
+        """Compute the worth [...] of views that cover [..., P, 7] and hold information [..., P, 3, 3]."""
+        found = self.quality * view_quality(covered, self.weight)
+        if information is not None:
+            known = log_determinant(information + self.prior * np.eye(3))
+            found = found + self.information * (known * self.weight).sum(axis=-1)
+        return found
+
+
+Path = tuple[int, Int64]
+"""Number of the choice that a drone takes, and its states [T]."""
+
+
+def plan_in_turn(choices: Sequence[Sequence[SlotChoice]], worth: Worth) -> list[Path]:
+    """Plan a team: one drone after the other, given the paths of the others, until nobody finds a better one.
+
+    Each path is the cheapest of all choices of its drone (dynamic programming): its price and turning, less
+    what its views add to the worth of those of the others.
+
+    Args:
+        choices: of each drone.
+        worth: of the views of all.
+    """
+    taken: dict[int, Path] = {}
+    for _ in range(MAX_ROUNDS_IN_TURN):
+        changed = False
+        for i, own in enumerate(choices):
+            others = [(choices[j][choice], path) for j, (choice, path) in taken.items() if j != i]
+            found = _best_path(own, others, worth)
+            before = taken.get(i)
+            changed |= before is None or found[0] != before[0] or not np.array_equal(found[1], before[1])
+            taken[i] = found
+        if not changed:
+            break
+    return [taken[i] for i in range(len(choices))]
+
+
+def _best_path(
+    choices: Sequence[SlotChoice], others: Sequence[tuple[SlotChoice, Int64]], worth: Worth
+) -> Path:
+    best, least = (0, np.zeros(0, np.int64)), np.inf
+    for number, choice in enumerate(choices):
+        cost = choice.price.copy()
+        for t in range(len(cost)):
+            covered, information = choice.covered[t], choice.information
+            before = sum((other.covered[t, path[t]] for other, path in others), np.zeros(covered.shape[1:]))
+            known, knows = None, None
+            if information is not None:
+                known, knows = np.zeros(information.shape[2:]), information[t]
+                for other, path in others:
+                    if other.information is not None:
+                        known = known + other.information[t, path[t]]
+                knows = known + knows
+            cost[t] += worth.of(before, known) - worth.of(before + covered, knows)
+            for other, path in others if worth.apart_m else ():
+                apart = np.linalg.norm(choice.position[t] - other.position[t, path[t]], axis=-1)
+                cost[t] += np.where(apart < worth.apart_m, TOO_NEAR, 0.0)
+        path, total = best_sequence(cost, choice.lattice, choice.start)
+        if total < least:
+            best, least = (number, path), total
+    return best
+
+
+class _GroupPlanner(_TeamPlanner):
     """Planner for several people: for each drone its yaw, and whom it films.
 
     A drone films one person or the weighted middle of all, from the tilt and range of the settings. All
-    drones maximise the worth of their views together (`groups.Worth`): for each person, by weight, the
-    information on a joint, as `greedy`, and the view quality, in units of a face seen straight from that
+    drones maximise the worth of their views together (`Worth`): for each person, by weight, the
+    information on a joint, and the view quality, in units of a face seen straight from that
     range.
     """
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
         neighbour = _in_a_turn(drones)
-        yaws = yaw_set(max(round(config.yaws / neighbour), 1) * neighbour, yaw_rad)
+        yaws = yaw_set(max(round(config.tuning.yaws / neighbour), 1) * neighbour, yaw_rad)
         states = _all_states(yaws, np.array([config.tilt_rad]), np.array([config.radius_m]))
-        self._lattice = lattice(
-            states, rates=np.array(config.slot_rates), knot_s=config.knot_s, w_turn=config.w_turn
-        )
+        self._lattice = _lattice_of(states, config)
         self._config, self._rates = config, np.array(config.slot_rates)
         self._aims: list[Float] | None = None  # [P] of each drone
 
@@ -417,9 +455,9 @@ class _Group(_SeldomPlanner):
             choices,
             Worth(
                 len(people) * shares,
-                config.w_error / face,
-                config.w_error,
-                config.prior_sigma_m**-2,
+                config.tuning.w_error / face,
+                config.tuning.w_error,
+                config.tuning.prior_sigma_m**-2,
                 config.soft_separation_m,
             ),
         )
@@ -429,7 +467,7 @@ class _Group(_SeldomPlanner):
         through = _through(np.where(stays[:, None], commanded, slots[0]), slots)
         return FormationPath(_knots(t_s, through, self._lattice), through, self._rates, np.stack(self._aims))
 
-    def _views(self, aim: Float, people: Float, heading_rad: Float, field: DistanceField) -> Choice:
+    def _views(self, aim: Float, people: Float, heading_rad: Float, field: DistanceField) -> SlotChoice:
         """Compute prices and views of all slots about a place among people [P, T, 3]."""
         config = self._config
         place = aim @ people.swapaxes(0, 1)  # [T, 3]
@@ -437,28 +475,31 @@ class _Group(_SeldomPlanner):
         position, looks_rad = place[:, None] + slot_offsets(slots), slots[..., YAW] + np.pi
         at_knots = people.swapaxes(0, 1)[:, None]  # [T, 1, P, 3]
         eyes = position[:, :, None]
-        seen = visible(field, eyes, at_knots, start_m=config.sight_start_m)
+        seen = visible(field, eyes, at_knots, start_m=config.tuning.sight_start_m)
         if len(people) > 1:
-            seen &= in_view(eyes, looks_rad[..., None], at_knots, config.errors.fov_rad)
+            seen &= in_view(eyes, looks_rad[..., None], at_knots, config.tuning.errors.fov_rad)
             for p in range(len(people)):
                 others = np.delete(people, p, axis=0)[:, :, None]
                 seen[..., p] &= ~hidden_by_people(position, at_knots[:, :, p], others)
         covered = coverage(
-            position, looks_rad, at_knots, np.zeros(at_knots.shape[:-1]), fov_rad=config.errors.fov_rad
+            position, looks_rad, at_knots, np.zeros(at_knots.shape[:-1]), fov_rad=config.tuning.errors.fov_rad
         )
         offset = eyes - at_knots
         costs = costs_in_frame(field, Forecast(place, heading_rad), self._lattice.states[:, None], config)
-        near = np.linalg.norm(offset, axis=-1).min(axis=-1) < config.actor_distance_m + _ASIDE_M
-        return Choice(
+        near = (
+            np.linalg.norm(offset, axis=-1).min(axis=-1)
+            < config.actor_distance_m + config.tuning.group_margin_m
+        )
+        return SlotChoice(
             lattice=self._lattice,
             start=self._lattice.states[0],
             price=cost_map(costs, config) + np.where(near, TOO_NEAR, 0.0),
             position=position,
             covered=covered * seen[..., None],
-            information=ray_information(offset, config.errors) * seen[..., None, None],
+            information=ray_information(offset, config.tuning.errors) * seen[..., None, None],
         )
 
-    def _from_elsewhere(self, view: Choice, place: Float, about: Float, actor: Forecast) -> Choice:
+    def _from_elsewhere(self, view: SlotChoice, place: Float, about: Float, actor: Forecast) -> SlotChoice:
         """Return the views of a drone that begins to film somebody else: none before it can have arrived.
 
         It flies there from `place` [3] at its limits of acceleration and speed, from rest to rest.
@@ -471,7 +512,7 @@ class _Group(_SeldomPlanner):
             2.0 * np.sqrt(way / config.acceleration_mps2),
             (way + most_m) / config.speed_mps,
         )
-        there = takes_s <= config.knot_s * np.arange(1, len(way) + 1)[:, None]
+        there = takes_s <= config.tuning.knot_s * np.arange(1, len(way) + 1)[:, None]
         start = _from_east(slot_of(place - about), -actor.heading_rad[:1])[0]
         return view._replace(
             start=start,
@@ -480,44 +521,10 @@ class _Group(_SeldomPlanner):
         )
 
 
-def _from_east(slots: Float, heading_rad: Float) -> Float:
-    """Return slots [..., 3] whose yaws count from headings [T] with yaws from east, [T, ..., 3]."""
-    found = np.repeat(slots[None], len(heading_rad), axis=0)
-    found[..., YAW] += heading_rad.reshape(-1, *[1] * (slots.ndim - 1))
-    return found
+# --- all arms ---
 
 
-def _in_a_turn(drones: int) -> int:
-    """Return how many neighbours of a formation fill a turn: so many equal parts of it hold their yaws."""
-    return 4 if drones == 2 else drones
-
-
-def _steps_through(start: float, reached: Sequence[float], step: float) -> Float:
-    """Return values by steps from a start, as far as they are within those to be reached."""
-    low, high = (round((end - start) / step) for end in (min(reached), max(reached)))
-    return start + step * np.arange(low, high + 1, dtype=np.float64)
-
-
-def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
-    """Return every combination, [S, 3]."""
-    return np.stack(np.meshgrid(yaws, tilts, ranges, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _look(
-    field: DistanceField, actor: Forecast, slots: Float, offsets: Float, config: PlannerConfig
-) -> SlotCosts:
-    """Compute the costs of slots [S, n, 3]; `offsets` [S, n, 3] are valid if yaws count from east."""
-    if config.yaw_frame == "heading":
-        return costs_in_frame(field, actor, slots, config)
-    return costs_of_slots(field, actor.position, offsets, config)
-
-
-def _through(commanded: Float, slots: Float) -> Float:
-    """Return the commanded slots [n, 3], then slots [T, n, 3], each turn the shorter way round."""
-    through = np.concatenate([commanded[None], slots])
-    turn_the_shorter_way(through)
-    return through
-
-
-def _knots(t_s: float, through: Float, grid: Lattice) -> Float:
-    return t_s + grid.knot_s * np.arange(len(through), dtype=np.float64)
+FIXED = PlannerArm("fixed", "fixed yaw", _FixedPlanner)
+ADAPTIVE = PlannerArm("adaptive", "adaptive formation", _AdaptivePlanner)
+JOINT = PlannerArm("joint", "all drones together, any spacing", _JointPlanner)
+GROUP = PlannerArm("group", "several people, each drone films whom the others miss", _GroupPlanner)

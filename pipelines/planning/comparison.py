@@ -15,7 +15,7 @@ from pipelines.geometry.bootstrap import LEVEL, STRETCH_S, intervals
 from pipelines.planning.arm_flights import LOGGED, ArmFlight, aimed_at, looks_rad, seen_people
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.formation import TILT, slot_of
-from pipelines.planning.scene import Scene
+from pipelines.planning.scene import ReplayScene
 from pipelines.planning.scores import blind_s, score, view_quality
 from pipelines.planning.scores import coverage as viewed
 
@@ -123,7 +123,7 @@ class ArmResult:
     joint_frames: int
 
 
-def compare(scene: Scene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
+def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
     """Score every arm and the differences to the reference.
 
     Errors are compared on common joint-frames: those that all arms measured in a trial, for `mpjpe_mm` and
@@ -177,12 +177,12 @@ def compare(scene: Scene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
     }
 
 
-def measure_alone(scene: Scene, name: str, result: ArmResult) -> dict[str, Any]:
+def measure_alone(scene: ReplayScene, name: str, result: ArmResult) -> dict[str, Any]:
     """Score one arm as in metrics.json; `mpjpe_mm` is that of all joint-frames that it measured."""
     return _scores(scene, name, result, None if result.error_m is None else np.isfinite(result.error_m))
 
 
-def _scores(scene: Scene, name: str, result: ArmResult, shared: Bool | None) -> dict[str, Any]:
+def _scores(scene: ReplayScene, name: str, result: ArmResult, shared: Bool | None) -> dict[str, Any]:
     flown = result.flight
     seen = seen_people(scene, flown)
     found = score(
@@ -216,7 +216,7 @@ def _scores(scene: Scene, name: str, result: ArmResult, shared: Bool | None) -> 
     }
 
 
-def _by_person(scene: Scene, result: ArmResult, seen: Bool, shared: Bool | None) -> dict[str, Any]:
+def _by_person(scene: ReplayScene, result: ArmResult, seen: Bool, shared: Bool | None) -> dict[str, Any]:
     """Compute the view quality over all people, and of several people the figures of each.
 
     View quality is a mean over time; that over all people is the sum by weight.
@@ -227,7 +227,7 @@ def _by_person(scene: Scene, result: ArmResult, seen: Bool, shared: Bool | None)
         looks_rad(flown),
         people.swapaxes(0, 1),
         np.zeros(people.shape[1::-1]),
-        fov_rad=scene.config.errors.fov_rad,
+        fov_rad=scene.config.tuning.errors.fov_rad,
     )
     covered = (covered * seen.transpose(1, 2, 0)[..., None]).sum(axis=0)  # [T, P, 7]
     each = [float(view_quality(covered[:, [p]], np.ones(1)).mean()) for p in range(len(people))]
@@ -257,7 +257,7 @@ def _by_person(scene: Scene, result: ArmResult, seen: Bool, shared: Bool | None)
 
 
 def _errors(
-    scene: Scene, result: ArmResult, shared: Bool | None
+    scene: ReplayScene, result: ArmResult, shared: Bool | None
 ) -> tuple[Estimate | None, Estimate | None, Estimate | None]:
     """Return the mean error of all measured joint-frames and of the common ones, and the coverage."""
     error, seed = result.error_m, scene.settings.seed
@@ -268,13 +268,13 @@ def _errors(
     return own, common, mean_of_trials(coverage(error, result.joint_frames), seed)
 
 
-def _pck(scene: Scene, result: ArmResult) -> Estimate | None:
+def _pck(scene: ReplayScene, result: ArmResult) -> Estimate | None:
     if result.error_m is None:
         return None
     return mean_of_trials(pck(result.error_m, result.joint_frames), scene.settings.seed)
 
 
-def _difference(scene: Scene, one: ArmResult, other: ArmResult, shared: Bool | None) -> dict[str, Any]:
+def _difference(scene: ReplayScene, one: ArmResult, other: ArmResult, shared: Bool | None) -> dict[str, Any]:
     """Compute one minus the other, with intervals.
 
     Both have the same seeds, moments and joint-frames as in the table.
@@ -309,7 +309,7 @@ def _difference(scene: Scene, one: ArmResult, other: ArmResult, shared: Bool | N
     }
 
 
-def _over_flights(scene: Scene, one: Float32, other: Float32, both: Bool) -> dict[str, object]:
+def _over_flights(scene: ReplayScene, one: Float32, other: Float32, both: Bool) -> dict[str, object]:
     """Compute the intervals of the differences over stretches of the flight, noise averaged over trials.
 
     They answer another question than those over trials: what another flight of this kind could show.
@@ -326,18 +326,18 @@ def _over_flights(scene: Scene, one: Float32, other: Float32, both: Bool) -> dic
     return {name: None if ends is None else list(ends) for name, ends in found.items()}
 
 
-def _tilt_deg(scene: Scene, flown: ArmFlight) -> Float:
+def _tilt_deg(scene: ReplayScene, flown: ArmFlight) -> Float:
     tilt_deg: Float = np.degrees(slot_of(flown.position - aimed_at(scene, flown))[..., TILT])
     return tilt_deg
 
 
-def _hidden(scene: Scene, flown: ArmFlight) -> Float:
+def _hidden(scene: ReplayScene, flown: ArmFlight) -> Float:
     hidden: Float = 1.0 - seen_people(scene, flown).mean(axis=0)
     return hidden
 
 
 def _best(
-    scene: Scene,
+    scene: ReplayScene,
     results: Mapping[str, ArmResult],
     arms: Mapping[str, Mapping[str, Any]],
     shared: Bool | None,

@@ -186,7 +186,7 @@ class YawZero:
     """
 
     def __init__(self, config: PlannerConfig, heading_rad: float = 0.0) -> None:
-        self._least_mps, self._rate = config.heading_speed_mps, config.slot_rates[0]
+        self._least_mps, self._rate = config.tuning.heading_speed_mps, config.slot_rates[0]
         self._from_s = 0.0
         self._from = self._goal = heading_rad if config.yaw_frame == "heading" else 0.0
 

@@ -25,7 +25,7 @@ from pipelines.planning.forecast import ActorFilter, PeopleFilter
 from pipelines.planning.tracking import (
     POSITION,
     VELOCITY,
-    Plan,
+    DronePlan,
     flying_of,
     roll_out,
     stopping_ticks,
@@ -68,7 +68,7 @@ class _Motion:
     """A motion that ends at rest, and its least distances."""
 
     kind: Flown
-    plan: Plan
+    plan: DronePlan
     states: Float  # [K + 1, 4, 3], see `tracking`
     clearance_m: float
     separation_m: float
@@ -86,13 +86,13 @@ class Guard:
 
     def __init__(self, position: Float, config: PlannerConfig, *, exactly: bool = False) -> None:
         self._config, self._flying, self._exactly = config, flying_of(config), exactly
-        self._ticks = math.ceil(config.tracking_hz / config.local_hz - 1e-9)
+        self._ticks = math.ceil(config.tuning.tracking_hz / config.tuning.local_hz - 1e-9)
         rows = self._ticks + stopping_ticks(self._flying) + 1
-        self._ticks_ahead = min(round(_ACTOR_AHEAD_S * config.tracking_hz), rows - 1)
+        self._ticks_ahead = min(round(_ACTOR_AHEAD_S * config.tuning.tracking_hz), rows - 1)
         self._states = np.zeros((len(position), rows, 4, 3))
         self._states[:, :, POSITION] = position[:, None]
         self._age = np.zeros(len(position), dtype=np.int64)  # periods since a drone's motion was committed
-        self._last: list[Plan | None] = [None] * len(position)
+        self._last: list[DronePlan | None] = [None] * len(position)
         self.counts: Counter[Flown] = Counter()
 
     @property
@@ -117,8 +117,8 @@ class Guard:
         return [states[age:] for states, age in zip(self._states, self._age, strict=True)]
 
     def admit(
-        self, drone: int, t_s: float, plan: Plan, actor: ActorFilter | PeopleFilter, field: DistanceField
-    ) -> Plan:
+        self, drone: int, t_s: float, plan: DronePlan, actor: ActorFilter | PeopleFilter, field: DistanceField
+    ) -> DronePlan:
         """Commit a drone to the best safe motion, and return the plan that is flown.
 
         `plan` is the local planner's, from the drone's place and now.
@@ -159,7 +159,7 @@ class Guard:
         stated = (
             wanted_clearance_m(config, around.field.grid),
             config.separation_m,
-            config.actor_distance_m + config.actor_sigma_m if config.actor_distance_m else 0.0,
+            config.actor_distance_m + config.tuning.actor_sigma_m if config.actor_distance_m else 0.0,
         )
         map_m, drones_m, actor_m = (
             min(one, other) - _ROUNDING_M for one, other in zip(stated, now, strict=True)
@@ -167,12 +167,12 @@ class Guard:
         return map_m, drones_m, actor_m
 
     def _motions(
-        self, drone: int, t_s: float, plan: Plan, around: _Around, clearance_m: float
+        self, drone: int, t_s: float, plan: DronePlan, around: _Around, clearance_m: float
     ) -> Iterator[_Motion]:
         """Yield motions from the best to the last resort, from a place of this clearance."""
         here, field = self._states[drone, self._age[drone]], around.field
 
-        def follow(kind: Flown, followed: Plan) -> _Motion:
+        def follow(kind: Flown, followed: DronePlan) -> _Motion:
             exactly = self._exactly and followed is plan
             states, stopped = self._rolled_out(t_s, here, followed, self._ticks, exactly)
             ahead, _ = self._rolled_out(t_s, here, followed, self._ticks_ahead, exactly, stops=False)
@@ -198,7 +198,7 @@ class Guard:
         yield self._measured(Flown.BRAKED, braked, committed, len(committed) - 1, committed, around)
 
     def _rolled_out(
-        self, t_s: float, here: Float, plan: Plan, ticks: int, exactly: bool, *, stops: bool = True
+        self, t_s: float, here: Float, plan: DronePlan, ticks: int, exactly: bool, *, stops: bool = True
     ) -> tuple[Float, int]:
         """Return states [K + 1, 4, 3] of a drone that follows a plan and then stops, and the row of the stop.
 
@@ -235,7 +235,7 @@ class Guard:
         ]
 
     def _measured(
-        self, kind: Flown, plan: Plan, states: Float, stopped: int, ahead: Float, around: _Around
+        self, kind: Flown, plan: DronePlan, states: Float, stopped: int, ahead: Float, around: _Around
     ) -> _Motion:
         """Measure the least distances of a motion to the map and to drones, and of its plan to the actor.
 
@@ -253,7 +253,7 @@ class Guard:
         )
         return _Motion(kind, plan, states, *distances)
 
-    def _steered(self, t_s: float, here: Float, velocity: Float) -> Plan:
+    def _steered(self, t_s: float, here: Float, velocity: Float) -> DronePlan:
         """Return a plan that takes up a velocity [3] m/s with a constant acceleration."""
         after = self._waypoint_times()
         change = velocity - here[VELOCITY]
@@ -261,18 +261,20 @@ class Guard:
         share = np.minimum(after, until)
         gained = change * (share**2 / (2.0 * max(until, 1e-9)) + after - share)
         path = here[POSITION] + here[VELOCITY] * after + gained
-        return Plan(t_s, path, here[VELOCITY].copy(), self._config.waypoint_s)
+        return DronePlan(t_s, path, here[VELOCITY].copy(), self._config.tuning.waypoint_s)
 
-    def _plan_of(self, t_s: float, states: Float) -> Plan:
+    def _plan_of(self, t_s: float, states: Float) -> DronePlan:
         """Return the plan that other drones see of a motion that is already committed."""
-        every = max(round(self._config.waypoint_s * self._config.tracking_hz), 1)
-        rows = np.minimum(every * np.arange(self._config.waypoints + 1), len(states) - 1)
-        return Plan(t_s, states[rows, POSITION], states[0, VELOCITY].copy(), self._config.waypoint_s)
+        every = max(round(self._config.tuning.waypoint_s * self._config.tuning.tracking_hz), 1)
+        rows = np.minimum(every * np.arange(self._config.tuning.waypoints + 1), len(states) - 1)
+        return DronePlan(
+            t_s, states[rows, POSITION], states[0, VELOCITY].copy(), self._config.tuning.waypoint_s
+        )
 
     def _waypoint_times(self) -> Float:
         """Return the times [N + 1, 1] s of waypoints, from the start of a plan."""
         config = self._config
-        return config.waypoint_s * np.arange(config.waypoints + 1, dtype=np.float64)[:, None]
+        return config.tuning.waypoint_s * np.arange(config.tuning.waypoints + 1, dtype=np.float64)[:, None]
 
 
 def wanted_clearance_m(config: PlannerConfig, grid: Grid) -> float:

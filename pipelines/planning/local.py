@@ -34,7 +34,7 @@ from pipelines.planning.distance_field import (
     interpolate,
     nearest,
 )
-from pipelines.planning.tracking import Plan
+from pipelines.planning.tracking import DronePlan
 
 TERMS = ("smooth", "form", "obs", "occ", "sep")
 _SLOWEST_STEP = 1e4  # of eta: beyond it nothing moves
@@ -65,21 +65,21 @@ class Weights(NamedTuple):
 
 def weights_of(config: PlannerConfig, resolution_m: float) -> Weights:
     """Return the weights; sight lines from `radius_m` are sampled every half voxel."""
-    reach_m = max(config.radius_m - config.sight_start_m, resolution_m)
+    reach_m = max(config.radius_m - config.tuning.sight_start_m, resolution_m)
     return Weights(
         l_obs=config.l_obs,
         l_occ=config.l_occ,
         l_form=config.l_form,
-        l_sep=config.l_sep,
-        a_velocity=config.a_velocity,
-        a_acceleration=config.a_acceleration,
-        a_jerk=config.a_jerk,
-        eps_obs_m=config.eps_obs_m,
-        eps_occ_m=config.eps_occ_m,
+        l_sep=config.tuning.l_sep,
+        a_velocity=config.tuning.a_velocity,
+        a_acceleration=config.tuning.a_acceleration,
+        a_jerk=config.tuning.a_jerk,
+        eps_obs_m=config.tuning.eps_obs_m,
+        eps_occ_m=config.tuning.eps_occ_m,
         soft_separation_m=config.soft_separation_m,
-        sight_start_m=config.sight_start_m,
-        speed_floor_mps=config.speed_floor_mps,
-        step_s=config.waypoint_s,
+        sight_start_m=config.tuning.sight_start_m,
+        speed_floor_mps=config.tuning.speed_floor_mps,
+        step_s=config.tuning.waypoint_s,
         samples=max(math.ceil(2 * reach_m / resolution_m), 4),
     )
 
@@ -346,7 +346,7 @@ class Separation(StrEnum):
 class LocalPlan:
     """Result of the local planner."""
 
-    plan: Plan
+    plan: DronePlan
     cost: float  # of the optimised path, before any projection
     evaluations: int
     separation: Separation
@@ -357,7 +357,7 @@ class LocalPlanner:
 
     def __init__(self, config: PlannerConfig) -> None:
         self._config = config
-        self._factor = _factorise(config.waypoints, weights_of(config, 1.0))
+        self._factor = _factorise(config.tuning.waypoints, weights_of(config, 1.0))
         self._weights: dict[float, Weights] = {}
 
     def plan(
@@ -368,11 +368,11 @@ class LocalPlanner:
         *,
         slots: Float,
         actor: Float,
-        others: Sequence[Plan],
+        others: Sequence[DronePlan],
         field: DistanceField,
-        previous: Plan | None,
+        previous: DronePlan | None,
     ) -> LocalPlan:
-        """Plan from the drone's place and velocity.
+        """DronePlan from the drone's place and velocity.
 
         Args:
             position: [3] metres, world.
@@ -383,7 +383,7 @@ class LocalPlanner:
             previous: this drone's previous plan, the initial guess; without one it is the slots.
         """
         config = self._config
-        times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
+        times = t_s + config.tuning.waypoint_s * np.arange(1, config.tuning.waypoints + 1, dtype=np.float64)
         waypoints = np.stack([p.at(np.append(t_s, times))[0] for p in others]) if others else _nobody(times)
         guess = slots if previous is None else previous.at(times)[0]
         path, cost, evaluations = self._descended(position, velocity, guess, slots, actor, waypoints, field)
@@ -395,7 +395,9 @@ class LocalPlanner:
                 path, cost = other[:2]
         old = None if previous is None else np.concatenate([position[None], guess])
         kept, separation = _keep_apart(path[2:], waypoints, old, field, config.separation_m)
-        return LocalPlan(Plan(t_s, kept, velocity.copy(), config.waypoint_s), cost, evaluations, separation)
+        return LocalPlan(
+            DronePlan(t_s, kept, velocity.copy(), config.tuning.waypoint_s), cost, evaluations, separation
+        )
 
     def _descended(
         self,
@@ -410,16 +412,16 @@ class LocalPlanner:
         """Descend from a guess [N, 3]: path [N + 3, 3], cost, evaluations. `others` is [M, N + 1, 3]."""
         config = self._config
         return _descend(
-            _with_start(position, velocity, guess, config.waypoint_s),
+            _with_start(position, velocity, guess, config.tuning.waypoint_s),
             np.ascontiguousarray(slots),
             np.ascontiguousarray(actor),
             np.ascontiguousarray(others[:, 1:]),
             field.grid,
             self._weights_for(field),
             self._factor,
-            config.iterations,
-            config.tolerance,
-            config.step_cap_m,
+            config.tuning.iterations,
+            config.tuning.tolerance,
+            config.tuning.step_cap_m,
         )
 
     def cost(
@@ -438,7 +440,7 @@ class LocalPlanner:
         `others` [M, N, 3] are the other drones' waypoints; the rest is as in `plan`.
         """
         terms, gradient = np.zeros(len(TERMS)), np.zeros_like(waypoints)
-        path = _with_start(position, velocity, waypoints, self._config.waypoint_s)
+        path = _with_start(position, velocity, waypoints, self._config.tuning.waypoint_s)
         total = _evaluate(path, slots, actor, others, field.grid, self._weights_for(field), terms, gradient)
         return total, dict(zip(TERMS, terms.tolist(), strict=True)), gradient
 

@@ -30,7 +30,7 @@ from pipelines.planning.formation import (
 )
 from pipelines.planning.guard import Flown, Guard
 from pipelines.planning.local import LocalPlanner, Separation
-from pipelines.planning.tracking import Plan, tracking_times
+from pipelines.planning.tracking import DronePlan, tracking_times
 
 _NOW_S = 1e-6  # times are sums of periods: due this much early is due
 
@@ -115,13 +115,13 @@ class Pilot:
         self._local_planner = LocalPlanner(config)
         self._weight = np.array(weights, dtype=np.float64)
         self._by_weight = np.tile(self._weight / self._weight.sum(), (start.drones, 1))
-        people = [ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m) for _ in weights]
+        people = [ActorFilter(q=config.actor_q, sigma_m=config.tuning.actor_sigma_m) for _ in weights]
         self._filter = actor or PeopleFilter(people, self._weight)
         slots = formation_slots(
             np.array([yaw_rad]), start.drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
         )
         self._formation = FormationPath(np.zeros(1), slots, np.array(config.slot_rates))
-        self._plans: list[Plan | None] = [None] * start.drones
+        self._plans: list[DronePlan | None] = [None] * start.drones
         self._next_central_s = self._next_local_s = -np.inf
         self.guard: Guard | None = None
         """Filter of the local plans: it decides which motion is flown. Set by a replay; None otherwise."""
@@ -146,10 +146,10 @@ class Pilot:
         """
         config = self._config
         if t_s >= self._next_central_s - _NOW_S:
-            self._next_central_s = max(self._next_central_s, t_s) + 1.0 / config.central_hz
+            self._next_central_s = max(self._next_central_s, t_s) + 1.0 / config.tuning.central_hz
             self._plan_formation(t_s, position, velocity, field)
         if t_s >= self._next_local_s - _NOW_S:
-            self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.local_hz
+            self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.tuning.local_hz
             self._plan_locally(t_s, position, velocity, field)
 
     @property
@@ -186,7 +186,7 @@ class Pilot:
     def _plan_formation(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
         config = self._config
         started = self._clock()
-        knots = t_s + config.knot_s * np.arange(1, config.horizon_knots + 1, dtype=np.float64)
+        knots = t_s + config.tuning.knot_s * np.arange(1, config.horizon_knots + 1, dtype=np.float64)
         commanded = self._formation.at(np.array([t_s]))[0]
         if config.yaw_frame == "heading":
             self._zero.follow(t_s, *self._filter.at(t_s)[1:])
@@ -202,7 +202,7 @@ class Pilot:
     def _wanted_ahead(self, path: FormationPath, t_s: float) -> tuple[Float, Float]:
         """Return wanted places of drones [T, N, 3] and the places [N, T, 3] that they film, at waypoints."""
         config = self._config
-        times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
+        times = t_s + config.tuning.waypoint_s * np.arange(1, config.tuning.waypoints + 1, dtype=np.float64)
         aimed = self._aimed(times)
         return aimed.swapaxes(0, 1) + slot_offsets(self._slots_at(times, path)), aimed
 
@@ -211,7 +211,7 @@ class Pilot:
     ) -> tuple[Float, Float]:
         """Predict the flight along a path (`arms.RollOut`): the drones plan locally, one after the other."""
         wanted, aimed = self._wanted_ahead(path, t_s)
-        made: list[Plan] = []
+        made: list[DronePlan] = []
         for i, previous in enumerate(self._plans):
             local = self._local_planner.plan(
                 t_s,
@@ -293,7 +293,7 @@ def replay(
     first, last = int(known.argmax(axis=0).max()), len(t_ns) - int(known[::-1].argmax(axis=0).max())
     log_s = (t_ns - t_ns[first]) / 1e9
     noise = np.random.default_rng(seed).normal(size=measured.shape)
-    noisy = measured + config.actor_noise_m * noise
+    noisy = measured + config.tuning.actor_noise_m * noise
     maps = sorted(fields, key=lambda field: field.from_ns)
     replay_ns = tracking_times(t_ns[first:last], config)
     map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")

@@ -1,8 +1,10 @@
 """Data that all arms of a comparison share: settings, the actor, the maps, the cameras and the times."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import sum_sigma
 from pipelines.geometry.poses import rates
-from pipelines.planning.config import ErrorModel, Mode, PlannerConfig
+from pipelines.planning.config import ErrorModel, Mode, PlannerConfig, PlannerTuning, planner_config
 from pipelines.planning.distance_field import (
     OCCUPIED,
     DistanceField,
@@ -24,12 +26,20 @@ from pipelines.planning.distance_field import (
     zone_edges,
 )
 from pipelines.planning.forecast import first_heading
-from pipelines.planning.formation import YAW, formation_slots, slot_of, slot_offsets, yaw_set
+from pipelines.planning.formation import (
+    YAW,
+    cost_map,
+    costs_of_slots,
+    formation_slots,
+    slot_of,
+    slot_offsets,
+    yaw_set,
+)
 from pipelines.planning.loading import LoggedFlight, Source, flown_poses, points_at
 from pipelines.planning.scores import near_obstacle
-from pipelines.planning.search import cost_map, costs_of_slots
 from pipelines.planning.tracking import tracking_times
 from pipelines.session.description import Description
+from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 
 MOST_DRONES = 8
@@ -41,7 +51,7 @@ _HIDDEN_HZ = 10.0  # rate of the moments of `hidden_shares`
 
 
 @dataclass(frozen=True)
-class Settings:
+class ReplanSettings:
     """Settings that determine a comparison, in addition to the session; None takes the session's value."""
 
     arms: tuple[str, ...] | None = (
@@ -56,12 +66,33 @@ class Settings:
     planner: PlannerConfig = field(default_factory=PlannerConfig)
 
 
+def replan_settings(values: Mapping[str, object], source: Path | str, **others: Any) -> ReplanSettings:
+    """Make settings of a mapping, as from YAML: those of the planner, `yaw_deg` and `mode`.
+
+    Raises:
+        DataError: a setting is unknown or out of range.
+    """
+    planner = dict(values)
+    own: dict[str, Any] = {}
+    if "mode" in planner:
+        own["mode"] = planner.pop("mode")
+        if own["mode"] not in get_args(Mode):
+            raise DataError(
+                source, f"mode: {own['mode']!r} is none of {', '.join(get_args(Mode))}", code="bad-value"
+            )
+    if "yaw_deg" in planner:
+        yaw_deg = own["yaw_deg"] = planner.pop("yaw_deg")
+        if isinstance(yaw_deg, bool) or not isinstance(yaw_deg, int | float) or not abs(yaw_deg) <= 360:
+            raise DataError(source, f"yaw_deg: {yaw_deg!r} is no angle from -360 to 360", code="bad-value")
+    return ReplanSettings(planner=planner_config(planner, source), **own, **others)
+
+
 @dataclass(frozen=True)
-class Scene:
+class ReplayScene:
     """A flight that can be flown again. T times, one per tracking step; C cameras of the session."""
 
     flight: LoggedFlight
-    settings: Settings
+    settings: ReplanSettings
     drones: int
     yaw_rad: float  # of the first camera at the start, from east
     heading_rad: float  # of the actor's first way, from east; 0 where yaws count from east
@@ -116,7 +147,7 @@ class Scene:
     @property
     def pictures(self) -> slice:
         """Times at which pictures are taken."""
-        return slice(None, None, max(round(self.config.tracking_hz / PICTURES_HZ), 1))
+        return slice(None, None, max(round(self.config.tuning.tracking_hz / PICTURES_HZ), 1))
 
     @cached_property
     def near(self) -> Bool:
@@ -149,7 +180,7 @@ class Scene:
 
     def cost_map(self) -> tuple[Int64, Float, Float]:
         """Compute times [M], yaws [D] of the first camera, and the formation's cost [M, D] there."""
-        rows = slice(None, None, max(round(self.config.tracking_hz / _COST_MAP_HZ), 1))
+        rows = slice(None, None, max(round(self.config.tuning.tracking_hz / _COST_MAP_HZ), 1))
         yaws = yaw_set(_COST_MAP_YAWS, self.yaw_rad)
         slots = formation_slots(
             yaws, self.drones, tilt_rad=self.config.tilt_rad, range_m=self.config.radius_m
@@ -168,10 +199,10 @@ def build_scene(
     flight: LoggedFlight,
     maps: Sequence[Occupancy],
     description: Description,
-    settings: Settings,
+    settings: ReplanSettings,
     *,
     errors: ErrorModel | None = None,
-) -> Scene:
+) -> ReplayScene:
     """Prepare a comparison: distance fields, times, the first camera's start, and warnings.
 
     `errors` are those of the detector, by default as in `ErrorModel`; those of the poses are the flight's.
@@ -191,7 +222,9 @@ def build_scene(
     actor = np.average(people, axis=0, weights=flight.weights)
     flown = flown_poses(flight, description, t_ns)
     errors = with_pose_errors(errors or ErrorModel(), flight, t_ns, *flown[:2])
-    settings = replace(settings, planner=replace(settings.planner, errors=errors))
+    settings = replace(
+        settings, planner=replace(settings.planner, tuning=replace(settings.planner.tuning, errors=errors))
+    )
     drones = settings.drones or min(max(len(flight.cameras), 2), MOST_DRONES)
     if settings.drones is None and drones != len(flight.cameras):
         notes.append(f"{drones} drones are replayed, the session has {len(flight.cameras)} cameras")
@@ -205,7 +238,7 @@ def build_scene(
         yaw_rad = float(slot_of(flown[0][0, 0] - actor[0])[YAW])
         first = flight.cameras[0].name
         notes.append(f"formations start at {np.degrees(yaw_rad):.1f} deg, where {first} was")
-    scene = Scene(
+    scene = ReplayScene(
         flight=flight,
         settings=settings,
         drones=drones,
@@ -252,7 +285,7 @@ def with_pose_errors(
     )
 
 
-def _doubts(scene: Scene) -> list[str]:
+def _doubts(scene: ReplayScene) -> list[str]:
     """List problems of the maps, the start and the skeleton, one line each."""
     doubts = []
     fields = scene.fields
@@ -275,7 +308,7 @@ def _doubts(scene: Scene) -> list[str]:
     if inside:
         doubts.append(
             f"{inside} of {scene.drones} drones start within {scene.config.drone_radius_m:g} m of an obstacle"
-            " or a no-fly zone and leave by the shortest way: choose another --yaw, --radius or --tilt"
+            " or a no-fly zone and leave by the shortest way: choose another yaw_deg, radius_m or tilt_deg"
         )
     doubts += scene.config.out_of_reach()
     if scene.flight.skeleton is None:
@@ -293,7 +326,7 @@ def hidden_shares(
     sight line next to the actor is left out (the default `sight_start_m`): maps contain the actor. So are
     cameras that never have a pose.
     """
-    start_m = PlannerConfig().sight_start_m
+    start_m = PlannerTuning().sight_start_m
     first_ns, last_ns = int(flight.actor_t_ns[0]), int(flight.actor_t_ns[-1])
     count = max(2, round((last_ns - first_ns) / 1e9 * _HIDDEN_HZ) + 1)
     t_ns = np.linspace(first_ns, last_ns, count).round().astype(np.int64)

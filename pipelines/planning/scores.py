@@ -1,11 +1,14 @@
-"""Scores of a flight from positions over time: the same figures for every arm, replayed or flown."""
+"""Scores of a flight, and what its cameras see: the same figures for every arm, replayed or flown.
+
+The ray model is the information of cameras before they have seen anything.
+"""
 
 from itertools import combinations
 
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
-from pipelines.planning.config import PlannerConfig
+from pipelines.planning.config import ErrorModel, PlannerConfig
 from pipelines.planning.distance_field import (
     DistanceField,
     MapsInTurn,
@@ -15,26 +18,151 @@ from pipelines.planning.distance_field import (
     zone_edges,
 )
 from pipelines.planning.formation import RANGE, TILT, YAW, slot_of, wrapped
-from pipelines.planning.information import predicted_error, ray_information
 
 Scores = dict[str, object]
 
+# Higher things within 15 m of a slot can hide the actor or be in a drone's way soon.
 NEAR_OBSTACLE_M = 15.0
-_MOTION_HZ = 10.0  # speed, acceleration and jerk are means over this period: plans change at 5 Hz
-_ROUNDING = 1.0 + 1e-6  # differences of positions; drones fly at their limits
-_LOOKS_PER_S = 5.0  # rate of the search for obstacles near the slots
-_FEWEST_VIEWS = 2  # that determine a point
+# Plans change at 5 Hz, so that means over 0.1 s show every change of acceleration.
+MOTION_HZ = 10.0
+# Drones fly at their limits; differences of rounded positions exceed these by less than a millionth.
+LIMIT_ROUNDING = 1.0 + 1e-6
+# An actor who runs moves 1 m between two looks for obstacles near the slots.
+LOOKS_PER_S = 5.0
+# A point needs two views.
+MIN_VIEWS = 2
+# The person of Hughes et al. 2024 is a hexagonal prism with a lid: distance of a side from the axis, height.
+PRISM_SIDES = 6
+PRISM_APOTHEM_M = 0.484
+PRISM_HEIGHT_M = 1.8
+# The values of a rotary-wing aircraft of 20 N are those of Zeng, Xu & Zhang 2019 ("Energy Minimization for
+# Wireless Communication with Rotary-Wing UAV", IEEE Trans. Wireless Commun. 18(4), table I and eq. 12).
+BLADE_POWER_W = 79.8563  # in hovering
+INDUCED_POWER_W = 88.6279  # in hovering
+TIP_SPEED_MPS = 120.0
+INDUCED_SPEED_MPS = 4.03
+PARASITE_W_PER_MPS3 = 0.5 * 0.6 * 1.225 * 0.05 * 0.503  # drag ratio, air density, solidity, disc area
+WEIGHT_N = 20.0
+# A standing person of 1.75 m is a cylinder of this radius and these heights about the hips.
+BODY_RADIUS_M = 0.25
+BODY_BELOW_HIPS_M = 0.95
+BODY_ABOVE_HIPS_M = 0.8
 
-# The person of Hughes et al. 2024: a hexagonal prism with a lid.
-_SIDES = 6
-_APOTHEM_M, _PRISM_M = 0.484, 1.8  # from the axis to a side, and the height
 
-# Rotary-wing aircraft of Zeng, Xu & Zhang 2019 ("Energy Minimization for Wireless Communication with
-# Rotary-Wing UAV", IEEE Trans. Wireless Commun. 18(4), table I and eq. 12): 20 N.
-_BLADE_W, _INDUCED_W = 79.8563, 88.6279  # in hovering
-_TIP_MPS, _INDUCED_MPS = 120.0, 4.03  # speed of the rotor's tip; mean induced velocity in hovering
-_PARASITE_W_PER_MPS3 = 0.5 * 0.6 * 1.225 * 0.05 * 0.503  # drag ratio, air density, solidity, disc area
-_WEIGHT_N = 20.0
+# --- the ray model ---
+
+
+def ray_information(offset: Float, errors: ErrorModel) -> Float:
+    """Compute one camera's expected information on a point: I = p (1 - d d')/s^2, none along the ray d.
+
+    s^2 = sigma_key(tilt)^2 + (rho sigma_rot)^2 + sigma_pos^2, rho the distance. sigma_key is the detector's
+    error in metres at the person and p the share of joints that it finds, both by tilt: by geometry alone,
+    steep views would be as good. A detector's errors in pixels are shares of the person's height in the
+    picture, so that distance and focal length cancel. Offsets [..., 3] m go from the point to the camera and
+    are not zero; the result is [..., 3, 3] 1/m^2.
+    """
+    square = np.sum(offset**2, axis=-1)[..., None, None]
+    across = np.eye(3) - offset[..., :, None] * offset[..., None, :] / square
+    tilt_deg = np.degrees(np.arcsin(np.abs(offset[..., 2]) / np.sqrt(square[..., 0, 0])))
+    placed = np.interp(tilt_deg, errors.tilts_deg, errors.placed_share)[..., None, None]
+    keypoint = np.interp(tilt_deg, errors.tilts_deg, errors.keypoint_sigma_m)[..., None, None]
+    turned = np.radians(errors.rotation_sigma_deg) ** 2
+    information: Float = placed * across / (keypoint**2 + square * turned + errors.position_sigma_m**2)
+    return information
+
+
+def predicted_error(information: Float) -> Float:
+    """Compute sqrt(tr S), S = I^-1: the expected error in metres of [..., 3, 3].
+
+    It is inf where a direction is unseen.
+    """
+    minors, determinant = _minors(information)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        trace = np.sum(minors, axis=-1) / determinant
+    # Singular up to rounding: the determinant is far below the cube of the trace.
+    scale = np.trace(information, axis1=-2, axis2=-1) ** 3
+    return np.sqrt(np.where(determinant > 1e-12 * scale, trace, np.inf))
+
+
+def log_determinant(information: Float) -> Float:
+    """Compute the logarithm of the determinant of positive definite [..., 3, 3]."""
+    logarithm: Float = np.log(_minors(information)[1])
+    return logarithm
+
+
+def _minors(matrix: Float) -> tuple[Float, Float]:
+    """Compute the three principal 2x2 minors [..., 3] and the determinant of symmetric matrices."""
+    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
+    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
+    first = d * f - e * e
+    determinant = a * first - b * (b * f - c * e) + c * (b * e - c * d)
+    return np.stack([first, a * f - c * c, a * d - b * b], axis=-1), determinant
+
+
+# --- sight ---
+
+
+def hidden_by_people(camera: Float, target: Float, people: Float) -> Bool:
+    """Test if somebody's body, an upright cylinder, stands in a sight line.
+
+    Args:
+        camera: [..., 3] metres, world.
+        target: [..., 3] metres, world.
+        people: [Q, ..., 3] metres, world; hips of those who may stand in the way, not of the target.
+
+    Returns:
+        [...], all shapes broadcast.
+    """
+    way, aside = target - camera, people - camera
+    level = np.maximum((way[..., :2] ** 2).sum(axis=-1), 1e-12)
+    along = (aside[..., :2] * way[..., :2]).sum(
+        axis=-1
+    ) / level  # of the nearest point, as a share of the way
+    away = np.linalg.norm(aside[..., :2] - along[..., None] * way[..., :2], axis=-1)
+    height = along * way[..., 2] - aside[..., 2]
+    between = (along > 0.0) & (along < 1.0) & (height > -BODY_BELOW_HIPS_M) & (height < BODY_ABOVE_HIPS_M)
+    found: Bool = (between & (away < BODY_RADIUS_M)).any(axis=0)
+    return found
+
+
+def sights(
+    camera: Float,
+    looks_rad: Float,
+    people: Float,
+    maps: DistanceField | MapsInTurn,
+    config: PlannerConfig,
+) -> Bool:
+    """Test [P, N, T] which cameras see which people.
+
+    The person is in the level field of view, and neither the map nor anybody else stands between. A single
+    person is in the picture of every camera that films them, so that only the map counts.
+
+    Args:
+        camera: [N, T, 3] metres, world.
+        looks_rad: [N, T] yaw of the optical axis from east.
+        people: [P, T, 3] metres, world, the middle of the hips.
+        maps: the distance field, or the map of each of the T moments.
+        config: `sight_start_m` and the field of view.
+    """
+    seen = []
+    for p, person in enumerate(people):
+        free = seen_actor(camera, person, maps, config)
+        if len(people) > 1:
+            free = free & in_view(camera, looks_rad, person, config.tuning.errors.fov_rad)
+            free &= ~hidden_by_people(camera, person, np.delete(people, p, axis=0)[:, None])
+        seen.append(free)
+    return np.stack(seen)
+
+
+def in_view(camera: Float, looks_rad: Float, person: Float, fov_rad: float) -> Bool:
+    """Test [...] if people [..., 3] are in the level field of view of cameras [..., 3] with yaws [...]."""
+    offset = person - camera
+    aside = wrapped(np.arctan2(offset[..., 1], offset[..., 0]) - looks_rad)
+    inside: Bool = np.abs(aside) <= fov_rad / 2.0
+    return inside
+
+
+# --- figures of a flight ---
 
 
 def score(
@@ -92,7 +220,7 @@ def score(
         "actor": _episodes(near_m < config.actor_distance_m),
         "zone": _episodes(zone_m < 0.0),
         "separation": _episodes(apart < config.separation_m) if pairs else 0,
-        **{name: _episodes(motion[name] > limit * _ROUNDING) for name, limit in limits.items()},
+        **{name: _episodes(motion[name] > limit * LIMIT_ROUNDING) for name, limit in limits.items()},
     }
     return {
         "tilt_deg": {
@@ -124,7 +252,7 @@ def score(
 
 def blind_s(t_s: Float, seen: Bool) -> float:
     """Compute for how long fewer than two cameras see a person, the mean over people: of [P, N, T] sights."""
-    blind = (seen.sum(axis=1) < _FEWEST_VIEWS).mean(axis=0)
+    blind = (seen.sum(axis=1) < MIN_VIEWS).mean(axis=0)
     return float(np.trapezoid(blind, t_s))
 
 
@@ -166,8 +294,8 @@ def view_quality(covered: Float, weight: Float) -> Float:
     The root of a face's density counts with the face's area and the person's weight: a second view of the
     same face adds less than the first of another one (Hughes et al. 2024).
     """
-    side_m = 2.0 * _APOTHEM_M * np.tan(np.pi / _SIDES)
-    area = np.full(_SIDES + 1, side_m * _PRISM_M)
+    side_m = 2.0 * PRISM_APOTHEM_M * np.tan(np.pi / PRISM_SIDES)
+    area = np.full(PRISM_SIDES + 1, side_m * PRISM_HEIGHT_M)
     area[-1] = 1.5 * np.sqrt(3.0) * side_m**2
     quality: Float = (weight[:, None] * area * np.sqrt(covered)).sum(axis=(-2, -1))
     return quality
@@ -175,11 +303,11 @@ def view_quality(covered: Float, weight: Float) -> Float:
 
 def _faces(people: Float, heading_rad: Float) -> tuple[Float, Float]:
     """Return normals and centres [..., A, 7, 3] of the sides and the lid; all centres are at one height."""
-    yaw = heading_rad[..., None] + 2.0 * np.pi / _SIDES * np.arange(1, _SIDES + 1)
-    normal = np.zeros((*people.shape[:-1], _SIDES + 1, 3))
-    normal[..., :_SIDES, 0], normal[..., :_SIDES, 1] = np.cos(yaw), np.sin(yaw)
-    centre = people[..., None, :] + _APOTHEM_M * normal
-    normal[..., _SIDES, 2] = 1.0
+    yaw = heading_rad[..., None] + 2.0 * np.pi / PRISM_SIDES * np.arange(1, PRISM_SIDES + 1)
+    normal = np.zeros((*people.shape[:-1], PRISM_SIDES + 1, 3))
+    normal[..., :PRISM_SIDES, 0], normal[..., :PRISM_SIDES, 1] = np.cos(yaw), np.sin(yaw)
+    centre = people[..., None, :] + PRISM_APOTHEM_M * normal
+    normal[..., PRISM_SIDES, 2] = 1.0
     return normal, centre
 
 
@@ -191,11 +319,11 @@ def propulsion_w(level_mps: Float, climb_mps: Float) -> Float:
     It compares arms: another drone needs another energy.
     """
     square = level_mps**2
-    blade = _BLADE_W * (1.0 + 3.0 * square / _TIP_MPS**2)
-    ratio = square / (2.0 * _INDUCED_MPS**2)
-    induced = _INDUCED_W * np.sqrt(np.sqrt(1.0 + ratio**2) - ratio)
-    power: Float = blade + induced + _PARASITE_W_PER_MPS3 * level_mps**3
-    return power + _WEIGHT_N * np.maximum(climb_mps, 0.0)
+    blade = BLADE_POWER_W * (1.0 + 3.0 * square / TIP_SPEED_MPS**2)
+    ratio = square / (2.0 * INDUCED_SPEED_MPS**2)
+    induced = INDUCED_POWER_W * np.sqrt(np.sqrt(1.0 + ratio**2) - ratio)
+    power: Float = blade + induced + PARASITE_W_PER_MPS3 * level_mps**3
+    return power + WEIGHT_N * np.maximum(climb_mps, 0.0)
 
 
 def _energy_j(t_s: Float, position: Float) -> float:
@@ -212,7 +340,9 @@ def seen_actor(
     """Test [N, T] if cameras at [N, T, 3] see the actor [T, 3], by the map of each moment."""
     return looked(
         maps,
-        lambda field, rows: visible(field, position[:, rows], actor[rows], start_m=config.sight_start_m),
+        lambda field, rows: visible(
+            field, position[:, rows], actor[rows], start_m=config.tuning.sight_start_m
+        ),
         axis=1,
     )
 
@@ -233,7 +363,11 @@ def predicted_errors(
 
 def errors_of_views(position: Float, people: Float, seen: Bool, config: PlannerConfig) -> Float:
     """Compute sqrt(tr S) [P, T] in metres of people [P, T, 3] whom cameras [N, T, 3] see [P, N, T]."""
-    return predicted_error(_information(position - people[:, None], seen, config))
+    return predicted_error(
+        (ray_information(position - people[:, None], config.tuning.errors) * seen[..., None, None]).sum(
+            axis=1
+        )
+    )
 
 
 def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: DistanceField) -> Bool:
@@ -248,7 +382,7 @@ def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: Distanc
     levels = np.arange(1, occupied.shape[2] + 1)
     top_m = grid.origin[2] + grid.resolution_m * (occupied * levels).max(axis=2)
     top_m[~occupied.any(axis=2)] = -np.inf  # the map may begin above the actor
-    wanted = np.minimum(np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _LOOKS_PER_S), t_s[-1])
+    wanted = np.minimum(np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / LOOKS_PER_S), t_s[-1])
     looks = np.unique(np.searchsorted(t_s, wanted))
     found = np.zeros(len(looks), dtype=np.bool_)
     centres = [grid.origin[a] + grid.resolution_m * (np.arange(top_m.shape[a]) + 0.5) for a in range(2)]
@@ -265,24 +399,18 @@ def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: Distanc
     return found[latest]
 
 
-def _information(offset: Float, seen: Bool, config: PlannerConfig) -> Float:
-    """Sum the information [P, T, 3, 3] of all cameras; offsets are [P, N, T, 3]."""
-    total: Float = (ray_information(offset, config.errors) * seen[..., None, None]).sum(axis=1)
-    return total
-
-
 def _motion(t_s: Float, position: Float) -> dict[str, Float]:
     """Compute magnitudes [N, ...] of the derivatives, from positions at 10 Hz."""
     value = _at_even_times(t_s, position)
     motion = {}
     for name in ("speed", "acceleration", "jerk"):
-        value = np.diff(value, axis=-1) * _MOTION_HZ
+        value = np.diff(value, axis=-1) * MOTION_HZ
         motion[name] = np.linalg.norm(value, axis=1)
     return motion
 
 
 def _even(t_s: Float) -> Float:
-    return np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _MOTION_HZ)
+    return np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / MOTION_HZ)
 
 
 def _at_even_times(t_s: Float, position: Float) -> Float:

@@ -29,7 +29,7 @@ _LONGEST_MARGIN_S = 3.5  # of a stop: the exponential end from 1.3 m/s to 1 mm/s
 
 
 @dataclass(frozen=True)
-class Plan:
+class DronePlan:
     """Waypoints of one drone, evenly spaced in time."""
 
     start_s: float
@@ -62,20 +62,20 @@ class Flying(NamedTuple):
 def flying_of(config: PlannerConfig) -> Flying:
     """Return gains, limits and period of the drones."""
     return Flying(
-        config.k_position,
-        config.k_velocity,
-        config.k_integral,
+        config.tuning.k_position,
+        config.tuning.k_velocity,
+        config.tuning.k_integral,
         config.acceleration_mps2,
         config.jerk_mps3,
         config.speed_mps,
-        1.0 / config.tracking_hz,
+        1.0 / config.tuning.tracking_hz,
     )
 
 
 def tracking_times(actor_t_ns: Int64, config: PlannerConfig) -> Int64:
     """Return the times [T] of a replay: every tracking step from the first measurement to the last."""
     first_ns, last_ns = int(actor_t_ns[0]), int(actor_t_ns[-1])
-    period_ns = round(1e9 / config.tracking_hz)
+    period_ns = round(1e9 / config.tuning.tracking_hz)
     return first_ns + period_ns * np.arange((last_ns - first_ns) // period_ns + 1, dtype=np.int64)
 
 

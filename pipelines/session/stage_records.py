@@ -31,7 +31,7 @@ COMMANDS = {
     "reconstruct": "mocap reconstruct",
     "replan": "mocap replan-compare",
     "sweep": "mocap replan-sweep",
-    "film": "mocap replan-compare --render",
+    "film": "mocap replan-compare --render 5",
     "report": "mocap report",
 }
 """The command that makes each stage."""

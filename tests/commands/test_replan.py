@@ -226,7 +226,7 @@ def test_unchanged_is_skipped_and_forced_is_the_same(calm: Path) -> None:
 
 def test_every_comparison_stays_by_its_name(calm: Path) -> None:
     once = ("--arms", "fixed", "--trials", "1")
-    first = compared(calm, *once, "--name", "near", "--radius", "8")
+    first = compared(calm, *once, "--name", "near", "--config", "radius_m=8")
     second = compared(calm, *once)
     folder = calm / "replan"
 
@@ -241,7 +241,7 @@ def test_every_comparison_stays_by_its_name(calm: Path) -> None:
     assert track["slot_range_m"].max() == pytest.approx(8.0)
     assert stored(folder)["arms"]["fixed"]["range_m"]["mean"] > 9
     (folder / "near" / "metrics.json").write_text("{}")  # what was changed since is not kept as if it were
-    again = compare(calm, *once, "--name", "near", "--radius", "12")
+    again = compare(calm, *once, "--name", "near", "--config", "radius_m=12")
     assert again.exit_code == 0
     assert stored(folder / "near")["arms"]["fixed"]["range_m"]["mean"] > 11
     assert {path.parent.name for path in folder.glob("*/metrics.json")} == {"near", second["name"]}
@@ -282,7 +282,7 @@ def test_an_interrupted_comparison_flies_only_what_is_missing(
 
 def test_in_the_open_nothing_is_found_between_the_arms(calm: Path) -> None:
     """Check that equal flights with equal seeds have a difference of exactly zero."""
-    metrics = compared(calm, "--arms", "fixed,adaptive", "--trials", "3", "--mode", "plan-only")
+    metrics = compared(calm, "--arms", "fixed,adaptive", "--trials", "3", "--config", "mode=plan-only")
     (difference,) = metrics["differences"]
     assert (difference["arm"], difference["against"]) == ("adaptive", "fixed")
     assert difference["mpjpe_mm"] == {"mean": 0.0, "interval": [0.0, 0.0]}
@@ -298,8 +298,9 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     config.write_text("radius_m: 6\ntilt_deg: 40\n", encoding="utf-8")
     metrics = compared(
         calm,
-        *("--arms", "fixed", "--drones", "4", "--config", config, "--tilt", "30", "--yaw", "10"),
-        *("--horizon", "7", "--yaws", "12", "--trials", "1", "--pose-noise", "white:position_m=0.3"),
+        *("--arms", "fixed", "--drones", "4", "--config", config, "--config", "tilt_deg=30"),
+        *("--config", "yaw_deg=10", "--config", "horizon_s=7", "--config", "ranges_m=[6, 9]"),
+        *("--trials", "1", "--pose-noise", "white:position_m=0.3"),
     )
     arm = metrics["arms"]["fixed"]
     assert metrics["drones"] == arm["drones"] == 4
@@ -310,7 +311,7 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     assert metrics["differences"] == []
     assert metrics["verdict"].startswith("fixed ")
     stated = json.loads((calm / "replan" / "stage.json").read_text())["settings"]
-    assert (stated["planner.horizon_knots"], stated["planner.yaws"]) == (7, 12)
+    assert (stated["planner.horizon_s"], stated["planner.ranges_m"]) == (7.0, [6.0, 9.0])
     table = pd.read_parquet(calm / "replan" / "fixed" / "trajectories.parquet")
     assert list(table["camera"][:4]) == ["drone1", "drone2", "drone3", "drone4"]
 
@@ -319,9 +320,9 @@ def test_yaws_count_from_the_heading_of_who_walks_north(tmp_path: Path) -> None:
     """Use an actor who looks east at first, and turns on the spot for two seconds."""
     north = CALM.replace("walk: {distance_m: 5}", "walk: {to: [0, 5]}").replace("_s: 4", "_s: 6")
     session = session_of(tmp_path, north)
-    asked = ("--arms", "fixed", "--yaw", "90", "--trials", "1", "--mode", "plan-only")
+    asked = ("--arms", "fixed", "--config", "yaw_deg=90", "--trials", "1", "--config", "mode=plan-only")
     assert compared(session, *asked)["yaw_deg"] == pytest.approx(90)
-    turned = compared(session, *asked, "--yaw-frame", "heading")
+    turned = compared(session, *asked, "--config", "yaw_frame=heading")
     assert turned["yaw_deg"] == pytest.approx(180, abs=10)  # from where the hips sway to in the first metre
     assert any(f"{turned['yaw_deg'] - 90:.1f} deg" in note for note in turned["notes"])
     stated = json.loads((session / "replan" / "stage.json").read_text())["settings"]
@@ -392,7 +393,9 @@ def test_what_the_map_and_the_log_leave_open_is_said(tmp_path: Path) -> None:
     kept = (actor.index < 10) | (actor.index > 24)
     actor[kept].to_parquet(session / "actor.parquet", index=False)
     as_if_written(session, "actor.parquet", "ingest")
-    metrics = compared(session, "--trials", "1", "--yaw", "0", "--radius", "3", "--tilt", "0")
+    metrics = compared(
+        session, "--trials", "1", "--config", "yaw_deg=0", "--config", "radius_m=3", "--config", "tilt_deg=0"
+    )
     warnings = " | ".join(metrics["warnings"])
     for figures in (r"\bmap\b.* \d+ %", r"\b1 times\b.* 1 s\b.* 1\.\d s\b", r"\b1 of 2\b.* 0\.5 m\b"):
         assert re.search(figures, warnings)
@@ -415,7 +418,7 @@ def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:
     ingest(manifest, session=session)
     stated = json.loads((session / "session.json").read_text())["map"]
     assert stated["occupied"] == 185673
-    metrics = compared(session, "--trials", "1", "--radius", "2.5", "--tilt", "10")
+    metrics = compared(session, "--trials", "1", "--config", "radius_m=2.5", "--config", "tilt_deg=10")
     for arm in ("adaptive", "fixed"):
         assert metrics["arms"][arm]["min_clearance_m"] is not None
         assert metrics["arms"][arm]["tilt_deg"]["near_obstacle"] is not None
@@ -424,10 +427,10 @@ def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:
 BAD = {
     "unknown arm": (
         ["--arms", "adaptive,clever"],
-        "there are adaptive, covariance, fixed, greedy, group, joint, flown",
+        "there are adaptive, fixed, group, joint, flown",
     ),
     "unknown noise": (["--pose-noise", "pink:position_m=1"], "pink"),
-    "out of range": (["--radius", "0.5", "--yaws", "360", "--horizon", "600"], "horizon_knots"),
+    "out of range": (["--config", "horizon_s=600"], "horizon_s"),
 }
 
 

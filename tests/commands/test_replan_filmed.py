@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.film import Settings, film
+from pipelines.film import FilmSettings, film, film_settings
 from pipelines.formats.videos.video import index_video
 from pipelines.geometry.arrays import Float
 from pipelines.ingest import ingest
@@ -36,7 +36,7 @@ drones:
   count: 2
   camera: {rate_hz: 5, width: 640, height: 360}
 """
-SMALL = ("--arms", "fixed", "--trials", "1", "--render", "--render-hz", "4", "--render-end", "1")
+SMALL = ("--arms", "fixed", "--trials", "1", "--render", "4,end=1")
 FIRST_MM = 150.0
 """People of 67 px: keypoints of BlazePose are off by some 3 px of 26 mm, points of two views by more."""
 
@@ -63,14 +63,24 @@ def test_arms_are_filmed_and_a_detector_looks_at_them(tmp_path: Path) -> None:
     assert " 4 Hz" in again.stdout
     assert "unchanged: " in again.stdout
     assert read_json(session / "replan" / "stage.json") == replanned
-    assert film(session, Settings(rate_hz=4.0, end_s=1.0)).skipped
+    assert film(session, FilmSettings(rate_hz=4.0, end_s=1.0)).skipped
 
     other = tmp_path / "other.yaml"
     other.write_text(SHORT.replace("distance_m: 5", "distance_m: 5, turn_deg: 90"), encoding="utf-8")
     assert re.search(
-        r"\bother.yaml: .*\d\.\d\d m\b.*--scenario", refused(session, *SMALL, "--scenario", other)
+        r"\bother.yaml: .*\d\.\d\d m\b.*scenario=",
+        refused(session, *SMALL, "--render", f"4,end=1,scenario={other}"),
     )
-    assert re.search(r"session: 1 pictures\b", refused(session, *SMALL, "--render-start", "0.9"))
+    assert re.search(r"session: 1 pictures\b", refused(session, *SMALL, "--render", "4,start=0.9,end=1"))
+
+
+@pytest.mark.parametrize("stated", ["", "0", "31", "5,end", "5,stop=3", "5,start=nan"])
+def test_a_film_that_cannot_be_meant_is_refused(stated: str) -> None:
+    with pytest.raises(ValueError, match=r"."):
+        film_settings(stated)
+    detector, scenario = "onnx:model.onnx,provider=cuda", Path("my,scenario.yaml")
+    expected = FilmSettings(5.0, 1.0, None, detector), scenario
+    assert film_settings(f"5,start=1,detector={detector},scenario={scenario}") == expected
 
 
 class StartedError(Exception):
@@ -91,7 +101,7 @@ def test_another_motion_file_is_another_film(tmp_path: Path, monkeypatch: pytest
     for text in ("one", "another", "one"):
         motion.write_text(text, encoding="utf-8")
         with pytest.raises(StartedError) as caught:
-            film(session, Settings(detector=spot_detector(tmp_path)), scenario=scenario)
+            film(session, FilmSettings(detector=spot_detector(tmp_path)), scenario=scenario)
         inputs.append(caught.value.args[0])
     assert inputs[0] == inputs[2]
     assert inputs[0] != inputs[1]
@@ -142,7 +152,7 @@ def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(Renderer, "picture", picture)
     monkeypatch.setattr("pipelines.film.FollowedPeople", Everybody)
-    settings = Settings(rate_hz=5.0, end_s=0.5, detector=spot_detector(tmp_path))
+    settings = FilmSettings(rate_hz=5.0, end_s=0.5, detector=spot_detector(tmp_path))
     figures = film(session, settings).metrics["arms"]["fixed"]
     assert len(rendered) == 6
     for people_seen in rendered:  # both stand; the middles of a body and of its joints differ

@@ -7,7 +7,6 @@ import pytest
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.planning.comparison import (
-    broken_limits,
     common_frames,
     coverage,
     equal_ranges,
@@ -15,9 +14,7 @@ from pipelines.planning.comparison import (
     mean_over_time,
     mpjpe_mm,
     pck,
-    verdict,
 )
-from pipelines.planning.config import PlannerConfig
 
 
 def test_the_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:
@@ -35,13 +32,6 @@ def test_the_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:
     expected = values.mean() + 1.96 * standard_error * np.array([-1, 1])
     assert estimate.interval == pytest.approx(tuple(expected), abs=0.25 * standard_error)
     assert mean_of_trials(values, seed=0) == estimate
-
-
-def test_one_trial_has_no_interval_and_none_no_mean() -> None:
-    single = mean_of_trials(np.array([7.0]), seed=0)
-    assert single is not None
-    assert (single.mean, single.interval) == (7.0, None)
-    assert mean_of_trials(np.array([]), seed=0) is None
 
 
 def test_a_finer_time_makes_a_mean_no_surer() -> None:
@@ -100,78 +90,3 @@ def test_arms_of_equal_range_are_grouped_from_near_to_far() -> None:
         ["e"],
     ]
     assert equal_ranges({}) == []
-
-
-def arm(tilt_deg: float, covered: float | None = 1.0) -> dict[str, object]:
-    share = None if covered is None else {"mean": covered, "interval": None}
-    return {"tilt_deg": {"max": tilt_deg}, "reconstruction_error": {"coverage": share}}
-
-
-@pytest.mark.parametrize(
-    ("own", "other", "error", "said"),
-    [
-        (
-            arm(16),
-            arm(38),
-            {"mean": -41.0, "interval": [-44.0, -38.0]},
-            "a keeps the tilt at 16 deg where b climbs to 38;"
-            " its reconstruction error is 41.0 mm [38.0, 44.0] smaller (simulated)",
-        ),
-        (
-            arm(38),
-            arm(16),
-            {"mean": 5.0, "interval": [1.0, 9.0]},
-            "a climbs to a tilt of 38 deg where b keeps it at 16;"
-            " its reconstruction error is 5.0 mm [1.0, 9.0] larger (simulated)",
-        ),
-        (
-            arm(16),
-            arm(17),
-            {"mean": -1.0, "interval": [-3.0, 1.0]},
-            "a and b tilt alike, up to 16 and 17 deg;"
-            " no difference in reconstruction error was found (-1.0 mm [-3.0, +1.0], simulated)",
-        ),
-        (
-            arm(16, 0.95),
-            arm(16, 0.9),
-            {"mean": 2.0, "interval": None},
-            "a and b tilt alike, up to 16 and 16 deg;"
-            " its reconstruction error differs by +2 mm in the only trial (simulated),"
-            " and it measures 95 % of the joints where b measures 90 %",
-        ),
-        (
-            arm(16, None),
-            arm(16, None),
-            None,
-            "a and b tilt alike, up to 16 and 16 deg; its reconstruction error could not be compared",
-        ),
-    ],
-)
-def test_the_verdict_in_words(
-    own: dict[str, object], other: dict[str, object], error: object, said: str
-) -> None:
-    assert verdict("a", "b", {"a": own, "b": other}, {"mpjpe_mm": error}) == said
-
-
-def test_every_limit_that_is_violated_is_named_with_its_number() -> None:
-    config = PlannerConfig(drone_radius_m=0.4, speed_mps=7.5)
-    kept = dict.fromkeys(
-        ("collision", "clearance", "actor", "separation", "speed", "acceleration", "jerk"), 0
-    )
-    assert broken_limits("a", {"limit_violations": kept}, config) is None
-    for kind, number in {
-        "clearance": "0.4 m",
-        "actor": "3 m",
-        "separation": "3 m",
-        "speed": "7.5 m/s",
-        "acceleration": "4 m/s^2",
-        "jerk": "50 m/s^3",
-    }.items():
-        said = broken_limits("a", {"limit_violations": {**kept, kind: 2}}, config)
-        assert said is not None
-        assert number in said
-        assert said.startswith("a ")
-        assert said.endswith("(2 times)")
-    collided = broken_limits("a", {"limit_violations": {**kept, "jerk": 1, "collision": 1}}, config)
-    assert collided is not None
-    assert collided.index("collides") < collided.index("jerk")

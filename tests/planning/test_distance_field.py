@@ -21,7 +21,6 @@ from pipelines.planning.distance_field import (
     zone_edges,
 )
 from pipelines.session.records import Occupancy
-from tests.planning.worlds import wall
 
 RES = 0.25
 
@@ -47,28 +46,10 @@ def test_a_flat_surface_is_exact(x: float, y: float, z: float) -> None:
         assert gradient == pytest.approx([0, 0, 1], abs=1e-5)
 
 
-def test_a_sphere_is_within_a_voxel() -> None:
-    """Every surface voxel's centre lies within half a diagonal of the sphere, as does every look-up."""
-    centres = -3 + RES * (np.arange(24) + 0.5)
-    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
-    occupied = x**2 + y**2 + z**2 < 1.5**2
-    field = distance_field(Occupancy(occupied.astype(np.float32), np.full(3, -3.0), RES))
-    points = np.random.default_rng(1).uniform(-2.8, 2.8, (500, 3))
-    distance, _ = field.sample(points)
-    assert np.abs(distance - (np.linalg.norm(points, axis=1) - 1.5)).max() < RES * np.sqrt(3)
-
-
 def expected_distances(occupied: Bool) -> Float32:
     """Compute the distances of a whole map at once, with scipy."""
     free_m, inside_m = (distance_transform_edt(side, sampling=RES) for side in (~occupied, occupied))
     return np.where(occupied, RES / 2 - inside_m, free_m - RES / 2).astype(np.float32)
-
-
-def test_slabs_give_the_distances_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    occupied = np.random.default_rng(3).random((13, 7, 9)) < 0.05
-    monkeypatch.setattr("pipelines.planning.distance_field._SLAB_VOXELS", 130)
-    field = distance_field(Occupancy(occupied.astype(np.float32), np.zeros(3), RES))
-    assert np.array_equal(field.grid.distance_m, expected_distances(occupied))
 
 
 @given(st.lists(st.tuples(st.integers(0, 8), st.integers(1, 9)), min_size=3, max_size=3))
@@ -124,17 +105,6 @@ def test_maps_without_anything_and_of_one_layer() -> None:
     layer[0, 0, 0] = 1
     distance, _ = distance_field(Occupancy(layer, np.zeros(3), RES)).sample(np.array([5.0, 1.0, -5.0]))
     assert distance == pytest.approx(1.0 - RES, abs=1e-6)
-
-
-def test_what_a_map_covers() -> None:
-    """The box of `worlds`: 80 x 60 x 30 m from (-25, -30, 0), its lower faces included."""
-    field = wall()
-    inside = np.array([[-25.0, -30.0, 0.0], [54.99, 29.99, 29.99], [0.0, 0.0, 1.0]])
-    outside = np.array([[-25.01, 0.0, 1.0], [55.01, 0.0, 1.0], [0.0, 0.0, -0.1]])
-    assert field.covers(inside).all()
-    assert not field.covers(outside).any()
-    assert field.has_obstacles
-    assert not open_space().has_obstacles
 
 
 YARD = Zone(((0.0, 0.0), (6.0, 0.0), (6.0, 2.0), (2.0, 2.0), (2.0, 6.0), (0.0, 6.0)), -1.0, 3.0)  # an L

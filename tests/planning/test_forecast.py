@@ -17,30 +17,6 @@ def test_a_steady_walk_is_forecast_exactly() -> None:
     assert ahead == pytest.approx(np.array([[2.4, 2.0, 1.0], [14.4, -3.0, 1.0]]), abs=1e-3)
 
 
-def test_the_covariance_grows_as_integrated_white_acceleration() -> None:
-    """Between measurements P(t + dt) = F P F' + Q, whatever the division of the time."""
-    actor = ActorFilter(q=0.3, sigma_m=0.2)
-    actor.measure(0.0, np.zeros(3))
-    actor.measure(0.5, np.ones(3))
-    _, _, P = actor.at(0.5)
-    dt = 1.7
-    F = np.array([[1, dt], [0, 1]])
-    Q = 0.3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    assert actor.at(0.5 + dt)[2] == pytest.approx(F @ P @ F.T + Q, rel=1e-12)
-
-
-def test_two_measurements_in_closed_form() -> None:
-    """The gain of the second one, from the innovation's variance."""
-    actor = ActorFilter(q=0.1, sigma_m=0.2)
-    actor.measure(0.0, np.zeros(3))
-    actor.measure(1.0, np.array([1.0, 0.0, 0.0]))
-    prior = 0.2**2 + 3.0**2 + 0.1 / 3
-    position, velocity, covariance = actor.at(1.0)
-    assert position[0] == pytest.approx(prior / (prior + 0.2**2))
-    assert velocity[0] == pytest.approx((3.0**2 + 0.1 / 2) / (prior + 0.2**2))
-    assert covariance[0, 0] == pytest.approx(prior * 0.2**2 / (prior + 0.2**2))
-
-
 def test_errors_are_as_large_as_stated() -> None:
     """Normalised squared errors of 400 simulated walks: mean 2 per axis for position and velocity.
 
@@ -63,21 +39,6 @@ def test_errors_are_as_large_as_stated() -> None:
         error = truth - np.stack([position, velocity])
         total += float((error * np.linalg.solve(covariance, error)).sum())
     assert total / 1200 == pytest.approx(2.0, abs=5 * 0.058)
-
-
-def test_what_is_refused() -> None:
-    actor = ActorFilter(q=0.1, sigma_m=0.2)
-    with pytest.raises(ValueError, match=r"\bmeasured\b"):
-        actor.at(0.0)
-    with pytest.raises(ValueError, match=r"\bmeasured\b"):
-        actor.forecast(np.zeros(1))
-    actor.measure(1.0, np.zeros(3))
-    with pytest.raises(ValueError, match=r"\b0\.1 s\b"):
-        actor.measure(0.9, np.zeros(3))
-    with pytest.raises(ValueError, match="finite"):
-        actor.measure(2.0, np.array([0, np.nan, 0]))
-    with pytest.raises(ValueError, match="ahead"):
-        actor.forecast(np.array([0.5]))
 
 
 def test_foresight_knows_the_way_and_goes_on_straight() -> None:

@@ -10,9 +10,8 @@ from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import open_space
 from pipelines.planning.forecast import ActorFilter, Forecast, PeopleFilter
 from pipelines.planning.formation import formation_slots, slot_offsets
-from pipelines.planning.groups import hidden_by_people, sights
 from pipelines.planning.replay import Start, replay
-from pipelines.planning.scores import blind_s
+from pipelines.planning.scores import blind_s, hidden_by_people, sights
 
 CONFIG = PlannerConfig()
 FIELD = open_space()
@@ -94,19 +93,3 @@ def test_drones_of_a_group_follow_people_who_part() -> None:
         assert done.aim.sum(axis=2) == pytest.approx(1.0)
     assert max(looks["group"]) < 1.0
     assert min(looks["adaptive"]) > 3.0
-
-
-def test_people_measured_at_other_times_are_followed_alike() -> None:
-    """Logs need not share stamps; the replay lasts while both are known."""
-    stamps, people = parted(6.0)
-    gappy = people.copy()
-    gappy[1::2, 1] = np.nan  # every other measurement of the second
-    gappy[:5, 1] = gappy[-7:, 1] = np.nan
-    done = replay(GROUP, stamps, gappy, [], Start(3), config=CONFIG, weights=(1.0, 1.0))
-    known = np.flatnonzero(np.isfinite(gappy[:, 1, 0]))
-    assert done.t_ns[0] == stamps[known[0]]
-    assert stamps[known[-1]] - done.t_ns[-1] < 20_000_000
-    with pytest.raises(ValueError, match="two measurements"):
-        replay(
-            GROUP, stamps, np.where(np.arange(2)[:, None] == 1, np.nan, people), [], Start(3), config=CONFIG
-        )

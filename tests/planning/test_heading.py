@@ -10,13 +10,21 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm
-from pipelines.planning.config import PlannerConfig
+from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT, Arm
+from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import open_space
 from pipelines.planning.forecast import Forecast, YawZero, first_heading
-from pipelines.planning.formation import YAW, formation_slots, slot_of, slot_offsets, wrapped, yaw_set
+from pipelines.planning.formation import (
+    YAW,
+    cost_map,
+    costs_of_slots,
+    formation_slots,
+    slot_of,
+    slot_offsets,
+    wrapped,
+    yaw_set,
+)
 from pipelines.planning.replay import Start, replay
-from pipelines.planning.search import cost_map, costs_of_slots
 from tests.planning.worlds import trees, walker
 
 WORLD_FRAME = PlannerConfig()
@@ -32,11 +40,6 @@ def towards(deg: float, speed_mps: float = 1.2) -> Float:
 
 def zero_deg(zero: YawZero, *t_s: float) -> list[float]:
     return [float(angle) for angle in np.degrees(zero.at(np.array(t_s)))]
-
-
-def test_in_the_world_frame_yaws_count_from_east() -> None:
-    zero = YawZero(WORLD_FRAME, heading_rad=1.0)
-    assert zero_deg(zero, 0.0, 9.0) == [0.0, 0.0]
 
 
 def test_the_zero_follows_the_heading_as_fast_as_a_formation_turns_and_no_faster() -> None:
@@ -76,15 +79,15 @@ def test_the_first_heading_of_a_log_is_where_the_actor_leaves_to() -> None:
     assert first_heading(np.concatenate([[[np.nan] * 3], standing])) == 0.0
 
 
-@pytest.mark.parametrize("arm", [FIXED, ADAPTIVE, COVARIANCE, GREEDY], ids=lambda arm: arm.name)
+@pytest.mark.parametrize("arm", [FIXED, ADAPTIVE, JOINT], ids=lambda arm: arm.name)
 def test_who_walks_straight_east_is_filmed_alike_in_both_frames(arm: Arm) -> None:
     flights = [
-        replay(arm, *walker(8.0), [WORLD], Start(2, 0.7), config=config)
+        replay(arm, *walker(4.0), [WORLD], Start(2, 0.7), config=config)
         for config in (WORLD_FRAME, HEADING_FRAME)
     ]
     for name in ("position", "slots"):
         assert np.array_equal(getattr(flights[0], name), getattr(flights[1], name))
-    assert np.ptp(flights[0].position[0], axis=0).max() > 5
+    assert np.ptp(flights[0].position[0], axis=0).max() > 2
 
 
 def on_a_circle(seconds: float) -> tuple[NDArray[np.int64], Float, Float]:
@@ -122,7 +125,7 @@ def test_a_formation_in_the_heading_frame_turns_with_the_actor(arm: Arm) -> None
 
 def test_no_sequence_of_yaws_from_the_heading_is_cheaper() -> None:
     """All sequences of 8 yaws at 3 knots between trees; the actor turns by 40 deg from knot to knot."""
-    config = replace(HEADING_FRAME, yaws=8, knot_s=2.0, horizon_knots=3)
+    config = replace(HEADING_FRAME, horizon_s=6.0, tuning=PlannerTuning(yaws=8, knot_s=2.0))
     form = {"tilt_rad": config.tilt_rad, "range_m": config.radius_m}
     yaws = yaw_set(8, 0.0)
     for seed in range(20):

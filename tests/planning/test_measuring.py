@@ -84,17 +84,6 @@ def test_outside_the_picture_and_without_a_pose_nothing_is_seen() -> None:
     assert measured[TIMES // 2 :].all()
 
 
-def test_joints_that_nobody_knows_are_not_counted() -> None:
-    shot = watching(SOUTH, EAST)
-    joints = shot.joints.copy()
-    joints[:10, 0] = np.nan
-    measured = measure(replace(shot, joints=joints), open_space(), exact, start_m=1.5, trials=1, seed=0)
-    assert measured.joint_frames == TIMES * JOINTS - 10
-    assert not np.isfinite(measured.error_m[0, :10, 0]).any()
-    assert np.isfinite(measured.error_m[0, :, 1:]).all()
-    assert measured.seen_share == 1.0
-
-
 def test_pose_noise_costs_what_it_says() -> None:
     """White noise of 0.1 m on two cameras 90 deg apart, level: across both axes of the plane one camera
     decides (0.1 m each), upwards the mean of both (0.1/sqrt 2). The mean length of such an error lies

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm, FormationPlanner
-from pipelines.planning.config import PlannerConfig
+from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT, Arm, FormationPlanner
+from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.formation import FormationPath
 from pipelines.planning.replay import Pilot, Replay, Start, replay
@@ -66,16 +65,6 @@ def test_the_adaptive_formation_goes_round_the_mound_and_the_fixed_one_over_it()
         assert np.linalg.norm(result.position[0] - result.position[1], axis=-1).min() > 3
 
 
-def test_a_higher_mound_lifts_the_fixed_formation_further() -> None:
-    config = replace(CONFIG, l_obs=200.0, l_occ=5.0)
-    highest = [
-        tilt_deg(fly(arm, mound(height), config=config)).max()
-        for arm, height in ((FIXED, 6.0), (FIXED, 9.0), (ADAPTIVE, 9.0))
-    ]
-    assert highest[1] > highest[0] > 30
-    assert highest[2] < 20
-
-
 def test_a_wall_blinds_the_fixed_formation_and_not_the_adaptive_one() -> None:
     """1 m thick, 12 m high, 5 m beside the way: too high to look over, and the slots are behind it."""
     field = high_wall()
@@ -86,13 +75,6 @@ def test_a_wall_blinds_the_fixed_formation_and_not_the_adaptive_one() -> None:
     assert tilt_deg(adaptive).max() < 20
     for result in (fixed, adaptive):
         assert field.sample(result.position)[0].min() > 1
-
-
-def test_between_trees_the_adaptive_formation_stays_low_and_with_the_actor() -> None:
-    """With cells of 45 deg and 2 s it swept through trees and reached 40 deg."""
-    result = fly(ADAPTIVE, trees(), seconds=30.0)
-    assert tilt_deg(result).max() < 20
-    assert np.linalg.norm(result.position - result.actor, axis=-1).max() < 15
 
 
 @pytest.mark.parametrize("arm", [FIXED, ADAPTIVE], ids=lambda arm: arm.name)
@@ -134,7 +116,7 @@ def test_who_starts_beside_the_mound_turns_away_in_time() -> None:
         assert figures["limit_violations"]["collision"] == figures["limit_violations"]["separation"] == 0
 
 
-@pytest.mark.parametrize("arm", [FIXED, ADAPTIVE, COVARIANCE, GREEDY], ids=lambda arm: arm.name)
+@pytest.mark.parametrize("arm", [FIXED, JOINT], ids=lambda arm: arm.name)
 @pytest.mark.parametrize("world", [wall, trees], ids=["wall", "trees"])
 def test_no_collision_and_enough_distance_past_wall_and_trees(arm: Arm, world: object) -> None:
     field = wall() if world is wall else trees()
@@ -172,9 +154,9 @@ def test_drones_that_want_the_same_slot_keep_three_metres(drones: int) -> None:
     assert apart[~np.eye(drones, dtype=bool)].min() >= CONFIG.separation_m
 
 
-@pytest.mark.parametrize("arm", [ADAPTIVE, COVARIANCE, GREEDY], ids=lambda arm: arm.name)
+@pytest.mark.parametrize("arm", [ADAPTIVE, JOINT], ids=lambda arm: arm.name)
 def test_the_same_arguments_give_the_same_bytes(arm: Arm) -> None:
-    config = replace(CONFIG, actor_noise_m=0.2)
+    config = replace(CONFIG, tuning=PlannerTuning(actor_noise_m=0.2))
 
     def flown(seed: int) -> Replay:
         return replay(arm, *walker(5.0), [wall()], Start(2), config=config, seed=seed)
@@ -201,17 +183,6 @@ def test_nothing_is_seen_before_its_time() -> None:
     assert not np.allclose(plain.position[:, -1], changed.position[:, -1], atol=0.5)
     assert np.ptp(changed.formation_yaw_rad[before]) == 0
     assert np.ptp(changed.formation_yaw_rad) > 0
-
-
-def test_cameras_aim_at_the_estimate_and_not_at_the_truth() -> None:
-    config = replace(CONFIG, actor_noise_m=1.0)
-    result = replay(FIXED, *walker(5.0), [], Start(2), config=config)
-    forward = matrix_from_quaternion(result.quaternion_xyzw)[..., 2]
-    for target, met in ((result.estimate, True), (result.actor, False)):
-        towards = target - result.position
-        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
-        off = np.degrees(np.arccos(np.clip((forward * towards).sum(axis=-1), -1, 1)))
-        assert (off.max() < 1e-3) == met
 
 
 def test_plan_only_is_where_the_plans_are() -> None:

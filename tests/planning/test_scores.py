@@ -38,7 +38,7 @@ def test_a_still_formation_in_the_open() -> None:
     )
     assert figures["min_separation_m"] == pytest.approx(10 * np.cos(np.radians(30)) * np.sqrt(2))
     # cos gamma = cos^2 30 cos 90 + sin^2 30 = 1/4; the detector's errors are those at 30 deg.
-    errors = CONFIG.errors
+    errors = CONFIG.tuning.errors
     keypoint_m, placed = (
         np.interp(30.0, errors.tilts_deg, values) for values in (errors.keypoint_sigma_m, errors.placed_share)
     )
@@ -139,19 +139,3 @@ def test_near_is_what_stands_above_the_actor_within_fifteen_metres() -> None:
     assert near[np.argmax(near) :].all()
     assert not near_obstacle(T_S, slot, actor, bare_ground()).any()
     assert not near_obstacle(T_S, slot, actor + np.array([0, 0, 6.0]), wall()).any()
-
-
-def test_empty_columns_of_a_map_that_begins_above_the_actor_are_no_obstacles() -> None:
-    slot = np.tile([12.0, -20.0, 3.0], (len(T_S), 1))[None]
-    actor = np.tile([12.0, -25.0, -4.0], (len(T_S), 1))  # the map begins at 0
-    assert not near_obstacle(T_S, slot, actor, wall()).any()
-    assert not near_obstacle(T_S, slot, actor, open_space()).any()
-
-
-@pytest.mark.parametrize("last", [30, 390, 1000])
-def test_looks_for_obstacles_end_with_the_flight(last: int) -> None:
-    """Five looks a second up to 0.6 and 7.8 s: steps of 0.2 add up to more by rounding."""
-    t_s = np.arange(last + 1) / 50
-    near = near_obstacle(t_s, np.zeros((1, last + 1, 3)), np.zeros((last + 1, 3)), open_space())
-    assert near.shape == (last + 1,)
-    assert not near.any()
