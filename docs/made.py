@@ -254,7 +254,7 @@ def planner() -> str:
     own = meanings(PlannerConfig)
     rows = []
     for field in dataclasses.fields(PlannerConfig):
-        if field.name != "errors":  # taken from the session
+        if field.name != "tuning":  # no setting
             default = field.default if isinstance(field.default, tuple) else (field.default,)
             shown = " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in default)
             rows.append((f"`{field.name}`", shown or "none", own[field.name]))

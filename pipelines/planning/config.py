@@ -49,9 +49,9 @@ class PlannerTuning:
     yaws: int = 32
     # Knots of 2 s leave obstacles between two knots untested.
     knot_s: float = 1.0
-    # A slower actor has no direction that the filter can tell, and keeps the last heading.
+    # A slower actor counts as standing, and keeps the last heading.
     heading_speed_mps: float = 0.5
-    # Drones climb and approach this slowly, so that the tilt of the pictures changes little in a second.
+    # Slow changes of tilt and range leave the pictures steady.
     tilt_rate_deg_per_s: float = 5.0
     range_rate_mps: float = 1.0
     # A turn of 45 deg must gain more than this, or formations turn to and fro for nothing.
@@ -81,7 +81,7 @@ class PlannerTuning:
     a_velocity: float = 1.0
     a_acceleration: float = 1.0
     a_jerk: float = 1.0
-    # Drones feel obstacles from 3 m on, which they need to give way at full speed.
+    # Obstacles push from 3 m on; the guard alone keeps the last half metre.
     eps_obs_m: float = 3.0
     # At 3 m bare ground alone would push cameras up to a tilt of 39 deg.
     eps_occ_m: float = 0.5
@@ -101,18 +101,18 @@ class PlannerTuning:
     step_cap_m: float = 0.5
 
     # --- rates and tracking ---
-    # The published system plans formations at 10 Hz and trajectories at 5 Hz.
+    # Formations are planned at 10 Hz and trajectories at 5 Hz.
     central_hz: float = 10.0
     local_hz: float = 5.0
     # A flight controller tracks positions at this rate.
     tracking_hz: float = 50.0
-    # The gains are critically damped at the position error's time constant of half a second.
+    # The gains damp a position error by four fifths of critical; the integral removes a constant one.
     k_position: float = 6.0
     k_velocity: float = 4.0
     k_integral: float = 0.5
 
     # --- actor and cameras ---
-    # Satellite positions of a person with RTK or a good pedestrian filter err by this much per axis.
+    # Planners take the logged position of the actor to err by this much per axis.
     actor_sigma_m: float = 0.2
     # Replays add no noise to the log; studies of the forecast do.
     actor_noise_m: float = 0.0
@@ -193,38 +193,34 @@ class PlannerConfig:
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    # The formation.
-    radius_m: Positive = 10.0
-    tilt_deg: Annotated[float, Field(ge=-10, le=85, strict=True)] = 15.0
+    radius_m: Positive = 10.0  # distance of the slots from the actor's hips
+    tilt_deg: Annotated[float, Field(ge=-10, le=85, strict=True)] = 15.0  # elevation of the slots
     ranges_m: Annotated[tuple[Positive, ...], Field(min_length=1)] = (8.0, 10.0, 12.0)
-    """Ends of the ranges of `joint`."""
+    """`joint` chooses ranges between the least and the largest of these"""
     yaw_frame: Literal["world", "heading"] = "world"
-    """Zero of yaws: east, or the actor's heading (`forecast.YawZero`)."""
-    yaw_rate_deg_per_s: Positive = 22.5
+    """zero of yaws: east, or the actor's heading"""
+    yaw_rate_deg_per_s: Positive = 22.5  # formations turn no faster
     horizon_s: Annotated[float, Field(gt=0, le=60, strict=True)] = 10.0
+    """the formation search looks so far ahead"""
 
-    # Weights of the formation search: obstacles, and lines of sight.
-    w_obs: NotNegative = 1.0
-    w_occ: NotNegative = 1.0
+    w_obs: NotNegative = 1.0  # formation search: weight of a slot near an obstacle
+    w_occ: NotNegative = 1.0  # formation search: weight of the occupied share of a line of sight
 
-    # Weights of the local planner: obstacles, lines of sight, distance from the slot.
-    l_obs: NotNegative = 50.0
-    l_occ: NotNegative = 5.0
-    l_form: Positive = 3.0
+    l_obs: NotNegative = 50.0  # local planner: weight of obstacles
+    l_occ: NotNegative = 5.0  # local planner: weight of occupied lines of sight
+    l_form: Positive = 3.0  # local planner: weight of the distance from the slot
 
-    # Distances that every drone keeps, and where it must not fly.
-    separation_m: Positive = 3.0
-    drone_radius_m: NotNegative = 0.5
-    actor_distance_m: NotNegative = 3.0
-    zones: Annotated[tuple[Zone, ...], BeforeValidator(_zones)] = ()
+    separation_m: Positive = 3.0  # least distance of two drones
+    drone_radius_m: NotNegative = 0.5  # least distance of a drone from obstacles
+    actor_distance_m: NotNegative = 3.0  # least distance of a drone from everybody
+    zones: Annotated[tuple[Zone, ...], BeforeValidator(_zones)] = ()  # where drones must not fly
 
-    # Limits of the drone.
-    acceleration_mps2: Positive = 4.0
-    speed_mps: Positive = 8.0
-    jerk_mps3: Positive = 50.0
+    acceleration_mps2: Positive = 4.0  # limit of a drone
+    speed_mps: Positive = 8.0  # limit of a drone
+    jerk_mps3: Positive = 50.0  # limit of a drone
 
     actor_q: Positive = 0.1
-    """Spectral density of the actor's acceleration, m^2/s^3: 0.1 walks, 1.5 jogs and stops."""
+    """spectral density of the actor's acceleration, m²/s³: 0.1 for who walks, 1.5 for who jogs and stops"""
 
     tuning: PlannerTuning = field(default=PlannerTuning(), repr=False)
 

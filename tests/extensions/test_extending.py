@@ -124,8 +124,8 @@ def test_an_arm_is_compared(outside: Path, session: Path) -> None:
         "fixed,opposite",
         "--trials",
         "1",
-        "--mode",
-        "plan-only",
+        "--config",
+        "mode=plan-only",
         "-q",
     )
     arms = {
