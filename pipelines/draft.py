@@ -39,16 +39,15 @@ from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import NO_DATE_NS, Alike, match
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
-from pipelines.formats.drone_logs.subtitles import read_subtitles
+from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
 from pipelines.formats.drone_logs.tlog import FORMAT as TLOG
 from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
 from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
-from pipelines.formats.poses.kitti import times_of
+from pipelines.formats.poses.trajectory_files import times_of
 from pipelines.formats.videos.frame_times import read_frame_times
 from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
-from pipelines.formats.videos.picture_motion import followed_points
-from pipelines.formats.videos.video import created_ns, index_video
+from pipelines.formats.videos.video import created_ns, followed_points, index_video
 from pipelines.geometry.arrays import Int64
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.clocks import Followed, explain_motion

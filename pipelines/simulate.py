@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.calibrations.ros_camera_info import write_camera_info
-from pipelines.formats.logs.ros2_writing import Ros2Recording
+from pipelines.formats.calibrations.camera_matrices import write_camera_info
 from pipelines.formats.maps.octomap import write_octomap
+from pipelines.formats.scenes.mcap_writing import Ros2Recording
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import join_videos, write_h264
 from pipelines.geometry.arrays import Float, Picture

@@ -20,9 +20,9 @@ import numpy as np
 from benchmarks.corpus.stored import RECORDED, Flight, read_backgrounds, read_keypoints
 from pipelines.detect import Block as DetectorBlock
 from pipelines.follow import Block
-from pipelines.formats.calibrations.ros_camera_info import write_camera_info
-from pipelines.formats.logs.ros2_writing import Ros2Recording
+from pipelines.formats.calibrations.camera_matrices import write_camera_info
 from pipelines.formats.maps.octomap import write_octomap
+from pipelines.formats.scenes.mcap_writing import Ros2Recording
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.arrays import Float

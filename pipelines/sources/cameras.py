@@ -11,8 +11,7 @@ import numpy as np
 
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
 from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED, taken_ns
-from pipelines.formats.videos.picture_motion import followed_points
-from pipelines.formats.videos.video import black_bars, created_ns
+from pipelines.formats.videos.video import black_bars, created_ns, followed_points
 from pipelines.geometry.arrays import Int64
 from pipelines.geometry.cameras import Intrinsics, fit_to_size, is_resized
 from pipelines.geometry.clocks import fit_start

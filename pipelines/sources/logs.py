@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, Self
 
-from pipelines.formats.logs.commands import COMMAND_TYPES, read_commands
 from pipelines.formats.logs.messages import Kind, all_samples, kind_of
 from pipelines.formats.logs.pictures import (
     TRIGGER_TYPES,
@@ -23,11 +22,13 @@ from pipelines.formats.logs.pictures import (
 from pipelines.formats.logs.presets import FIXES, pairs_of
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.formats.logs.trajectories import (
+    COMMAND_TYPES,
     Gathered,
     StampCheck,
     attitudes_of,
     chained,
     poses_of,
+    read_commands,
     transforms_in,
 )
 from pipelines.geometry.arrays import Int64

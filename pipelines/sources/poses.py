@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
-from pipelines.formats.drone_logs.subtitles import parse_subtitles
+from pipelines.formats.drone_logs.dji_subtitles import parse_subtitles
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
 from pipelines.formats.logs.presets import FIXES, px4_names, read_pair, read_positions, read_preset
 from pipelines.formats.logs.px4_topics import read_px4

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.formats.poses.tum import write_trajectory
+from pipelines.formats.poses.trajectory_files import write_tum as write_trajectory
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import conjugate, multiply, rotate

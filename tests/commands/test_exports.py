@@ -13,8 +13,8 @@ from filelock import FileLock
 from rosbags.highlevel import AnyReader
 
 from pipelines.export import export, load_recording
-from pipelines.formats.poses import tum
-from pipelines.formats.skeletons import c3d, joints_csv, trc
+from pipelines.formats.poses import trajectory_files
+from pipelines.formats.skeletons import c3d, joint_files, trc
 from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
@@ -81,8 +81,8 @@ def test_files_written_in_parts_are_those_written_at_once(
     export(filmed, ["trc", "csv", "tum"], at_once)
     for module, name in (
         (trc, "_FRAMES_AT_ONCE"),
-        (joints_csv, "_TIMES_AT_ONCE"),
-        (tum, "_POSES_AT_ONCE"),
+        (joint_files, "_TIMES_AT_ONCE"),
+        (trajectory_files, "_POSES_AT_ONCE"),
     ):
         monkeypatch.setattr(module, name, 5)
     export(filmed, ["trc", "csv", "tum"], parts)

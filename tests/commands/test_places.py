@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.maps.pcd import FORMAT as PCD
-from pipelines.formats.poses.tum import write_trajectory
+from pipelines.formats.maps.point_files import PCD
+from pipelines.formats.poses.trajectory_files import write_tum as write_trajectory
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.geodesy import Place, enu_from_geodetic, place_at
 from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from pipelines.formats.calibrations import ros_camera_info
-from pipelines.formats.calibrations.ros_camera_info import write_camera_info
+from pipelines.formats.calibrations import camera_matrices
+from pipelines.formats.calibrations.camera_matrices import write_camera_info
 from pipelines.formats.logs import mcap_log
-from pipelines.formats.logs.ros2_writing import Ros2Recording
+from pipelines.formats.scenes.mcap_writing import Ros2Recording
 from pipelines.formats.videos import video
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.geometry.cameras import Intrinsics, project
@@ -122,7 +122,7 @@ def test_intrinsics_come_back_exactly(
 ) -> None:
     path = tmp_path_factory.mktemp("camera") / "camera.yaml"
     write_camera_info(path, "drone1", Intrinsics(640, 480, fx, fy, cx, cy, "radtan", tuple(distortion)))
-    (read,) = ros_camera_info.FORMAT.read_calibration(path).values()
+    (read,) = camera_matrices.CAMERA_INFO.read_calibration(path).values()
     assert read.intrinsics is not None
     full = read.intrinsics
     assert (full.width, full.height, full.fx, full.fy, full.cx, full.cy) == (640, 480, fx, fy, cx, cy)
@@ -133,7 +133,7 @@ def test_intrinsics_come_back_exactly(
 def test_a_lens_without_distortion_comes_back(tmp_path: Path) -> None:
     lens = Intrinsics(1280, 720, 762.7, 762.7, 639.5, 359.5)
     write_camera_info(tmp_path / "camera.yaml", "drone1", lens)
-    read = ros_camera_info.FORMAT.read_calibration(tmp_path / "camera.yaml")["drone1"].intrinsics
+    read = camera_matrices.CAMERA_INFO.read_calibration(tmp_path / "camera.yaml")["drone1"].intrinsics
     assert read is not None
     assert np.array_equal(project(POINTS, read), project(POINTS, lens))
 
@@ -142,4 +142,4 @@ def test_a_fisheye_comes_back(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     lens = Intrinsics(640, 480, 300.0, 301.0, 320.0, 240.0, "fisheye", (0.1, -0.02, 0.003, -0.0004))
     write_camera_info(path, "left", lens)
-    assert ros_camera_info.FORMAT.read_calibration(path)["left"].intrinsics == lens
+    assert camera_matrices.CAMERA_INFO.read_calibration(path)["left"].intrinsics == lens

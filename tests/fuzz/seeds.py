@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.poses import tum
+from pipelines.formats.poses import trajectory_files
 from pipelines.formats.scenes import mcap_writing
-from pipelines.formats.skeletons import bvh_writing, joints_csv, trc
+from pipelines.formats.skeletons import bvh_writing, joint_files, trc
 from pipelines.session.registries import Export
 from tests.formats.calibrations import (
     test_anipose_toml,
@@ -149,7 +149,7 @@ SEEDS: dict[str, Writer] = {
     "gopro": lambda folder: video_tracks.write_gopro(folder / "a.mp4", _truth(folder)),
     "gopro with attitudes": _turned_gopro,
     "gopro without telemetry": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
-    "joints_csv": lambda folder: joints_csv.write_joints(folder / "joints.csv", walking(4)),
+    "joints_csv": lambda folder: joint_files.write_joints(folder / "joints.csv", walking(4)),
     "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),
     "kitti": test_kitti.write,
     "las": lambda folder: test_las.write(folder / "a.las"),
@@ -184,7 +184,7 @@ SEEDS: dict[str, Writer] = {
     "trc of others": _text(
         "a.trc", test_trc.HEADER + "\n1\t0.0\t1000\t2000\t3000\t\t\t\n2\t0.0166\t1\t2\t3\t4\t5\t6\n"
     ),
-    "tum": lambda folder: tum.write_trajectory(folder / "a.tum", flown(12)),
+    "tum": lambda folder: trajectory_files.write_tum(folder / "a.tum", flown(12)),
     "ulog": _ulog,
     "video": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
     "video, mkv": lambda folder: videos.write_video(folder / "a.mkv", videos.even_ticks(15)),

@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.calibrations.anipose_toml import FORMAT as ANIPOSE
-from pipelines.formats.keypoint_files.alphapose import FORMAT as ALPHAPOSE
-from pipelines.formats.keypoint_files.coco_results import FORMAT as COCO
-from pipelines.formats.keypoint_files.openpose import FORMAT as OPENPOSE
-from pipelines.formats.poses.pose_csv import FORMAT as POSE_CSV
-from pipelines.formats.poses.tum import FORMAT as TUM
+from pipelines.formats.calibrations.rigs import ANIPOSE
+from pipelines.formats.keypoint_files.result_files import ALPHAPOSE, COCO, OPENPOSE
+from pipelines.formats.poses.trajectory_files import POSE_CSV, TUM
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.poses import interpolate_poses, rotate

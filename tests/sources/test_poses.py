@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.formats.drone_logs.dji_srt import FORMAT as SUBTITLES
+from pipelines.formats.drone_logs.dji_subtitles import DJI_SRT as SUBTITLES
 from pipelines.session.errors import DataError
 from pipelines.sources.poses import _reader
 from tests.formats.drone_logs.test_dji_srt import subtitles

@@ -25,7 +25,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from pipelines.formats.logs.ros2_writing import build
+from pipelines.formats.scenes.mcap_writing import build
 from tests.formats.foxglove_protobuf import protobuf
 from tests.synthetic.driver_messages import register
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import get_types_from_msg
 
 from pipelines.formats.logs.maps import OCCUPANCY_GRID, POINT_CLOUD
-from pipelines.formats.logs.message_decoders import GRID_MAP, OCTOMAP
+from pipelines.formats.logs.message_decoders import OCTOMAP
 from pipelines.formats.maps.octomap import write_octomap
 from pipelines.geometry.arrays import Float
 from pipelines.session.records import Occupancy
@@ -26,19 +26,6 @@ for _store in (ROS1, ROS2):
             "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n", OCTOMAP
         )
     )
-
-# grid_map_msgs/msg/GridMap.msg of ANYbotics/grid_map; ROS 1 has the header in the info.
-_INFO = "float64 resolution\nfloat64 length_x\nfloat64 length_y\ngeometry_msgs/Pose pose\n"
-_GRID = (
-    "grid_map_msgs/GridMapInfo info\nstring[] layers\nstring[] basic_layers\n"
-    "std_msgs/Float32MultiArray[] data\nuint16 outer_start_index\nuint16 inner_start_index\n"
-)
-for _store, _first, _second in (
-    (ROS1, "std_msgs/Header header\n", ""),
-    (ROS2, "", "std_msgs/Header header\n"),
-):
-    _store.register(get_types_from_msg(_first + _INFO, "grid_map_msgs/msg/GridMapInfo"))
-    _store.register(get_types_from_msg(_second + _GRID, GRID_MAP))
 
 Pose = tuple[tuple[float, ...], tuple[float, ...]]
 """Position and quaternion."""
@@ -91,52 +78,6 @@ def grid_entry(
     }
     fields = {"header": header(stamp_ns, frame), "info": info, "data": np.ascontiguousarray(cells.T).ravel()}
     return Entry(topic, OCCUPANCY_GRID, stamp_ns, fields)
-
-
-def elevation_entry(
-    heights: Float,
-    stamp_ns: int,
-    *,
-    ros1: bool = False,
-    cell_m: float = 0.5,
-    middle: tuple[float, float] = (0.0, 0.0),
-    start: tuple[int, int] = (0, 0),
-    by_rows: bool = False,
-    layers: tuple[str, ...] = ("variance", "elevation"),
-    frame: str = "map",
-) -> Entry:
-    """Build a GridMap of heights [X, Y], both rising, as grid_map keeps them: from the far corner."""
-    buffer = np.roll(heights[::-1, ::-1], start, (0, 1)).astype(np.float32)
-    rows, columns = buffer.shape
-    sizes = [("row_index", rows, rows * columns), ("column_index", columns, columns)]
-    if not by_rows:
-        sizes = [("column_index", columns, rows * columns), ("row_index", rows, rows)]
-    layout = {"dim": [dict(zip(("label", "size", "stride"), each, strict=True)) for each in sizes]}
-    values = {name: buffer if name == "elevation" else np.zeros_like(buffer) for name in layers}
-    data = [
-        {"layout": layout | {"data_offset": 0}, "data": (each if by_rows else each.T).ravel()}
-        for each in values.values()
-    ]
-    info = {
-        "resolution": cell_m,
-        "length_x": rows * cell_m,
-        "length_y": columns * cell_m,
-        "pose": {
-            "position": {"x": middle[0], "y": middle[1], "z": 0.0},
-            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-        },
-    }
-    head = {"header": header(stamp_ns, frame)}
-    fields = {
-        **({} if ros1 else head),
-        "info": info | (head if ros1 else {}),
-        "layers": list(layers),
-        "basic_layers": [],
-        "data": data,
-        "outer_start_index": start[0],
-        "inner_start_index": start[1],
-    }
-    return Entry("/elevation_map", GRID_MAP, stamp_ns, fields)
 
 
 def cloud_fields(

@@ -19,7 +19,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 
-from pipelines.formats.logs.ros2_writing import build
+from pipelines.formats.scenes.mcap_writing import build
 from pipelines.ingest import ingest
 from pipelines.session.registries import LogFormat, recognise
 from tests.synthetic.logs import ROS1, ROS2

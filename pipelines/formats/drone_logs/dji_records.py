@@ -29,7 +29,7 @@ import numpy as np
 
 from pipelines.formats.common.files import first_bytes, read_head
 from pipelines.formats.common.rows import describe_times
-from pipelines.formats.drone_logs.dji_rows import (
+from pipelines.formats.drone_logs.dji_subtitles import (
     DjiRows,
     any_finite,
     attitudes_of_rows,

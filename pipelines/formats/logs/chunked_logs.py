@@ -5,7 +5,6 @@ and one that ends early. Chunks are skipped, because the index after each gives 
 messages. Only a chunk without an index is decompressed to find them.
 """
 
-import struct
 import zlib
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.formats.logs.message_decoders import inflate
 from pipelines.formats.logs.recordings import (
@@ -29,7 +27,6 @@ from pipelines.formats.logs.recordings import (
     Channel,
     LogPart,
     MessageTable,
-    UnlikeError,
     require_content,
 )
 from pipelines.geometry.arrays import Int64
@@ -71,16 +68,6 @@ class Chunk:
     crc: int = 0  # 0: the file has none
     cut: bool = False  # the file ends within this chunk
     index: list[Int64] = field(default_factory=list)  # a channel's [n, 3] each: channel, stamp, place
-
-
-@dataclass(frozen=True)
-class RecordShape:
-    """Layout of a message's record, from its place in the chunk on."""
-
-    head: int  # bytes before the message
-    message: int  # bytes of the message
-    stamp: slice  # the stamp in the head
-    free: slice  # the bytes that differ between records of one channel, with the stamp
 
 
 @dataclass(frozen=True)
@@ -165,14 +152,6 @@ class ChunkedPart(LogPart):
     def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
         """Return the bytes of the message at the index's place; ValueError if it is not there."""
 
-    @abstractmethod
-    def shape(self, content: memoryview, place: int) -> RecordShape:
-        """Return the shape of the record of a message; ValueError or struct.error if it is none."""
-
-    @abstractmethod
-    def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
-        """Return stamps [n] as bytes in the form of a record's head [n, 8]."""
-
     def close(self) -> None:
         """Close the file."""
         self.file.close()
@@ -209,46 +188,6 @@ class ChunkedPart(LogPart):
                 self.lose(int(rows[k]), MISPLACED)
                 continue
             yield k, data
-
-    def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """Read all messages of a chunk at once; the heads of the records must agree with the index."""
-        table = self.table
-        shape: RecordShape | None = None
-        first: NDArray[np.uint8] | None = None
-        for block_rows in np.split(rows, np.flatnonzero(np.diff(table.block[rows])) + 1):
-            if not len(block_rows):
-                continue
-            number, places = int(table.block[block_rows[0]]), table.place[block_rows]
-            content = self._content(number)
-            self._drop(number)
-            if content is None:
-                self.lose(block_rows, DAMAGED)
-                continue
-            if shape is None:
-                shape = self._first_shape(content, int(block_rows[0]))
-            records = _records(content, places, shape.head + shape.message)
-            if first is None:
-                first = records[0]
-            head = records[:, : shape.head]
-            same = head == first[: shape.head]
-            same[:, shape.free] = True
-            stamps = self.stamp_bytes(table.stamp_ns[block_rows])
-            if not same.all() or not np.array_equal(head[:, shape.stamp], stamps):
-                raise UnlikeError
-            yield block_rows, records[:, shape.head :]
-
-    def _first_shape(self, content: memoryview, row: int) -> RecordShape:
-        table = self.table
-        place = int(table.place[row])
-        try:
-            # Check the channel once. Other records are not checked again, because their heads must be equal.
-            self.payload(content, place, int(table.channel[row]), int(table.stamp_ns[row]))
-            shape = self.shape(content, place)
-        except (ValueError, struct.error, KeyError, IndexError) as error:
-            raise UnlikeError from error
-        if shape.message <= 0:
-            raise UnlikeError
-        return shape
 
     def bytes_at(self, offset: int, length: int) -> bytes:
         """Read bytes of the file; fewer at its end."""
@@ -328,12 +267,3 @@ class ChunkedPart(LogPart):
         next_place = np.where(same_block, np.roll(rows[:, 2], -1), ends)
         size = np.maximum(next_place - rows[:, 2] - self.record_overhead, 0)
         return MessageTable(rows[:, 0], rows[:, 1], block, rows[:, 2], size)
-
-
-def _records(content: memoryview, places: Int64, length: int) -> NDArray[np.uint8]:
-    """Return the bytes [n, length] at the given places; UnlikeError if one ends outside."""
-    if int(places.min()) < 0 or int(places.max()) + length > len(content):
-        raise UnlikeError
-    # A view of all windows of that length: row k begins at byte k.
-    windows = np.ndarray((len(content) - length + 1, length), np.uint8, content, strides=(1, 1))
-    return windows[places]

@@ -1,6 +1,6 @@
-"""Maps in logs: Octomap, OccupancyGrid, grid_map_msgs/GridMap, PointCloud2 and PointCloud.
+"""Maps in logs: Octomap, OccupancyGrid and PointCloud2.
 
-Consecutive octomaps, floor plans and elevation maps of a topic replace each other, as they did in flight.
+Consecutive octomaps and floor plans of a topic replace each other, as they did in flight.
 So every change is a map of its own, with the stamp from which it is valid. A log of any length needs the
 memory of its largest map only; its messages are read twice if there is more than one map.
 
@@ -9,7 +9,6 @@ holds all points up to one of a few times of the flight. Moving things, above al
 occupied voxels.
 """
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,22 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.logs.message_decoders import GRID_MAP, OCTOMAP
+from pipelines.formats.logs.message_decoders import OCTOMAP
 from pipelines.formats.logs.messages import Stamps, bytes_of, nanoseconds
 from pipelines.formats.maps.octomap import leaves_of, occupancy_from
 from pipelines.formats.maps.voxel_grids import Pose, VoxelSet, extruded, placed
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import compose, interpolate_poses, transform
 from pipelines.session.errors import DataError
-from pipelines.session.maps import MOST_VOXELS, check_resolution, check_size
+from pipelines.session.maps import MOST_VOXELS, check_resolution
 from pipelines.session.records import Message, Occupancy, Trajectory
 
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-_CLOUDS = (POINT_CLOUD, "sensor_msgs/msg/PointCloud")
-MAP_TYPES = (OCTOMAP, OCCUPANCY_GRID, GRID_MAP, *_CLOUDS)
-
-_ELEVATION = "elevation"  # the layer of heights, as grid_map's own packages name it
+MAP_TYPES = (OCTOMAP, OCCUPANCY_GRID, POINT_CLOUD)
 
 MOST_MAPS = 100
 """Limit of the maps kept; a replay computes the distance field of each, which takes seconds if large."""
@@ -91,7 +87,7 @@ class _Change:
 
 def read_maps(read: Callable[[], Iterator[Message]], type_: str, about: MapTopic) -> LoggedMaps:
     """Read the maps of a topic, in the world's axes, by the log's times; each `read()` begins anew."""
-    if type_ in _CLOUDS:
+    if type_ == POINT_CLOUD:
         return _accumulated(read(), about)
     return _changing(read, about)
 
@@ -99,14 +95,9 @@ def read_maps(read: Callable[[], Iterator[Message]], type_: str, about: MapTopic
 def frame_of(message: Message, source: str) -> str:
     """Return the frame of a map, without the leading slash of ROS 1."""
     try:
-        return str(_header(message.value).frame_id).lstrip("/")
+        return str(message.value.header.frame_id).lstrip("/")
     except AttributeError as error:
         raise DataError(source, f"its messages lack the field {error.name!r}", _RECORD_AGAIN) from error
-
-
-def _header(value: Any) -> Any:
-    """Return the header of a map; a GridMap of ROS 1 has it in its info."""
-    return value.header if hasattr(value, "header") else value.info.header
 
 
 class Losses:
@@ -159,7 +150,7 @@ def _time_of(message: Message, about: MapTopic) -> int:
         raise DataError(
             about.source, f"lies in frame {frame!r}, the messages before in {about.frame!r}", _RECORD_AGAIN
         )
-    stamp_ns = nanoseconds(_header(message.value).stamp) if about.stamps == "header" else 0
+    stamp_ns = nanoseconds(message.value.header.stamp) if about.stamps == "header" else 0
     return stamp_ns or message.receive_ns
 
 
@@ -239,7 +230,7 @@ def _made(message: Message, about: MapTopic) -> Occupancy | None:
         pose = _place_at(t_ns, about)
         if pose is None:
             return None
-        make = {OCTOMAP: _octomap, GRID_MAP: _elevations}.get(message.topic.type, _plan)
+        make = _octomap if message.topic.type == OCTOMAP else _plan
         return replace(make(message.value, about, pose), from_ns=t_ns)
     except AttributeError as error:
         raise DataError(
@@ -312,56 +303,6 @@ def _plan(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
     )
 
 
-def _elevations(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
-    """Return the ground of an elevation map: occupied from its lowest height up to that of each cell."""
-    source, info = about.source, value.info
-    cell_m = check_resolution(source, float(info.resolution))
-    side = cell_m if about.resolution_m is None else check_resolution(source, about.resolution_m)
-    heights = _layer(value, source)
-    heights = np.roll(heights, (-int(value.outer_start_index), -int(value.inner_start_index)), (0, 1))
-    heights = heights[::-1, ::-1]  # [X, Y], both rising
-    known = np.isfinite(heights)
-    if not known.any():
-        raise _EmptyMapError
-    low_m = float(np.floor(heights[known].min() / side)) * side
-    layers = int(min((heights[known].max() - low_m) // side + 1, 2**40))
-    sides = [*(math.ceil(cells * cell_m / side - 1e-6) for cells in heights.shape), layers]
-    check_size(source, sides, side)
-    tops = np.full(sides[:2], -1, dtype=np.int64)
-    level = np.where(known, (np.nan_to_num(heights) - low_m) // side, -1).astype(np.int64)
-    if side >= cell_m:  # a column is as high as the highest cell whose middle is in it
-        along = [((np.arange(cells) + 0.5) * cell_m // side).astype(np.int64) for cells in heights.shape]
-        np.maximum.at(tops, np.ix_(*along), level)
-    else:
-        along = [((np.arange(n) + 0.5) * side // cell_m).astype(np.int64) for n in sides[:2]]
-        tops = level[np.ix_(*(np.minimum(k, n - 1) for k, n in zip(along, heights.shape, strict=True)))]
-    grid = np.where(np.arange(layers) <= tops[:, :, None], np.float32(1), np.float32(np.nan))
-    at = info.pose.position
-    corner = [float(at.x) - heights.shape[0] * cell_m / 2, float(at.y) - heights.shape[1] * cell_m / 2, low_m]
-    if not np.isfinite(corner).all():
-        raise DataError(source, f"its position is none ({corner})", _RECORD_AGAIN)
-    return placed(source, Occupancy(grid, np.array(corner), side), pose)
-
-
-def _layer(value: Any, source: str) -> Float:
-    """Return the elevation layer of a GridMap [rows, columns], as it lies in the buffer."""
-    names = [str(name) for name in value.layers]
-    chosen = _ELEVATION if _ELEVATION in names else names[0] if len(names) == 1 else None
-    if chosen is None or len(names) != len(value.data):
-        problem = f"has no layer {_ELEVATION!r} ({', '.join(names)[:100] or 'none'})"
-        raise DataError(source, problem, "record the heights under that name")
-    layer = value.data[names.index(chosen)]
-    labels = [str(each.label) for each in layer.layout.dim]
-    sizes = [int(each.size) for each in layer.layout.dim]
-    if sorted(labels) != ["column_index", "row_index"]:
-        raise DataError(source, f"has dimensions {labels}", "row_index and column_index are read")
-    numbers = np.asarray(layer.data, dtype=np.float64)[int(layer.layout.data_offset) :]
-    if numbers.size != sizes[0] * sizes[1] or not numbers.size:
-        raise DataError(source, f"holds {numbers.size} of {sizes[0]} x {sizes[1]} cells", _RECORD_AGAIN)
-    table = numbers.reshape(sizes)
-    return table if labels[0] == "row_index" else table.T
-
-
 def _origin(stated: Any, source: str) -> Pose:
     """Return the pose of a plan's corner; a quaternion of zeros, which is common, means no rotation."""
     at, turned = stated.position, stated.orientation
@@ -422,9 +363,7 @@ def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
 
 
 def cloud_points(value: Any, source: str) -> Float:
-    """Return the points [N, 3] of a PointCloud2 or PointCloud in its own frame; NaN stays NaN."""
-    if hasattr(value, "points"):  # the PointCloud of ROS 1
-        return np.array([(at.x, at.y, at.z) for at in value.points], dtype=np.float64).reshape(-1, 3)
+    """Return the points [N, 3] of a PointCloud2 in its own frame; NaN stays NaN."""
     width, height, stride = int(value.width), int(value.height), int(value.point_step)
     order = ">" if value.is_bigendian else "<"
     fields = {str(each.name): each for each in value.fields}

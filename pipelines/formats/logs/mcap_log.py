@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 
@@ -18,9 +19,8 @@ import numpy as np
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from numpy.typing import NDArray
 
-from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT, Chunk, ChunkedPart, Content, RecordShape
+from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT, Chunk, ChunkedPart, Content
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.geometry.arrays import Int64
@@ -157,16 +157,6 @@ class McapPart(ChunkedPart):
             raise ValueError("another record")
         return content[place + _MESSAGE_HEAD.size : end]
 
-    def shape(self, content: memoryview, place: int) -> RecordShape:
-        """Return the shape of a record: sequence number, log time and publish time differ."""
-        head = _MESSAGE_HEAD.size
-        length = _MESSAGE_HEAD.unpack_from(content, place)[1]
-        return RecordShape(head, length - (head - _HEAD.size), slice(15, 23), slice(11, head))
-
-    def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
-        """Return stamps as one unsigned number each."""
-        return stamp_ns.astype("<u8").view(np.uint8).reshape(-1, 8)
-
     def _take_chunk(self, content_at: int, length: int) -> None:
         head = self.bytes_at(content_at, _CHUNK_HEAD.size)
         _, _, size, crc, name_length = _CHUNK_HEAD.unpack(head)
@@ -270,12 +260,11 @@ def checksum_is_right(path: Path) -> bool | None:
     stated = stated_checksum(path)
     if stated is None:
         return None
-    crc, left = 0, stated.size
+    checked = CheckedHash(stated)
     with path.open("rb") as file:
-        while left and (data := file.read(min(left, _BLOCK))):
-            crc = zlib.crc32(data, crc)
-            left -= len(data)
-    return crc == stated.crc
+        for data in iter(partial(file.read, _BLOCK), b""):
+            checked.update(memoryview(data))
+    return not checked.differs
 
 
 def stated_checksum(path: Path) -> StatedChecksum | None:

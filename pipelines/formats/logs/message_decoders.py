@@ -33,20 +33,10 @@ _DEFINITION_LIMIT = 1 << 18  # bytes; the largest of ROS have some 10,000, and t
 ARRAY_LIMIT = 1 << 20  # entries of a fixed array; rosbags unrolls arrays of messages into code
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)+", re.ASCII)
 OCTOMAP = "octomap_msgs/msg/Octomap"
-GRID_MAP = "grid_map_msgs/msg/GridMap"
 # rosbags does not know these types, and logs of ROS 2 up to Humble carry no definitions.
 _DEFINITIONS = {
     OCTOMAP: {
         OCTOMAP: "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n",
-    },
-    GRID_MAP: {
-        "grid_map_msgs/msg/GridMapInfo": (
-            "float64 resolution\nfloat64 length_x\nfloat64 length_y\ngeometry_msgs/Pose pose\n"
-        ),
-        GRID_MAP: (
-            "std_msgs/Header header\ngrid_map_msgs/GridMapInfo info\nstring[] layers\nstring[] basic_layers\n"
-            "std_msgs/Float32MultiArray[] data\nuint16 outer_start_index\nuint16 inner_start_index\n"
-        ),
     },
 }
 _BASE64 = "base64"

@@ -62,10 +62,6 @@ class MessageTable:
     size: Int64  # bytes, uncompressed; bytes between two messages count to the first of them
 
 
-class UnlikeError(Exception):
-    """Error for messages that cannot be read as one array."""
-
-
 class LogPart(ABC):
     """Open file of a log."""
 
@@ -88,29 +84,20 @@ class LogPart(ABC):
     def read(self, rows: Int64) -> Iterator[tuple[int, memoryview | bytes]]:
         """Yield the bytes of messages, by rows of the table; pass unreadable rows to `lose`."""
 
-    @abstractmethod
-    def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """Yield the bytes of messages of one channel that are all of one length, many at a time.
-
-        Yields:
-            Rows of the table, increasing, and their messages [n, length]. Unreadable rows are passed to
-            `lose`.
-        """
-
     def read_heads(self, rows: Int64, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
-        """Yield the first bytes of messages, many at a time.
+        """Yield the first bytes of messages, many at a time; unreadable rows are passed to `lose`.
 
         Yields:
             Rows of the table, in the order given; the length of each message in bytes [n]; its first bytes
-            [n, length], with zeros after the end of a shorter one. Unreadable rows are passed to `lose`,
-            also if the damage is after their heads.
+            [n, length], with zeros after the end of a shorter one.
         """
         for start in range(0, len(rows), _HEADS):
             batch = rows[start : start + _HEADS]
             found = [(k, len(data), bytes(data[:length])) for k, data in self.read(batch)]
             if found:
                 which, sizes, heads = zip(*found, strict=True)
-                yield batch[list(which)], np.array(sizes, np.int64), joined_heads(heads, length)
+                padded = np.array(heads, f"S{length}").view(np.uint8).reshape(-1, length)
+                yield batch[list(which)], np.array(sizes, np.int64), padded
 
     def take(self, table: MessageTable) -> None:
         """Keep the table of found messages, without those of undefined channels, which are counted."""
@@ -199,17 +186,6 @@ class OpenLog:
         streams = [self._of_part(part, frozenset(topics)) for part in self.parts]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
 
-    def arrays(self, topic: Topic) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """Yield the messages of a topic as arrays: stamps of receipt [n] and bytes [n, length].
-
-        In the order of the files; a stable sort by the stamps gives that of `messages`.
-        """
-        for part, channels in self._channels_of(topic):
-            if len(channels) > 1:
-                raise UnlikeError
-            for rows, data in part.read_alike(np.sort(part.rows_of(channels))):
-                yield part.table.stamp_ns[rows], data
-
     def heads(self, topic: Topic, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
         """Yield the heads of a topic's messages: stamps of receipt [n], sizes [n], first bytes [n, length].
 
@@ -282,11 +258,6 @@ class OpenLog:
         stamps = self.stamps(Topic(name, type_, encoding, 0, None, None))
         first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
         return Topic(name, type_, encoding, len(stamps), first, last)
-
-
-def joined_heads(heads: Sequence[bytes], length: int) -> NDArray[np.uint8]:
-    """Join the first bytes of messages to one array [n, length]; shorter ones are padded with zeros."""
-    return np.array(heads, f"S{length}").view(np.uint8).reshape(-1, length)
 
 
 def open_file(path: Path) -> tuple[IO[bytes], int]:

@@ -7,13 +7,11 @@ So this module walks the records itself.
 import re
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.formats.logs.chunked_logs import Chunk, ChunkedPart, Content, RecordShape
+from pipelines.formats.logs.chunked_logs import Chunk, ChunkedPart, Content
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.geometry.arrays import Int64
@@ -59,32 +57,11 @@ class Ros1Bag:
         return OpenLog(*open_parts(paths, _open_part))
 
 
-@dataclass(frozen=True)
-class _Head:
-    """Head of a channel's messages, which differ only in the stamp if one writer wrote them."""
-
-    layout: struct.Struct  # bytes before the stamp, the stamp, bytes after it, the length
-    before: bytes
-    behind: bytes
-
-    def message(self, content: memoryview, place: int, stamp_ns: int) -> memoryview | None:
-        """Return the message if this head with this stamp is here; else None."""
-        data_at = place + self.layout.size
-        if place < 0 or data_at > len(content):
-            return None
-        before, seconds, nanoseconds, behind, length = self.layout.unpack_from(content, place)
-        same = before == self.before and behind == self.behind
-        if not same or seconds * 10**9 + nanoseconds != stamp_ns or data_at + length > len(content):
-            return None
-        return content[data_at : data_at + length]
-
-
 class _Bag(ChunkedPart):
     record_overhead = 46  # lengths of header and message, and the header's fields op, conn and time
 
     def walk(self) -> tuple[int, bool]:
         """Walk the records up to the end of the file or to the first incomplete one."""
-        self._heads: dict[int, _Head] = {}
         position, chunks_stated = self._bag_header()
         while position < self.file_size:
             try:
@@ -128,9 +105,6 @@ class _Bag(ChunkedPart):
 
     def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
         """Return the bytes of a message; some writers let the index point to the connection before it."""
-        head = self._heads.get(channel)
-        if head is not None and (data := head.message(content, place, stamp_ns)) is not None:
-            return data
         try:
             fields, data_at, length = _parse_record(content, place)
             while fields[b"op"][0] == _CONNECTION:
@@ -145,20 +119,7 @@ class _Bag(ChunkedPart):
             raise ValueError("no record here") from error
         if not right:
             raise ValueError("another record")
-        if channel not in self._heads:
-            self._heads[channel] = _head(bytes(content[place:data_at]), fields[b"time"])
         return content[data_at : data_at + length]
-
-    def shape(self, content: memoryview, place: int) -> RecordShape:
-        """Return the shape of a record: only the stamp differs."""
-        fields, data_at, length = _parse_record(content, place)
-        head = _head(bytes(content[place:data_at]), fields[b"time"])
-        stamp = slice(len(head.before), len(head.before) + _STAMP.size)
-        return RecordShape(head.layout.size, length, stamp, stamp)
-
-    def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
-        """Return stamps as seconds and nanoseconds."""
-        return np.stack(np.divmod(stamp_ns, 10**9), axis=1).astype("<u4").view(np.uint8)
 
     def _bag_header(self) -> tuple[int, int]:
         """Return the position after the bag's header, and its number of chunks (-1 if unknown)."""
@@ -212,14 +173,6 @@ def _parse_record(content: memoryview, position: int) -> tuple[Fields, int, int]
     header_end = position + 4 + _U32.unpack_from(content, position)[0]
     (length,) = _U32.unpack_from(content, header_end)
     return _fields(bytes(content[position + 4 : header_end])), header_end + 4, length
-
-
-def _head(head: bytes, stamp: bytes) -> _Head:
-    """Split the bytes from a message's place to its data into the parts before and after the stamp."""
-    before, name, behind = head.partition(b"time=")
-    behind = behind[len(stamp) : -_U32.size]
-    layout = struct.Struct(f"<{len(before + name)}sII{len(behind)}sI")
-    return _Head(layout, before + name, behind)
 
 
 def _fields(header: bytes) -> Fields:

@@ -8,7 +8,6 @@ without keeping the pages in memory.
 
 from __future__ import annotations
 
-import json
 import re
 from array import array
 from collections import Counter
@@ -21,7 +20,6 @@ from typing import Any
 
 import apsw
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT, RECORD_AGAIN, inflated_limit
 from pipelines.formats.logs.mcap_log import open_mcap
@@ -33,9 +31,7 @@ from pipelines.formats.logs.recordings import (
     LogPart,
     MessageTable,
     OpenLog,
-    UnlikeError,
     describe_log,
-    joined_heads,
     open_file,
     open_parts,
     require_content,
@@ -56,7 +52,6 @@ _MAGIC = b"SQLite format 3\0"
 
 _LARGEST_ROWID = 1 << 48
 _BATCH = 4096  # rows at a time
-_LISTED = 1 << 14  # rows that are listed at a time
 _SMALLEST_ROW = 6  # smallest size of a row in a file, in bytes: length, number, a header of four
 _MOST_ATTEMPTS = 10_000  # attempts to continue after damage
 _UNREADABLE = (apsw.Error, UnicodeDecodeError)  # text in a damaged file may be invalid UTF-8
@@ -271,61 +266,13 @@ class Sqlite3Part(LogPart):
         self.database.close()
 
     def read(self, rows: Int64) -> Iterator[tuple[int, bytes]]:
-        """Yield the bytes of messages: by one query if they are in the order of receipt, else one by one."""
-        places = self.table.place[rows].tolist()
-        done = 0
-        if places and np.all(np.diff(places) > 0):
-            for k, data in self._in_one_query(rows, places):
-                yield k, data
-                done = k + 1
-        for k in range(done, len(places)):
-            message = self._message(places[k])
+        """Yield the bytes of messages, row by row."""
+        for k, place in enumerate(self.table.place[rows].tolist()):
+            message = self._message(place)
             if message is None:
                 self.lose(int(rows[k]), DAMAGED)
             else:
                 yield k, message
-
-    def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """Join the rows of one query; if a row cannot be read, the messages count as unlike."""
-        if not len(rows):
-            return
-        places = self.table.place[rows]
-        length = int(self.table.size[rows[0]])
-        try:
-            found = self._query(rows, places.tolist())
-            for start in range(0, len(rows), _BATCH):
-                batch = list(islice(found, min(_BATCH, len(rows) - start)))
-                found_places, data = zip(*batch, strict=True) if batch else ((), ())
-                if not np.array_equal(found_places, places[start : start + _BATCH]):
-                    raise UnlikeError
-                if set(map(type, data)) != {bytes} or set(map(len, data)) != {length} or not length:
-                    raise UnlikeError
-                joined = np.frombuffer(b"".join(data), np.uint8)
-                yield rows[start : start + _BATCH], joined.reshape(-1, length)
-        except _UNREADABLE as error:
-            raise UnlikeError from error
-
-    def read_heads(self, rows: Int64, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
-        """Read by queries that name the rows; after the first damage read one by one."""
-        # sqlite still reads the messages to their ends, so that damage after a head is found.
-        query = (
-            "SELECT messages.rowid, length(data), substr(data, 1, ?) "
-            "FROM json_each(?) AS wanted CROSS JOIN messages ON messages.rowid = wanted.value"
-        )
-        done = 0
-        try:
-            while done < len(rows):
-                batch = rows[done : done + _BATCH]
-                places = self.table.place[batch].tolist()
-                found = self.database.execute(query, (length, json.dumps(places))).fetchall()
-                found_places, sizes, heads = zip(*found, strict=True) if found else ((), (), ())
-                if found_places != tuple(places) or set(map(type, heads)) != {bytes}:
-                    break
-                yield batch, np.array(sizes, np.int64), joined_heads(heads, length)
-                done += len(batch)
-        except _UNREADABLE:
-            pass
-        yield from super().read_heads(rows[done:], length)
 
     def _refuse_views(self, path: Path) -> None:
         """Refuse a bag whose messages or topics are computed: a view can go on without end."""
@@ -335,26 +282,6 @@ class Sqlite3Part(LogPart):
             return
         if views:
             raise DataError(path, "has a view in place of a table", "give the bag that was recorded")
-
-    def _query(self, rows: Int64, places: Sequence[int]) -> apsw.Cursor:
-        """Query the rows from the first place to the last, of the topics of some messages."""
-        query = (
-            "SELECT rowid, data FROM messages WHERE rowid BETWEEN ? AND ? "
-            "AND topic_id IN (SELECT value FROM json_each(?)) ORDER BY rowid"
-        )
-        topics = json.dumps(np.unique(self.table.channel[rows]).tolist())
-        return self.database.execute(query, (places[0], places[-1], topics))
-
-    def _in_one_query(self, rows: Int64, places: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """Yield the messages up to the first damaged one."""
-        try:
-            found = self._query(rows, places)
-            for k, (place, (found_place, data)) in enumerate(zip(places, found, strict=False)):
-                if found_place != place or not isinstance(data, bytes):
-                    return
-                yield k, data
-        except _UNREADABLE:
-            return
 
     def _message(self, place: int) -> bytes | None:
         try:
@@ -394,9 +321,7 @@ class Sqlite3Part(LogPart):
         numbers = array("q")
         # Pages of a damaged file can form a loop and give rows without end.
         most = 4 * (self.file_size // _SMALLEST_ROW)
-        whole = self._take_joined(query, numbers, most)
-        attempts = 0
-        last, step = numbers[-4] if numbers else -1, 1
+        whole, attempts, last, step = False, 0, -1, 1
         while not whole and last < _LARGEST_ROWID and attempts < _MOST_ATTEMPTS:
             attempts += 1
             begin = len(numbers)
@@ -409,29 +334,6 @@ class Sqlite3Part(LogPart):
                 last, step = last + step, 2 * step
         rows = np.array(numbers, np.int64).reshape(-1, 4)
         return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0], rows[:, 3])
-
-    def _take_joined(self, query: str, numbers: array[int], most: int) -> bool:
-        """Append rows like `_take_rows`, in half its time, up to any damage; return True if that was all."""
-        columns = (
-            "count(*), group_concat(place), group_concat(topic), group_concat(stamp), group_concat(size)"
-        )
-        joined = f"SELECT {columns} FROM ({query} LIMIT {_LISTED})"  # noqa: S608  # of constants
-        last = -1
-        while len(numbers) < most:
-            try:
-                ((count, *texts),) = self.database.execute(joined, (last,)).fetchall()
-            except _UNREADABLE:
-                return False
-            if not count:
-                return True
-            rows = np.stack([np.fromstring(str(text), np.int64, sep=",") for text in texts], axis=1)
-            if len(rows) != count or (np.diff(rows[:, 0], prepend=last) <= 0).any():
-                return False
-            numbers.frombytes(rows.tobytes())
-            if count < _LISTED:
-                return True
-            last = int(rows[-1, 0])
-        return False
 
     def _take_rows(self, query: str, last: int, numbers: array[int], most: int) -> bool:
         """Append rows of four numbers; the first must rise from `last` on. Return True if that was all."""

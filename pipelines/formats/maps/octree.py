@@ -1,8 +1,9 @@
-"""Compiled walks over OctoMap's trees: from a file to its leaves, to a grid, and from a grid to a file.
+"""Compiled walks of OctoMap's trees (from a stream to leaves, from a grid to a stream) and of LZF streams.
 
-Module `octomap` explains the formats. All kernels are in this one module, because numba's cache watches the
-file of the outermost function only.
+This module is imported where it is used, because numba takes long to import.
 """
+
+from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,3 +182,43 @@ def write_depth_first(flat: Bytes, begin: Int64, low: Int64, shape: Int64, words
         words[written] = word
         written += 1
     return leaves
+
+
+@cached
+def decompress(packed: Bytes, target: Bytes) -> int:
+    """Fill `target` from an LZF stream.
+
+    The stream (liblzf by Marc Lehmann, lzf_d.c) is a sequence of instructions, each with a byte c first:
+
+    - c < 32: copy the c + 1 bytes that follow;
+    - else: repeat (c >> 5) + 2 bytes of the output (if c >> 5 is 7, a byte to add to the length follows) from
+      ((c & 31) << 8) + next byte + 1 bytes back; the two may overlap.
+
+    Returns:
+        The bytes written, or -1 if the stream is cut off, too long or points outside.
+    """
+    read, written = 0, 0
+    while read < len(packed):
+        control = int(packed[read])
+        read += 1
+        if control < 32:
+            length = control + 1
+            if read + length > len(packed) or written + length > len(target):
+                return -1
+            target[written : written + length] = packed[read : read + length]
+            read += length
+        else:
+            length = (control >> 5) + 2
+            if length == 9 and read < len(packed):
+                length += int(packed[read])
+                read += 1
+            if read >= len(packed):
+                return -1
+            source = written - ((control & 31) << 8) - int(packed[read]) - 1
+            read += 1
+            if source < 0 or written + length > len(target):
+                return -1
+            for k in range(length):  # one by one, because the two ranges may overlap
+                target[written + k] = target[source + k]
+        written += length
+    return written

@@ -1,6 +1,9 @@
 """Voxel grids: of point clouds, and of grids and floor plans that lie turned in the world."""
 
+from __future__ import annotations
+
 import math
+import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +15,14 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Bytes, Float, Float32, Int64
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
-from pipelines.session.maps import MOST_VOXELS, check_resolution, check_size, describe_grid
+from pipelines.session.maps import (
+    MOST_VOXELS,
+    check_resolution,
+    check_size,
+    describe_grid,
+    describe_stored,
+    read_grid,
+)
 from pipelines.session.records import Occupancy
 
 DEFAULT_RESOLUTION_M = 0.2
@@ -350,3 +360,40 @@ def _looked_up(grid: Occupancy, world_from_plane: Float, x: Float, y: Float) -> 
     found = grid.probability[np.where(inside, column, 0), np.where(inside, row, 0)]
     found[~inside] = np.nan
     return found
+
+
+class GridNpz:
+    """Reader of a dense grid in its own voxels."""
+
+    name = "npz"
+    title = "voxel map (npz)"
+    suffixes: tuple[str, ...] = (".npz",)
+
+    def recognises(self, path: Path) -> bool:
+        """Return True for an npz that holds a grid and its place."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        try:
+            with zipfile.ZipFile(path) as archive:
+                names = set(archive.namelist())
+        except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
+            return False
+        return "origin.npy" in names and bool(names & {"probability.npy", "occupancy.npy"})
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe box, voxels and their states; the arrays are read part by part."""
+        return describe_stored(path)
+
+    def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
+        """Read the grid as it is."""
+        occupancy = read_grid(path)
+        if resolution_m is not None and not math.isclose(resolution_m, occupancy.resolution_m, rel_tol=1e-6):
+            raise DataError(
+                path,
+                f"its voxels are {occupancy.resolution_m:g} m, not {resolution_m:g} m",
+                "leave resolution_m out, or store the grid at that resolution",
+            )
+        return occupancy
+
+
+NPZ = GridNpz()

@@ -16,7 +16,7 @@ from pipelines.formats.common.rows import (
     parse_stamps,
     rows_below,
 )
-from pipelines.formats.drone_logs.subtitles import parse_subtitles, read_subtitles
+from pipelines.formats.drone_logs.dji_subtitles import parse_subtitles, read_subtitles
 from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
 

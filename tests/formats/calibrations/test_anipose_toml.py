@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.calibrations import anipose_toml
+from pipelines.formats.calibrations import rigs
 from pipelines.geometry.cameras import project
 from pipelines.session.errors import DataError
 from pipelines.session.registries import CalibrationFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
-READER: CalibrationFormat = anipose_toml.FORMAT
+READER: CalibrationFormat = rigs.ANIPOSE
 POSE2SIM = "pose2sim_single/calibration/Calib_qualisys.toml"
 TODAY = "second/caliscope_4cam_camera_array.toml"
 

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.formats.calibrations import kalibr
+from pipelines.formats.calibrations import rigs
 from pipelines.geometry.cameras import project
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, CalibrationFormat
 from tests.real_data import real_data
 
-READER: CalibrationFormat = kalibr.FORMAT
+READER: CalibrationFormat = rigs.KALIBR
 CAMERA = {
     "camera_model": "pinhole",
     "intrinsics": "[460.0, 458.5, 366.25, 248.5]",

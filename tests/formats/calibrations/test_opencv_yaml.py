@@ -16,7 +16,7 @@ from pipelines.session.registries import CalibrationFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
-READER: CalibrationFormat = opencv_yaml.FORMAT
+READER: CalibrationFormat = opencv_yaml.OPENCV
 K = np.array([[800.0, 0, 330.5], [0, 790.0, 241.25], [0, 0, 1]])
 D = np.array([[-0.21, 0.08, 0.001, -0.002, 0.01]])
 

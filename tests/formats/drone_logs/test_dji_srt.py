@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.drone_logs.dji_srt import FORMAT
-from pipelines.formats.drone_logs.subtitles import read_subtitles
+from pipelines.formats.drone_logs.dji_subtitles import DJI_SRT as FORMAT
+from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
 from pipelines.formats.drone_logs.telemetry_rows import between_refreshed_angles, between_repeats
 from pipelines.geometry.poses import rotate
 from pipelines.session.telemetry import Telemetry, TelemetryChoice

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.formats.keypoint_files.mmpose import FORMAT
+from pipelines.formats.keypoint_files.result_files import MMPOSE as FORMAT
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, KeypointFormat, recognise
 from pipelines.session.skeletons import get_skeleton

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.formats.keypoint_files.openpose import FORMAT
+from pipelines.formats.keypoint_files.result_files import OPENPOSE as FORMAT
 from pipelines.session.registries import KeypointFormat, recognise
 from pipelines.session.skeletons import take_joints
 from tests.formats.refusals import refuses

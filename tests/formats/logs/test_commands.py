@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.logs.commands import PATH, TARGET, TRAJECTORY, read_commands
+from pipelines.formats.logs.trajectories import PATH, TARGET, TRAJECTORY, read_commands
 from pipelines.session.errors import DataError
 from pipelines.session.records import Message, Topic, Trajectory
 from pipelines.session.registries import LogFormat, recognise

@@ -33,7 +33,6 @@ from tests.synthetic.map_logs import (
     as_bt,
     cloud_entry,
     cloud_fields,
-    elevation_entry,
     grid_entry,
     octomap_entry,
     transform_entry,
@@ -432,47 +431,6 @@ def test_plan_on_edge_is_refused(tmp_path: Path) -> None:
         Read(tmp_path, [grid_entry(plan(), T0, origin=upright)])
 
 
-# --- elevation maps ------------------------------------------------------------------------------------
-
-HILL = np.array([[0.1, 0.1, 0.1], [0.1, 1.2, 0.6], [np.nan, 0.1, 2.4], [0.1, 0.1, 0.1]])  # [X, Y]
-
-
-@pytest.mark.parametrize("container", ["mcap-cdr", "mcap-ros1"])
-@pytest.mark.parametrize("by_rows", [False, True])
-@pytest.mark.parametrize("start", [(0, 0), (3, 1)])
-def test_elevations_are_ground_wherever_the_buffer_begins(
-    tmp_path: Path, container: Container, by_rows: bool, start: tuple[int, int]
-) -> None:
-    ros1 = container == "mcap-ros1"
-    entry = elevation_entry(HILL, T0, ros1=ros1, by_rows=by_rows, start=start, middle=(10.0, -5.0))
-    found = Read(tmp_path, [entry], container=container).only
-    assert found.origin.tolist() == [9.0, -5.75, 0.0]  # 4 x 3 cells of 0.5 m about (10, -5)
-    tops = (found.probability == 1).sum(axis=2)  # 0.1 m is in the first voxel, 2.4 m in the fifth
-    assert tops.tolist() == [[1, 1, 1], [1, 3, 2], [0, 1, 5], [1, 1, 1]]
-    assert np.isnan(found.probability[1, 1, 3])
-    assert not (found.probability == 0).any()
-
-
-@pytest.mark.parametrize(("side", "tops"), [(1.0, [[2, 1], [1, 3]]), (0.25, None)])
-def test_elevations_at_another_resolution(tmp_path: Path, side: float, tops: list[list[int]] | None) -> None:
-    found = Read(tmp_path, [elevation_entry(HILL, T0)], resolution_m=side).only
-    heights = (found.probability == 1).sum(axis=2)
-    if tops:  # the highest cell of each four
-        assert heights.tolist() == tops
-    else:
-        expected = np.nan_to_num(HILL // side + 1).repeat(2, axis=0).repeat(2, axis=1)
-        assert heights.tolist() == expected.tolist()
-
-
-def test_elevations_that_cannot_be_used_are_one_clear_line(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="slope"):
-        Read(tmp_path, [elevation_entry(HILL, T0, layers=("variance", "slope"))])
-    with pytest.raises(DataError):
-        Read(tmp_path, [elevation_entry(np.full((2, 2), np.nan), T0)])
-    with pytest.raises(DataError, match="resolution_m"):
-        Read(tmp_path, [elevation_entry(HILL * 1e9, T0)])
-
-
 # --- clouds --------------------------------------------------------------------------------------------
 
 POINTS = np.array(
@@ -485,19 +443,6 @@ def test_cloud_is_that_of_a_file(tmp_path: Path, container: Container) -> None:
     found = Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0)], container=container)
     expected = occupancy_of("cloud", POINTS.astype(np.float32).astype(np.float64), None)
     same(found.only, expected)
-    assert list(found.dropped.values()) == [1]
-
-
-@pytest.mark.parametrize("container", ["ros1", "ros2-mcap"])
-def test_the_old_point_cloud_is_read_like_the_new_one(tmp_path: Path, container: Container) -> None:
-    points = [dict(zip("xyz", point.tolist(), strict=True)) for point in POINTS]
-    new = cloud_entry(cloud_fields(POINTS), T0)
-    old = Entry(
-        new.topic, "sensor_msgs/msg/PointCloud", T0, {"header": new.fields["header"], "points": points}
-    )
-    found = Read(tmp_path, [old], container=container)
-    (tmp_path / "new").mkdir()
-    same(found.only, Read(tmp_path / "new", [new], container=container).only)
     assert list(found.dropped.values()) == [1]
 
 

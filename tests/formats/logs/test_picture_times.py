@@ -20,7 +20,7 @@ from pipelines.formats.logs.pictures import (
     stamp_of,
     stamps_at_once,
 )
-from pipelines.formats.logs.ros2_writing import build
+from pipelines.formats.scenes.mcap_writing import build
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample

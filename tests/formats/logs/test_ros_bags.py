@@ -11,7 +11,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.formats.logs import ros2_bag
 from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT
 from pipelines.formats.logs.recordings import (
     DAMAGED,
@@ -20,10 +19,9 @@ from pipelines.formats.logs.recordings import (
     UNCLOSED,
     UNDECODABLE,
     UNDEFINED,
-    UNNAMED,
     UNREADABLE_FILES,
 )
-from pipelines.formats.logs.ros2_bag import BAD_METADATA, GAPS, MISSING_FILES, NOT_IN_FILES, UNMERGED
+from pipelines.formats.logs.ros2_bag import BAD_METADATA, MISSING_FILES, NOT_IN_FILES, UNMERGED
 from tests.formats.log_entries import (
     OTHER,
     PICTURE,
@@ -302,35 +300,6 @@ def test_a_length_of_gigabytes_is_damage(tmp_path: Path) -> None:
     lost = dropped[DAMAGED]
     assert 0 < lost < 40
     assert len(found) + lost == len(ALL)
-
-
-@pytest.mark.parametrize("lost_page", [None, 13, 20, 30])
-def test_rows_listed_together_are_those_listed_one_by_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost_page: int | None
-) -> None:
-    path = write_ros2(tmp_path / "bag", FLIGHT) / "bag.db3"
-    database = sqlite3.connect(path)
-    with database:
-        database.execute("DELETE FROM messages WHERE id % 5 = 2")
-        database.execute("UPDATE messages SET timestamp = 'noon' WHERE id = 60")
-        database.execute("UPDATE messages SET topic_id = 77 WHERE id = 61")
-    database.close()
-    if lost_page:
-        content = bytearray(path.read_bytes())
-        content[4096 * lost_page : 4096 * (lost_page + 1)] = bytes(4096)
-        path.write_bytes(content)
-    else:
-        monkeypatch.setattr(ros2_bag, "_LISTED", 7)
-    together = everything(path)
-    monkeypatch.setattr(ros2_bag.Sqlite3Part, "_take_joined", lambda *_: False)
-    assert together == everything(path)
-    kept = [message for k, message in enumerate(ALL, start=1) if k % 5 != 2 and k not in {60, 61}]
-    if lost_page:
-        # A page holds at most ten rows of 400 bytes; the steps over it grow to twice that.
-        assert 0 < len(kept) - len(together[0]) <= 30
-        assert together[1][GAPS] == 1
-    else:
-        assert together == (kept, {UNNAMED: 2})
 
 
 def test_bags_that_are_not_read_are_named(tmp_path: Path) -> None:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.maps import grid_npz
+from pipelines.formats.maps import voxel_grids
 from pipelines.session import maps
 from pipelines.session.registries import MapFormat
 from tests.formats.damaged_maps import refuse_or_read
 from tests.formats.refusals import refuses
 
-READER: MapFormat = grid_npz.FORMAT
+READER: MapFormat = voxel_grids.NPZ
 
 
 def write(path: Path) -> Path:

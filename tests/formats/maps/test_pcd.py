@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.formats.maps import pcd
-from pipelines.formats.maps.lzf import decompress
+from pipelines.formats.maps import point_files
+from pipelines.formats.maps.octree import decompress
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
@@ -21,7 +21,7 @@ from tests.formats.damaged_maps import refuse_or_read
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
-READER: MapFormat = pcd.FORMAT
+READER: MapFormat = point_files.PCD
 
 # Packed by liblzf: x, intensity, y, z of 36 points, one field after the other.
 PACKED_BY_LIBLZF = bytes.fromhex(

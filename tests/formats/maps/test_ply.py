@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.maps import pcd, ply
+from pipelines.formats.maps import point_files
 from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
 from tests.formats import clouds
 from tests.formats.damaged_maps import refuse_or_read
 from tests.real_data import real_data
 
-READER: MapFormat = ply.FORMAT
+READER: MapFormat = point_files.PLY
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 
 
@@ -129,6 +129,6 @@ def test_the_real_cloud_is_read_as_by_other_readers() -> None:
 
 def test_the_same_points_make_the_same_map_from_ply_and_pcd() -> None:
     from_ply = READER.read_map(real_data("maps/small_gicp_target.ply"))
-    from_pcd = pcd.FORMAT.read_map(real_data("maps/ndt_omp_251370668.pcd"))
+    from_pcd = point_files.PCD.read_map(real_data("maps/ndt_omp_251370668.pcd"))
     np.testing.assert_array_equal(from_ply.probability, from_pcd.probability)
     np.testing.assert_array_equal(from_ply.origin, from_pcd.origin)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.poses import kitti, tum
+from pipelines.formats.poses import trajectory_files
 from pipelines.geometry.arrays import Float
 from pipelines.session.registries import TrajectoryFormat, recognise
 from tests.formats.refusals import refuses
 
-READER: TrajectoryFormat = kitti.FORMAT
+READER: TrajectoryFormat = trajectory_files.KITTI
 TIMES = np.arange(5) / 10
 
 
@@ -37,7 +37,7 @@ def write(folder: Path, rows: Float | None = None, times: str = "times.txt") -> 
 def test_poses_stand_upright_and_have_their_times(tmp_path: Path, times: str) -> None:
     path = write(tmp_path / "poses", times=times)
     assert recognise(path, TrajectoryFormat, "trajectory") is READER
-    assert not tum.FORMAT.recognises(path)
+    assert not trajectory_files.TUM.recognises(path)
     poses = READER.read_trajectory(path)
     assert poses.t_ns.tolist() == [100_000_000 * k for k in range(5)]
     expected = np.array([[0.5 * k, 2.0 * k, -0.25] for k in range(5)])  # right, ahead, up

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from pipelines.formats.poses import pose_csv, tum
+from pipelines.formats.poses import trajectory_files
 from pipelines.formats.videos import frame_times
 from pipelines.session.records import Trajectory
 from pipelines.session.registries import TrajectoryFormat
@@ -17,7 +17,7 @@ from tests.formats.refusals import refuses
 from tests.formats.trajectories import trajectories
 from tests.real_data import real_data
 
-READER: TrajectoryFormat = pose_csv.FORMAT
+READER: TrajectoryFormat = trajectory_files.POSE_CSV
 
 EUROC = """#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []
 1403636580838555648,4.688319,-1.786938,0.783338,0.534108,-0.153029,-0.827383,-0.082152
@@ -34,7 +34,9 @@ def write(folder: Path, text: str, name: str = "poses.csv") -> Path:
 def test_euroc_ground_truth(tmp_path: Path) -> None:
     path = write(tmp_path, EUROC)
     assert READER.recognises(path)
-    assert not tum.FORMAT.recognises(path), "its order is w first: as TUM it would be another rotation"
+    assert not trajectory_files.TUM.recognises(path), (
+        "its order is w first: as TUM it would be another rotation"
+    )
     poses = READER.read_trajectory(path)
     assert poses.t_ns.tolist() == [1403636580838555648, 1403636580843555328]
     # With six decimals per number the norm is within 4 * 0.5e-6 of one.
@@ -189,7 +191,7 @@ def test_writing_and_reading_gives_the_same(
     tmp_path_factory: pytest.TempPathFactory, trajectory: Trajectory
 ) -> None:
     path = tmp_path_factory.mktemp("csv") / "poses.csv"
-    pose_csv.write_trajectory(path, trajectory)
+    trajectory_files.write_pose_csv(path, trajectory)
     assert READER.recognises(path)
     back = READER.read_trajectory(path)
     np.testing.assert_array_equal(back.t_ns, trajectory.t_ns)

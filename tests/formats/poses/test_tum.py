@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from pipelines.formats.poses import pose_csv, tum
+from pipelines.formats.poses import trajectory_files
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import Export, TrajectoryFormat
@@ -19,8 +19,8 @@ from tests.formats.refusals import refuses
 from tests.formats.trajectories import trajectories
 from tests.real_data import real_data
 
-READER: TrajectoryFormat = tum.FORMAT
-WRITER: Export = tum.EXPORT
+READER: TrajectoryFormat = trajectory_files.TUM
+WRITER: Export = trajectory_files.TUM_EXPORT
 IDENTITY = "0 0 0 1"
 
 
@@ -165,7 +165,7 @@ def test_a_line_with_a_cell_of_megabytes_is_named(tmp_path: Path, quoted: bool) 
     cell = f'"{cell}"' if quoted else cell
     text = f"t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n2,{cell},0,0,0,0,0,1\n3,0,0,0,0,0,0,1\n"
     with pytest.raises(DataError, match="line 3: ") as refused:
-        pose_csv.FORMAT.read_trajectory(write(tmp_path, text, "poses.csv"))
+        trajectory_files.POSE_CSV.read_trajectory(write(tmp_path, text, "poses.csv"))
     assert len(str(refused.value)) < 1000
 
 
@@ -232,7 +232,7 @@ def test_writing_and_reading_gives_the_same(
     tmp_path_factory: pytest.TempPathFactory, trajectory: Trajectory
 ) -> None:
     path = tmp_path_factory.mktemp("tum") / "poses.tum"
-    tum.write_trajectory(path, trajectory)
+    trajectory_files.write_tum(path, trajectory)
     back = READER.read_trajectory(path)
     np.testing.assert_array_equal(back.t_ns, trajectory.t_ns)
     np.testing.assert_array_equal(back.position, trajectory.position)

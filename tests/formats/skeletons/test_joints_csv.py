@@ -9,16 +9,16 @@ import pandas as pd
 import pytest
 from hypothesis import given
 
-from pipelines.formats.poses import pose_csv
-from pipelines.formats.skeletons import joints_csv
+from pipelines.formats.poses import trajectory_files
+from pipelines.formats.skeletons import joint_files
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import Export, JointFormat
 from tests.formats.motions import motions
 from tests.formats.refusals import refuses
 
-READER: JointFormat = joints_csv.FORMAT
-WRITER: Export = joints_csv.EXPORT
+READER: JointFormat = joint_files.JOINTS_CSV
+WRITER: Export = joint_files.CSV_EXPORT
 
 
 def write(folder: Path, text: str) -> Path:
@@ -101,9 +101,9 @@ def test_writing_and_reading_gives_the_same(
     tmp_path_factory: pytest.TempPathFactory, motion: JointMotion
 ) -> None:
     path = tmp_path_factory.mktemp("joints") / "joints.csv"
-    joints_csv.write_joints(path, motion)
+    joint_files.write_joints(path, motion)
     assert READER.recognises(path)
-    assert not pose_csv.FORMAT.recognises(path)
+    assert not trajectory_files.POSE_CSV.recognises(path)
     back = read(path)
     assert back.joints == motion.joints
     np.testing.assert_array_equal(back.t_ns, motion.t_ns)
@@ -116,7 +116,7 @@ def test_writing_and_reading_gives_the_same(
 
 
 def test_a_motion_of_no_times_has_the_columns(tmp_path: Path) -> None:
-    joints_csv.write_joints(
+    joint_files.write_joints(
         tmp_path / "none.csv", JointMotion(np.empty(0, np.int64), ("nose",), np.empty((0, 1, 1, 3)))
     )
     assert (tmp_path / "none.csv").read_text() == "t_ns,person,joint,x,y,z\n"
@@ -128,6 +128,8 @@ def test_export_writes_skeleton_and_cameras(tmp_path: Path) -> None:
     paths = WRITER.write(Recording("walk", motion, {"d1": poses}), tmp_path)
     assert [path.stem for path in paths] == ["walk", "walk_d1"]
     np.testing.assert_array_equal(read(paths[0]).position, motion.position)
-    np.testing.assert_array_equal(pose_csv.FORMAT.read_trajectory(paths[1]).position, poses.position)
+    np.testing.assert_array_equal(
+        trajectory_files.POSE_CSV.read_trajectory(paths[1]).position, poses.position
+    )
     with refuses("walk", "reconstruct"):
         WRITER.write(Recording("walk", None, {}), tmp_path)

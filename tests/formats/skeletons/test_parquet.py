@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.formats.skeletons import parquet
+from pipelines.formats.skeletons import joint_files
 from pipelines.session.records import Recording
 from pipelines.session.registries import Export
 from tests.formats.exported import flown, recording
 from tests.formats.refusals import refuses
 
-WRITER: Export = parquet.EXPORT
+WRITER: Export = joint_files.PARQUET_EXPORT
 
 
 def test_tables_by_name_time_and_joint(tmp_path: Path) -> None:

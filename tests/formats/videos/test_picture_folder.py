@@ -10,18 +10,22 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from pipelines.formats.common.exif import Tags, picture_times
-from pipelines.formats.drone_logs import picture_tags
 from pipelines.formats.videos import picture_folder
-from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED, FolderPictures
+from pipelines.formats.videos.picture_folder import (
+    SHARED_SECONDS,
+    UNTIMED,
+    FolderPictures,
+    Tags,
+    picture_times,
+)
 from pipelines.geometry.poses import rotate
 from pipelines.session.registries import VideoFormat, recognise
 from pipelines.session.telemetry import TelemetryChoice
 from tests.commands.runner import mocap, refused, succeeds
 from tests.formats.refusals import refuses
 
-READER: VideoFormat = picture_folder.FORMAT
-TAGS = picture_tags.FORMAT
+READER: VideoFormat = picture_folder.PICTURES
+TAGS = picture_folder.PICTURE_TAGS
 COUNT = 4
 START_NS = 1704164645_250_000_000  # 2024-01-02 03:04:05.25
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GpsLatitude="{lat:.9f}"

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.videos.picture_motion import followed_points
+from pipelines.formats.videos.video import followed_points
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.geometry.clocks import fit_start

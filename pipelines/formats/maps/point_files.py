@@ -1,14 +1,10 @@
-"""Reader of Point Cloud Library's PCD, versions .5 to .7: ascii, binary and binary_compressed.
+"""Point clouds of PCL (.pcd) and Stanford (.ply) as voxels: occupied with a point in them, else unknown."""
 
-Layout (PCL documentation, "The PCD file format"): lines VERSION, FIELDS (in old files COLUMNS), SIZE, TYPE,
-COUNT, WIDTH, HEIGHT, VIEWPOINT, POINTS, DATA, then the points. binary: records, packed, little-endian.
-binary_compressed: two uint32, bytes compressed and uncompressed, and an LZF stream of all values of the first
-field, all of the second, and so on. VIEWPOINT, the pose of the sensor, is not applied to the points.
-"""
+from __future__ import annotations
 
 import re
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +32,7 @@ MOST_EXPANSION = 88
 
 
 @dataclass(frozen=True)
-class _Header:
+class _PcdHeader:
     version: str
     fields: tuple[str, ...]
     sizes: tuple[int, ...]  # bytes of one value
@@ -68,7 +64,7 @@ class PcdFormat:
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe header, points, and their map at the default resolution."""
-        header, points = _read(path)
+        header, points = _read_pcd(path)
         summary: dict[str, object] = {
             "version": header.version,
             "fields": list(header.fields),
@@ -82,12 +78,12 @@ class PcdFormat:
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
         """Read points as voxels: occupied (1.0) with a point in it, else unknown; 0.2 m unless stated."""
-        return occupancy_of(path, _read(path)[1], resolution_m)
+        return occupancy_of(path, _read_pcd(path)[1], resolution_m)
 
 
-def _read(path: Path) -> tuple[_Header, Float]:
+def _read_pcd(path: Path) -> tuple[_PcdHeader, Float]:
     lines, body = split_header(path, read_bytes(path), "DATA")
-    header = _header(path, lines)
+    header = _pcd_header(path, lines)
     place = {name: header.fields.index(name) for name in ("x", "y", "z")}
     if any(header.counts[k] != 1 for k in place.values()):
         raise DataError(path, "has more than one x, y or z in a point", _EXPORT_AGAIN, code="bad-value")
@@ -109,7 +105,7 @@ def _read(path: Path) -> tuple[_Header, Float]:
     )
 
 
-def _header(path: Path, lines: list[list[str]]) -> _Header:
+def _pcd_header(path: Path, lines: list[list[str]]) -> _PcdHeader:
     words = {line[0]: line[1:] for line in lines if not line[0].startswith("#")}
     fields = words.get("FIELDS") or words.get("COLUMNS") or []
     if not {"x", "y", "z"} <= set(fields):
@@ -128,15 +124,15 @@ def _header(path: Path, lines: list[list[str]]) -> _Header:
         ) from error
     if not len(fields) == len(sizes) == len(types) == len(counts):
         raise DataError(path, "FIELDS, SIZE, TYPE and COUNT are not equally long", _EXPORT_AGAIN)
-    for field, size, kind, count in zip(fields, sizes, types, counts, strict=True):
+    for name, size, kind, count in zip(fields, sizes, types, counts, strict=True):
         if size not in _KINDS.get(kind, ()) or count < 1:
-            raise DataError(path, f"field {field[:40]} is {count} times {kind[:8]}{size}", _EXPORT_AGAIN)
+            raise DataError(path, f"field {name[:40]} is {count} times {kind[:8]}{size}", _EXPORT_AGAIN)
     if data not in {"ascii", "binary", "binary_compressed"}:
         raise DataError(path, f"DATA is {data[:40]!r}", "ascii, binary and binary_compressed are read")
     if points < 1 or width * height != points:
         raise DataError(path, f"states {width} x {height} and {points} points", _EXPORT_AGAIN)
     viewpoint = tuple(words.get("VIEWPOINT", []))
-    return _Header(
+    return _PcdHeader(
         " ".join(words.get("VERSION", [])),
         tuple(fields),
         tuple(sizes),
@@ -157,7 +153,7 @@ def _is_identity(viewpoint: tuple[str, ...]) -> bool:
         return False
 
 
-def _decompressed(path: Path, body: Bytes, header: _Header) -> Bytes:
+def _decompressed(path: Path, body: Bytes, header: _PcdHeader) -> Bytes:
 
     if len(body) < _SIZES.size:
         check_count(path, header.points, 0)
@@ -177,7 +173,7 @@ def _decompressed(path: Path, body: Bytes, header: _Header) -> Bytes:
             _EXPORT_AGAIN,
             code="damaged",
         )
-    from pipelines.formats.maps.lzf import decompress
+    from pipelines.formats.maps.octree import decompress
 
     values = np.zeros(size, dtype=np.uint8)
     if decompress(packed, values) != size:
@@ -187,4 +183,136 @@ def _decompressed(path: Path, body: Bytes, header: _Header) -> Bytes:
     return values
 
 
-FORMAT = PcdFormat()
+PCD = PcdFormat()
+
+
+_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: dict[str, str] = field(default_factory=dict)  # to numpy type, or "list"
+
+    @property
+    def stride(self) -> int:
+        """Bytes of one element; meaningless with lists."""
+        return sum(int(kind[1:]) for kind in self.properties.values() if kind != "list")
+
+
+class PlyFormat:
+    """Reader of vertices; x, y and z are metres. Vertices that are not finite are counted."""
+
+    name = "ply"
+    title = "point cloud (PLY)"
+    suffixes: tuple[str, ...] = (".ply",)
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if the file begins with the line `ply`."""
+        return first_bytes(path, 16, suffixes=self.suffixes).split(b"\n")[0].strip() == b"ply"
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe elements, properties, vertices, and their map at the default resolution."""
+        encoding, elements, points = _read_ply(path)
+        return {
+            "data": encoding,
+            "elements": {element.name: element.count for element in elements},
+            "fields": list(_vertex(path, elements)[1].properties),
+            **describe_points(path, points),
+        }
+
+    def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
+        """Read vertices as voxels: occupied (1.0) with a vertex in it, else unknown; 0.2 m unless stated."""
+        return occupancy_of(path, _read_ply(path)[2], resolution_m)
+
+
+def _read_ply(path: Path) -> tuple[str, list[_Element], Float]:
+    lines, body = split_header(path, read_bytes(path), "end_header")
+    encoding, elements = _ply_header(path, lines)
+    earlier, vertex = _vertex(path, elements)
+    names = list(vertex.properties)
+    if encoding == "ascii":
+        x, y, z = (names.index(name) for name in ("x", "y", "z"))
+        skipped = sum(element.count for element in earlier)
+        return encoding, elements, written_points(path, body, skipped, vertex.count, (x, y, z))
+    if any("list" in element.properties.values() for element in earlier):
+        raise DataError(path, "has lists before its vertices", "export it with the vertices first")
+    start = sum(element.count * element.stride for element in earlier)
+    check_count(path, vertex.count, 0 if start > len(body) else vertex.count)
+    columns, offset = {}, 0
+    for name, kind in vertex.properties.items():
+        columns[name] = (_BYTE_ORDERS[encoding] + kind, offset)
+        offset += int(kind[1:])
+    return encoding, elements, packed_points(path, body[start:], vertex.count, columns, vertex.stride)
+
+
+def _ply_header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Element]]:
+    encoding, elements = "", list[_Element]()
+    for words in lines:
+        match words:
+            case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as stated, "1.0"]:
+                encoding = stated
+            case ["element", name, count] if count.isdecimal() and len(count) < 19:
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", length, item, name] if elements and {length, item} <= set(_TYPES):
+                elements[-1].properties[name] = "list"
+            case ["property", kind, name] if elements and kind in _TYPES:
+                if name in elements[-1].properties:
+                    raise DataError(
+                        path, f"names the property {name[:40]} twice", _EXPORT_AGAIN, code="stated-twice"
+                    )
+                elements[-1].properties[name] = _TYPES[kind]
+            case ["ply"] | ["end_header"] | ["comment", *_] | ["obj_info", *_]:
+                pass
+            case _:
+                raise DataError(
+                    path,
+                    f"its header cannot be read (line {' '.join(words)[:60]!r})",
+                    _EXPORT_AGAIN,
+                    code="damaged",
+                )
+    if lines[0] != ["ply"] or not encoding:
+        raise DataError(
+            path,
+            "is no PLY file of version 1.0",
+            "its first lines must be `ply` and `format`",
+            code="wrong-kind",
+        )
+    return encoding, elements
+
+
+def _vertex(path: Path, elements: list[_Element]) -> tuple[list[_Element], _Element]:
+    """Return the elements before the vertices, and the vertices."""
+    names = [element.name for element in elements]
+    if "vertex" not in names:
+        raise DataError(path, "has no vertices", _EXPORT_AGAIN)
+    k = names.index("vertex")
+    element = elements[k]
+    if not {"x", "y", "z"} <= set(element.properties) or "list" in element.properties.values():
+        stated = " ".join(element.properties)[:100]
+        raise DataError(path, f"its vertices have {stated or 'nothing'}", "x, y, z and no lists are needed")
+    if not element.count:
+        raise DataError(path, "has 0 vertices", _EXPORT_AGAIN, code="empty")
+    return elements[:k], element
+
+
+PLY = PlyFormat()

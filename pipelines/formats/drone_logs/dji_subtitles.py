@@ -1,0 +1,454 @@
+"""Reader of DJI's subtitles, which log the drone's position and the gimbal's angles beside the video.
+
+Generations have only the form of subtitles in common. All of these are read:
+
+- `[latitude: 41.4] [longitude: 2.2] [rel_alt: 3.6 abs_alt: 6.4] [gb_yaw: 30.0 gb_pitch: -45.0 gb_roll: 0.0]`
+  (since 2018). Blanks before the colons are optional; some drones spell `longitude` as `longtitude`. Only
+  enterprise models log gimbal angles. Some log one height called `altitude`, without its reference (for a
+  Mavic Air 2 it is the take-off);
+- `GPS(149.0251,-20.2533,16)`: longitude, latitude, satellites (until 2018), with `Hb:1.9`, `BAROMETER:20.1`
+  or `H 85.80m` as height above take-off, and `F.PRY (...)`, `G.PRY (...)` as the angles of body and gimbal;
+- `GPS(36.6146,-6.1120,0.0M)`: latitude, longitude, height (Matrice 300): the M tells them apart.
+
+Angles are those of an FRD body and gimbal in NED (docs/formats.md).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.common.files import read_head
+from pipelines.formats.common.rows import describe_times, longest_rising
+from pipelines.formats.drone_logs.telemetry_rows import (
+    attitude_track,
+    between_refreshed_angles,
+    between_repeats,
+    of_angles,
+    position_track,
+    turned_as_stated,
+    whatever_from,
+)
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.session.errors import DataError
+from pipelines.session.storage import code_of, plain_text
+from pipelines.session.telemetry import Attitudes, AttitudeTrack, Height, Telemetry, TelemetryChoice
+
+_HIGHEST_M = 500  # above the take-off: the largest height that DJI's drones reach
+
+
+@dataclass(frozen=True)
+class DjiRows:
+    """Rows of a file of DJI's, of whatever kind; NaN where a row does not hold a value."""
+
+    t_ns: Int64  # [N]
+    timed: Bool  # [N] True where the time is known
+    columns: Mapping[str, Float]  # [N] by name: latitude, longitude (deg), relative, absolute, altitude (m)
+    clock: str  # as in `Telemetry`
+    body: Float  # [N, 3] yaw, pitch, roll (deg)
+    gimbal: Float  # [N, 3] the same of the camera
+    names: tuple[str, str] = ("its body's angles", "its gimbal angles")
+    rows: str = "rows"  # name of the rows where losses are counted
+    repeats: bool = True  # a position is repeated until the next measurement
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+
+def telemetry_of_rows(
+    path: Path, found: DjiRows, choice: TelemetryChoice, notes: Sequence[str] = ()
+) -> Telemetry:
+    """Build positions and attitudes; a repeated position is replaced by linear interpolation."""
+    columns, dropped = found.columns, dict(found.dropped)
+    height, which, note_on_height = choose_height(path, columns, choice)
+    track = position_track(
+        path,
+        "its GPS",
+        found.t_ns,
+        np.stack([columns["latitude"], columns["longitude"], height], axis=1),
+        dropped,
+        on_earth=True,
+        height=which,
+        unusable={"no time": ~found.timed, "no position": ~np.isfinite(columns["latitude"])},
+    )
+    said = [*notes, note_on_height]
+    if found.repeats:
+        values, moved = between_repeats(track.t_ns, track.values)
+        track = replace(track, values=values)
+        if moved:
+            said.append(
+                f"{moved} of {len(values)} positions repeat the one before: taken between measurements"
+            )
+    body, gimbal = (
+        angles_track(name, found.t_ns[found.timed], angles[found.timed], dropped, rows=found.rows)
+        for name, angles in zip(found.names, (found.body, found.gimbal), strict=True)
+    )
+    return Telemetry(
+        position=track,
+        body=body,
+        gimbal=gimbal,
+        clock=found.clock,
+        notes=tuple(f"{path}: {note}" for note in said),
+        dropped=dropped,
+    )
+
+
+def attitudes_of_rows(path: Path, found: DjiRows) -> Attitudes:
+    """Build the attitudes of the camera, whatever the rows say of positions."""
+    dropped = dict(found.dropped)
+    camera = angles_track(
+        found.names[1], found.t_ns[found.timed], found.gimbal[found.timed], dropped, rows=found.rows
+    )
+    if camera is None:
+        raise DataError(
+            path,
+            "holds no gimbal angles",
+            "name the log and topic that do, or fixed angles",
+            code="no-attitude",
+        )
+    return Attitudes(replace(camera, dropped=dropped), found.clock)
+
+
+def choose_height(
+    path: Path, columns: Mapping[str, Float], choice: TelemetryChoice
+) -> tuple[Float, Height, str]:
+    """Choose the height of each position; return it with its reference and a note about the choice.
+
+    Args:
+        path: the file, for messages.
+        columns: [N] m: `relative` to the take-off, `absolute`, and `altitude` without a reference, which is
+            used for each of the two that has no column of its own. NaN where there is none.
+        choice: the user's choice.
+    """
+    stated, unnamed = choice.altitude, columns["altitude"]
+    if isinstance(stated, int | float):
+        throughout = np.full(len(columns["latitude"]), float(stated))
+        return throughout, "stated", "its height is the one stated, throughout"
+    both = ("relative", "absolute")
+    named = {name: columns[name] for name in both if any_finite(columns[name])}
+    there = (dict.fromkeys(both, unnamed) if any_finite(unnamed) else {}) | named
+    if not there:
+        raise DataError(
+            path,
+            "holds no height",
+            "state it, in metres above the take-off: pose: {dji: ..., altitude: 30}",
+            code="no-positions",
+        )
+    if stated is not None and stated not in there:
+        raise DataError(
+            path, f"holds no {stated} height", f"write altitude: {next(iter(there))}, or the metres"
+        )
+    if stated is None and not named:
+        highest_m = float(np.nanmax(unnamed))
+        if highest_m > _HIGHEST_M:
+            problem = f"its altitude of up to {highest_m:.0f} m is no height above the take-off"
+            return unnamed, "unknown", f"{problem}: taken as absolute, from a barometer"
+        problem = "its altitude does not say what it counts from"
+        return unnamed, "take-off", f"{problem}: taken from the take-off (else write altitude: absolute)"
+    name = stated or ("relative" if "relative" in named else "absolute")
+    if name == "relative":
+        return there[name], "take-off", "heights count from the take-off"
+    return (
+        there[name],
+        "unknown",
+        "heights are absolute (barometer or terrain model): drones differ by many metres",
+    )
+
+
+def angles_track(
+    name: str,
+    t_ns: Int64,
+    yaw_pitch_roll_deg: Float,
+    dropped: MutableMapping[str, int],
+    *,
+    rows: str = "subtitles",
+) -> AttitudeTrack | None:
+    """Build the attitude from angles [N, 3]; None if there are none.
+
+    An angle that is repeated until the next measurement is replaced by linear interpolation. `rows` names
+    the rows of the file where losses are counted.
+    """
+    stated = np.isfinite(yaw_pitch_roll_deg).all(axis=1)
+    if not stated.any():
+        return None
+    if missing := int(np.count_nonzero(~stated)):
+        dropped[f"{rows} without {name}"] = missing
+    kept = np.flatnonzero(stated)
+    kept = kept[longest_rising(t_ns[kept])]
+    if late := int(np.count_nonzero(stated)) - len(kept):
+        dropped[f"{name} out of order"] = late
+    continuous = np.degrees(np.unwrap(np.radians(yaw_pitch_roll_deg[kept]), axis=0))
+    between = between_refreshed_angles(t_ns[kept], continuous)
+    as_logged = whatever_from(of_angles(between))
+    return attitude_track(name, t_ns[kept], turned_as_stated(between), dropped, stated=as_logged)
+
+
+def any_finite(values: Float) -> bool:
+    """Return True if there is any number."""
+    return bool(np.isfinite(values).any())
+
+
+def range_of(values: Float, decimals: int) -> list[float]:
+    """Return the smallest and the largest number, rounded; empty without any."""
+    finite = values[np.isfinite(values)]
+    return [round(float(v), decimals) for v in (finite.min(), finite.max())] if len(finite) else []
+
+
+_TIMECODE = r"(\d+):([0-5]\d):([0-6]\d)[,.](\d{3})"  # a Matrice 300 ends its 60th second at :60
+_BLOCK = re.compile(rf"(?m)^{_TIMECODE} --> {_TIMECODE}[ \t]*$")
+_CLOCK = re.compile(
+    r"(\d{4})[-./](\d{1,2})[-./](\d{1,2}) +(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d{3}))?(?:,(\d{3}))?(?!\d)"
+)
+# Some Mavic 2 write no display times: a number, then the clock time on a line of its own.
+_UNTIMED = re.compile(r"(?m)^\d+[ \t]*\n(?=\d{4}[-./]\d{1,2}[-./]\d{1,2} +\d)")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_LARGEST_NS = 2**63  # in the year 2262
+_SLOW_NS = 500_000_000  # subtitles further apart than this come once a second, with whole seconds
+
+
+@dataclass(frozen=True)
+class Subtitles:
+    """Subtitles of a video, with their display times and the clock times in their text."""
+
+    media_ns: Int64  # [B] since the video's start
+    clock_ns: Int64  # [B] since the epoch, local time taken as UTC; 0 where none is shown
+    texts: list[str]  # [B]
+
+    @property
+    def has_clock(self) -> Bool:
+        """[B] True if a clock time is shown."""
+        shown: Bool = self.clock_ns != 0
+        return shown
+
+    @property
+    def are_slow(self) -> bool:
+        """True if subtitles come about once a second, and not with each frame."""
+        return len(self.media_ns) > 1 and float(np.median(np.diff(self.media_ns))) >= _SLOW_NS
+
+    def start_ns(self) -> int | None:
+        """Return the clock time at the video's start, by the first subtitle with a clock; None without."""
+        shown = np.flatnonzero(self.has_clock)
+        return int(self.clock_ns[shown[0]] - self.media_ns[shown[0]]) if len(shown) else None
+
+    def times(self) -> tuple[Int64, Bool]:
+        """Return the time at which each subtitle was written [B], and True if that is known [B].
+
+        Subtitles of each frame: the time on their clock. Slow ones show whole seconds, so the video's own
+        time is added to the clock time of its start. Without any clock it is the video's own time.
+        """
+        start_ns = self.start_ns()
+        if start_ns is None:
+            return self.media_ns, np.ones(len(self.media_ns), dtype=np.bool_)
+        if self.are_slow:
+            return self.media_ns + start_ns, np.ones(len(self.media_ns), dtype=np.bool_)
+        return self.clock_ns, self.has_clock
+
+
+def read_subtitles(path: Path) -> Subtitles:
+    """Read all subtitles of a file; bytes that are not UTF-8 become a sign that no number contains."""
+    try:
+        text = plain_text(path.read_bytes())
+    except OSError as error:
+        raise DataError(
+            path, f"cannot be read ({error.strerror})", "check the path", code=code_of(error)
+        ) from error
+    subtitles = parse_subtitles(text)
+    if not subtitles.texts:
+        raise DataError(
+            path,
+            "holds no subtitles" if text.strip() else "is empty",
+            "copy it from the drone again",
+            code="empty",
+        )
+    return subtitles
+
+
+def parse_subtitles(text: str) -> Subtitles:
+    """Parse the subtitles of a text; the result is empty if it has none.
+
+    Subtitles without display times are taken to be shown from their clock times on, the first at 0.
+    """
+    blocks = list(_BLOCK.finditer(text))
+    timed = bool(blocks)
+    blocks = blocks or list(_UNTIMED.finditer(text))
+    ends = [block.start() for block in blocks[1:]] + [len(text)]
+    texts = [text[block.end() : end] for block, end in zip(blocks, ends, strict=False)]
+    clock_ns = np.array([_clock_ns(each) or 0 for each in texts], dtype=np.int64)
+    if timed:
+        media_ns = np.array([_timecode_ns(block) for block in blocks], dtype=np.int64)
+    else:  # since the first clock time; a subtitle without one has the time of the one before
+        shown = np.maximum.accumulate(clock_ns)
+        media_ns = shown - clock_ns[:1]
+    return Subtitles(media_ns=media_ns, clock_ns=clock_ns, texts=texts)
+
+
+def _clock_ns(text: str) -> int | None:
+    """Parse the clock time of a subtitle: 2022-08-07 13:40:40,774,808 and its variants."""
+    match = _CLOCK.search(text)
+    if match is None:
+        return None
+    *whole, milliseconds, microseconds = (int(part or 0) for part in match.groups())
+    try:
+        elapsed = datetime(*whole, tzinfo=UTC) - _EPOCH  # type: ignore[misc,arg-type]  # six integers
+    except ValueError:
+        return None
+    t_ns = elapsed // timedelta(microseconds=1) * 1000 + milliseconds * 1_000_000 + microseconds * 1000
+    return t_ns if abs(t_ns) < _LARGEST_NS else None
+
+
+def _timecode_ns(block: re.Match[str]) -> int:
+    hours, minutes, seconds, milliseconds = (int(part[-6:]) for part in block.groups()[:4])
+    return (((hours * 60 + minutes) * 60 + seconds) * 1000 + milliseconds) * 1_000_000
+
+
+_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
+_BRACKETS = re.compile(r"\[([^\[\]\n]{1,300})\]")
+_PAIR = re.compile(r"([A-Za-z_]+)\s*:\s*([-+]?\d+(?:[.,]\d+)?)(?![\d/])")  # with a decimal dot or comma
+_GPS = re.compile(rf"GPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(M?)")
+_ANGLES = {
+    part: re.compile(rf"\b{letter}\.PRY\s*\(\s*{_NUMBER}[^,\d]*,\s*{_NUMBER}[^,\d]*,\s*{_NUMBER}")
+    for part, letter in (("drone", "F"), ("gb", "G"))
+}
+_ABOVE_TAKE_OFF = re.compile(rf"(?:\bBAROMETER\s*:\s*|\bHb\s*:\s*|\bH\s+){_NUMBER}")
+
+_NAMES = {"longtitude": "longitude"} | {
+    f"{old}{angle}": f"{new}_{angle}"
+    for old, new in (("gimbal_", "gb"), ("gb_", "gb"), ("drone_", "drone"), ("uav_", "drone"))
+    for angle in ("yaw", "pitch", "roll")
+}
+_COLUMNS = (
+    *("latitude", "longitude", "relative", "absolute", "altitude"),
+    *("gb_yaw", "gb_pitch", "gb_roll", "drone_yaw", "drone_pitch", "drone_roll"),
+)
+_HEIGHTS = {"rel_alt": "relative", "abs_alt": "absolute"}
+
+
+class DjiSrtFormat:
+    """Reader of subtitles that hold the drone's position."""
+
+    name = "dji"
+    title = "DJI telemetry (subtitles)"
+    suffixes: tuple[str, ...] = (".srt",)
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if there are subtitles and one of the first holds a position."""
+        return bool(
+            np.isfinite(_columns(parse_subtitles(read_head(path, self.suffixes)).texts)["latitude"]).any()
+        )
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe subtitles, times, ranges of the positions, heights and angles."""
+        subtitles = read_subtitles(path)
+        columns = _columns(subtitles.texts)
+        t_ns, timed = subtitles.times()
+        placed = np.isfinite(columns["latitude"])
+        facts: dict[str, object] = {
+            "subtitles": len(subtitles.texts),
+            "positions": int(np.count_nonzero(placed)),
+            **describe_times(np.unique(t_ns[timed])),
+            "clock": _clock_name(subtitles),
+        }
+        for name in ("latitude", "longitude"):
+            facts[f"{name}_deg"] = range_of(columns[name], 7)
+        heights = {
+            "height_above_take_off_m": "relative",
+            "height_absolute_m": "absolute",
+            "height_m": "altitude",
+        }
+        named = {label: name for label, name in heights.items() if any_finite(columns[name])}
+        facts |= {label: range_of(columns[name], 3) for label, name in named.items()}
+        for label, part in (("gimbal", "gb"), ("body", "drone")):
+            angles = _angles(columns, part)
+            if any_finite(angles):
+                facts[f"{label}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
+                facts[f"{label}_pitch_deg"] = range_of(angles[:, 1], 2)
+        if not any(name.endswith("_angles") for name in facts):
+            facts["orientation"] = "none: state a gimbal in the manifest"
+        return facts
+
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Read positions, and the angles of body and gimbal if the subtitles have them.
+
+        A position that is repeated until the next measurement is replaced by linear interpolation.
+        """
+        subtitles = read_subtitles(path)
+        return telemetry_of_rows(path, _rows(subtitles), choice, [_note_on_clock(subtitles)])
+
+    def read_attitudes(self, path: Path) -> Attitudes:
+        """Read the gimbal's angles, also where the drone had no position."""
+        subtitles = read_subtitles(path)
+        found = attitudes_of_rows(path, _rows(subtitles))
+        return replace(found, notes=(f"{path}: {_note_on_clock(subtitles)}",))
+
+
+# --- content of a subtitle -----------------------------------------------------------------------------
+
+
+def _rows(subtitles: Subtitles) -> DjiRows:
+    columns = _columns(subtitles.texts)
+    t_ns, timed = subtitles.times()
+    return DjiRows(
+        t_ns,
+        timed,
+        columns,
+        _clock_name(subtitles),
+        body=_angles(columns, "drone"),
+        gimbal=_angles(columns, "gb"),
+        names=("F.PRY", "its gimbal angles"),
+        rows="subtitles",
+    )
+
+
+def _columns(texts: Sequence[str]) -> dict[str, Float]:
+    """Return all columns of `_COLUMNS`, [B] each, NaN if a subtitle does not hold the value."""
+    rows = [_fields(text) for text in texts]
+    return {name: np.array([row.get(name, np.nan) for row in rows]) for name in _COLUMNS}
+
+
+def _fields(text: str) -> dict[str, float]:
+    fields: dict[str, float] = {}
+    for bracket in _BRACKETS.findall(text):
+        for key, number in _PAIR.findall(bracket):
+            name = key.lower()
+            fields[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number.replace(",", "."))
+    if "GPS" in text and (gps := _GPS.search(text)):
+        first, second, third = (float(part) for part in gps.groups()[:3])
+        if gps[4]:  # the M of a height: only this form begins with the latitude
+            fields |= {"latitude": first, "longitude": second, "absolute": third}
+        else:
+            fields |= {"longitude": first, "latitude": second}
+        if above := _ABOVE_TAKE_OFF.search(text):
+            fields.setdefault("relative", float(above[1]))
+        for part, pattern in _ANGLES.items():
+            if angles := pattern.search(text):
+                pitch, roll, yaw = (float(angle) for angle in angles.groups())
+                fields |= {f"{part}_pitch": pitch, f"{part}_roll": roll, f"{part}_yaw": yaw}
+    if "latitude" not in fields or "longitude" not in fields:  # the text was cut between the two
+        fields.pop("latitude", None)
+    return fields
+
+
+def _angles(columns: Mapping[str, Float], part: str) -> Float:
+    """Return yaw, pitch, roll [B, 3] in degrees; a missing roll is 0."""
+    yaw, pitch, roll = (columns[f"{part}_{angle}"] for angle in ("yaw", "pitch", "roll"))
+    return np.stack(
+        [yaw, pitch, np.where(np.isnan(roll), np.where(np.isnan(yaw), np.nan, 0.0), roll)], axis=1
+    )
+
+
+def _clock_name(subtitles: Subtitles) -> str:
+    return "the drone's clock" if subtitles.has_clock.any() else "the video's start"
+
+
+def _note_on_clock(subtitles: Subtitles) -> str:
+    if not subtitles.has_clock.any():
+        return "shows no clock: its times count from the video's start"
+    if subtitles.are_slow:
+        return "shows whole seconds of local time, taken as UTC: let clock.sigma_s be 1"
+    return "its clock is the drone's local time, taken as UTC"
+
+
+DJI_SRT = DjiSrtFormat()
