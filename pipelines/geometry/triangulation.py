@@ -63,7 +63,6 @@ _MAX_PAIRS = 28  # all of 8 views; above, enough that with half the views bad on
 _BLOCK = 4096  # joint-frames that a thread takes at once
 _NOISE_SAMPLE = 20_000  # joint-frames; a median over them is accurate to one per cent
 _NOISE_ROUNDS = 2
-_MIN_PIXEL_SIGMA = 1.0  # px of a detector; few redundant views may show less by chance
 _START_WIDTH = (
     2.0  # a constant pose error gives few different pairs: undoubled, 2 % of draws at n = 3 lost all
 )
@@ -375,33 +374,6 @@ def triangulate_pictures(
     own = replace(views, rays=views.rays[rows], weight=views.weight[rows], pose_index=views.pose_index[rows])
     residual_px[rows] = np.where(gross[rows], reprojection_px(own, found.points[rows]), residual_px[rows])
     return replace(found, status=status, residual_px=residual_px)
-
-
-def detector_sigma(views: Views, found: Triangulation, *, picture: Int64, pixel_sigma: Float) -> Float:
-    """Estimate the pixel noise per axis [C] of the detector alone, from joints relative to their picture.
-
-    The median residual of each picture is taken off first. Nearly all of the pose's error goes with it.
-
-    Args:
-        views: the observations.
-        found: their triangulation.
-        picture: [N], as for `triangulate_pictures`.
-        pixel_sigma: [C] px, what is assumed of the detector; returned where no picture can be judged.
-
-    Returns:
-        At least `_MIN_PIXEL_SIGMA`.
-    """
-    chosen = picture % max(1, -(-len(picture) // _NOISE_SAMPLE)) == 0
-    sample = replace(
-        views,
-        rays=views.rays[chosen],
-        weight=np.where(found.inlier[chosen], views.weight[chosen], 0.0),
-        pose_index=views.pose_index[chosen],
-        pixel_sigma=pixel_sigma,
-    )
-    moved, _ = _moved(sample, picture[chosen], found.points[chosen])
-    agreed = triangulate(moved, method="robust")
-    return residual_sigma(moved, agreed, np.full(len(pixel_sigma), _MIN_PIXEL_SIGMA))
 
 
 def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float, threads: int) -> Bool:

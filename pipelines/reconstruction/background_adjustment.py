@@ -85,7 +85,6 @@ _UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1
 
 _UNKNOWN_ARM_M, _USUAL_ARM_M = 0.05, 0.03  # constant shift in the camera: a lever arm that is wrong
 _USUAL_TURN = float(np.radians(0.15))  # constant rotation
-_LEAST_TURNED = 0.05  # share of the constant rotation of a camera that flies, by the direction of its path
 _LEVEL_STEPS = 20  # of the constant rotation's level; it halves its distance in each
 _DRAWS = 32  # of the posterior
 _LEVEL_ROUNDS = 6
@@ -731,9 +730,8 @@ def with_constant_levels(prior: PosePrior, found: Float, covariance: Float) -> P
 
     They say little, so a usual level counts as `USUAL_COUNT` more (inverse gamma prior; expectation
     maximisation). What is known well stays what it is. What rests on a drifting path gives way: a rotation to
-    the log, an arm to none. A rotation of which the pictures say nothing keeps its wide level; a camera that
-    flies shows a little by the direction of its path. An arm's never grows: a large one that pictures hardly
-    show would bend the path.
+    the log, an arm to none. A rotation of which the pictures say little keeps its wide level. An arm's never
+    grows: a large one that pictures hardly show would bend the path.
 
     Args:
         prior: levels with which the constants were found.
@@ -741,8 +739,7 @@ def with_constant_levels(prior: PosePrior, found: Float, covariance: Float) -> P
         covariance: [6, 6], posterior.
     """
     place, turn, arm = prior.constant
-    least = _LEAST_DETERMINED if arm == 0 else _LEAST_TURNED
-    if 1 - np.trace(covariance[:3, :3]) / (3 * turn**2) >= least:
+    if 1 - np.trace(covariance[:3, :3]) / (3 * turn**2) >= _LEAST_DETERMINED:
         turn = _constant_level(found[:3], covariance[:3, :3], turn, _USUAL_TURN)
     if arm > 0:  # a camera that stands has none
         arm = min(arm, _constant_level(found[3:], covariance[3:, 3:], arm, _USUAL_ARM_M))

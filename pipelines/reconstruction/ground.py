@@ -72,7 +72,6 @@ _PAIR_SIGMA_M = 0.012  # of an error that all patches of a pair share: clouds an
 _MATCH_SIGMA_M = 0.03  # of one comparison
 _TURN_SIGMA = np.radians(0.1)  # of attitudes from the background, at least: followed points drift alike
 _USUAL_RANGE_M = 10.0  # at which a slow error of an attitude moves a patch
-_CAMERA_SIGMA_M = 0.007  # of each camera's error that no pair shows: its path is bent a little
 _REPEATED = 0.5  # correlation of the errors of comparisons of the same patch
 _LOSS = 2.0  # standard deviations at which a patch counts half
 _ROUNDS = 8
@@ -703,9 +702,7 @@ def _bound(
         place = slice(3 * c, 3 * c + 3)
         own = float(np.trace(solution.covariance[place, place] - common)) / 3
         relative = own * len(group) / (len(group) - 1)
-        sigma = float(
-            np.sqrt(max(relative, 0.0) + (0.0 if camera.static else _CAMERA_SIGMA_M) ** 2 + EXACT**2)
-        )
+        sigma = float(np.sqrt(max(relative, 0.0) + EXACT**2))
         left_m[camera.name] = sigma
         turned = slice(3 * (total + c), 3 * (total + c) + 3)
         turn_sigma = float(np.sqrt(np.trace(solution.covariance[turned, turned]) / 3))

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 _SEARCHED = 300  # times of the skeleton that the search for clock offsets uses, at most
 _MOST_SHIFTS = 6  # of the clocks; offsets of 0.2 s took one to five
 _UNDETERMINED = 0.5  # a clock is determined if its posterior sigma is below this share of its prior sigma
-_FEWEST_GUIDES = 6
+_FEWEST_LIMBS = 6
 _WORST = (
     75.0  # percentile of a person's squared residuals: the right views of half of a flight hide no others
 )
@@ -73,17 +73,14 @@ class RobustFlight:
     between: Interpolation  # rules for interpolating between logged poses
     threads: int  # see `triangulate`
     trusted: Bool  # [P] people who determine cameras and clocks; the others are triangulated afterwards
-    only_guides: bool = False  # other joints are not refined
+    only_limbs: bool = False  # other joints are not refined
     waiting: Waiting | None = None  # where the arrays wait meanwhile
 
     @property
-    def guides(self) -> Bool:
-        """Joints [J] that determine cameras and clocks: those of limbs, if enough of them have names.
-
-        A detector places faces, hands and feet by the side that it sees: wrongly, and always in the same way.
-        """
+    def limbs(self) -> Bool:
+        """Joints [J] of limbs, if enough of them have names; else all joints."""
         limbs = np.array([name.endswith(_OF_LIMBS) for name in self.observations.joints])
-        return limbs if limbs.sum() >= _FEWEST_GUIDES else np.ones_like(limbs)
+        return limbs if limbs.sum() >= _FEWEST_LIMBS else np.ones_like(limbs)
 
     @property
     def t_s(self) -> Float:
@@ -238,7 +235,7 @@ def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
     held = FoundClocks(searched_s, prior_s, prior_s)
     if not prior_s.any():
         return held
-    limbs = replace(flight, clock_sigma_s=prior_s, only_guides=True)
+    limbs = replace(flight, clock_sigma_s=prior_s, only_limbs=True)
     refined, offset_s = _settle_clocks(limbs, searched_s)
     if refined.fallback is not None:
         return held
@@ -282,8 +279,8 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
     _, people, joints, _ = flight.observations.confidence.shape
     cameras = shifted(flight.cameras, offset_s)
     start = np.where(flight.trusted[:, None, None], started.points.reshape(-1, people, joints, 3), np.nan)
-    if flight.only_guides:
-        start = np.where(flight.guides[:, None], start, np.nan)
+    if flight.only_limbs:
+        start = np.where(flight.limbs[:, None], start, np.nan)
     sightings = [_sighting(flight, c, camera) for c, camera in enumerate(cameras)]
     if flight.waiting is not None:
         flight.waiting.release()
@@ -294,8 +291,6 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
         rigid_pairs(flight.observations.joints, people),
         flight.prior,
         flight.clock_sigma_s,
-        guides=np.tile(flight.guides, people),
-        placing=rigid_pairs(flight.observations.joints, people, trunk=False),
         contested=not flight.measured,
         threads=flight.threads,
     )
@@ -429,18 +424,18 @@ def white_covariance(camera: Camera, prior: PoseErrors) -> Float | None:
     return None if logged is None else WHITE_SHARE * logged
 
 
-def rigid_pairs(joints: tuple[str, ...], people: int, *, trunk: bool = True) -> Int64:
+def rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
     """List pairs of joints [B, 2] with a nearly constant distance: bones, and the points of the head.
+
+    Shoulders come nearer to the hips where a person bends, so the trunk is no bone.
 
     Args:
         joints: names of one person's joints.
         people: number of people; the joints of each follow those of the one before.
-        trunk: False to leave out the pairs of the trunk. Shoulders come nearer to the hips where a person
-            bends, and constant lengths then move the hips.
     """
     number = {name: index for index, name in enumerate(joints)}
     head = [number[name] for name in _HEAD if name in number]
-    bones = [pair for pair in bones_of(joints) if trunk or not _is_of_trunk(*pair)]
+    bones = [pair for pair in bones_of(joints) if not _is_of_trunk(*pair)]
     pairs = {(number[a], number[b]) for a, b in bones} | {(i, j) for i in head for j in head}
     own = np.array(sorted({(min(p), max(p)) for p in pairs if p[0] != p[1]}), dtype=np.int64).reshape(-1, 2)
     return np.concatenate([own + person * len(joints) for person in range(people)])

@@ -1,7 +1,6 @@
 """Solvers of joint-frames: their noise, the choice between them, and how they scale covariances and weights.
 
-Covariances are wider where nothing is known of the poses' errors, and narrower where the detector is better
-than assumed. Inliers are weighted again in two ways:
+Covariances are wider where nothing is known of the poses' errors. Inliers are weighted again in two ways:
 
 - By the full logged 6x6 pose covariances. Triangulation uses one standard deviation for a position and one
   for a rotation; its gates and its choice of views need no more. Logs contain more: satellite positioning
@@ -31,9 +30,7 @@ from pipelines.geometry.triangulation import (
     Method,
     Triangulation,
     Views,
-    detector_sigma,
     estimate_noise,
-    pose_variance_px,
     reprojection_px,
     triangulate,
     triangulate_pictures,
@@ -108,7 +105,7 @@ def solver_for(
 
     For calibrated cameras, `robust` has its own loss. For poses with errors, it has a gate that knows the
     common error of a picture's joints, and weights from logged covariances. Its covariances are wider than
-    residuals say where nothing is known of the poses' errors, and else have the detector's own noise.
+    residuals say where nothing is known of the poses' errors.
     """
     if method in ("robust", "auto") and are_calibrated(cameras, observations):
         return partial(triangulate_heavy_tailed, threads=threads)
@@ -122,7 +119,7 @@ def solver_for(
         in_pictures = partial(
             triangulate_weighted, solve=in_pictures, pose_covariance=observations.pose_covariance
         )
-    return partial(triangulate_narrowed, solve=in_pictures, picture=picture, pixel_sigma=of_detector)
+    return in_pictures
 
 
 def are_calibrated(cameras: Sequence[Camera], observations: Observations) -> bool:
@@ -166,37 +163,6 @@ def triangulate_widened(views: Views, *, solve: Callable[[Views], Triangulation]
     """Triangulate, and widen covariances by `_UNKNOWN_POSES`."""
     found = solve(views)
     return replace(found, covariance=_UNKNOWN_POSES * found.covariance)
-
-
-# --- poses' errors known --------------------------------------------------------------------------------
-
-
-def triangulate_narrowed(
-    views: Views, *, solve: Callable[[Views], Triangulation], picture: Int64, pixel_sigma: Float
-) -> Triangulation:
-    """Triangulate, and narrow covariances where the detector is better than assumed.
-
-    Gates and weights need noise that is large enough, covariances the true one. It is estimated from joints
-    relative to their picture, since small common residuals of constant pose errors may be luck. The poses'
-    part of the covariances stays.
-
-    Args:
-        views: the views; `pixel_sigma` is that of the detector and of what the stated noise does not explain.
-        solve: `robust` with the options for these views.
-        picture: [N], see `triangulate_pictures`.
-        pixel_sigma: [C] px, what is assumed of the detector alone.
-    """
-    found = solve(views)
-    own = np.minimum(detector_sigma(views, found, picture=picture, pixel_sigma=pixel_sigma), pixel_sigma)
-    variance = views.pixel_sigma**2
-    by_pose = np.where(found.inlier, pose_variance_px(views, found.points), 0.0)
-    weight = np.where(found.inlier, views.weight, 0.0)
-    assumed, estimated = (
-        (weight**2 / (pixels + weight**2 * by_pose)).sum(axis=1)
-        for pixels in (variance, variance - pixel_sigma**2 + own**2)
-    )
-    ratio = np.divide(assumed, estimated, out=np.ones_like(assumed), where=estimated > 0)
-    return replace(found, covariance=ratio[:, None, None] * found.covariance)
 
 
 # --- full pose covariances -----------------------------------------------------------------------------

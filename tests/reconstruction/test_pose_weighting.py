@@ -10,9 +10,8 @@ import pytest
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import ROTATION, errors_of_level
-from pipelines.geometry.triangulation import STATUS, Views, detector_sigma, estimate_noise, triangulate
+from pipelines.geometry.triangulation import STATUS, Views, estimate_noise, triangulate
 from pipelines.reconstruction.solving import (
-    triangulate_narrowed,
     triangulate_weighted,
     triangulate_widened,
 )
@@ -88,48 +87,6 @@ def test_what_a_log_knows_of_its_axes_makes_points_better_and_covariances_true()
     predicted = np.sqrt(np.trace(weighted.covariance[first], axis1=1, axis2=2).mean() / 3)
     assert rms == pytest.approx(predicted, rel=4 / np.sqrt(2 * 2 * len(first)))
     assert rms < 0.9 * rms_before
-
-
-def test_covariances_are_those_of_a_detector_that_is_better_than_assumed() -> None:
-    """State 6 px of pixel noise instead of 2, and the true noise of the poses, new in every frame."""
-    frames = 700
-    truth, exact = ring(frames, 3)
-    covariance = np.tile(np.diag([0.02**2] * 3 + [np.radians(0.1) ** 2] * 3), (frames, 3, 1, 1))
-    views = with_pixel_noise(disturbed(exact, covariance, np.random.default_rng(4)), np.random.default_rng(5))
-    views = replace(views, pixel_sigma=3 * views.pixel_sigma)
-    found = triangulate_narrowed(
-        views,
-        solve=partial(triangulate, method="robust"),
-        picture=views.pose_index,
-        pixel_sigma=views.pixel_sigma,
-    )
-    first = np.arange(0, len(truth), 17)[found.status[::17] == OK]  # a joint of every frame
-    off = found.points[first] - truth[first]
-    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance[first]), off)
-    assert squared.mean() == pytest.approx(3, abs=4 * np.sqrt(6 / len(first)))
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_constant_pose_errors_do_not_change_the_detectors_noise(seed: int) -> None:
-    """Estimate 2 px for any draw of constant pose errors.
-
-    The median of 17 joints has pi / 2 / 17 of their variance: taking it off changes sigma by 5 % at most. The
-    median over 1700 joint-frames has a standard error of 1 %.
-    """
-    rng = np.random.default_rng(seed)
-    _, exact = ring(100, 3)
-    level = np.array([0.05, np.radians(0.3)])
-    error = np.repeat(level, 3) * rng.standard_normal((1, 3, 6))
-    views = replace(
-        exact,
-        position=exact.position + error[..., :3],
-        rotation=turned(exact.rotation, error[..., 3:]),
-        pose_sigma=np.broadcast_to(level, (100, 3, 2)),
-    )
-    views = with_pixel_noise(views, rng)
-    found = triangulate(views, method="robust")
-    sigma = detector_sigma(views, found, picture=views.pose_index, pixel_sigma=np.full(3, 2.0))
-    np.testing.assert_allclose(sigma, 2.0, rtol=0.08)
 
 
 def test_covariances_hold_where_nobody_stated_constant_errors() -> None:

@@ -227,54 +227,6 @@ def reestimated(system: System, state: State, at: Eliminated, *, poses: bool, mo
     )
 
 
-def shrunk(acceleration: Float, t_s: Float, position: Float) -> Float:
-    """Shrink the correlations of a covariance of accelerations [J, J] according to the flight's length.
-
-    Limbs repeat their motion, so a short flight has few independent accelerations, and some combination of
-    joints seems to stay at rest by chance. With that prior, posterior covariances were a third
-    too small. Correlations are multiplied by 1 - sum var(r) / sum r^2 (Schafer & Strimmer, "A shrinkage
-    approach to large-scale covariance matrix estimation", 2005), where var(r) is (1 - r^2)^2 / (N - 1) and N
-    the number of accelerations over 1 + 2 sum rho^2 of their autocorrelation (Bartlett 1946).
-
-    Args:
-        acceleration: [J, J] (m/s^2)^2, as estimated.
-        t_s: [T] times (s).
-        position: [T, J, 3] m, the estimate from which it was computed.
-    """
-    joints = len(acceleration)
-    if joints < 2:
-        return acceleration
-    steps = np.diff(t_s)
-    velocity = np.diff(position, axis=0) / steps[:, None, None]
-    whole = np.maximum(steps[1:], steps[:-1]) < _GAP * np.median(steps)
-    change = (np.diff(velocity, axis=0) / (0.5 * (steps[1:] + steps[:-1]))[:, None, None])[whole]
-    unit = change / np.sqrt(np.maximum(np.mean(change**2, axis=(0, 2)), 1e-12))[:, None]
-    lags = range(1, len(unit) // 4)
-    repeated = 1 + 2 * sum(float(np.mean(unit[lag:] * unit[:-lag])) ** 2 for lag in lags)
-    independent = 3 * len(unit) / repeated
-    deviation = np.sqrt(np.diagonal(acceleration))
-    correlation2 = (acceleration / np.outer(deviation, deviation))[~np.eye(joints, dtype=bool)] ** 2
-    chance = float(np.sum((1 - correlation2) ** 2)) / max(independent - 1, 1.0)
-    share = min(chance / max(float(correlation2.sum()), 1e-12), 1.0)
-    return (1 - share) * acceleration + share * np.diag(deviation**2)
-
-
-def limber(acceleration: Float, spread: float) -> Float:
-    """Enlarge accelerations relative to the body's for the estimate of joints, if views are imprecise.
-
-    The accelerations of limbs repeat in a gait and are not white as in the prior. With imprecise views,
-    joints are averaged over longer times, and more of their swings would be lost. Standard deviations
-    relative to the body grow with those of triangulated points. The body is the best-determined mean under
-    A: that of all joints with weights A^-1 1, whose variance stays 1 / (1' A^-1 1).
-
-    Args:
-        acceleration: [J, J] (m/s^2)^2, A, as estimated.
-        spread: standard deviation of a triangulated point over that of its rays; no change below 1.
-    """
-    body = np.full_like(acceleration, 1 / np.linalg.inv(acceleration).sum())
-    return body + max(spread, 1.0) ** 2 * (acceleration - body)
-
-
 def _acceleration(before: Float, found: Moments, bodies: Float) -> Float:
     """Estimate the covariance of accelerations, in coordinates where the previous one is the identity.
 

@@ -30,8 +30,6 @@ from pipelines.reconstruction.refinement.estimate import (
     evidence,
     initial_state,
     learn,
-    limber,
-    shrunk,
     solve,
 )
 from pipelines.reconstruction.refinement.kernels import State, turned
@@ -43,19 +41,15 @@ from pipelines.reconstruction.refinement.problem import (
     Sighting,
     build,
 )
-from pipelines.reconstruction.refinement.system import AT_ONCE, System, misfit
+from pipelines.reconstruction.refinement.system import System, misfit
 
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
 _LEARNING_ROUNDS, _FEWER_ROUNDS = 8, 3
-_ROUNDS_IN_CORRECTED = 4  # to learn motion and keypoint errors in poses that the guides have corrected
 _ROUNDS = 8
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a walking body, its limbs
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
-_LOOSE_MOTION = 3.0  # times the accelerations of the prior, for the estimate of clocks and slow pose errors
-_ANYWHERE_M = 100.0  # standard deviation of a joint that no picture shows
 _FAST_MOTION = 2.0  # times the accelerations of the prior, where they were learned in uncorrected poses
-_OUTLIER = 1.5  # stated standard deviations: a correlated keypoint that is nearer is no outlier
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
@@ -128,8 +122,6 @@ def refine(
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
     *,
-    guides: Bool | None = None,
-    placing: Int64 | None = None,
     contested: bool = True,
     threads: int = 1,
 ) -> Refined:
@@ -142,49 +134,37 @@ def refine(
         bones: [B, 2] pairs of joints with a nearly constant distance; without any, the first two joints.
         prior: prior of each camera's pose errors; None without stated noise.
         clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
-        guides: [J] joints whose keypoints determine the cameras where keypoint errors last; None for all.
-        placing: [B', 2] the pairs among `bones` for the estimate of all joints, after `guides` determined
-            cameras whose pose errors were measured; None for all.
         contested: False if the prior was measured, and no other level of pose errors competes with it.
         threads: at most two are used, one for each half of the flight; the result does not depend on it.
     """
     part = _participating(start)
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
         return _none(len(clock_sigma_s), start, "too few joints or times were triangulated")
-    whole = _Views(
+    views = _Views(
         t_s,
         tuple(_of_joints(sighting, part) for sighting in sightings),
         _renumbered(bones, part),
-        _renumbered(bones if placing is None else placing, part),
         _without_gaps(t_s, start[:, part]),
-        np.ones(int(part.sum()), dtype=np.bool_),
         threads,
     )
     del sightings  # a clock's offset and the choice of joints made copies
-    guiding = np.ones(int(part.sum()), dtype=np.bool_) if guides is None else guides[part]
-    few = [] if guiding.all() or guiding.sum() < 3 else [whole.of(guiding)]
     refused = None
     try:
-        for views in (*few, whole):
-            stretches, filled = views.stretches()
-            if prior is not None and not contested:
-                priors = _measured_prior(stretches, filled, prior, clock_sigma_s)
-            else:
-                priors = _priors(stretches, filled, prior, clock_sigma_s)
-            for found in priors:
-                if views is not whole and found.known.memory <= REMEMBERED:
-                    break  # all joints tell of the cameras
-                refined = _refined(views, whole, guiding, found, measured=not contested)
-                refined = replace(
-                    refined,
-                    position=_of_all_joints(refined.position, part),
-                    covariance=_of_all_joints(refined.covariance, part),
-                )
-                if refined.fallback is None:
-                    return refined
-                refused = refused or refined
-            else:
-                break
+        stretches, filled = views.stretches()
+        if prior is None or contested:
+            priors = _priors(stretches, filled, prior, clock_sigma_s)
+        else:
+            priors = _measured_prior(stretches, filled, prior, clock_sigma_s)
+        for found in priors:
+            refined = _refined(views, found, measured=not contested)
+            refined = replace(
+                refined,
+                position=_of_all_joints(refined.position, part),
+                covariance=_of_all_joints(refined.covariance, part),
+            )
+            if refined.fallback is None:
+                return refined
+            refused = refused or refined
     except np.linalg.LinAlgError as error:
         refused = refused or _none(len(clock_sigma_s), start, str(error))
     return refused or _none(len(clock_sigma_s), start, "no prior could be found")
@@ -192,44 +172,23 @@ def refine(
 
 @dataclass(frozen=True)
 class _Views:
-    """Constants from which a problem of some joints is built; its arrays are those of all J."""
+    """Constants from which a problem is built."""
 
     t_s: Float  # [T]
     sightings: tuple[Sighting, ...]
-    bones: Int64  # [B, 2] of the joints that are taken
-    placing: Int64  # [B', 2] for the estimate of all joints, after guides determined the cameras
+    bones: Int64  # [B, 2]
     start: Float  # [T, J, 3] m, without gaps
-    taken: Bool  # [J]
     threads: int
-
-    def of(self, joints: Bool) -> _Views:
-        """Take some of the joints [J]; copies of a long flight are made only while they are needed."""
-        return replace(self, bones=_renumbered(self.bones, joints), taken=joints)
-
-    def corrected_by(self, corrections: Sequence[tuple[Float, Float]]) -> _Views:
-        """Correct the poses of each camera by errors [F, 10] at times [F]."""
-        sightings = []
-        for sighting, (at_s, numbers) in zip(self.sightings, corrections, strict=True):
-            if len(at_s):
-                every = np.stack([np.interp(sighting.t_s, at_s, column) for column in numbers.T], axis=1)
-                position, rotation = corrected(sighting.position, sighting.rotation, every)
-                sightings.append(replace(sighting, position=position, rotation=rotation))
-            else:
-                sightings.append(sighting)
-        return replace(self, sightings=tuple(sightings))
 
     def problem(self) -> Problem:
         """Build the problem of the whole flight."""
-        return self._problem_at(self.t_s)
+        return build(self.t_s, self.sightings, self.bones, threads=self.threads)
 
     def stretches(self) -> tuple[Problem, Float]:
         """Build that of the stretches from which the prior is learned, and take their start [T', J, 3]."""
         chosen = _stretches(len(self.t_s))
-        return self._problem_at(self.t_s[chosen]), self.start[chosen][:, self.taken]
-
-    def _problem_at(self, t_s: Float) -> Problem:
-        sightings = tuple(_of_joints(sighting, self.taken) for sighting in self.sightings)
-        return build(t_s, sightings, self.bones, threads=self.threads)
+        problem = build(self.t_s[chosen], self.sightings, self.bones, threads=self.threads)
+        return problem, self.start[chosen]
 
 
 @dataclass(frozen=True)
@@ -243,27 +202,20 @@ class _Prior:
     held_m: float = 0.0  # standard deviation per axis by constant errors that are held as logged
 
 
-def _refined(views: _Views, whole: _Views, guiding: Bool, prior: _Prior, *, measured: bool) -> Refined:
+def _refined(views: _Views, prior: _Prior, *, measured: bool) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails.
 
-    Poses and clocks are estimated from the joints of `views`: all of the whole, or those that are `guiding`
-    [J]. The others are placed afterwards. `measured` is True if the prior of the poses was measured.
+    `measured` is True if the prior of the poses was measured.
 
     Raises:
         LinAlgError: its equations are singular.
     """
-    known, cameras, problem = prior.known, len(prior.known.poses), views.problem()
-    state = initial_state(problem, known, views.start[:, views.taken])
+    known, problem = prior.known, views.problem()
+    state = initial_state(problem, known, views.start)
     clock_s, clock_left_s = _clocks(problem, known, state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)
-    freely = replace(known, acceleration=limber(known.acceleration, _spread_of(cameras)))
-    lasting = freely
-    if known.memory > REMEMBERED:
-        # A detector's lasting errors do not average out, however long a flight is.
-        longer = len(views.t_s) / len(_stretches(len(views.t_s)))
-        lasting = replace(freely, memory=known.memory * longer)
-    system, state, at = solve(problem, lasting, state, rounds=_ROUNDS)
+    system, state, at = solve(problem, known, state, rounds=_ROUNDS)
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
     as_stated = not prior.learned and _scale_unseen(system, state, at)
@@ -271,36 +223,23 @@ def _refined(views: _Views, whole: _Views, guiding: Bool, prior: _Prior, *, meas
     as_logged = prior.learned and not assumed and _position_undetermined(system, state, at, covariance)
     del at  # the next solutions have their own factors
     slow = system, state  # determines the poses
-    of_all = freely
     if known.memory > REMEMBERED:
         still = _without_slow_errors(system, state)
-        begin = state.position
-        if views is not whole:
-            placing = whole.placing if measured else whole.bones
-            still, begin, of_all = _with_all_joints(whole, guiding, placing, system, state, freely)
-        remembering, placed = _joints_without_slow_errors(still, begin, of_all, measured=measured)
-        joints = placed.position
-        covariance = _with_own(covariance, remembering, placed, guiding, measured=measured)
-        state = placed
-    elif _mainly_slow(problem, known, state):
-        slow = _solve_with_loose_motion(problem, known, state)[:2]
-        joints = _joints_without_slow_errors(_without_slow_errors(*slow), slow[1].position, freely)[
-            1
-        ].position
-    else:
-        joints = state.position
-    fallback = doubts or _too_far(joints, whole.start, prior.expected_m)
+        remembering, state = _joints_without_slow_errors(still, state.position, known, measured=measured)
+        covariance = _with_own(covariance, remembering, state)
+    joints = state.position
+    fallback = doubts or _too_far(joints, views.start, prior.expected_m)
     as_logged = as_logged or prior.held_m > 0
-    shift = np.median(whole.start - joints, axis=(0, 1)) if as_logged else np.zeros(3)
+    shift = np.median(views.start - joints, axis=(0, 1)) if as_logged else np.zeros(3)
     return Refined(
         position=joints + shift,
         covariance=covariance + prior.held_m**2 * np.eye(3),
         corrections=_corrections(*slow, shift),
         clock_offset_s=clock_s,
         clock_sigma_s=clock_left_s,
-        levels=_levels(replace(of_all, poses=known.poses)),
-        bone_lengths_m=state.shared[len(state.shared) - len(of_all.bone_sigma_m) :],
-        acceleration=of_all.acceleration,
+        levels=_levels(known),
+        bone_lengths_m=state.shared[len(state.shared) - len(known.bone_sigma_m) :],
+        acceleration=known.acceleration,
         learned=prior.learned,
         warnings=(
             *prior.warnings,
@@ -315,41 +254,14 @@ def _clocks(problem: Problem, known: Knowledge, state: State) -> tuple[Float, Fl
     """Estimate each clock's offset and its standard deviation [C] s, 0 for known clocks."""
     if not (known.clock_sigma_s > 0).any():
         return np.zeros(len(known.poses)), np.zeros(len(known.poses))
-    system, state, at = _solve_with_loose_motion(problem, known, state)
+    system, state, at = solve(problem, known, state, rounds=_ROUNDS)
     left = np.sqrt(np.diagonal(shared_covariance(system, at)))
     return _of_clocks(system, state.shared), _of_clocks(system, left)
-
-
-def _mainly_slow(problem: Problem, known: Knowledge, state: State) -> bool:
-    """Test if pose errors are mainly slow: white ones move a joint in the pictures less than keypoint noise.
-
-    Larger white errors are separated from motion only by the tight motion prior, which must then be kept.
-    """
-    pictures = problem.pictures
-    _, distance = _residuals(problem, state.position)
-    range_m = float(np.nanmedian(distance))
-    blur = known.pixel_scale / float(np.median(pictures.sharpness[pictures.sharpness > 0]))
-    new_m = max(float(np.hypot(shift, range_m * turn)) for shift, turn in (e.white for e in known.poses))
-    return any(errors.processes for errors in known.poses) and new_m < range_m * blur
 
 
 def _spread_of(cameras: int) -> float:
     """Compute the error of a point whose rays, from all directions, each miss it by 1 on two axes."""
     return float(np.sqrt(4.5 / cameras))
-
-
-def _solve_with_loose_motion(
-    problem: Problem, known: Knowledge, state: State
-) -> tuple[System, State, Eliminated]:
-    """Estimate clock offsets and slow pose errors with a looser motion prior (accelerations 3 times larger).
-
-    The accelerations of a gait repeat and are not random. The tight prior makes the swings of limbs smaller.
-    With bones of constant length, this biases clock offsets (by five standard deviations in flights of 4 s)
-    and constant pose errors. With no motion prior at all, a picture would fit anywhere between two times of
-    the skeleton, and some clocks would not be estimated.
-    """
-    loose = replace(known, acceleration=_LOOSE_MOTION**2 * known.acceleration)
-    return solve(problem, loose, state, rounds=_ROUNDS)
 
 
 def _without_slow_errors(system: System, state: State) -> Problem:
@@ -360,38 +272,6 @@ def _without_slow_errors(system: System, state: State) -> Problem:
     return replace(system.problem, pictures=replace(pictures, position=position, rotation=rotation))
 
 
-def _with_all_joints(
-    whole: _Views, guiding: Bool, placing: Int64, system: System, state: State, known: Knowledge
-) -> tuple[Problem, Float, Knowledge]:
-    """Learn the motion, bones and keypoint errors of all joints with the poses that guides determined.
-
-    Returns the problem of all joints, with the bones that are `placing` and without slow pose errors, its
-    start and its prior.
-    """
-    slow = state._replace(white=np.zeros_like(state.white))
-    moved = np.mean(state.position - whole.start[:, guiding], axis=1, keepdims=True)
-    begin = whole.start + moved
-    begin[:, guiding] = state.position
-    views = replace(whole.corrected_by(_corrections(system, slow, np.zeros(3))), start=begin)
-    stretches, start = views.stretches()
-    unlearned = _unlearned(stretches, start, _white_only(system.problem, known), known.clock_sigma_s)
-    first = initial_state(stretches, unlearned, start)
-    learned, first = learn(stretches, unlearned, first, poses=False, memory=True, rounds=_ROUNDS_IN_CORRECTED)
-    acceleration = shrunk(learned.acceleration, stretches.t_s, first.position)
-    lengths_m = first.shared[len(first.shared) - len(views.bones) :]
-    place = (views.bones[:, None] == placing).all(axis=2).any(axis=1)
-    place |= not place.any()  # of some joints, no other pairs are left
-    of_all = replace(
-        learned,
-        poses=known.poses,
-        acceleration=limber(acceleration, _spread_of(len(known.poses))),
-        bone_sigma_m=learned.bone_sigma_m[place],
-        size_m=float(lengths_m[place].mean()),
-        memory=max(learned.memory, known.memory),
-    )
-    return replace(views, bones=views.bones[place]).problem(), begin, of_all
-
-
 def _white_only(problem: Problem, known: Knowledge) -> tuple[PoseErrors, ...]:
     """Return the levels of pose errors where slow ones are removed."""
     knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
@@ -400,80 +280,37 @@ def _white_only(problem: Problem, known: Knowledge) -> tuple[PoseErrors, ...]:
 
 
 def _joints_without_slow_errors(
-    problem: Problem, start: Float, known: Knowledge, *, measured: bool = False
+    problem: Problem, start: Float, known: Knowledge, *, measured: bool
 ) -> tuple[System, State]:
     """Estimate the joints after the removal of slow pose errors, with the full weight of keypoints.
 
-    Slow errors were estimated with correlated keypoints weighted less, or with a looser motion prior. That is
-    right for slow errors and wrong for limbs: their motion would be smoothed away, or become jittery. Clocks
-    and the motion that depends on them stay unknowns.
+    Slow errors were estimated with correlated keypoints weighted less. That is right for slow errors and
+    wrong for limbs: their motion would be smoothed away. Clocks and the motion that depends on them stay
+    unknowns.
 
     Returns the estimate, and a system of the same poses in which correlated keypoints count less again.
     """
     known = replace(known, poses=_white_only(problem, known))
-    freely, bound = 1.0, BOUND
-    if known.memory > REMEMBERED:
-        if measured:
-            # Residuals show only a part of correlated errors. A gate by that part would reject one of two
-            # disagreeing views, by chance.
-            bound = max(BOUND, _OUTLIER / known.pixel_scale)
-        else:
-            freely = _FAST_MOTION**2  # kicks would be smoothed
-    weighted = replace(known, memory=1.0, acceleration=freely * known.acceleration)
+    faster = 1.0 if measured else _FAST_MOTION**2  # kicks would be smoothed
+    weighted = replace(known, memory=1.0, acceleration=faster * known.acceleration)
     initial = initial_state(problem, weighted, start)
-    solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(bound,))
+    solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
     return System(problem, known, solved.layout, BOUND**2), found
 
 
-def _of_single_pictures(problem: Problem, pixel_scale: float, position: Float) -> Float:
-    """Compute the covariance [T, J, 3, 3] m^2 of joints from the pictures nearest to each time alone.
-
-    Pictures have the poses of the problem. A joint that fewer than two cameras see is known to `_ANYWHERE_M`
-    along its rays.
-    """
-    pictures, whole = problem.pictures, _nearest(problem)
-    information = np.tile(_ANYWHERE_M**-2 * np.eye(3), (*position.shape[:2], 1, 1))
-    for rows in (slice(k, k + AT_ONCE) for k in range(0, len(whole), AT_ONCE)):
-        nearest, rotation = whole[rows], pictures.rotation[rows]
-        own = np.einsum("gji,gkj->gki", rotation, position[nearest] - pictures.position[rows, None])
-        depth = np.where(own[..., 2] > 0.1, own[..., 2], np.inf)
-        across = np.broadcast_to(np.eye(3)[:2], (*depth.shape, 2, 3)).copy()
-        across[..., 2] = -own[..., :2] / depth[..., None]
-        across = across @ np.swapaxes(rotation, 1, 2)[:, None]
-        weight = (pictures.sharpness[rows] / (pixel_scale * depth)) ** 2
-        np.add.at(information, nearest, weight[..., None, None] * np.swapaxes(across, -1, -2) @ across)
-    return np.asarray(np.linalg.inv(information), dtype=np.float64)
-
-
-def _with_own(covariance: Float, system: System, state: State, guiding: Bool, *, measured: bool) -> Float:
+def _with_own(covariance: Float, system: System, state: State) -> Float:
     """Compute covariances [T, J, 3, 3] of joints: each has its own error, and one by slow pose errors.
 
-    Where keypoint errors last longer than motion is smooth, a joint's own error is that of a single picture.
-    Where pose errors were not measured, they and lasting keypoint errors look alike, and it stays wider. A
-    joint that did not determine the cameras has the error by poses of the guide that is mostly the nearest.
-
     Args:
-        covariance: [T, G, 3, 3] of the estimate of the guides and cameras, or [T, J, 3, 3] of all joints.
+        covariance: [T, J, 3, 3] of the estimate of the joints and cameras together.
         system: in it slow pose errors are removed, and correlated keypoints count less.
         state: the estimate of this system.
-        guiding: [J]
-        measured: pose errors were measured, by backgrounds.
     """
-    position = state.position
     own = covariances(system, eliminate(system, state))
-    of = np.flatnonzero(guiding) if covariance.shape[1] < position.shape[1] else np.arange(position.shape[1])
-    found = own.copy()
-    if measured:
-        least = _of_single_pictures(system.problem, system.knowledge.pixel_scale, position)
-        single = np.trace(least, axis1=2, axis2=3) < np.trace(own, axis1=2, axis2=3)
-        found[single] = least[single]
-    for joint in range(position.shape[1]):
-        away = np.linalg.norm(position[:, of] - position[:, joint, None], axis=-1)
-        near = np.argmin(np.median(away, axis=0))
-        by_poses = covariance[:, near] - own[:, of[near]]
-        variance, axes = np.linalg.eigh(0.5 * (by_poses + by_poses.swapaxes(-1, -2)))
-        found[:, joint] += np.einsum("tij,tj,tkj->tik", axes, np.maximum(variance, 0.0), axes)
-    return found
+    by_poses = covariance - own
+    variance, axes = np.linalg.eigh(0.5 * (by_poses + by_poses.swapaxes(-1, -2)))
+    both: Float = own + np.einsum("tjik,tjk,tjlk->tjil", axes, np.maximum(variance, 0.0), axes)
+    return both
 
 
 def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, Float]:
@@ -600,7 +437,6 @@ def _priors(
         _, known, state = found[name]
         if name != "estimated":
             known, state = learn(problem, known, state, poses=False, memory=False, rounds=_FEWER_ROUNDS)
-        known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
         most = min(_UNEXPLAINED * image, _LEFT_BY_GIVEN * free.pixel_scale)
         if known.memory < REMEMBERED and known.pixel_scale > most:
             raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
@@ -640,13 +476,11 @@ def _measured_prior(
         levels = [as_usual] if found is None else [found, as_usual]
     measured_m = float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     expected_m = _spread_of(len(prior)) * max(_FARTHEST * disagreement_m, _FARTHEST_STATED * measured_m)
-    acceleration = shrunk(known.acceleration, problem.t_s, state.position)
     for number, level in enumerate(levels, 1):
-        settled = replace(level, acceleration=acceleration)
-        yield _Prior(settled, learned=number < len(levels), warnings=(), expected_m=expected_m)
+        yield _Prior(level, learned=number < len(levels), warnings=(), expected_m=expected_m)
     if any(errors.assumed for errors in prior):
         levels_held = {kind: _HELD * sigma for kind, sigma in _usual_levels(guessed).items()}
-        held = _of_levels(replace(known, acceleration=acceleration), levels_held)
+        held = _of_levels(known, levels_held)
         ray_m = _ray_sigma_m(PoseErrors(USUAL_CONSTANT, ()), range_m)
         held_m = _spread_of(len(prior)) * ray_m / float(np.sqrt(3))
         yield _Prior(held, learned=False, warnings=(), expected_m=expected_m, held_m=held_m)
