@@ -24,8 +24,7 @@ import yaml  # type: ignore[import-untyped]
 
 from benchmarks.flights import SAMPLE
 from benchmarks.results import fixed, keep, markdown_table
-from pipelines.batch import Settings as BatchSettings
-from pipelines.batch import batch
+from pipelines.batch import BatchSettings, batch
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
 from pipelines.simulate import simulate

@@ -23,7 +23,7 @@ from mocap_cli.terminal import one_line, print_json, say, watching
 
 if TYPE_CHECKING:
     from mocap_cli.options import ChosenPictures
-    from pipelines.batch import Settings
+    from pipelines.batch import BatchSettings
 
 GONE = {
     "--every": "write --pictures ::N",
@@ -31,12 +31,12 @@ GONE = {
 }
 
 
-def _settings(stages: str, pictures: ChosenPictures, **others: Any) -> Settings:
-    from pipelines.batch import Settings
+def _settings(stages: str, pictures: ChosenPictures, **others: Any) -> BatchSettings:
+    from pipelines.batch import BatchSettings
 
     names = tuple(name.strip() for name in stages.split(",") if name.strip())
     start_s, end_s = pictures.start_s, pictures.end_s
-    return Settings(stages=names, every=pictures.every, start_s=start_s, end_s=end_s, **others)
+    return BatchSettings(stages=names, every=pictures.every, start_s=start_s, end_s=end_s, **others)
 
 
 _settings_options = grouped(
@@ -93,7 +93,7 @@ def batch_command(
     output: Path | None,
     workers: int | None,
     scheduler: str | None,
-    settings: Settings,
+    settings: BatchSettings,
     force: bool,
     overwrite: bool,
     shown: Shown,
@@ -106,7 +106,7 @@ def batch_command(
     if workers is not None and scheduler is not None:
         raise click.UsageError("--workers are those of this machine: leave them out with --scheduler.")
     from pipelines.batch import batch
-    from pipelines.session.stores import url_of
+    from pipelines.session.urls import url_of
 
     with watching(shown.level) as progress:
         result = batch(

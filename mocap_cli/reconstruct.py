@@ -165,19 +165,19 @@ def reconstruct_command(
     """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
     from pipelines.precompile import precompile_for
     from pipelines.reconstruct import reconstruct
-    from pipelines.session.clusters import Cluster, connected
+    from pipelines.session.parallel import connected
     from pipelines.session.stages import open_session
 
     open_session(session)  # a wrong session is refused before anything is compiled
     with watching(shown.level) as progress, ExitStack() as stack:
-        cluster = Cluster.of(stack.enter_context(connected(scheduler))) if scheduler else None
+        client = stack.enter_context(connected(scheduler, progress)) if scheduler else None
         precompile_for("reconstruct", progress)
         result = reconstruct(
             session,
             settings,
             strict=strict,
             workers=workers,
-            cluster=cluster,
+            executor=client and client.get_executor(pure=False),
             force=force,
             progress=progress,
         )

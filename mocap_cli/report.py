@@ -16,7 +16,7 @@ from mocap_cli.options import (
     output_options,
     overwrite_option,
 )
-from mocap_cli.several import end, expanded, session_here, tell
+from mocap_cli.several import end, expanded, tell
 from mocap_cli.terminal import print_json, say, say_warnings, watching
 from pipelines.session.errors import MocapError
 
@@ -73,6 +73,7 @@ def report_command(
     better, by how much, and if that is more than noise.
     """
     from pipelines.report import compare_sessions, report, write_figures_of
+    from pipelines.session.urls import session_here
 
     ones = expanded(sessions)
     if output is not None and len(ones) < 2:

@@ -2,8 +2,8 @@
 
 import functools
 import glob
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ def expanded(paths: Iterable[str | Path]) -> list[Path]:
 
 
 def _matching(pattern: str) -> list[str]:
-    from pipelines.session.stores import matching, url_of
+    from pipelines.session.urls import matching, url_of
 
     found = matching(url_of(pattern) or pattern)
     if not found:
@@ -46,36 +46,23 @@ def _matching(pattern: str) -> list[str]:
     return found
 
 
-@contextmanager
-def session_here(place: Path, *, create: bool = False, quiet: bool = True) -> Iterator[Path]:
-    """Yield the folder of a session; one in an object store is fetched, and published when it has changed.
-
-    Args:
-        create: allow a URL at which there is no session yet.
-        quiet: do not print what was published.
-    """
-    if not is_url(place):
-        yield place
-        return
-    from pipelines.session.stores import staged, url_of
-
-    with staged(url_of(place) or "", create=create) as copy:
-        yield copy.folder
-        if copy.publish() and not quiet:
-            say(f"published: {copy.version}")
-
-
 def _here(stack: ExitStack, argument: str, suffix: str, options: dict[str, Any]) -> dict[str, Any]:
     """Return a command's options with places of object stores replaced by copies, until the stack ends."""
     place, output = options[argument], options.get("output")
-    quiet = bool(options.get("as_json") or options.get("quiet"))
     own: dict[str, Any] = {}
     if is_url(place):
-        from pipelines.session.stores import fetched, holds_session, url_of
+        from pipelines.session.urls import fetched, holds_session, session_here, url_of
 
         url = url_of(place) or ""
+        if options.get("scheduler"):
+            raise DataError(
+                url,
+                "is copied to this machine, where no worker of a cluster sees it",
+                "leave --scheduler out, or copy the session to a folder that all machines see",
+                code="bad-option",
+            )
         if argument == "session" or (argument == "path" and holds_session(url)):
-            own[argument] = stack.enter_context(session_here(place, quiet=quiet))
+            own[argument] = stack.enter_context(session_here(place))
             if suffix and output is None:  # beside the session is nowhere: into the working directory
                 own["output"] = Path(place.name).with_suffix(suffix)
         else:
@@ -89,7 +76,9 @@ def _here(stack: ExitStack, argument: str, suffix: str, options: dict[str, Any])
                 "write it here, and copy it there",
                 code="url-refused",
             )
-        own["output"] = stack.enter_context(session_here(output, create=True, quiet=quiet))
+        from pipelines.session.urls import session_here
+
+        own["output"] = stack.enter_context(session_here(output, create=True))
     return options | own
 
 

@@ -38,7 +38,7 @@ def say(text: str = "", *, err: bool = False) -> None:
     Copies of what lies in an object store are called by its URL.
     """
     if "/mocap/stores/" in text:
-        from pipelines.session.stores import as_urls
+        from pipelines.session.urls import as_urls
 
         text = as_urls(text)
     click.echo("".join(c if _is_shown(c) else "?" for c in text), err=err)

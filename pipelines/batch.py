@@ -1,8 +1,8 @@
 """Stages over many flights, on Dask; this is the only module above the stages.
 
-A flight is one task, and on a cluster so is each block of its pictures. If a worker dies, only its current
-task is interrupted; the next worker continues a flight where its stages stopped. Sessions are the same as
-those of single runs, byte for byte.
+A flight is one task. If a worker dies, the next one continues the flight where its stages stopped. Sessions
+are the same as those of single runs, byte for byte. A session at a URL is uploaded once, when its flight is
+done.
 """
 
 import csv
@@ -13,7 +13,8 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from concurrent.futures import as_completed
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -27,14 +28,14 @@ from pipelines.replan import replan
 from pipelines.report import report
 from pipelines.reporting.flights import COLUMNS, FlightRow, render_flights
 from pipelines.reporting.wording import cell_text
-from pipelines.session.clusters import Cluster, connected, local_cluster, result_of
 from pipelines.session.description import read_description
 from pipelines.session.errors import BusyError, DataError, MocapError
+from pipelines.session.parallel import connected, local_cluster, result_of
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.registries import need
 from pipelines.session.stages import names_of
 from pipelines.session.storage import as_data_error, make_folder, read_json, write_whole
-from pipelines.session.stores import as_urls, fetched, get, put, staged, url_of
+from pipelines.session.urls import as_urls, fetched, get, put, session_here, url_of
 
 STAGES = ("ingest", "reconstruct", "replan-compare", "report")
 
@@ -46,8 +47,8 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Settings for every flight."""
+class BatchSettings:
+    """BatchSettings for every flight."""
 
     stages: tuple[str, ...] = STAGES
     method: Method | Literal["refined", "auto"] = "auto"
@@ -63,10 +64,9 @@ class Job:
 
     flight: Path  # absolute, because workers have other working directories
     session: Path
-    settings: Settings
+    settings: BatchSettings
     force: bool
-    threads: int = 1  # blocks of its pictures in parallel; results do not depend on it
-    shared: bool = False  # blocks are tasks of the cluster instead, which any of its workers takes
+    workers: int = 1  # blocks of its pictures in parallel; results do not depend on it
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,10 @@ class Outcome:
     figures: dict[str, float] = field(default_factory=dict)  # by column of the summary
     warnings: tuple[str, ...] = ()
     doubt: str | None = None  # code of the doubt that explains the most
+    reported: bool = False  # the session has a report, perhaps of an earlier run
     seconds: dict[str, dict[str, float]] = field(default_factory=dict)  # of every stage: wall and cpu
     peak_memory_mb: float | None = None  # of the worker, up to the end of this flight
     worker: int | None = None  # its process id
-    version: str | None = None  # URL of the session's files, if it was published in an object store
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Batch:
 def batch(
     flights: Sequence[Path],
     output: Path | None = None,
-    settings: Settings | None = None,
+    settings: BatchSettings | None = None,
     *,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -120,7 +120,7 @@ def batch(
         output: the folder of the sessions and the summary. By default sessions lie beside their manifests,
             and the summary in `batch/` of the working directory.
         workers: the number of processes on this machine, one flight each; by default one for each core. Not
-            used with `scheduler`. If there are fewer flights than workers, a flight gets more threads.
+            used with `scheduler`. If there are fewer flights than workers, a flight gets several.
         scheduler: the address of a Dask cluster, which reads and writes the same folders by the same paths.
         overwrite: replace files that have the names of the summary's but are not of a batch.
 
@@ -128,7 +128,7 @@ def batch(
         DataError: Dask is not installed, no scheduler answers, sessions would have the same name, or the
             summary cannot be written. Errors of a flight are in its row.
     """
-    settings, progress = settings or Settings(), progress or Silent()
+    settings, progress = settings or BatchSettings(), progress or Silent()
     unknown = [stage for stage in settings.stages if stage not in STAGES]
     if unknown:
         raise DataError(
@@ -139,9 +139,9 @@ def batch(
     folder = output or Path(_FOLDER)
     _refuse_foreign(folder, overwrite)
     workers = workers or os.cpu_count() or 1
-    threads = 1 if scheduler else max(1, workers // max(len(flights), 1))
+    for_each = 1 if scheduler else max(1, workers // max(len(flights), 1))
     jobs = [
-        Job(_absolute(flight), _absolute(session), settings, force, threads, scheduler is not None)
+        Job(_absolute(flight), _absolute(session), settings, force, for_each)
         for flight, session in zip(flights, _sessions(flights, output), strict=True)
     ]
     outcomes = dict(_outcomes(jobs, workers, scheduler, progress))
@@ -152,25 +152,22 @@ def batch(
 
 
 def run_flight(job: Job) -> Outcome:
-    """Run all stages of one flight; errors are part of the outcome.
-
-    A session in an object store is published after each stage, so that another worker continues from there.
-    """
-    with ExitStack() as stack:
-        try:
-            if flight := url_of(job.flight):
-                job = replace(job, flight=fetched(flight, fresh=True))
-            if (place := url_of(job.session)) is None:
-                return _run_stages(job, lambda: None)
-            copy = _patiently(lambda: stack.enter_context(staged(place, create=True)))
-        except MocapError as error:
-            return Outcome(failed_stage=job.settings.stages[0], error=" ".join(str(error).split()))
-        outcome = _run_stages(replace(job, session=copy.folder), copy.publish)
-        return replace(outcome, version=copy.version)
+    """Run all stages of one flight, and upload its session if that lies at a URL; raise no error."""
+    outcome = Outcome()
+    try:
+        with ExitStack() as stack:
+            folder = _patiently(lambda: stack.enter_context(session_here(job.session, create=True)))
+            flight = url_of(job.flight)
+            here = fetched(flight, fresh=True) if flight else job.flight
+            outcome = _run_stages(replace(job, flight=here, session=folder))
+    except MocapError as error:  # of a store: before the first stage, or in the upload after the last
+        stage = job.settings.stages[-1 if outcome.seconds else 0]
+        outcome = replace(outcome, failed_stage=stage, error=" ".join(str(error).split()))
+    return outcome
 
 
-def _run_stages(job: Job, publish: Callable[[], object]) -> Outcome:
-    """Run all stages of one flight, and publish after each."""
+def _run_stages(job: Job) -> Outcome:
+    """Run all stages of one flight."""
     failed: dict[str, str] = {}  # the first error, by its stage
     finished: list[str] = []
     seconds: dict[str, dict[str, float]] = {}
@@ -181,7 +178,6 @@ def _run_stages(job: Job, publish: Callable[[], object]) -> Outcome:
         wall_s, cpu_s = time.perf_counter(), time.process_time()
         try:
             unchanged &= _patiently(partial(_run, stage, job))
-            publish()
             finished.append(stage)
         except MocapError as error:
             failed = failed or {stage: str(error)}
@@ -203,6 +199,7 @@ def _run_stages(job: Job, publish: Callable[[], object]) -> Outcome:
         failed_stage=next(iter(failed), None),
         error=next((" ".join(line.split()) for line in failed.values()), None),
         unchanged=unchanged and not failed,
+        reported=(job.session / "report" / "index.html").is_file(),
         seconds=seconds,
         peak_memory_mb=_peak_memory_mb(),
         worker=os.getpid(),
@@ -228,10 +225,7 @@ def _run(stage: str, job: Job) -> bool:
                 start_s=chosen.start_s,
                 end_s=chosen.end_s,
             )
-            cluster = Cluster.of_task() if job.shared else None
-            return reconstruct(
-                job.session, settings, workers=job.threads, cluster=cluster, force=job.force
-            ).skipped
+            return reconstruct(job.session, settings, workers=job.workers, force=job.force).skipped
         case "replan-compare":
             return replan(job.session, force=job.force).skipped
         case _:
@@ -288,33 +282,20 @@ def _outcomes(
     jobs: Sequence[Job], workers: int, scheduler: str | None, progress: Progress
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield the number and outcome of every job, in the order in which they end."""
-    distributed = need("distributed", "batch")
     progress.start("Flights", len(jobs))
-    with _client(min(workers, len(jobs)), scheduler) as client:
-        futures = {client.submit(run_flight, job, pure=False): k for k, job in enumerate(jobs)}
-        if scheduler and not client.scheduler_info()["workers"]:
-            progress.note(f"{scheduler} has no workers yet: waiting for them")
-        for future in distributed.as_completed(futures):
-            k = futures[future]
-            outcome = _result(future, jobs[k])
+    on_dask = connected(scheduler, progress) if scheduler else local_cluster(min(workers, len(jobs)))
+    with on_dask as client, client.get_executor(pure=False) as executor:
+        numbers = {executor.submit(run_flight, job): number for number, job in enumerate(jobs)}
+        for future in as_completed(numbers):
+            number = numbers[future]
+            try:
+                outcome: Outcome = result_of(future, jobs[number].flight)
+            except MocapError as error:  # of the cluster, because a job itself raises nothing
+                outcome = Outcome(error=str(error))
             if outcome.error is not None:
                 progress.note(f"failed: {_as_here(outcome.error)}")
             progress.advance()
-            yield k, outcome
-
-
-def _result(future: Any, job: Job) -> Outcome:
-    """Return the outcome of a finished task; the job itself raises nothing, so an error is the cluster's."""
-    try:
-        result: Outcome = result_of(future, job.flight)
-    except MocapError as error:
-        return Outcome(error=str(error))
-    return result
-
-
-def _client(workers: int, scheduler: str | None) -> AbstractContextManager[Any]:
-    """Connect to the cluster at an address, or to a temporary local one."""
-    return local_cluster(workers) if scheduler is None else connected(scheduler)
+            yield number, outcome
 
 
 # --- the summary ---------------------------------------------------------------------------------------
@@ -360,9 +341,7 @@ def _refuse_foreign(folder: Path, overwrite: bool) -> None:
 def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:
     """Make a row of the summary, with paths relative to the summary's folder."""
     page = job.session / "report" / "index.html"
-    report = _from(folder, page) if page.is_file() else None
-    if outcome.version is not None:
-        report = f"{outcome.version}/report/index.html"
+    report = _from(folder, page) if outcome.reported else None
     return FlightRow(
         flight=_from(folder, job.flight),
         name=outcome.name,

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -30,18 +30,17 @@ from pipelines.follow import Block as FollowedBlock
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.keypoints.hints import Hint, actor_hints
 from pipelines.keypoints.tracking import PeopleTracker
-from pipelines.session.clusters import Cluster, SharedSession, contents_of, write_contents
 from pipelines.session.description import (
     Description,
     MediaEntry,
     read_description,
 )
 from pipelines.session.errors import DataError
+from pipelines.session.parallel import SharedSession, contents_of, each_part, write_contents
 from pipelines.session.people import logged_people
-from pipelines.session.progress import Halt, Progress, Silent, side_by_side
+from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Detections
 from pipelines.session.registries import (
-    AcceleratedDetector,
     Detector,
     KeypointNetworks,
     advice_on,
@@ -67,6 +66,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DETECT = Stage("detect", revision=5)
+
+# A process takes 2 s to start, in which this one looks at 40 pictures. Fewer than these are not worth it.
+MIN_PICTURES_FOR_PROCESSES = 150
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def detect(
     workers: int = 1,
     force: bool = False,
     following: Following | None = None,
-    cluster: Cluster | None = None,
+    executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> StageRecord | None:
     """Detect keypoints for cameras without imported ones.
@@ -116,10 +118,10 @@ def detect(
         start_s: use only pictures at or after this time, in seconds since the flight's first frame of any
             camera, also of those with keypoints; by default from the first.
         end_s: use only pictures before this time; by default to the last.
-        workers: the number of blocks in parallel; the result does not depend on it.
+        workers: the number of processes of this machine; the result does not depend on it.
         force: run it again even if nothing changed.
         following: is shown the pictures too.
-        cluster: works on the blocks instead of threads of this process.
+        executor: works on the blocks instead of these processes.
         progress: receives the progress.
 
     Returns:
@@ -176,13 +178,8 @@ def detect(
             code="no-overlap",
         )
     progress.start("Detecting keypoints", pictures)
-    if cluster is not None:
-        _gather(cluster, run, work, blocks, chosen, people == 1, following, progress)
-    hints_at = _Hints(session.folder, description, media, only_one=people == 1)
-    produce = partial(_produce_here, work, hints_at, chosen, people == 1, following, progress)
-    folders = side_by_side(
-        lambda block: run.chunk(block.name, partial(produce, block)), blocks, workers=workers, halt=work.halt
-    )
+    workers = 1 if pictures < MIN_PICTURES_FOR_PROCESSES else workers
+    folders = _detected(run, work, blocks, chosen, people == 1, following, workers, executor, progress)
     counts = _assemble(run.folder, media, blocks, folders)
     _refuse_nobody(session.folder, counts, pictures)
     joints = list(read_json(folders[0] / "counts.json")["joints"])
@@ -326,7 +323,6 @@ class _Work:
     ) -> None:
         self.folder = folder
         self.every = every
-        self.halt = Halt()
         self.description = description
         self._frames = {
             name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
@@ -394,7 +390,7 @@ def _span_words(start_s: float | None, end_s: float | None) -> str:
 
 @dataclass(frozen=True)
 class _Order:
-    """A block for a worker of a Dask cluster."""
+    """A block for a worker."""
 
     session: SharedSession
     detector: Detector
@@ -417,7 +413,7 @@ def detect_block(order: _Order) -> tuple[dict[str, bytes], dict[str, bytes] | No
             order.detector.name,
             "has other model files on a machine of the Dask cluster, or none",
             "every machine needs the same ones (see `mocap models`)",
-            code="wrong-model",
+            code="wrong-worker",
         )
     description = read_description(folder)
     work = _Work(folder, description, order.every, (None, None))
@@ -427,23 +423,24 @@ def detect_block(order: _Order) -> tuple[dict[str, bytes], dict[str, bytes] | No
         detected, followed = Path(place, "detected"), Path(place, "followed")
         detected.mkdir()
         followed.mkdir()
-        _produce(work, hints, order.detector, order.only_one, part, Silent(), order.block, detected)
+        _produce(work, hints, order.detector, order.only_one, part, order.block, detected)
         if part is not None:
             part.write(followed)
         return contents_of(detected), None if part is None else contents_of(followed)
 
 
-def _gather(
-    cluster: Cluster,
+def _detected(
     run: Run,
     work: _Work,
     blocks: Sequence[Block],
     detector: Detector,
     only_one: bool,
     following: Following | None,
+    workers: int,
+    executor: Executor | None,
     progress: Progress,
-) -> None:
-    """Have the blocks that no earlier run finished worked on by a cluster, and store them as they come."""
+) -> list[Path]:
+    """Return the folders of all blocks; those that no earlier run finished are worked on now."""
     session, models = SharedSession.at(work.folder), hashes_of_models(detector)
     missing = [block for block in blocks if not run.has_chunk(block.name)]
     orders = [
@@ -451,32 +448,19 @@ def _gather(
         for block in missing
     ]
     progress.advance(sum(work.pictures(block) for block in blocks if block not in missing))
-    on_gpu = isinstance(detector, AcceleratedDetector) and detector.provider != "cpu"
-    with closing(cluster.each(detect_block, orders, on_gpu=on_gpu, progress=progress)) as found:
+    made = {block: run.chunk(block.name, _never) for block in blocks if block not in missing}
+    with closing(each_part(detect_block, orders, workers=workers, executor=executor)) as found:
         for number, (detected, followed) in found:
             block, background = missing[number], orders[number].followed
             if following is not None and background is not None and followed is not None:
                 following.keep(background, partial(write_contents, followed))
-            run.chunk(block.name, partial(write_contents, detected))
+            made[block] = run.chunk(block.name, partial(write_contents, detected))
             progress.advance(work.pictures(block))
+    return [made[block] for block in blocks]
 
 
-def _produce_here(
-    work: _Work,
-    hints: _Hints,
-    detector: Detector,
-    only_one: bool,
-    following: Following | None,
-    progress: Progress,
-    block: Block,
-    folder: Path,
-) -> None:
-    """Write what the detector finds in the pictures of one block, and store its background."""
-    background = _followed(following, block)
-    part = None if background is None else FollowedPart(background)
-    _produce(work, hints, detector, only_one, part, progress, block, folder)
-    if following is not None and part is not None:
-        following.keep(part.block, part.write)
+def _never(place: Path) -> None:
+    raise RuntimeError(f"{place} was finished before")
 
 
 def _followed(following: Following | None, block: Block) -> FollowedBlock | None:
@@ -490,7 +474,6 @@ def _produce(
     detector: Detector,
     only_one: bool,
     part: FollowedPart | None,
-    progress: Progress,
     block: Block,
     folder: Path,
 ) -> None:
@@ -510,8 +493,6 @@ def _produce(
         if part is not None and before:
             part.see(before[0], next(decoded))
         for number, picture, hints_here in zip(numbers, decoded, hints.at(block.camera, t_ns), strict=True):
-            work.halt.check()
-            progress.advance()
             if part is not None:
                 part.see(number, picture)
             if picture is None:

@@ -41,8 +41,8 @@ from pipelines.session.storage import (
     sync,
     write_json,
 )
-from pipelines.session.stores import is_there
 from pipelines.session.tables import ANGLES, FRAMES, POSES, SKELETON, read_motion, read_table, trajectory_from
+from pipelines.session.urls import is_there
 from pipelines.session.whole_folders import working_folder
 from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
 

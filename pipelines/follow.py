@@ -11,6 +11,7 @@ others, but that picture binds them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -22,10 +23,10 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bytes, Int64, Picture
 from pipelines.reconstruction.background_tracks import Follower, rows_to_follow, still_name, tracks_path
-from pipelines.session.clusters import Cluster, SharedSession, contents_of, write_contents
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
-from pipelines.session.progress import Halt, Progress, Silent, side_by_side
+from pipelines.session.parallel import SharedSession, contents_of, each_part, write_contents
+from pipelines.session.progress import Progress, Silent
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import WritableSession
 from pipelines.session.storage import hash_of, read_json, write_json
@@ -36,6 +37,9 @@ BACKGROUND = Stage("background", revision=1)
 
 BLOCK = 300
 """Rows of a camera's frames in a block: ten seconds of work are a small loss."""
+
+# A process takes 2 s to start, in which this one looks at 150 pictures. Fewer than these are not worth it.
+MIN_PICTURES_FOR_PROCESSES = 600
 
 _STILL_S = 0.9  # between stills
 _MOST_STILLS = 200
@@ -114,31 +118,21 @@ class FollowedPart:
 
 
 def follow_block(order: tuple[SharedSession, Block]) -> dict[str, bytes]:
-    """Follow through the pictures of a block on a worker of a Dask cluster; return its files.
+    """Follow through the pictures of a block on a worker; return its files.
 
     Raises:
         DataError: the worker has no such session or pictures, or others.
     """
     session, block = order
     folder = session.opened()
-    part = _follow(folder, read_description(folder), block, Halt(), Silent())
+    part = FollowedPart(block)
+    before = [] if block.before is None else [block.before]
+    with open_pictures(folder, read_description(folder), block.camera) as pictures:
+        for number in before + block.numbers.tolist():
+            part.see(number, pictures.read(number))
     with TemporaryDirectory() as place:
         part.write(Path(place))
         return contents_of(Path(place))
-
-
-def _follow(
-    folder: Path, description: Description, block: Block, halt: Halt, progress: Progress
-) -> FollowedPart:
-    """Show the pictures of one block to its part."""
-    part = FollowedPart(block)
-    before = [] if block.before is None else [block.before]
-    with open_pictures(folder, description, block.camera) as pictures:
-        for number in before + block.numbers.tolist():
-            halt.check()
-            part.see(number, pictures.read(number))
-            progress.advance(number != block.before)
-    return part
 
 
 class Following:
@@ -193,13 +187,13 @@ class Following:
         self._kept.add(block.name)
 
     def finish(
-        self, *, workers: int = 1, cluster: Cluster | None = None, progress: Progress | None = None
+        self, *, workers: int = 1, executor: Executor | None = None, progress: Progress | None = None
     ) -> StageRecord:
         """Follow through the pictures that nobody showed, and publish the stage.
 
         Args:
-            workers: the number of blocks in parallel; the result does not depend on it.
-            cluster: works on the blocks instead of threads of this process.
+            workers: the number of processes of this machine; the result does not depend on it.
+            executor: works on the blocks instead of these processes.
             progress: receives the progress.
 
         Raises:
@@ -209,18 +203,18 @@ class Following:
         if self._run.finished:
             return self._run.record
         blocks = [block for seen in self._seen.values() for block in seen]
-        left = [len(block.numbers) for block in blocks if block.name not in self._kept]
+        left = sum(len(block.numbers) for block in blocks if block.name not in self._kept)
         if left:
-            progress.start("Following backgrounds", sum(left))
-        if cluster is not None:
-            self._gather(cluster, blocks, progress)
-        halt = Halt()
-
-        def follow(block: Block) -> Path:
-            return self._run.chunk(block.name, partial(self._produce, block, halt, progress))
-
-        folders = side_by_side(follow, blocks, workers=workers, halt=halt)
-        made = {block.name: folder for block, folder in zip(blocks, folders, strict=True)}
+            progress.start("Following backgrounds", left)
+        missing = [block for block in blocks if not self._run.has_chunk(block.name)]
+        workers = 1 if left < MIN_PICTURES_FOR_PROCESSES else workers
+        session = SharedSession.at(self._folder)
+        orders = [(session, block) for block in missing]
+        with closing(each_part(follow_block, orders, workers=workers, executor=executor)) as found:
+            for number, contents in found:
+                self.keep(missing[number], partial(write_contents, contents))
+                progress.advance(len(missing[number].numbers))
+        made = {block.name: self._run.chunk(block.name, _never) for block in blocks}
         counts = {
             name: self._assemble(name, [made[block.name] for block in seen])
             for name, seen in self._seen.items()
@@ -250,20 +244,6 @@ class Following:
             blocks.append(Block(camera, first, before, numbers[own], numbers[np.intersect1d(own, stills)]))
         return blocks
 
-    def _produce(self, block: Block, halt: Halt, progress: Progress, folder: Path) -> None:
-        """Follow through the pictures of one block."""
-        _follow(self._folder, self._description, block, halt, progress).write(folder)
-
-    def _gather(self, cluster: Cluster, blocks: list[Block], progress: Progress) -> None:
-        """Have the blocks that were not shown worked on by a cluster, and store them as they come."""
-        missing = [block for block in blocks if not self._run.has_chunk(block.name)]
-        session = SharedSession.at(self._folder)
-        orders = [(session, block) for block in missing]
-        with closing(cluster.each(follow_block, orders, progress=progress)) as found:
-            for number, contents in found:
-                self.keep(missing[number], partial(write_contents, contents))
-                progress.advance(len(missing[number].numbers))
-
     def _assemble(self, camera: str, parts: Iterable[Path]) -> dict[str, int]:
         """Join the parts of a camera; return their counts."""
         total = {"pictures": 0, "undecoded": 0, "points": 0, "stills": 0}
@@ -282,3 +262,7 @@ class Following:
 
         join_tables(tracks_path(folder), tables(), TRACKS)
         return total
+
+
+def _never(place: Path) -> None:
+    raise RuntimeError(f"{place} was finished before")

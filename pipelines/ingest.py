@@ -40,7 +40,6 @@ from pipelines.session.registries import MapFormat, noise_models, recognise
 from pipelines.session.stage_records import Stage, StageRecord, note_sources
 from pipelines.session.stages import Run, locked
 from pipelines.session.storage import read_json, write_json
-from pipelines.session.stores import as_urls, located, media_path, named
 from pipelines.session.tables import (
     ACTOR,
     CAMERA_POSES,
@@ -54,6 +53,7 @@ from pipelines.session.tables import (
     trajectory_from,
     write_table,
 )
+from pipelines.session.urls import as_urls, located, media_path, named
 from pipelines.sources.cameras import FlightCameras
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.hashes import fetch_sources, hash_sources, refuse_written, source_stamps, stated_paths

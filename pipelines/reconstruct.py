@@ -7,6 +7,7 @@ Detect people in the pictures and follow backgrounds where that was not done; re
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,6 @@ from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import noise_text
 from pipelines.reconstruction.trials import PoseDisturbance, disturbed, summary_of_trials
 from pipelines.segmented import by_segments, stated_segments
-from pipelines.session.clusters import Cluster
 from pipelines.session.description import Description, Doubt, read_description, said_assumptions, said_doubts
 from pipelines.session.errors import DataError
 from pipelines.session.memory import Waiting, return_freed_arrays
@@ -66,7 +66,7 @@ def reconstruct(
     *,
     strict: bool = False,
     workers: int = 1,
-    cluster: Cluster | None = None,
+    executor: Executor | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Reconstructed:
@@ -76,8 +76,8 @@ def reconstruct(
         folder: the session.
         settings: the settings that determine the result.
         strict: refuse a flight that is doubted.
-        workers: the number of threads; the result does not depend on it.
-        cluster: works on the pictures instead of threads; neither does the result depend on that.
+        workers: the number of processes and threads; the result does not depend on it.
+        executor: works on the pictures and segments instead; neither does the result depend on that.
         force: run it again even if nothing changed, and the detection too.
         progress: receives the progress.
 
@@ -102,10 +102,10 @@ def reconstruct(
         description = read_description(folder)
         settings = replace(settings, people=settings.people or ("auto" if description.actors else 1))
         following, left_out = _following(session, description, settings, force)
-        detected = _detected(session, settings, workers, force, following, cluster, progress)
+        detected = _detected(session, settings, workers, force, following, executor, progress)
         background = None
         if following is not None:
-            background, left_out = _finished(following, settings, workers, cluster, progress)
+            background, left_out = _finished(following, settings, workers, executor, progress)
         measured = measured_for(detected.settings["detector"]) if detected else None
         base, t_ns = load_time_base(folder, description, detected, settings.rate_hz)
         keypoints = len(description.cameras) * len(common_joints(folder, description, detected))
@@ -123,7 +123,7 @@ def reconstruct(
 
         source = Source(folder, description, settings, detected, background is not None, left_out)
         if len(segments) > 1:
-            outcome = by_segments(run, source, segments, base, workers, cluster, strict, progress)
+            outcome = by_segments(run, source, segments, base, workers, executor, strict, progress)
         else:
             outcome = _at_once(run.folder, source, disturbance, workers, strict, progress)
         record = run.publish(
@@ -187,7 +187,7 @@ def _detected(
     workers: int,
     force: bool,
     following: Following | None,
-    cluster: Cluster | None,
+    executor: Executor | None,
     progress: Progress,
 ) -> StageRecord | None:
     """Run the stage `detect`; return None if every camera has imported keypoints."""
@@ -201,7 +201,7 @@ def _detected(
         workers=workers,
         force=force,
         following=following,
-        cluster=cluster,
+        executor=executor,
         progress=progress,
     )
     if detected is None and (settings.start_s, settings.end_s) != (None, None):
@@ -284,11 +284,11 @@ def _following(
 
 
 def _finished(
-    following: Following, settings: Settings, workers: int, cluster: Cluster | None, progress: Progress
+    following: Following, settings: Settings, workers: int, executor: Executor | None, progress: Progress
 ) -> tuple[StageRecord | None, str | None]:
     """Follow what the detector did not show; None with the reason why `auto` goes without backgrounds."""
     try:
-        return following.finish(workers=workers, cluster=cluster, progress=progress), None
+        return following.finish(workers=workers, executor=executor, progress=progress), None
     except DataError as error:
         if settings.refine_cameras is not None:
             raise

@@ -37,7 +37,6 @@ from pipelines.session.records import Occupancy
 from pipelines.session.stage_records import Stage, StageRecord, outdated, versions_of
 from pipelines.session.stages import Session, locked, open_session, session_name
 from pipelines.session.storage import as_data_error, hash_of, read_json, sha256_of, write_whole
-from pipelines.session.stores import is_there
 from pipelines.session.tables import (
     ACTOR,
     ANGLES,
@@ -56,6 +55,7 @@ from pipelines.session.tables import (
     read_rows,
     read_table,
 )
+from pipelines.session.urls import is_there
 from pipelines.session.whole_folders import STUDY_MARK, is_made, whole_folder
 from pipelines.simulation.study.settings import command_of
 from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_pictures

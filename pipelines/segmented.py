@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -52,15 +53,14 @@ from pipelines.reconstruction.segments import (
     sampled,
     warnings_of_flight,
 )
-from pipelines.session.clusters import Cluster, Processes, SharedSession, contents_of, write_contents
 from pipelines.session.description import Description, Doubt, read_description, said_doubts
 from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.memory import Waiting, available_bytes, return_freed_arrays, return_unused
+from pipelines.session.parallel import SharedSession, contents_of, each_part, write_contents
 from pipelines.session.people import LoggedActor
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Run, Session
 from pipelines.session.storage import jsonable, read_json, write_json
-from pipelines.session.stores import publish_meanwhile
 from pipelines.session.tables import (
     ANGLES,
     CAMERA_POSES,
@@ -209,7 +209,7 @@ def by_segments(
     segments: Sequence[Segment],
     base: str,
     workers: int,
-    cluster: Cluster | None,
+    executor: Executor | None,
     strict: bool,
     progress: Progress,
 ) -> Outcome:
@@ -221,20 +221,18 @@ def by_segments(
         segments: at least two.
         base: the camera whose pictures give the times of the skeleton.
         workers: the number of processes on this machine, as far as its memory allows.
-        cluster: works on the segments instead.
+        executor: works on the segments instead.
         strict: refuse a flight that is doubted.
         progress: receives the progress.
     """
     folder = source.folder
-    each: Each
-    if cluster is not None:
-        publish_meanwhile(folder)  # workers need what was found in the pictures
-        each, threads = partial(cluster.each, progress=progress), 1
-    else:
+    threads = 1
+    if executor is None:
         memory = available_bytes()
         most = workers if memory is None else min(workers, max(memory // _SEGMENT_BYTES, 1))
         count = min(most, len(segments))
-        each, threads = Processes(count).each, max(workers // count, 1)
+        workers, threads = count, max(workers // count, 1)
+    each: Each = partial(each_part, workers=workers, executor=executor)
     progress.start("Reconstructing", len(segments))
 
     def order_of(segment: Segment) -> _Order:

@@ -60,6 +60,7 @@ CODES = {
     "wrong-kind": "a file is of another kind than belongs there",
     "wrong-model": "a model file is not the expected one",
     "wrong-size": "pictures, calibrations or keypoints differ in size",
+    "wrong-worker": "a machine of a cluster has another version of mocap, session or model",
 }
 """Every code of a DataError, and what it stands for. Codes stay when a message's words change."""
 

@@ -19,7 +19,7 @@ from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, FrameTimes, IntrinsicsSource, TriggerLog
 from pipelines.session.records import Detections, Trajectory, VideoIndex
-from pipelines.session.stores import located, media_path
+from pipelines.session.urls import located, media_path
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs, Frames
 from pipelines.sources.parts import CameraFrames

@@ -16,7 +16,7 @@ from pipelines.session.registries import (
     VideoFormat,
     recognise,
 )
-from pipelines.session.stores import located
+from pipelines.session.urls import located
 from pipelines.sources.world import losses
 
 _FARTHEST_M = 10_000  # in any flight a person's joints are closer to their median than this

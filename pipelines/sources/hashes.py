@@ -11,7 +11,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
 from pipelines.session.progress import Progress
 from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
-from pipelines.session.stores import fetched, located, named, source_url
+from pipelines.session.urls import fetched, located, named, source_url
 
 _HASHERS = 4
 

@@ -37,7 +37,7 @@ from pipelines.session.manifest import Flight
 from pipelines.session.manifest import Log as LogSource
 from pipelines.session.records import IntrinsicsSample, PictureSample, Trajectory
 from pipelines.session.registries import Log, LogFormat, recognise
-from pipelines.session.stores import located
+from pipelines.session.urls import located
 from pipelines.sources.world import world_times
 
 _KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 MB

@@ -29,7 +29,6 @@ from pipelines.session.description import (
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, Camera, PoseSource
 from pipelines.session.records import Detections, Trajectory
-from pipelines.session.stores import named
 from pipelines.session.tables import (
     FRAMES,
     KEYPOINTS,
@@ -39,6 +38,7 @@ from pipelines.session.tables import (
     pose_table,
     write_table,
 )
+from pipelines.session.urls import named
 from pipelines.sources.world import doubts_of_speed, doubts_of_stillness, losses, mounted
 
 _MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log gets a note

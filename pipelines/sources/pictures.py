@@ -17,7 +17,7 @@ from pipelines.session.records import PictureSample
 from pipelines.session.registries import Log, LogFormat, recognise
 from pipelines.session.stage_records import noted_stamps
 from pipelines.session.storage import file_stamp, sha256_of
-from pipelines.session.stores import located
+from pipelines.session.urls import located
 
 
 class Pictures(Protocol):

@@ -40,7 +40,6 @@ from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan
 from pipelines.session.manifest import Log as LogSource
 from pipelines.session.records import Occupancy, Trajectory
 from pipelines.session.registries import FORMATS, Format, TrajectoryFormat, recognise
-from pipelines.session.stores import located
 from pipelines.session.telemetry import (
     AttitudeFormat,
     AttitudeTrack,
@@ -50,6 +49,7 @@ from pipelines.session.telemetry import (
     TelemetryFormat,
     TriggerFormat,
 )
+from pipelines.session.urls import located
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.parts import CameraFrames

@@ -13,25 +13,26 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
-from importlib.metadata import version
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from pipelines import batch
-from pipelines.batch import Job, Outcome, Settings, run_flight
+from pipelines import batch, follow
+from pipelines import detect as detection
+from pipelines.batch import BatchSettings, Job, Outcome, run_flight
 from pipelines.detect import detect
 from pipelines.follow import Following
+from pipelines.reconstruct import Settings as ReconstructSettings
 from pipelines.reconstruct import reconstruct
 from pipelines.reconstruction import segments
 from pipelines.report import Reported
 from pipelines.reporting.flights import FlightRow, render_flights
-from pipelines.session.clusters import Cluster as Workers
-from pipelines.session.clusters import SharedSession, connected
-from pipelines.session.errors import BusyError, DataError
+from pipelines.session.errors import BusyError
+from pipelines.session.parallel import connected
 from pipelines.session.registries import install_command
 from pipelines.session.stages import locked
 from tests.commands.runner import MOCAP, content, mocap, refused, succeeds
@@ -40,13 +41,6 @@ from tests.synthetic.flights import write_flight
 
 DASK = str(Path(sys.executable).with_name("dask"))
 FEW_STAGES = "ingest,reconstruct"
-
-
-@dataclass
-class Skipped:
-    """The part of a stage's result that a batch needs."""
-
-    skipped: bool
 
 
 class Cluster:
@@ -62,13 +56,12 @@ class Cluster:
         while not file.exists():
             time.sleep(0.05)
         self.address: str = json.loads(file.read_text(encoding="utf-8"))["address"]
-        # The second stands in for a worker with a graphics card.
         self.workers = [
             self._start(
                 *("worker", "--scheduler-file", file, "--nthreads", "1", "--memory-limit", "0"),
-                *("--no-nanny", "--no-dashboard", "--local-directory", folder, *resources),
+                *("--no-nanny", "--no-dashboard", "--local-directory", folder),
             )
-            for resources in ((), ("--resources", "GPU=1"))
+            for _ in range(2)
         ]
 
     def _start(self, *arguments: str | Path) -> subprocess.Popen[bytes]:
@@ -109,61 +102,50 @@ def flights_and_single_runs(folder: Path, detector: str) -> tuple[list[Path], li
     return manifests, single
 
 
-def test_blocks_of_a_flight_on_a_cluster_make_the_bytes_of_one_process(
+def test_blocks_of_a_flight_make_the_same_bytes_here_on_processes_and_on_a_cluster(
     tmp_path: Path, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("pipelines.detect", "pipelines.follow"):
-        monkeypatch.setattr(f"{module}.BLOCK", 10)
+    for module in (detection, follow):
+        monkeypatch.setattr(module, "BLOCK", 10)
+        monkeypatch.setattr(module, "MIN_PICTURES_FOR_PROCESSES", 0)
     manifest = write_spotted_flight(tmp_path, 25)
-    here, there, apart = (tmp_path / f"{name}.session" for name in ("here", "there", "apart"))
+    here, processes, there, apart = (tmp_path / f"{name}.session" for name in "abcd")
     succeeds("ingest", manifest, "-o", here)
-    shutil.copytree(here, there)
-    shutil.copytree(here, apart)
+    for copy in (processes, there, apart):
+        shutil.copytree(here, copy)
     detector = spot_detector(tmp_path)
-    with locked(here) as session:
-        following = Following(session)
-        detect(session, detector=detector, following=following)
-        following.finish()
-    with connected(cluster.address) as client, locked(there) as session:
-        following = Following(session)
-        detect(session, detector=detector, following=following, cluster=Workers.of(client))
-        following.finish(cluster=Workers.of(client))
-    assert content(there) == content(here)
-    # Backgrounds without keypoints.
-    with connected(cluster.address) as client, locked(apart) as session:
-        Following(session).finish(cluster=Workers.of(client))
+
+    def found(folder: Path, *, workers: int = 1, executor: Executor | None = None) -> dict[str, str]:
+        with locked(folder) as session:
+            following = Following(session)
+            detect(session, detector=detector, following=following, workers=workers, executor=executor)
+            following.finish(workers=workers, executor=executor)
+        return content(folder)
+
+    expected = found(here)
+    assert found(processes, workers=2) == expected
+    with connected(cluster.address) as client:
+        executor = client.get_executor(pure=False)
+        assert found(there, executor=executor) == expected
+        with locked(apart) as session:  # backgrounds without keypoints
+            Following(session).finish(executor=executor)
     assert content(apart / "background") == content(here / "background")
 
 
 def test_segments_of_a_long_flight_on_a_cluster_make_the_bytes_of_one_process(
     tmp_path: Path, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, value in {"LENGTH_S": 2.0, "OVERLAP_S": 1.0, "_BLENDED_NS": 600_000_000}.items():
+    for name, value in {"LENGTH_S": 1.0, "OVERLAP_S": 0.5, "_BLENDED_NS": 300_000_000}.items():
         monkeypatch.setattr(segments, name, value)
-    manifest = write_flight(tmp_path, cameras=3, seconds=5.0).manifest
+    manifest = write_flight(tmp_path, seconds=1.8).manifest
     here, there = tmp_path / "here.session", tmp_path / "there.session"
     succeeds("ingest", manifest, "-o", here)
     shutil.copytree(here, there)
-    assert len(reconstruct(here, workers=1).metrics["segments"]) == 3
+    settings = ReconstructSettings(method="robust")
+    assert len(reconstruct(here, settings, workers=1).metrics["segments"]) == 2
     with connected(cluster.address) as client:
-        reconstruct(there, cluster=Workers.of(client))
+        reconstruct(there, settings, executor=client.get_executor(pure=False))
     assert content(there / "reconstruct") == content(here / "reconstruct")
-
-
-def test_parts_for_graphics_cards_go_to_workers_that_have_one(cluster: Cluster) -> None:
-    with connected(cluster.address) as client:
-        client.wait_for_workers(2)
-        on_any = Workers.of(client)
-        found = dict(on_any.each(os.readlink, ["/proc/self"] * 4, on_gpu=True))
-        assert found == dict.fromkeys(range(4), str(cluster.workers[1].pid))
-        # An error of a part arrives as it was raised.
-        with pytest.raises(DataError) as raised:
-            list(
-                on_any.each(
-                    SharedSession.opened, [SharedSession("/nowhere", "key", version("mocap-pipeline"))]
-                )
-            )
-        assert raised.value.source == "/nowhere"
 
 
 @pytest.mark.slow
@@ -219,13 +201,13 @@ def test_cluster_makes_the_bytes_of_single_runs_and_a_killed_worker_loses_nothin
 def test_all_stages_of_a_flight_are_those_of_the_commands(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=1.2)
     session = tmp_path / "flight.session"
-    outcome = run_flight(Job(flight.manifest, session, Settings(), force=False))
+    outcome = run_flight(Job(flight.manifest, session, BatchSettings(), force=False))
     assert outcome.error is None
     assert not outcome.unchanged
     assert {"reconstructed_share", "mpjpe_mm", "tilt_deg_adaptive", "tilt_deg_fixed"} <= set(outcome.figures)
     for command in ("reconstruct", "replan-compare", "report"):
         assert "unchanged" in succeeds(command, session)
-    assert run_flight(Job(flight.manifest, session, Settings(), force=False)).unchanged
+    assert run_flight(Job(flight.manifest, session, BatchSettings(), force=False)).unchanged
 
 
 def test_workers_that_are_left_over_split_the_videos_of_the_flights_there_are(
@@ -238,24 +220,28 @@ def test_workers_that_are_left_over_split_the_videos_of_the_flights_there_are(
         return [(k, Outcome()) for k in range(len(jobs))]
 
     monkeypatch.setattr(batch, "_outcomes", taken)
-    flights = [write_flight(tmp_path / name).manifest for name in "ab"]
-    for workers, threads in ((1, 1), (2, 1), (3, 1), (4, 2), (9, 4)):
+    flights = [tmp_path / f"{name}.yaml" for name in "ab"]
+    for workers, for_each in ((1, 1), (2, 1), (3, 1), (4, 2), (9, 4)):
         batch.batch(flights, tmp_path / "out", workers=workers)
-        assert [job.threads for job in given[-2:]] == [threads, threads]
+        assert [job.workers for job in given[-2:]] == [for_each, for_each]
     batch.batch(flights, tmp_path / "out", scheduler="tcp://somewhere:1")
-    assert [job.threads for job in given[-2:]] == [1, 1]
+    assert [job.workers for job in given[-2:]] == [1, 1]
 
-    given.clear()
-    used: list[int] = []
 
-    def reconstructed(*_: object, workers: int, **__: object) -> Skipped:
-        used.append(workers)
-        return Skipped(skipped=False)
-
-    monkeypatch.setattr(batch, "reconstruct", reconstructed)
-    job = Job(flights[0], tmp_path / "a.session", Settings(stages=("ingest", "reconstruct")), False, 3)
-    run_flight(job)
-    assert used == [3]
+def test_a_session_at_a_url_is_uploaded_when_its_flight_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    flight = write_flight(tmp_path, seconds=0.4)
+    (tmp_path / "store").mkdir()
+    settings = BatchSettings(stages=("ingest", "reconstruct"), method="dlt")
+    job = Job(flight.manifest, Path(f"file://{tmp_path}/store/flight.session"), settings, force=False)
+    assert run_flight(job).error is None
+    assert (tmp_path / "store" / "flight.session" / "reconstruct" / "skeleton.parquet").is_file()
+    assert run_flight(job).unchanged
+    failed = run_flight(replace(job, session=Path("s3://me:pw@bucket/x.session")))
+    assert failed.failed_stage == "ingest"
+    assert "pw" not in str(failed.error)
 
 
 def test_flight_that_fails_late_gets_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,7 +254,7 @@ def test_flight_that_fails_late_gets_its_report(tmp_path: Path, monkeypatch: pyt
         return Reported(folder, skipped=False)
 
     monkeypatch.setattr(batch, "report", write_no_page)  # a real one takes seconds
-    settings = Settings(stages=("ingest", "replan-compare", "report"))
+    settings = BatchSettings(stages=("ingest", "replan-compare", "report"))
     outcome = run_flight(Job(flight.manifest, session, settings, force=False))
     assert outcome.failed_stage == "replan-compare"
     assert reported == [session]
@@ -338,7 +324,7 @@ def test_what_a_batch_cannot_start_with(tmp_path: Path, monkeypatch: pytest.Monk
     (foreign / "summary.csv").write_text("my,own,table\n", encoding="utf-8")
     assert "--overwrite" in refused("batch", tmp_path / "a" / "*.yaml", "-o", foreign)
     assert mocap("batch", pattern, "--workers", "1", "--scheduler", "tcp://x:1").returncode == 2
-    monkeypatch.setattr("pipelines.session.clusters._ANSWER_S", 0.2)
+    monkeypatch.setattr("pipelines.session.parallel.SCHEDULER_ANSWER_TIMEOUT_S", 0.2)
     assert "--scheduler tcp://127.0.0.1:9: " in refused(
         "batch", tmp_path / "a" / "*.yaml", "--scheduler", "tcp://127.0.0.1:9", "-o", tmp_path / "out"
     )

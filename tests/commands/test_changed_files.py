@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 import pipelines.sources.pictures
+from pipelines import detect, follow
 from pipelines.export import export, load_recording
 from pipelines.film import film
 from pipelines.formats.videos.video import VideoReader
@@ -179,7 +180,11 @@ class Meddler(Silent):
 
 
 @pytest.mark.parametrize("steps", [3, FRAMES + 3])
-def test_nothing_is_kept_of_a_video_that_is_exchanged_while_it_is_looked_at(flight: Path, steps: int) -> None:
+def test_nothing_is_kept_of_a_video_that_is_exchanged_while_it_is_looked_at(
+    flight: Path, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (detect, follow):
+        monkeypatch.setattr(module, "BLOCK", FRAMES // 2)
     session, video = flight / "flight.session", flight / ("left.mp4" if steps < FRAMES else "right.mp4")
     settings = Settings(detector=spot_detector(flight))
     reconstruct(session, settings)

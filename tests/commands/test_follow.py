@@ -68,8 +68,11 @@ def test_tracks_and_stills_are_kept_for_other_methods_and_poses(session: Path) -
     assert set(pictures.tolist()) == set(range(FRAMES))
 
 
-def test_auto_goes_on_without_a_video_that_is_exchanged_while_it_is_followed(session: Path) -> None:
+def test_auto_goes_on_without_a_video_that_is_exchanged_while_it_is_followed(
+    session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nothing of it is kept: with the right video, the result is that of a flight where nothing happened."""
+    monkeypatch.setattr(follow, "BLOCK", 15)
     reconstruct(session)
     expected = content(session)
     video = session.parent / "drone1.mp4"

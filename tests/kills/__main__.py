@@ -1,4 +1,4 @@
-"""Long run of the kill tests: `python -m tests.kills`; `--dask 30` kills workers, `--power` loses power."""
+"""Long run of the kill tests: `python -m tests.kills`; `--power` loses power."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.kills.clusters import print_soak
 from tests.kills.killing import commands_on, soak
 from tests.kills.power import print_replays
 
@@ -18,17 +17,11 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", help="commands, with those before them")
-    parser.add_argument(
-        "--dask", type=float, metavar="MINUTES", help="kill workers under `mocap batch` instead"
-    )
-    parser.add_argument("--kill-every", type=float, default=60.0, metavar="S", help="with --dask")
     parser.add_argument("--power", action="store_true", help="replay losses of power instead")
     parser.add_argument("--moments", type=int, default=100, help="of each command, with --power")
     stated = parser.parse_args()
     if stated.power:
         return print_replays(stated.only or (), moments=stated.moments, seed=stated.seed)
-    if stated.dask is not None:
-        return print_soak(stated.dask, kill_every_s=stated.kill_every, seed=stated.seed)
     found = []
     with tempfile.TemporaryDirectory() as folder:
         commands = commands_on(Path(folder))

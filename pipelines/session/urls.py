@@ -1,0 +1,448 @@
+"""Places that are named by URL: sources are fetched into the user's cache, sessions are uploaded when done.
+
+A URL is one that fsspec opens (`s3://bucket/flight/drone1.mp4`). A session at a URL is worked on in a copy on
+this machine's disk, whose files are uploaded once, at the end, under the names that they have in a session.
+Credentials come from where the store's own library looks for them, never from a URL, and no message repeats
+what a store says.
+"""
+
+import errno
+import ipaddress
+import os
+import re
+import shutil
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
+from urllib.parse import unquote
+
+from filelock import FileLock
+
+from pipelines.session.errors import BusyError, DataError, MocapError
+from pipelines.session.registries import need
+from pipelines.session.storage import (
+    as_data_error,
+    hash_of,
+    read_json,
+    remove_tree,
+    sha256_of,
+    sync_tree,
+    write_json,
+)
+from pipelines.session.whole_folders import held
+
+# fsspec has many more, some of which open files of this machine, archives, or other URLs.
+SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "http", "https", "file")
+
+# A disk that is filled to the last byte stops every other program of the user.
+MIN_FREE_BYTES_BESIDE_SOURCES = 1 << 30
+
+_URL = re.compile(r"(?is)(?P<scheme>[a-z][a-z0-9+.-]+):(?P<chained>:.*:)?/+(?P<rest>[^/].*)")
+_SECRET = re.compile(r"(?i)[?&#;][^=&/]*(sig|token|key|secret|credential|passw|pwd|auth)[^=&/]*(=|&|$)")
+_REFUSED = {"PermissionError", "NoCredentialsError", "PartialCredentialsError", "TokenRetrievalError"}
+_FULL = {errno.ENOSPC, errno.EDQUOT}
+
+T = TypeVar("T")
+
+
+def url_of(place: Path | str) -> str | None:
+    """Return the URL that a place is; None for a place on this machine.
+
+    A URL that has become a Path has lost one of its two slashes. A path that exists is no URL.
+
+    Raises:
+        DataError: the URL holds a secret, which results and messages would repeat, or is of a kind that is
+            not fetched.
+    """
+    text = str(place)
+    found = _URL.fullmatch(text)
+    if found is None or os.path.lexists(text):
+        return None
+    scheme, rest = found["scheme"].lower(), found["rest"].rstrip("/")
+    if found["chained"] or "::" in rest or scheme not in SCHEMES:
+        raise DataError(
+            f"{scheme}://...",
+            f"is a kind of URL that mocap does not open (it opens {', '.join(SCHEMES)})",
+            "copy the file to this machine, and give its path",
+            code="url-refused",
+        )
+    if "@" in unquote(rest.partition("/")[0]) or _SECRET.search(unquote(rest)):
+        raise DataError(
+            f"{scheme}://...",
+            "is a URL with credentials in it",
+            "leave them out of it, and set them where the store's own tools look for them",
+            code="url-with-secret",
+        )
+    return f"{scheme}:///{rest}" if scheme == "file" else f"{scheme}://{rest}"
+
+
+def located(base: Path, stated: str | Path) -> Path:
+    """Return the path of a file or folder that is stated by a path relative to `base`, or by URL.
+
+    What is stated by URL is fetched if it is not in the cache. If `base` itself was fetched, the path is
+    relative to its URL.
+
+    Raises:
+        DataError: the store cannot be read, or holds no such thing.
+    """
+    url = source_url(base, stated)
+    return base / stated if url is None else fetched(url)
+
+
+def source_url(base: Path, stated: str | Path) -> str | None:
+    """Return the URL of a source; None if it lies on this machine. See `located`."""
+    url = url_of(stated)
+    if url is not None or not str(stated) or Path(stated).is_absolute():
+        return url
+    if base.parent != _cache() / "sources":
+        return None
+    origin = read_json(base.with_suffix(".json"), "remove it")["url"]
+    return f"{origin.rpartition('/')[0]}/{PurePosixPath(stated)}"
+
+
+def named(base: Path, stated: str) -> Path | str:
+    """Return a source's name for messages; nothing is fetched."""
+    return source_url(base, stated) or base / stated
+
+
+def is_there(base: Path, stated: str) -> bool:
+    """Return True if a source exists; what is stated by URL is fetched."""
+    try:
+        return located(base, stated).exists()
+    except DataError:
+        return False
+
+
+def as_urls(text: str) -> str:
+    """Replace the paths of copies in a text by the URLs that they were made from."""
+    cache = str(_cache())
+    if cache not in text:
+        return text
+
+    def url(match: re.Match[str]) -> str:
+        return str(_noted(_cache() / match[1] / f"{match[2]}.json").get("url", match[0]))
+
+    return re.sub(re.escape(cache) + r"/(sources|sessions)/([0-9a-f]{16})(?:/[^/\s:;,]+)?", url, text)
+
+
+def media_path(base: Path, stated: str, session: Path) -> str:
+    """Write where a source lies, for a session: its URL, or its path relative to the session's folder.
+
+    A session at a URL holds the whole path instead.
+
+    Args:
+        stated: empty for `base` itself.
+    """
+    url = source_url(base, stated or ".")
+    if url is not None:
+        return url
+    if session.absolute().parent.parent == _cache() / "sessions":
+        return (base / stated).absolute().as_posix()
+    return Path(os.path.relpath(base / stated, session)).as_posix()
+
+
+def fetched(url: str, *, fresh: bool = False) -> Path:
+    """Return the copy of a file or folder of a store; fetch it if it is missing.
+
+    Args:
+        fresh: ask the store, and fetch what has changed there since.
+
+    Raises:
+        DataError: the store cannot be read, holds no such thing, or it does not fit on the disk.
+    """
+    folder = _cache() / "sources" / _short(url)
+    target, note = folder / url.rpartition("/")[2], folder.with_suffix(".json")
+    with _own_disk(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder.with_suffix(".lock")):  # others wait, and find it there
+            known = _noted(note) if target.exists() else {}
+            if known and not fresh:
+                os.utime(note)  # what was used last is removed last
+                return target
+            files, version = _asked(url, _files_at)
+            if known.get("version") != version:
+                _fetch(url, files, target)
+                write_json(note, {"url": url, "version": version})
+    return target
+
+
+def _fetch(url: str, files: dict[str, tuple[str, int]], target: Path) -> None:
+    """Replace a copy by the files of a store; `files` as of `_files_at`."""
+    folder = target.parent
+    _make_room(folder, sum(size for _, size in files.values()), url)
+    new = folder.with_suffix(".new")
+    remove_tree(new)
+    folder.with_suffix(".json").unlink(missing_ok=True)
+    places = {inner: new / target.name / name for name, (inner, _) in files.items()}
+    for place in places.values():
+        place.parent.mkdir(parents=True, exist_ok=True)
+    _asked(url, lambda store, _: store.get(list(places), list(map(str, places.values()))))
+    sync_tree(new)
+    remove_tree(folder)
+    new.rename(folder)
+
+
+def _noted(note: Path) -> dict[str, Any]:
+    try:
+        return read_json(note)
+    except DataError:
+        return {}
+
+
+def _files_at(store: Any, path: str) -> tuple[dict[str, tuple[str, int]], str]:
+    """List a file, or the files of a folder: relative name to (path in the store, size); with a version."""
+    info = store.info(path)
+    found = {path: info} if info["type"] != "directory" else store.find(path, detail=True)
+    if not found:
+        raise FileNotFoundError(path)
+    marks = ("size", "ETag", "etag", "md5Hash", "generation", "mtime", "LastModified", "updated")
+    stamps = {
+        name: [str(own[mark]) for mark in marks if own.get(mark) is not None] for name, own in found.items()
+    }
+    names = {name: name[len(path) :].lstrip("/") for name in found}
+    if any(".." in PurePosixPath(name).parts for name in names.values()):
+        raise FileNotFoundError(path)
+    return {names[name]: (name, int(own["size"] or 0)) for name, own in found.items()}, hash_of(stamps)
+
+
+def _make_room(folder: Path, size: int, url: str) -> None:
+    """Remove the sources that were not used for longest, until one of this size fits on the disk."""
+    notes = sorted((_cache() / "sources").glob("*.json"), key=lambda note: note.stat().st_mtime_ns)
+    while shutil.disk_usage(folder.parent).free < size + MIN_FREE_BYTES_BESIDE_SOURCES:
+        if not notes:
+            free = shutil.disk_usage(folder.parent).free
+            raise DataError(
+                url,
+                f"has {size / 1e9:.3g} GB, and the disk of {folder.parent} has {free / 1e9:.3g} GB free",
+                "free some space, or set XDG_CACHE_HOME to another disk",
+                code="disk-full",
+            )
+        oldest = notes.pop(0)
+        remove_tree(oldest)
+        remove_tree(oldest.with_suffix(""))
+
+
+# --- sessions ------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def session_here(place: Path | str, *, create: bool = False) -> Iterator[Path]:
+    """Yield the folder of a session. One at a URL is copied here, and uploaded at the end if it has changed.
+
+    After an error nothing is uploaded. What was made stays in the copy, and the same command continues.
+
+    Args:
+        create: allow a URL at which there is no session yet (ingest).
+
+    Raises:
+        DataError: the store cannot be used, or holds no session there.
+        BusyError: another process of this machine works on it, or somebody else has uploaded meanwhile.
+    """
+    url = url_of(place)
+    if url is None:
+        yield Path(place)
+        return
+    folder = _cache() / "sessions" / _short(url) / url.rpartition("/")[2]
+    note = folder.parent.with_suffix(".json")
+    with _own_disk(folder):
+        folder.parent.parent.mkdir(parents=True, exist_ok=True)
+    with held(folder.parent.with_suffix(".lock"), url):
+        with _own_disk(folder):
+            files, version = _session_at(url)
+            if not files and not create:
+                remedy = "make one with `mocap ingest -o` and this URL"
+                raise DataError(url, "is not a session", remedy, code="not-a-session")
+            known = _noted(note)
+            # An upload that was cut short has changed the store, and the copy is what was to be there.
+            if not folder.exists() or (known.get("version") != version and not known.get("uploading")):
+                if files:
+                    _fetch(url, files, folder)
+                else:
+                    remove_tree(folder.parent)
+                    folder.parent.mkdir()
+                write_json(note, {"url": url, "version": version, "files": _digests(folder)})
+        yield folder
+        with _own_disk(folder):
+            _upload(url, folder, note)
+            remove_tree(note)
+            remove_tree(folder.parent)
+
+
+def holds_session(url: str) -> bool:
+    """Return True if a session lies at a URL; DataError if the store cannot be read."""
+    return bool(_session_at(url)[0])
+
+
+def _session_at(url: str) -> tuple[dict[str, tuple[str, int]], str]:
+    """List the files of a session in a store, with a version; none if there is no session."""
+    try:
+        files, version = _asked(url, _files_at, missing=FileNotFoundError)
+    except FileNotFoundError:
+        return {}, ""
+    return (files, version) if "session.json" in files else ({}, "")
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """Compute the SHA-256 of every file that belongs to a session, by name."""
+    tops = [top for top in folder.glob("[!.]*") if not top.name.endswith(".new")]
+    paths = [path for top in tops for path in ([top] if top.is_file() else top.rglob("*")) if path.is_file()]
+    return {path.relative_to(folder).as_posix(): sha256_of(path) for path in sorted(paths)}
+
+
+def _upload(url: str, folder: Path, note: Path) -> None:
+    """Upload what has changed of a copy of a session, and remove in the store what is gone.
+
+    Raises:
+        BusyError: somebody else has uploaded since the copy was made.
+        DataError: the store cannot be written. The copy stays, and the same command continues.
+    """
+    known, files = _noted(note), _digests(folder)
+    before: dict[str, str] = known.get("files", {})
+    if "session.json" not in files or files == before:
+        return
+    if not known.get("uploading") and _session_at(url)[1] != known["version"]:
+        raise BusyError(f"{url} was written by somebody else meanwhile; run the command again")
+    write_json(note, {**known, "uploading": True})
+    changed = [name for name, digest in files.items() if before.get(name) != digest or known.get("uploading")]
+
+    def send(store: Any, path: str) -> None:
+        store.put([str(folder / name) for name in changed], [f"{path}/{name}" for name in changed])
+        gone = [f"{path}/{name}" for name in before if name not in files]
+        if gone:
+            store.rm(gone)
+
+    _asked(url, send)
+
+
+@contextmanager
+def _own_disk(place: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise as_data_error(error, place) from error
+
+
+def put(url: str, content: bytes) -> None:
+    """Write one object; DataError if the store does not take it."""
+    _asked(url, lambda store, path: store.pipe_file(path, content))
+
+
+def get(url: str) -> bytes | None:
+    """Read one object; None if there is none. DataError if the store cannot be read."""
+    try:
+        content: bytes = _asked(url, lambda store, path: store.cat_file(path), missing=FileNotFoundError)
+    except FileNotFoundError:
+        return None
+    return content
+
+
+def matching(pattern: str) -> list[str]:
+    """List the URLs that a pattern matches, sorted; DataError if the store cannot be read."""
+    return _asked(pattern, lambda store, path: sorted(map(store.unstrip_protocol, store.glob(path))))
+
+
+# --- stores --------------------------------------------------------------------------------------------
+
+
+def _cache() -> Path:
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(cache).expanduser().absolute() / "mocap" / "stores"
+
+
+def _short(url: str) -> str:
+    return hash_of(url)[:16]
+
+
+def _opened(url: str) -> tuple[Any, str]:
+    """Open the store of a URL; return it and the path inside it."""
+    url_to_fs = need("fsspec.core", "s3").url_to_fs
+    scheme = url.partition(":")[0]
+    options: dict[str, Any] = {"use_listings_cache": False}
+    if scheme == "file":
+        options["auto_mkdir"] = True
+    if scheme.startswith("http"):
+        options["get_client"] = _public_client
+    try:
+        store, path = url_to_fs(url, **options)
+    except ImportError as error:
+        problem, remedy = f"needs a library for {scheme}://", "install s3fs, gcsfs, adlfs or aiohttp"
+        raise DataError(url, problem, remedy, code="missing-library") from error
+    except ValueError as error:
+        problem = "is no URL that fsspec opens"
+        raise DataError(url, problem, "check the URL", code="url-refused") from error
+    return store, path
+
+
+def is_public(address: str) -> bool:
+    """Return True for an address that belongs to the Internet, not to this machine or a private network."""
+    ip = ipaddress.ip_address(address)
+    return ip.is_global and not ip.is_multicast
+
+
+class _PrivateAddressError(OSError):
+    """A web server that a flight.yaml names is not on the public Internet."""
+
+
+async def _public_client(**options: Any) -> Any:
+    """Make a web client that connects to public addresses alone, also after a redirection."""
+    aiohttp = need("aiohttp", "s3")
+
+    def connect(address: tuple[Any, ...]) -> socket.socket:
+        family, kind, protocol, _, place = address
+        if not is_public(place[0].partition("%")[0]):
+            raise _PrivateAddressError
+        return socket.socket(family, kind, protocol)
+
+    return aiohttp.ClientSession(connector=aiohttp.TCPConnector(socket_factory=connect), **options)
+
+
+def _asked(url: str, call: Callable[[Any, str], T], *, missing: type[Exception] | None = None) -> T:
+    """Call a function with the store and the path of a URL.
+
+    Errors become one line that repeats none of the store's words.
+
+    Args:
+        missing: raised for an object that does not exist, instead of a DataError.
+    """
+    store, path = _opened(url)
+    try:
+        return call(store, path)
+    except MocapError:
+        raise
+    except Exception as error:
+        chain = list(_chain(error))
+        names = {type(each).__name__ for each in chain}
+        if any(isinstance(each, _PrivateAddressError) for each in chain):
+            raise DataError(
+                url,
+                "leads to an address of this machine or of a private network",
+                "fetch the file yourself, and give its path",
+                code="url-refused",
+            ) from None
+        if isinstance(error, OSError) and error.errno in _FULL:
+            raise
+        if isinstance(error, FileNotFoundError | NotADirectoryError):
+            if missing is not None:
+                raise missing(url) from None
+            raise DataError(url, "does not exist", "check the URL", code="no-such-file") from None
+        if names & _REFUSED:
+            raise DataError(
+                url,
+                "the store refuses these credentials, or there are none",
+                "set them where the store's own tools look for them (of S3: AWS_PROFILE, ~/.aws)",
+                code="store-refused",
+            ) from None
+        raise DataError(
+            url,
+            f"the store does not answer as it should ({type(error).__name__})",
+            "check the network and the store's address, and run the command again, which continues",
+            code="store-unreachable",
+        ) from None
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__

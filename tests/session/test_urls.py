@@ -1,0 +1,324 @@
+"""Sources and sessions that are named by URL; the S3 server runs on the loopback."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from pipelines.session import urls
+from pipelines.session.errors import BusyError, DataError
+from pipelines.session.urls import fetched, get, located, matching, put, session_here, source_url, url_of
+from tests.commands.runner import content, mocap, refused, succeeds
+from tests.raising import refused as refusing
+from tests.synthetic.flights import write_flight
+
+SERVER = str(Path(sys.executable).with_name("moto_server"))
+KEY, SECRET = "AKIAEXAMPLEOFAKEY", "a-secret-that-nobody-may-print"
+
+
+class Server:
+    """An S3 server in a process of its own."""
+
+    def __init__(self, *, refusing: bool = False) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port: int = free.getsockname()[1]
+        self.address = f"http://127.0.0.1:{self.port}"
+        # After so many requests without a known key, moto refuses as AWS does.
+        more = {"INITIAL_NO_AUTH_ACTION_COUNT": "0"} if refusing else {}
+        self._process = subprocess.Popen(
+            [SERVER, "-H", "127.0.0.1", "-p", str(self.port)],
+            env=os.environ | more,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def wait(self) -> None:
+        until_s = time.monotonic() + 60
+        while time.monotonic() < until_s:
+            try:
+                socket.create_connection(("127.0.0.1", self.port), 1).close()
+            except OSError:
+                time.sleep(0.05)
+            else:
+                return
+        raise TimeoutError(self.port)
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+
+@pytest.fixture(scope="module")
+def servers() -> Iterator[tuple[Server, Server]]:
+    """One that admits everybody, and one that refuses everybody."""
+    with ExitStack() as stack:
+        both = Server(), Server(refusing=True)
+        for server in both:
+            stack.callback(server.close)
+        for server in both:
+            server.wait()
+        yield both
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "mocap" / "stores"
+
+
+@pytest.fixture
+def store(tmp_path: Path, cache: Path) -> str:
+    """Return the URL of an empty folder."""
+    (tmp_path / "store").mkdir()
+    return f"file://{tmp_path}/store"
+
+
+@pytest.fixture
+def bucket(
+    servers: tuple[Server, Server], cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[str]:
+    """Make an empty bucket; return its URL."""
+    for name, value in {
+        "AWS_ACCESS_KEY_ID": KEY,
+        "AWS_SECRET_ACCESS_KEY": SECRET,
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": servers[0].address,
+    }.items():
+        monkeypatch.setenv(name, value)
+    name = tmp_path.name.replace("_", "-")[:60].strip("-")
+    connection = HTTPConnection("127.0.0.1", servers[0].port)
+    connection.request("PUT", f"/{name}")
+    assert connection.getresponse().status == 200
+    connection.close()
+    yield f"s3://{name}"
+    from s3fs import S3FileSystem
+
+    S3FileSystem.clear_instance_cache()  # of the clients of this endpoint
+
+
+def written(folder: Path, **files: str) -> None:
+    """Write a session of these files."""
+    for name, text in {"session.json": "{}", **files}.items():
+        folder.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def texts(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+def test_a_flight_in_a_store_makes_the_same_tables_as_on_disk(
+    bucket: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = write_flight(tmp_path / "flight", seconds=0.4)
+    for path in sorted((tmp_path / "flight").iterdir()):
+        put(f"{bucket}/flights/{path.name}", path.read_bytes())
+    there, manifest = f"{bucket}/there.session", f"{bucket}/flights/flight.yaml"
+    succeeds("ingest", flight.manifest, "-o", tmp_path / "here.session")
+    succeeds("ingest", manifest, "-o", there)
+    succeeds("ingest", manifest, "-o", tmp_path / "both.session")
+    tables = {
+        name: digest
+        for name, digest in content(tmp_path / "here.session").items()
+        if name.endswith(".parquet") or name == "session.json"
+    }
+    assert len(tables) > 5
+    assert tables.items() <= content(tmp_path / "both.session").items()
+    with session_here(there) as copy:
+        assert tables.items() <= content(copy).items()
+    # Files lie there under their own names.
+    assert f"{there}/cameras/drone1/poses.parquet" in matching(f"{there}/cameras/drone1/*")
+    assert "unchanged" in succeeds("ingest", manifest, "-o", there)
+    assert "drone1" in succeeds("info", there)
+    assert "drone1" in succeeds("info", manifest)
+    refused("reconstruct", there, "--scheduler", "tcp://somewhere:1", code="bad-option")
+    assert not list((cache / "sessions").glob("*/*.session"))
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    succeeds("export", there, "--to", "tum")
+    assert list(Path("there.export").glob("*.tum"))
+
+
+def test_sources_by_url_are_fetched_when_they_change(store: str, tmp_path: Path) -> None:
+    put(f"{store}/logs/one.csv", b"1")
+    put(f"{store}/logs/deep/two.csv", b"2")
+    assert located(tmp_path, f"{store}/logs/one.csv").read_bytes() == b"1"
+    assert (located(tmp_path, f"{store}/logs") / "deep" / "two.csv").read_bytes() == b"2"
+    put(f"{store}/logs/one.csv", b"other")
+    assert fetched(f"{store}/logs/one.csv").read_bytes() == b"1"
+    assert fetched(f"{store}/logs/one.csv", fresh=True).read_bytes() == b"other"
+    inside = fetched(f"{store}/logs/one.csv").parent
+    assert source_url(inside, "deep/two.csv") == f"{store}/logs/deep/two.csv"
+    assert source_url(tmp_path, "deep/two.csv") is None
+
+
+def test_a_session_is_uploaded_once_when_it_is_done(store: str, tmp_path: Path) -> None:
+    url, there = f"{store}/x.session", tmp_path / "store" / "x.session"
+    with session_here(url, create=True) as copy:
+        written(copy, a="1", gone="1")
+        with pytest.raises(BusyError), session_here(url, create=True):
+            pass
+        assert not there.exists()
+    with session_here(url) as copy:
+        written(copy, a="2", b="1")
+        (copy / "gone").unlink()
+        (copy / ".partial").mkdir()
+    assert texts(there) == {"session.json": "{}", "a": "2", "b": "1"}
+    before = (there / "a").stat().st_mtime_ns
+    with session_here(url):
+        pass
+    assert (there / "a").stat().st_mtime_ns == before
+    with refusing("not-a-session", f"{store}/none.session"), session_here(f"{store}/none.session"):
+        pass
+
+
+def test_after_an_error_the_same_command_continues(
+    store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url, there = f"{store}/x.session", tmp_path / "store" / "x.session"
+    with session_here(url, create=True) as copy:
+        written(copy, a="1")
+    with pytest.raises(RuntimeError), session_here(url) as copy:  # noqa: PT012
+        written(copy, a="2")
+        raise RuntimeError
+    assert texts(there)["a"] == "1"
+    from fsspec.implementations.local import LocalFileSystem  # type: ignore[import-untyped]
+
+    def broken(*_: object, **__: object) -> None:
+        raise ConnectionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LocalFileSystem, "put", broken)
+        with refusing("store-unreachable", url), session_here(url) as copy:
+            assert texts(copy)["a"] == "2"
+            written(copy, a="3")
+    (there / "a").write_text("half of an upload")
+    with session_here(url) as copy:
+        assert texts(copy)["a"] == "3"
+    assert texts(there)["a"] == "3"
+
+
+def test_what_somebody_else_has_uploaded_meanwhile_is_not_overwritten(store: str, tmp_path: Path) -> None:
+    url, there = f"{store}/x.session", tmp_path / "store" / "x.session"
+    with session_here(url, create=True) as copy:
+        written(copy, a="1")
+    with pytest.raises(BusyError), session_here(url) as copy:  # noqa: PT012
+        written(copy, a="mine")
+        (there / "a").write_text("theirs")
+    with session_here(url) as copy:
+        assert texts(copy)["a"] == "theirs"
+
+
+def test_refused_credentials_are_one_line_without_a_secret(
+    servers: tuple[Server, Server], bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", servers[1].address)
+    flight = write_flight(tmp_path / "flight", seconds=0.1)
+    for arguments in (
+        ("info", f"{bucket}/x.session"),
+        ("ingest", f"{bucket}/flight.yaml"),
+        ("ingest", flight.manifest, "-o", f"{bucket}/x.session"),
+    ):
+        line = refused(*arguments, code="store-refused")
+        assert bucket in line
+        assert KEY not in line
+        assert SECRET not in line
+    with pytest.raises(DataError) as caught:
+        get(f"{bucket}/x")
+    assert caught.value.__cause__ is None  # whose words might repeat a key
+
+
+@pytest.mark.parametrize(
+    ("url", "code"),
+    [
+        (f"s3://{KEY}:{SECRET}@bucket/x", "url-with-secret"),
+        (f"HTTPS://me:{SECRET}@host/x", "url-with-secret"),
+        (f"https://me%3A{SECRET}%40host/x", "url-with-secret"),
+        (f"https://host/x?X-Amz-Signature={SECRET}", "url-with-secret"),
+        (f"https://host/x?a=1&token={SECRET}", "url-with-secret"),
+        (f"https://host/x#access_token={SECRET}", "url-with-secret"),
+        (f"zip://inner.csv::https://me:{SECRET}@host/x.zip", "url-refused"),
+        (f"simplecache::https://me:{SECRET}@host/x", "url-refused"),
+        ("zip://inner.csv::s3://bucket/x.zip", "url-refused"),
+        ("reference://x", "url-refused"),
+        ("dir://x", "url-refused"),
+        ("generic://x", "url-refused"),
+        ("nothing://x/y.yaml", "url-refused"),
+    ],
+)
+def test_a_url_of_another_kind_or_with_a_secret_is_refused_without_repeating_it(
+    url: str, code: str, tmp_path: Path
+) -> None:
+    for place in (url, Path(url)):
+        with refusing(code) as caught:
+            url_of(place)
+        assert SECRET not in str(caught.value)
+    flight = write_flight(tmp_path, seconds=0.1)
+    flight.settings["cameras"]["drone1"]["keypoints"] = url
+    flight.save()
+    assert SECRET not in refused("ingest", flight.manifest)
+
+
+class Redirecting(BaseHTTPRequestHandler):
+    """Server of one file, which sends those who ask by its first name to its second."""
+
+    asked: list[str]
+
+    def _answer(self) -> None:
+        self.asked.append(self.headers["Host"])
+        self.send_response(302 if self.path == "/away" else 200)
+        self.send_header("Location", f"http://127.0.0.2:{self.server.server_port}/secret")  # type: ignore[attr-defined]
+        self.send_header("Content-Length", "6")
+        self.end_headers()
+        if self.command == "GET":
+            self.wfile.write(b"secret")
+
+    do_GET = do_HEAD = _answer  # noqa: N815  # the base class's names
+
+    def log_message(self, *arguments: object) -> None:
+        """Stay silent."""
+
+
+def test_nothing_is_fetched_from_private_addresses_nor_by_redirection(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Redirecting.asked = []
+    with ThreadingHTTPServer(("", 0), Redirecting) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        for host in ("127.0.0.1", "localhost", "0.0.0.0"):  # noqa: S104
+            with refusing("url-refused"):
+                fetched(f"http://{host}:{server.server_port}/secret")
+        assert not Redirecting.asked
+        monkeypatch.setattr(urls, "is_public", "127.0.0.1".__eq__)  # stands for a server of the Internet
+        assert fetched(f"http://127.0.0.1:{server.server_port}/secret").read_bytes() == b"secret"
+        with refusing("url-refused"):
+            fetched(f"http://127.0.0.1:{server.server_port}/away")
+        assert all(host.startswith("127.0.0.1") for host in Redirecting.asked)
+        server.shutdown()
+    for address in ("10.0.0.1", "192.168.1.1", "169.254.169.254", "fe80::1", "::1", "::ffff:127.0.0.1"):
+        monkeypatch.undo()
+        assert not urls.is_public(address)
+    assert urls.is_public("93.184.216.34")
+
+
+def test_what_is_no_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert url_of("C:/flights/flight.yaml") is None
+    assert url_of("a/b.yaml") is None
+    assert url_of(Path("s3://bucket/x/flight.yaml")) == "s3://bucket/x/flight.yaml"
+    assert url_of("file:///x/y") == url_of(Path("file:///x/y")) == "file:///x/y"
+    (tmp_path / "s3:").mkdir()
+    assert url_of(Path("s3:")) is None
+    assert mocap("export", "x.session", "-o", "s3://bucket/out").returncode == 2
