@@ -1,11 +1,11 @@
 """Triangulation of image points to 3D points, over all frames, people and joints in one call.
 
-There are three methods, all weighted by the square of the detector's confidence w. A view of confidence w
-has the standard deviation pixel_sigma / w, which is the same as multiplying its rows by w.
+There are three methods. `midpoint` and `robust` are weighted by the square of the detector's confidence w.
+A view of confidence w has the standard deviation pixel_sigma / w: its rows are multiplied by w.
 
-- `dlt`: homogeneous linear triangulation (Hartley & Zisserman, Multiple View Geometry, 12.2) with rows in
-  pixels. The world is moved to the mean centre of the cameras that see the point, and its unit is their RMS
-  distance from it. Without that, the result depends on the origin and fails under pose noise.
+- `dlt`: homogeneous linear triangulation of viewing directions by pycolmap, without confidences: a baseline.
+  The world is moved to the mean centre of the cameras, and its unit is their RMS distance from it. Without
+  that, the result depends on the origin and fails under pose noise.
 - `midpoint`: the point closest to the viewing lines, sum w^2 (I - d d')(X - c) = 0.
 - `robust`: least squares of the reprojection errors, whitened by pixel and pose noise together. If every
   view is within `gate` standard deviations, this is the result. Otherwise every pair of views (above 8
@@ -174,7 +174,7 @@ def _run(views: Views, method: Method, min_views: int, gate: float, threads: int
 
     n, cameras = views.weight.shape
     found = kernels.Found(
-        np.empty((n, 3)),
+        _linear_points(views) if method == "dlt" else np.empty((n, 3)),
         np.empty((n, cameras), np.bool_),
         np.empty(n, np.int8),
         np.empty((described, 3, 3)),
@@ -207,6 +207,32 @@ def _run(views: Views, method: Method, min_views: int, gate: float, threads: int
         ]:
             done.result()
     return found
+
+
+def _linear_points(views: Views) -> Float:
+    """Triangulate each joint-frame [N, 3] by pycolmap from all its views; NaN where it finds no point."""
+    from pycolmap import triangulate_multi_view_point
+
+    posed = np.isfinite(views.position).all(axis=-1) & np.isfinite(views.rotation).all(axis=(-1, -2))
+    count = np.maximum(posed.sum(axis=1), 1)[:, None]
+    centre = np.where(posed[..., None], views.position, 0.0).sum(axis=1) / count  # [F, 3]
+    away = views.position - centre[:, None]
+    spread = np.where(posed, (away**2).sum(axis=-1), 0.0).sum(axis=1, keepdims=True)
+    unit = np.where(spread > 0, np.sqrt(spread / count), 1.0)  # [F, 1] m
+    camera_from_world = np.swapaxes(views.rotation, -1, -2)
+    shift = -camera_from_world @ (away / unit[..., None])[..., None]
+    projection = np.concatenate([camera_from_world, shift], axis=-1)
+    seen = (views.weight > 0) & np.isfinite(views.rays).all(axis=-1) & posed[views.pose_index]
+    rays = np.where(seen[..., None], views.rays, 0.0)
+    direction = np.concatenate([rays, np.ones((*seen.shape, 1))], axis=-1)
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    points = np.full((len(seen), 3), np.nan)
+    for n in np.flatnonzero(seen.sum(axis=1) >= 2):
+        own = seen[n]
+        found = triangulate_multi_view_point(list(projection[views.pose_index[n], own]), direction[n, own])
+        if found is not None:
+            points[n] = found.ravel()
+    return points * unit[views.pose_index] + centre[views.pose_index]
 
 
 def reprojection_px(views: Views, points: Float) -> Float:

@@ -55,7 +55,7 @@ class Gates(NamedTuple):
 class Found(NamedTuple):
     """Results; see `triangulation.Triangulation`."""
 
-    points: Float  # [N, 3]
+    points: Float  # [N, 3]; for DLT it holds the points before the call
     inlier: Bool  # [N, C]
     status: Int8  # [N]
     covariance: Float  # [N, 3, 3], or without rows if points alone are wanted; so the next two
@@ -233,83 +233,6 @@ def _midpoint(ids: Int64, ray: Float, views: int, camera: Float) -> Vector:
         by += w * cy - qy * along
         bz += w * cz - qz * along
     return _times(_inverse((xx, xy, xz, yy, yz, zz)), (bx, by, bz))
-
-
-@helper
-def _dlt(ids: Int64, ray: Float, views: int, camera: Float, focal: Float) -> Vector:
-    """Compute the homogeneous linear solution (Hartley and Zisserman 12.2) in a normalised world.
-
-    The smallest eigenvector of A'A = [B b; b' c] is (y, 1) with y = -(B - l)^-1 b, where l is the smallest
-    root of c - l + b'y = 0. Newton's method on that equation starts with the inhomogeneous solution (l = 0)
-    and needs only 3x3 systems. An eigenvalue of B bounds the root from above (interlacing), so a bracket
-    keeps the iteration left of it.
-    """
-    # The world's unit is the RMS distance of the cameras from the mean of the ones that see the point.
-    mx = my = mz = 0.0
-    for k in range(views):
-        c = ids[k]
-        mx += camera[c, 9]
-        my += camera[c, 10]
-        mz += camera[c, 11]
-    mx /= views
-    my /= views
-    mz /= views
-    spread = 0.0
-    for k in range(views):
-        c = ids[k]
-        spread += (camera[c, 9] - mx) ** 2 + (camera[c, 10] - my) ** 2 + (camera[c, 11] - mz) ** 2
-    unit = math.sqrt(spread / views)
-    scale = 1.0 / unit
-
-    xx = xy = xz = yy = yz = zz = 0.0
-    bx = by = bz = 0.0
-    corner = 0.0
-    for k in range(views):
-        c = ids[k]
-        cx = (camera[c, 9] - mx) * scale
-        cy = (camera[c, 10] - my) * scale
-        cz = (camera[c, 11] - mz) * scale
-        w = ray[k, 2] * focal[c] * focal[c]
-        for axis in range(2):
-            at = ray[k, axis]
-            rx = at * camera[c, 2] - camera[c, axis]
-            ry = at * camera[c, 5] - camera[c, 3 + axis]
-            rz = at * camera[c, 8] - camera[c, 6 + axis]
-            rw = -(rx * cx + ry * cy + rz * cz)
-            wx = w * rx
-            wy = w * ry
-            wz = w * rz
-            xx += wx * rx
-            xy += wx * ry
-            xz += wx * rz
-            yy += wy * ry
-            yz += wy * rz
-            zz += wz * rz
-            bx += wx * rw
-            by += wy * rw
-            bz += wz * rw
-            corner += w * rw * rw
-    trace = xx + yy + zz
-    low, high = 0.0, trace
-    root = 0.0
-    x = y = z = 0.0
-    for _ in range(40):
-        inverse = _inverse((xx - root, xy, xz, yy - root, yz, zz - root))
-        x, y, z = _times(inverse, (-bx, -by, -bz))
-        leading = (xx - root) * (yy - root) - xy * xy
-        value = corner - root + bx * x + by * y + bz * z
-        beyond = not (xx > root and leading > 0.0 and inverse[5] > 0.0)  # no longer positive definite
-        if beyond or value < 0.0:
-            high = root
-        else:
-            low = root
-        step = value / (1.0 + x * x + y * y + z * z)
-        if not beyond and abs(step) <= 1e-10 * root + 1e-15 * trace:
-            break
-        root += step
-        if beyond or not low <= root <= high:
-            root = 0.5 * (low + high)
-    return mx + unit * x, my + unit * y, mz + unit * z
 
 
 @helper
@@ -669,17 +592,15 @@ def _describe(
             a, b, d = _information(ray, k, inverse)
             h = _add_quadratic(h, a, b, d, p, q)
             continue
-        if method == DLT:
-            # A row of A is w f z times the image residual.
-            a = d = ray[k, 2] * (focal[c] * depth) ** 2
-            b = 0.0
-        else:
-            # The distance to the line is z times the part of (r, 0) across the direction (u, v, 1).
-            scale = ray[k, 2] * depth * depth
-            across = scale / ray[k, 6]
-            a = scale - across * u * u
-            b = -across * u * v
-            d = scale - across * v * v
+        # The distance to the line is z times the part of (r, 0) across the direction (u, v, 1). DLT minimises
+        # its square, too, without the confidence.
+        scale = depth * depth
+        if method == MIDPOINT:
+            scale *= ray[k, 2]
+        across = scale / ray[k, 6]
+        a = scale - across * u * u
+        b = -across * u * v
+        d = scale - across * v * v
         at = inverse * inverse
         sa = ray[k, 7] + ray[k, 10] * at
         sb = ray[k, 8] + ray[k, 11] * at
@@ -742,7 +663,9 @@ def triangulate_range(first: int, last: int, views: ViewArrays, gates: Gates, fo
                 if method == MIDPOINT:
                     x, y, z = _midpoint(ids, ray, seen, camera)
                 else:
-                    x, y, z = _dlt(ids, ray, seen, camera, focal)
+                    x = points[n, 0] - origin[0]
+                    y = points[n, 1] - origin[1]
+                    z = points[n, 2] - origin[2]
                 if not _in_front(ids, seen, camera, x, y, z):
                     outcome = REJECTED
         status[n] = outcome

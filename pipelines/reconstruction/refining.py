@@ -539,7 +539,7 @@ def _disagreement(views: Views, instants: int, known: Bool, camera: int) -> floa
         pixel_sigma=views.pixel_sigma[chosen],
         pose_sigma=views.pose_sigma[:, chosen],
     )
-    points = locate(views, method="dlt").points
+    points = locate(views, method="midpoint").points
     away = points[:, None] - views.position[views.pose_index]
     seen = np.einsum("ncij,nci->ncj", views.rotation[views.pose_index], away)
     depth = np.where(seen[..., 2] > 0, seen[..., 2], np.nan)

@@ -128,7 +128,9 @@ def test_dlt_is_the_smallest_singular_vector() -> None:
     camera_from_world = np.swapaxes(views.rotation, -1, -2)
     shift = -camera_from_world @ ((views.position - centre) / unit)[..., None]
     P = np.concatenate([camera_from_world, shift], axis=-1)[views.pose_index]
-    rows = FOCAL * views.weight[..., None, None] * (views.rays[..., None] * P[:, :, 2:] - P[:, :, :2])
+    ray = np.concatenate([views.rays, np.ones((*views.weight.shape, 1))], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    rows = P - ray[..., None] * np.einsum("nci,ncij->ncj", ray, P)[..., None, :]  # perpendicular to the ray
     X = np.linalg.svd(rows.reshape(len(rows), -1, 4))[2][:, -1]
     expected = (X[:, :3] / X[:, 3:]) * unit[views.pose_index, 0] + centre[views.pose_index, 0]
 
