@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 
-.PHONY: setup demo test check lint house bench results fuzz wheel docs sample lock clean
+.PHONY: setup demo pictures test check lint house bench results fuzz wheel docs sample lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -28,6 +28,10 @@ demo: setup
 	$(BIN)/mocap report $(DEMO)/mound_walk.session
 	$(BIN)/mocap export $(DEMO)/mound_walk.session --to trc,csv,tum --overwrite
 	@echo "Open $(DEMO)/mound_walk.session/report/index.html in a browser."
+
+# The moving picture of README and that of the report, from the demo.
+pictures: demo
+	$(BIN)/python docs/pictures.py $(DEMO)/mound_walk.session
 
 # The bytecode first: where Python may not write any, every command under test would compile all modules.
 test: setup
