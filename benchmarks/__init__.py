@@ -1,1 +1,1 @@
-"""Benchmarks, with comparisons to other tools; docs/benchmarks.md holds their figures."""
+"""Benchmarks, with comparisons to other tools; docs/results.md holds their figures."""

@@ -325,7 +325,7 @@ def measure_filmed() -> None:
             )
     header = ["experiment", "arm", "tilt mean deg", "max", "in view %", "detected %", "keypoints right %"]
     header += ["measured %", "PCK@150 mm %", "MPJPE", "root-relative"]
-    keep("filmed", markdown_table(header, rows), "mocap replan-compare SESSION --render")
+    keep("filmed", markdown_table(header, rows), "mocap replan-compare SESSION --render 5")
 
 
 def measure_studies() -> None:

@@ -5,7 +5,7 @@
 
 A table stands between `<!-- made: NAME -->` and `<!-- end -->`. Keys and settings come from the models with
 their docstrings or comments, formats and exports from the registries, columns and codes of doubts from
-`session`.
+`session`, the figures of README from docs/results.json.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import json
 import re
 import sys
 import textwrap
@@ -31,6 +32,7 @@ from pipelines.session.description import DOUBT_CODES
 from pipelines.session.manifest import Flight
 
 DOCS = Path(__file__).parent
+PAGES = (DOCS.parent / "README.md", *sorted(DOCS.glob("*.md")))
 _MARKED = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _KINDS = (  # what a format reads, and the part of flight.yaml that names such files
     ("open_log", "log"),
@@ -51,6 +53,13 @@ def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
 
 
+def sentence(text: str) -> str:
+    """Begin a text with a capital letter, unless its first word is a name, and end it with a full stop."""
+    first = text.partition(" ")[0]
+    begun = text[:1].upper() + text[1:] if first.isalpha() and first.islower() else text
+    return begun + ("" if begun.endswith((".", ")")) or not begun else ".")
+
+
 def meanings(thing: type) -> dict[str, str]:
     """Find the meaning of each field: the docstring or comment beside it, of the class or of one above it."""
     found: dict[str, str] = {}
@@ -69,7 +78,7 @@ def _meanings_of(thing: type) -> dict[str, str]:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             beside = lines[(node.end_lineno or 0) - 1][node.end_col_offset or 0 :].partition("#")[2]
             above = [line.strip() for line in _comment_above(lines[: node.lineno - 1])]
-            found[node.target.id] = _text_of(following) or beside.strip() or " ".join(above)
+            found[node.target.id] = sentence(_text_of(following) or beside.strip() or " ".join(above))
     return found
 
 
@@ -213,7 +222,7 @@ def formats() -> str:
         for each in registries.FORMATS.all():
             if (not method or hasattr(each, method)) and each.name not in [name for _, name, *_ in rows]:
                 names = ", ".join(suffix or "folder" for suffix in each.suffixes)
-                rows.append((order, each.name, kind, each.title, names))
+                rows.append((order, each.name, kind, sentence(each.title), names))
     cells = [(kind, f"`{name}`", title, names) for _, name, kind, title, names in sorted(rows)]
     return table(("kind", "`format:`", "is", "usual names"), cells)
 
@@ -224,7 +233,7 @@ def exports() -> str:
     for export in registries.EXPORTS.all():
         choice = export if isinstance(export, registries.ChoiceOfAxes) else None
         units, axes = (choice.units, choice.axes) if choice else ((), ())
-        rows.append((f"`{export.name}`", export.title, ", ".join(units), ", ".join(axes)))
+        rows.append((f"`{export.name}`", sentence(export.title), ", ".join(units), ", ".join(axes)))
     return table(("`--to`", "is", "unit", "axes"), rows)
 
 
@@ -236,7 +245,7 @@ def columns() -> str:
         file, colon, meaning = _text_of(following).partition(": ")
         if isinstance(node, ast.Assign) and colon and file.endswith(".parquet"):
             names = getattr(tables, ast.unparse(node.targets[0])).names
-            rows.append((f"`{file}`", ", ".join(f"`{name}`" for name in names), meaning))
+            rows.append((f"`{file}`", ", ".join(f"`{name}`" for name in names), sentence(meaning)))
     return table(("file", "columns", "holds"), rows)
 
 
@@ -247,6 +256,39 @@ def codes() -> str:
         for code, (meaning, keys) in DOUBT_CODES.items()
     ]
     return table(("code", "means", "change"), rows)
+
+
+def figures() -> str:
+    """List the five figures of README, as docs/results.json has them."""
+    poses, corpus, gimbals = _cells("sample-poses", 1), _cells("corpus-model", 2), _cells("gimbals-kept", 3)
+    mistakes, worlds = _cells("mistakes-kept", 1), _cells("planner-worlds", 1)
+    sample = [f"{float(poses[f'logged poses, `{method}`']['MPJPE']):.0f} mm" for method in ("auto", "robust")]
+    kept = [f"{corpus[f'kept {method}']['MPJPE']} mm" for method in ("auto", "robust")]
+    real = [
+        f"{float(gimbals[f'0.5 deg yes {method}']['distance mm']):.0f} mm" for method in ("auto", "robust")
+    ]
+    named = mistakes["3"]
+    flights, touched = (sum(int(row[key]) for row in worlds.values()) for key in ("flights", "touched"))
+    rows = [
+        ("the sample flight, logged poses off by 0.05 m and 0.3 deg (rendered, tuned on)", *sample),
+        ("twelve flights with six kinds of pose errors (rendered, kept aside)", *kept),
+        ("real pictures of cameras that turn, attitudes off by 0.5 deg (kept aside)", *real),
+    ]
+    said = (
+        f"`mocap check` names the mistake in {named['named first']} of {named['mistakes that count']}"
+        " flights that are described with one (modelled, three drones, kept aside).\n"
+        f"In {flights} replays of planners in random worlds {touched or 'no'} drone touches anything"
+        " (simulated)."
+    )
+    header = ("mean error of a joint", "`mocap reconstruct`", "triangulation alone")
+    return f"{table(header, rows)}\n{said}\n"
+
+
+def _cells(name: str, words: int) -> dict[str, dict[str, str]]:
+    """Read a table of docs/results.json: its rows by their first cells, each by the header."""
+    lines = json.loads((DOCS / "results.json").read_text(encoding="utf-8"))[name]["lines"]
+    header, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
+    return {" ".join(row[:words]): dict(zip(header, row, strict=True)) for row in rows}
 
 
 def planner() -> str:
@@ -262,6 +304,7 @@ def planner() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
+    "figures": figures,
     "flight": flight,
     "noise": noise,
     "formats": formats,
@@ -279,7 +322,7 @@ def current(page: str) -> str:
 
 def stale() -> dict[Path, str]:
     """Return the pages whose tables are not current, as they ought to be."""
-    pages = {path: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}
+    pages = {path: path.read_text(encoding="utf-8") for path in PAGES}
     return {path: made for path, text in pages.items() if (made := current(text)) != text}
 
 

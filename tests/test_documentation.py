@@ -34,7 +34,7 @@ _PAGES = [
     *(_ROOT / name for name in ("README.md", "CONTRIBUTING.md", "sample_data/README.md")),
     *sorted(_DOCS.rglob("*.md")),
 ]
-_FOLDERS = ("benchmarks", "docs", "mocap_cli", "pipelines", "sample_data", "tests")
+_FOLDERS = ("benchmarks", "docs", "examples", "mocap_cli", "pipelines", "sample_data", "tests", "tools")
 _FENCED = re.compile(r"^```(\w*).*?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _SPAN = re.compile(r"`([^`]+)`")
 
@@ -156,7 +156,7 @@ def test_the_walk_names_as_many_files_as_its_heading_says() -> None:
 
 
 def test_every_page_that_code_names_exists() -> None:
-    for folder in (*set(_FOLDERS) - {"benchmarks"}, "."):
+    for folder in (*_FOLDERS, "."):
         pattern = "*" if folder == "." else "**/*"
         for path in (_ROOT / folder).glob(pattern):
             if path.suffix in {".py", ".yaml", ".toml", ".md"} and "CHANGELOG" not in path.name:
@@ -247,11 +247,11 @@ def test_every_dependency_is_imported() -> None:
                 imported |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 imported |= {node.module.partition(".")[0]}
-                imported |= {f"{node.module}.{alias.name}".partition(".")[0] for alias in node.names}
     brought = {
         re.sub(r"[-_.]+", "-", distribution).lower()
-        for module in imported | {"google"}
-        for distribution in packages_distributions().get(module, [])
+        for module, distributions in packages_distributions().items()
+        if module in imported
+        for distribution in distributions
     }
     project = tomllib.loads((_ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     wanted = {re.split(r"[<>=!\[; ]", each)[0].lower() for each in project["dependencies"]}
