@@ -1,4 +1,4 @@
-"""Driver of the crafted inputs: each is read by a process of its own, whose time and memory are measured."""
+"""Driver of inputs: each is read by a process of its own, whose time and memory are measured."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ class Met:
 def attack(inputs: Iterable[Crafted], folder: Path) -> Iterator[Met]:
     """Write and read inputs, one at a time, in an empty folder."""
     place = folder / "input"
-    with _Reader() as reader:
+    with Reader() as reader:
         for crafted in inputs:
             place.mkdir()
             crafted.write(place)
@@ -56,10 +56,17 @@ def attack(inputs: Iterable[Crafted], folder: Path) -> Iterator[Met]:
             yield Met(crafted.kind, crafted.what, size, **answer)
 
 
-class _Reader:
-    """Process with all readers loaded, which forks one for each input."""
+class Reader:
+    """Process with all readers loaded, which forks one for each input.
 
-    def __enter__(self) -> _Reader:
+    Args:
+        warm: paths of sound inputs with their formats, which load what the readers import late.
+    """
+
+    def __init__(self, warm: Sequence[tuple[str, str]] = ()) -> None:
+        self._warm = json.dumps(warm)
+
+    def __enter__(self) -> Reader:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tests.fuzz.attacking"],
             stdin=subprocess.PIPE,
@@ -67,6 +74,8 @@ class _Reader:
             stderr=subprocess.DEVNULL,
             text=True,
         )
+        assert self._process.stdin is not None
+        self._process.stdin.write(self._warm + "\n")
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -85,11 +94,13 @@ class _Reader:
 def main() -> None:
     """Read the inputs that stdin names as JSON lines; answer with a line for each on stdout."""
     from pipelines.session.registries import FORMATS
-    from tests.fuzz import reading  # noqa: F401  # loads the stages before memory is counted
+    from tests.fuzz.reading import read_or_refuse  # loads the stages before memory is counted
 
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     FORMATS.all()
+    for path, stated in json.loads(sys.stdin.readline()):
+        read_or_refuse(Path(path), stated)
     for line in sys.stdin:
         path, stated = json.loads(line)
         print(json.dumps(_measured(Path(path), stated)), file=answers, flush=True)

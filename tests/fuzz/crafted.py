@@ -47,15 +47,18 @@ class Crafted:
     entry: str  # the path in that folder to read
 
 
-_Input = tuple[str, str, str, Writer | bytes | str]
-"""What it is, the stated format, the entry, and its content or writer."""
+Content = Writer | bytes | str
+_Input = tuple[str, Content] | tuple[str, str, str, Content]
+"""What it is, and its content or writer; before that format and entry, if not those of the class."""
+_Make = Callable[[], Iterable[_Input]]
 
-KINDS: dict[str, Callable[[], Iterable[_Input]]] = {}
+KINDS: dict[str, tuple[str, str, _Make]] = {}
+"""Classes by name: the format that a user names, the entry to read, and a generator of inputs."""
 
 
-def _kind(name: str) -> Callable[[Callable[[], Iterable[_Input]]], Callable[[], Iterable[_Input]]]:
-    def register(make: Callable[[], Iterable[_Input]]) -> Callable[[], Iterable[_Input]]:
-        KINDS[name] = make
+def _kind(name: str, stated: str, entry: str) -> Callable[[_Make], _Make]:
+    def register(make: _Make) -> _Make:
+        KINDS[name] = stated, entry, make
         return make
 
     return register
@@ -68,8 +71,11 @@ def crafted(kinds: Collection[str] | None = None) -> Iterator[Crafted]:
         kinds: the classes; all by default.
     """
     for kind in kinds or KINDS:
-        make = KINDS[kind]
-        for what, stated, entry, content in make():
+        usual_format, usual_entry, make = KINDS[kind]
+        for given in make():
+            what, stated, entry, content = (
+                given if len(given) == 4 else (given[0], usual_format, usual_entry, given[1])
+            )
             write = content if callable(content) else _writer(entry, content)
             yield Crafted(kind, what, stated, write, entry)
 
@@ -124,68 +130,63 @@ def _mcap(*records: bytes, closed: bool = True) -> bytes:
 _STRING = _schema(1, "std_msgs/msg/String", b"string data")
 
 
-@_kind("MCAP: many channels")
+@_kind("MCAP: many channels", "mcap", "a.mcap")
 def _mcap_channels() -> Iterator[_Input]:
     n = 60_000
     topics = b"".join(_channel(k, 1, f"/topic{k}") for k in range(n))
-    yield "60,000 topics", "mcap", "a.mcap", _mcap(_STRING, topics)
+    yield "60,000 topics", _mcap(_STRING, topics)
     messages = b"".join(_message(k, k) for k in range(n))
-    yield "60,000 topics with a message each", "mcap", "a.mcap", _mcap(_STRING, topics, messages)
+    yield "60,000 topics with a message each", _mcap(_STRING, topics, messages)
     one = b"".join(_channel(k, 1, "/topic") for k in range(n))
-    yield "60,000 channels of one topic", "mcap", "a.mcap", _mcap(_STRING, one, messages)
+    yield "60,000 channels of one topic", _mcap(_STRING, one, messages)
     schemas = b"".join(
         _schema(k + 1, f"a/msg/T{k}", b"float64 x\n") + _channel(k, k + 1, f"/t{k}") for k in range(n)
     )
-    yield "60,000 types", "mcap", "a.mcap", _mcap(schemas, messages)
+    yield "60,000 types", _mcap(schemas, messages)
     inside = _STRING + topics + messages
-    yield "60,000 topics in a chunk", "mcap", "a.mcap", _mcap(_chunk(inside, size=len(inside)))
+    yield "60,000 topics in a chunk", _mcap(_chunk(inside, size=len(inside)))
     other = b"".join(_channel(k, 0, f"/t{k}", "none" + str(k)) for k in range(n))
-    yield "60,000 unknown encodings", "mcap", "a.mcap", _mcap(other, messages)
+    yield "60,000 unknown encodings", _mcap(other, messages)
 
 
-@_kind("MCAP: inflated chunks")
+@_kind("MCAP: inflated chunks", "mcap", "a.mcap")
 def _mcap_bombs() -> Iterator[_Input]:
     for name, press in (("zstd", zstd.compress), ("lz4", lz4.frame.compress)):
         large = press(bytes(1000 * MB))
-        yield f"{name}, 1,000 MB of zeros", "mcap", "a.mcap", _mcap(_chunk(large, name, 1000 * MB))
-        yield f"{name}, states 100 bytes", "mcap", "a.mcap", _mcap(_chunk(large, name, 100))
-        yield f"{name}, states 2^63", "mcap", "a.mcap", _mcap(_chunk(large, name, 2**63))
+        yield f"{name}, 1,000 MB of zeros", _mcap(_chunk(large, name, 1000 * MB))
+        yield f"{name}, states 100 bytes", _mcap(_chunk(large, name, 100))
+        yield f"{name}, states 2^63", _mcap(_chunk(large, name, 2**63))
         body = _STRING + _channel(1, 1, "/a") + _message(1, 1, bytes(900 * MB))
-        yield f"{name}, one message of 900 MB", "mcap", "a.mcap", _mcap(_chunk(press(body), name, len(body)))
+        yield f"{name}, one message of 900 MB", _mcap(_chunk(press(body), name, len(body)))
         some = press(bytes(60 * MB))
-        yield f"{name}, 400 times 60 MB", "mcap", "a.mcap", _mcap(*[_chunk(some, name, 60 * MB)] * 400)
+        yield f"{name}, 400 times 60 MB", _mcap(*[_chunk(some, name, 60 * MB)] * 400)
     messages = _STRING + _channel(1, 1, "/a") + _message(1, 1) * 1_500_000
     pressed = zstd.compress(messages)
-    yield "zstd, 1,500,000 messages", "mcap", "a.mcap", _mcap(_chunk(pressed, "zstd", len(messages)))
+    yield "zstd, 1,500,000 messages", _mcap(_chunk(pressed, "zstd", len(messages)))
 
 
-@_kind("MCAP: chunks and indices")
+@_kind("MCAP: chunks and indices", "mcap", "a.mcap")
 def _mcap_indices() -> Iterator[_Input]:
     head = _STRING + _channel(1, 1, "/a")
     body = head + _message(1, 1)
     rows = [(1, len(head))] * 1_000_000
-    yield "300,000 empty chunks", "mcap", "a.mcap", _mcap(*[_chunk(b"")] * 300_000)
-    yield (
-        "1,000,000 rows for one message",
-        "mcap",
-        "a.mcap",
-        _mcap(_chunk(body, size=len(body)), _index(1, rows)),
-    )
+    yield "300,000 empty chunks", _mcap(*[_chunk(b"")] * 300_000)
+    yield ("1,000,000 rows for one message", _mcap(_chunk(body, size=len(body)), _index(1, rows)))
     empty = _index(1, []) * 300_000
-    yield "300,000 empty indices", "mcap", "a.mcap", _mcap(_chunk(body, size=len(body)), empty)
+    yield "300,000 empty indices", _mcap(_chunk(body, size=len(body)), empty)
     far = _index(1, [(2**63 - 1, 2**63 - 1)])
-    yield "places of 2^63 - 1", "mcap", "a.mcap", _mcap(_chunk(body, size=len(body)), far)
+    yield "places of 2^63 - 1", _mcap(_chunk(body, size=len(body)), far)
     late = _index(1, [(2**64 - 1, 0)])
-    yield "stamps of 2^64 - 1", "mcap", "a.mcap", _mcap(_chunk(body, size=len(body)), late)
-    yield "500,000 unknown records", "mcap", "a.mcap", _mcap(head, _op(99, b"") * 500_000, _message(1, 1))
-    yield "a record of 2^63 bytes", "mcap", "a.mcap", _mcap(head, struct.pack("<BQ", 5, 2**63), closed=False)
+    yield "stamps of 2^64 - 1", _mcap(_chunk(body, size=len(body)), late)
+    yield "500,000 unknown records", _mcap(head, _op(99, b"") * 500_000, _message(1, 1))
+    yield "a record of 2^63 bytes", _mcap(head, struct.pack("<BQ", 5, 2**63), closed=False)
     count = _op(11, struct.pack("<QHIIIIQQI", 2**64 - 1, 1, 1, 0, 0, 1, 0, 0, 0))
-    yield "2^64 - 1 messages stated", "mcap", "a.mcap", _mcap(head, _message(1, 1), count)
+    yield "2^64 - 1 messages stated", _mcap(head, _message(1, 1), count)
     mixed = b"".join(_message(1, k) + _op(99, b"") for k in range(200_000))
-    yield "200,000 runs of one message", "mcap", "a.mcap", _mcap(head, mixed)
+    yield "200,000 runs of one message", _mcap(head, mixed)
 
 
-@_kind("messages: definitions")
+@_kind("messages: definitions", "mcap", "a.mcap")
 def _definitions() -> Iterator[_Input]:
     def log(definition: str, data: bytes = bytes(64)) -> bytes:
         return _mcap(
@@ -195,47 +196,42 @@ def _definitions() -> Iterator[_Input]:
         )
 
     rule = "\n" + "=" * 80 + "\nMSG: a/"
-    yield "100,000 fields", "mcap", "a.mcap", log("\n".join(f"float64 x{k}" for k in range(100_000)))
+    yield "100,000 fields", log("\n".join(f"float64 x{k}" for k in range(100_000)))
     deep = "B0 x" + "".join(f"{rule}B{k}\nB{k + 1} x" for k in range(2000)) + f"{rule}B2000\nfloat64 x"
-    yield "2,000 types deep", "mcap", "a.mcap", log(deep)
+    yield "2,000 types deep", log(deep)
     wide = "B0[10] x" + "".join(f"{rule}B{k}\nB{k + 1}[10] x" for k in range(12)) + f"{rule}B12\nfloat64 x"
-    yield "arrays of arrays, 10^13 numbers", "mcap", "a.mcap", log(wide)
+    yield "arrays of arrays, 10^13 numbers", log(wide)
     shared = _schema(1, "a/msg/A", f"{deep}\nfloat".encode()) + b"".join(
         _channel(k, 1, f"/t{k}") for k in range(30_000)
     )
-    yield "30,000 topics of one faulty type", "mcap", "a.mcap", _mcap(shared)
-    yield "an array of 10^12", "mcap", "a.mcap", log("float64[1000000000000] x")
-    yield "a type within itself", "mcap", "a.mcap", log("A x")
-    yield "two types within each other", "mcap", "a.mcap", log(f"B x{rule}B\nA x")
-    yield "a sequence of 2^32 - 1", "mcap", "a.mcap", log("float64[] x", b"\xff\xff\xff\xff" + bytes(8))
-    yield "2^32 - 1 empty strings", "mcap", "a.mcap", log("string[] x", b"\xff\xff\xff\xff" + bytes(64))
+    yield "30,000 topics of one faulty type", _mcap(shared)
+    yield "an array of 10^12", log("float64[1000000000000] x")
+    yield "a type within itself", log("A x")
+    yield "two types within each other", log(f"B x{rule}B\nA x")
+    yield "a sequence of 2^32 - 1", log("float64[] x", b"\xff\xff\xff\xff" + bytes(8))
+    yield "2^32 - 1 empty strings", log("string[] x", b"\xff\xff\xff\xff" + bytes(64))
     empty = log(f"B[] x{rule}B\n", b"\xff\xff\xff\xff" + bytes(8))
-    yield "2^32 - 1 messages without fields", "mcap", "a.mcap", empty
-    yield "a name of 1 MB", "mcap", "a.mcap", log("float64 " + "x" * MB)
+    yield "2^32 - 1 messages without fields", empty
+    yield "a name of 1 MB", log("float64 " + "x" * MB)
     bomb = _mcap(_STRING, _channel(1, 1, "/a"), _message(1, 1, zstd.compress(bytes(1000 * MB))))
-    yield "a compressed message of 1,000 MB", "mcap", "a.mcap", bomb
+    yield "a compressed message of 1,000 MB", bomb
 
 
-@_kind("messages: JSON and protobuf")
+@_kind("messages: JSON and protobuf", "mcap", "a.mcap")
 def _other_messages() -> Iterator[_Input]:
     def log(data: bytes, encoding: str = "json", schema: bytes = b"{}", name: str = "a.A") -> bytes:
         kind = {"json": "jsonschema", "protobuf": "protobuf"}[encoding]
         return _mcap(_schema(1, name, schema, kind), _channel(1, 1, "/a", encoding), _message(1, 1, data))
 
-    yield "JSON nested 100,000 deep", "mcap", "a.mcap", log(b"[" * 100_000)
-    yield "JSON with an integer of 100,000 digits", "mcap", "a.mcap", log(b'{"a": ' + b"9" * 100_000 + b"}")
+    yield "JSON nested 100,000 deep", log(b"[" * 100_000)
+    yield "JSON with an integer of 100,000 digits", log(b'{"a": ' + b"9" * 100_000 + b"}")
     schema = b'{"a":' * 50_000 + b"{}" + b"}" * 50_000
-    yield "a JSON schema 50,000 deep", "mcap", "a.mcap", log(b"{}", schema=schema)
-    yield "a protobuf schema of zeros", "mcap", "a.mcap", log(b"", "protobuf", bytes(MB))
+    yield "a JSON schema 50,000 deep", log(b"{}", schema=schema)
+    yield "a protobuf schema of zeros", log(b"", "protobuf", bytes(MB))
     deep = b""
     for _ in range(5000):
         deep = b"\x1a" + _varint(len(deep)) + deep
-    yield (
-        "protobuf types nested deep",
-        "mcap",
-        "a.mcap",
-        log(b"", "protobuf", b"\x0a" + _varint(len(deep)) + deep),
-    )
+    yield ("protobuf types nested deep", log(b"", "protobuf", b"\x0a" + _varint(len(deep)) + deep))
 
 
 def _varint(value: int) -> bytes:
@@ -289,52 +285,52 @@ def _bag_index(number: int, rows: bytes) -> bytes:
     return _bag_record(fields | {"count": struct.pack("<I", len(rows) // 12)}, rows)
 
 
-@_kind("ROS 1: inflated chunks")
+@_kind("ROS 1: inflated chunks", "ros1", "a.bag")
 def _bag_bombs() -> Iterator[_Input]:
     large = bz2.compress(bytes(1000 * MB))
-    yield "bz2, 1,000 MB of zeros", "ros1", "a.bag", _bag(_bag_chunk(large, "bz2", 1000 * MB))
-    yield "bz2, states 100 bytes", "ros1", "a.bag", _bag(_bag_chunk(large, "bz2", 100))
-    yield "bz2, states 2^32 - 1", "ros1", "a.bag", _bag(_bag_chunk(large, "bz2", 2**32 - 1))
+    yield "bz2, 1,000 MB of zeros", _bag(_bag_chunk(large, "bz2", 1000 * MB))
+    yield "bz2, states 100 bytes", _bag(_bag_chunk(large, "bz2", 100))
+    yield "bz2, states 2^32 - 1", _bag(_bag_chunk(large, "bz2", 2**32 - 1))
     some = bz2.compress(bytes(60 * MB))
-    yield "bz2, 100 times 60 MB", "ros1", "a.bag", _bag(_bag_chunk(some, "bz2", 60 * MB) * 100)
+    yield "bz2, 100 times 60 MB", _bag(_bag_chunk(some, "bz2", 60 * MB) * 100)
     large = lz4.frame.compress(bytes(1000 * MB))
-    yield "lz4, 1,000 MB of zeros", "ros1", "a.bag", _bag(_bag_chunk(large, "lz4", 1000 * MB))
+    yield "lz4, 1,000 MB of zeros", _bag(_bag_chunk(large, "lz4", 1000 * MB))
     frames = lz4.frame.compress(bytes(1000)) * 100_000
-    yield "lz4, 100,000 frames", "ros1", "a.bag", _bag(_bag_chunk(frames, "lz4", 100_000_000))
+    yield "lz4, 100,000 frames", _bag(_bag_chunk(frames, "lz4", 100_000_000))
     tail = bz2.compress(_bag_topic(0, "/a") + _bag_message(0) * 1_000_000)
     size = len(_bag_topic(0, "/a") + _bag_message(0) * 1_000_000)
-    yield "bz2, 1,000,000 messages", "ros1", "a.bag", _bag(_bag_chunk(tail, "bz2", size))
+    yield "bz2, 1,000,000 messages", _bag(_bag_chunk(tail, "bz2", size))
 
 
-@_kind("ROS 1: records")
+@_kind("ROS 1: records", "ros1", "a.bag")
 def _bag_records() -> Iterator[_Input]:
-    yield "300,000 empty chunks", "ros1", "a.bag", _bag(_bag_chunk(b"") * 300_000, chunks=300_000)
+    yield "300,000 empty chunks", _bag(_bag_chunk(b"") * 300_000, chunks=300_000)
     bad = _bag_chunk(b"\0", "bz2", 5) * 300_000
-    yield "300,000 damaged chunks", "ros1", "a.bag", _bag(bad, chunks=300_000)
+    yield "300,000 damaged chunks", _bag(bad, chunks=300_000)
     small = bz2.compress(_bag_topic(0, "/a") + _bag_message(0))
     both = _bag_chunk(small, "bz2", len(_bag_topic(0, "/a") + _bag_message(0)))
-    yield "50,000 chunks of a message", "ros1", "a.bag", _bag(both * 50_000, chunks=50_000)
-    yield "9,000 chunks of a message", "ros1", "a.bag", _bag(both * 9000, chunks=9000)
+    yield "50,000 chunks of a message", _bag(both * 50_000, chunks=50_000)
+    yield "9,000 chunks of a message", _bag(both * 9000, chunks=9000)
     topics = b"".join(_bag_topic(k, f"/t{k}") for k in range(60_000))
-    yield "60,000 topics", "ros1", "a.bag", _bag(topics)
+    yield "60,000 topics", _bag(topics)
     messages = b"".join(_bag_message(k) for k in range(60_000))
-    yield "60,000 topics with a message each", "ros1", "a.bag", _bag(topics, _bag_chunk(messages))
+    yield "60,000 topics with a message each", _bag(topics, _bag_chunk(messages))
     content = _bag_topic(0, "/a") + _bag_message(0)
     place = struct.pack("<III", 0, 0, len(_bag_topic(0, "/a")))
     rows = _bag_index(0, place * 1_000_000)
-    yield "1,000,000 rows for one message", "ros1", "a.bag", _bag(_bag_chunk(content), rows, chunks=1)
+    yield "1,000,000 rows for one message", _bag(_bag_chunk(content), rows, chunks=1)
     empty = _bag_index(0, b"") * 300_000
-    yield "300,000 empty indices", "ros1", "a.bag", _bag(_bag_chunk(content), empty, chunks=1)
+    yield "300,000 empty indices", _bag(_bag_chunk(content), empty, chunks=1)
     fields = struct.pack("<I", 2) + b"a="
     header = fields * (MB // 6)
     record = (struct.pack("<I", len(header)) + header + bytes(4)) * 20
-    yield "headers of 170,000 fields", "ros1", "a.bag", _bag(record)
+    yield "headers of 170,000 fields", _bag(record)
     topic = _bag_chunk(_bag_topic(0, "/a") * 100_000 + _bag_message(0))
     first = _bag_index(0, bytes(12) * 1000)
-    yield "an index that points before 100,000 topics", "ros1", "a.bag", _bag(topic, first, chunks=1)
+    yield "an index that points before 100,000 topics", _bag(topic, first, chunks=1)
 
 
-@_kind("ROS 2: databases")
+@_kind("ROS 2: databases", "ros2", "a.db3")
 def _databases() -> Iterator[_Input]:
     topics = (
         "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,"
@@ -356,8 +352,6 @@ def _databases() -> Iterator[_Input]:
     many = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 60000)"
     yield (
         "60,000 topics",
-        "ros2",
-        "a.db3",
         database(
             topics,
             plain,
@@ -370,24 +364,20 @@ def _databases() -> Iterator[_Input]:
         "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
         " SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"
     )
-    yield "a view without end", "ros2", "a.db3", database(topics, named, endless)
+    yield "a view without end", database(topics, named, endless)
     zeros = "SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, zeroblob(999000000) AS data"
-    yield "a view of 1 GB", "ros2", "a.db3", database(topics, named, f"CREATE VIEW messages AS {zeros}")
+    yield "a view of 1 GB", database(topics, named, f"CREATE VIEW messages AS {zeros}")
     no_topics = (
         "CREATE VIEW topics AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS id"
     )
     yield (
         "a view of topics without end",
-        "ros2",
-        "a.db3",
         database(
             f"{no_topics}, '/t' || i AS name, 'a/msg/A' AS type, 'cdr' AS serialization_format FROM n", plain
         ),
     )
     yield (
         "1,000,000 messages",
-        "ros2",
-        "a.db3",
         database(
             topics,
             plain,
@@ -399,14 +389,10 @@ def _databases() -> Iterator[_Input]:
     )
     yield (
         "texts in place of numbers",
-        "ros2",
-        "a.db3",
         database(topics, plain, named, "INSERT INTO messages VALUES (1, '1', 'x', 5), (2, 1, 1e308, NULL)"),
     )
     yield (
         "stamps of 2^63 - 1",
-        "ros2",
-        "a.db3",
         database(
             topics,
             plain,
@@ -417,8 +403,6 @@ def _databases() -> Iterator[_Input]:
     generated = plain.replace("data BLOB", "data BLOB AS (zeroblob(900000000))")
     yield (
         "generated columns of 900 MB",
-        "ros2",
-        "a.db3",
         database(
             topics,
             generated,
@@ -428,7 +412,7 @@ def _databases() -> Iterator[_Input]:
     )
 
 
-@_kind("ROS 2: folders")
+@_kind("ROS 2: folders", "ros2", "bag")
 def _bag_folders() -> Iterator[_Input]:
     def bag(metadata: str, **files: bytes) -> Writer:
         def write(folder: Path) -> None:
@@ -445,20 +429,15 @@ def _bag_folders() -> Iterator[_Input]:
         return f"rosbag2_bagfile_information:\n  message_count: 1\n  relative_file_paths:\n{listed}"
 
     log = _mcap(_STRING, _channel(1, 1, "/a"), _message(1, 1))
-    yield (
-        "metadata of 10,000 files",
-        "ros2",
-        "bag",
-        bag(stated(f"{k}.mcap" for k in range(10_000)), a__mcap=log),
-    )
-    yield "one file named 2,000 times", "ros2", "bag", bag(stated(["a.mcap"] * 2000), a__mcap=log)
-    yield "metadata of aliases", "ros2", "bag", bag(_laughs(), a__mcap=log)
-    yield "metadata nested deep", "ros2", "bag", bag("[" * 100_000, a__mcap=log)
-    yield "metadata of 15 MB", "ros2", "bag", bag("a: [" + "1, " * 5_000_000 + "1]", a__mcap=log)
+    yield ("metadata of 10,000 files", bag(stated(f"{k}.mcap" for k in range(10_000)), a__mcap=log))
+    yield "one file named 2,000 times", bag(stated(["a.mcap"] * 2000), a__mcap=log)
+    yield "metadata of aliases", bag(_laughs(), a__mcap=log)
+    yield "metadata nested deep", bag("[" * 100_000, a__mcap=log)
+    yield "metadata of 15 MB", bag("a: [" + "1, " * 5_000_000 + "1]", a__mcap=log)
     bomb = zstd.compress(bytes(4000 * MB))
-    yield "a zstd file of 4 GB", "ros2", "bag", bag(stated(["a.db3.zstd"]), a__db3__zstd=bomb)
+    yield "a zstd file of 4 GB", bag(stated(["a.db3.zstd"]), a__db3__zstd=bomb)
     nested = zstd.compress(zstd.compress(log))
-    yield "zstd in zstd", "ros2", "bag", bag(stated(["a.mcap.zstd.zstd"]), a__mcap__zstd__zstd=nested)
+    yield "zstd in zstd", bag(stated(["a.mcap.zstd.zstd"]), a__mcap__zstd__zstd=nested)
 
 
 # --- YAML, TOML, XML ----------------------------------------
@@ -476,44 +455,34 @@ _LENS = (
 )
 
 
-@_kind("YAML: calibrations")
+@_kind("YAML: calibrations", "kalibr", "chain.yaml")
 def _yaml_calibrations() -> Iterator[_Input]:
     chain = "".join(f"cam{k}:\n{_LENS}" for k in range(10_000))
-    yield "10,000 cameras", "kalibr", "chain.yaml", chain
-    yield (
-        "5,000 cameras, under 1 MB",
-        "kalibr",
-        "chain.yaml",
-        "".join(f"cam{k}:\n{_LENS}" for k in range(5000)),
-    )
-    yield "1,500 cameras", "kalibr", "chain.yaml", "".join(f"cam{k}:\n{_LENS}" for k in range(1500))
+    yield "10,000 cameras", chain
+    yield ("5,000 cameras, under 1 MB", "".join(f"cam{k}:\n{_LENS}" for k in range(5000)))
+    yield "1,500 cameras", "".join(f"cam{k}:\n{_LENS}" for k in range(1500))
     aliases = f"cam0: &c\n{_LENS}" + "".join(f"cam{k}: *c\n" for k in range(1, 50_000))
-    yield "50,000 cameras by aliases", "kalibr", "chain.yaml", aliases
+    yield "50,000 cameras by aliases", aliases
     head = f"cam0:\n{_LENS}"
-    yield "aliases of aliases", "kalibr", "chain.yaml", head + _laughs()
+    yield "aliases of aliases", head + _laughs()
     keys = ["m0: &m0 {a: 1}"] + [
         f"m{k}: &m{k} {{<<: [{', '.join([f'*m{k - 1}'] * 9)}]}}" for k in range(1, 9)
     ]
-    yield "merges of merges", "kalibr", "chain.yaml", head + "\n".join(keys)
-    yield "nested 100,000 deep", "kalibr", "chain.yaml", head + "a: " + "[" * 100_000
-    yield "blocks 700 deep", "kalibr", "chain.yaml", head + "".join(" " * k + "a:\n" for k in range(700))
-    yield "a scalar of 900 kB", "kalibr", "chain.yaml", head + "a: " + "9" * 900_000
-    yield "100,000 anchors", "kalibr", "chain.yaml", head + "".join(f"k{k}: &n{k} 1\n" for k in range(50_000))
-    yield "400,000 short items", "kalibr", "chain.yaml", head + "a: [" + "1," * 400_000 + "1]"
-    yield (
-        "a date with 100,000 digits",
-        "kalibr",
-        "chain.yaml",
-        head + "a: 2001-01-01 00:00:00." + "0" * 100_000,
-    )
-    yield "a sexagesimal number", "kalibr", "chain.yaml", head + "a: 1" + ":59" * 100_000
-    yield "an integer in base 2", "kalibr", "chain.yaml", head + "a: 0b" + "1" * 500_000
+    yield "merges of merges", head + "\n".join(keys)
+    yield "nested 100,000 deep", head + "a: " + "[" * 100_000
+    yield "blocks 700 deep", head + "".join(" " * k + "a:\n" for k in range(700))
+    yield "a scalar of 900 kB", head + "a: " + "9" * 900_000
+    yield "100,000 anchors", head + "".join(f"k{k}: &n{k} 1\n" for k in range(50_000))
+    yield "400,000 short items", head + "a: [" + "1," * 400_000 + "1]"
+    yield ("a date with 100,000 digits", head + "a: 2001-01-01 00:00:00." + "0" * 100_000)
+    yield "a sexagesimal number", head + "a: 1" + ":59" * 100_000
+    yield "an integer in base 2", head + "a: 0b" + "1" * 500_000
     tags = "".join(f"%TAG !t{k}! tag:x,{k}:\n" for k in range(20_000))
-    yield "20,000 tags", "kalibr", "chain.yaml", tags + "---\n" + head
-    yield "%50,000 questions", "kalibr", "chain.yaml", head + "? " * 50_000
+    yield "20,000 tags", tags + "---\n" + head
+    yield "%50,000 questions", head + "? " * 50_000
 
 
-@_kind("YAML: flights")
+@_kind("YAML: flights", "", "flight.yaml")
 def _yaml_flights() -> Iterator[_Input]:
     def flight(change: Callable[[str], str]) -> Writer:
         def write(folder: Path) -> None:
@@ -528,36 +497,26 @@ def _yaml_flights() -> Iterator[_Input]:
         raw["cameras"] = {f"drone{k}": one for k in range(count)}
         return json.dumps(raw)
 
-    yield "10,000 cameras", "", "flight.yaml", flight(lambda text: cameras(text, 10_000))
-    yield "1,000 cameras", "", "flight.yaml", flight(lambda text: cameras(text, 1000))
-    yield "128 cameras", "", "flight.yaml", flight(lambda text: cameras(text, 128))
-    yield "aliases of aliases", "", "flight.yaml", flight(lambda text: text + _laughs())
-    yield "nested 100,000 deep", "", "flight.yaml", flight(lambda text: text + "a: " + "{a: " * 100_000)
-    yield (
-        "30,000 unknown keys",
-        "",
-        "flight.yaml",
-        flight(lambda text: text + "".join(f"key{k}: 1\n" for k in range(30_000))),
-    )
-    yield "a name of 900 kB", "", "flight.yaml", flight(lambda text: text + "name: " + "x" * 900_000)
-    yield "999 kB of blanks", "", "flight.yaml", flight(lambda text: text + " " * 900_000)
+    yield "10,000 cameras", flight(lambda text: cameras(text, 10_000))
+    yield "1,000 cameras", flight(lambda text: cameras(text, 1000))
+    yield "128 cameras", flight(lambda text: cameras(text, 128))
+    yield "aliases of aliases", flight(lambda text: text + _laughs())
+    yield "nested 100,000 deep", flight(lambda text: text + "a: " + "{a: " * 100_000)
+    yield ("30,000 unknown keys", flight(lambda text: text + "".join(f"key{k}: 1\n" for k in range(30_000))))
+    yield "a name of 900 kB", flight(lambda text: text + "name: " + "x" * 900_000)
+    yield "999 kB of blanks", flight(lambda text: text + " " * 900_000)
 
 
-@_kind("TOML, INI: calibrations")
+@_kind("TOML, INI: calibrations", "anipose", "calib.toml")
 def _toml() -> Iterator[_Input]:
     def cameras(count: int) -> str:
         return "".join(test_anipose_toml.CAMERA.replace("one", f"cam_{k}") for k in range(count))
 
-    yield "10,000 cameras", "anipose", "calib.toml", cameras(10_000)
-    yield "nested 100,000 deep", "anipose", "calib.toml", cameras(1) + "a = " + "[" * 100_000
-    yield "a key of 100,000 dots", "anipose", "calib.toml", cameras(1) + "a" + ".a" * 100_000 + " = 1\n"
-    yield "an integer of 500,000 digits", "anipose", "calib.toml", cameras(1) + "a = " + "9" * 500_000 + "\n"
-    yield (
-        "40,000 tables",
-        "anipose",
-        "calib.toml",
-        cameras(1) + "".join(f"[a.b.c{k}]\n" for k in range(40_000)),
-    )
+    yield "10,000 cameras", cameras(10_000)
+    yield "nested 100,000 deep", cameras(1) + "a = " + "[" * 100_000
+    yield "a key of 100,000 dots", cameras(1) + "a" + ".a" * 100_000 + " = 1\n"
+    yield "an integer of 500,000 digits", cameras(1) + "a = " + "9" * 500_000 + "\n"
+    yield ("40,000 tables", cameras(1) + "".join(f"[a.b.c{k}]\n" for k in range(40_000)))
     yield (
         "an INI of 200,000 keys",
         "camera_info",
@@ -566,16 +525,14 @@ def _toml() -> Iterator[_Input]:
     )
 
 
-@_kind("XML")
+@_kind("XML", "opencv", "calib.xml")
 def _xml() -> Iterator[_Input]:
     head = '<?xml version="1.0"?>'
     cv = f"{head}<opencv_storage><camera_matrix>"
-    yield "nested 50,000 deep, OpenCV", "opencv", "calib.xml", cv + "<a>" * 50_000
+    yield "nested 50,000 deep, OpenCV", cv + "<a>" * 50_000
     matrix = '<?xml version="1.0"?><opencv_storage><camera_matrix type_id="opencv-matrix">'
     yield (
         "a matrix of 2^31 rows, OpenCV",
-        "opencv",
-        "calib.xml",
         (
             f"{matrix}<rows>2147483647</rows><cols>2147483647</cols><dt>d</dt><data>1</data></camera_matrix>"
             "</opencv_storage>"
@@ -586,7 +543,7 @@ def _xml() -> Iterator[_Input]:
 # --- keypoints ----------------------------------------
 
 
-@_kind("keypoints: frame numbers")
+@_kind("keypoints: frame numbers", "coco", "a.json")
 def _frame_numbers() -> Iterator[_Input]:
     def person(image: object) -> dict[str, object]:
         return {"image_id": image, "category_id": 1, "keypoints": [100.0, 100.0, 0.9] * 17, "score": 2.0}
@@ -603,24 +560,19 @@ def _frame_numbers() -> Iterator[_Input]:
         both = [person("0.jpg"), person(f"{number}.jpg")]
         yield f"frames 0 and {number:,}", "", "flight.yaml", flight(both)
     yield "frame 5,000,000 alone, read", "alphapose", "a.json", json.dumps([person("5000000.jpg")])
-    yield "frame -5,000,000", "coco", "a.json", json.dumps([person(-5_000_000)])
-    yield "frame 1e300", "coco", "a.json", json.dumps([person(1e300)])
+    yield "frame -5,000,000", json.dumps([person(-5_000_000)])
+    yield "frame 1e300", json.dumps([person(1e300)])
 
 
-@_kind("keypoints: JSON")
+@_kind("keypoints: JSON", "alphapose", "a.json")
 def _keypoint_json() -> Iterator[_Input]:
     person = {"image_id": "0.jpg", "category_id": 1, "keypoints": [100.0, 100.0, 0.9] * 17, "score": 2.0}
     text = json.dumps(person)
-    yield "30,000 people in a frame", "alphapose", "a.json", "[" + ",".join([text] * 30_000) + "]"
-    yield "nested 1,000,000 deep", "alphapose", "a.json", "[" * 1_000_000
-    yield (
-        "an integer of 1,000,000 digits",
-        "alphapose",
-        "a.json",
-        f"[{text[:-1]}, {chr(34)}idx{chr(34)}: {'9' * 10**6}}}]",
-    )
+    yield "30,000 people in a frame", "[" + ",".join([text] * 30_000) + "]"
+    yield "nested 1,000,000 deep", "[" * 1_000_000
+    yield ("an integer of 1,000,000 digits", f"[{text[:-1]}, {chr(34)}idx{chr(34)}: {'9' * 10**6}}}]")
     long = json.dumps(person | {"keypoints": [1.0] * 3_000_000})
-    yield "1,000,000 keypoints in a person", "alphapose", "a.json", f"[{long}]"
+    yield "1,000,000 keypoints in a person", f"[{long}]"
     yield "a key of 20 MB", "coco", "a.json", f'[{{"{"x" * 20 * MB}": 1}}]'
     yield "2,000,000 empty lists", "mmpose", "a.json", '{"instance_info": [' + "[]," * 2_000_000 + "[]]}"
     deep: object = 1.0
@@ -666,7 +618,7 @@ def _keypoint_json() -> Iterator[_Input]:
 # --- text tables ----------------------------------------
 
 
-@_kind("text tables")
+@_kind("text tables", "joints_csv", "joints.csv")
 def _tables() -> Iterator[_Input]:
     row = "1700000000.0 0 0 0 0 0 0 1\n"
     for name, entry, good in (
@@ -683,15 +635,10 @@ def _tables() -> Iterator[_Input]:
     yield "csv: an open quote over 20 MB", "csv", "poses.csv", 't_ns,x\n1,"' + "a\n" * (10 * MB)
     joints = "t_ns,person,joint,x,y,z\n"
     many = "".join(f"{k},0,joint{k},0,0,0\n" for k in range(20_000))
-    yield "joints: 20,000 joints at 20,000 times", "joints_csv", "joints.csv", joints + many
+    yield "joints: 20,000 joints at 20,000 times", joints + many
     people = "".join(f"{k},{k},nose,0,0,0\n" for k in range(20_000))
-    yield "joints: 20,000 people at 20,000 times", "joints_csv", "joints.csv", joints + people
-    yield (
-        "joints: person 10^12",
-        "joints_csv",
-        "joints.csv",
-        joints + f"1,{10**12},nose,0,0,0\n2,0,nose,0,0,0\n",
-    )
+    yield "joints: 20,000 people at 20,000 times", joints + people
+    yield ("joints: person 10^12", joints + f"1,{10**12},nose,0,0,0\n2,0,nose,0,0,0\n")
     yield "frame times: frame 10^15", "frame_times", "f.csv", f"frame,t_ns\n0,1\n{10**15},2\n"
     yield "frame times: frame 5,000,000", "frame_times", "f.csv", "frame,t_ns\n0,1\n5000000,2\n"
     wide = ",".join(
@@ -700,7 +647,7 @@ def _tables() -> Iterator[_Input]:
     yield "DJI record: 100,000 columns", "dji_record", "a.csv", wide + "\n1,2024-01-01 00:00:00,1,2\n"
 
 
-@_kind("skeletons: BVH")
+@_kind("skeletons: BVH", "bvh", "a.bvh")
 def _bvh() -> Iterator[_Input]:
     def motion(head: str, channels: int, frames: int = 1) -> str:
         return f"{head}MOTION\nFrames: {frames}\nFrame Time: 0.01\n" + ("0 " * channels + "\n") * frames
@@ -708,50 +655,43 @@ def _bvh() -> Iterator[_Input]:
     root = "HIERARCHY\nROOT r\n{\nOFFSET 0 0 0\nCHANNELS 3 Xrotation Yrotation Zrotation\n"
     n = 50_000
     deep = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\n" for k in range(n)) + "}\n" * (n + 1)
-    yield "nested 50,000 deep", "bvh", "a.bvh", motion(root + deep, 3)
+    yield "nested 50,000 deep", motion(root + deep, 3)
     turned = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\nCHANNELS 1 Xrotation\n" for k in range(n)) + "}\n" * (
         n + 1
     )
-    yield "nested 50,000 deep with channels", "bvh", "a.bvh", motion(root + turned, 3 + n)
+    yield "nested 50,000 deep with channels", motion(root + turned, 3 + n)
     wide = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\n}}\n" for k in range(n)) + "}\n"
-    yield "50,000 bones side by side", "bvh", "a.bvh", motion(root + wide, 3)
-    yield (
-        "10^9 frames stated",
-        "bvh",
-        "a.bvh",
-        motion(root + "}\n", 3).replace("Frames: 1", "Frames: 1000000000"),
-    )
-    yield "2,000,000 frames", "bvh", "a.bvh", motion(root + "}\n", 3, 2_000_000)
+    yield "50,000 bones side by side", motion(root + wide, 3)
+    yield ("10^9 frames stated", motion(root + "}\n", 3).replace("Frames: 1", "Frames: 1000000000"))
+    yield "2,000,000 frames", motion(root + "}\n", 3, 2_000_000)
     many = root.replace("CHANNELS 3 Xrotation Yrotation Zrotation", "CHANNELS 90000" + " Xrotation" * 90_000)
-    yield "90,000 channels of a bone", "bvh", "a.bvh", motion(many + "}\n", 90_000)
+    yield "90,000 channels of a bone", motion(many + "}\n", 90_000)
     yield (
         "an offset of 1e308",
-        "bvh",
-        "a.bvh",
         motion(root + "JOINT a\n{\nOFFSET 1e308 0 0\nJOINT b\n{\nOFFSET 1e308 1e308 0\n}\n}\n}\n", 3),
     )
-    yield "one line of 500,000 braces", "bvh", "a.bvh", motion(root + "{" * 500_000 + "}" * 500_001, 3)
-    yield "a frame time of 1e300", "bvh", "a.bvh", motion(root + "}\n", 3, 3).replace("0.01", "1e300")
+    yield "one line of 500,000 braces", motion(root + "{" * 500_000 + "}" * 500_001, 3)
+    yield "a frame time of 1e300", motion(root + "}\n", 3, 3).replace("0.01", "1e300")
     sites = "End Site\n{\nOFFSET 0 1 0\n}\n" * 100_000
-    yield "100,000 end sites", "bvh", "a.bvh", motion(root + sites + "}\n", 3)
+    yield "100,000 end sites", motion(root + sites + "}\n", 3)
 
 
-@_kind("skeletons: C3D, TRC, AMC")
+@_kind("skeletons: C3D, TRC, AMC", "trc", "a.trc")
 def _skeletons() -> Iterator[_Input]:
     head = "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n"
     for markers in (10**9, 2**62):
         text = f"{head}60\t60\t1\t{markers}\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t0.0\t1\t2\t3\n"
-        yield f"TRC: {markers:,} markers stated", "trc", "a.trc", text
+        yield f"TRC: {markers:,} markers stated", text
     names = "\t\t\t".join(f"m{k}" for k in range(20_000))
     places = "\t".join(f"X{k}\tY{k}\tZ{k}" for k in range(20_000))
     text = (
         f"{head}60\t60\t1\t20000\tmm\nFrame#\tTime\t{names}\n\t\t{places}\n\n1\t0.0" + "\t1" * 60_000 + "\n"
     )
-    yield "TRC: 20,000 markers", "trc", "a.trc", text
+    yield "TRC: 20,000 markers", text
     same = text.replace("m0\t", "m1\t")
-    yield "TRC: a marker twice", "trc", "a.trc", same
+    yield "TRC: a marker twice", same
     rate = f"{head}1e-300\t1e308\t1\t1\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t1e308\t1\t2\t3\n"
-    yield "TRC: a time of 1e308", "trc", "a.trc", rate
+    yield "TRC: a time of 1e308", rate
     c3d = bytearray(512 * 2)
     c3d[:2] = b"\x02\x50"
     struct.pack_into(
@@ -797,7 +737,7 @@ def _session(table: str, change: Callable[[Path], object]) -> Writer:
     return write
 
 
-@_kind("sessions: large tables")
+@_kind("sessions: large tables", "", "a.session")
 def _parquet() -> Iterator[_Input]:
     def repeated(rows: int) -> Callable[[Path], object]:
         """Repeat the first row, which takes a few bytes for any number of rows."""
@@ -823,12 +763,12 @@ def _parquet() -> Iterator[_Input]:
         pq.write_table(table.append_column("note", named), path, compression="zstd")
 
     for name, table in (("poses", _POSES), ("keypoints", _KEYPOINTS), ("joints", _SKELETON)):
-        yield f"50,000,000 equal {name}", "", "a.session", _session(table, repeated(50_000_000))
-    yield "5,000 columns", "", "a.session", _session(_POSES, wide)
-    yield "a text of 1,000 MB", "", "a.session", _session(_POSES, text)
+        yield f"50,000,000 equal {name}", _session(table, repeated(50_000_000))
+    yield "5,000 columns", _session(_POSES, wide)
+    yield "a text of 1,000 MB", _session(_POSES, text)
 
 
-@_kind("sessions: absurd numbers")
+@_kind("sessions: absurd numbers", "", "a.session")
 def _sessions() -> Iterator[_Input]:
     def changed(table: str, column: str, value: float) -> Writer:
         def change(path: Path) -> None:
@@ -842,52 +782,37 @@ def _sessions() -> Iterator[_Input]:
         return _session(table, change)
 
     for value in (1e308, -1e308, float("inf")):
-        yield f"a joint at {value:g} m", "", "a.session", changed(_SKELETON, "x", value)
-        yield f"a camera at {value:g} m", "", "a.session", changed(_POSES, "x", value)
-        yield f"a keypoint at {value:g} px", "", "a.session", changed(_KEYPOINTS, "x", value)
-    yield "a stamp of 2^62 ns", "", "a.session", changed(_SKELETON, "t_ns", 2**62)
-    yield "a pose at 2^62 ns", "", "a.session", changed(_POSES, "t_ns", 2**62)
-    yield "frame 2^62", "", "a.session", changed(_KEYPOINTS, "frame", 2**31 - 1)
+        yield f"a joint at {value:g} m", changed(_SKELETON, "x", value)
+        yield f"a camera at {value:g} m", changed(_POSES, "x", value)
+        yield f"a keypoint at {value:g} px", changed(_KEYPOINTS, "x", value)
+    yield "a stamp of 2^62 ns", changed(_SKELETON, "t_ns", 2**62)
+    yield "a pose at 2^62 ns", changed(_POSES, "t_ns", 2**62)
+    yield "frame 2^62", changed(_KEYPOINTS, "frame", 2**31 - 1)
 
 
 # --- maps ----------------------------------------
 
 
-@_kind("maps: point clouds")
+@_kind("maps: point clouds", "pcd", "a.pcd")
 def _clouds() -> Iterator[_Input]:
     pcd = (
         "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEIGHT 1\n"
         "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {data}\n"
     )
-    yield "PCD: 10^12 points", "pcd", "a.pcd", pcd.format(n=10**12, data="binary").encode() + bytes(120)
+    yield "PCD: 10^12 points", pcd.format(n=10**12, data="binary").encode() + bytes(120)
     lzf = struct.pack("<II", 3 * 4_000_000, 264 * 4_000_000) + b"\xe0\xff\x00" * 4_000_000
-    yield (
-        "PCD: LZF to 1 GB",
-        "pcd",
-        "a.pcd",
-        pcd.format(n=88_000_000, data="binary_compressed").encode() + lzf,
-    )
+    yield ("PCD: LZF to 1 GB", pcd.format(n=88_000_000, data="binary_compressed").encode() + lzf)
     short = struct.pack("<II", 12, 2**32 - 1) + bytes(12)
-    yield (
-        "PCD: LZF to 2^32 - 1",
-        "pcd",
-        "a.pcd",
-        pcd.format(n=357_913_941, data="binary_compressed").encode() + short,
-    )
+    yield ("PCD: LZF to 2^32 - 1", pcd.format(n=357_913_941, data="binary_compressed").encode() + short)
     count = pcd.replace("COUNT 1 1 1", "COUNT 1 1 1000000000000")
-    yield "PCD: a count of 10^12", "pcd", "a.pcd", count.format(n=1, data="ascii") + "1 2 3\n"
+    yield "PCD: a count of 10^12", count.format(n=1, data="ascii") + "1 2 3\n"
     fields = pcd.replace("x y z", "x y z" + " a" * 5000).replace("4 4 4", "4" + " 4" * 5002)
     fields = fields.replace("F F F", "F" + " F" * 5002).replace("1 1 1", "1" + " 1" * 5002)
-    yield (
-        "PCD: 5,003 fields",
-        "pcd",
-        "a.pcd",
-        fields.format(n=1000, data="ascii") + ("1 " * 5003 + "\n") * 1000,
-    )
+    yield ("PCD: 5,003 fields", fields.format(n=1000, data="ascii") + ("1 " * 5003 + "\n") * 1000)
     far = "\n".join(["0 0 0", "1e308 0 0", "-1e308 1e308 1e38"])
-    yield "PCD: points at 1e308", "pcd", "a.pcd", pcd.format(n=3, data="ascii") + far
+    yield "PCD: points at 1e308", pcd.format(n=3, data="ascii") + far
     box = "\n".join(["0 0 0", "9000 9000 9000"])
-    yield "PCD: two points 9 km apart", "pcd", "a.pcd", pcd.format(n=2, data="ascii") + box
+    yield "PCD: two points 9 km apart", pcd.format(n=2, data="ascii") + box
     ply = "ply\nformat {kind} 1.0\nelement vertex {n}\nproperty float x\nproperty float y\nproperty float z\n"
     yield (
         "PLY: 10^15 points",
@@ -919,7 +844,7 @@ def _clouds() -> Iterator[_Input]:
     yield "LAZ: 2^32 - 1 points", "las", "a.laz", bytes(packed)
 
 
-@_kind("maps: grids")
+@_kind("maps: grids", "ros_map", "map.yaml")
 def _grids() -> Iterator[_Input]:
     def npz(shape: str, data: bytes = b"", kind: str = "<f4", level: int = 9) -> bytes:
         file = BytesIO()
@@ -957,39 +882,14 @@ def _grids() -> Iterator[_Input]:
 
     about = "resolution: {r}\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
     usual = about.format(r=0.05)
-    yield (
-        "map.yaml: 2^31 pixels wide",
-        "ros_map",
-        "map.yaml",
-        ros(usual, "a.pgm", b"P5\n2147483647 2147483647\n255\n\0"),
-    )
-    yield "map.yaml: PNG of 10^9 pixels", "ros_map", "map.yaml", ros(usual, "a.png", _png(31_000, 31_000))
-    yield (
-        "map.yaml: PNG of 400,000,000 pixels",
-        "ros_map",
-        "map.yaml",
-        ros(usual, "a.png", _png(20_000, 20_000)),
-    )
-    yield (
-        "map.yaml: voxels of 1e-300 m",
-        "ros_map",
-        "map.yaml",
-        ros(about.format(r=1e-300), "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"),
-    )
-    yield (
-        "map.yaml: voxels of 1e300 m",
-        "ros_map",
-        "map.yaml",
-        ros(about.format(r=1e300), "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"),
-    )
-    yield "map.yaml: the picture is a device", "ros_map", "map.yaml", ros(usual, "/dev/zero", b"")
+    yield ("map.yaml: 2^31 pixels wide", ros(usual, "a.pgm", b"P5\n2147483647 2147483647\n255\n\0"))
+    yield "map.yaml: PNG of 10^9 pixels", ros(usual, "a.png", _png(31_000, 31_000))
+    yield ("map.yaml: PNG of 400,000,000 pixels", ros(usual, "a.png", _png(20_000, 20_000)))
+    yield ("map.yaml: voxels of 1e-300 m", ros(about.format(r=1e-300), "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"))
+    yield ("map.yaml: voxels of 1e300 m", ros(about.format(r=1e300), "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"))
+    yield "map.yaml: the picture is a device", ros(usual, "/dev/zero", b"")
     turned = usual.replace("[0, 0, 0]", "[1e308, -1e308, 0.7]")
-    yield (
-        "map.yaml: an origin of 1e308",
-        "ros_map",
-        "map.yaml",
-        ros(turned, "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"),
-    )
+    yield ("map.yaml: an origin of 1e308", ros(turned, "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"))
 
 
 def _png(width: int, height: int) -> bytes:
@@ -1005,7 +905,7 @@ def _png(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", data) + part(b"IEND", b"")
 
 
-@_kind("maps: OctoMap")
+@_kind("maps: OctoMap", "octomap", "a.bt")
 def _octomaps() -> Iterator[_Input]:
     tree = test_octomap.at([7] * 13, [3.5, None, -2.0, [3.5, None] * 4, *[None] * 4])
     good = test_octomap.file_of(tree)
@@ -1013,23 +913,23 @@ def _octomaps() -> Iterator[_Input]:
         changed = b"\n".join(
             b"res " + resolution.encode() if line.startswith(b"res ") else line for line in good.split(b"\n")
         )
-        yield f"voxels of {resolution} m", "octomap", "a.bt", changed
+        yield f"voxels of {resolution} m", changed
     head, _, _ = good.partition(b"data\n")
     full = struct.pack("<H", 0xFFFF)
-    yield "only inner nodes", "octomap", "a.bt", head + b"data\n" + full * 2_000_000
+    yield "only inner nodes", head + b"data\n" + full * 2_000_000
     corners = b"\n".join(
         b"size 999999999999" if line.startswith(b"size ") else line for line in good.split(b"\n")
     )
-    yield "a size of 10^12", "octomap", "a.bt", corners
-    yield "the whole world in eight leaves", "octomap", "a.bt", head + b"data\n" + struct.pack("<H", 0xAAAA)
+    yield "a size of 10^12", corners
+    yield "the whole world in eight leaves", head + b"data\n" + struct.pack("<H", 0xAAAA)
     ends = test_octomap.file_of([3.5, None, None, None, None, None, None, test_octomap.at([7] * 15, 3.5)])
-    yield "an octant and a voxel", "octomap", "a.bt", ends
+    yield "an octant and a voxel", ends
 
 
 # --- calibrations in binary, pictures, videos ----------------------------------------
 
 
-@_kind("COLMAP")
+@_kind("COLMAP", "colmap", "model")
 def _colmap() -> Iterator[_Input]:
     def model(cameras: bytes, images: bytes = bytes(8), **others: bytes) -> Writer:
         def write(folder: Path) -> None:
@@ -1043,40 +943,23 @@ def _colmap() -> Iterator[_Input]:
 
     camera = struct.pack("<QIiQQddd", 1, 1, 0, 640, 480, 500.0, 320.0, 240.0)
     image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1)
-    yield "2^64 - 1 cameras", "colmap", "model", model(struct.pack("<Q", 2**64 - 1) + camera[8:])
-    yield (
-        "2^64 - 1 images",
-        "colmap",
-        "model",
-        model(camera, struct.pack("<Q", 2**64 - 1) + image + b"a\0" + bytes(8)),
-    )
+    yield "2^64 - 1 cameras", model(struct.pack("<Q", 2**64 - 1) + camera[8:])
+    yield ("2^64 - 1 images", model(camera, struct.pack("<Q", 2**64 - 1) + image + b"a\0" + bytes(8)))
     yield (
         "2^60 points of an image",
-        "colmap",
-        "model",
         model(camera, struct.pack("<Q", 1) + image + b"a\0" + struct.pack("<Q", 2**60)),
     )
-    yield (
-        "a name without an end",
-        "colmap",
-        "model",
-        model(camera, struct.pack("<Q", 1) + image + b"a" * (20 * MB)),
-    )
+    yield ("a name without an end", model(camera, struct.pack("<Q", 1) + image + b"a" * (20 * MB)))
     many = struct.pack("<Q", 200_000) + b"".join(
         struct.pack("<I7dI", k, 1, 0, 0, 0, 0, 0, 0, 1) + f"{k}.jpg".encode() + b"\0" + bytes(8)
         for k in range(200_000)
     )
-    yield "200,000 images", "colmap", "model", model(camera, many)
+    yield "200,000 images", model(camera, many)
     wide = struct.pack("<QIiQQddd", 1, 1, 0, 2**63, 2**63, 1e308, 1e308, 1e308)
-    yield (
-        "pictures of 2^63 pixels",
-        "colmap",
-        "model",
-        model(wide, struct.pack("<Q", 1) + image + b"a\0" + bytes(8)),
-    )
+    yield ("pictures of 2^63 pixels", model(wide, struct.pack("<Q", 1) + image + b"a\0" + bytes(8)))
 
 
-@_kind("pictures")
+@_kind("pictures", "pictures", "film")
 def _pictures() -> Iterator[_Input]:
     def film(content: Callable[[int], bytes], count: int = 3, suffix: str = "png") -> Writer:
         def write(folder: Path) -> None:
@@ -1087,17 +970,17 @@ def _pictures() -> Iterator[_Input]:
         return write
 
     large = _png(30_000, 30_000)
-    yield "PNG of 900,000,000 pixels", "pictures", "film", film(lambda _: large)
+    yield "PNG of 900,000,000 pixels", film(lambda _: large)
     medium = _png(12_000, 12_000)
-    yield "PNG of 144,000,000 pixels", "pictures", "film", film(lambda _: medium)
+    yield "PNG of 144,000,000 pixels", film(lambda _: medium)
     small = _png(16, 16)
-    yield "10,000 pictures", "pictures", "film", film(lambda _: small, 10_000)
-    yield "another size each", "pictures", "film", film(lambda k: _png(16 + k, 16), 50)
+    yield "10,000 pictures", film(lambda _: small, 10_000)
+    yield "another size each", film(lambda k: _png(16 + k, 16), 50)
     first = _png(16, 16)
     lied = bytearray(first)
     struct.pack_into(">II", lied, 16, 2**31 - 1, 2**31 - 1)
     struct.pack_into(">I", lied, 29, zlib.crc32(bytes(lied[12:29])))
-    yield "PNG that states 2^31 - 1", "pictures", "film", film(lambda _: bytes(lied))
+    yield "PNG that states 2^31 - 1", film(lambda _: bytes(lied))
 
     def jpeg(tags: bytes) -> bytes:
         exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + tags
@@ -1115,7 +998,7 @@ def _box(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", 8 + len(content)) + kind + content
 
 
-@_kind("videos: boxes")
+@_kind("videos: boxes", "video", "a.mp4")
 def _boxes() -> Iterator[_Input]:
     def changed(change: Callable[[bytearray], object], suffix: str = "mp4") -> Writer:
         def write(folder: Path) -> None:
@@ -1136,22 +1019,22 @@ def _boxes() -> Iterator[_Input]:
         return change
 
     for scale in (0, 1, 2**31 - 1, 2**31, 2**32 - 1):
-        yield f"mdhd: a time scale of {scale}", "video", "a.mp4", changed(number(b"mdhd", 12, scale))
-        yield f"mvhd: a time scale of {scale}", "video", "a.mp4", changed(number(b"mvhd", 12, scale))
+        yield f"mdhd: a time scale of {scale}", changed(number(b"mdhd", 12, scale))
+        yield f"mvhd: a time scale of {scale}", changed(number(b"mvhd", 12, scale))
     for kind, offset in ((b"stts", 4), (b"stsz", 8), (b"stsc", 4), (b"stco", 4), (b"ctts", 4), (b"elst", 4)):
-        yield f"{kind.decode()}: 2^32 - 1 entries", "video", "a.mp4", changed(number(kind, offset, 2**32 - 1))
-    yield "stts: a step of 2^32 - 1", "video", "a.mp4", changed(number(b"stts", 12, 2**32 - 1))
-    yield "stts: 2^31 - 1 pictures", "video", "a.mp4", changed(number(b"stts", 8, 2**31 - 1))
-    yield "tkhd: 2^31 wide", "video", "a.mp4", changed(number(b"tkhd", 76, 2**31 - 1))
+        yield f"{kind.decode()}: 2^32 - 1 entries", changed(number(kind, offset, 2**32 - 1))
+    yield "stts: a step of 2^32 - 1", changed(number(b"stts", 12, 2**32 - 1))
+    yield "stts: 2^31 - 1 pictures", changed(number(b"stts", 8, 2**31 - 1))
+    yield "tkhd: 2^31 wide", changed(number(b"tkhd", 76, 2**31 - 1))
     deep = _box(b"ftyp", b"isom\0\0\0\0")
     nested = b""
     for _ in range(20_000):
         nested = struct.pack(">I", 8 + len(nested)) + b"moov" + nested if len(nested) < 60_000 else nested
-    yield "boxes nested deep", "video", "a.mp4", deep + nested
-    yield "200,000 empty boxes", "video", "a.mp4", deep + _box(b"free", b"") * 200_000
+    yield "boxes nested deep", deep + nested
+    yield "200,000 empty boxes", deep + _box(b"free", b"") * 200_000
     tracks = _box(b"moov", _box(b"trak", b"") * 50_000)
-    yield "50,000 empty tracks", "video", "a.mp4", deep + tracks
-    yield "a box of no length", "video", "a.mp4", deep + bytes(4) + b"moov" + bytes(100)
+    yield "50,000 empty tracks", deep + tracks
+    yield "a box of no length", deep + bytes(4) + b"moov" + bytes(100)
 
 
 # --- telemetry ----------------------------------------
@@ -1163,7 +1046,7 @@ def _drone(folder: Path) -> drone_logs.DroneTruth:
     return truth
 
 
-@_kind("PX4 logs")
+@_kind("PX4 logs", "ulog", "a.ulg")
 def _ulogs() -> Iterator[_Input]:
     head = b"ULog\x01\x12\x35\x01" + bytes(8)
 
@@ -1171,29 +1054,24 @@ def _ulogs() -> Iterator[_Input]:
         return head + b"".join(drone_logs.ulog_record("F", text.encode()) for text in formats) + rest
 
     nested = [f"t{k}:t{k + 1}[10] a;" for k in range(12)]
-    yield "arrays of arrays", "ulog", "a.ulg", log("t12:float a;", *nested)
-    yield "a type within itself", "ulog", "a.ulg", log("a:a x;")
-    yield "a chain of 5,000 types", "ulog", "a.ulg", log(*(f"t{k}:t{k + 1} a;" for k in range(5000)))
-    yield (
-        "60,000 formats",
-        "ulog",
-        "a.ulg",
-        log(*(f"t{k}:uint64_t timestamp;float x;" for k in range(60_000))),
-    )
+    yield "arrays of arrays", log("t12:float a;", *nested)
+    yield "a type within itself", log("a:a x;")
+    yield "a chain of 5,000 types", log(*(f"t{k}:t{k + 1} a;" for k in range(5000)))
+    yield ("60,000 formats", log(*(f"t{k}:uint64_t timestamp;float x;" for k in range(60_000))))
     topic = log("a:uint64_t timestamp;float x;")
     subscribed = b"".join(drone_logs.ulog_record("A", struct.pack("<BH", 0, k) + b"a") for k in range(60_000))
-    yield "60,000 subscriptions", "ulog", "a.ulg", topic + subscribed
+    yield "60,000 subscriptions", topic + subscribed
     rows = drone_logs.ulog_record("D", struct.pack("<HQf", 0, 1, 2.0)) * 1_000_000
-    yield "1,000,000 equal rows", "ulog", "a.ulg", topic + drone_logs.ulog_record("A", bytes(3) + b"a") + rows
-    yield "300,000 dropouts", "ulog", "a.ulg", topic + drone_logs.ulog_record("O", bytes(2)) * 300_000
+    yield "1,000,000 equal rows", topic + drone_logs.ulog_record("A", bytes(3) + b"a") + rows
+    yield "300,000 dropouts", topic + drone_logs.ulog_record("O", bytes(2)) * 300_000
     info = drone_logs.ulog_record("M", b"\0" + b"\x06char[2]aab"[:9] + b"xx")
-    yield "100,000 pieces of information", "ulog", "a.ulg", topic + info * 100_000
+    yield "100,000 pieces of information", topic + info * 100_000
     parameter = drone_logs.ulog_record("P", b"\x09float ABC" + struct.pack("<f", 1e38))
-    yield "300,000 parameters", "ulog", "a.ulg", topic + parameter * 300_000
-    yield "an array of 999,999,999", "ulog", "a.ulg", log("a:uint64_t timestamp;float[999999999] x;")
+    yield "300,000 parameters", topic + parameter * 300_000
+    yield "an array of 999,999,999", log("a:uint64_t timestamp;float[999999999] x;")
 
 
-@_kind("other telemetry")
+@_kind("other telemetry", "dji", "a.SRT")
 def _telemetry() -> Iterator[_Input]:
     def dataflash(definitions: int, rows: bytes) -> bytes:
         made = b"".join(
@@ -1224,30 +1102,15 @@ def _telemetry() -> Iterator[_Input]:
     place = "[latitude: 1.0] [longitude: 2.0] [rel_alt: 1.0 abs_alt: 2.0]"
     cue = "{k}\n00:00:00,{a:03d} --> 00:00:00,{b:03d}\n" + place + "\n\n"
     cues = "".join(cue.format(k=k, a=k % 1000, b=k % 1000 + 1) for k in range(200_000))
-    yield "SRT: 200,000 cues that go back", "dji", "a.SRT", cues
+    yield "SRT: 200,000 cues that go back", cues
     one = cue.format(k=1, a=0, b=33)
-    yield (
-        "SRT: an hour of 20 digits",
-        "dji",
-        "a.SRT",
-        one.replace("00:00:00,033", "9" * 20 + ":00:00,033") + one,
-    )
-    yield (
-        "SRT: 1,000,000 brackets",
-        "dji",
-        "a.SRT",
-        one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[" * 1_000_000,
-    )
-    yield "SRT: a latitude of 1e308", "dji", "a.SRT", (one + one).replace("1.0]", "1e308]")
-    yield (
-        "SRT: 500,000 pairs in a cue",
-        "dji",
-        "a.SRT",
-        one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[a: 1] " * 500_000,
-    )
+    yield ("SRT: an hour of 20 digits", one.replace("00:00:00,033", "9" * 20 + ":00:00,033") + one)
+    yield ("SRT: 1,000,000 brackets", one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[" * 1_000_000)
+    yield "SRT: a latitude of 1e308", (one + one).replace("1.0]", "1e308]")
+    yield ("SRT: 500,000 pairs in a cue", one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[a: 1] " * 500_000)
 
 
-@_kind("telemetry in videos")
+@_kind("telemetry in videos", "gopro", "a.mp4")
 def _tracks() -> Iterator[_Input]:
     def gpmf(content: bytes) -> Writer:
         return lambda folder: video_tracks.write_track(folder / "a.mp4", [(0, content), (10**9, content)])
@@ -1258,10 +1121,10 @@ def _tracks() -> Iterator[_Input]:
     deep = b""
     for _ in range(7000):
         deep = item(b"DEVC", b"\0", 1, len(deep), deep) if len(deep) < 60_000 else deep
-    yield "GPMF: nested 7,000 deep", "gopro", "a.mp4", gpmf(deep)
+    yield "GPMF: nested 7,000 deep", gpmf(deep)
     empty = item(b"DEVC", b"\0", 1, 60_000, item(b"STRM", b"\0", 0, 0, b"") * 7500)
-    yield "GPMF: 7,500 empty streams", "gopro", "a.mp4", gpmf(empty)
+    yield "GPMF: 7,500 empty streams", gpmf(empty)
     rows = item(b"GPS5", b"l", 20, 65_535, b"")
-    yield "GPMF: more rows than bytes", "gopro", "a.mp4", gpmf(item(b"DEVC", b"\0", 1, len(rows), rows))
+    yield "GPMF: more rows than bytes", gpmf(item(b"DEVC", b"\0", 1, len(rows), rows))
     types = item(b"TYPE", b"c", 1, 60, b"l[99999999]" * 5) + item(b"SYST", b"?", 255, 1, bytes(255))
-    yield "GPMF: a type of 10^8 numbers", "gopro", "a.mp4", gpmf(item(b"DEVC", b"\0", 1, len(types), types))
+    yield "GPMF: a type of 10^8 numbers", gpmf(item(b"DEVC", b"\0", 1, len(types), types))

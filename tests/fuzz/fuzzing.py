@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import random
-import select
 import shutil
-import signal
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from tests.fuzz.attacking import Reader
 from tests.fuzz.mutations import damage_one
 from tests.fuzz.seeds import HEADS, SEEDS, sown
-
-_WAIT_S = 120.0  # for an answer, however busy the machine is; the worker counts its own CPU time
 
 
 @dataclass(frozen=True)
@@ -51,23 +44,20 @@ def fuzz(folder: Path, inputs: int, *, seed: int = 0, names: Sequence[str] | Non
     """
     chosen = list(names or SEEDS)
     sources = sown(folder / "seeds", chosen)
-    reader = _Reader([[str(sources[name]), format_of(name)] for name in chosen])
     read = refused = 0
     troubles = []
-    try:
+    with Reader([(str(sources[name]), format_of(name)) for name in chosen]) as reader:
         for number in range(inputs):
             name = chosen[number % len(chosen)]
             place = folder / "input"
             copy, file = _damaged_copy(sources[name], place, random.Random(f"{seed} {number}"))  # noqa: S311
             answer = reader.ask(copy, format_of(name))
-            read += answer.get("read", 0)
-            refused += answer.get("refused", 0)
-            if "trouble" in answer:
+            read += answer["read"]
+            refused += answer["refused"]
+            if answer["trouble"]:
                 troubles.append(Trouble(name, number, file, answer["trouble"]))
                 shutil.copytree(place, folder / "trouble" / f"{number}", dirs_exist_ok=True)
             shutil.rmtree(place)
-    finally:
-        reader.close()
     return Fuzzed(inputs, read, refused, troubles)
 
 
@@ -87,48 +77,3 @@ def _damaged_copy(source: Path, place: Path, choice: random.Random) -> tuple[Pat
     target = place / source.name
     shutil.copyfile(source, target)
     return target, damage_one(target, choice)
-
-
-class _Reader:
-    """Process that reads; replaced by another one after it died."""
-
-    def __init__(self, warm: list[list[str]]) -> None:
-        self._warm = json.dumps(warm)
-        self._process: subprocess.Popen[str] | None = None
-
-    def ask(self, path: Path, stated: str) -> dict[str, Any]:
-        process = self._process or self._start()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdin.write(json.dumps([str(path), stated]) + "\n")
-        process.stdin.flush()
-        if not select.select([process.stdout], [], [], _WAIT_S)[0]:
-            self.close()
-            return {"trouble": f"no answer within {_WAIT_S:g} s"}
-        line = process.stdout.readline()
-        if line:
-            answer: dict[str, Any] = json.loads(line)
-            return answer
-        status = process.wait()
-        self.close()
-        if status == -signal.SIGPROF:
-            return {"trouble": "took more than 10 s of CPU"}
-        return {"trouble": f"the process died with status {status}"}
-
-    def _start(self) -> subprocess.Popen[str]:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.fuzz.worker"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        assert self._process.stdin is not None
-        self._process.stdin.write(self._warm + "\n")
-        return self._process
-
-    def close(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
-            self._process = None

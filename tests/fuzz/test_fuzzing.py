@@ -15,7 +15,7 @@ from tests.fuzz.mutations import damaged
 from tests.fuzz.reading import NotOneLineError, read_or_refuse
 from tests.fuzz.seeds import SEEDS, sown
 
-SHORT = 100
+SHORT = 60
 
 
 def test_every_format_is_fuzzed_and_every_seed_is_sound(tmp_path: Path) -> None:
@@ -25,7 +25,7 @@ def test_every_format_is_fuzzed_and_every_seed_is_sound(tmp_path: Path) -> None:
         assert read or (name == "dji_binary" and refused), name
 
 
-def test_a_hundred_damaged_files_are_read_or_refused(tmp_path: Path) -> None:
+def test_damaged_files_are_read_or_refused(tmp_path: Path) -> None:
     found = fuzz(tmp_path, SHORT)
     assert not found.troubles, "\n".join(f"{trouble.seed}: {trouble.what}" for trouble in found.troubles)
     assert found.read > SHORT // 4, "damage that nothing survives tests the first line of a reader alone"
