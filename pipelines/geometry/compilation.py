@@ -1,7 +1,8 @@
 """Compilation of numerical functions with numba, with a cache on disk; a lost or bad cache is no error.
 
-numba puts its cache beside the source, else in the user's cache folder, or in NUMBA_CACHE_DIR. It compiles
-again if the file of the outermost function changed. With this module, it does so also if the file of a
+numba puts its cache beside the source, else in the user's cache folder, or in NUMBA_CACHE_DIR; where none of
+them can be written, this module puts it among temporary files. numba compiles again if the file of the
+outermost function changed. With this module, it does so also if the file of a
 helper changed, and it compares what the files contain, not their age. The first compilation of a process is
 logged, because it takes seconds. Of several processes that start together one compiles, and the others wait
 for what it writes into the cache.
@@ -13,6 +14,9 @@ and of Python. With others it is not used.
 
 import hashlib
 import logging
+import os
+import stat
+import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache, wraps
@@ -70,7 +74,7 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
     """
     options = {"nogil": True, **_OPTIONS}
     try:
-        compiled = numba.njit(function, cache=True, **options)
+        compiled = _with_cache(function, options)
         _watch_helpers(compiled, function)
         _use_shipped(compiled)
         _compile_in_one_process(compiled)
@@ -90,6 +94,25 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
         return result
 
     return call
+
+
+def _with_cache(function: Callable[Arguments, Result], options: dict[str, Any]) -> Any:
+    """Make numba's compiler of a function with a cache, for temporary files if need be.
+
+    Raises:
+        RuntimeError: there is no place for a cache.
+    """
+    try:
+        return numba.njit(function, cache=True, **options)
+    except RuntimeError:
+        folder = Path(tempfile.gettempdir()) / f"mocap-numba-{os.getuid()}"
+        with suppress(OSError):
+            folder.mkdir(mode=0o700, exist_ok=True)
+            state = folder.lstat()
+            # The cache is code: nobody else may write it.
+            if stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o077:
+                numba.config.CACHE_DIR = str(folder)
+        return numba.njit(function, cache=True, **options)
 
 
 class _Announcement(event.Listener):  # type: ignore[misc]  # numba has no types

@@ -213,7 +213,8 @@ def _linear_points(views: Views) -> Float:
     """Triangulate each joint-frame [N, 3] by pycolmap from all its views; NaN where it finds no point."""
     from pycolmap import triangulate_multi_view_point
 
-    posed = np.isfinite(views.position).all(axis=-1) & np.isfinite(views.rotation).all(axis=(-1, -2))
+    known = np.isfinite(views.position).all(axis=-1) & np.isfinite(views.rotation).all(axis=(-1, -2))
+    posed: Bool = np.asarray(known, np.bool_)
     count = np.maximum(posed.sum(axis=1), 1)[:, None]
     centre = np.where(posed[..., None], views.position, 0.0).sum(axis=1) / count  # [F, 3]
     away = views.position - centre[:, None]
@@ -232,7 +233,8 @@ def _linear_points(views: Views) -> Float:
         found = triangulate_multi_view_point(list(projection[views.pose_index[n], own]), direction[n, own])
         if found is not None:
             points[n] = found.ravel()
-    return points * unit[views.pose_index] + centre[views.pose_index]
+    result: Float = points * unit[views.pose_index] + centre[views.pose_index]
+    return result
 
 
 def reprojection_px(views: Views, points: Float) -> Float:

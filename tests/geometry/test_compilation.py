@@ -145,6 +145,25 @@ def test_a_function_without_a_place_for_its_cache_still_runs() -> None:
     assert cached(space["double"])(2.0) == 4.0
 
 
+@pytest.mark.parametrize("of_others", [False, True])
+def test_where_no_cache_can_be_written_temporary_files_hold_it_unless_others_may_write_them(
+    tmp_path: Path,
+    load_quarter: Callable[[], Callable[[float], float]],
+    monkeypatch: pytest.MonkeyPatch,
+    of_others: bool,
+) -> None:
+    caching = importlib.import_module("numba.core.caching")
+    monkeypatch.setattr(
+        caching.CacheImpl, "_locator_classes", [caching.UserProvidedCacheLocator], raising=True
+    )
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    folder = tmp_path / "tmp" / f"mocap-numba-{os.getuid()}"
+    (folder if of_others else folder.parent).mkdir(parents=True, mode=0o755)
+
+    assert load_quarter()(2.0) == 0.5
+    assert bool(cache_files(folder)) is not of_others
+
+
 def test_the_first_compilation_of_a_process_is_announced_and_no_other(
     load_quarter: Callable[[], Callable[[float], float]],
     monkeypatch: pytest.MonkeyPatch,
