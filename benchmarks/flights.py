@@ -23,7 +23,7 @@ def real_flight(folder: Path, calibration: str = "Calib_qualisys.toml", frame_ti
     lines = ["schema: 1", "name: Walk", "cameras:"]
     for name in CAMERAS:
         video = REAL / "videos" / f"{name}.mp4"
-        lines.append(f"  {name}: {{video: {video}, pose: {{static: {file}}}, intrinsics: {file}{times}}}")
+        lines.append(f"  {name}: {{video: {video}, pose: {{file: {file}}}, intrinsics: {file}{times}}}")
     path = folder / "flight.yaml"
     text = "\n".join(lines) + "\n"
     if not path.exists() or path.read_text(encoding="utf-8") != text:

@@ -227,7 +227,7 @@ def write_flight(place: Path, log: Log, path: str, shots: dict[str, Shot]) -> No
                 f"  {name}:",
                 f"    video: {name}.mp4",
                 f"    frame_times: {{start: 0.0, fps: {_FPS}}}",
-                f"    pose: {{tum: {file}, of: camera}}",
+                f"    pose: {{file: {file}, of: camera}}",
                 f"    intrinsics: {{width: {_SIZE[0]}, height: {_SIZE[1]},"
                 f" fx: {fx:.6f}, fy: {fy:.6f}, cx: {cx}, cy: {cy}}}",
             ]

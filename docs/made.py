@@ -29,7 +29,8 @@ from pydantic import BaseModel
 from pipelines.planning.config import PlannerConfig
 from pipelines.session import registries, tables
 from pipelines.session.description import DOUBT_CODES
-from pipelines.session.manifest import Flight
+from pipelines.session.manifest import Manifest, Source
+from pipelines.session.source_options import option_models
 
 DOCS = Path(__file__).parent
 PAGES = (DOCS.parent / "README.md", *sorted(DOCS.glob("*.md")))
@@ -101,14 +102,28 @@ def _text_of(node: ast.stmt | None) -> str:
 
 def flight() -> str:
     """List the keys of flight.yaml, part by part."""
-    parts: list[tuple[str, type[BaseModel]]] = [("", Flight)]
+    parts: list[tuple[str, type[BaseModel]]] = [("", Manifest)]
     sections: dict[type[BaseModel], str] = {}
     for place, model in parts:
         rows, nested = _rows_of(model, place, "")
         parts += [part for part in nested if part[1] not in dict.fromkeys(each for _, each in parts)]
         title = f"### {place}" if place else "### The flight"
         sections[model] = f"{title}\n\n{_first_line(model)}\n\n{table(('key', 'value', 'meaning'), rows)}"
-    return "\n" + "\n".join(sections.values()) + "\n"
+    rows, _ = _rows_of(Source, "", "")
+    sections[Source] = f"### A source\n\n{_first_line(Source)}\n\n{table(('key', 'value', 'meaning'), rows)}"
+    return "\n" + "\n".join([*sections.values(), _options()]) + "\n"
+
+
+def _options() -> str:
+    """List the options that stand beside a file, part by part."""
+    rows: dict[str, tuple[str, ...]] = {}
+    for part in ("pose", "gimbal", "intrinsics", "keypoints", "map"):
+        for model in option_models(part):
+            beside = _first_line(model).removeprefix("Options of ").rstrip(".")
+            for key, value, meaning in _rows_of(model, "", "")[0]:
+                rows.setdefault(f"{part}{key}", (f"`{part}`", key, value, meaning, beside))
+    lines = table(("part", "key", "value", "meaning", "beside"), list(rows.values()))
+    return f"### Options of formats\n\nThey stand beside `file`.\n\n{lines}"
 
 
 def _rows_of(
@@ -120,7 +135,7 @@ def _rows_of(
     own = meanings(model)
     for name, field in model.model_fields.items():
         key = field.alias or name
-        if key == "assumed":
+        if key == "assumed" or (model is not Source and name in Source.model_fields):
             continue
         inner, many = _part_of(field.annotation)
         path = f"{place}.{key}" if place else key

@@ -1,42 +1,32 @@
 """Stage `draft`: write a flight.yaml for files and folders; it can be ingested or says what is missing."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from pipelines.drafting.found import (
+    LAST_POSE_TYPE,
+    NO_DATE_NS,
+    POSE_TYPES,
     Angles,
-    Calibration,
-    Driver,
-    DroneLog,
+    Candidate,
     Edge,
-    Findings,
-    Found,
-    FrameTimes,
-    Joints,
-    Keypoints,
-    Lens,
-    Map,
-    Poses,
+    Film,
+    Flown,
+    Kind,
+    Listed,
     Recording,
-    Search,
     Span,
-    Thing,
-    TopicFound,
-    TopicKind,
-    Video,
     VideoStart,
-    kind_of_format,
-    with_remedy,
 )
+from pipelines.drafting.labels import NED, OPTICAL, is_called, label_of, label_of_place
 from pipelines.drafting.manifest_text import write_manifest
-from pipelines.drafting.matching import NO_DATE_NS, Alike, match
+from pipelines.drafting.matching import Alike, match
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
@@ -45,17 +35,17 @@ from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
 from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
 from pipelines.formats.poses.trajectory_files import times_of
-from pipelines.formats.videos.frame_times import read_frame_times
+from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
 from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
 from pipelines.formats.videos.video import created_ns, followed_points, index_video
-from pipelines.geometry.arrays import Int64
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.clocks import Followed, explain_motion
 from pipelines.geometry.geodesy import Place, enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import interpolate_points, multiply
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import AngleLog, OwnLog, read_flight
+from pipelines.session.manifest import read_flight
 from pipelines.session.maps import MapSizeError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import PoseSample
@@ -72,37 +62,47 @@ from pipelines.session.registries import (
     VideoFormat,
 )
 from pipelines.session.storage import as_data_error
-from pipelines.session.telemetry import AttitudeFormat, Telemetry, TelemetryChoice, TelemetryFormat
-from pipelines.session.unknown_files import EXPECTED
+from pipelines.session.telemetry import AttitudeFormat, TelemetryChoice, TelemetryFormat
+from pipelines.session.unknown_files import EXPECTED, describe_unknown
 
-_FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
-_KEYS: dict[str, OwnLog] = {
-    "dji": "dji",
-    "dji_record": "dji",
-    "picture_tags": "dji",
-    "ulog": "ulog",
-    "ardupilot": "ardupilot",
-    "tlog": "tlog",
-    "gopro": "gopro",
-}
-"""The key in a manifest for each format of a drone's own log."""
+# Coordinates beyond it are those of a map projection, m.
+MAX_LOCAL_M = 100_000.0
 
-_ANGLE_KEYS: dict[OwnLog, AngleLog] = {"dji": "dji", "gopro": "gopro"}
-"""The key in a gimbal for each key of a log whose angles are of use without its positions."""
+# One minute of a video is enough to compare its motion with logs.
+WATCHED_NS = 60_000_000_000
 
-_OTHER_KINDS: dict[str, TopicKind] = {
-    **dict.fromkeys(MAP_TYPES, "maps"),
-    **dict.fromkeys(FIXES, "fixes"),
-}
-"""Kinds of topics whose messages are no samples, by type."""
+# A picture is 1.25 focal lengths wide at an ordinary angle of view, 64 deg.
+NOMINAL_FOCAL = 0.8
 
-_LOCAL_M = 100_000.0  # coordinates beyond it are those of a map projection
-_WATCHED_NS = 60_000_000_000  # of a video, to compare its motion with logs
-_NOMINAL_FOCAL = 0.8  # of a picture's width: an angle of view of 64 degrees
-_DOWN_DEG = (0.0, 30.0, 60.0, 90.0)  # of a camera whose mount nobody stated
-_BRIDGED_NS = 2_000_000_000  # between two positions of a log
-_MADE_WITHIN_NS = 5_000_000_000  # of the time when a video was made by its metadata, beside its length
-_TRANSFORMS_ASKED = 2000  # messages of a topic that are read for the names of its frames
+# Tilts that are tried for a camera whose mount nobody stated, deg.
+TRIED_DOWN_DEG = (0.0, 30.0, 60.0, 90.0)
+
+# Positions of a log that are further apart are not interpolated.
+MAX_GAP_NS = 2_000_000_000
+
+# The metadata of a video state when it began or ended, to some seconds.
+MADE_WITHIN_NS = 5_000_000_000
+
+# The first messages of a topic of transforms name all of its frames.
+TRANSFORMS_READ = 2000
+
+# A calibration of more cameras holds the pictures of one moving camera.
+MAX_CAMERAS_OF_CALIBRATION = 200
+
+# So many files of a folder tell if they are keypoints of one camera.
+FILES_ASKED = 16
+
+KINDS = (
+    KeypointFormat,
+    TrajectoryFormat,
+    CalibrationFormat,
+    JointFormat,
+    LogFormat,
+    VideoFormat,
+    MapFormat,
+    TelemetryFormat,
+    FrameTimesFormat,
+)
 
 
 @dataclass(frozen=True)
@@ -136,23 +136,34 @@ def draft(
     Raises:
         DataError: nothing was recognised, a path is missing, or the output exists or cannot be written.
     """
-    search = Search()
+    search = _Search()
     things, home = search.look([_absolute(path) for path in paths])
     target = output or home / "flight.yaml"
     if target.exists() and not overwrite:
-        raise DataError(target, "exists", "choose another with --output, or replace it with --overwrite")
-    findings, unread = _read_all(things, home, progress or Silent())
-    left_out = search.left_out | unread
-    for path in (_absolute(target), *_read_beside(findings)):
-        left_out.pop(path, None)
-    if not findings.all():
-        path, reason = home, f"holds nothing that can be used ({len(left_out)} files)"
-        if len(left_out) == 1:
-            [(path, reason)] = left_out.items()
-        raise DataError(path, reason, "" if "; " in reason else EXPECTED)
+        raise DataError(
+            target, "exists", "choose another with --output, or replace it with --overwrite", code="exists"
+        )
+    progress = progress or Silent()
+    progress.start("Reading", len(things))
+    found: list[Candidate | Recording] = []
+    for path, formats in things:
+        read, problem = _read(path, formats, home)
+        found += read
+        if problem:
+            search.left_out[path] = problem
+        progress.advance()
+    kitti = [each.path for each in found if isinstance(each, Candidate) and each.type == "kitti"]
+    for path in (_absolute(target), *map(times_of, kitti)):
+        search.left_out.pop(path, None)
+    if not found:
+        path, reason = home, f"holds nothing that can be used ({len(search.left_out)} files)"
+        if len(search.left_out) == 1:
+            [(path, reason)] = search.left_out.items()
+        raise DataError(path, reason, "" if "; " in reason else EXPECTED, code="wrong-kind")
 
-    comparison = _Comparison()
-    flight = match(findings, comparison, comparison.distance_m)
+    candidates = [each for each in found if isinstance(each, Candidate)]
+    logs = [each for each in found if isinstance(each, Recording)]
+    flight = match(candidates, logs, _Comparison(), _distance_m)
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
     problem = _write(target, manifest.text)
     return Drafted(
@@ -161,20 +172,8 @@ def draft(
         cameras=[camera.name for camera in flight.cameras],
         missing=manifest.missing or ([problem] if problem else []),
         assumed=manifest.assumed,
-        left_out=left_out,
+        left_out=search.left_out,
     )
-
-
-_CLOCKS: dict[str, Literal["whole seconds", "none"]] = {SHARED_SECONDS: "whole seconds", UNTIMED: "none"}
-"""Clocks of sequences of pictures by the codec of their index."""
-
-_BESIDE: dict[str, Callable[[Path], Path]] = {"kitti": times_of}
-"""Functions that find the file that belongs to one of a format, by the format's name."""
-
-
-def _read_beside(findings: Findings) -> list[Path]:
-    """List the files that were read with others: the times of a trajectory."""
-    return [_BESIDE[found.format](found.path) for found in findings.all() if found.format in _BESIDE]
 
 
 def _absolute(path: Path) -> Path:
@@ -184,110 +183,235 @@ def _absolute(path: Path) -> Path:
 
 def _stated(path: Path, folder: Path) -> str:
     """Write a path as in a manifest in a folder, with slashes: relative if it is below it, else absolute."""
-    return (
-        path.relative_to(_absolute(folder)) if path.is_relative_to(_absolute(folder)) else path
-    ).as_posix()
+    inside = path.is_relative_to(_absolute(folder))
+    return (path.relative_to(_absolute(folder)) if inside else path).as_posix()
 
 
 def _write(target: Path, text: str) -> str:
     """Write the manifest completely or not at all; return the problem if it is not valid, else ''."""
     temporary = target.with_name(f"{target.name}.new")
+    problem = ""
     try:
         temporary.write_text(text, encoding="utf-8", newline="\n")
         try:
             read_flight(temporary)
         except DataError as error:
             problem = error.problem
-        else:
-            problem = ""
         temporary.replace(target)
     except OSError as error:
         raise as_data_error(error, target) from error
     return problem
 
 
+# --- search --------------------------------------------------------------------------------------------
+
+Thing = tuple[Path, list[Format]]
+"""A file or folder, and the formats that recognise it."""
+
+
+class _Search:
+    """Search through files and folders; `left_out` has the paths that cannot be used, with the reason."""
+
+    def __init__(self) -> None:
+        self.left_out: dict[Path, str] = {}
+        self._formats = FORMATS.all()
+        self._seen: set[Path] = set()
+
+    def look(self, paths: Sequence[Path]) -> tuple[list[Thing], Path]:
+        """Find everything that is recognised, each thing once, and the folder that all paths share.
+
+        Raises:
+            DataError: a path does not exist.
+        """
+        things: list[Thing] = []
+        bases: list[Path] = []
+        for path in paths:
+            if not path.exists():
+                raise DataError(path, "does not exist", "check the path", code="no-such-file")
+            found = list(self._under(path))
+            alone = not path.is_dir() or [thing for thing, _ in found] == [path]
+            bases.append(path.parent if alone else path)
+            things += found
+        return sorted(things, key=lambda thing: thing[0]), Path(os.path.commonpath(bases))
+
+    def _under(self, path: Path) -> Iterator[Thing]:
+        """Yield the things at a path and below it."""
+        if path.resolve() in self._seen:  # named twice, or a link that leads back
+            return
+        self._seen.add(path.resolve())
+        try:
+            str(path).encode()
+        except UnicodeEncodeError:
+            self.left_out[path] = "its name is no text that a manifest could state, left out"
+            return
+        if path.is_dir():
+            yield from self._under_folder(path)
+        elif formats := self._recognising(path):
+            yield path, formats
+        else:
+            self.left_out[path] = _why_left_out(path)
+
+    def _under_folder(self, folder: Path) -> Iterator[Thing]:
+        """Yield the folder itself if it is one thing, and things in it that are not part of that."""
+        try:
+            every = sorted(folder.iterdir())
+        except OSError as error:
+            self.left_out[folder] = f"cannot be read ({error.strerror}), left out"
+            return
+        children = [c for c in every if c.name[0] != "." and c.suffix != ".session" and c.exists()]
+        formats = [f for f in self._recognising(folder) if self._is_whole(folder, children, f)]
+        if formats:
+            yield folder, formats
+        kinds = {_kind_of_format(format_) for format_ in formats}
+        for child in children:
+            if child.is_dir() or not formats:
+                yield from self._under(child)
+            elif KeypointFormat not in kinds or child.suffix.lower() != ".json":
+                others = [f for f in self._recognising(child) if _kind_of_format(f) not in kinds]
+                if others:
+                    yield child, others
+
+    def _is_whole(self, folder: Path, children: Sequence[Path], format_: Format) -> bool:
+        """Test if a folder that a format recognises is one thing, not a folder with several such things.
+
+        A folder is also recognised if it holds keypoint files, one for each camera, or a single log, or the
+        files of a bag beside the videos of its flight.
+        """
+        if isinstance(format_, LogFormat):
+            inside = [_kind_of_format(f) for child in children for f in self._recognising(child)]
+            alone = len(inside) == 1 and not (folder / "metadata.yaml").exists()
+            return not alone and all(kind is LogFormat for kind in inside)
+        if not isinstance(format_, KeypointFormat):
+            return True
+        files = [child for child in children if child.suffix.lower() == ".json"]
+        asked = files[:: max(1, len(files) // FILES_ASKED)]
+        if len(files) < 2 or any(f is not format_ for file in asked for f in self._recognising(file)):
+            return False
+        try:
+            format_.read_keypoints(folder, skeleton=None, first_frame=0)
+        except DataError:  # two files of one frame: they are of several cameras
+            return False
+        return True
+
+    def _recognising(self, path: Path) -> list[Format]:
+        return [format_ for format_ in self._formats if format_.recognises(path)]
+
+
+def _kind_of_format(format_: Format) -> type | None:
+    return next((kind for kind in KINDS if isinstance(format_, kind)), None)
+
+
+def _why_left_out(path: Path) -> str:
+    if path.suffix.lower() in {".yaml", ".yml"}:
+        with suppress(DataError):
+            read_flight(path)
+            return "is a flight manifest already (run `mocap ingest` on it), left out"
+    like = describe_unknown(path)
+    return "; ".join(filter(None, [f"{like.problem}, left out", like.remedy]))
+
+
 # --- reading -------------------------------------------------------------------------------------------
 
 
-def _read_all(things: Sequence[Thing], home: Path, progress: Progress) -> tuple[Findings, dict[Path, str]]:
-    """Read all things as far as the matching needs it; return also those that are of no use."""
-    progress.start("Reading", len(things))
-    found: list[Found] = []
-    unread: dict[Path, str] = {}
-    for path, formats in things:
-        known, problem = _read(path, formats, home)
-        found += known
-        if problem:
-            unread[path] = problem
-        progress.advance()
-    return Findings(found), unread
-
-
-def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found], str]:
+def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Candidate | Recording], str]:
     """Read a thing as every kind that it can be; of several formats of a kind, the first that works is used.
 
     Return also the reason if it is of no kind, or if one of its kinds cannot be read.
     """
-    found: dict[type[Found], Sequence[Found]] = {}
-    kinds: set[type | None] = set()  # of formats that read it
-    problems: list[tuple[Format, DataError]] = []
     *folders, name = path.relative_to(home).parts or (path.name,)
     place = (*folders, name if path.is_dir() else Path(name).stem)
+    found: dict[type | None, list[Candidate | Recording]] = {}
+    problems: list[tuple[Format, DataError]] = []
     for format_ in formats:
-        ambiguous = sum(kind_of_format(other) is kind_of_format(format_) for other in formats) > 1
-        head = Found(path, place, format_.name, format_.title)
+        kind = _kind_of_format(format_)
+        rivals = [other for other in formats if _kind_of_format(other) is kind]
         try:
-            if isinstance(format_, TelemetryFormat):
-                things: Sequence[Found] = _drone_logs(head, format_)
-            else:
-                thing = _described(head, format_, ambiguous)
-                things = [thing] if thing else []
+            known = [] if kind in found else list(_described(path, place, format_, len(rivals) > 1))
         except DataError as error:
             problems.append((format_, error))
             continue
-        if things:
-            found.setdefault(type(things[0]), things)
-            kinds.add(kind_of_format(format_))
+        if known:
+            found[kind] = known
     problem = "" if found else "of no use here, left out"
     for format_, cause in problems:
-        # A missing library names itself.
-        own = str(cause.source).startswith(str(path))
-        what = cause.problem if own else f"{cause.source} {cause.problem}"
-        if not found:
-            problem = with_remedy(f"{what}, left out", cause.remedy)
-            break
-        if kind_of_format(format_) not in kinds:
-            problem = with_remedy(f"{format_.title} left out: {what}", cause.remedy)
+        if _kind_of_format(format_) not in found:
+            own = str(cause.source).startswith(str(path))  # a missing library names itself
+            what = cause.problem if own else f"{cause.source} {cause.problem}"
+            said = f"{format_.title} left out: {what}" if found else f"{what}, left out"
+            problem = "; ".join(filter(None, [said, cause.remedy]))
             break
     return [thing for things in found.values() for thing in things], problem
 
 
-def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
-    """Describe a thing by the kind of its format; None for kinds that manifests cannot name.
+def _described(
+    path: Path, place: tuple[str, ...], format_: Format, ambiguous: bool
+) -> Iterator[Candidate | Recording]:
+    """Describe a thing by the kind of its format.
 
     Raises:
         DataError: it cannot be read.
     """
-    path = head.path
-    about = (path, head.place, head.format, head.title)
+    label = label_of_place(place)
+    named: dict[str, object] = {"file": path}
+    head = (path, place, format_.title)
     if isinstance(format_, KeypointFormat):
         listed = format_.read_keypoints(path, skeleton=None, first_frame=0).frames_listed
-        return Keypoints(*about, len(listed), int(listed[0]), int(listed[-1]), ambiguous)
-    if isinstance(format_, TrajectoryFormat):
-        return Poses(*about, _span(format_.read_trajectory(path).t_ns))
-    if isinstance(format_, CalibrationFormat):
+        about = f"{format_.title}, {len(listed)} frames"
+        yield Listed(
+            "keypoints",
+            path,
+            place,
+            about,
+            named,
+            (label,),
+            (0, place),
+            frames=len(listed),
+            first_frame=int(listed[0]),
+            last_frame=int(listed[-1]),
+            ambiguous=format_.name if ambiguous else "",
+        )
+    elif isinstance(format_, TrajectoryFormat):
+        span = _span(format_.read_trajectory(path).t_ns)
+        about = f"{format_.title}, {span}"
+        yield Candidate("pose", path, place, about, named, (label,), (0, 0, place), span, type=format_.name)
+    elif isinstance(format_, CalibrationFormat):
         cameras = format_.read_calibration(path)
-        held = {name: Lens(c.intrinsics is not None, c.position is not None) for name, c in cameras.items()}
-        return Calibration(*about, held)
-    if isinstance(format_, JointFormat):
-        return Joints(*about, _span(format_.read_joints(path, unit=None, axes=None).t_ns))
-    if isinstance(format_, LogFormat):
-        return _recording(head, format_)
-    if isinstance(format_, VideoFormat):
+        if len(cameras) > MAX_CAMERAS_OF_CALIBRATION:
+            return
+        for name, camera in cameras.items():
+            own, alone = label_of(name), len(cameras) == 1
+            both = tuple({word.key: word for word in (*label, *own)}.values())
+            labels = tuple(each for each in ([label, own] if alone else [own, both]) if each) or ((),)
+            settings = named if alone else {**named, "camera": name}
+            kinds: list[tuple[Kind, bool]] = [
+                ("intrinsics", camera.intrinsics is not None),
+                ("still", camera.position is not None),
+            ]
+            for kind, there in kinds:
+                if there:
+                    yield Candidate(kind, *head, settings, labels, (0, place, name))
+    elif isinstance(format_, JointFormat):
+        span = _span(format_.read_joints(path, unit=None, axes=None).t_ns)
+        yield Candidate("joints", *head, named, (label,), (0, place), span, type=format_.name)
+    elif isinstance(format_, LogFormat):
+        yield _recording(path, place, format_)
+    elif isinstance(format_, VideoFormat):
         index = format_.index(path)
-        made_ns = (index.start_ns or None) if path.is_dir() else created_ns(path)
-        return Video(*about, index.count, int(index.pts_ns[-1]), made_ns, _CLOCKS.get(index.codec, "own"))
-    if isinstance(format_, MapFormat):
+        length_ns = int(index.pts_ns[-1])
+        yield Film(
+            "video",
+            path,
+            place,
+            f"{index.count} frames, {length_ns / 1e9:.6g} s",
+            named,
+            (label,),
+            (0, place),
+            frames=index.count,
+            length_ns=length_ns,
+            made_ns=(index.start_ns or None) if path.is_dir() else created_ns(path),
+            clock={SHARED_SECONDS: "whole seconds", UNTIMED: "none"}.get(index.codec, "own"),
+        )
+    elif isinstance(format_, MapFormat):
         fitting_m = None
         try:
             grid = format_.read_map(path)
@@ -295,90 +419,26 @@ def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
             if (fitting_m := error.fitting_m) is None:
                 raise
             grid = format_.read_map(path, resolution_m=fitting_m)
-        far = float(np.abs(grid.origin[:2]).max()) > _LOCAL_M
-        return Map(*about, fitting_m, projected=far and grid.crs is None)
-    if head.format == _FRAME_TIMES:
-        stamps = read_frame_times(path)
-        key: Literal["csv", "srt"] = "srt" if path.suffix.lower() == ".srt" else "csv"
-        return FrameTimes(*about, key, len(stamps.t_ns), _span(stamps.t_ns))
-    return None
-
-
-class _Comparison:
-    """Comparison of videos with drones' logs by their motion; each is read once."""
-
-    def __init__(self) -> None:
-        self._followed: dict[Path, Followed] = {}
-        self._telemetry: dict[tuple[Path, int | None], Telemetry | None] = {}
-
-    def __call__(self, video: Video, log: DroneLog) -> Alike | None:
-        """Return how well the poses in a log explain the motion in a video's pictures; None without poses.
-
-        The lens is taken to have an ordinary angle of view. Without a gimbal, the camera is taken to look
-        forward and down by the angle that explains most.
-        """
-        if video.path not in self._followed:
-            self._followed[video.path] = _followed_points(video.path)
-        telemetry = self._read(log)
-        if telemetry is None or (track := telemetry.gimbal or telemetry.body) is None:
-            return None
-        if telemetry.position.on_earth:
-            latitude, longitude, height = telemetry.position.values.T
-            place = Place(float(latitude[0]), float(longitude[0]), float(height[0]))
-            position = enu_from_geodetic(latitude, longitude, height, place)
-        else:
-            position = telemetry.position.values
-        moved = interpolate_points(telemetry.position.t_ns, position, track.t_ns, max_gap_ns=_BRIDGED_NS)
-        rows = np.isfinite(moved).all(axis=1)
-        if video.made_ns is not None and log.span.first_ns > NO_DATE_NS:  # it began or ended at that time
-            within_ns = 2 * video.length_ns + _MADE_WITHIN_NS
-            rows &= np.abs(track.t_ns - video.made_ns) <= within_ns
-        found: list[Alike] = []
-        for down_deg in (0.0,) if telemetry.gimbal else _DOWN_DEG:
-            turned = multiply(track.quaternion_xyzw[rows], body_from_camera("forward", down_deg))
-            explained = explain_motion(
-                track.t_ns[rows], moved[rows], turned, self._followed[video.path], max_gap_ns=_BRIDGED_NS
-            )
-            if explained is not None:
-                found.append(Alike(*explained))
-        return max(found, key=lambda alike: float(np.nansum(alike.gain)), default=None)
-
-    def distance_m(self, log: DroneLog, other: DroneLog) -> float | None:
-        """Return the median distance across of positions on Earth in two logs, at the times of the first."""
-        tracks = [each.position for each in map(self._read, (log, other)) if each and each.position.on_earth]
-        if len(tracks) < 2:
-            return None
-        place = Place(*tracks[0].values[0].tolist())
-        own, theirs = (
-            enu_from_geodetic(track.values[:, 0], track.values[:, 1], track.values[:, 2] * 0, place)[:, :2]
-            for track in tracks
+        far = float(np.abs(grid.origin[:2]).max()) > MAX_LOCAL_M
+        settings = named if fitting_m is None else {**named, "resolution_m": fitting_m}
+        projected = "projected" if far and grid.crs is None else ""
+        yield Candidate("map", *head, settings, (label,), (0, place), frame=projected)
+    elif isinstance(format_, TelemetryFormat):
+        yield from _drone_logs(path, place, format_)
+    elif isinstance(format_, FrameTimesFormat):
+        t_ns = read_frame_times(path).t_ns
+        utc = ", local time taken as UTC" if path.suffix.lower() == ".srt" else ""
+        yield Listed(
+            "frame_times",
+            path,
+            place,
+            f"{len(t_ns)} times{utc}",
+            named,
+            (label,),
+            (0, place),
+            _span(t_ns),
+            frames=len(t_ns),
         )
-        there = interpolate_points(tracks[1].t_ns, theirs, tracks[0].t_ns, max_gap_ns=_BRIDGED_NS)
-        apart_m = np.linalg.norm(own - there, axis=1)
-        return float(np.nanmedian(apart_m)) if np.isfinite(apart_m).any() else None
-
-    def _read(self, log: DroneLog) -> Telemetry | None:
-        key = log.path, log.instance
-        if key not in self._telemetry:
-            self._telemetry[key] = _telemetry_of(log)
-        return self._telemetry[key]
-
-
-def _followed_points(path: Path) -> Followed:
-    index = index_video(path)
-    focal_px = _NOMINAL_FOCAL * index.width
-    nominal = Intrinsics(
-        index.width, index.height, focal_px, focal_px, (index.width - 1) / 2, (index.height - 1) / 2
-    )
-    return followed_points(path, nominal, index.pts_ns[index.pts_ns <= _WATCHED_NS])
-
-
-def _telemetry_of(log: DroneLog) -> Telemetry | None:
-    reader = FORMATS.get(log.format)
-    if not isinstance(reader, TelemetryFormat):
-        return None
-    altitude = 0.0 if log.height == "stated" else None
-    return reader.read_telemetry(log.path, TelemetryChoice(altitude=altitude, instance=log.instance))
 
 
 def _span(t_ns: Int64) -> Span:
@@ -388,7 +448,7 @@ def _span(t_ns: Int64) -> Span:
 # --- drones' own logs ------------------------------------------------------------------------------------
 
 
-def _drone_logs(head: Found, format_: TelemetryFormat) -> list[Found]:
+def _drone_logs(path: Path, place: tuple[str, ...], format_: TelemetryFormat) -> Iterator[Candidate]:
     """Describe the poses in a drone's own log, with or without attitudes; those of each vehicle in it.
 
     Attitudes that come without positions, or without north, are a thing of their own.
@@ -396,44 +456,42 @@ def _drone_logs(head: Found, format_: TelemetryFormat) -> list[Found]:
     Raises:
         DataError: it cannot be read, or holds neither positions nor attitudes.
     """
-    key = _KEYS.get(head.format)
-    if key is None:
-        return []
-    vehicles = TLOG.vehicles(head.path) if head.format == TLOG.name else []
-    instances = vehicles if len(vehicles) > 1 else [None]
+    vehicles = TLOG.vehicles(path) if format_.name == TLOG.name else []
+    angles = list(_angles(path, place, format_))
     try:
-        logs = [_drone_log(head, format_, key, instance) for instance in instances]
+        logs = [
+            _drone_log(path, place, format_, instance)
+            for instance in (vehicles if len(vehicles) > 1 else [None])
+        ]
     except DataError:
-        if angles := _angles(head, format_, key):
-            return [*angles]
-        raise
-    whole = any(log.gimbal for log in logs)
-    return [*logs, *([] if whole else _angles(head, format_, key))]
+        if not angles:
+            raise
+        logs = []
+    yield from logs
+    if not any(log.telemetry and log.telemetry.gimbal for log in logs):
+        yield from angles
 
 
-def _angles(head: Found, format_: Format, key: OwnLog) -> list[Angles]:
-    """Describe the camera's attitudes in a log that can be used for them alone; empty without any."""
-    angle_key = _ANGLE_KEYS.get(key)
-    if angle_key is None or not isinstance(format_, AttitudeFormat):
-        return []
+def _angles(path: Path, place: tuple[str, ...], format_: Format) -> Iterator[Angles]:
+    """Describe the camera's attitudes in a log that can be used for them alone."""
+    if isinstance(format_, AttitudeFormat):
+        with suppress(DataError):
+            found = format_.read_attitudes(path)
+            about = f"{len(found.camera.t_ns)} attitudes of the camera in its video"
+            label = label_of_place(place)
+            yield Angles(
+                "angles", path, place, about, {"file": path}, (label,), knows_north=found.knows_north
+            )
+
+
+def _drone_log(path: Path, place: tuple[str, ...], format_: TelemetryFormat, instance: int | None) -> Flown:
     try:
-        found = format_.read_attitudes(head.path)
-    except DataError:
-        return []
-    about = (head.path, head.place, head.format, head.title)
-    return [Angles(*about, angle_key, len(found.camera.t_ns), found.knows_north)]
-
-
-def _drone_log(head: Found, format_: TelemetryFormat, key: OwnLog, instance: int | None) -> DroneLog:
-    try:
-        telemetry = format_.read_telemetry(head.path, TelemetryChoice(instance=instance))
+        telemetry = format_.read_telemetry(path, TelemetryChoice(instance=instance))
     except DataError:  # if only heights are missing, reading with a stated height works
-        telemetry = format_.read_telemetry(head.path, TelemetryChoice(altitude=0.0, instance=instance))
-    track = telemetry.position
-    start = None
-    films = recordings_of(head.path) if head.format == "dji_record" else []
-    if head.path.suffix.lower() == ".srt":
-        subtitles = read_subtitles(head.path)
+        telemetry = format_.read_telemetry(path, TelemetryChoice(altitude=0.0, instance=instance))
+    track, start = telemetry.position, None
+    if path.suffix.lower() == ".srt":
+        subtitles = read_subtitles(path)
         start_ns = subtitles.start_ns() if subtitles.are_slow else None
         if start_ns is not None:
             start = VideoStart(start_ns, "by the subtitles' clock, local time taken as UTC", sigma_s=1)
@@ -442,88 +500,188 @@ def _drone_log(head: Found, format_: TelemetryFormat, key: OwnLog, instance: int
         made = telemetry.clock == "the video's time of creation"
         source = f"by the {'time of creation in its metadata' if made else 'telemetry in it'}"
         start = VideoStart(began_ns, source, sigma_s)
-    return DroneLog(
-        head.path,
-        head.place,
-        head.format,
-        head.title,
-        key=key,
-        span=_span(track.t_ns),
-        positions=len(track.t_ns),
-        step_ns=int(median_step_ns(track.t_ns) or 0),
+    films = recordings_of(path) if format_.name == "dji_record" else []
+    turned, held = telemetry.gimbal is not None, telemetry.body is not None
+    span = _span(track.t_ns)
+    has = "with gimbal angles" if turned else "no gimbal angles"
+    return Flown(
+        "pose",
+        path,
+        place,
+        f"{format_.title}, {len(track.t_ns)} positions, {has}, {span}",
+        {"file": path} | ({} if instance is None else {"instance": instance}),
+        (label_of_place(place) if instance is None else label_of(f"vehicle{instance}"),),
+        (0, int(not turned), place, instance or 0),
+        span,
+        of_body=held and not turned,
+        unturned=not (held or turned),
         by_gps=track.on_earth or track.origin is not None,
-        body=telemetry.body is not None,
-        gimbal=telemetry.gimbal is not None,
+        telemetry=telemetry,
+        step_ns=int(median_step_ns(track.t_ns) or 0),
+        states_altitude="altitude" in getattr(format_, "choices", ()),
         height=track.height,
-        instance=instance,
         video_start=start,
         films=tuple(Span(*film) for film in films),
     )
 
 
+class _Comparison:
+    """Comparison of videos with drones' logs by their motion; each video is followed once."""
+
+    def __init__(self) -> None:
+        self._followed: dict[Path, Followed] = {}
+
+    def __call__(self, film: Film, log: Flown) -> Alike | None:
+        """Return how well the poses in a log explain the motion in a video's pictures; None without poses.
+
+        The lens is taken to have an ordinary angle of view. Without a gimbal, the camera is taken to look
+        forward and down by the angle that explains most.
+        """
+        telemetry = log.telemetry
+        if telemetry is None or (track := telemetry.gimbal or telemetry.body) is None:
+            return None
+        if film.path not in self._followed:
+            index = index_video(film.path)
+            focal_px = NOMINAL_FOCAL * index.width
+            middle = (index.width - 1) / 2, (index.height - 1) / 2
+            lens = Intrinsics(index.width, index.height, focal_px, focal_px, *middle)
+            watched_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
+            self._followed[film.path] = followed_points(film.path, lens, watched_ns)
+        position = telemetry.position.values
+        if telemetry.position.on_earth:
+            position = _enu(position, Place(*position[0].tolist()))
+        moved = interpolate_points(telemetry.position.t_ns, position, track.t_ns, max_gap_ns=MAX_GAP_NS)
+        rows = np.isfinite(moved).all(axis=1)
+        if film.made_ns is not None and log.span and log.span.first_ns > NO_DATE_NS:
+            rows &= np.abs(track.t_ns - film.made_ns) <= 2 * film.length_ns + MADE_WITHIN_NS
+        found: list[Alike] = []
+        for down_deg in (0.0,) if telemetry.gimbal else TRIED_DOWN_DEG:
+            turned = multiply(track.quaternion_xyzw[rows], body_from_camera("forward", down_deg))
+            explained = explain_motion(
+                track.t_ns[rows], moved[rows], turned, self._followed[film.path], max_gap_ns=MAX_GAP_NS
+            )
+            if explained is not None:
+                found.append(Alike(*explained))
+        return max(found, key=lambda alike: float(np.nansum(alike.gain)), default=None)
+
+
+def _enu(geodetic: Float, place: Place) -> Float:
+    """Convert latitudes, longitudes and heights [N, 3] to metres east, north and up of a place."""
+    return enu_from_geodetic(geodetic[:, 0], geodetic[:, 1], geodetic[:, 2], place)
+
+
+def _distance_m(log: Flown, other: Flown) -> float | None:
+    """Return the median distance across of positions on Earth in two logs, at the times of the first."""
+    tracks = [each.telemetry.position for each in (log, other) if each.telemetry]
+    if len(tracks) < 2 or not all(track.on_earth for track in tracks):
+        return None
+    place = Place(*tracks[0].values[0].tolist())
+    own, theirs = (_enu(track.values * [1, 1, 0], place)[:, :2] for track in tracks)
+    there = interpolate_points(tracks[1].t_ns, theirs, tracks[0].t_ns, max_gap_ns=MAX_GAP_NS)
+    apart_m = np.linalg.norm(own - there, axis=1)
+    return float(np.nanmedian(apart_m)) if np.isfinite(apart_m).any() else None
+
+
 # --- logs ----------------------------------------------------------------------------------------------
 
 
-def _recording(head: Found, format_: LogFormat) -> Recording:
+def _recording(path: Path, place: tuple[str, ...], format_: LogFormat) -> Recording:
     """Describe the topics of a log, with the frames of its poses and transforms."""
-    with format_.open_log([head.path]) as log:
-        topics: dict[str, TopicFound] = {}
+    kinds: dict[str, Kind] = {"poses": "pose", "pictures": "video", "angles": "gimbal"}
+    kinds |= {"intrinsics": "intrinsics", "transforms": "transforms"}
+    topics: dict[str, Candidate] = {}
+    edges: dict[Edge, None] = {}
+    with format_.open_log([path]) as log:
         for topic in log.topics:
-            kind = kind_of(topic) or _OTHER_KINDS.get(topic.type)
-            if kind and topic.name not in topics:
-                span = Span(topic.first_ns or 0, topic.last_ns or 0)
-                lead_ns = _lead_ns(log, topic.name) if topic.count else None
-                topics[topic.name] = TopicFound(
-                    topic.name, topic.type, kind, topic.count, span, lead_ns=lead_ns
-                )
-        drivers = tuple(_drivers(log))
-        edges: dict[Edge, None] = {}
-        for name, known in topics.items():
-            if known.kind == "poses":
-                first = next(_pose_samples(log, name, 1, head.path), None)
-                if first:
-                    topics[name] = replace(known, target=first.target, source=first.source)
-            elif known.kind == "maps":
-                message = next(iter(log.messages([name])), None)
+            kind = kinds.get(kind_of(topic) or "")
+            kind = "map" if topic.type in MAP_TYPES else "fixes" if topic.type in FIXES else kind
+            if kind is None or topic.name in topics:
+                continue
+            span = Span(topic.first_ns or 0, topic.last_ns or 0) if topic.count else None
+            short = topic.type.rpartition("/")[2]
+            known = Candidate(
+                kind,
+                path,
+                place,
+                f"{topic.count} {short}" + (f", {span}" if span else ""),
+                {"file": path, "topic": topic.name},
+                ((),),
+                (1, -topic.count, topic.name),
+                span,
+                topic=topic.name,
+                type=topic.type,
+                lead_ns=_lead_ns(log, topic.name) if topic.count else None,
+            )
+            if kind == "pose":
+                known = _pose_topic(log, known, short.rpartition(".")[2], topic.count)
+            elif kind == "map" and (message := next(iter(log.messages([topic.name])), None)):
                 with suppress(DataError):
-                    topics[name] = replace(known, target=frame_of(message, name) if message else "")
-            elif known.kind == "transforms":
-                still = name.rstrip("/").endswith("tf_static")
-                for sample in _pose_samples(log, name, _TRANSFORMS_ASKED, head.path):
+                    known = replace(known, frame=frame_of(message, topic.name))
+            elif kind == "transforms":
+                still = topic.name.rstrip("/").endswith("tf_static")
+                for sample in _pose_samples(log, topic.name, TRANSFORMS_READ, path):
                     lead_ns = sample.stamp_ns - sample.receive_ns if sample.stamp_ns else None
-                    link = (name, sample.target, sample.source, still)
+                    link = (topic.name, sample.target, sample.source, still)
                     edges.setdefault(Edge(*link, sample.receive_ns, lead_ns))
-    about = (head.path, head.place, head.format, head.title)
-    return Recording(*about, (head.path,), tuple(topics.values()), tuple(edges), drivers)
+            topics[topic.name] = known
+        topics |= {f"{each.rank}": each for each in _drivers(log, path, place)}
+    return Recording(path, place, format_.title, topics, tuple(edges), (path,))
 
 
-def _drivers(log: Log) -> Iterator[Driver]:
-    """Yield the drones whose drivers' usual topics are in a log."""
+def _pose_topic(log: Log, topic: Candidate, type_: str, count: int) -> Candidate:
+    """Add the frames of a topic's first pose, and what its names say of it."""
+    first = next(_pose_samples(log, topic.topic, 1, topic.path), None)
+    target, source = (first.target, first.source) if first else ("", "")
+    of_body = not is_called(source or topic.topic, OPTICAL)
+    likelihood = POSE_TYPES.index(type_) if type_ in POSE_TYPES else LAST_POSE_TYPE
+    return replace(
+        topic,
+        rank=(1, int(of_body), likelihood, -count, topic.topic),
+        of_body=of_body,
+        ned_hint=next((name for name in (target, source, topic.topic) if is_called(name, NED)), ""),
+        frame=target,
+    )
+
+
+def _drivers(log: Log, path: Path, place: tuple[str, ...]) -> Iterator[Candidate]:
+    """Yield the drones whose drivers' usual topics are in a log: together they hold more than each alone."""
     topics = {topic.name: topic for topic in log.topics if topic.count}
     every = namespaces(list(topics))
+    found: list[tuple[dict[str, object], str, list[str], bool, bool, bool]] = []
     for preset, namespace in every:
         parts = parts_of(preset, namespace, list(topics))
-        spans = [topics[name] for name in parts.position]
         alone = len([known for known, _ in every if known == preset]) == 1
-        yield Driver(
-            settings={"preset": preset, "namespace": None if alone else namespace or "/"},
-            span=Span(min(t.first_ns or 0 for t in spans), max(t.last_ns or 0 for t in spans)),
-            count=max(topic.count for topic in spans),
-            body=bool(parts.attitude),
-            gimbal=bool(parts.gimbal),
-            by_gps=preset == "px4" or any(topics[name].type in FIXES for name in parts.position),
-            lead_ns=0 if preset == "px4" else _lead_ns(log, parts.position[0]),
+        settings: dict[str, object] = {"preset": preset} | ({} if alone else {"namespace": namespace or "/"})
+        by_gps = preset == "px4" or any(topics[name].type in FIXES for name in parts.position)
+        named = "" if alone else namespace
+        found.append(
+            (settings, named, list(parts.position), bool(parts.attitude), bool(parts.gimbal), by_gps)
         )
-    for place, turned in pairs_of(list(topics.values())):
-        topic = topics[place]
-        yield Driver(
-            settings={"topic": place, "attitude": turned},
-            span=Span(topic.first_ns or 0, topic.last_ns or 0),
-            count=topic.count,
-            body=True,
-            gimbal=False,
-            by_gps=True,
-            lead_ns=_lead_ns(log, place),
+    for position, attitude in pairs_of(list(topics.values())):
+        found.append(({"topic": position, "attitude": attitude}, position, [position], True, False, True))
+    for settings, named, names, body, gimbal, by_gps in found:
+        parts_ = [topics[name] for name in names]
+        span = Span(min(t.first_ns or 0 for t in parts_), max(t.last_ns or 0 for t in parts_))
+        count = max(topic.count for topic in parts_)
+        preset_ = "preset" in settings
+        likelihood = -1 if preset_ else LAST_POSE_TYPE
+        what = (
+            f"usual topics{' with gimbal angles' if gimbal else ''}" if preset_ else "positions and attitudes"
+        )
+        yield Candidate(
+            "pose",
+            path,
+            place,
+            f"{what}, {span}",
+            {"file": path, **settings},
+            ((),),
+            (1, 1 - int(gimbal) + int(not body), likelihood, -count, named),
+            span,
+            of_body=body and not gimbal,
+            unturned=not (body or gimbal),
+            by_gps=by_gps,
+            topic=named,
+            lead_ns=0 if settings.get("preset") == "px4" else _lead_ns(log, names[0]),
         )
 
 
@@ -537,7 +695,5 @@ def _lead_ns(log: Log, topic: str) -> int | None:
 def _pose_samples(log: Log, topic: str, messages: int, source: Path) -> Iterator[PoseSample]:
     """Yield the poses in the first messages of a topic; those that cannot be read are skipped."""
     for message in islice(log.messages([topic]), messages):
-        try:
+        with suppress(DataError):
             yield from (sample for sample in samples(message, source) if isinstance(sample, PoseSample))
-        except DataError:
-            continue

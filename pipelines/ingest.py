@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from pipelines.session.description import (
 )
 from pipelines.session.errors import DataError, MocapError
 from pipelines.session.log_doubts import doubts_of_logs, doubts_of_places
-from pipelines.session.manifest import Axes, Camera, Flight, read_flight
+from pipelines.session.manifest import Axes, CameraSources, LogSource, Manifest, Source, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
@@ -56,7 +56,7 @@ from pipelines.session.tables import (
 from pipelines.session.urls import as_urls, located, media_path, named
 from pipelines.sources.cameras import FlightCameras
 from pipelines.sources.files import FlightFiles
-from pipelines.sources.hashes import fetch_sources, hash_sources, refuse_written, source_stamps, stated_paths
+from pipelines.sources.hashes import fetch_sources, hash_sources, refuse_written, source_stamps
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.maps import maps_of_log
 from pipelines.sources.parts import (
@@ -73,7 +73,9 @@ from pipelines.sources.parts import (
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=8)
+INGEST = Stage("ingest", revision=9)
+
+T = TypeVar("T")
 
 _AHEAD_ROWS = 200_000  # of cameras that are read during hashing: some 70 MB
 
@@ -128,6 +130,7 @@ def ingest(
     }
 
     with _FlightReader(flight, flight_path, target, interpolation) as reader:
+        reader.refuse_unfit()
         stamps = source_stamps(flight, flight_path.parent)
         check_sources = partial(refuse_written, flight, flight_path.parent, stamps)
         # If nothing can be skipped, sources are read while they are hashed.
@@ -194,7 +197,7 @@ class _FlightReader:
     """
 
     def __init__(
-        self, flight: Flight, flight_path: Path, session: Path, interpolation: Interpolation
+        self, flight: Manifest, flight_path: Path, session: Path, interpolation: Interpolation
     ) -> None:
         base, gap_ns, note = flight_path.parent, interpolation.max_gap_ns, self._take_note
         self._flight = flight
@@ -203,7 +206,7 @@ class _FlightReader:
         self._interpolation = interpolation
         self._notes: list[str] = []
         self._logs = FlightLogs(flight, base, note)
-        self._files = FlightFiles(flight, base)
+        self._files = FlightFiles(flight, flight_path)
         self._poses = FlightPoses(flight, flight_path, self._logs, self._files, max_gap_ns=gap_ns, note=note)
         self._cameras = FlightCameras(
             flight_path, self._logs, self._files, self._poses, max_gap_ns=gap_ns, note=note
@@ -218,6 +221,11 @@ class _FlightReader:
     def __exit__(self, *exception: object) -> None:
         """Close the logs."""
         self._logs.__exit__(*exception)
+
+    def refuse_unfit(self) -> None:
+        """Refuse files, options and mounts that do not belong where they stand."""
+        self._files.refuse_other_options()
+        self._poses.refuse_unfit()
 
     def _take_note(self, line: str) -> None:
         self._notes.append(as_urls(line))
@@ -255,25 +263,34 @@ class _FlightReader:
             data,
             self._interpolation,
             base=self._flight_path.parent,
-            stamps=self._logs.settings(camera.pose.log).stamps if camera.pose.log else None,
+            stamps=self._log_of("pose", camera.pose, lambda log: log.stamps),
             axes=(self._pose_axes(camera), self._gimbal_axes(camera)),
             note=self._take_note,
         )
         warnings = list(dict.fromkeys(data.notes + self.take_notes()))
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
 
-    def _pose_axes(self, camera: Camera) -> Axes:
+    def _pose_axes(self, camera: CameraSources) -> Axes:
         """Return the axes that the poses of a camera or its body are in."""
         pose = camera.pose
-        return pose.axes or (pose.log and self._logs.settings(pose.log).axes) or self._flight.world.frame
+        logged: Axes | None = self._log_of("pose", pose, lambda log: log.axes)
+        return pose.axes or logged or self._flight.world.frame
 
-    def _gimbal_axes(self, camera: Camera) -> Axes:
+    def _gimbal_axes(self, camera: CameraSources) -> Axes:
         """Return the axes that the angles of a camera's gimbal are in."""
         gimbal = camera.gimbal
-        if gimbal and gimbal.fixed is not None:
+        if gimbal is None:
+            return self._flight.world.frame
+        if gimbal.is_fixed:
             return "ned"
-        stated = gimbal and (gimbal.axes or (gimbal.log and self._logs.settings(gimbal.log).axes))
-        return stated or self._flight.world.frame
+        logged: Axes | None = self._log_of("gimbal", gimbal, lambda log: log.axes)
+        return gimbal.axes or logged or self._flight.world.frame
+
+    def _log_of(self, part: str, source: Source, setting: Callable[[LogSource], T | None]) -> T | None:
+        """Return a setting of the log that is a source; None if the source is no log."""
+        if not self._files.is_log(part, source):
+            return None
+        return setting(self._logs.settings(source.file or ""))
 
     def _read_camera(self, name: str) -> CameraData:
         """Read everything about one camera, and check the parts against each other."""
@@ -298,6 +315,7 @@ class _FlightReader:
                     self._flight_path,
                     f"cameras.{name}: no frame of its keypoints is one of its pictures",
                     "check first_frame and frame_times",
+                    code="no-overlap",
                 )
         return CameraData(
             detections,
@@ -307,6 +325,7 @@ class _FlightReader:
             trajectory,
             media=self._cameras.media(camera, frames, self._session),
             log_clock=self._poses.log_clock(camera),
+            still=self._poses.is_still(camera),
             notes=self.take_notes(),
         )
 
@@ -330,11 +349,11 @@ class _FlightReader:
         if truth is None:
             return None
         base = self._flight_path.parent
-        motion = self._files.true_joints(truth.joints) if truth.joints else None
-        if motion is not None and truth.joints is not None:
-            place = located(base, truth.joints.path)
+        motion = self._files.true_joints(truth) if truth.file else None
+        if motion is not None and truth.file is not None:
+            place = located(base, truth.file)
             motion = replace(motion, position=self._poses.joints(place, motion.position))
-            refuse_no_overlap(named(base, truth.joints.path), motion.t_ns, entries)
+            refuse_no_overlap(named(base, truth.file), motion.t_ns, entries)
             write_table(folder / "truth.parquet", motion_table(motion), TRUTH)
         missing, dropped = self._note_truth_missing(motion) if motion else (0, {})
         poses_dropped = {}
@@ -374,16 +393,16 @@ class _FlightReader:
         """Write the logged positions of people."""
         found, tracks = [], []
         for name, actor in self._flight.logged_people.items():
-            trajectory = self._poses.actor(actor.log, actor.topic, name)
-            refuse_no_overlap(named(self._flight_path.parent, actor.log), trajectory.t_ns, entries)
+            trajectory = self._poses.actor(name, actor)
+            refuse_no_overlap(named(self._flight_path.parent, actor.file), trajectory.t_ns, entries)
             if trajectory.dropped:
                 self._notes.append(f"{name or 'actor'}: dropped: {losses(trajectory.dropped)}")
             tracks.append(trajectory)
             found.append(
                 ActorEntry(
                     name=name,
-                    source=actor.log,
-                    sources=self._logs.settings(actor.log).path,
+                    source=actor.file,
+                    sources=self._logs.settings(actor.file).file,
                     topic=actor.topic,
                     point=actor.point,
                     weight=actor.weight,
@@ -400,7 +419,7 @@ class _FlightReader:
         stated = self._flight.map
         if stated is None:
             return None
-        if stated.log:
+        if self._files.is_log("map", stated):
             logged = maps_of_log(
                 self._flight,
                 stated,
@@ -408,13 +427,13 @@ class _FlightReader:
                 max_gap_ns=self._interpolation.max_gap_ns,
                 note=self._take_note,
             )
-            self._refuse_later_map(stated.log, int(logged.from_ns[0]), entries)
-            log = self._logs.paths(stated.log)[0]
+            self._refuse_later_map(stated.file, int(logged.from_ns[0]), entries)
+            log = self._logs.paths(stated.file)[0]
             held, dropped = store_map(folder, self._near_origin(log, logged.maps)), logged.dropped
         else:
-            path = stated.path or ""
-            file = located(self._flight_path.parent, path)
-            occupancy = recognise(file, MapFormat, "map").read_map(file, resolution_m=stated.resolution_m)
+            path, file = stated.file, self._files.path(stated.file)
+            reader = recognise(file, MapFormat, "map", name=stated.format)
+            occupancy = reader.read_map(file, resolution_m=stated.resolution_m)
             held, dropped = store_map(folder, self._near_origin(file, [occupancy])), occupancy.dropped
             if occupancy.crs and not (stated.crs or self._poses.origin()):
                 named = " ".join(occupancy.crs.split())[:60]
@@ -424,7 +443,7 @@ class _FlightReader:
         if dropped:
             self._notes.append(f"map: dropped: {losses(dropped)}")
         return MapEntry(
-            source=stated.log or stated.path or "",
+            source=stated.file,
             unknown=stated.unknown,
             resolution_m=held[-1].resolution_m,
             shape=held[-1].shape,
@@ -437,14 +456,14 @@ class _FlightReader:
     def store_plan(self, folder: Path, entries: Mapping[str, CameraEntry]) -> dict[str, PlannedEntry] | None:
         """Write the positions that the on-board planner commanded."""
         plan = self._flight.plan
-        if plan is None:
+        if not plan:
             return None
         import pandas as pd
 
         tables, found = [], {}
-        for name in (camera for camera in self._flight.cameras if camera in plan.cameras):
-            stated = plan.files.get(name) or plan.log_of(name)
-            sent = self._poses.planned(name, plan)
+        for name in (camera for camera in self._flight.cameras if camera in plan):
+            stated = plan[name].file
+            sent = self._poses.planned(plan[name])
             refuse_no_overlap(named(self._flight_path.parent, stated), sent.t_ns, entries)
             if sent.dropped:
                 self._notes.append(f"{name}: commands dropped: {losses(sent.dropped)}")
@@ -457,7 +476,7 @@ class _FlightReader:
         first, last = span_of_pictures(entries)
         if from_ns > last:
             raise DataError(
-                f"{self._flight_path}: map.log {log}",
+                f"{self._flight_path}: map.file {log}",
                 f"has its first map at {from_ns / 1e9:.3f} s, after the pictures ({span_words(first, last)})",
                 "check its clock, or take `stamps: receive`",
                 code="no-overlap",
@@ -538,9 +557,9 @@ def _refuse_unsound(flight_path: Path, description: Description) -> None:
         raise DataError(flight_path, f"is doubted: {doubt.what} ({doubt.code})", doubt.remedy, code="doubted")
 
 
-def _refuse_ways_out(flight: Flight, path: Path) -> None:
+def _refuse_ways_out(flight: Manifest, path: Path) -> None:
     """Refuse relative paths out of the manifest's folder: a flight that was sent reads its own files."""
-    ways_out = [stated for stated in stated_paths(flight) if leads_out(stated)]
+    ways_out = [stated for stated in flight.files if leads_out(stated)]
     if ways_out:
         raise DataError(
             path,
@@ -550,7 +569,7 @@ def _refuse_ways_out(flight: Flight, path: Path) -> None:
         )
 
 
-def _refuse_other_flight(target: Path, flight: Flight, overwrite: bool) -> None:
+def _refuse_other_flight(target: Path, flight: Manifest, overwrite: bool) -> None:
     existing = target / "session.json"
     if overwrite or not existing.is_file():
         return

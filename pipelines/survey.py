@@ -11,7 +11,7 @@ from pipelines.planning.config import SETTINGS
 from pipelines.planning.scene import replan_settings
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Flight, read_flight
+from pipelines.session.manifest import Manifest, read_flight
 from pipelines.session.registries import FORMATS
 from pipelines.session.stage_records import SCHEMA, STAGES, outdated
 from pipelines.session.stages import open_session
@@ -158,7 +158,7 @@ def _of_yaml(path: Path) -> Survey:
     """Describe a flight manifest, a scenario or planner settings; the kind is that of most of the keys."""
     stated = read_yaml(path)
     kinds = {
-        "flight manifest": (keys_of(Flight), _of_manifest),
+        "flight manifest": (keys_of(Manifest), _of_manifest),
         "scenario": (keys_of(Scenario), _of_scenario),
         "planner settings": ({*SETTINGS, "yaw_deg", "mode"}, _of_planner),
     }

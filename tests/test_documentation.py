@@ -24,7 +24,7 @@ from ruamel.yaml import YAML
 
 from mocap_cli.main import mocap
 from pipelines.geometry.triangulation import STATUS
-from pipelines.session.manifest import Flight
+from pipelines.session.manifest import Manifest
 from pipelines.simulation.scenario import Scenario
 from tests.synthetic.flights import write_flight
 
@@ -214,7 +214,7 @@ def test_every_example_of_a_manifest_or_scenario_is_valid() -> None:
     for page, example in _blocks_of_yaml():
         if "cameras" in example:
             named = {name: camera for name, camera in example["cameras"].items() if camera != "..."}
-            Flight.model_validate(example | {"cameras": named})
+            Manifest.model_validate(example | {"cameras": named})
         else:
             Scenario.model_validate({"schema": 2, "duration_s": 6} | example)
         kinds.append(page)

@@ -170,7 +170,7 @@ class DrawnFlight:
                     place / f"{drone.name}_shared.tum", drone.at_log.t_ns + flight.scenario.start_ns, *moved
                 )
                 text = text.replace(
-                    f"pose: {{tum: truth/{drone.name}.tum}}", f"pose: {{tum: {drone.name}_shared.tum}}"
+                    f"pose: {{file: truth/{drone.name}.tum}}", f"pose: {{file: {drone.name}_shared.tum}}"
                 )
         (place / "flight.yaml").write_text(text, encoding="utf-8")
         return ingest(place / "flight.yaml", place / "session").folder

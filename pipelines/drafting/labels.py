@@ -165,9 +165,6 @@ ACTOR = frozenset(
 )
 NO_PICTURES = frozenset({"depth", "disparity", "infra", "mask", "segmentation", "confidence"})
 OPTICAL = frozenset({"camera", "cam", "optical", "lens"})
-_NED = frozenset({"ned", "px4", "fmu"})
-
-
-def hints_at_ned(*names: str) -> str:
-    """Return the first of some names that suggests north-east-down; empty if none does."""
-    return next((name for name in names if is_called(name, _NED)), "")
+BODIES = frozenset({"base", "body", "imu", "fcu"})
+GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "ptz", "camera", "cam"})
+NED = frozenset({"ned", "px4", "fmu"})

@@ -85,7 +85,6 @@ class PosesEntry(Entry):
     frames_without_pose: int
     dropped: dict[str, int]
     stamps: str | None = None  # of a log's messages: header or receive
-    key: str = "log"  # of `pose` in the manifest that names it: log, topic, tum, csv, ...
     topic: str | None = None  # of the log
     gimbal: str | None = None  # what a gimbal's angles of a topic, or fixed ones, are relative to
     gimbal_fixed: bool = False  # they are fixed

@@ -42,6 +42,7 @@ CODES = {
     "not-a-folder": "a file lies where a folder belongs, or a folder where a file does",
     "not-a-session": "a folder is no session, or no whole one",
     "nothing-reconstructed": "no joint could be reconstructed",
+    "old-spelling": "a key of flight.yaml has another name today",
     "out-of-memory": "the memory does not suffice",
     "outside-folder": "a relative path leads out of its folder",
     "place-unknown": "a place on Earth cannot be brought into the world",
@@ -59,6 +60,7 @@ CODES = {
     "worker-lost": "a process or a machine of a cluster ended",
     "wrong-kind": "a file is of another kind than belongs there",
     "wrong-model": "a model file is not the expected one",
+    "wrong-option": "an option stands beside a file that does not take it",
     "wrong-size": "pictures, calibrations or keypoints differ in size",
     "wrong-worker": "a machine of a cluster has another version of mocap, session or model",
 }

@@ -152,14 +152,14 @@ def _topic(pair: Mapping[str, CameraEntry]) -> str:
         poses = pair[name].poses
         stated = poses.topic or poses.source
         if other in stated and name not in stated:
-            lines = [f"pose.{'topic' if poses.topic else poses.key}: {stated.replace(other, name)}"]
+            lines = [f"pose.{'topic' if poses.topic else 'file'}: {stated.replace(other, name)}"]
             if poses.topic and other in poses.source:
-                lines.insert(0, f"pose.log: {poses.source.replace(other, name)}")
-            gimbals = (("log", poses.gimbal_log), ("topic", poses.gimbal_topic))
+                lines.insert(0, f"pose.file: {poses.source.replace(other, name)}")
+            gimbals = (("file", poses.gimbal_log), ("topic", poses.gimbal_topic))
             lines += [
                 f"gimbal.{key}: {value.replace(other, name)}"
                 for key, value in gimbals
                 if value is not None and other in value and name not in value
             ]
             return "; ".join(f"cameras.{name}.{line}" for line in lines)
-    return "; ".join(f"cameras.{name}.pose: {{log: ..., topic: ...}}  # that of {name}" for name in pair)
+    return "; ".join(f"cameras.{name}.pose: {{file: ..., topic: ...}}  # that of {name}" for name in pair)

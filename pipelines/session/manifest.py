@@ -1,8 +1,8 @@
-"""`flight.yaml`: the files of one flight and how they belong together (DESIGN, section 4).
+"""`flight.yaml`: the files of one flight and how they belong together.
 
-The whole schema is defined here, including the parts that have no reader yet. Those are valid, but the
-stage that needs them refuses them. All problems of a manifest are reported in one message, an unknown key
-with the nearest known one.
+A source is a file, or a topic of a log. Its format is recognised by content, and the options that belong
+to the format stand beside it (`source_options`). All problems of a manifest are reported in one message, an
+unknown key with the nearest known one.
 """
 
 from __future__ import annotations
@@ -12,23 +12,33 @@ import math
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
-from pipelines.geometry.mounting import RelativeTo
+from pipelines.geometry.mounting import Looks, RelativeTo
+from pipelines.session.errors import DataError
+from pipelines.session.old_spellings import old_spellings
+from pipelines.session.source_options import option_names
 from pipelines.session.storage import refuse_camera_names, refuse_names_of_people
-from pipelines.session.yaml_files import Part, SecondsAsNs, nanoseconds, read_yaml_model
+from pipelines.session.yaml_files import (
+    Part,
+    SecondsAsNs,
+    nanoseconds,
+    read_yaml_model,
+    unknown_key,
+)
 
 SCHEMA = 1
 
-_MOST_FRAMES = 10**9  # a year at 30 Hz
+# A year at 30 Hz has fewer frames: a larger number was misread.
+_MAX_FRAME_NUMBER = 10**9
 
 Axes = Literal["enu", "ned"]
+Unit = Literal["m", "cm", "mm", "ft"]
 Side = Annotated[int, Field(gt=0, le=100_000)]
 """Pixels along one side of a picture."""
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Quaternion = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
 def _unit_quaternion(value: list[float]) -> list[float]:
@@ -56,102 +66,132 @@ def _seconds(value: float) -> float:
     return value
 
 
+Quaternion = Annotated[list[float], Field(min_length=4, max_length=4), AfterValidator(_unit_quaternion)]
 Fps = Annotated[Fraction, BeforeValidator(_fps)]
 Seconds = Annotated[float, AfterValidator(_seconds)]
 """Seconds that can be added to any time."""
 
 
 class Guess(Part):
-    """A mapping of which something may be a guess of `mocap init` that nobody has confirmed yet."""
+    """A mapping that `mocap init` may have guessed."""
 
     assumed: bool = False
+    """True for what `mocap init` guessed and nobody has confirmed yet."""
 
 
-class Origin(Part):
+class Source(Guess):
+    """A file, or a topic of a log, with the options of its format."""
+
+    model_config = ConfigDict(extra="allow")
+    shorthand = "file"
+    part: ClassVar[str] = ""
+    """Name of the part of the manifest, by which formats declare their options."""
+
+    file: str | None = None
+    """Path or URL of a file or folder, or the name of one of the `logs`; its content says what it is."""
+    topic: str | None = None
+    """Topic, where the file is a log; without it, the only one of its kind."""
+    format: str | None = None
+    """Name of the file's format, where several recognise its content."""
+
+    @model_validator(mode="after")
+    def _options_exist(self) -> Source:
+        known = option_names(self.part)
+        for key in self.options:
+            if key not in known:
+                raise ValueError(f"{key}: {unknown_key(key, [*type(self).model_fields, *known])}")
+        return self
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options that belong to the file's format, as they were stated."""
+        return dict(self.model_extra or {})
+
+
+class WorldOrigin(Part):
     """Place on Earth of the world's origin."""
 
     latitude_deg: float = Field(ge=-90, le=90)
+    """Latitude, degrees north."""
     longitude_deg: float = Field(ge=-180, le=180)
+    """Longitude, degrees east."""
     altitude_m: float = 0.0
+    """Height, m."""
 
 
-class World(Guess):
+class WorldAxes(Guess):
     """The axes of all sources that do not state their own, and the world's origin."""
 
     frame: Axes = "enu"
-    origin: Origin | None = None
-    crs: str | None = None  # of positions in metres that are those of a map projection: EPSG:32632
+    """Axes of all sources that do not state their own: east, north, up or north, east, down."""
+    origin: WorldOrigin | None = None
+    """Place on Earth of the world's origin; without it, the first position of the first camera."""
+    crs: str | None = None
+    """Map projection of all positions that are coordinates of one, `EPSG:32632` for example."""
 
 
 class LogClock(Part):
-    """Relation of a recorder's clock to the world's: the offset at the first message, and the drift since."""
+    """Relation of a recorder's clock to the world's."""
 
     offset_s: Seconds = 0.0
+    """Seconds that are added to the log's times."""
     drift_ppm: float = Field(0.0, ge=-100_000, le=100_000)
+    """Drift of the log's clock since its first message, parts per million."""
 
 
-class WorldFromLog(Part):
-    """Pose in the world of the origin of a drone's estimator."""
+class Placement(Part):
+    """Pose in the world of the origin of a source."""
 
     translation: Vector = [0.0, 0.0, 0.0]
+    """Place in the world of the source's zero, m."""
     yaw_deg: float = 0.0
+    """Angle from the world's axes to the source's about the vertical, degrees."""
 
 
-class Log(Guess):
+class LogSource(Guess):
     """A recording: one file or several parts of it."""
 
-    shorthand = "path"
-    path: Annotated[
+    shorthand = "file"
+    file: Annotated[
         list[str], BeforeValidator(lambda v: [v] if isinstance(v, str) else v), Field(min_length=1)
     ]
+    """A file, the folder of a bag, or the parts of a split log in their order."""
     stamps: Literal["header", "receive"] = "header"
+    """Times that count: those in the messages, or those at which the recorder received them."""
     axes: Axes | None = None
+    """Axes of the log; without them, those of the world."""
     clock: LogClock = LogClock()
-    world_from_log: WorldFromLog = WorldFromLog()
+    """Relation of the log's clock to the world's."""
+    world_from_source: Placement = Placement()
+    """Place in the world of the log's origin."""
 
 
-class Video(Guess):
-    """A video file, or pictures in a log."""
+class VideoSource(Source):
+    """A video, a folder of pictures, or pictures in a log."""
 
-    shorthand = "path"
-    one_of = ("path", "log")
-    path: str | None = None
-    log: str | None = None
-    topic: str | None = None
+    file: str
+    """A video, a folder of pictures, or a log that holds them."""
 
 
-_COUNTED = (("start", "start_ns"), ("start_from", "start_from"), ("fps", "fps"))  # not with other keys
-
-
-TriggerLog = Literal["ulog", "ardupilot", "tlog"]
-
-
-class FrameTimes(Guess):
+class FrameTimes(Source):
     """Source of the frames' times; by default the container's stamps, counted from `start`."""
 
     start_ns: SecondsAsNs = Field(0, alias="start")
-    # container: the creation time that the video states; motion: the start at which the pictures turn as
-    # the poses do.
+    """Time of the first picture, s."""
     start_from: Literal["container", "motion"] | None = None
+    """What tells the time of the first picture: the video's metadata, or the motion in the pictures."""
     fps: Fps | None = None
-    csv: str | None = None
-    log: str | None = None
-    topic: str | None = None
-    srt: str | None = None
-    ulog: str | None = None  # triggers that an autopilot logged, one for each frame
-    ardupilot: str | None = None
-    tlog: str | None = None
+    """Frame rate, which replaces the stamps of the video: 30, 29.97 or 30000/1001."""
 
     @model_validator(mode="after")
     def _from_one_place(self) -> FrameTimes:
-        every = ("csv", "srt", "log", "ulog", "ardupilot", "tlog")
-        stated = [name for name in every if getattr(self, name) is not None]
-        counted = [key for key, name in _COUNTED if name in self.model_fields_set]
-        if len(stated) > 1 or (stated and counted):
-            problem = f"has {', '.join(stated + counted)}, which say different things of the same pictures"
+        counted = (("start", "start_ns"), ("start_from", "start_from"), ("fps", "fps"))
+        stated = [key for key, name in counted if name in self.model_fields_set]
+        if self.file is not None and stated:
+            problem = f"has {', '.join(['file', *stated])}, which say different things of the same pictures"
             raise ValueError(f"{problem}: leave all but one of them out")
-        if self.topic is not None and self.log is None:
-            raise ValueError("topic: needs the log that holds it")
+        if self.topic is not None and self.file is None:
+            raise ValueError("topic: needs the file of the log that holds it")
         return self
 
     @property
@@ -162,223 +202,115 @@ class FrameTimes(Guess):
     @property
     def is_placed(self) -> bool:
         """True if the times are world times: more than a rate, or the container's stamps from 0 on."""
-        named = (self.start_from, self.csv, self.log, self.srt, self.triggers)
-        return self.has_start or any(source is not None for source in named)
-
-    @property
-    def triggers(self) -> tuple[TriggerLog, str] | None:
-        """Format and log of the triggers in a drone's own log; None without one."""
-        stated: dict[TriggerLog, str | None] = {
-            "ulog": self.ulog,
-            "ardupilot": self.ardupilot,
-            "tlog": self.tlog,
-        }
-        return next(((kind, log) for kind, log in stated.items() if log is not None), None)
+        return self.has_start or self.start_from is not None or self.file is not None
 
 
-class Clock(Guess):
-    """World time = video time + offset; sigma 0 means that it is known."""
+class CameraClock(Guess):
+    """World time = video time + offset."""
 
     offset_ns: SecondsAsNs = Field(0, alias="offset_s")
+    """Seconds that are added to the times of the pictures."""
     sigma_s: float = Field(0.2, ge=0)
+    """Standard deviation of the offset, s; 0 means that it is known."""
 
 
-class StaticPose(Part):
-    """A calibration file with the pose of a camera that stands still."""
+class PoseSource(Source):
+    """Source of a camera's poses: a trajectory, a log, a drone's own log or a calibration."""
 
-    shorthand = "path"
-    path: str
-    camera: str | None = None
-
-
-OwnLog = Literal["dji", "ulog", "ardupilot", "tlog", "gopro"]
-"""The key of a drone's own log in a pose."""
-
-
-class PoseSource(Guess):
-    """Source of a camera's poses."""
-
-    one_of = ("log", "tum", "csv", "static", *get_args(OwnLog))
-    log: str | None = None
-    topic: str | None = None
-    parent: str | None = None
-    child: str | None = None
-    preset: Literal["dji_osdk", "mavros", "px4"] | None = None  # the usual topics of a driver, in a log
-    namespace: str | None = None  # of the preset's topics, where a log holds several drones: /uav1
-    attitude: str | None = None  # topic of attitudes, if `topic` has only positions (NavSatFix, PointStamped)
-    tum: str | None = None
-    csv: str | None = None
-    static: StaticPose | None = None
-    dji: str | None = None  # subtitles beside a video, a flight record as CSV, or pictures
-    ulog: str | None = None  # PX4
-    ardupilot: str | None = None  # DataFlash .bin
-    tlog: str | None = None  # of a ground station
-    gopro: str | None = None  # video with a track of GPMF
-    position: Literal["local", "global", "gps"] | None = None  # which of a drone's own estimates
-    instance: int | None = Field(None, ge=0, le=255)
-    time: Literal["gps", "boot"] | None = None
-    altitude: Literal["relative", "absolute"] | float | None = None  # or metres, held throughout
+    part = "pose"
+    file: str
+    """A trajectory, a log, a drone's own log, or a calibration that holds the pose of a still camera."""
     of: Literal["camera", "body"] | None = None
+    """What the poses are of: the camera, or the body that carries it by a mount or gimbal."""
     axes: Axes | None = None
-    inverse: bool = False  # the file has camera_from_world, or body_from_world
-    quaternion: Literal["xyzw", "wxyz"] | None = None  # the order in which the file has it [its format's]
-    unit: Literal["m", "cm", "mm", "ft"] = "m"  # of its positions
-    z: Literal["up", "down"] = "up"  # where its positions count to, where its axes are east, north, up else
-    world_from_source: WorldFromLog = WorldFromLog()  # where the file's zero and north lie in the world
-
-    @model_validator(mode="after")
-    def _only_where_it_belongs(self) -> PoseSource:
-        autopilot = any(part is not None for part in (self.ulog, self.ardupilot, self.tlog))
-        allowed = {
-            ("topic", "parent", "child", "preset", "attitude"): (self.log is not None, "from a log"),
-            ("namespace",): (self.preset is not None, "by a preset"),
-            ("position",): (autopilot or self.preset is not None, "by ulog, ardupilot, tlog or a preset"),
-            ("instance", "time"): (autopilot, "by ulog, ardupilot or tlog"),
-            ("altitude",): (self.dji is not None, "by dji"),
-            ("axes",): (
-                not self.is_telemetry or self.attitude is not None,
-                "that is no drone's own log (those state theirs)",
-            ),
-            ("inverse", "quaternion", "unit", "z"): (
-                not self.is_telemetry and self.static is None,
-                "from a log, tum or csv",
-            ),
-            ("world_from_source",): (self.static is None, "that moves"),
-        }
-        for names, (may, whose) in allowed.items():
-            unasked = {name: type(self).model_fields[name].default for name in names}
-            stated = [name for name, default in unasked.items() if getattr(self, name) != default]
-            if stated and not may:
-                raise ValueError(f"{', '.join(stated)}: only a pose {whose} has that")
-        if (self.parent is None) != (self.child is None):
-            raise ValueError("needs both parent and child, or neither")
-        if self.preset and (self.topic or self.parent):
-            raise ValueError("has a preset and names topics or frames: leave one of them out")
-        if self.attitude and (self.topic is None or self.preset or self.parent):
-            raise ValueError(
-                "attitude: needs the topic of the positions beside it, and neither preset nor frames"
-            )
-        return self
-
-    @property
-    def is_telemetry(self) -> bool:
-        """True if position and attitude come separately, from a drone's own log or its driver's topics."""
-        return self.own_log is not None or self.preset is not None or self.attitude is not None
-
-    @property
-    def own_log(self) -> tuple[OwnLog, str] | None:
-        """Key and path of the drone's own log; None for poses of another kind."""
-        keys: tuple[OwnLog, ...] = get_args(OwnLog)
-        return next(((key, stated) for key in keys if (stated := getattr(self, key)) is not None), None)
-
-    @property
-    def telemetry_source(self) -> str:
-        """The log of positions and attitudes as the manifest names it."""
-        return self.own_log[1] if self.own_log else self.log or ""
-
-
-class RigidTransform(Part):
-    """Translation in metres and a unit quaternion."""
-
-    translation: Vector
-    rotation_xyzw: Annotated[Quaternion, AfterValidator(_unit_quaternion)]
+    """Axes of the poses; without them, those of the log or the world."""
+    unit: Unit = "m"
+    """Unit of the positions."""
+    world_from_source: Placement = Placement()
+    """Place in the world of the source's zero, and its north."""
 
 
 class Mount(Guess):
     """Pose of the camera on the body."""
 
-    looks: Literal["forward", "backward", "left", "right", "down", "up"] | None = None
+    one_of = ("looks", "rotation_xyzw")
+    looks: Looks | None = None
+    """Direction in which the camera looks, seen from the body."""
     down_deg: float = 0.0
+    """Angle by which the camera looks down from there, degrees."""
+    rotation_xyzw: Quaternion | None = None
+    """Rotation body_from_camera, in place of `looks`."""
     translation: Vector = [0.0, 0.0, 0.0]
-    body_from_camera: RigidTransform | None = None
-    one_of = ("looks", "body_from_camera")
+    """Place of the camera on the body: forward, left, up, m."""
 
 
-class FixedAngles(Part):
-    """Constant direction of a camera in DJI's angles: yaw from north to east, pitch up, roll right."""
-
-    yaw_deg: float = Field(ge=-360, le=360)
-    pitch_deg: float = Field(ge=-180, le=180)
-    roll_deg: float = Field(0.0, ge=-180, le=180)
-
-
-AngleLog = Literal["dji", "gopro"]
-"""The key of a log in a gimbal, whose angles of the camera are used without its positions."""
-
-
-_ANGLE_LOGS: tuple[AngleLog, ...] = get_args(AngleLog)
-
-
-class Gimbal(Guess):
+class GimbalSource(Source):
     """Source of the gimbal's angles: a topic, fixed angles, another log, or the log that gives the pose."""
 
-    log: str | None = None
-    topic: str | None = None
-    fixed: FixedAngles | None = None
-    dji: str | None = None  # flight record or subtitles
-    gopro: str | None = None  # video with a track of GPMF
-    yaw_deg: float | None = Field(None, ge=-360, le=360)  # heading of the first picture, where none is logged
+    part = "gimbal"
+    yaw_deg: float | None = Field(None, ge=-360, le=360)
+    """Constant yaw from north to east, degrees; beside a file without north, that of the first picture."""
+    pitch_deg: float | None = Field(None, ge=-180, le=180)
+    """Constant pitch, up, degrees."""
+    roll_deg: float = Field(0.0, ge=-180, le=180)
+    """Constant roll to the right, degrees."""
     relative_to: RelativeTo | None = None
-    order: Literal["ypr", "rpy", "pry"] = "ypr"
-    units: Literal["deg", "rad"] = "deg"
+    """What the angles are relative to: the world, the body, or a level frame with the body's heading."""
     axes: Axes | None = None
+    """Axes of the angles; without them, those of the log or the world."""
 
     @model_validator(mode="after")
-    def _complete(self) -> Gimbal:
-        sources: dict[str, object] = {"a log": self.log, "fixed angles": self.fixed}
-        sources |= {key: getattr(self, key) for key in _ANGLE_LOGS}
-        if len(stated := [name for name, source in sources.items() if source is not None]) > 1:
-            raise ValueError(f"has {' and '.join(stated)}: leave all but one of them out")
-        if self.gopro is not None and self.yaw_deg is None:
-            raise ValueError(
-                "lacks yaw_deg, the heading of the first picture from north to east: a GoPro logs how it"
-                " turned from there on, not where north is"
-            )
-        if self.gopro is None and self.yaw_deg is not None:
-            raise ValueError("yaw_deg: only a gopro has that; write fixed: {yaw_deg, pitch_deg}")
-        if self.gopro is not None and self.relative_to not in {None, "world"}:
-            raise ValueError("relative_to: a GoPro's attitudes are those in the world, leave it out")
-        if self.own_log is not None and self.topic is None:
-            return self
-        if self.log is not None:
-            missing = [name for name in ("topic", "relative_to") if getattr(self, name) is None]
-            if missing:
-                raise ValueError(f"lacks {', '.join(missing)}")
-        elif self.topic is not None:
-            raise ValueError("topic: needs the log that holds it")
-        elif self.fixed is None and self.relative_to is None:
-            raise ValueError("needs log and topic, fixed angles, or what the drone's own are relative_to")
+    def _complete(self) -> GimbalSource:
+        if self.file is None:
+            if self.topic is not None:
+                raise ValueError("topic: needs the file of the log that holds it")
+            if (self.yaw_deg is None) != (self.pitch_deg is None):
+                raise ValueError("constant angles need both yaw_deg and pitch_deg")
+            if not self.is_fixed and self.relative_to is None:
+                raise ValueError(
+                    "needs a file, constant angles {yaw_deg, pitch_deg}, or what the drone's own angles are"
+                    " relative_to"
+                )
+        elif self.pitch_deg is not None:
+            raise ValueError("has a file and constant angles: leave one of them out")
+        elif self.topic is not None and self.relative_to is None:
+            raise ValueError("lacks relative_to: what the angles of the topic are relative to")
         return self
 
     @property
-    def own_log(self) -> tuple[AngleLog, str] | None:
-        """Key and path of the log whose angles are used without its positions; None for another source."""
-        return next(((key, path) for key in _ANGLE_LOGS if (path := getattr(self, key)) is not None), None)
+    def is_fixed(self) -> bool:
+        """True if the angles are constant."""
+        return self.pitch_deg is not None
 
     @property
     def is_of_pose(self) -> bool:
         """True if the angles are those of the log that gives the pose."""
-        return self.log is None and self.fixed is None and self.own_log is None
+        return self.file is None and not self.is_fixed
 
 
-class IntrinsicsSource(Guess):
+class IntrinsicsSource(Source):
     """A calibration file (and which of its cameras), a topic, or the numbers themselves."""
 
-    shorthand = "path"
-    one_of = ("path", "log", "fx")
-    path: str | None = None
-    camera: str | None = None
-    log: str | None = None
-    topic: str | None = None
+    part = "intrinsics"
+    one_of = ("file", "fx")
     width: Side | None = None
+    """Width of the pictures, px."""
     height: Side | None = None
+    """Height of the pictures, px."""
     fx: float | None = Field(None, gt=0)
+    """Focal length across, px."""
     fy: float | None = Field(None, gt=0)
+    """Focal length down, px."""
     cx: float | None = None
+    """Column of the principal point, px from the centre of the first pixel."""
     cy: float | None = None
+    """Row of the principal point, px from the centre of the first pixel."""
     model: Literal["radtan", "fisheye"] = "radtan"
+    """Model of the distortion."""
     distortion: list[float] = []
+    """Coefficients of the distortion, as OpenCV orders them."""
     readout_s: float = Field(0.0, ge=0)
+    """Time from the first to the last row of a rolling shutter, s."""
 
     @model_validator(mode="after")
     def _complete(self) -> IntrinsicsSource:
@@ -389,47 +321,50 @@ class IntrinsicsSource(Guess):
         return self
 
 
-class KeypointSource(Guess):
+class KeypointSource(Source):
     """2D keypoints of this camera, made by a detector of the user's own."""
 
-    shorthand = "path"
-    path: str
-    format: str | None = None
-    skeleton: str | None = None
-    first_frame: int = Field(0, ge=-_MOST_FRAMES, le=_MOST_FRAMES)
-    # true: found in mirrored pictures; x counts from the right, y from below; names: left is right
+    part = "keypoints"
+    file: str
+    """Results of a detector: a file, or a folder of one file for each picture."""
+    first_frame: int = Field(0, ge=-_MAX_FRAME_NUMBER, le=_MAX_FRAME_NUMBER)
+    """Number that the file gives to the first picture of the video."""
     mirrored: bool | Literal["x", "y", "names"] = False
+    """True for mirrored pictures; `x`, `y` or `names` where only columns, rows or left and right are."""
     image_size: Annotated[list[Side], Field(min_length=2, max_length=2)] | None = None
+    """Width and height of the pictures that the detector saw, px."""
 
 
-class Camera(Part):
-    """One camera in the air (or on the ground)."""
+class CameraSources(Part):
+    """One camera in the air, or on the ground."""
 
-    video: Video | None = None
+    video: VideoSource | None = None
+    """The pictures."""
     frame_times: FrameTimes | None = None
-    clock: Clock | None = None
+    """When the pictures were taken."""
+    clock: CameraClock | None = None
+    """Clock of the pictures, relative to the world's."""
     pose: PoseSource
+    """Where the camera was."""
     mount: Mount | None = None
-    gimbal: Gimbal | None = None
+    """How the camera is fixed to the body whose poses are logged."""
+    gimbal: GimbalSource | None = None
+    """Angles of the gimbal that turns the camera."""
     intrinsics: IntrinsicsSource
+    """Lens."""
     keypoints: KeypointSource | None = None
+    """Keypoints of a detector of your own."""
     pose_noise: dict[str, dict[str, float | str]] | None = None
+    """What is known of the errors of the poses: parameters by noise model."""
 
     @model_validator(mode="after")
-    def _has_pictures(self) -> Camera:
+    def _has_pictures(self) -> CameraSources:
         if self.video is None and self.keypoints is None:
             raise ValueError("needs a video or keypoints")
-        carried = self.mount is not None or self.gimbal is not None
-        if self.pose.of == "body" and not carried:
+        if self.pose.of == "body" and not self.is_carried:
             raise ValueError("pose is of the body: say how the camera sits on it with `mount` or `gimbal`")
-        may_carry = (self.pose.log or self.pose.is_telemetry) and self.pose.of is None
-        if carried and self.pose.of != "body" and not may_carry:
+        if self.pose.of == "camera" and self.is_carried:
             raise ValueError("a mount or gimbal needs the pose of the body: add `of: body` to `pose`")
-        gimbal = self.gimbal
-        if gimbal and gimbal.is_of_pose and not self.pose.is_telemetry:
-            raise ValueError("gimbal: needs log and topic, or fixed: {yaw_deg: 90, pitch_deg: -30}")
-        if self.pose.static and self.pose.of == "body":
-            raise ValueError("a still camera's pose is its own: leave `of: body` and the mount out")
         times = self.frame_times
         found = times is not None and times.start_from == "motion" and not times.has_start
         if found and self.clock is not None and self.clock.offset_ns:
@@ -439,112 +374,87 @@ class Camera(Part):
             )
         return self
 
+    @property
+    def is_carried(self) -> bool:
+        """True if the camera has a mount or a gimbal."""
+        return self.mount is not None or self.gimbal is not None
 
-class Actor(Guess):
-    """Source of the actor's positions, logged in flight."""
 
-    log: str
-    topic: str | None = None
+class ActorSource(Source):
+    """Source of a person's positions, logged in flight."""
+
+    file: str
+    """A log, or the tracks of a watch."""
     point: Literal["hip", "head", "feet", "centre"] = "hip"
-    weight: float = Field(1.0, ge=0, allow_inf_nan=False)  # of several people, for the planners
+    """Point of the person that the positions follow."""
+    weight: float = Field(1.0, ge=0, allow_inf_nan=False)
+    """Weight of this person for the planners, among several."""
 
 
-class Map(Part):
+class MapSource(Source):
     """Source of the map of the surroundings."""
 
-    shorthand = "path"
-    one_of = ("path", "log")
-    path: str | None = None
-    log: str | None = None
-    topic: str | None = None
-    parent: str | None = None  # the frame that is the log's world
-    crs: str | None = None  # of its coordinates [world.crs]
+    part = "map"
+    file: str
+    """A map, a cloud of points, or a log that holds them."""
+    crs: str | None = None
+    """Map projection of its coordinates; without it, the file's own or `world.crs`."""
     unknown: Literal["free", "occupied"] = "free"
+    """State of voxels that nothing is known of."""
     resolution_m: float | None = Field(None, gt=0)
-    height_m: float | None = Field(None, gt=0, le=1000)  # of obstacles on a logged floor plan
-
-    @model_validator(mode="after")
-    def _only_of_logs(self) -> Map:
-        stated = [name for name in ("topic", "parent", "height_m") if getattr(self, name) is not None]
-        if stated and self.log is None:
-            raise ValueError(f"{', '.join(stated)}: only a map from a log has that")
-        return self
+    """Side of the voxels that a cloud of points is divided into, m."""
 
 
-class TruthJoints(Part):
-    """True joints, with unit and axes where the file leaves them open."""
-
-    shorthand = "path"
-    path: str
-    format: str | None = None
-    unit: Literal["m", "cm", "mm"] | None = None
-    axes: Literal["z-up", "y-up", "ned"] | None = None
-    offset_s: Seconds = 0.0  # added to the times of the file: those of a C3D begin at 0
-
-
-class Truth(Part):
+class TruthSource(Source):
     """Sources of ground truth: joints, and camera poses by camera."""
 
-    shorthand = "joints"
-    joints: TruthJoints | None = None
+    unit: Literal["m", "cm", "mm"] | None = None
+    """Unit of the joints, where the file does not state it."""
+    axes: Literal["z-up", "y-up", "ned"] | None = None
+    """Axes of the joints, where the file does not state them."""
+    offset_s: Seconds = 0.0
+    """Seconds that are added to the times of the joints."""
     poses: dict[str, str] = {}
+    """Files of true poses by camera."""
 
 
-class PlannedTopic(Part):
-    """A topic of commanded positions, and its log where that is not the plan's `log`."""
+class PlanSource(Source):
+    """Setpoints of the on-board planner for one drone."""
 
-    shorthand = "topic"
-    topic: str
-    log: str | None = None
-
-
-class Plan(Part):
-    """Setpoints of the on-board planner by camera: topics of a log, or files of poses."""
-
-    log: str | None = None
-    topics: dict[str, PlannedTopic] = {}
-    files: dict[str, str] = {}
-
-    @model_validator(mode="after")
-    def _complete(self) -> Plan:
-        if not self.topics and not self.files:
-            raise ValueError("needs `topics` or `files` by camera: {drone1: /drone1/setpoint}")
-        twice = [name for name in self.topics if name in self.files]
-        if twice:
-            raise ValueError(f"{twice[0]} has a topic and a file: leave one of them out")
-        without = [name for name, stated in self.topics.items() if not (stated.log or self.log)]
-        if without:
-            raise ValueError(f"the topic of {without[0]} needs a `log`")
-        return self
-
-    @property
-    def cameras(self) -> list[str]:
-        """The cameras that have a topic or a file."""
-        return [*self.topics, *self.files]
-
-    def log_of(self, camera: str) -> str:
-        """Return the log of a camera's topic."""
-        return self.topics[camera].log or self.log or ""
+    file: str
+    """A log, or a trajectory."""
 
 
-class Flight(Part):
+class Manifest(Part):
     """One flight, as `flight.yaml` states it."""
 
     schema_version: Literal[1] = Field(alias="schema")
+    """Version of this description: 1."""
     name: str = Field("", max_length=1000)
-    world: World = World()
+    """Name of the flight; without it, that of the file."""
+    world: WorldAxes = WorldAxes()
+    """Axes and origin of the world."""
     simulated: bool = False
+    """True for a flight of `mocap simulate`."""
     clock_reference: str | None = None
-    logs: dict[str, Log] = {}
-    cameras: dict[str, Camera] = Field(min_length=1, max_length=128)
-    actor: Actor | None = None
-    actors: dict[str, Actor] = {}
-    map: Map | None = None
-    truth: Truth | None = None
-    plan: Plan | None = None
+    """Camera whose clock is held when no clock is known; without it, the first."""
+    logs: dict[str, LogSource] = {}
+    """Recordings by name, for settings that all their topics share."""
+    cameras: dict[str, CameraSources] = Field(min_length=1, max_length=128)
+    """Cameras by name."""
+    actor: ActorSource | None = None
+    """Logged positions of the actor."""
+    actors: dict[str, ActorSource] = {}
+    """Logged positions of several people by name."""
+    map: MapSource | None = None
+    """What stands around."""
+    truth: TruthSource | None = None
+    """What is known to be true."""
+    plan: dict[str, PlanSource] = {}
+    """Commands of the on-board planner by camera."""
 
     @model_validator(mode="after")
-    def _names_exist(self) -> Flight:
+    def _names_exist(self) -> Manifest:
         refuse_camera_names(self.cameras)
         refuse_names_of_people(self.actors)
         if self.actor is not None and self.actors:
@@ -552,8 +462,7 @@ class Flight(Part):
         if self.logged_people and not any(actor.weight for actor in self.logged_people.values()):
             raise ValueError("weight: somebody must have one above 0")
         named = [self.clock_reference] if self.clock_reference else []
-        named += list(self.truth.poses) if self.truth else []
-        named += self.plan.cameras if self.plan else []
+        named += [*(self.truth.poses if self.truth else []), *self.plan]
         for name in named:
             if name not in self.cameras:
                 near = difflib.get_close_matches(name, self.cameras, n=1)
@@ -563,7 +472,7 @@ class Flight(Part):
         return self
 
     @property
-    def logged_people(self) -> dict[str, Actor]:
+    def logged_people(self) -> dict[str, ActorSource]:
         """The people who were logged, by name; whom `actor:` states has none (the empty name)."""
         return {"": self.actor} if self.actor else self.actors
 
@@ -577,6 +486,26 @@ class Flight(Part):
         """The camera whose clock offset is held where none is known and no background shows one."""
         return self.clock_reference or next(iter(self.cameras))
 
+    @property
+    def files(self) -> list[str]:
+        """Every path and URL that the manifest states, each once, spelled as in it."""
+        sources: list[Source | None] = [
+            *self.logged_people.values(),
+            self.map,
+            *self.plan.values(),
+            self.truth,
+        ]
+        for camera in self.cameras.values():
+            sources += [camera.pose, camera.intrinsics, camera.keypoints, camera.gimbal]
+            sources += [camera.frame_times, camera.video]
+        named = [source.file for source in sources if source is not None and source.file]
+        named += list(self.truth.poses.values()) if self.truth else []
+        return list(dict.fromkeys(path for name in named for path in self.paths_of(name)))
+
+    def paths_of(self, file: str) -> list[str]:
+        """Return the paths of a `file:`, several if it names a split log."""
+        return self.logs[file].file if file in self.logs else [file]
+
 
 def _assumed_in(mapping: Mapping[str, Any], place: str) -> Iterator[str]:
     if mapping.get("assumed"):
@@ -586,7 +515,7 @@ def _assumed_in(mapping: Mapping[str, Any], place: str) -> Iterator[str]:
             yield from _assumed_in(value, f"{place}.{key}" if place else key)
 
 
-def read_flight(path: Path) -> Flight:
+def read_flight(path: Path) -> Manifest:
     """Read and validate a manifest.
 
     Raises:
@@ -595,10 +524,16 @@ def read_flight(path: Path) -> Flight:
     """
     flight = read_yaml_model(
         path,
-        Flight,
+        Manifest,
         "flight manifest",
         newest=SCHEMA,
         shape="a mapping with `schema: 1` and `cameras:`",
         made="`mocap init FOLDER` drafts one",
+        refuse=_refuse_old_spellings,
     )
     return flight if flight.name else flight.model_copy(update={"name": path.stem})
+
+
+def _refuse_old_spellings(path: Path, stated: Mapping[object, object]) -> None:
+    if old := old_spellings(stated):
+        raise DataError(path, "; ".join(old), "docs/flight.md explains every key", code="old-spelling")

@@ -357,10 +357,12 @@ def find_detector(text: str) -> Detector:
     found = DETECTORS.get(name)
     if isinstance(found, DetectorFamily):
         if not argument:
-            raise DataError(text, "does not say which model", f"write {found.usage.splitlines()[0]}")
+            raise DataError(
+                text, "does not say which model", f"write {found.usage.splitlines()[0]}", code="bad-option"
+            )
         return found.configured(argument)
     if colon:
-        raise DataError(text, f"{name} takes nothing behind its name", f"write {name}")
+        raise DataError(text, f"{name} takes nothing behind its name", f"write {name}", code="bad-option")
     return found
 
 
@@ -390,7 +392,9 @@ def find_models(text: str) -> FetchesModels:
         return exports[text]
     if text.partition(":")[0] not in DETECTORS.names():
         names = ", ".join([*DETECTORS.names(), *exports])
-        raise DataError(text, "nothing of that name has model files", f"there are {names}")
+        raise DataError(
+            text, "nothing of that name has model files", f"there are {names}", code="no-such-name"
+        )
     return find_detector(text)
 
 
@@ -405,17 +409,31 @@ def hashes_of_models(detector: Detector) -> dict[str, str]:
     return {name: sha256_of(path) for name, path in detector.models().items() if path is not None}
 
 
-def recognise(path: Path, protocol: type[F], noun: str) -> F:
-    """Find the one registered format of a kind that recognises a file.
+def recognise(path: Path, protocol: type[F], noun: str, *, name: str | None = None) -> F:
+    """Find the one registered format of a kind that recognises a file; arguments as `recognise_any` has."""
+    found: Any = recognise_any(path, (protocol,), noun, name=name)
+    read: F = found
+    return read
+
+
+def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: str | None = None) -> Format:
+    """Find the one registered format of some kinds that recognises a file.
 
     Args:
         path: an existing file or folder.
-        protocol: the kind, one of the runtime-checkable protocols above.
-        noun: the kind's name in messages ("keypoint file", "camera trajectory").
+        protocols: the kinds, of the runtime-checkable protocols above.
+        noun: the name of such a file in messages ("keypoint file", "camera trajectory").
+        name: the format that the user states.
 
     Raises:
-        DataError: the path is missing, no format of the kind knows it, or several do.
+        DataError: the path is missing, no format of the kinds knows it, several do, or the stated format is
+            of another kind.
     """
+    if name is not None:
+        stated = FORMATS.get(name)
+        if isinstance(stated, protocols):
+            return stated
+        raise DataError(path, f"{name} is no format of a {noun}", "leave `format:` out", code="wrong-kind")
     if not path.exists():
         raise DataError(
             path,
@@ -424,11 +442,14 @@ def recognise(path: Path, protocol: type[F], noun: str) -> F:
             code="no-such-file",
         )
     refuse_special(path)
-    candidates = [f for f in FORMATS.all() if isinstance(f, protocol)]
+    candidates = [f for f in FORMATS.all() if isinstance(f, protocols)]
     matches = [f for f in candidates if f.recognises(path)]
     if len(matches) == 1:
         return matches[0]
     if not matches:
+        likely = [f for f in candidates if path.suffix and path.suffix.lower() in f.suffixes]
+        if len(likely) == 1 and path.is_file():
+            return likely[0]  # its reader says exactly what is wrong
         raise _unrecognised(path, noun, sorted(f.name for f in candidates))
     raise DataError(
         path,
@@ -471,7 +492,9 @@ def parsed_noise_models(place: str, text: str) -> list[NoiseModel]:
     try:
         parts = parse(text)
     except ValueError as error:
-        raise DataError(place, str(error), "write white:position_m=0.3,rotation_deg=1") from None
+        raise DataError(
+            place, str(error), "write white:position_m=0.3,rotation_deg=1", code="bad-value"
+        ) from None
     return _built(place, parts)
 
 
@@ -480,7 +503,7 @@ def _built(place: str, parts: Iterable[tuple[str, Mapping[str, object]]]) -> lis
     try:
         return build(parts, classes)
     except ValueError as error:
-        raise DataError(place, str(error)) from None
+        raise DataError(place, str(error), code="bad-value") from None
 
 
 _OF_EXTRA = re.compile(r"(?P<requirement>[^;]+?)\s*;\s*extra == ['\"](?P<extra>[^'\"]+)['\"]")

@@ -5,11 +5,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
+from pydantic import Field
+
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import RelativeTo
 from pipelines.session.registries import Format
+from pipelines.session.yaml_files import Part
 
 Height = Literal["sea level", "ellipsoid", "take-off", "stated", "unknown"]
 """The zero level of the heights of geodetic positions."""
@@ -74,19 +77,25 @@ class Attitudes:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class TelemetryChoice:
-    """The user's choice among several sources in a drone's log; None leaves the choice to the reader."""
+class TelemetryChoice(Part):
+    """Options of a drone's own log."""
 
     position: Literal["local", "global", "gps"] | None = None
-    instance: int | None = None  # of an estimator or a receiver
+    """Estimate of the position that is read."""
+    instance: int | None = Field(None, ge=0, le=255)
+    """Number of the estimator, receiver or vehicle."""
     time: Literal["gps", "boot"] | None = None
+    """Clock of the times: UTC by GPS, or seconds since the start of the autopilot."""
     altitude: Literal["relative", "absolute"] | float | None = None
+    """Heights above the take-off, above the sea, or a height in metres that was held throughout."""
 
 
 @runtime_checkable
 class TelemetryFormat(Format, Protocol):
-    """Logs that drones write themselves: positions, attitudes, gimbal angles, moments of pictures."""
+    """Logs that drones write themselves: positions, attitudes, gimbal angles, moments of pictures.
+
+    An attribute `choices` lists the fields of `TelemetryChoice` that users may state; without it, none.
+    """
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position and attitudes, in ENU and FLU; raise DataError if there is no position."""

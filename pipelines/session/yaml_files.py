@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
@@ -36,10 +36,10 @@ SecondsAsNs = Annotated[int, BeforeValidator(nanoseconds)]
 class Part(BaseModel):
     """A mapping of the manifest: unknown keys are refused, numbers are finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
     shorthand: ClassVar[str | None] = None
-    """The key that a bare text (or list) stands for: `map: site.bt` means `map: {path: site.bt}`."""
+    """The key that a bare text (or list) stands for: `map: site.bt` means `map: {file: site.bt}`."""
     one_of: ClassVar[tuple[str, ...]] = ()
     """The keys that exclude each other; exactly one of them must be there."""
 
@@ -64,7 +64,16 @@ def keys_of(model: type[Part]) -> set[str]:
     return {field.alias or name for name, field in model.model_fields.items()}
 
 
-def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape: str, made: str = "") -> M:
+def read_yaml_model(
+    path: Path,
+    model: type[M],
+    noun: str,
+    *,
+    newest: int,
+    shape: str,
+    made: str = "",
+    refuse: Callable[[Path, Mapping[object, object]], None] | None = None,
+) -> M:
     """Read and validate a file.
 
     Args:
@@ -73,6 +82,7 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
         newest: the newest version of the schema.
         shape: a description of the file's form, for the message if the file is no mapping.
         made: how one is made, for the message if the file is another one.
+        refuse: raises a DataError for a content that is worth a message of its own.
 
     Raises:
         DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
@@ -89,10 +99,12 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
             "use a newer version of mocap",
             code="newer-schema",
         )
+    if refuse is not None:
+        refuse(path, raw)
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        problems = [_describe(problem, model) for problem in error.errors()]
+        problems = [describe_problem(problem, model) for problem in error.errors()]
         raise DataError(path, "; ".join(dict.fromkeys(problems)), code="bad-value") from None
 
 
@@ -113,13 +125,12 @@ def _read_yaml(path: Path, noun: str, how: str) -> object:
     return plain_yaml(path, text)
 
 
-def _describe(problem: Any, model: type[Part]) -> str:  # ErrorDetails, whose ctx has no fixed shape
+def describe_problem(problem: Any, model: type[Part]) -> str:  # ErrorDetails, whose ctx has no fixed shape
+    """Describe a problem that pydantic found, with its place."""
     place = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
         known = _keys_at(model, problem["loc"][:-1])
-        near = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-        return f"{place}: unknown key, {hint}"
+        return f"{place}: {unknown_key(str(problem['loc'][-1]), known)}"
     if problem["type"] == "missing":
         return f"{place}: is missing"
     if problem["type"] in {"model_type", "model_attributes_type", "dict_type"}:
@@ -128,6 +139,13 @@ def _describe(problem: Any, model: type[Part]) -> str:  # ErrorDetails, whose ct
         return f"{place}: needs at least one"
     message = problem["msg"].removeprefix("Value error, ")
     return f"{place}: {message}" if place else message
+
+
+def unknown_key(key: str, known: Sequence[str]) -> str:
+    """Describe a key that nothing knows, with the nearest known one."""
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+    return f"unknown key, {hint}"
 
 
 def _keys_at(model: type[Part], place: tuple[str | int, ...]) -> list[str]:
@@ -226,7 +244,7 @@ def _refuse_impossible_values(path: Path, value: object) -> None:
 
 def _impossible(path: Path, place: tuple[object, ...], problem: str) -> DataError:
     where = ".".join(map(str, place))[:200]
-    return DataError(path, f"{where}: {problem}" if where else problem, "mend it")
+    return DataError(path, f"{where}: {problem}" if where else problem, "mend it", code="bad-value")
 
 
 def _is_unicode(text: str) -> bool:

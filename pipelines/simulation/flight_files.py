@@ -170,7 +170,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
         "simulated: true",
         "world: {frame: enu}",
         "logs:",
-        *(f"  {drone.name}: {{path: {drone.name}.mcap}}" for drone in flight.drones),
+        *(f"  {drone.name}: {{file: {drone.name}.mcap}}" for drone in flight.drones),
         "cameras:",
     ]
     for drone in flight.drones:
@@ -180,7 +180,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
         *_logged_people(flight),
         "map: site.bt",
         "truth:",
-        "  joints: truth/joints.csv",
+        "  file: truth/joints.csv",
         f"  poses: {{{poses}}}",
         "",
     ]
@@ -190,10 +190,13 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
 def _logged_people(flight: SimulatedFlight) -> list[str]:
     """Write who was logged: by name where the scenario has `actors`."""
     if flight.scenario.actors is None:
-        return [f"actor: {{log: drone1, topic: {flight.people[0].topic}, point: hip}}"]
+        return [f"actor: {{file: drone1, topic: {flight.people[0].topic}, point: hip}}"]
     return [
         "actors:",
-        *(f"  {person.name}: {{log: drone1, topic: {person.topic}, point: hip}}" for person in flight.people),
+        *(
+            f"  {person.name}: {{file: drone1, topic: {person.topic}, point: hip}}"
+            for person in flight.people
+        ),
     ]
 
 
@@ -226,13 +229,13 @@ def _pictures(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> li
         pictures = [f"    video: {name}.mp4", f"    frame_times: {{start: {whole}.{fraction:09d}}}"]
     else:
         pictures = [
-            f"    frame_times: {{csv: {name}_frames.csv}}",
-            f"    keypoints: {{path: {name}_keypoints.json, format: alphapose, skeleton: coco17}}",
+            f"    frame_times: {{file: {name}_frames.csv}}",
+            f"    keypoints: {{file: {name}_keypoints.json, format: alphapose, skeleton: coco17}}",
         ]
     sigma_s = 0 if known else _UNKNOWN_CLOCK_SIGMA_S
     intrinsics, readout_s = f"{name}_camera.yaml", drone.intrinsics.readout_s
     if readout_s:
-        intrinsics = f"{{path: {intrinsics}, readout_s: {readout_s:g}}}"
+        intrinsics = f"{{file: {intrinsics}, readout_s: {readout_s:g}}}"
     return [
         f"  {name}:",
         *pictures,
@@ -244,12 +247,12 @@ def _pictures(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> li
 def _poses(flight: SimulatedFlight, drone: SimulatedDrone, true_poses: bool) -> list[str]:
     name, drones = drone.name, flight.scenario.drones
     if true_poses:
-        return [f"    pose: {{tum: truth/{name}.tum}}"]
+        return [f"    pose: {{file: truth/{name}.tum}}"]
     arm = ", ".join(f"{v:g}" for v in LEVER_ARM)
     lines = [
-        f"    pose: {{log: {name}, topic: /{name}/odometry, of: body}}",
+        f"    pose: {{file: {name}, topic: /{name}/odometry, of: body}}",
         f"    mount: {{looks: forward, translation: [{arm}]}}",
-        f"    gimbal: {{log: {name}, topic: /{name}/gimbal, relative_to: world}}",
+        f"    gimbal: {{file: {name}, topic: /{name}/gimbal, relative_to: world}}",
     ]
     if drones.pose_noise and drones.state_pose_noise:
         lines.append("    pose_noise:")

@@ -17,9 +17,9 @@ from pipelines.geometry.cameras import Intrinsics, fit_to_size, is_resized
 from pipelines.geometry.clocks import fit_start
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Camera, FrameTimes, IntrinsicsSource, TriggerLog
+from pipelines.session.manifest import CameraSources, FrameTimes, IntrinsicsSource
 from pipelines.session.records import Detections, Trajectory, VideoIndex
-from pipelines.session.urls import located, media_path
+from pipelines.session.urls import media_path
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs, Frames
 from pipelines.sources.parts import CameraFrames
@@ -40,11 +40,14 @@ _LARGEST_SHARE_OUTSIDE = 0.5
 class PosesOfCameras(Protocol):
     """Reader of the poses of cameras, for videos whose start is estimated, and of trigger times."""
 
-    def trajectory(self, name: str, camera: Camera, frames: CameraFrames | None) -> Trajectory:
+    def is_still(self, camera: CameraSources) -> bool:
+        """Return True for a camera that stands still."""
+
+    def trajectory(self, name: str, camera: CameraSources, frames: CameraFrames | None) -> Trajectory:
         """Read world_from_camera over time."""
 
-    def triggers(self, kind: TriggerLog, stated: str) -> Int64:
-        """Read the trigger times of pictures from a drone's own log, at world times."""
+    def triggers(self, times: FrameTimes) -> Int64 | None:
+        """Read the trigger times of pictures from a drone's own log, at world times; None if it is none."""
 
 
 class FlightCameras:
@@ -79,7 +82,7 @@ class FlightCameras:
     def frames(
         self,
         name: str,
-        camera: Camera,
+        camera: CameraSources,
         video: VideoIndex | None,
         detections: Detections | None,
         intrinsics: Intrinsics,
@@ -104,12 +107,12 @@ class FlightCameras:
         return replace(unclocked, t_ns=unclocked.t_ns + offset_ns)
 
     def _unclocked_frames(
-        self, name: str, camera: Camera, video: VideoIndex | None, detections: Detections | None
+        self, name: str, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
     ) -> CameraFrames:
         times = camera.frame_times or FrameTimes()
         logged = None
-        if camera.video is not None and camera.video.log is not None:
-            logged = self._logs.frames(camera.video.log, camera.video.topic)
+        if camera.video is not None and self._files.is_log("video", camera.video):
+            logged = self._logs.frames(camera.video.file, camera.video.topic)
         pictures = _pictures(video, logged)
         if times.fps is not None:
             count = len(pictures.t_ns) if pictures else self._listed_frames(camera, detections)
@@ -117,14 +120,15 @@ class FlightCameras:
             topic, lost = (pictures.topic, pictures.dropped) if pictures else (None, {})
             start_ns = self._start_ns(name, camera, times)
             return CameraFrames(np.arange(count), start_ns + since_start, since_start, topic, lost)
-        if times.csv or times.srt:
-            return self._frames_of_file(located(self._base, times.csv or times.srt or ""), pictures)
-        if times.log is not None:
-            triggers = self._logs.triggers(times.log, times.topic)
-            stamped = triggers or self._logs.frames(times.log, times.topic)
+        if times.file is not None and self._files.is_log("frame_times", times):
+            triggers = self._logs.triggers(times.file, times.topic)
+            stamped = triggers or self._logs.frames(times.file, times.topic)
             return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
-        if times.triggers is not None:
-            return self._frames_by_stamps(self._poses.triggers(*times.triggers), {}, pictures)
+        if times.file is not None:
+            triggered = self._poses.triggers(times)
+            if triggered is not None:
+                return self._frames_by_stamps(triggered, {}, pictures)
+            return self._frames_of_file(self._files.path(times.file), pictures)
         if pictures is None:
             raise DataError(
                 self._manifest,
@@ -152,10 +156,11 @@ class FlightCameras:
                 self._manifest,
                 f"cameras.{name}.frame_times: {key} has no use, the log stamps its pictures",
                 "leave it out, or correct the log's clock with logs: {...: {clock: ...}}",
+                code="stated-twice",
             )
         return pictures
 
-    def _listed_frames(self, camera: Camera, detections: Detections | None) -> int:
+    def _listed_frames(self, camera: CameraSources, detections: Detections | None) -> int:
         if detections is None or camera.keypoints is None:
             raise DataError(
                 self._manifest,
@@ -166,9 +171,10 @@ class FlightCameras:
         count = int(detections.frames_listed[-1]) + 1
         if count > _MOST_FRAMES:
             raise DataError(
-                located(self._base, camera.keypoints.path),
+                self._files.path(camera.keypoints.file),
                 f"numbers its frames up to {count - 1}",
                 "say with first_frame which number the first frame bears",
+                code="bad-value",
             )
         return count
 
@@ -195,14 +201,14 @@ class FlightCameras:
             dropped=dict(+lost),
         )
 
-    def _start_ns(self, name: str, camera: Camera, times: FrameTimes) -> int:
+    def _start_ns(self, name: str, camera: CameraSources, times: FrameTimes) -> int:
         """Return the start of a video that has stamps of its own."""
         if times.start_from == "motion":
             return 0  # estimated later, from the pictures and the poses
         if times.start_from is None:
             return times.start_ns
-        path = located(self._base, camera.video.path or "") if camera.video else None
-        made_ns = _made_ns(path) if path is not None and camera.video and camera.video.path else None
+        path = self._files.video_file(camera)
+        made_ns = _made_ns(path) if path is not None else None
         if made_ns is None:
             raise DataError(
                 path or self._manifest,
@@ -218,13 +224,21 @@ class FlightCameras:
         return times.start_ns + made_ns
 
     def _started_by_motion(
-        self, name: str, camera: Camera, frames: CameraFrames, intrinsics: Intrinsics, near_ns: int | None
+        self,
+        name: str,
+        camera: CameraSources,
+        frames: CameraFrames,
+        intrinsics: Intrinsics,
+        near_ns: int | None,
     ) -> CameraFrames:
         """Shift the frames of a video in time so that the motion in its pictures fits the poses."""
         place = f"{self._manifest}: cameras.{name}.frame_times"
         remedy = "say start: SECONDS instead, or give the stamps of a log"
-        if camera.video is None or camera.video.path is None or camera.pose.static:
-            raise DataError(place, "start_from: motion needs a video and poses that move", remedy)
+        video = self._files.video_file(camera)
+        if video is None or self._poses.is_still(camera):
+            raise DataError(
+                place, "start_from: motion needs a video and poses that move", remedy, code="no-pictures"
+            )
         poses = self._poses.trajectory(name, camera, None)
         some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + _WATCHED_NS))
         try:
@@ -232,13 +246,13 @@ class FlightCameras:
                 poses.t_ns,
                 poses.position,
                 poses.quaternion_xyzw,
-                followed_points(located(self._base, camera.video.path), intrinsics, frames.pts_ns[:some]),
+                followed_points(video, intrinsics, frames.pts_ns[:some]),
                 max_gap_ns=self._max_gap_ns,
                 near_ns=near_ns,
             )
         except ValueError as error:
             problem = f"its pictures do not say when the video began: {error}"
-            raise DataError(place, problem, remedy) from None
+            raise DataError(place, problem, remedy, code="clock-unknown") from None
         self._note(
             f"{name}: its video begins at {fit.start_ns / 1e9:.3f} s +- {1e3 * fit.sigma_s:.1f} ms, by the"
             f" motion in its pictures (points move by {1e3 * fit.moved:.2g} mrad in a fifth of a second, and"
@@ -265,23 +279,24 @@ class FlightCameras:
             dropped=dict(+lost),
         )
 
-    def media(self, camera: Camera, frames: CameraFrames, session: Path) -> MediaEntry | None:
+    def media(self, camera: CameraSources, frames: CameraFrames, session: Path) -> MediaEntry | None:
         """Return the paths of the pictures relative to the session, which moves together with its flight."""
         video = camera.video
         if video is None:
             return None
-        stated = self._logs.settings(video.log).path if video.log else [video.path or ""]
+        is_log = self._files.is_log("video", video)
+        stated = self._logs.settings(video.file).file
         return MediaEntry(
             paths=[media_path(self._base, path, session) for path in stated],
             sources=stated,
             topic=frames.topic,
-            stamps=self._logs.settings(video.log).stamps if video.log else "header",
+            stamps=self._logs.settings(video.file).stamps if is_log else "header",
         )
 
     # --- intrinsics ------------------------------------------------------------------------------------
 
     def intrinsics(
-        self, name: str, camera: Camera, video: VideoIndex | None, detections: Detections | None
+        self, name: str, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
     ) -> Intrinsics:
         """Return the intrinsics of a camera, fitted to the size of its pictures.
 
@@ -290,37 +305,34 @@ class FlightCameras:
         """
         source = camera.intrinsics
         place = f"{self._manifest}: cameras.{name}.intrinsics"
-        if source.path:
-            calibrated = self._files.camera(name, source.path, source.camera)
+        if source.file and not self._files.is_log("intrinsics", source):
+            path = self._files.path(source.file)
+            calibrated = self._files.camera(name, "intrinsics", source)
             if calibrated.intrinsics is None:
                 raise DataError(
-                    located(self._base, source.path),
-                    "holds poses but no intrinsics",
-                    "name one with both",
-                    code="no-intrinsics",
+                    path, "holds poses but no intrinsics", "name one with both", code="no-intrinsics"
                 )
             intrinsics = calibrated.intrinsics
             if not calibrated.size_stated:
                 size = self._picture_size(camera, video, detections)
-                intrinsics = _with_size(intrinsics, size, located(self._base, source.path))
+                intrinsics = _with_size(intrinsics, size, path)
                 self._note(f"{name}: its calibration states no picture size; that of its pictures is taken")
-        elif source.log:
-            intrinsics = self._logs.intrinsics(source.log, source.topic).intrinsics
+        elif source.file:
+            intrinsics = self._logs.intrinsics(source.file, source.topic).intrinsics
         else:
             intrinsics = _inline_intrinsics(source, place)
         if source.readout_s:
             intrinsics = replace(intrinsics, readout_s=source.readout_s)
         if size := self._picture_size(camera, video, detections):
             bars = (0, 0, 0, 0)
-            stated = camera.video.path if camera.video else None
-            file = located(self._base, stated) if stated else None
+            file = self._files.video_file(camera)
             if file is not None and not file.is_dir() and not is_resized(intrinsics, *size):
                 bars = black_bars(file)
             try:
                 intrinsics, note = fit_to_size(intrinsics, *size, bars)
             except ValueError as error:
                 remedy = "give the calibration that belongs to these pictures"
-                raise DataError(place, str(error), remedy) from None
+                raise DataError(place, str(error), remedy, code="wrong-size") from None
             if note:
                 self._note(f"{name}: {note}")
         if detections is not None:
@@ -328,14 +340,16 @@ class FlightCameras:
         return intrinsics
 
     def _picture_size(
-        self, camera: Camera, video: VideoIndex | None, detections: Detections | None
+        self, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
     ) -> tuple[int, int] | None:
         """Return the size of the pictures themselves, or the size that the keypoints file gives."""
         if video is not None:
             return video.width, video.height
-        logged = camera.video.log if camera.video else None
-        if camera.video and logged and (size := self._logs.picture_size(logged, camera.video.topic)):
-            return size
+        logged = camera.video
+        if logged and self._files.is_log("video", logged):
+            size = self._logs.picture_size(logged.file, logged.topic)
+            if size:
+                return size
         return detections.image_size if detections else None
 
 
@@ -403,7 +417,7 @@ def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
             distortion=coefficients,
         )
     except ValueError as error:
-        raise DataError(place, str(error), "mend the numbers") from None
+        raise DataError(place, str(error), "mend the numbers", code="bad-value") from None
 
 
 def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: Detections) -> None:

@@ -1,99 +1,174 @@
-"""Readers of the files that a manifest names for one flight, in the axes and at the times of the files."""
+"""Files that a manifest names for one flight: their formats, and readers in the files' axes and times."""
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from pipelines.formats.videos.frame_times import FrameTimesFormat
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Camera, Flight, KeypointSource, TruthJoints
+from pipelines.session.manifest import CameraSources, KeypointSource, Manifest, Source, TruthSource
 from pipelines.session.records import CalibratedCamera, Detections, JointMotion, VideoIndex
 from pipelines.session.registries import (
-    FORMATS,
     CalibrationFormat,
+    Format,
     JointFormat,
     KeypointFormat,
+    LogFormat,
+    MapFormat,
+    TrajectoryFormat,
     VideoFormat,
     recognise,
+    recognise_any,
 )
+from pipelines.session.source_options import CameraOfCalibration, DetectorOutput, options_of
+from pipelines.session.telemetry import AttitudeFormat, TelemetryFormat, TriggerFormat
 from pipelines.session.urls import located
+from pipelines.session.yaml_files import Part
 from pipelines.sources.world import losses
 
 _FARTHEST_M = 10_000  # in any flight a person's joints are closer to their median than this
 _LARGEST_M = 1e8  # metric grids have coordinates up to 1e7
 
 
+_KINDS: dict[str, tuple[str, tuple[type, ...]]] = {
+    "video": ("video", (VideoFormat, LogFormat)),
+    "frame_times": ("file of frame times", (FrameTimesFormat, TriggerFormat, LogFormat)),
+    "pose": ("source of poses", (CalibrationFormat, TrajectoryFormat, TelemetryFormat, LogFormat)),
+    "gimbal": ("source of angles", (AttitudeFormat, LogFormat)),
+    "intrinsics": ("calibration", (CalibrationFormat, LogFormat)),
+    "keypoints": ("keypoint file", (KeypointFormat,)),
+    "map": ("map", (MapFormat, LogFormat)),
+    "truth": ("file of true joints", (JointFormat,)),
+    "plan": ("file of commanded poses", (TrajectoryFormat, LogFormat)),
+}
+"""Name and kinds of formats of the file in each part of a manifest."""
+
+O = TypeVar("O", bound=Part)
+
+
 class FlightFiles:
     """Reader of the files of one flight; each calibration is read once."""
 
-    def __init__(self, flight: Flight, base: Path) -> None:
+    def __init__(self, flight: Manifest, manifest: Path) -> None:
         self._flight = flight
-        self._base = base
+        self._manifest = manifest
+        self._base = manifest.parent
+        self._formats: dict[tuple[str, str, str | None], Format] = {}
         self._calibrations: dict[str, dict[str, CalibratedCamera]] = {}
+
+    def path(self, file: str) -> Path:
+        """Return the path of a `file:`, the first one of a split log."""
+        return located(self._base, self._flight.paths_of(file)[0])
+
+    def format_of(self, part: str, source: Source) -> Format:
+        """Recognise the file of a part of the manifest; errors as in `recognise`."""
+        key = (part, source.file or "", source.format)
+        if key not in self._formats:
+            noun, kinds = _KINDS[part]
+            self._formats[key] = recognise_any(self.path(key[1]), kinds, noun, name=source.format)
+        return self._formats[key]
+
+    def is_log(self, part: str, source: Source) -> bool:
+        """Return True if a source is a log of topics."""
+        return source.file is not None and isinstance(self.format_of(part, source), LogFormat)
+
+    def options(self, part: str, source: Source, wanted: type[O], place: str = "") -> O:
+        """Validate the options beside the file of a part of the manifest, and return them."""
+        where = f"{self._manifest}: {place or part}"
+        return options_of(where, part, self.format_of(part, source), source.options, wanted)
+
+    def refuse_other_options(self) -> None:
+        """Recognise every file.
+
+        Raises:
+            DataError: a file does not exist, is of no kind that belongs where it stands, or has options or
+                a topic that such a file does not take.
+        """
+        parts: list[tuple[str, str, Source | None]] = []
+        for name, camera in self._flight.cameras.items():
+            named = ("video", "frame_times", "pose", "gimbal", "intrinsics", "keypoints")
+            parts += [(f"cameras.{name}.{part}", part, getattr(camera, part)) for part in named]
+        parts += [("map", "map", self._flight.map), ("truth", "truth", self._flight.truth)]
+        parts += [(f"plan.{name}", "plan", source) for name, source in self._flight.plan.items()]
+        for place, part, source in parts:
+            if source is None or source.file is None:
+                continue
+            self.options(part, source, Part, place)
+            if source.topic is not None and not self.is_log(part, source):
+                raise DataError(
+                    f"{self._manifest}: {place}",
+                    f"has a topic, and {source.file} is no log ({self.format_of(part, source).title})",
+                    "leave the topic out, or name the log",
+                    code="wrong-option",
+                )
 
     def keypoints(self, source: KeypointSource) -> tuple[Detections, str]:
         """Read the keypoints that the manifest gives for a camera; return them with their format's name."""
-        path = located(self._base, source.path)
-        if source.format:
-            reader = FORMATS.get(source.format)
-            if not isinstance(reader, KeypointFormat):
-                raise DataError(
-                    path, f"{source.format} is no keypoint format", "leave `format:` out", code="wrong-kind"
-                )
-        else:
-            reader = recognise(path, KeypointFormat, "keypoint file")
-        detections = reader.read_keypoints(path, skeleton=source.skeleton, first_frame=source.first_frame)
+        path, reader = self.path(source.file), self.format_of("keypoints", source)
+        if not isinstance(reader, KeypointFormat):
+            raise DataError(
+                path, f"{reader.name} is no keypoint format", "leave `format:` out", code="wrong-kind"
+            )
+        skeleton = self.options("keypoints", source, DetectorOutput).skeleton
+        detections = reader.read_keypoints(path, skeleton=skeleton, first_frame=source.first_frame)
         if not len(detections.frame):
-            raise DataError(path, "holds no keypoints", "run the detector again, or leave the camera out")
+            raise DataError(
+                path,
+                "holds no keypoints",
+                "run the detector again, or leave the camera out",
+                code="no-keypoints",
+            )
         if source.image_size:
             detections = replace(detections, image_size=(source.image_size[0], source.image_size[1]))
         return detections, reader.name
 
-    def video(self, camera: Camera) -> VideoIndex | None:
-        """Return the index of a camera's video file; None if it has none."""
-        if camera.video is None or camera.video.path is None:
+    def video_file(self, camera: CameraSources) -> Path | None:
+        """Return the path of a camera's video; None if it has none, or pictures in a log."""
+        if camera.video is None or self.is_log("video", camera.video):
             return None
-        path = located(self._base, camera.video.path)
-        return recognise(path, VideoFormat, "video").index(path)
+        return self.path(camera.video.file)
 
-    def camera(self, name: str, path: str, camera: str | None) -> CalibratedCamera:
+    def video(self, camera: CameraSources) -> VideoIndex | None:
+        """Return the index of a camera's video file; None if it has none."""
+        path = self.video_file(camera)
+        return None if path is None else recognise(path, VideoFormat, "video").index(path)
+
+    def camera(self, name: str, part: str, source: Source) -> CalibratedCamera:
         """Return the camera that is asked for, or the one of this name, or the only one of the file."""
+        path, camera = source.file or "", self.options(part, source, CameraOfCalibration).camera
         if path not in self._calibrations:
-            file = located(self._base, path)
-            self._calibrations[path] = recognise(file, CalibrationFormat, "calibration").read_calibration(
-                file
-            )
+            reader = self.format_of(part, source)
+            if not isinstance(reader, CalibrationFormat):
+                raise TypeError(f"{reader.name} reads no calibrations")
+            self._calibrations[path] = reader.read_calibration(self.path(path))
         cameras = self._calibrations[path]
         if camera is None and name not in cameras and len(cameras) == 1:
             return next(iter(cameras.values()))
         if (camera or name) not in cameras:
             listed = ", ".join(sorted(cameras)[:20])
             raise DataError(
-                located(self._base, path),
+                self.path(path),
                 f"holds no camera {camera or name!r} (there are {listed})",
-                "say which with {path: ..., camera: ...}",
+                "say which with {file: ..., camera: ...}",
                 code="no-such-name",
             )
         return cameras[camera or name]
 
-    def true_joints(self, source: TruthJoints) -> JointMotion:
+    def true_joints(self, source: TruthSource) -> JointMotion:
         """Read the true joints; drop and count positions too far from the others to be true.
 
         Raises:
             DataError: the file cannot be used, its axes are unknown, or no position is left.
         """
-        path = located(self._base, source.path)
-        named = FORMATS.get(source.format) if source.format else None
-        reader = named or recognise(path, JointFormat, "file of true joints")
-        if not isinstance(reader, JointFormat):
-            raise DataError(
-                path, f"{source.format} holds no joints", "leave `format:` out", code="wrong-kind"
-            )
+        path = self.path(source.file or "")
+        reader = recognise(path, JointFormat, "file of true joints", name=source.format)
         if source.axes is None and self._flight.world.frame == "ned":
             raise DataError(
                 path,
                 "has joints of unknown axes in a NED world",
-                "say truth: {joints: {axes: ned}} or z-up, y-up",
+                "say truth: {axes: ned} or z-up, y-up",
                 code="axes-unknown",
             )
         is_ned = source.axes == "ned"

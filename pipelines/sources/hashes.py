@@ -8,7 +8,7 @@ from pathlib import Path
 from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM, CheckedHash, stated_checksum
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Flight
+from pipelines.session.manifest import Manifest
 from pipelines.session.progress import Progress
 from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
 from pipelines.session.urls import fetched, located, named, source_url
@@ -17,13 +17,13 @@ _HASHERS = 4
 
 
 def hash_sources(
-    flight: Flight, base: Path, progress: Progress, meanwhile: Iterator[object]
+    flight: Manifest, base: Path, progress: Progress, meanwhile: Iterator[object]
 ) -> tuple[dict[str, str], dict[str, dict[str, int]]]:
     """Compute the sha256 of every file that is read, and the damage, both by the manifest's path.
 
     Steps of `meanwhile` run until all is hashed.
     """
-    unique = stated_paths(flight)
+    unique = flight.files
     for path in unique:  # before anything waits for one of them
         refuse_special(located(base, path))
     progress.start("Hashing sources", len(unique))
@@ -44,13 +44,13 @@ def hash_sources(
     return hashes, damage
 
 
-def fetch_sources(flight: Flight, base: Path, progress: Progress) -> None:
+def fetch_sources(flight: Manifest, base: Path, progress: Progress) -> None:
     """Fetch the files that a manifest states by URL, where the copies in the cache are not as in the store.
 
     Raises:
         DataError: a store cannot be read, or holds no such file.
     """
-    urls = [url for path in stated_paths(flight) if (url := source_url(base, path))]
+    urls = [url for path in flight.files if (url := source_url(base, path))]
     if urls:
         progress.start("Fetching sources", len(urls))
     for url in urls:
@@ -58,20 +58,19 @@ def fetch_sources(flight: Flight, base: Path, progress: Progress) -> None:
         progress.advance()
 
 
-def source_stamps(flight: Flight, base: Path) -> dict[str, str]:
+def source_stamps(flight: Manifest, base: Path) -> dict[str, str]:
     """Return the stamp of every file that is read, by the manifest's path.
 
     Raises:
         DataError: one of them is missing or cannot be read.
     """
     stamps = {
-        path: [file_stamp(file) for file in _source_files(located(base, path))]
-        for path in stated_paths(flight)
+        path: [file_stamp(file) for file in _source_files(located(base, path))] for path in flight.files
     }
     return {path: own[0] if len(own) == 1 else hash_of(own) for path, own in stamps.items()}
 
 
-def refuse_written(flight: Flight, base: Path, stamps: Mapping[str, str]) -> None:
+def refuse_written(flight: Manifest, base: Path, stamps: Mapping[str, str]) -> None:
     """Refuse sources that changed since they had these stamps, so that the hash fits what was read.
 
     Raises:
@@ -85,52 +84,6 @@ def refuse_written(flight: Flight, base: Path, stamps: Mapping[str, str]) -> Non
                 "run `mocap ingest` again when it is complete",
                 code="changed",
             )
-
-
-def stated_paths(flight: Flight) -> list[str]:
-    """Return every path that a manifest states, each once, spelled as in the manifest."""
-    stated: list[str] = []
-
-    def take(*paths: str | None) -> None:
-        stated.extend(path for path in paths if path)
-
-    def take_log(log: str | None) -> None:
-        if log:
-            take(*(flight.logs[log].path if log in flight.logs else [log]))
-
-    for camera in flight.cameras.values():
-        pose, times, video = camera.pose, camera.frame_times, camera.video
-        take(pose.tum, pose.csv, pose.static.path if pose.static else None, camera.intrinsics.path)
-        take(camera.keypoints.path if camera.keypoints else None)
-        gimbal = camera.gimbal
-        angles = gimbal.own_log if gimbal else None
-        for log in (
-            pose.log,
-            pose.own_log[1] if pose.own_log else None,
-            camera.intrinsics.log,
-            gimbal.log if gimbal else None,
-            angles[1] if angles else None,
-        ):
-            take_log(log)
-        if times:
-            take(times.csv, times.srt)
-            for log in (times.log, times.triggers[1] if times.triggers else None):
-                take_log(log)
-        if video:
-            take(video.path)
-            take_log(video.log)
-    for actor in flight.logged_people.values():
-        take_log(actor.log)
-    if flight.map:
-        take(flight.map.path)
-        take_log(flight.map.log)
-    if flight.plan:
-        for name in flight.plan.topics:
-            take_log(flight.plan.log_of(name))
-        take(*flight.plan.files.values())
-    if flight.truth:
-        take(flight.truth.joints.path if flight.truth.joints else None, *flight.truth.poses.values())
-    return list(dict.fromkeys(stated))
 
 
 def _hash_of(path: Path) -> tuple[str, int]:

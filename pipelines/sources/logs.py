@@ -33,8 +33,7 @@ from pipelines.formats.logs.trajectories import (
 )
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Flight
-from pipelines.session.manifest import Log as LogSource
+from pipelines.session.manifest import LogSource, Manifest
 from pipelines.session.records import IntrinsicsSample, PictureSample, Trajectory
 from pipelines.session.registries import Log, LogFormat, recognise
 from pipelines.session.urls import located
@@ -104,10 +103,15 @@ class FlightLog:
                 turned = next((b for a, b in pairs_of(self.recording.topics) if a == topic), "TOPIC")
                 problem += ", but positions alone"
                 remedy = f"name the attitudes beside it, attitude: {turned}; {remedy}"
-            raise DataError(self.source, problem, remedy)
+            raise DataError(self.source, problem, remedy, code="no-such-topic")
         if len(there) != 1:
             problem = f"has {len(there)} topics with {noun} ({listed})"
-            raise DataError(self.source, problem, "say which with `topic:`" if there else "name another log")
+            raise DataError(
+                self.source,
+                problem,
+                "say which with `topic:`" if there else "name another log",
+                code="ambiguous",
+            )
         self.note(f"{self.source}: took {noun} from {there[0]}, the only candidate")
         return there[0]
 
@@ -143,7 +147,7 @@ class FlightLogs:
         note: receives each choice and each doubt, one line each.
     """
 
-    def __init__(self, flight: Flight, base: Path, note: Callable[[str], None]) -> None:
+    def __init__(self, flight: Manifest, base: Path, note: Callable[[str], None]) -> None:
         self._flight = flight
         self._base = base
         self._note = note
@@ -160,11 +164,11 @@ class FlightLogs:
 
     def settings(self, log: str) -> LogSource:
         """Return the manifest's settings of a log, given by its name or by a path."""
-        return self._flight.logs.get(log) or LogSource(path=[log])
+        return self._flight.logs.get(log) or LogSource(file=[log])
 
     def paths(self, log: str) -> list[Path]:
         """Return the files of a log."""
-        return [located(self._base, path) for path in self.settings(log).path]
+        return [located(self._base, path) for path in self.settings(log).file]
 
     @contextmanager
     def open(self, log: str) -> Iterator[FlightLog]:
@@ -224,10 +228,10 @@ class FlightLogs:
             lost = opened.lost + Counter({"trigger without a later stamp": repeated})
             return Frames(topic, opened.world_times(t_ns), dict(lost))
 
-    def commands(self, log: str, topic: str) -> Trajectory | None:
+    def commands(self, log: str, topic: str | None) -> Trajectory | None:
         """Read commanded positions of a drone, at world times; None if the topic holds no command type."""
         with self.open(log) as opened:
-            if opened.type_of(topic) not in COMMAND_TYPES:
+            if topic is None or opened.type_of(topic) not in COMMAND_TYPES:
                 return None
             found = read_commands(opened.recording, opened.source, topic, opened.settings.stamps)
             dropped = dict(Counter(found.dropped) + opened.lost)
@@ -260,12 +264,15 @@ class FlightLogs:
             name, source = opened.choose("intrinsics", topic), opened.source
             for sample in all_samples(opened.recording.messages([name]), source):
                 if not isinstance(sample, IntrinsicsSample):
-                    raise DataError(source, f"{name} holds no camera info", "name another topic")
+                    raise DataError(
+                        source, f"{name} holds no camera info", "name another topic", code="no-intrinsics"
+                    )
                 if first is not None and sample.intrinsics != first.intrinsics:
                     raise DataError(
                         source,
                         f"{name} changes during the flight (zoom?)",
                         "give one calibration in a file or inline",
+                        code="no-intrinsics",
                     )
                 first = first or sample
         if first is None:

@@ -16,9 +16,9 @@ from pipelines.formats.logs.maps import (
 from pipelines.formats.logs.trajectories import frames_of_poses, place_of_frame
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Flight
-from pipelines.session.manifest import Map as MapSource
+from pipelines.session.manifest import Manifest, MapSource
 from pipelines.session.records import Message, Occupancy
+from pipelines.session.source_options import LoggedMap
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.world import in_enu, in_world, world_times
 
@@ -27,7 +27,12 @@ DEFAULT_HEIGHT_M = 2.5
 
 
 def maps_of_log(
-    flight: Flight, stated: MapSource, logs: FlightLogs, *, max_gap_ns: int, note: Callable[[str], None]
+    flight: Manifest,
+    stated: MapSource,
+    logs: FlightLogs,
+    *,
+    max_gap_ns: int,
+    note: Callable[[str], None],
 ) -> LoggedMaps:
     """Read the maps of a topic, in ENU axes at world times.
 
@@ -35,7 +40,7 @@ def maps_of_log(
         DataError: no such topic, several candidates, no readable map, or a map in a frame that the
             log does not connect with its world.
     """
-    log = stated.log or ""
+    log, options = stated.file, LoggedMap.model_validate(stated.options)
     with logs.open(log) as opened:
         recording, source, settings = opened.recording, opened.source, opened.settings
         there = [known.name for known in recording.topics if known.type in MAP_TYPES]
@@ -45,16 +50,16 @@ def maps_of_log(
         first = next(recording.messages([topic]), None)
         if first is None:
             raise Losses(place, recording.dropped).nothing_usable()
-        if stated.height_m is not None and type_ != OCCUPANCY_GRID:
+        if options.height_m is not None and type_ != OCCUPANCY_GRID:
             problem = f"{topic} holds {type_}, which has heights of its own"
-            raise DataError(source, problem, "leave `height_m` out")
+            raise DataError(source, problem, "leave `height_m` out", code="wrong-option")
         frame = frame_of(first, place)
         log_from_frame = place_of_frame(
             recording,
             source,
             place,
             frame,
-            parent=stated.parent,
+            parent=options.parent,
             poses_in=frames_of_poses(recording, source, _poses_taken(flight, logs, log)),
             stamps=settings.stamps,
             max_gap_ns=max_gap_ns,
@@ -73,11 +78,11 @@ def maps_of_log(
         frame=frame,
         stamps=settings.stamps,
         world_from_frame=in_world(
-            in_enu(log_from_frame, settings.axes or flight.world.frame), settings.world_from_log
+            in_enu(log_from_frame, settings.axes or flight.world.frame), settings.world_from_source
         ),
         max_gap_ns=max_gap_ns,
         resolution_m=stated.resolution_m,
-        height_m=DEFAULT_HEIGHT_M if stated.height_m is None else stated.height_m,
+        height_m=DEFAULT_HEIGHT_M if options.height_m is None else options.height_m,
     )
     found = read_maps(read, type_, about)
     for line in found.notes:
@@ -91,13 +96,13 @@ def maps_of_log(
     )
 
 
-def _poses_taken(flight: Flight, logs: FlightLogs, log: str) -> list[tuple[str | None, str | None]]:
+def _poses_taken(flight: Manifest, logs: FlightLogs, log: str) -> list[tuple[str | None, str | None]]:
     """Return topic and parent of all poses that the flight takes from a log."""
     poses = [camera.pose for camera in flight.cameras.values()]
-    taken = [(pose.log, pose.topic, pose.parent) for pose in poses]
-    taken += [(actor.log, actor.topic, None) for actor in flight.logged_people.values()]
+    taken = [(pose.file, pose.topic, pose.options.get("parent")) for pose in poses]
+    taken += [(actor.file, actor.topic, None) for actor in flight.logged_people.values()]
     paths = logs.paths(log)
-    return [(topic, parent) for name, topic, parent in taken if name and logs.paths(name) == paths]
+    return [(topic, parent) for name, topic, parent in taken if logs.paths(name) == paths]
 
 
 def _at_times(maps: Iterator[Occupancy], from_ns: Int64) -> Iterator[Occupancy]:

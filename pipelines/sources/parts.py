@@ -27,7 +27,7 @@ from pipelines.session.description import (
     PosesEntry,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, Camera, PoseSource
+from pipelines.session.manifest import Axes, CameraSources
 from pipelines.session.records import Detections, Trajectory
 from pipelines.session.tables import (
     FRAMES,
@@ -71,6 +71,7 @@ class CameraData:
     trajectory: Trajectory
     media: MediaEntry | None
     log_clock: ClockFit | None
+    still: bool  # it stands still, with one pose
     notes: list[str]
 
     @property
@@ -95,7 +96,7 @@ def store_camera(data: CameraData, folder: Path) -> None:
 
 def camera_entry(
     name: str,
-    camera: Camera,
+    camera: CameraSources,
     data: CameraData,
     interpolation: Interpolation,
     *,
@@ -126,7 +127,7 @@ def camera_entry(
         clock=ClockEntry(
             offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
             sigma_s=_clock_sigma_s(camera, frames),
-            start=_clock_start(camera),
+            start=_clock_start(camera, frames),
         ),
         log_clock=LogClockEntry(**asdict(data.log_clock)) if data.log_clock else None,
         pose_noise=camera.pose_noise,
@@ -146,7 +147,7 @@ def camera_entry(
 
 def _poses_entry(
     name: str,
-    camera: Camera,
+    camera: CameraSources,
     data: CameraData,
     interpolation: Interpolation,
     *,
@@ -156,7 +157,7 @@ def _poses_entry(
     note: Callable[[str], None],
 ) -> PosesEntry:
     pose, trajectory, frames_t_ns = camera.pose, data.trajectory, data.frames.t_ns
-    static = pose.static is not None
+    static = data.still
     without_pose = 0
     if not static:
         position, _ = poses_at(trajectory, frames_t_ns, interpolation)
@@ -164,7 +165,7 @@ def _poses_entry(
         if without_pose == len(frames_t_ns):
             frames, poses = (span_words(*t_ns[[0, -1]]) for t_ns in (frames_t_ns, trajectory.t_ns))
             raise DataError(
-                named(base, _pose_source(pose)),
+                named(base, pose.file),
                 f"has a pose for none of the {without_pose} frames of camera {name}: frames span {frames},"
                 f" poses {poses} at {_rate(trajectory.t_ns) or 0:.3g} Hz",
                 "check clocks and units, or raise --max-pose-gap",
@@ -182,7 +183,7 @@ def _poses_entry(
         if covered < _MUCH_SHORTER * span and span - covered > _SHORTER_S:
             note(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses")
     return PosesEntry(
-        source=_pose_source(pose),
+        source=pose.file,
         static=static,
         count=len(trajectory.t_ns),
         rate_hz=_rate(trajectory.t_ns),
@@ -190,39 +191,38 @@ def _poses_entry(
         frames_without_pose=without_pose,
         dropped=trajectory.dropped,
         stamps=stamps,
-        key=_pose_key(pose),
         topic=pose.topic,
         gimbal=_gimbal_of(camera),
-        gimbal_fixed=camera.gimbal is not None and camera.gimbal.fixed is not None,
+        gimbal_fixed=camera.gimbal is not None and camera.gimbal.is_fixed,
         gimbal_axes=axes[1],
-        gimbal_log=camera.gimbal.log if camera.gimbal is not None else None,
+        gimbal_log=camera.gimbal.file if camera.gimbal is not None else None,
         gimbal_topic=camera.gimbal.topic if camera.gimbal is not None else None,
         axes=axes[0],
         mount=None if camera.gimbal else _mount_entry(camera),
         in_gimbal=_mount_entry(camera) if camera.gimbal else None,
-        inverse=pose.inverse,
-        z=pose.z,
+        inverse=bool(pose.options.get("inverse")),
+        z="down" if pose.options.get("z") == "down" else "up",
         world_from_source=PlaceEntry(
             translation=tuple(pose.world_from_source.translation), yaw_deg=pose.world_from_source.yaw_deg
         ),
     )
 
 
-def _gimbal_of(camera: Camera) -> str | None:
+def _gimbal_of(camera: CameraSources) -> str | None:
     """Return what the stated angles of a gimbal are relative to; None without such angles."""
     gimbal = camera.gimbal
-    if gimbal is None or (gimbal.topic is None and gimbal.fixed is None):
+    if gimbal is None or (gimbal.topic is None and not gimbal.is_fixed):
         return None
     return gimbal.relative_to or "world"
 
 
-def _keypoints_entry(camera: Camera, data: CameraData) -> KeypointsEntry | None:
+def _keypoints_entry(camera: CameraSources, data: CameraData) -> KeypointsEntry | None:
     detections = data.detections
     if camera.keypoints is None or detections is None:
         return None
     frames, people = np.unique(detections.frame, return_counts=True)
     return KeypointsEntry(
-        source=camera.keypoints.path,
+        source=camera.keypoints.file,
         format=data.detector_format,
         joints=list(detections.joints),
         detections=len(detections.frame),
@@ -307,7 +307,7 @@ def within(detections: Detections, frames: CameraFrames) -> Detections:
     )
 
 
-def _clock_sigma_s(camera: Camera, frames: CameraFrames) -> float:
+def _clock_sigma_s(camera: CameraSources, frames: CameraFrames) -> float:
     """Return the clock sigma of the manifest; one estimated by motion comes before the manifest's default."""
     clock = camera.clock
     if clock is None or (frames.start_sigma_s and "sigma_s" not in clock.model_fields_set):
@@ -315,28 +315,17 @@ def _clock_sigma_s(camera: Camera, frames: CameraFrames) -> float:
     return clock.sigma_s
 
 
-def _clock_start(camera: Camera) -> Literal["stated", "assumed", "none"]:
+def _clock_start(camera: CameraSources, frames: CameraFrames) -> Literal["stated", "assumed", "none"]:
     """Return if the manifest, or a file or log that it names, states when the pictures were taken."""
     times, clock = camera.frame_times, camera.clock
     if (times and times.assumed) or (clock and clock.assumed):
         return "assumed"
-    if clock or (camera.video and camera.video.log) or (times and times.is_placed):
+    if clock or frames.topic or (times and times.is_placed):
         return "stated"
     return "none"
 
 
-def _pose_source(pose: PoseSource) -> str:
-    drones_own = pose.own_log[1] if pose.own_log else ""
-    return pose.tum or pose.csv or drones_own or (pose.static.path if pose.static else pose.log) or ""
-
-
-def _pose_key(pose: PoseSource) -> str:
-    if pose.topic is not None:
-        return "topic"
-    return next(key for key in PoseSource.one_of if getattr(pose, key) is not None)
-
-
-def _mount_entry(camera: Camera) -> MountEntry | None:
+def _mount_entry(camera: CameraSources) -> MountEntry | None:
     """Describe how a camera is fixed to what turns it; None where nothing is said of that."""
     if camera.mount is None:
         return None

@@ -141,6 +141,7 @@ class LoggedPictures:
                 self._source,
                 f"the pictures of {self._topic} are encoded as {first.encoding!r}, which is not known",
                 f"convert them to one of {', '.join(KNOWN)}, or give the camera a video",
+                code="unsupported",
             )
 
     def _begin(self) -> Iterator[PictureSample]:

@@ -5,14 +5,12 @@ They are joined here, in ENU axes about one origin on Earth.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.files import read_head
-from pipelines.formats.drone_logs.dji_subtitles import parse_subtitles
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
 from pipelines.formats.logs.presets import FIXES, px4_names, read_pair, read_positions, read_preset
 from pipelines.formats.logs.px4_topics import read_px4
@@ -36,10 +34,27 @@ from pipelines.geometry.poses import (
 )
 from pipelines.session.description import Doubt
 from pipelines.session.errors import DataError, NoPositionsError
-from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan, PoseSource, TriggerLog
-from pipelines.session.manifest import Log as LogSource
+from pipelines.session.manifest import (
+    ActorSource,
+    Axes,
+    CameraSources,
+    FrameTimes,
+    GimbalSource,
+    LogSource,
+    Manifest,
+    Mount,
+    Placement,
+    PlanSource,
+    PoseSource,
+)
 from pipelines.session.records import Occupancy, Trajectory
-from pipelines.session.registries import FORMATS, Format, TrajectoryFormat, recognise
+from pipelines.session.registries import (
+    CalibrationFormat,
+    Format,
+    TrajectoryFormat,
+    recognise,
+)
+from pipelines.session.source_options import FiledPose, LoggedAngles, LoggedPose
 from pipelines.session.telemetry import (
     AttitudeFormat,
     AttitudeTrack,
@@ -69,8 +84,8 @@ _FIXED = "fixed angles"
 _SAME_PLACE_M = 1.0  # datums of one continent differ by less, as ETRS89 and WGS84
 _ABOVE_TAKE_OFF = ("take-off", "stated")
 _ADD_ANGLES = (
-    "add gimbal: {log, topic, relative_to: world} with the angles of another log, or"
-    " gimbal: {fixed: {yaw_deg: 90, pitch_deg: -30}} if the camera never turned"
+    "add gimbal: {file, topic, relative_to: world} with the angles of another log, or"
+    " gimbal: {yaw_deg: 90, pitch_deg: -30} if the camera never turned"
 )
 _ADD_MOUNT = "say how the camera sits on the body, mount: {looks: forward, down_deg: 0}, or add a gimbal"
 
@@ -93,7 +108,7 @@ class FlightPoses:
 
     def __init__(
         self,
-        flight: Flight,
+        flight: Manifest,
         manifest: Path,
         logs: FlightLogs,
         files: FlightFiles,
@@ -117,7 +132,7 @@ class FlightPoses:
 
     # --- cameras ---------------------------------------------------------------------------------------
 
-    def trajectory(self, name: str, camera: Camera, frames: CameraFrames | None) -> Trajectory:
+    def trajectory(self, name: str, camera: CameraSources, frames: CameraFrames | None) -> Trajectory:
         """Read world_from_camera over time; a static camera has one row, at its first frame.
 
         Args:
@@ -129,32 +144,32 @@ class FlightPoses:
             DataError: nothing usable, or the manifest does not state the camera's mount on the body.
         """
         pose = camera.pose
-        if pose.static:
+        if self.is_still(camera):
             source, still = self._stated_poses(name, camera)
             first_ns = int(frames.t_ns[0]) if frames is not None else 0
             return replace(self._local(source, still), t_ns=np.array([first_ns]))
         angles = None if camera.gimbal is None else self._stated_angles(name, camera, frames)
-        if pose.is_telemetry:
+        if self._is_joined(pose):
             return in_world(self._joined_trajectory(name, camera, angles), pose.world_from_source)
         source, stated = self._stated_poses(name, camera)
         of_camera = self._is_of_camera(camera)
-        if of_camera and pose.log and pose.of is None and pose.child is None:
+        if of_camera and self._is_log(pose) and pose.of is None and self._logged(pose).child is None:
             self._note(
-                f"{name}: poses in {pose.log} are taken as the camera's (say `of: body` with a mount if not)"
+                f"{name}: poses in {pose.file} are taken as the camera's (say `of: body` with a mount if not)"
             )
         local = self._local(source, stated)
         if not of_camera:
             local = self._on_body(name, camera, local, angles)
         return in_world(local, pose.world_from_source)
 
-    def _stated_poses(self, name: str, camera: Camera) -> tuple[Path, Trajectory]:
+    def _stated_poses(self, name: str, camera: CameraSources) -> tuple[Path, Trajectory]:
         """Read poses of a camera or of its body, in ENU axes, but not yet out of a map projection."""
         if name in self._stated:
             return self._stated.pop(name)
         pose = camera.pose
-        if pose.static:
-            path = located(self._base, pose.static.path)
-            calibrated = self._files.camera(name, pose.static.path, pose.static.camera)
+        path = self._files.path(pose.file)
+        if self.is_still(camera):
+            calibrated = self._files.camera(name, "pose", pose)
             if calibrated.position is None or calibrated.quaternion_xyzw is None:
                 raise DataError(
                     path,
@@ -168,33 +183,91 @@ class FlightPoses:
                 quaternion_xyzw=calibrated.quaternion_xyzw[None],
             )
             return path, in_enu(still, self._axes(pose.axes))
-        if pose.log:
-            settings = self._logs.settings(pose.log)
+        if self._is_log(pose):
+            settings, options = self._logs.settings(pose.file), self._logged(pose)
             logged = self._logs.trajectory(
-                pose.log, pose.topic, pose.parent, pose.child, max_gap_ns=self._max_gap_ns
+                pose.file, pose.topic, options.parent, options.child, max_gap_ns=self._max_gap_ns
             )
-            turned = self._turned(camera, as_stated(logged, pose), self._axes(pose.axes, settings.axes))
-            return self._logs.paths(pose.log)[0], in_world(turned, settings.world_from_log)
-        stated = pose.tum or pose.csv or ""
-        filed = as_stated(self._filed_trajectory(stated, "tum" if pose.tum else "csv"), pose)
-        return located(self._base, stated), self._turned(camera, filed, self._axes(pose.axes))
+            logged = as_stated(logged, pose, options)
+            turned = self._turned(camera, logged, self._axes(pose.axes, settings.axes))
+            return path, in_world(turned, settings.world_from_source)
+        filed = as_stated(self._filed_trajectory(pose), pose, self._files.options("pose", pose, FiledPose))
+        return path, self._turned(camera, filed, self._axes(pose.axes))
 
-    def _is_of_camera(self, camera: Camera) -> bool:
+    # --- kinds of sources ------------------------------------------------------------------------------
+
+    def is_still(self, camera: CameraSources) -> bool:
+        """Return True for a camera that stands still, whose pose is in a calibration."""
+        return isinstance(self._files.format_of("pose", camera.pose), CalibrationFormat)
+
+    def _is_log(self, pose: PoseSource) -> bool:
+        return self._files.is_log("pose", pose)
+
+    def _logged(self, pose: PoseSource) -> LoggedPose:
+        return self._files.options("pose", pose, LoggedPose)
+
+    def _is_joined(self, pose: PoseSource) -> bool:
+        """Return True if position and attitude come separately: a drone's own log, or several topics."""
+        if self._is_log(pose):
+            return self._logged(pose).joins_topics
+        return isinstance(self._files.format_of("pose", pose), TelemetryFormat)
+
+    def refuse_unfit(self) -> None:
+        """Refuse poses, mounts and gimbals that do not go together, for the kind of file that each one is.
+
+        Raises:
+            DataError: the camera cannot be meant so.
+        """
+        for name, camera in self._flight.cameras.items():
+            place = f"{self._manifest}: cameras.{name}"
+            for problem, remedy in (*self._unfit_pose(camera), *self._unfit_gimbal(camera)):
+                raise DataError(place, problem, remedy, code="wrong-option")
+
+    def _unfit_pose(self, camera: CameraSources) -> Iterator[tuple[str, str]]:
+        pose, is_log = camera.pose, self._is_log(camera.pose)
+        title = self._files.format_of("pose", pose).title
+        if self.is_still(camera):
+            if pose.of == "body" or camera.is_carried:
+                yield "pose: a still camera's pose is its own", "leave `of: body` and the mount out"
+            if pose.world_from_source != Placement():
+                yield "pose: world_from_source: only a pose that moves has that", "leave it out"
+        elif self._is_joined(pose):
+            if pose.unit != "m":
+                yield f"pose: unit: a file of this kind ({title}) states its own", "leave it out"
+            if pose.axes and not (is_log and self._logged(pose).attitude):
+                yield f"pose: axes: a file of this kind ({title}) states its own", "leave them out"
+        elif camera.is_carried and pose.of != "body" and not is_log:
+            yield "a mount or gimbal needs the pose of the body", "add `of: body` to `pose`"
+        if is_log:
+            logged = self._logged(pose)
+            if logged.preset and pose.topic:
+                yield "pose: has a preset and a topic", "leave one of them out"
+            if logged.attitude and not pose.topic:
+                yield "pose: attitude: needs the topic of the positions", "add topic: TOPIC"
+
+    def _unfit_gimbal(self, camera: CameraSources) -> Iterator[tuple[str, str]]:
+        gimbal = camera.gimbal
+        if gimbal is None:
+            return
+        if gimbal.is_of_pose and not self._is_joined(camera.pose):
+            remedy = "add file and topic, or constant angles {yaw_deg: 90, pitch_deg: -30}"
+            yield "gimbal: does not say where its angles are", remedy
+        if self._files.is_log("gimbal", gimbal) and gimbal.topic is None:
+            yield "gimbal: lacks the topic of its angles", "add topic: TOPIC, and what they are relative_to"
+
+    def _is_of_camera(self, camera: CameraSources) -> bool:
         """Return True if stated poses are those of the camera, not of the body that carries it."""
-        pose = camera.pose
-        if not pose.log:
-            return pose.of != "body"
-        return pose.of == "camera" or (pose.of is None and camera.mount is None and camera.gimbal is None)
+        if camera.pose.of is None and self._is_log(camera.pose):
+            return not camera.is_carried
+        return camera.pose.of != "body"
 
-    def _turned(self, camera: Camera, poses: Trajectory, axes: Axes) -> Trajectory:
+    def _turned(self, camera: CameraSources, poses: Trajectory, axes: Axes) -> Trajectory:
         return in_enu(poses, axes) if self._is_of_camera(camera) else body_in_enu(poses, axes)
 
-    def _filed_trajectory(self, stated: str, kind: str) -> Trajectory:
-        path = located(self._base, stated)
-        kitti = FORMATS.get("kitti")
-        reader = kitti if kitti.recognises(path) else FORMATS.get(kind)
+    def _filed_trajectory(self, pose: PoseSource) -> Trajectory:
+        path, reader = self._files.path(pose.file), self._files.format_of("pose", pose)
         if not isinstance(reader, TrajectoryFormat):
-            raise DataError(path, f"the format {kind} reads no trajectories", code="wrong-kind")
+            raise TypeError(f"{reader.name} reads no trajectories")
         trajectory = reader.read_trajectory(path)
         if not len(trajectory.t_ns):
             raise DataError(
@@ -207,10 +280,12 @@ class FlightPoses:
             return mounted(mount)
         except ValueError as error:
             place = f"{self._manifest}: cameras.{name}.mount"
-            raise DataError(place, str(error), "say how the camera sits on the body") from None
+            raise DataError(
+                place, str(error), "say how the camera sits on the body", code="bad-value"
+            ) from None
 
     def _on_body(
-        self, name: str, camera: Camera, body: Trajectory, angles: AttitudeTrack | None
+        self, name: str, camera: CameraSources, body: Trajectory, angles: AttitudeTrack | None
     ) -> Trajectory:
         """Compute the poses of the camera from those of the body that carries it, and of its gimbal."""
         lever_arm, rotation = self._mounted(name, camera.mount)
@@ -259,7 +334,9 @@ class FlightPoses:
             lost["pose without gimbal angles"] = without
         return position, quaternion, lost
 
-    def _stated_angles(self, name: str, camera: Camera, frames: CameraFrames | None) -> AttitudeTrack | None:
+    def _stated_angles(
+        self, name: str, camera: CameraSources, frames: CameraFrames | None
+    ) -> AttitudeTrack | None:
         """Return the attitude of a gimbal by the source that the manifest names, in our axes at world times.
 
         None if it names none: the angles are those of the drone's own log that gives the pose.
@@ -267,22 +344,23 @@ class FlightPoses:
         gimbal = camera.gimbal
         if gimbal is None or gimbal.is_of_pose:
             return None
-        if gimbal.own_log is not None:
-            return self._angles_alone(name, camera, gimbal, frames)
         relative_to = gimbal.relative_to or "world"
-        if gimbal.fixed is not None:
-            angles = np.array([[gimbal.fixed.yaw_deg, gimbal.fixed.pitch_deg, gimbal.fixed.roll_deg]])
+        if gimbal.is_fixed:
+            angles = np.array([[gimbal.yaw_deg or 0.0, gimbal.pitch_deg or 0.0, gimbal.roll_deg]])
             turned = turned_as_stated(angles, relative_to=relative_to)
             return AttitudeTrack(_FIXED, np.zeros(1, dtype=np.int64), turned, relative_to)
-        log, topic = gimbal.log or "", gimbal.topic or ""
-        logged = self._logs.attitudes(log, topic, order=gimbal.order, units=gimbal.units)
+        if not self._files.is_log("gimbal", gimbal):
+            return self._angles_alone(name, camera, gimbal, frames)
+        log, topic = gimbal.file or "", gimbal.topic or ""
+        options = self._files.options("gimbal", gimbal, LoggedAngles)
+        logged = self._logs.attitudes(log, topic, order=options.order, units=options.units)
         axes = self._axes(gimbal.axes, self._logs.settings(log).axes)
         turned = attitude_in_enu(logged.quaternion_xyzw, relative_to=relative_to, axes=axes)
         lost = {f"gimbal angles: {cause}": count for cause, count in logged.dropped.items()}
         return AttitudeTrack(topic, logged.t_ns, turned, relative_to, dropped=lost)
 
     def _angles_alone(
-        self, name: str, camera: Camera, gimbal: Gimbal, frames: CameraFrames | None
+        self, name: str, camera: CameraSources, gimbal: GimbalSource, frames: CameraFrames | None
     ) -> AttitudeTrack:
         """Read the camera's attitudes from a log whose positions are not used.
 
@@ -292,21 +370,23 @@ class FlightPoses:
         Raises:
             DataError: there are none, or nothing places them in time.
         """
-        kind, stated = gimbal.own_log or ("dji", "")
+        stated = gimbal.file or ""
         path, place = self._one_file(stated), f"{self._manifest}: cameras.{name}.gimbal"
-        reader = _reader(kind, path)
+        reader = self._files.format_of("gimbal", gimbal)
         if not isinstance(reader, AttitudeFormat):
-            raise DataError(path, "gives no angles without positions", "name it as the pose, or another log")
+            raise TypeError(f"{reader.name} reads no attitudes")
         found = reader.read_attitudes(path)
+        _refuse_heading(place, found.knows_north, gimbal)
         track = found.camera
-        own = camera.video.path if camera.video else None
-        if found.video_began_ns is not None and own and located(self._base, own).samefile(path):
+        own = self._files.video_file(camera)
+        if found.video_began_ns is not None and own and own.samefile(path):
             if frames is None:
                 raise DataError(
                     place,
                     "its attitudes are at the times of its pictures, which start_from: motion cannot find by"
                     " them",
                     "state frame_times: {start: SECONDS}",
+                    code="clock-unknown",
                 )
             track = replace(track, t_ns=_at_pictures(track.t_ns - found.video_began_ns, frames))
             clock = "at the times of its pictures"
@@ -315,6 +395,7 @@ class FlightPoses:
                 path,
                 "has angles that count from its own start, and is not the camera's video",
                 "name that video, if they are in it",
+                code="clock-unknown",
             )
         else:
             track = replace(track, t_ns=self._world_times(stated, track.t_ns, int(track.t_ns[0])))
@@ -434,8 +515,9 @@ class FlightPoses:
 
     # --- people, commands, truth -----------------------------------------------------------------------
 
-    def actor(self, log: str, topic: str | None, name: str = "") -> Trajectory:
+    def actor(self, name: str, actor: ActorSource) -> Trajectory:
         """Read the logged positions of the actor, or of one of several; the rotation has no meaning."""
+        log, topic = actor.file, actor.topic
         with self._logs.open(log) as opened:
             if topic is not None and opened.type_of(topic) in FIXES:
                 dropped: dict[str, int] = {}
@@ -449,23 +531,23 @@ class FlightPoses:
         trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return self._local(
             self._logs.paths(log)[0],
-            in_world(in_enu(trajectory, self._axes(settings.axes)), settings.world_from_log),
+            in_world(in_enu(trajectory, self._axes(settings.axes)), settings.world_from_source),
         )
 
-    def planned(self, camera: str, plan: Plan) -> Trajectory:
+    def planned(self, plan: PlanSource) -> Trajectory:
         """Read the commanded positions of a drone; the rotation has no meaning."""
-        if camera in plan.files:
-            path = located(self._base, plan.files[camera])
-            filed = recognise(path, TrajectoryFormat, "file of commanded poses").read_trajectory(path)
-            return self._local(path, in_enu(filed, self._flight.world.frame))
-        log, topic = plan.log_of(camera), plan.topics[camera].topic
+        log, topic = plan.file, plan.topic
+        reader = self._files.format_of("plan", plan)
+        if isinstance(reader, TrajectoryFormat):
+            path = self._files.path(log)
+            return self._local(path, in_enu(reader.read_trajectory(path), self._flight.world.frame))
         settings = self._logs.settings(log)
         sent = self._logs.commands(log, topic)
         if sent is None:
             sent = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return self._local(
             self._logs.paths(log)[0],
-            in_world(in_enu(sent, self._axes(settings.axes)), settings.world_from_log),
+            in_world(in_enu(sent, self._axes(settings.axes)), settings.world_from_source),
         )
 
     def true_poses(self, stated: str) -> Trajectory:
@@ -478,57 +560,56 @@ class FlightPoses:
 
     def _read(self, pose: PoseSource) -> Telemetry:
         """Read a drone's own log, at its own times; each log is read once."""
-        choice = TelemetryChoice(pose.position, pose.instance, pose.time, pose.altitude)
         key = pose.model_dump_json(exclude={"of"})
         if key not in self._telemetry:
-            if pose.own_log is None:
-                self._telemetry[key] = self._logged_telemetry(pose, choice)
+            reader = self._files.format_of("pose", pose)
+            if isinstance(reader, TelemetryFormat):
+                choice = self._files.options("pose", pose, TelemetryChoice)
+                self._telemetry[key] = _positions_of(reader, self._one_file(pose.file), choice)
             else:
-                kind, stated = pose.own_log
-                path = self._one_file(stated)
-                reader = _reader(kind, path)
-                if not isinstance(reader, TelemetryFormat):
-                    raise DataError(path, f"the format {kind} reads no telemetry", code="wrong-kind")
-                self._telemetry[key] = _positions_of(reader, path, choice)
+                self._telemetry[key] = self._logged_telemetry(pose, self._logged(pose))
         return self._telemetry[key]
 
-    def _logged_telemetry(self, pose: PoseSource, choice: TelemetryChoice) -> Telemetry:
+    def _logged_telemetry(self, pose: PoseSource, options: LoggedPose) -> Telemetry:
         """Read telemetry from a driver's usual topics, or from two named ones, at the log's own times."""
-        with self._logs.open(pose.log or "") as opened:
+        choice = TelemetryChoice(position=options.position)
+        with self._logs.open(pose.file) as opened:
             recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
-            if pose.preset == "px4":
-                names = px4_names(recording, source, pose.namespace)
+            if options.preset == "px4":
+                names = px4_names(recording, source, options.namespace)
                 found = read_px4(recording, source, names, choice, stamps)
-            elif pose.preset:
-                found = read_preset(recording, source, pose.preset, pose.namespace, choice, stamps)
+            elif options.preset:
+                found = read_preset(recording, source, options.preset, options.namespace, choice, stamps)
             else:
                 axes = self._axes(pose.axes, opened.settings.axes)
-                found = read_pair(recording, source, pose.topic or "", pose.attitude or "", axes, stamps)
+                topics = pose.topic or "", options.attitude or ""
+                found = read_pair(recording, source, *topics, axes, stamps)
             return replace(found, dropped=dict(Counter(found.dropped) + opened.lost))
 
     def _own_angles(self, pose: PoseSource) -> str:
         """Return the gimbal's entry that takes the attitudes without north in the log of a pose, or ""."""
-        if pose.own_log is None:
+        if self._is_log(pose):
             return ""
-        path = self._one_file(pose.own_log[1])
-        return _entry_of_angles(_reader(pose.own_log[0], path), path)
+        return _entry_of_angles(self._files.format_of("pose", pose), self._one_file(pose.file))
 
-    def log_clock(self, camera: Camera) -> ClockFit | None:
+    def log_clock(self, camera: CameraSources) -> ClockFit | None:
         """Return the fit of a drone's log clock to GPS time; None without one."""
-        return self._read(camera.pose).fit if camera.pose.is_telemetry else None
+        return self._read(camera.pose).fit if self._is_joined(camera.pose) else None
 
-    def triggers(self, kind: TriggerLog, stated: str) -> Int64:
-        """Read the trigger times of pictures from a drone's own log, at world times."""
-        reader, path = FORMATS.get(kind), self._one_file(stated)
+    def triggers(self, times: FrameTimes) -> Int64 | None:
+        """Read the trigger times of pictures from a drone's own log, at world times; None if it is none."""
+        stated, reader = times.file or "", self._files.format_of("frame_times", times)
         if not isinstance(reader, TriggerFormat):
-            raise DataError(path, f"the format {kind} reads no triggers", code="wrong-kind")
-        t_ns = reader.picture_times(path, TelemetryChoice())
+            return None
+        t_ns = reader.picture_times(self._one_file(stated), TelemetryChoice())
         return self._world_times(stated, t_ns, int(t_ns[0]))
 
     def _one_file(self, stated: str) -> Path:
         paths = self._logs.paths(stated)
         if len(paths) != 1:
-            raise DataError(self._manifest, f"logs.{stated}: a drone's own log is one file", "name one")
+            raise DataError(
+                self._manifest, f"logs.{stated}: a drone's own log is one file", "name one", code="ambiguous"
+            )
         return paths[0]
 
     def _world_times(self, stated: str, t_ns: Int64, since_ns: int) -> Int64:
@@ -550,12 +631,12 @@ class FlightPoses:
             self._origin = Origin(place, "world.origin")
             return self._origin
         for camera in self._flight.cameras.values():
-            if not camera.pose.is_telemetry:
+            if not self._is_joined(camera.pose):
                 continue
             track = self._read(camera.pose).position
             first = track.origin or (_first_place(track) if track.on_earth else None)
             if first is not None:
-                self._origin = Origin(first, camera.pose.telemetry_source)
+                self._origin = Origin(first, camera.pose.file)
                 return self._origin
         if self._projection is not None:  # the first position of the first camera
             name, camera = next(iter(self._flight.cameras.items()))
@@ -568,7 +649,7 @@ class FlightPoses:
         kinds = {
             name: self._read(camera.pose).position.height
             for name, camera in self._flight.cameras.items()
-            if camera.pose.is_telemetry and self._read(camera.pose).position.on_earth
+            if self._is_joined(camera.pose) and self._read(camera.pose).position.on_earth
         }
         if len(set(kinds.values())) > 1:
             said = ", ".join(f"{name}: {height}" for name, height in kinds.items())
@@ -582,7 +663,7 @@ class FlightPoses:
             if origin is not None:
                 self._note(
                     f"{name}: its {track.name} counts from a place that its log does not state: taken for the"
-                    " world's origin (else say world_from_log under `logs`)"
+                    " world's origin (else say world_from_source under `logs`)"
                 )
             return track.values, level
         if origin is None:
@@ -611,11 +692,13 @@ class FlightPoses:
             )
         values, _ = self._in_world(name, track)
         still = np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
-        return in_world(Trajectory(track.t_ns, values, still), self._logs.settings(log).world_from_log)
+        return in_world(Trajectory(track.t_ns, values, still), self._logs.settings(log).world_from_source)
 
     # --- poses of cameras ------------------------------------------------------------------------------
 
-    def _joined_trajectory(self, name: str, camera: Camera, angles: AttitudeTrack | None) -> Trajectory:
+    def _joined_trajectory(
+        self, name: str, camera: CameraSources, angles: AttitudeTrack | None
+    ) -> Trajectory:
         """Compute world_from_camera over time from a drone's own log, and the stated angles of its gimbal.
 
         The stamps are those of positions or of attitudes, whichever have the higher rate. The others are
@@ -631,7 +714,7 @@ class FlightPoses:
             self._note(note)
         body, gimbal = telemetry.body, angles or self._gimbal(name, camera, telemetry)
         self._refuse_unturned(name, camera, telemetry, gimbal)
-        stated = pose.telemetry_source
+        stated = pose.file
         settings = self._logs.settings(stated)
         track = telemetry.position
         since_ns = int(track.t_ns[0])
@@ -661,39 +744,39 @@ class FlightPoses:
         dropped = dict(telemetry.dropped) | (dict(gimbal.dropped) if gimbal is not None else {})
         return self._complete(name, settings, dropped, t_ns, position, multiply(turned, quaternion))
 
-    def _gimbal(self, name: str, camera: Camera, telemetry: Telemetry) -> AttitudeTrack | None:
+    def _gimbal(self, name: str, camera: CameraSources, telemetry: Telemetry) -> AttitudeTrack | None:
         """Return the angles of the drone's own log, unless the body's attitudes are asked for."""
         gimbal, own = camera.gimbal, telemetry.gimbal
         if gimbal is None:
             if own is None or camera.pose.of == "body":
                 return None
-            self._note(f"{name}: its camera is turned by {own.name} of {camera.pose.telemetry_source}")
+            self._note(f"{name}: its camera is turned by {own.name} of {camera.pose.file}")
             return self._at_world_times(camera.pose, telemetry, own)
         if own is None:
             raise DataError(
                 self._manifest,
-                f"cameras.{name}.gimbal: {camera.pose.telemetry_source} holds no gimbal angles",
+                f"cameras.{name}.gimbal: {camera.pose.file} holds no gimbal angles",
                 "name the log and topic that do, or fixed angles",
                 code="no-attitude",
             )
         moved = self._at_world_times(camera.pose, telemetry, own)
         place = f"{self._manifest}: cameras.{name}.gimbal"
-        turned = _turned_as_named(place, camera.pose.telemetry_source, moved, gimbal)
+        turned = _turned_as_named(place, camera.pose.file, moved, gimbal)
         self._note(
-            f"{name}: its camera is turned by {own.name} of {camera.pose.telemetry_source},"
+            f"{name}: its camera is turned by {own.name} of {camera.pose.file},"
             f" relative to the {turned.relative_to} as stated"
         )
         return turned
 
     def _at_world_times(self, pose: PoseSource, telemetry: Telemetry, track: AttitudeTrack) -> AttitudeTrack:
         since_ns = int(telemetry.position.t_ns[0])
-        return replace(track, t_ns=self._world_times(pose.telemetry_source, track.t_ns, since_ns))
+        return replace(track, t_ns=self._world_times(pose.file, track.t_ns, since_ns))
 
     def _refuse_unturned(
-        self, name: str, camera: Camera, telemetry: Telemetry, gimbal: AttitudeTrack | None
+        self, name: str, camera: CameraSources, telemetry: Telemetry, gimbal: AttitudeTrack | None
     ) -> None:
         place = f"{self._manifest}: cameras.{name}"
-        stated = camera.pose.telemetry_source
+        stated = camera.pose.file
         if telemetry.body is None and gimbal is None:
             own = self._own_angles(camera.pose)
             remedy = f"add {own} with the heading of its first picture" if own else _ADD_ANGLES
@@ -740,7 +823,7 @@ class FlightPoses:
             if count:
                 dropped[cause] = int(count)
         poses = Trajectory(t_ns[known], position[known], quaternion[known], dropped=dropped)
-        return in_world(poses, settings.world_from_log)
+        return in_world(poses, settings.world_from_source)
 
     def _doubt(self, name: str, track: PositionTrack) -> None:
         if len(track.t_ns) < 2:
@@ -774,7 +857,7 @@ def _positions_of(reader: TelemetryFormat, path: Path, choice: TelemetryChoice) 
         if not entry:
             raise
         remedy = f"name another log of positions as pose, and {entry}"
-        raise DataError(error.source, error.problem, remedy) from None
+        raise DataError(error.source, error.problem, remedy, code="no-positions") from None
 
 
 def _entry_of_angles(reader: Format, path: Path) -> str:
@@ -786,10 +869,26 @@ def _entry_of_angles(reader: Format, path: Path) -> str:
     except DataError:
         return ""
     heading = "" if knows_north else ", yaw_deg: 90"
-    return f"gimbal: {{{reader.name.partition('_')[0]}: {path.name}{heading}}}"
+    return f"gimbal: {{file: {path.name}{heading}}}"
 
 
-def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: Gimbal) -> AttitudeTrack:
+def _refuse_heading(place: str, knows_north: bool, gimbal: GimbalSource) -> None:
+    """Refuse a stated heading of angles that know north, and its absence where they do not."""
+    if knows_north and gimbal.yaw_deg is not None:
+        raise DataError(
+            place, "yaw_deg: the angles of this file know where north is", "leave it out", code="wrong-option"
+        )
+    if not knows_north and gimbal.yaw_deg is None:
+        problem = "lacks yaw_deg: the file says how the camera turned, not where it looked at first"
+        raise DataError(
+            place,
+            problem,
+            "add the heading of its first picture from north to east: yaw_deg: 90",
+            code="no-attitude",
+        )
+
+
+def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: GimbalSource) -> AttitudeTrack:
     """Return logged angles of a gimbal relative to what the manifest names, by default what the log means.
 
     Raises:
@@ -803,6 +902,7 @@ def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: Gimb
             place,
             f"{track.name} of {source} cannot be taken relative to the {meant}",
             f"write relative_to: {track.relative_to}",
+            code="wrong-option",
         )
     turned = attitude_in_enu(track.stated[meant], relative_to=meant, axes="ned")
     return replace(track, quaternion_xyzw=turned, relative_to=meant)
@@ -814,21 +914,6 @@ def _at_pictures(since_ns: Int64, frames: CameraFrames) -> Int64:
     beyond = np.minimum(since_ns - frames.pts_ns[0], 0) + np.maximum(since_ns - frames.pts_ns[-1], 0)
     at_ns: Int64 = np.rint(inside).astype(np.int64) + beyond + frames.t_ns[0]
     return at_ns
-
-
-def _reader(kind: str, path: Path) -> Format:
-    """Return the format of a drone's own log; DJI's comes as subtitles, flight record or pictures."""
-    several = ("dji_record", "dji_binary", "picture_tags") if kind == "dji" else ()
-    found = next((found for name in several if (found := FORMATS.get(name)).recognises(path)), None)
-    is_other = several and found is None and path.exists() and path.suffix.lower() != ".srt"
-    if is_other and not parse_subtitles(read_head(path)).texts:
-        raise DataError(
-            path,
-            "holds no subtitles, flight record (CSV) or tagged pictures of DJI's",
-            "`mocap info` says what it is",
-            code="wrong-kind",
-        )
-    return found or FORMATS.get(kind)
 
 
 def _first_place(track: PositionTrack) -> Place:

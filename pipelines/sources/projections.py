@@ -127,7 +127,7 @@ class Projection:
         if len(known) and np.abs(known).max() < self._nearest_m:
             x, y = known[0].tolist()
             problem = f"its x {x:.0f}, y {y:.0f} are metres of a local frame, not coordinates in {self.name}"
-            raise DataError(source, problem, _NO_PLACE)
+            raise DataError(source, problem, _NO_PLACE, code="place-unknown")
         longitude, latitude = self._to_earth.transform(position[:, 0], position[:, 1])
         found = np.stack([latitude, longitude, position[:, 2]], axis=1)
         found[~np.isfinite(found).all(axis=1)] = np.nan  # pyproj says inf outside the CRS

@@ -18,8 +18,9 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, LogClock, Mount, PoseSource, WorldFromLog
+from pipelines.session.manifest import Axes, LogClock, Mount, Placement, PoseSource
 from pipelines.session.records import Trajectory
+from pipelines.session.source_options import FiledPose
 
 _FASTEST_MPS = 100.0  # no camera that films a person flies faster
 _FROZEN_S, _FROZEN_POSES = 1.0, 10  # a frozen pose stays the same for longer, and for as many messages
@@ -27,22 +28,22 @@ _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 _FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and UTM eastings begin at 166 km
 
 
-def as_stated(trajectory: Trajectory, pose: PoseSource) -> Trajectory:
+def as_stated(trajectory: Trajectory, pose: PoseSource, options: FiledPose) -> Trajectory:
     """Return poses world_from_camera (or body) in metres, of a file that has them as the manifest states.
 
     Covariances of inverted poses are left out: they are those of another pose.
     """
     position, quaternion, covariance = trajectory.position, trajectory.quaternion_xyzw, trajectory.covariance
-    if pose.quaternion == "wxyz":
+    if options.quaternion == "wxyz":
         quaternion = np.roll(quaternion, -1, axis=-1)
-    if pose.inverse:
+    if options.inverse:
         position, quaternion = invert(position, quaternion)
         covariance = None
     if (metres := _METRES[pose.unit]) != 1.0:
         position = position * metres
         scale = np.diag([metres] * 3 + [1.0] * 3)
         covariance = None if covariance is None else carried_covariance(scale, covariance)
-    if pose.z == "down":
+    if options.z == "down":
         flip = np.array([1.0, 1.0, -1.0])
         position = position * flip
         turned = np.diag([*flip, 1.0, 1.0, 1.0])
@@ -79,9 +80,9 @@ def body_in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
     return replace(turned, quaternion_xyzw=quaternion, covariance=covariance)
 
 
-def in_world(trajectory: Trajectory, place: WorldFromLog) -> Trajectory:
+def in_world(trajectory: Trajectory, place: Placement) -> Trajectory:
     """Move a trajectory in the ENU axes of its source to where the source has its origin in the world."""
-    if place == WorldFromLog():
+    if place == Placement():
         return trajectory
     turn = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(place.yaw_deg)]))
     position, quaternion = compose(
@@ -124,7 +125,12 @@ def refuse_projected(source: Path | str, position: Float, origin: Place, crs: st
         away = f"{away_m / 1000:.0f} km from the world's origin ({place})"
         if crs:
             problem = f"lies {away} by its CRS, {crs}"
-            raise DataError(source, problem, "give the files of one place, or correct world.crs or map.crs")
+            raise DataError(
+                source,
+                problem,
+                "give the files of one place, or correct world.crs or map.crs",
+                code="place-unknown",
+            )
         raise DataError(
             source,
             f"lies about x {x_m:.0f} m, y {y_m:.0f} m (UTM or another map projection), {away}",
@@ -177,7 +183,6 @@ def mounted(mount: Mount | None) -> tuple[Float, Float]:
     """Return lever arm [3] and rotation [4] of a camera in its body, or in its gimbal if there is one."""
     if mount is None:  # the manifest's checks guarantee a gimbal in this case
         return np.zeros(3), body_from_camera("forward")
-    if mount.body_from_camera is not None:
-        stated = mount.body_from_camera
-        return np.array(stated.translation), np.array(stated.rotation_xyzw)
+    if mount.rotation_xyzw is not None:
+        return np.array(mount.translation), np.array(mount.rotation_xyzw)
     return np.array(mount.translation), body_from_camera(mount.looks or "forward", mount.down_deg)

@@ -28,7 +28,7 @@ def write_actor(flight: SyntheticFlight, folder: Path) -> None:
     write_log(
         folder, "actor", "ros2-mcap", _logged("/actor", flight.t_ns, hips(flight.joints, flight.position))
     )
-    flight.settings["actor"] = {"log": "actor", "topic": "/actor"}
+    flight.settings["actor"] = {"file": "actor", "topic": "/actor"}
     flight.save()
 
 
@@ -38,7 +38,7 @@ def write_actors(flight: SyntheticFlight, folder: Path) -> None:
     entries = _logged("/abe", flight.t_ns, passing)
     entries += _logged("/zoe", flight.t_ns, hips(flight.joints, flight.position))
     write_log(folder, "people", "ros2-mcap", entries)
-    flight.settings["actors"] = {name: {"log": "people", "topic": f"/{name}"} for name in ("abe", "zoe")}
+    flight.settings["actors"] = {name: {"file": "people", "topic": f"/{name}"} for name in ("abe", "zoe")}
     flight.save()
 
 
@@ -98,7 +98,7 @@ def test_several_logged_people_are_reconstructed_under_their_names(tmp_path: Pat
 @pytest.mark.parametrize("names", [["person1"], ["a/b"], ["ben", "Ben"]])
 def test_names_of_people_that_cannot_be_in_file_names_are_refused(tmp_path: Path, names: list[str]) -> None:
     flight = write_flight(tmp_path, cameras=2, clean=True, seconds=0.2)
-    flight.settings["actors"] = {name: {"log": "people", "topic": "/abe"} for name in names}
+    flight.settings["actors"] = {name: {"file": "people", "topic": "/abe"} for name in names}
     flight.save()
     with pytest.raises(DataError):
         read_flight(flight.manifest)
@@ -135,9 +135,9 @@ def test_gimbal_angles_of_a_topic_do_not_lean_with_the_body(tmp_path: Path, rela
             ]
         write_log(tmp_path, f"{name}_log", "mcap-cdr", entries)
         camera = flight.settings["cameras"][name]
-        camera["pose"] = {"log": f"{name}_log.mcap", "topic": "/pose", "of": "body"}
+        camera["pose"] = {"file": f"{name}_log.mcap", "topic": "/pose", "of": "body"}
         camera["mount"] = {"looks": "forward", "translation": lever_arm.tolist()}
-        camera["gimbal"] = {"log": f"{name}_log.mcap", "topic": "/gimbal", "relative_to": relative_to}
+        camera["gimbal"] = {"file": f"{name}_log.mcap", "topic": "/gimbal", "relative_to": relative_to}
     flight.save()
     succeeds("ingest", flight.manifest)
     for k, name in enumerate(flight.cameras):
@@ -194,7 +194,7 @@ def test_what_the_logs_of_a_gimbal_and_an_actor_lose_is_counted(tmp_path: Path) 
     ]
     write_log(tmp_path, "gimbal", "mcap-cdr", entries)
     camera["pose"] |= {"of": "body"}
-    camera["gimbal"] = {"log": "gimbal.mcap", "topic": "/gimbal", "relative_to": "world"}
+    camera["gimbal"] = {"file": "gimbal.mcap", "topic": "/gimbal", "relative_to": "world"}
     fixes = [
         Entry(
             "/tag",
@@ -211,7 +211,7 @@ def test_what_the_logs_of_a_gimbal_and_an_actor_lose_is_counted(tmp_path: Path) 
         for row, stamp_ns in enumerate(flight.t_ns)
     ]
     write_log(tmp_path, "tag", "ros1", fixes)
-    flight.settings["actor"] = {"log": "tag.bag", "topic": "/tag"}
+    flight.settings["actor"] = {"file": "tag.bag", "topic": "/tag"}
     flight.settings["world"]["origin"] = {"latitude_deg": 47.5, "longitude_deg": 8.25, "altitude_m": 400}
     flight.save()
     done = mocap("ingest", flight.manifest)

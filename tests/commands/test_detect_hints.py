@@ -50,7 +50,7 @@ class Flight:
             for t in stamps
         ]
         write_log(self.folder, "actor", "mcap-cdr", entries)
-        self.settings["actor"] = {"log": "actor.mcap", "topic": "/actor", "point": point}
+        self.settings["actor"] = {"file": "actor.mcap", "topic": "/actor", "point": point}
 
     def ingest(self) -> None:
         YAML(typ="safe").dump(self.settings, self.manifest)
@@ -231,7 +231,7 @@ def test_a_span_counts_from_the_first_frame_of_cameras_with_keypoints_too(tmp_pa
         {"image_id": f"{k}.jpg", "category_id": 1, "keypoints": keypoints, "score": 1} for k in range(FRAMES)
     ]
     (tmp_path / "right.json").write_text(str(seen).replace("'", '"'), encoding="utf-8")
-    right["keypoints"] = {"path": "right.json", "format": "alphapose", "skeleton": "coco17"}
+    right["keypoints"] = {"file": "right.json", "format": "alphapose", "skeleton": "coco17"}
     spanned, whole = flight.key(detector, start_s=0.5 / FPS), flight.key(detector)
     # Its clock moves, and with it the moment from which the span is counted.
     right["clock"]["offset_s"] = -0.5 / FPS

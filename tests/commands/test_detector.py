@@ -41,7 +41,7 @@ def flight(tmp_path: Path) -> Path:
     calibration = recording / "calibration" / "Calib_qualisys.toml"
     lines = ["schema: 1", "name: Detected", "cameras:"]
     for name in ("cam01", "cam02", "cam03", "cam04"):
-        where = f"pose: {{static: {calibration}}}, intrinsics: {calibration}"
+        where = f"pose: {{file: {calibration}}}, intrinsics: {calibration}"
         lines.append(f"  {name}: {{video: videos/{name}.mp4, {where}}}")
     path = tmp_path / "flight.yaml"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -102,22 +102,22 @@ def test_subtitles_with_gimbal_angles_on_two_drones(tmp_path: Path) -> None:
 
 def _srt(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_srt(folder / f"{name}.SRT", truth)
-    return {"dji": f"{name}.SRT", "altitude": "absolute"}
+    return {"file": f"{name}.SRT", "altitude": "absolute"}
 
 
 def _record(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_record(folder / f"{name}.csv", truth)
-    return {"dji": f"{name}.csv", "altitude": "absolute"}
+    return {"file": f"{name}.csv", "altitude": "absolute"}
 
 
 def _ulog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_ulog(folder / f"{name}.ulg", ulog_rows(truth))
-    return {"ulog": f"{name}.ulg"}
+    return {"file": f"{name}.ulg"}
 
 
 def _dataflash(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_dataflash(folder / f"{name}.bin", truth)
-    return {"ardupilot": f"{name}.bin", "position": "local"}
+    return {"file": f"{name}.bin", "position": "local"}
 
 
 def _osdk(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
@@ -143,22 +143,22 @@ def _osdk(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
             ),
         ]
     write_log(folder, name, "ros1", entries)
-    return {"log": f"{name}.bag", "preset": "dji_osdk"}
+    return {"file": f"{name}.bag", "preset": "dji_osdk"}
 
 
 def _tlog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_tlog(folder / f"{name}.tlog", truth)
-    return {"tlog": f"{name}.tlog"}
+    return {"file": f"{name}.tlog"}
 
 
 def _px4(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_mcap(folder / f"{name}.mcap", px4_entries(truth, "/px4_1"))
-    return {"log": f"{name}.mcap", "preset": "px4", "namespace": "/px4_1"}
+    return {"file": f"{name}.mcap", "preset": "px4", "namespace": "/px4_1"}
 
 
 def _px4_since_boot(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     write_ros2(folder / name, px4_entries(truth, synchronised=False), storage="mcap")
-    return {"log": name, "preset": "px4"}
+    return {"file": name, "preset": "px4"}
 
 
 def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
@@ -218,7 +218,7 @@ def test_the_stated_reference_of_angles_is_used(tmp_path: Path, meant: str, says
         for us, turned in zip(truth.boot_us.tolist(), np.stack([w, x, -y, -z], axis=1).tolist(), strict=True):
             rows.append(("gimbal_device_attitude_status", 0, (us, *turned, flags)))  # FRD
         write_ulog(folder / f"{name}.ulg", rows)
-        return {"ulog": f"{name}.ulg"}
+        return {"file": f"{name}.ulg"}
 
     cameras = write_flight(tmp_path, cameras=2, seconds=1.0, clean=True).camera_quaternion
     flight = with_poses(tmp_path, write, ON_GIMBAL)
@@ -243,7 +243,7 @@ def _shifted_tum(flight: SyntheticFlight, path: Path, offset: Any) -> str:
 
 
 def _utm_pose(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
-    flight.settings["cameras"]["drone2"]["pose"] = {"tum": _shifted_tum(flight, folder / "b.tum", offset)}
+    flight.settings["cameras"]["drone2"]["pose"] = {"file": _shifted_tum(flight, folder / "b.tum", offset)}
 
 
 def _utm_log(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
@@ -258,7 +258,7 @@ def _utm_log(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
         said = {"header": header(stamp_ns, "utm"), "pose": pose}
         entries.append(Entry("/pose", "geometry_msgs/msg/PoseStamped", stamp_ns, said))
     write_log(folder, "b", "mcap-cdr", entries)
-    flight.settings["cameras"]["drone2"]["pose"] = {"log": "b.mcap", "topic": "/pose", "of": "camera"}
+    flight.settings["cameras"]["drone2"]["pose"] = {"file": "b.mcap", "topic": "/pose", "of": "camera"}
 
 
 def _utm_truth(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
@@ -266,7 +266,7 @@ def _utm_truth(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
 
 
 def _utm_plan(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
-    flight.settings["plan"] = {"files": {"drone2": _shifted_tum(flight, folder / "b.tum", offset)}}
+    flight.settings["plan"] = {"drone2": _shifted_tum(flight, folder / "b.tum", offset)}
 
 
 def _utm_grid(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
@@ -293,7 +293,7 @@ def test_coordinates_of_a_map_projection_are_refused_beside_gps(tmp_path: Path, 
 
 def test_a_cloud_in_utm_is_refused_beside_gps(tmp_path: Path) -> None:
     flight = with_poses(tmp_path, _osdk, ON_GIMBAL)
-    flight.settings["map"] = {"path": str(real_data("second/isprs_samp11-utm.pcd")), "resolution_m": 2.0}
+    flight.settings["map"] = {"file": str(real_data("second/isprs_samp11-utm.pcd")), "resolution_m": 2.0}
     flight.save()
     said = refused("ingest", flight.manifest)
     assert "isprs_samp11-utm.pcd" in said
@@ -323,7 +323,7 @@ def test_missing_gimbal_angles_are_refused_with_the_remedy(tmp_path: Path) -> No
     line = refused("ingest", flight.manifest)
     assert "gimbal:" in line
     camera = flight.settings["cameras"]["drone1"]
-    camera["gimbal"] = {"fixed": {"yaw_deg": 1, "pitch_deg": 1}, "relative_to": "body"}
+    camera["gimbal"] = {"yaw_deg": 1, "pitch_deg": 1, "relative_to": "body"}
     flight.save()
     with pytest.raises(DataError, match=r"\bbody\b.*\bdrone1\b"):
         ingest(flight.manifest)
@@ -338,7 +338,7 @@ def test_a_camera_that_never_turned_has_fixed_angles(tmp_path: Path) -> None:
     write_srt(tmp_path / "drone1.SRT", drone_of(flight, 0), gimbal=False)
     yaw, pitch, roll = drone_of(flight, 0).gimbal_ypr_deg[0].tolist()
     fixed = {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}
-    flight.settings["cameras"]["drone1"]["gimbal"] = {"fixed": fixed}
+    flight.settings["cameras"]["drone1"]["gimbal"] = fixed
     flight.save()
     ingest(flight.manifest)
     turned = poses_of(flight, "drone1")[["qx", "qy", "qz", "qw"]].to_numpy()
@@ -365,12 +365,12 @@ def test_fixes_and_attitudes_of_any_driver_an_actor_with_a_receiver_and_triggers
         for t, place in zip(flight.t_ns, places, strict=True)
     ]
     write_log(tmp_path, "tag", "ros1", entries)
-    flight.settings["actor"] = {"log": "tag.bag", "topic": "/tag"}
+    flight.settings["actor"] = {"file": "tag.bag", "topic": "/tag"}
     for k, name in enumerate(flight.cameras):
         camera = flight.settings["cameras"][name]
         yaw, pitch, roll = drone_of(flight, k).gimbal_ypr_deg[0].tolist()
-        camera["gimbal"] = {"fixed": {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}}
-        camera["frame_times"] = {"log": f"{name}.bag", "topic": "/trigger"}
+        camera["gimbal"] = {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}
+        camera["frame_times"] = {"file": f"{name}.bag", "topic": "/trigger"}
     flight.save()
     ingest(flight.manifest)
     for k, name in enumerate(flight.cameras):
@@ -386,7 +386,7 @@ def test_fixes_and_attitudes_of_any_driver_an_actor_with_a_receiver_and_triggers
     for name in flight.cameras:
         camera = flight.settings["cameras"][name]
         del camera["mount"], camera["gimbal"]
-        camera["pose"] = {"tum": f"{name}.tum"}
+        camera["pose"] = {"file": f"{name}.tum"}
     flight.save()
     with pytest.raises(DataError, match="says where it was on Earth, and no camera does"):
         ingest(flight.manifest)
@@ -403,13 +403,13 @@ def _any_driver(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
             Entry("/trigger", "sensor_msgs/msg/TimeReference", stamp_ns, {"header": stamped}),
         ]
     write_log(folder, name, "ros1", entries)
-    return {"log": f"{name}.bag", "topic": "/fix", "attitude": "/imu"}
+    return {"file": f"{name}.bag", "topic": "/fix", "attitude": "/imu"}
 
 
 def _tlog_with_pictures(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
-    path = folder / _tlog(folder, name, truth)["tlog"]
+    path = folder / _tlog(folder, name, truth)["file"]
     path.write_bytes(path.read_bytes() + tlog_pictures(truth))
-    return {"tlog": path.name}
+    return {"file": path.name}
 
 
 @pytest.mark.parametrize("write", [_ulog, _tlog_with_pictures])
@@ -443,7 +443,7 @@ def test_a_recorder_whose_clock_drifts_is_noted(tmp_path: Path) -> None:
     ]
     write_log(tmp_path, "drone1", "mcap-cdr", entries)
     flight = write_flight(tmp_path, cameras=1, seconds=1.0, clean=True)
-    flight.settings["cameras"]["drone1"]["pose"] = {"log": "drone1.mcap", "topic": "/pose", "of": "camera"}
+    flight.settings["cameras"]["drone1"]["pose"] = {"file": "drone1.mcap", "topic": "/pose", "of": "camera"}
     flight.save()
     warnings = ingest(flight.manifest).description.warnings
     (said,) = [line for line in warnings if "drift" in line]
@@ -474,7 +474,7 @@ def test_a_video_starts_at_the_time_of_its_container(tmp_path: Path) -> None:
 def _of_gopro(folder: Path, name: str, truth: DroneTruth, picture: Any) -> dict[str, Any]:
     turns = gopro_turns(truth.t_ns.tolist(), picture)
     write_gopro(folder / f"{name}_own.mp4", truth, turned=turns, places=False, pictures=30)
-    return {"gopro": f"{name}_own.mp4", "yaw_deg": float(truth.gimbal_ypr_deg[0, 0])}
+    return {"file": f"{name}_own.mp4", "yaw_deg": float(truth.gimbal_ypr_deg[0, 0])}
 
 
 @pytest.mark.parametrize("kind", ["srt", "tum"])
@@ -484,9 +484,9 @@ def test_attitudes_in_a_video_turn_the_camera_of_another_log(tmp_path: Path, kin
     def write(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
         if kind == "srt":
             write_srt(folder / f"{name}.SRT", truth, gimbal=False)
-            return {"dji": f"{name}.SRT", "altitude": "absolute"}
+            return {"file": f"{name}.SRT", "altitude": "absolute"}
         write_trajectory(folder / f"{name}_body.tum", Trajectory(truth.t_ns, truth.enu, truth.body))
-        return {"tum": f"{name}_body.tum", "of": "body"}
+        return {"file": f"{name}_body.tum", "of": "body"}
 
     flight = with_poses(tmp_path, write)
     for k, name in enumerate(flight.cameras):
@@ -520,6 +520,6 @@ def test_attitudes_from_elsewhere_are_refused_where_nothing_places_them(tmp_path
     flight.save()
     assert "yaw_deg" in refused("ingest", flight.manifest)
     camera["gimbal"] = None
-    camera["pose"] = {"gopro": f"{name}_own.mp4"}
+    camera["pose"] = {"file": f"{name}_own.mp4"}
     flight.save()
-    assert f"gimbal: {{gopro: {name}_own.mp4, yaw_deg: 90}}" in refused("ingest", flight.manifest)
+    assert f"gimbal: {{file: {name}_own.mp4, yaw_deg: 90}}" in refused("ingest", flight.manifest)

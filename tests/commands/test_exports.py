@@ -206,7 +206,10 @@ def test_c3d_is_truth(tmp_path: Path) -> None:
     even = at_even_times("x", since_start, Silent())
     c3d.write_joints(tmp_path / "truth.c3d", even, 0, unit="cm", axes="y-up")
     flight.settings["truth"] = {
-        "joints": {"path": "truth.c3d", "unit": "cm", "axes": "y-up", "offset_s": START_NS // 10**9}
+        "file": "truth.c3d",
+        "unit": "cm",
+        "axes": "y-up",
+        "offset_s": START_NS // 10**9,
     }
     flight.save()
     succeeds("ingest", flight.manifest)

@@ -94,7 +94,7 @@ def test_a_study_tells_the_error_of_every_condition(tmp_path: Path) -> None:
 @pytest.mark.parametrize("right", [True, False])
 def test_the_data_section_of_an_mcap_file_is_checked(tmp_path: Path, right: bool) -> None:
     flight = write_logged_flight(tmp_path, "mcap-cdr")
-    log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["log"]
+    log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["file"]
     assert "right" not in reading(log)["checksum"]
     whole = log.read_bytes()
     # The summary begins where the footer says; before it the end of the data states 0, no checksum.

@@ -28,7 +28,7 @@ def test_a_calibration_without_a_size_takes_that_of_the_pictures(tmp_path: Path)
     flight = write_flight(tmp_path, clean=True, seconds=0.2)
     camera = flight.settings["cameras"]["drone1"]
     _store(tmp_path / "camera.yaml", camera_matrix(LENS))
-    camera["intrinsics"] = {"path": "camera.yaml"}
+    camera["intrinsics"] = {"file": "camera.yaml"}
     flight.save()
     refused("ingest", flight.manifest)  # neither the calibration nor the keypoints have a size
     camera["keypoints"]["image_size"] = SIZE
@@ -56,7 +56,7 @@ def test_a_kitti_trajectory_gives_the_poses_of_its_camera(tmp_path: Path) -> Non
     ]
     (tmp_path / "times.txt").write_text("\n".join(stamps))
     succeeds("ingest", flight.manifest, "--output", tmp_path / "a.session")
-    flight.settings["cameras"]["drone1"]["pose"] = {"tum": "00.txt", "of": "camera"}
+    flight.settings["cameras"]["drone1"]["pose"] = {"file": "00.txt", "of": "camera"}
     flight.save()
     succeeds("ingest", flight.manifest, "--output", tmp_path / "b.session")
     poses = [pd.read_parquet(tmp_path / f"{name}.session/cameras/drone1/poses.parquet") for name in "ab"]

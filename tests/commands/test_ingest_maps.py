@@ -43,7 +43,7 @@ def flight_with_maps(
     start_ns = int(flight.t_ns[0])
     entries = [octomap_entry(file, start_ns + k * SECOND // 5) for k, file in enumerate(files)]
     log = write_log(folder / "logs", "ground", container, entries)
-    flight.settings["map"] = {"log": str(log.relative_to(folder))}
+    flight.settings["map"] = {"file": str(log.relative_to(folder))}
     flight.save()
     return flight
 
@@ -74,7 +74,7 @@ def test_maps_of_a_log_are_stored_with_their_times(tmp_path: Path, container: Co
     for one, entry in zip(stored["map"]["maps"], index, strict=True):
         assert (one["resolution_m"], one["shape"]) == (0.5, entry["shape"])
     assert stored["map"]["dropped"] == {}
-    assert any(flight.settings["map"]["log"] in path for path in stored["sources"])
+    assert any(flight.settings["map"]["file"] in path for path in stored["sources"])
 
 
 def test_the_same_map_from_a_file_and_from_a_log(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_the_same_map_from_a_file_and_from_a_log(tmp_path: Path) -> None:
     start_ns = int(flight.t_ns[0])
     file = as_bt(site(6), tmp_path / "site")
     log = write_log(tmp_path / "logs", "once", "ros1", [octomap_entry(file, start_ns)])
-    flight.settings["map"] = {"log": str(log.relative_to(tmp_path))}
+    flight.settings["map"] = {"file": str(log.relative_to(tmp_path))}
     flight.save()
     succeeds("ingest", flight.manifest)
     (logged,) = load_maps(tmp_path / "flight.session")
@@ -105,13 +105,13 @@ def test_place_clock_and_axes_of_the_log_are_applied(tmp_path: Path) -> None:
     place = {"translation": [100.0, 0.0, 5.0], "yaw_deg": 90}
     flight.settings["logs"] = {
         "ground": {
-            "path": flight.settings["map"]["log"],
-            "world_from_log": place,
+            "file": flight.settings["map"]["file"],
+            "world_from_source": place,
             "clock": {"offset_s": -0.25},
             "axes": "ned",
         }
     }
-    flight.settings["map"] = {"log": "ground"}
+    flight.settings["map"] = {"file": "ground"}
     flight.save()
     succeeds("ingest", flight.manifest)
     maps = load_maps(tmp_path / "flight.session")
@@ -128,8 +128,8 @@ def test_place_clock_and_axes_of_the_log_are_applied(tmp_path: Path) -> None:
 def test_maps_change_during_the_replay(tmp_path: Path) -> None:
     """Check that the replay has no map before the first one, and reports this."""
     flight = flight_with_maps(tmp_path, seconds=2.0)
-    flight.settings["logs"] = {"ground": {"path": flight.settings["map"]["log"], "clock": {"offset_s": 0.5}}}
-    flight.settings["map"] = {"log": "ground"}
+    flight.settings["logs"] = {"ground": {"file": flight.settings["map"]["file"], "clock": {"offset_s": 0.5}}}
+    flight.settings["map"] = {"file": "ground"}
     flight.save()
     succeeds("ingest", flight.manifest)
     succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust")
@@ -143,11 +143,11 @@ def test_height_belongs_to_plans_of_logs(tmp_path: Path) -> None:
     cells = np.zeros((8, 8), np.int8)
     cells[2, 3] = 100
     log = write_log(tmp_path / "logs", "plan", "ros2-mcap", [grid_entry(cells, int(flight.t_ns[0]))])
-    flight.settings["map"] = {"log": str(log.relative_to(tmp_path)), "height_m": 4}
+    flight.settings["map"] = {"file": str(log.relative_to(tmp_path)), "height_m": 4}
     flight.save()
     succeeds("ingest", flight.manifest)
     assert json.loads((tmp_path / "flight.session/session.json").read_text())["map"]["shape"] == [8, 8, 8]
-    flight.settings["map"] = {"path": "site/map.bt", "height_m": 4}
+    flight.settings["map"] = {"file": "site/map.bt", "height_m": 4}
     flight.save()
     assert "height_m: " in refused("ingest", flight.manifest)
 
@@ -155,12 +155,12 @@ def test_height_belongs_to_plans_of_logs(tmp_path: Path) -> None:
 def test_maps_of_another_day_are_refused(tmp_path: Path) -> None:
     flight = flight_with_maps(tmp_path)
     flight.settings["logs"] = {
-        "ground": {"path": flight.settings["map"]["log"], "clock": {"offset_s": 86400}}
+        "ground": {"file": flight.settings["map"]["file"], "clock": {"offset_s": 86400}}
     }
-    flight.settings["map"]["log"] = "ground"
+    flight.settings["map"]["file"] = "ground"
     flight.save()
     line = refused("ingest", flight.manifest)
-    assert re.search(r"flight\.yaml: map\.log .*: .*\bmap\b.*\bpictures\b.*`stamps: receive`", line)
+    assert re.search(r"flight\.yaml: map\.file .*: .*\bmap\b.*\bpictures\b.*`stamps: receive`", line)
 
 
 def test_truncated_maps_are_counted_or_refused(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_truncated_maps_are_counted_or_refused(tmp_path: Path) -> None:
     entries = [octomap_entry(file[:-2], start_ns), octomap_entry(file, start_ns + 1)]
     for count in (1, 2):
         log = write_log(tmp_path / "logs", f"cut{count}", "mcap-cdr", entries[:count])
-        flight.settings["map"]["log"] = str(log.relative_to(tmp_path))
+        flight.settings["map"]["file"] = str(log.relative_to(tmp_path))
         flight.save()
         if count == 1:
             assert re.search("/octomap: .*tree", refused("ingest", flight.manifest))
@@ -189,8 +189,8 @@ def test_real_octomap_in_a_log(tmp_path: Path, name: str) -> None:
     first_s = facts(HUSKY)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
     entry = octomap_entry(real_data(f"maps/{name}").read_bytes(), round(first_s * 1e9))
     log = write_log(tmp_path, "map", "ros2-sqlite3", [entry])
-    pose = {"log": str(real_data(HUSKY)), "of": "body"}
-    path = write_flight(tmp_path, pose, start_s=first_s + 1, map={"log": log.name})
+    pose = {"file": str(real_data(HUSKY)), "of": "body"}
+    path = write_flight(tmp_path, pose, start_s=first_s + 1, map={"file": log.name})
     succeeds("ingest", path)
     stored = session_of(path)["map"]
     assert stored["resolution_m"] == expected["resolution"]
@@ -208,11 +208,11 @@ def test_real_lidar(tmp_path: Path) -> None:
     expected = facts(name)["topics"]["/luminar_pointcloud"]
     first_s = facts(HUSKY)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
     lidar: dict[str, Any] = {
-        "path": str(real_data(name)),
+        "file": str(real_data(name)),
         "clock": {"offset_s": first_s - expected["header_stamp_range"][0]},
     }
-    pose = {"log": str(real_data(HUSKY)), "of": "body"}
-    about: dict[str, Any] = {"log": "lidar", "topic": "/luminar_pointcloud"}
+    pose = {"file": str(real_data(HUSKY)), "of": "body"}
+    about: dict[str, Any] = {"file": "lidar", "topic": "/luminar_pointcloud"}
     path = write_flight(tmp_path, pose, start_s=first_s + 1, logs={"lidar": lidar}, map=about)
     assert re.search("'luminar_lidar'.*`parent:`", refused("ingest", path))
     about |= {"parent": "luminar_lidar", "resolution_m": 0.5}

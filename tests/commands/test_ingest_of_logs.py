@@ -42,7 +42,7 @@ def all_closed(logs: list[OpenLog]) -> bool:
 
 def test_each_log_is_opened_once(tmp_path: Path, opened: list[OpenLog]) -> None:
     flight = write_logged_flight(tmp_path, "mcap-cdr")
-    flight.settings["actor"] = {"log": flight.settings["cameras"]["drone1"]["pose"]["log"]}
+    flight.settings["actor"] = {"file": flight.settings["cameras"]["drone1"]["pose"]["file"]}
     flight.settings["actor"]["topic"] = "/drone1/odometry"
     flight.save()
     ingest(flight.manifest)

@@ -98,9 +98,9 @@ def test_drafted_logs_are_ingested_as_they_were_flown(tmp_path: Path, container:
     assert not result.missing
     assert sorted(stated["logs"]) == flight.cameras
     for name, camera in stated["cameras"].items():
-        assert camera["video"] == {"log": name, "topic": f"/{name}/image/compressed"}
-        assert camera["pose"] == {"log": name, "topic": f"/{name}/odometry", "of": "body"}
-        assert camera["intrinsics"] == {"log": name, "topic": f"/{name}/camera_info"}
+        assert camera["video"] == {"file": name, "topic": f"/{name}/image/compressed"}
+        assert camera["pose"] == {"file": name, "topic": f"/{name}/odometry", "of": "body"}
+        assert camera["intrinsics"] == {"file": name, "topic": f"/{name}/camera_info"}
     mount = "{looks: forward, down_deg: %g, translation: %s, assumed: true}"
     edit(result.path, {mount % (0, [0, 0, 0]): mount % (30, list(LEVER_ARM))})
     ingest(result.path)
@@ -153,7 +153,7 @@ def test_what_is_missing_stands_where_it_belongs(tmp_path: Path) -> None:
     assert "pose" not in stated["cameras"]["drone2"]
     lines = result.text.splitlines()
     at = lines.index("  drone2:")
-    assert any("# pose: {tum: drone2.tum}  # missing" in line for line in lines[at:])
+    assert any("# pose: {file: drone2.tum}  # missing" in line for line in lines[at:])
     with pytest.raises(DataError, match=r"cameras\.drone1\.intrinsics: .*missing"):
         read_flight(result.path)
 
@@ -164,7 +164,7 @@ def test_the_truth_stands_in_for_poses_only_with_a_word(tmp_path: Path) -> None:
     write_lenses(flight)
     (tmp_path / "drone2.tum").unlink()
     result, stated = drafted(tmp_path)
-    assert stated["cameras"]["drone2"]["pose"] == {"tum": "drone2_true.tum", "assumed": True}
+    assert stated["cameras"]["drone2"]["pose"] == {"file": "drone2_true.tum", "assumed": True}
     assert stated["truth"]["poses"] == {"drone1": "drone1_true.tum"}
     assert any(remark.startswith("drone2: pose: ") and "truth" in remark for remark in result.assumed)
 
@@ -185,7 +185,7 @@ def test_files_that_cannot_be_read_are_listed_and_left_out(tmp_path: Path) -> No
 HOSTILE = [
     "true",
     "a: b #c",
-    "x\n  pose: {static: y}\n",
+    "x\n  pose: {file: y}\n",
     "bell\x07 esc\x1b[31m",
     "'single' \"double\" \\",
     "{a}, [b]",
@@ -215,7 +215,9 @@ def test_names_hostile_to_yaml_stay_names(tmp_path: Path, name: str) -> None:
     assert set(stated) == {"schema", "name", "world", "cameras"}
     [camera] = stated["cameras"].values()
     assert camera["keypoints"] == f"{name}.json"
-    assert camera["pose"]["tum"] in {f"{name}.tum", f"again/{name}.tum"}
+    pose = camera["pose"]
+    file = pose["file"] if isinstance(pose, dict) else pose  # with `assumed: true`
+    assert file in {f"{name}.tum", f"again/{name}.tum"}
     assert camera["intrinsics"] == f"{name}.toml"
     assert all(line.isprintable() for line in result.text.split("\n"))
     ingest(result.path)
@@ -276,7 +278,7 @@ def test_parts_of_a_log_beside_a_video_are_one_log_and_not_the_folder(tmp_path: 
     write_mcap(tmp_path / "drone1_1.mcap", odometry[10:])
     write_video(tmp_path / "drone1.mp4", even_ticks(30))
     result, stated = drafted(tmp_path)
-    assert stated["logs"] == {"drone1": {"path": ["drone1_0.mcap", "drone1_1.mcap"], "stamps": "header"}}
+    assert stated["logs"] == {"drone1": {"file": ["drone1_0.mcap", "drone1_1.mcap"], "stamps": "header"}}
     camera = stated["cameras"]["drone1"]
     assert camera["video"] == "drone1.mp4"
     # The container counts from 0, the log since the epoch.
@@ -302,15 +304,12 @@ def test_the_whereabouts_of_a_gimbal_are_for_the_user_to_say(tmp_path: Path) -> 
         ],
     )
     result, stated = drafted(tmp_path)
-    assert stated["cameras"]["drone1"]["gimbal"] == {
-        "log": "drone1",
-        "topic": "/drone1/gimbal",
-        "assumed": True,
-    }
+    assert "gimbal" not in stated["cameras"]["drone1"]
+    assert "{file: drone1, topic: /drone1/gimbal, relative_to: world}" in result.text
     assert "mount" not in stated["cameras"]["drone1"]
-    assert stated["actor"] == {"log": "drone1", "topic": "/actor/pose", "point": "hip", "assumed": True}
+    assert stated["actor"] == {"file": "drone1", "topic": "/actor/pose", "point": "hip", "assumed": True}
     assert [m for m in result.missing if "relative_to" in m]
-    edit(result.path, {"# relative_to": "relative_to", "# intrinsics": "intrinsics"})
+    edit(result.path, {"# gimbal": "gimbal", "# intrinsics": "intrinsics"})
     assert read_flight(result.path).cameras["drone1"].gimbal is not None
 
 
@@ -333,7 +332,7 @@ def test_transforms_of_a_camera_are_named_by_their_frames(tmp_path: Path) -> Non
     result, stated = drafted(tmp_path)
     assert result.path == tmp_path / "flight.yaml"  # one log in a folder is no bag
     assert stated["cameras"]["drone1"]["pose"] == {
-        "log": "flight",
+        "file": "flight",
         "parent": "map",
         "child": "drone1/optical",
         "of": "camera",

@@ -74,8 +74,8 @@ def test_videos_and_logs_of_one_flight_are_paired_by_motion(tmp_path: Path) -> N
     write_ulog(tmp_path / "log_11_07.ulg", ulog_rows(drone_of_sample("drone2")))
     write_dataflash(tmp_path / "00000042.bin", drone_of_sample("drone1"))
     cameras = cameras_of(tmp_path)
-    assert cameras["north"]["pose"] == {"ardupilot": "00000042.bin", "assumed": True}
-    assert cameras["lake"]["pose"] == {"ulog": "log_11_07.ulg", "assumed": True}
+    assert cameras["north"]["pose"] == {"file": "00000042.bin", "assumed": True}
+    assert cameras["lake"]["pose"] == {"file": "log_11_07.ulg", "assumed": True}
     true = YAML(typ="safe", pure=True).load((SAMPLE / "flight.yaml").read_text())["cameras"]
     for name, drone in (("north", "drone1"), ("lake", "drone2")):
         start_s = float(cameras[name]["frame_times"]["start"])
@@ -91,8 +91,8 @@ def test_videos_and_logs_of_different_hours_are_paired_by_time(tmp_path: Path) -
         write_video(tmp_path / f"{name}.mp4", even_ticks(60))
         made_at(tmp_path / f"{name}.mp4", int(first.t_ns[0]) + later_ns + 3_000_000_000)
     cameras = cameras_of(tmp_path)
-    assert cameras["a"]["pose"] == {"ulog": "log_8.ulg", "assumed": True}
-    assert cameras["b"]["pose"] == {"ulog": "log_3.ulg", "assumed": True}
+    assert cameras["a"]["pose"] == {"file": "log_8.ulg", "assumed": True}
+    assert cameras["b"]["pose"] == {"file": "log_3.ulg", "assumed": True}
 
 
 def test_videos_that_show_no_motion_are_not_paired(tmp_path: Path) -> None:

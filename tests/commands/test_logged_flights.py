@@ -82,7 +82,7 @@ def test_a_topic_that_is_left_out_is_chosen_and_said(tmp_path: Path) -> None:
 def test_strict_refuses_what_is_salvaged_otherwise(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path, "ros1")
     succeeds("ingest", flight.manifest, "--strict")
-    log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["log"]
+    log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["file"]
     log.write_bytes(log.read_bytes()[:-2000])
     line = refused("ingest", flight.manifest, "--strict")
     assert re.search(r"flight\.yaml: .*--strict .*\(drone1: ", line)
@@ -96,7 +96,7 @@ def test_strict_refuses_what_is_salvaged_otherwise(tmp_path: Path) -> None:
 
 def test_a_log_that_differs_from_its_own_checksum_is_said_and_refused_by_strict(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path, "mcap-cdr")
-    stated = flight.settings["cameras"]["drone1"]["pose"]["log"]
+    stated = flight.settings["cameras"]["drone1"]["pose"]["file"]
     log = tmp_path / stated
     whole = log.read_bytes()
     # The summary begins where the footer says; before it the end of the data states 0, no checksum.
@@ -174,9 +174,9 @@ def test_clock_of_another_day_is_refused(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path, "mcap-cdr")
     settings = flight.settings["cameras"]["drone1"]["pose"]
     flight.settings["logs"] = {
-        "d1": {"path": settings["log"], "clock": {"offset_s": 3600}},
+        "d1": {"file": settings["file"], "clock": {"offset_s": 3600}},
     }
-    settings["log"] = "d1"
+    settings["file"] = "d1"
     flight.save()
     line = refused("ingest", flight.manifest)
     assert "drone1" in line
@@ -186,7 +186,7 @@ def test_clock_of_another_day_is_refused(tmp_path: Path) -> None:
 def test_video_shorter_than_its_log_is_said(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path, "mcap-cdr", seconds=4.0)
     camera = flight.settings["cameras"]["drone1"]
-    keypoints = tmp_path / camera["keypoints"]["path"]
+    keypoints = tmp_path / camera["keypoints"]["file"]
     people = json.loads(keypoints.read_text(encoding="utf-8"))
     keypoints.write_text(json.dumps(people[:30]), encoding="utf-8")
     del camera["video"]
@@ -200,7 +200,7 @@ def test_video_shorter_than_its_log_is_said(tmp_path: Path) -> None:
 def test_keypoints_beyond_the_pictures_are_counted(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path, "mcap-cdr")
     camera = flight.settings["cameras"]["drone1"]
-    keypoints = tmp_path / camera["keypoints"]["path"]
+    keypoints = tmp_path / camera["keypoints"]["file"]
     people = json.loads(keypoints.read_text(encoding="utf-8"))
     beyond = [{**person, "image_id": f"{100 + k:06d}.jpg"} for k, person in enumerate(people[:3])]
     keypoints.write_text(json.dumps(people + beyond), encoding="utf-8")

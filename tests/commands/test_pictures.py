@@ -31,7 +31,7 @@ def with_videos(folder: Path) -> SyntheticFlight:
         # The pictures are small: their keypoints lie where a camera of that size would see them.
         width, height = SIZE
         scale = np.array([width / 1280, height / 720])
-        keypoints = folder / camera["keypoints"]["path"]
+        keypoints = folder / camera["keypoints"]["file"]
         people = json.loads(keypoints.read_text(encoding="utf-8"))
         for person in people:
             joints = np.array(person["keypoints"]).reshape(-1, 3)
@@ -68,7 +68,7 @@ def test_frame_times_of_a_csv(tmp_path: Path) -> None:
     flight = with_videos(tmp_path)
     rows = [f"{k},{START_NS + 40_000_000 * k}" for k in range(HALF_SECOND) if k != 3]
     (tmp_path / "times.csv").write_text("\n".join(["frame,t_ns", *rows]) + "\n", encoding="utf-8")
-    flight.settings["cameras"]["drone1"]["frame_times"] = {"csv": "times.csv"}
+    flight.settings["cameras"]["drone1"]["frame_times"] = {"file": "times.csv"}
     flight.save()
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0, done.stderr

@@ -70,7 +70,7 @@ def flown_in_utm(folder: Path, *, origin: bool = True) -> SyntheticFlight:
         write_trajectory(
             folder / f"{name}.tum", Trajectory(flight.t_ns, in_utm(flight.camera_position[k]), turned)
         )
-        flight.settings["cameras"][name]["pose"] = {"tum": f"{name}.tum"}
+        flight.settings["cameras"][name]["pose"] = {"file": f"{name}.tum"}
     flight.settings["world"] |= {"crs": ZONE}
     if origin:
         names = ("latitude_deg", "longitude_deg", "altitude_m")
@@ -111,11 +111,11 @@ def test_a_map_in_utm_stands_where_it_was_measured(tmp_path: Path) -> None:
     write_grid(tmp_path / "b.npz", Occupancy(grid, corner, 1.0))
     flight.settings["world"].pop("crs")
     for name in flight.cameras:
-        flight.settings["cameras"][name]["pose"] = {"tum": f"{name}_local.tum"}
+        flight.settings["cameras"][name]["pose"] = {"file": f"{name}_local.tum"}
     for k, name in enumerate(flight.cameras):
         local = Trajectory(flight.t_ns, flight.camera_position[k], flight.camera_quaternion[k])
         write_trajectory(tmp_path / f"{name}_local.tum", local)
-    flight.settings["map"] = {"path": "b.npz", "crs": ZONE}
+    flight.settings["map"] = {"file": "b.npz", "crs": ZONE}
     flight.save()
     session = ingest(flight.manifest)
     stored = read_grid(next((flight.manifest.with_suffix(".session") / "map").glob("*.npz")))
@@ -201,7 +201,7 @@ def test_poses_that_cannot_lie_in_one_place_are_doubted(
     flight = write_flight(tmp_path, cameras=2, seconds=1.0, clean=True)
     poses = Trajectory(flight.t_ns, change(flight.camera_position[1]), flight.camera_quaternion[1])
     write_trajectory(tmp_path / "b.tum", poses)
-    flight.settings["cameras"]["drone2"]["pose"] = {"tum": "b.tum"}
+    flight.settings["cameras"]["drone2"]["pose"] = {"file": "b.tum"}
     flight.save()
     (doubt,) = ingest(flight.manifest).description.doubts
     assert (doubt.code, doubt.cameras) == (code, ["drone2"])
@@ -210,7 +210,7 @@ def test_poses_that_cannot_lie_in_one_place_are_doubted(
 
 def test_a_map_far_from_all_cameras_is_doubted(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=2, seconds=1.0, clean=True)
-    flight.settings["map"] = {"path": str(real_data("second/isprs_samp11-utm.pcd")), "resolution_m": 2.0}
+    flight.settings["map"] = {"file": str(real_data("second/isprs_samp11-utm.pcd")), "resolution_m": 2.0}
     flight.save()
     (doubt,) = ingest(flight.manifest).description.doubts
     assert (doubt.code, doubt.cameras) == ("origin", [])
@@ -230,7 +230,7 @@ def test_the_crs_in_a_cloud_places_it_unless_another_is_stated(
     flight = flown_in_utm(tmp_path)
     pillar = np.array([30.0, -20.0, 4.0])  # m from HOME
     write_las(tmp_path / "site.laz", in_utm(pillar[None]), crs=pyproj.CRS.from_epsg(own))
-    flight.settings["map"] = {"path": "site.laz"} | ({"crs": stated} if stated else {})
+    flight.settings["map"] = {"file": "site.laz"} | ({"crs": stated} if stated else {})
     flight.save()
     doubts = ingest(flight.manifest).description.doubts
     grid = read_grid(next((flight.manifest.with_suffix(".session") / "map").glob("*.npz")))

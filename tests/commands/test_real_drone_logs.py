@@ -35,9 +35,8 @@ def write_flight(folder: Path, name: str, start_s: float, pose: dict[str, Any], 
     joints = [value for j in range(17) for value in (100 + j, 200, 0.9)]
     people = [{"image_id": k, "category_id": 1, "keypoints": joints, "score": 1.0} for k in range(FRAMES)]
     (folder / "keypoints.json").write_text(json.dumps(people), encoding="utf-8")
-    (kind,) = (key for key in pose if key in {"dji", "ulog", "ardupilot"})
     stated = {
-        "pose": {**pose, kind: log.name},
+        "pose": {**pose, "file": log.name},
         "intrinsics": {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240},
         "frame_times": {"start": start_s, "fps": 30},
         "keypoints": "keypoints.json",
@@ -59,13 +58,13 @@ def poses_of(path: Path) -> pd.DataFrame:
     return pd.read_parquet(path.with_suffix(".session") / "cameras" / "drone" / "poses.parquet")
 
 
-FIXED = {"gimbal": {"fixed": {"yaw_deg": 90, "pitch_deg": -30}}}
+FIXED = {"gimbal": {"yaw_deg": 90, "pitch_deg": -30}}
 
 
 def test_a_phantom_with_gimbal_angles_as_a_command(tmp_path: Path) -> None:
     name = "logs/dji_srt/p4_rtk.SRT"
     told = facts(name)
-    path = write_flight(tmp_path, name, 10.0, {"dji": ""})
+    path = write_flight(tmp_path, name, 10.0, {"file": ""})
     done = mocap("ingest", path, "--max-pose-gap", "1.5")
     assert done.returncode == 0, done.stderr
     latitude, longitude = told["lat_lon_first"]
@@ -92,7 +91,7 @@ def test_a_phantom_with_gimbal_angles_as_a_command(tmp_path: Path) -> None:
 )
 def test_subtitles_without_gimbal_angles(tmp_path: Path, name: str, start_s: float) -> None:
     told = facts(f"logs/dji_srt/{name}")
-    pose: dict[str, Any] = {"dji": "", **({"altitude": 40} if name == "mavic_2pro_new.SRT" else {})}
+    pose: dict[str, Any] = {"file": "", **({"altitude": 40} if name == "mavic_2pro_new.SRT" else {})}
     path = write_flight(tmp_path, f"logs/dji_srt/{name}", start_s, pose, **FIXED)
     ingest(path, max_pose_gap_s=1.5)
     poses = session_of(path)["cameras"]["drone"]["poses"]
@@ -112,7 +111,7 @@ def test_init_and_ingest_both_note_an_altitude_without_a_reference(
     tmp_path: Path, stated: dict[str, str], from_take_off: bool
 ) -> None:
     name = "second/mavic_air2.srt"
-    path = write_flight(tmp_path, name, 1651417318.6, {"dji": "", **stated}, **FIXED)
+    path = write_flight(tmp_path, name, 1651417318.6, {"file": "", **stated}, **FIXED)
     ingest(path)
     z = poses_of(path)["z"]
     first = 0.0 if from_take_off else 27.3  # absolute heights: the first one is the world's origin
@@ -147,7 +146,7 @@ def test_init_notes_absolute_heights(tmp_path: Path) -> None:
 def test_px4(tmp_path: Path, name: str, position: str, topic: str) -> None:
     told = facts(f"logs/ulog/{name}")
     start_s = 1710773365.0 if "events" in name else told["start_us"] / 1e6 + 1
-    pose = {"ulog": "", "position": position, "time": "boot"}
+    pose = {"file": "", "position": position, "time": "boot"}
     path = write_flight(tmp_path, f"logs/ulog/{name}", start_s, pose, mount={"looks": "forward"})
     ingest(path)
     described = session_of(path)
@@ -165,7 +164,7 @@ def test_px4_at_gps_time_as_a_command(tmp_path: Path) -> None:
     told = facts(name)
     first_s = told["gps_time_utc_usec_first_last"][0] / 1e6
     path = write_flight(
-        tmp_path, name, first_s + 1, {"ulog": "", "position": "gps"}, mount={"looks": "forward"}
+        tmp_path, name, first_s + 1, {"file": "", "position": "gps"}, mount={"looks": "forward"}
     )
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
@@ -181,18 +180,18 @@ def test_what_is_left_open_is_drafted_as_comments(tmp_path: Path) -> None:
         shutil.copyfile(real_data(f"logs/{name}"), tmp_path / Path(name).name)
     result = draft([tmp_path])
     stated = YAML(typ="safe", pure=True).load(result.text)["cameras"]
-    assert stated["air2"]["pose"] == {"dji": "air2s.srt", "assumed": True}
-    assert stated["air2"]["frame_times"] == {"srt": "air2s.srt"}
-    assert stated["sample"]["pose"] == {"ulog": "sample_px4_events.ulg"}
+    assert stated["air2"]["pose"] == {"file": "air2s.srt", "assumed": True}
+    assert stated["air2"]["frame_times"] == "air2s.srt"
+    assert stated["sample"]["pose"] == "sample_px4_events.ulg"
     assert stated["sample"]["mount"]["looks"] == "forward"
     assert "--max-pose-gap 1.5" in result.text
-    assert "# gimbal: {fixed: {yaw_deg: 90, pitch_deg: -30}}  # missing" in result.text
+    assert "# gimbal: {yaw_deg: 90, pitch_deg: -30}  # missing" in result.text
     assert "gauss-markov: {position_m: 1.5" in result.text
     assert "origin: {latitude_deg: 0" in result.text
     assert any("how the camera was turned" in line for line in result.missing)
 
 
 def test_a_flight_of_unknown_attitude_is_refused(tmp_path: Path) -> None:
-    path = write_flight(tmp_path, "logs/dji_srt/air2s.srt", 1659879640.8, {"dji": ""})
+    path = write_flight(tmp_path, "logs/dji_srt/air2s.srt", 1659879640.8, {"file": ""})
     with pytest.raises(DataError, match="not how it was turned"):
         ingest(path)

@@ -62,7 +62,7 @@ def test_odometry_of_a_real_robot(tmp_path: Path) -> None:
     name = "logs/ros1/husky_gps_imu_odom.bag"
     expected = facts(name)["topics"]["/husky_velocity_controller/odom"]
     first_s, last_s = expected["header_stamp_range"]
-    path = write_flight(tmp_path, {"log": str(real_data(name)), "of": "body"}, start_s=first_s + 10)
+    path = write_flight(tmp_path, {"file": str(real_data(name)), "of": "body"}, start_s=first_s + 10)
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
     assert " /husky_velocity_controller/odom, " in done.stderr
@@ -82,7 +82,7 @@ def test_odometry_of_a_real_robot(tmp_path: Path) -> None:
 def test_stamps_that_disagree_by_months_are_doubted(tmp_path: Path) -> None:
     name = "logs/ros1/embag_pointcloud2_lidar.bag"
     # Header stamps count from the simulation's start, 60.2 s; receive stamps are of 2020.
-    path = write_flight(tmp_path, {"log": str(real_data(name)), "of": "body"}, start_s=60)
+    path = write_flight(tmp_path, {"file": str(real_data(name)), "of": "body"}, start_s=60)
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
     assert re.search(r"\bheader and receive\b.* s in .*; header ", done.stderr)
@@ -91,7 +91,7 @@ def test_stamps_that_disagree_by_months_are_doubted(tmp_path: Path) -> None:
 def test_a_chain_of_transforms(tmp_path: Path) -> None:
     name = "logs/ros1/foxglove_example.bag"
     expected = facts(name)
-    pose = {"log": str(real_data(name)), "parent": "world", "child": "turtle1", "of": "body"}
+    pose = {"file": str(real_data(name)), "parent": "world", "child": "turtle1", "of": "body"}
     path = write_flight(tmp_path, pose, start_s=expected["start_ns"] / 1e9 + 5)
     succeeds("ingest", path)
     poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "husky" / "poses.parquet")
@@ -102,7 +102,7 @@ def test_a_chain_of_transforms(tmp_path: Path) -> None:
 def test_rotations_that_are_none_are_refused(tmp_path: Path) -> None:
     name = "logs/ros2/plotjuggler_rosbag2_test"
     path = write_flight(
-        tmp_path, {"log": str(real_data(name)), "topic": "/pose"}, start_s=facts(name)["start_ns"] / 1e9
+        tmp_path, {"file": str(real_data(name)), "topic": "/pose"}, start_s=facts(name)["start_ns"] / 1e9
     )
     line = refused("ingest", path)  # their norm is 13
     assert "1565" in line
@@ -119,15 +119,15 @@ def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
     )
     path = tmp_path / "flight.yaml"
     path.write_text(
-        f"schema: 1\nlogs:\n  json: {{path: {log}, stamps: receive}}\n"
-        "cameras:\n  camera:\n    video: {log: json}\n    pose: {static: still.toml}\n"
-        f"    intrinsics: {{log: {log}, topic: /camera_calibration}}\n",
+        f"schema: 1\nlogs:\n  json: {{file: {log}, stamps: receive}}\n"
+        "cameras:\n  camera:\n    video: {file: json}\n    pose: {file: still.toml}\n"
+        f"    intrinsics: {{file: {log}, topic: /camera_calibration}}\n",
         encoding="utf-8",
     )
     # Its calibration is an example that does not belong to its pictures.
     assert re.search(r"\b520 x 360, .* 640 x 480\b", refused("ingest", path))
     text = path.read_text(encoding="utf-8")
-    logged = f"{{log: {log}, topic: /camera_calibration}}"
+    logged = f"{{file: {log}, topic: /camera_calibration}}"
     inline = "{width: 520, height: 360, fx: 800, fy: 800, cx: 260, cy: 180, distortion: [-0.2, 0.1, 0, 0]}"
     path.write_text(text.replace(logged, inline), encoding="utf-8")
     succeeds("ingest", path)
@@ -148,7 +148,7 @@ def test_real_octomaps(tmp_path: Path, name: str) -> None:
     log = "logs/ros1/husky_gps_imu_odom.bag"
     first_s = facts(log)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
     path = write_flight(
-        tmp_path, {"log": str(real_data(log)), "of": "body"}, start_s=first_s + 1, map=str(real_data(name))
+        tmp_path, {"file": str(real_data(log)), "of": "body"}, start_s=first_s + 1, map=str(real_data(name))
     )
     succeeds("ingest", path)
     stored = session_of(path)["map"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -52,7 +51,7 @@ def test_file_that_is_not_there(flight: SyntheticFlight, change: dict[str, objec
     flight.save()
     line = refused("ingest", flight.manifest)
     [path] = change.values()
-    assert f"/{path}: {os.strerror(errno.ENOENT)}" in line
+    assert f"/{path}: " in line
 
 
 @pytest.mark.parametrize("stated", ["../drone1.tum", "poses/../../drone1.tum"])
@@ -60,10 +59,10 @@ def test_a_relative_path_does_not_leave_the_folder(flight: SyntheticFlight, stat
     outside = flight.manifest.parent.parent / f"{flight.manifest.parent.name}.tum"
     shutil.copy(flight.manifest.parent / "drone1.tum", outside)
     stated = stated.replace("drone1.tum", outside.name)
-    flight.settings["cameras"]["drone1"]["pose"]["tum"] = stated
+    flight.settings["cameras"]["drone1"]["pose"]["file"] = stated
     flight.save()
     assert f"({stated})" in refused("ingest", flight.manifest)
-    flight.settings["cameras"]["drone1"]["pose"]["tum"] = str(outside)
+    flight.settings["cameras"]["drone1"]["pose"]["file"] = str(outside)
     flight.save()
     succeeds("ingest", flight.manifest)
 
@@ -170,11 +169,9 @@ def test_empty_keypoint_file(flight: SyntheticFlight, tmp_path: Path, text: str)
 @pytest.mark.parametrize(
     ("stated", "keys"),
     [
-        ({"fps": 30, "csv": "a.csv"}, "csv, fps"),
-        ({"start": 0, "srt": "a.srt"}, "srt, start"),
-        ({"log": "d1", "ulog": "d1.ulg"}, "log, ulog"),
-        ({"start_from": "motion", "ardupilot": "d1.bin"}, "ardupilot, start_from"),
-        ({"csv": "a.csv", "srt": "a.srt", "fps": 30}, "csv, srt, fps"),
+        ({"fps": 30, "file": "a.csv"}, "file, fps"),
+        ({"start": 0, "file": "a.srt"}, "file, start"),
+        ({"start_from": "motion", "file": "d1.bin"}, "file, start_from"),
     ],
 )
 def test_frame_times_from_several_places_are_refused(
@@ -308,7 +305,7 @@ def test_text_that_no_name_of_a_file_can_hold(flight: SyntheticFlight, escape: s
     text = flight.manifest.read_text(encoding="utf-8")
     flight.manifest.write_text(text.replace("drone1.tum", f'"drone1{escape}.tum"', 1), encoding="utf-8")
     line = refused("ingest", flight.manifest)
-    assert line.startswith(f"mocap: {flight.manifest}: cameras.drone1.pose.tum: ")
+    assert line.startswith(f"mocap: {flight.manifest}: cameras.drone1.pose.file: ")
     assert (
         repr(f"drone1{json.loads(chr(34) + escape.replace(chr(92) + '0', chr(92) + 'u0000') + chr(34))}.tum")
         in line
@@ -330,14 +327,14 @@ HUGE = "0x" + "f" * 5000  # Python refuses to print it
         ("schema: 1", f"schema: 1\n? [{HUGE}]\n: 1", "an integer of about 6000 digits"),
         ("schema: 1", f"schema: 1\nname: {HUGE}", "name"),
         ("schema: 1", f"schema: 1\n? {HUGE}\n: 1", "an integer of about 6000 digits"),
-        ("path: k.json", f"path: k.json, first_frame: {10**30}", "keypoints.first_frame"),
-        ("path: k.json", f"path: k.json, image_size: [{10**30}, 480]", "keypoints.image_size"),
+        ("file: k.json", f"file: k.json, first_frame: {10**30}", "keypoints.first_frame"),
+        ("file: k.json", f"file: k.json, image_size: [{10**30}, 480]", "keypoints.image_size"),
     ],
 )
 def test_numbers_beyond_all_bounds(tmp_path: Path, old: str, new: str, place: str) -> None:
     text = (
-        "schema: 1\ncameras: {d: {frame_times: {start: 1700000000.0, fps: 30}, pose: {tum: a.tum},"
-        " intrinsics: i.yaml, keypoints: {path: k.json}}}\n"
+        "schema: 1\ncameras: {d: {frame_times: {start: 1700000000.0, fps: 30}, pose: {file: a.tum},"
+        " intrinsics: i.yaml, keypoints: {file: k.json}}}\n"
     )
     assert old in text
     path = tmp_path / "flight.yaml"
@@ -355,7 +352,7 @@ def test_pipes_and_sockets_are_refused_and_not_waited_for(flight: SyntheticFligh
         for command in commands:
             said = refusal(mocap_process(command, pipe, timeout=60))
             assert re.search(rf"/{pipe.name}: .*\bpipe\b", said)
-    flight.settings["cameras"]["drone1"]["pose"]["tum"] = "pipes/pipe.csv"
+    flight.settings["cameras"]["drone1"]["pose"]["file"] = "pipes/pipe.csv"
     flight.save()
     said = refusal(mocap_process("ingest", flight.manifest, timeout=60))
     assert "pipe.csv: is a pipe" in said

@@ -65,9 +65,8 @@ def test_what_was_commanded_is_an_arm_like_the_others(flown: Path, tmp_path: Pat
     manifest = with_plan(
         flown,
         "planned",
-        log="planner.mcap",
-        topics={"drone1": "/drone1/setpoint"},
-        files={"drone2": "drone2.tum"},
+        drone1={"file": "planner.mcap", "topic": "/drone1/setpoint"},
+        drone2="drone2.tum",
     )
     session = tmp_path / "planned.session"
     succeeds("ingest", manifest, "-o", session)
@@ -106,7 +105,7 @@ def test_one_drone_alone_and_a_gap_in_its_commands(flown: Path, tmp_path: Path) 
     rows = (flown / "drone2.tum").read_text(encoding="utf-8").splitlines()
     (flown / "gap.tum").write_text("\n".join([*rows[:4], *rows[-4:]]) + "\n", encoding="utf-8")
     session = tmp_path / "alone.session"
-    succeeds("ingest", with_plan(flown, "alone", files={"drone2": "gap.tum"}), "-o", session)
+    succeeds("ingest", with_plan(flown, "alone", drone2="gap.tum"), "-o", session)
     metrics = json.loads(succeeds("replan-compare", session, "--arms", "planned", "--trials", "1", "--json"))
     assert metrics["arms"]["planned"]["drones"] == 1
     assert any(re.search(r"^planned: \d+\.\d %", warning) for warning in metrics["warnings"])
@@ -115,15 +114,10 @@ def test_one_drone_alone_and_a_gap_in_its_commands(flown: Path, tmp_path: Path) 
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "nothing": ({"log": "planner.mcap"}, "plan: needs `topics` or `files` by camera"),
-    "no camera": ({"files": {"drone3": "drone2.tum"}}, "'drone3' is no camera of this flight"),
-    "both": (
-        {"log": "planner.mcap", "topics": {"drone2": "/a"}, "files": {"drone2": "drone2.tum"}},
-        "drone2 has a topic and a file",
-    ),
-    "no log": ({"topics": {"drone1": "/drone1/setpoint"}}, "the topic of drone1 needs a `log`"),
-    "no topic": ({"log": "planner.mcap", "topics": {"drone1": "/sent"}}, "has no topic /sent"),
-    "another day": ({"files": {"drone1": "old.tum"}}, "old.tum: spans 5.000 to 6.000 s, the pictures"),
+    "no camera": ({"drone3": "drone2.tum"}, "'drone3' is no camera of this flight"),
+    "no log": ({"drone1": {"file": "drone2.tum", "topic": "/a"}}, "plan.drone1: has a topic"),
+    "no topic": ({"drone1": {"file": "planner.mcap", "topic": "/sent"}}, "has no topic /sent"),
+    "another day": ({"drone1": "old.tum"}, "old.tum: spans 5.000 to 6.000 s, the pictures"),
 }
 
 

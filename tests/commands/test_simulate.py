@@ -260,7 +260,7 @@ def test_every_person_is_in_the_truth_the_keypoints_and_the_log(two: Path) -> No
     # Estimates err by 0.2 m; the second walks 4 m north of the first.
     assert logged == {"/actor/anna": pytest.approx(0, abs=1), "/actor/ben": pytest.approx(4, abs=1)}
     assert read_yaml(two)["actors"] == {
-        name: {"log": "drone1", "topic": f"/actor/{name}", "point": "hip"} for name in ("anna", "ben")
+        name: {"file": "drone1", "topic": f"/actor/{name}", "point": "hip"} for name in ("anna", "ben")
     }
     assert list(
         json.loads(succeeds("info", folder / "scenario.yaml", "--json"))["readings"][0]["actors"]

@@ -89,7 +89,7 @@ def test_missing_picture_is_not_bridged(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=2, clean=True)
     times = pd.DataFrame({"frame": np.arange(len(flight.t_ns)), "t_ns": flight.t_ns}).drop(index=10)
     times.to_csv(tmp_path / "times.csv", index=False)
-    flight.settings["cameras"]["drone2"]["frame_times"] = {"csv": "times.csv"}
+    flight.settings["cameras"]["drone2"]["frame_times"] = {"file": "times.csv"}
     flight.save()
     measured(flight)
     skeleton = pd.read_parquet(tmp_path / "flight.session" / "reconstruct" / "skeleton.parquet")
@@ -123,11 +123,11 @@ def test_still_and_moving_cameras_together(tmp_path: Path) -> None:
     del flight.settings["cameras"]["drone3"]
     still = write_flight(tmp_path / "still", cameras=3, clean=True, static=True)
     camera = still.settings["cameras"]["drone3"]
-    camera["keypoints"]["path"] = f"still/{camera['keypoints']['path']}"
-    camera["pose"] = {"static": "still/calibration.toml"}
+    camera["keypoints"]["file"] = f"still/{camera['keypoints']['file']}"
+    camera["pose"] = {"file": "still/calibration.toml"}
     camera["intrinsics"] = "still/calibration.toml"
     flight.settings["cameras"]["drone3"] = camera
-    flight.settings["truth"] = {"joints": "truth.csv"}
+    flight.settings["truth"] = {"file": "truth.csv"}
     flight.save()
     assert measured(flight)["mpjpe_mm"] < 0.5
 
@@ -149,7 +149,7 @@ def test_outliers_of_still_cameras_are_not_inliers(tmp_path: Path) -> None:
 
 def test_offsets_in_milliseconds_are_refused_before_anything_is_read(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=0.4)
-    flight.settings["logs"] = {"d1": {"path": "d1.mcap", "clock": {"offset_s": 1.7e12}}}
+    flight.settings["logs"] = {"d1": {"file": "d1.mcap", "clock": {"offset_s": 1.7e12}}}
     flight.save()
     line = refused("ingest", flight.manifest)
     assert re.search(r"logs\.d1\.clock\.offset_s: .*\bms or ns\b", line)

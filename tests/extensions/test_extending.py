@@ -73,14 +73,14 @@ cameras:
     video: {_SAMPLE}/drone1.mp4
     frame_times: {{start: 1700000000.021}}
     intrinsics: {_SAMPLE}/drone1_camera.yaml
-    pose: {{log: d1.jsonl, topic: /pose, of: camera}}
+    pose: {{file: d1.jsonl, topic: /pose, of: camera}}
   drone2:
     video: {_SAMPLE}/drone2.mp4
     frame_times: {{start: 1700000000.03}}
     intrinsics: {_SAMPLE}/drone2_camera.yaml
-    pose: {{tum: {_SAMPLE}/truth/drone2.tum}}
+    pose: {{file: {_SAMPLE}/truth/drone2.tum}}
 map: {_SAMPLE}/site.bt
-actor: {{log: {_SAMPLE}/drone1.mcap, topic: /actor}}
+actor: {{file: {_SAMPLE}/drone1.mcap, topic: /actor}}
 """,
         encoding="utf-8",
     )

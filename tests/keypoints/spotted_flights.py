@@ -49,7 +49,7 @@ def write_spotted_flight(folder: Path, frames: int) -> Path:
         numbers = ("width", "height", "fx", "fy", "cx", "cy")
         stated = ", ".join(f"{number}: {getattr(LENS, number):g}" for number in numbers)
         lines.append(
-            f"  {name}: {{video: {name}.mp4, frame_times: {{start: {START_S}}}, pose: {{tum: {name}.tum}},"
+            f"  {name}: {{video: {name}.mp4, frame_times: {{start: {START_S}}}, pose: {{file: {name}.tum}},"
             f" intrinsics: {{{stated}}}, clock: {{offset_s: 0, sigma_s: 0}}}}"
         )
     path = folder / "flight.yaml"

@@ -274,7 +274,7 @@ def test_the_keys_of_remedies_undo_what_they_say(flight: Described, tmp_path: Pa
 
 def test_poses_that_state_themselves_take_no_such_keys(flight: Described, tmp_path: Path) -> None:
     manifest = mistaken(flight, None)
-    assert with_remedy(manifest, "cameras.drone1.pose: {static: made/drone1_camera.yaml, inverse: true}")
+    assert with_remedy(manifest, "cameras.drone1.pose: {file: made/drone1_camera.yaml, inverse: true}")
     assert "cameras.drone1.pose" in (line := refused("ingest", manifest, "-o", tmp_path / "still.session"))
     assert "inverse" in line
 
@@ -364,7 +364,7 @@ STATED: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     "mirrored": (_mirrored, "cameras.drone1.keypoints.mirrored: false; "),
     "mount": (_looks_left, "cameras.drone1.mount: {looks: forward, "),
     "world": (_elsewhere, "cameras.drone1.pose.world_from_source: "),
-    "log": (_one_log, "cameras.drone2.pose.log: drone2; cameras.drone2.pose.topic: /drone2/"),
+    "log": (_one_log, "cameras.drone2.pose.file: drone2; cameras.drone2.pose.topic: /drone2/"),
 }
 
 

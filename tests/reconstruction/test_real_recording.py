@@ -29,7 +29,7 @@ def manifest_of(folder: Path, keypoints: str | None = None) -> Path:
             if keypoints
             else f"video: {recording / 'videos' / name}.mp4"
         )
-        lines += [f"  {name}: {{intrinsics: {calibration}, pose: {{static: {calibration}}}, {seen}}}"]
+        lines += [f"  {name}: {{intrinsics: {calibration}, pose: {{file: {calibration}}}, {seen}}}"]
     path = folder / f"{keypoints or 'videos'}.yaml"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Camera, Flight
+from pipelines.session.manifest import CameraSources, Manifest
 from pipelines.session.records import Detections
 from pipelines.sources.cameras import FlightCameras
 from pipelines.sources.files import FlightFiles
@@ -25,12 +25,14 @@ from tests.synthetic.flights import LENS, SyntheticFlight, write_flight
 
 WIDTH, HEIGHT = 1280, 720
 LENS_OF = {"width": WIDTH, "height": HEIGHT, "fx": 800, "fy": 800, "cx": 640, "cy": 360}
-CAMERA = Camera.model_validate({"pose": {"tum": "a.tum"}, "intrinsics": LENS_OF, "keypoints": "a.json"})
+CAMERA = CameraSources.model_validate(
+    {"pose": {"file": "a.tum"}, "intrinsics": LENS_OF, "keypoints": "a.json"}
+)
 
 
 def check(xy: Float, confidence: Float) -> None:
     """Request the intrinsics of a camera with these keypoints [N, 2]."""
-    flight = Flight.model_validate({"schema": 1, "cameras": {"drone1": CAMERA}})
+    flight = Manifest.model_validate({"schema": 1, "cameras": {"drone1": CAMERA}})
     manifest, files, logs = (
         Path("flight.yaml"),
         FlightFiles(flight, Path()),

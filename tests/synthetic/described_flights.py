@@ -254,12 +254,12 @@ class Described:
             cameras[name] = {
                 "frame_times": {"start": repr(start), "fps": RATE_HZ},
                 "keypoints": {
-                    "path": f"made/{name}_keypoints.json",
+                    "file": f"made/{name}_keypoints.json",
                     "format": "alphapose",
                     "skeleton": "coco17",
                 },
                 "intrinsics": f"made/{name}_camera.yaml",
-                "pose": {"tum": f"{name}.tum", "of": "body" if self.flight.carried else "camera"},
+                "pose": {"file": f"{name}.tum", "of": "body" if self.flight.carried else "camera"},
                 "pose_noise": right["pose_noise"],
             }
             if self.flight.carried:
@@ -272,11 +272,11 @@ class Described:
             "cameras": cameras,
         }
         if self.flight.actor:
-            manifest["logs"] = {"drone1": {"path": "made/drone1.mcap"}}
+            manifest["logs"] = {"drone1": {"file": "made/drone1.mcap"}}
             manifest["actor"] = made["actor"]
         if self.flight.map:
             manifest["map"] = "made/site.bt"
-        manifest["truth"] = {"joints": "made/truth/joints.csv"}
+        manifest["truth"] = "made/truth/joints.csv"
         return manifest
 
     def intrinsics(self, name: str) -> dict[str, float]:
@@ -318,7 +318,7 @@ class Mistaken:
                     pixels = np.array(person["keypoints"]).reshape(-1, 3)
                     person["keypoints"] = self.keypoints(pixels, 1280).ravel().tolist()
                 (folder / f"{name}_changed.json").write_text(json.dumps(found), encoding="utf-8")
-                self.manifest["cameras"][name]["keypoints"]["path"] = f"{name}_changed.json"
+                self.manifest["cameras"][name]["keypoints"]["file"] = f"{name}_changed.json"
         return written(self.manifest, folder / "flight.yaml")
 
 
@@ -363,7 +363,7 @@ def of_mounts(turn: Float, only: str | None = None) -> Change:
             if mistaken.of.flight.carried:
                 _, rotation = mistaken.of.mount()
                 mount = {"translation": LEVER, "rotation_xyzw": multiply(rotation, turn).tolist()}
-                mistaken.manifest["cameras"][name]["mount"] = {"body_from_camera": mount}
+                mistaken.manifest["cameras"][name]["mount"] = {**mount}
             else:
                 stamps, (position, quaternion) = mistaken.poses[name]
                 mistaken.poses[name] = (stamps, (position, multiply(quaternion, turn)))
@@ -428,7 +428,7 @@ def cycled(mistaken: Mistaken) -> None:
 
 def same_topic(mistaken: Mistaken) -> None:
     first, second = mistaken.names[:2]
-    mistaken.manifest["cameras"][first]["pose"]["tum"] = f"{second}.tum"
+    mistaken.manifest["cameras"][first]["pose"]["file"] = f"{second}.tum"
 
 
 def own_origins(mistaken: Mistaken) -> None:
@@ -576,7 +576,7 @@ def fixed_gimbal(pitch_deg: float, relative_to: str) -> Change:
         for name in mistaken.names:
             camera = mistaken.manifest["cameras"][name]
             camera["mount"] = {"looks": "forward", "translation": LEVER}
-            camera["gimbal"] = {"fixed": {"yaw_deg": 0, "pitch_deg": pitch_deg}, "relative_to": relative_to}
+            camera["gimbal"] = {"yaw_deg": 0, "pitch_deg": pitch_deg, "relative_to": relative_to}
 
     return apply
 

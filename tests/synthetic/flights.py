@@ -116,11 +116,11 @@ def write_flight(
         logged = disturb(noise, log_ns, true_position[k], true_quaternion[k], rng)
         if static:
             calibrations.append(_pose2sim_table(name, *(rows[0] for rows in logged)))
-            pose: dict[str, str] = {"static": "calibration.toml"}
+            pose: dict[str, str] = {"file": "calibration.toml"}
         else:
             file = f"{name}.{pose_format}"
             POSE_WRITERS[pose_format](folder / file, log_ns, *logged)
-            pose = {pose_format: file}
+            pose = {"file": file}
         write_tum(folder / f"{name}_true.tum", log_ns, true_position[k], true_quaternion[k])
 
         pixels.append(see(joints, position[k], quaternion[k], LENS))
@@ -135,7 +135,7 @@ def write_flight(
             "clock": {"offset_s": 0, "sigma_s": 0},
             "pose": pose,
             "intrinsics": "calibration.toml" if static else _inline(LENS),
-            "keypoints": {"path": keypoints, "format": keypoint_format, "skeleton": "coco17"},
+            "keypoints": {"file": keypoints, "format": keypoint_format, "skeleton": "coco17"},
         }
         if not clean:
             sources[name]["pose_noise"] = {name: dict(model) for name, model in pose_noise.items()}
@@ -143,7 +143,7 @@ def write_flight(
     if static:
         (folder / "calibration.toml").write_text("\n".join(calibrations), encoding="utf-8")
     write_joints(folder / "truth.csv", t_ns, COCO17, joints)
-    truth = {"joints": "truth.csv", "poses": {name: f"{name}_true.tum" for name in names}}
+    truth = {"file": "truth.csv", "poses": {name: f"{name}_true.tum" for name in names}}
     settings = {
         "schema": 1,
         "name": "Test flight",
@@ -167,7 +167,7 @@ def film_at(flight: SyntheticFlight, name: str, t_ns: Int64) -> None:
     write_alphapose(folder / f"{name}.json", [Sighting(1, pixels, np.ones(pixels.shape[:2]))])
     rows = [f"{frame},{stamp_ns}" for frame, stamp_ns in enumerate(t_ns.tolist())]
     (folder / f"{name}_times.csv").write_text("\n".join(["frame,t_ns", *rows]) + "\n", encoding="utf-8")
-    flight.settings["cameras"][name]["frame_times"] = {"csv": f"{name}_times.csv"}
+    flight.settings["cameras"][name]["frame_times"] = {"file": f"{name}_times.csv"}
 
 
 def _stamps(count: int, rate_hz: int, start_ns: int) -> Int64:

@@ -46,7 +46,7 @@ def write_logged_flight(
         )
         log = write_log(folder / "logs", name, container, entries)
         camera = flight.settings["cameras"][name]
-        where = {"log": str(log.relative_to(folder))}
+        where = {"file": str(log.relative_to(folder))}
         del camera["frame_times"]
         camera["video"] = {**where, "topic": f"/{name}/image/compressed"}
         camera["pose"] = {**where, "topic": f"/{name}/odometry", "of": "body"}

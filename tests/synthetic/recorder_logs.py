@@ -41,9 +41,9 @@ MANIFEST = f"""\
 schema: 1
 cameras:
   drone1:
-    video: {{{{log: {{log}}, topic: {PICTURE}}}}}
+    video: {{{{file: {{log}}, topic: {PICTURE}}}}}
     clock: {{{{sigma_s: 0}}}}
-    pose: {{{{log: {{log}}, topic: {POSE}, of: body}}}}
+    pose: {{{{file: {{log}}, topic: {POSE}, of: body}}}}
     mount: {{{{looks: forward}}}}
     intrinsics: {{{{width: 1920, height: 1080, fx: 1000, fy: 1000, cx: 960, cy: 540}}}}
 """

@@ -130,6 +130,7 @@ class ArduPilotFormat:
     name = "ardupilot"
     title = "ArduPilot log"
     suffixes: tuple[str, ...] = (".bin",)
+    choices: tuple[str, ...] = ("position", "instance", "time")
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins with the FMT message that defines FMT itself."""

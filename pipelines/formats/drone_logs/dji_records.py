@@ -95,6 +95,7 @@ class DjiRecordFormat:
     name = "dji_record"
     title = "DJI flight record (CSV)"
     suffixes: tuple[str, ...] = (".csv",)
+    choices: tuple[str, ...] = ("altitude",)
 
     def recognises(self, path: Path) -> bool:
         """Return True if the heading names times, positions on Earth, and heights or angles."""
@@ -180,7 +181,7 @@ def _binary(path: Path) -> DataError:
     return DataError(
         path,
         "is DJI's binary flight record, which mocap does not decode",
-        f"convert it to CSV ({ways}) and give that: pose: {{dji: RECORD.csv}}",
+        f"convert it to CSV ({ways}) and give that: pose: {{file: RECORD.csv}}",
     )
 
 

@@ -134,7 +134,7 @@ def choose_height(
         raise DataError(
             path,
             "holds no height",
-            "state it, in metres above the take-off: pose: {dji: ..., altitude: 30}",
+            "state it, in metres above the take-off: pose: {file: ..., altitude: 30}",
             code="no-positions",
         )
     if stated is not None and stated not in there:
@@ -332,6 +332,7 @@ class DjiSrtFormat:
     name = "dji"
     title = "DJI telemetry (subtitles)"
     suffixes: tuple[str, ...] = (".srt",)
+    choices: tuple[str, ...] = ("altitude",)
 
     def recognises(self, path: Path) -> bool:
         """Return True if there are subtitles and one of the first holds a position."""

@@ -71,6 +71,7 @@ class TlogFormat:
     name = "tlog"
     title = "ground station's log (MAVLink)"
     suffixes: tuple[str, ...] = (".tlog", ".mavlink")
+    choices: tuple[str, ...] = ("position", "instance", "time")
 
     def recognises(self, path: Path) -> bool:
         """Return True if it begins with three packets behind plausible times.
@@ -121,7 +122,7 @@ class TlogFormat:
         topics = [topic for topic, _ in messages]
         kinds = {"vehicle_global_position": "global", "vehicle_local_position": "local"}
         there = next((kind for name, kind in kinds.items() if any(t.name == name for t in topics)), None)
-        asked = replace(choice, instance=None, position=choice.position or there)  # type: ignore[arg-type]
+        asked = choice.model_copy(update={"instance": None, "position": choice.position or there})
         found = telemetry_of(path, topics, asked, fit, notes)
         found = _by_messages(found, {topic.name: name for topic, name in messages})
         found = replace(found, dropped=dict(Counter(found.dropped) + Counter(log.dropped)))

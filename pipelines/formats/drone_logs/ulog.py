@@ -71,6 +71,7 @@ class UlogFormat:
     name = "ulog"
     title = "PX4 log"
     suffixes: tuple[str, ...] = (".ulg", ".ulog")
+    choices: tuple[str, ...] = ("position", "instance", "time")
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins with ULog's magic bytes."""

@@ -125,7 +125,7 @@ def _likely_unit(path: Path, bones: list[_Bone], axes: str) -> float:
     raise DataError(
         path,
         f"states no unit, and its rest pose of {tall:.3g} is an adult's in none",
-        "say truth: {joints: {path: FILE, unit: cm}}",
+        "say truth: {file: FILE, unit: cm}",
         code="unit-unknown",
     )
 

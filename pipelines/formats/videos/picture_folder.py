@@ -296,6 +296,7 @@ class PictureTags:
     name = "picture_tags"
     title = "tags of pictures (EXIF, XMP)"
     suffixes: tuple[str, ...] = ("",)
+    choices: tuple[str, ...] = ("altitude",)
 
     def recognises(self, path: Path) -> bool:
         """Return True for a folder of pictures whose first says where it was taken."""

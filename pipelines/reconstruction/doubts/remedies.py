@@ -58,7 +58,7 @@ def videos(cameras: Sequence[Filmed], order: Sequence[int]) -> str:
 
     def said(camera: Filmed) -> str:
         if camera.entry.keypoints is not None:
-            return f"keypoints.path: {camera.entry.keypoints.source}"
+            return f"keypoints.file: {camera.entry.keypoints.source}"
         media = camera.entry.media
         return f"video: {media.sources[0] if media and media.sources else camera.name}"
 
@@ -96,7 +96,7 @@ def down_deg(camera: Filmed) -> float:
 
 def _rigid(translation: Sequence[float], rotation_xyzw: Float) -> str:
     numbers = ", ".join(f"{value:.6f}" for value in rotation_xyzw)
-    return f"{{body_from_camera: {{translation: {_vector(translation)}, rotation_xyzw: [{numbers}]}}}}"
+    return f"{{translation: {_vector(translation)}, rotation_xyzw: [{numbers}]}}"
 
 
 def _vector(values: Sequence[float]) -> str:
@@ -261,4 +261,4 @@ def own_origins(cameras: Sequence[Filmed], shifts: Float) -> str:
 def another_pose(cameras: Sequence[Filmed], index: int) -> str:
     """Ask for other poses of a camera, or for the flight without it."""
     name = cameras[index].name
-    return f"cameras.{name}.pose: {{log: ..., topic: ...}}  # that of {name}; or leave {name} out"
+    return f"cameras.{name}.pose: {{file: ..., topic: ...}}  # that of {name}; or leave {name} out"

@@ -269,7 +269,7 @@ def test_binary_records_are_refused_with_the_way_to_a_csv(tmp_path: Path) -> Non
     onboard.write_bytes(bytes(16) + b"BUILD" + bytes(221) + b"DJI_LOG_V3" + bytes(100))
     for path in (newest, onboard):
         assert BINARY.recognises(path)
-        with refuses(path, "pose: {dji: RECORD.csv}"):
+        with refuses(path, "pose: {file: RECORD.csv}"):
             BINARY.read_telemetry(path, TelemetryChoice())
     text = tmp_path / "notes.txt"
     text.write_text(

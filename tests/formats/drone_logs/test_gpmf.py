@@ -156,7 +156,7 @@ def test_a_flight_takes_poses_from_the_video(tmp_path: Path) -> None:
     (tmp_path / "karma.mp4").symlink_to(real_data(KARMA))
     (tmp_path / "flight.yaml").write_text(
         "schema: 1\ncameras:\n  drone1:\n    video: karma.mp4\n    frame_times: {start: 1492457277.5}\n"
-        "    pose: {gopro: karma.mp4}\n    mount: {looks: forward}\n"
+        "    pose: {file: karma.mp4}\n    mount: {looks: forward}\n"
         "    intrinsics: {width: 854, height: 480, fx: 500, fy: 500, cx: 426.5, cy: 239.5}\n"
     )
     succeeds("ingest", tmp_path / "flight.yaml")

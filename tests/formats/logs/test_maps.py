@@ -21,7 +21,7 @@ from pipelines.formats.logs.maps import cloud_points, evenly
 from pipelines.formats.maps import octomap
 from pipelines.formats.maps.voxel_grids import occupancy_of
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Flight, Log, Map, WorldFromLog
+from pipelines.session.manifest import LogSource, Manifest, MapSource, Placement
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import MapFormat
 from pipelines.sources.logs import FlightLogs
@@ -55,7 +55,7 @@ class Read:
         entries: Sequence[Entry],
         *,
         container: Container = "mcap-cdr",
-        place: WorldFromLog | None = None,
+        place: Placement | None = None,
         ned: bool = False,
         pose_topic: str | None = None,
         stamps: str = "header",
@@ -63,19 +63,19 @@ class Read:
     ) -> None:
         log = write_log(folder, f"log{len(list(folder.iterdir()))}", container, entries)
         self.notes: list[str] = []
-        camera: dict[str, Any] = {"pose": {"tum": "x"}, "intrinsics": "x", "keypoints": "y"}
+        camera: dict[str, Any] = {"pose": {"file": "x"}, "intrinsics": "x", "keypoints": "y"}
         if pose_topic:
-            camera["pose"] = {"log": "a", "topic": pose_topic}
-        settings = Log(
-            path=[log.name],
+            camera["pose"] = {"file": "a", "topic": pose_topic}
+        settings = LogSource(
+            file=[log.name],
             stamps=stamps,
             axes="ned" if ned else "enu",
-            world_from_log=place or WorldFromLog(),
+            world_from_source=place or Placement(),
         )
-        flight = Flight.model_validate({"schema": 1, "cameras": {"c": camera}, "logs": {"a": settings}})
+        flight = Manifest.model_validate({"schema": 1, "cameras": {"c": camera}, "logs": {"a": settings}})
         with FlightLogs(flight, folder, self.notes.append) as logs:
             found = maps_of_log(
-                flight, Map(log="a", **stated), logs, max_gap_ns=SECOND, note=self.notes.append
+                flight, MapSource(file="a", **stated), logs, max_gap_ns=SECOND, note=self.notes.append
             )
             self.maps = list(found.maps)
         self.dropped = found.dropped
@@ -117,10 +117,10 @@ def test_octomap_of_a_log_without_definitions(tmp_path: Path) -> None:
     """Omit the definitions, as ROS 2 up to Humble does; octomap_msgs is not part of ROS itself."""
     file = as_bt(box(), tmp_path / "site")
     path = write_ros2(tmp_path / "bag", [octomap_entry(file, T0)], definitions=False)
-    camera = {"pose": {"tum": "x"}, "intrinsics": "x", "keypoints": "y"}
-    flight = Flight.model_validate({"schema": 1, "cameras": {"c": camera}})
+    camera = {"pose": {"file": "x"}, "intrinsics": "x", "keypoints": "y"}
+    flight = Manifest.model_validate({"schema": 1, "cameras": {"c": camera}})
     with FlightLogs(flight, tmp_path, lambda _: None) as logs:
-        (one,) = maps_of_log(flight, Map(log=path.name), logs, max_gap_ns=SECOND, note=print).maps
+        (one,) = maps_of_log(flight, MapSource(file=path.name), logs, max_gap_ns=SECOND, note=print).maps
     same(one, READER.read_map(tmp_path / "site" / "map.bt"))
 
 
@@ -261,7 +261,7 @@ def in_order(points: NDArray[np.float64]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("ned", [False, True])
 def test_right_angles_keep_every_voxel(tmp_path: Path, yaw_deg: float, ned: bool) -> None:
     file = as_bt(box(), tmp_path / "site")
-    place = WorldFromLog(translation=[10.0, -3.3, 0.7], yaw_deg=yaw_deg)
+    place = Placement(translation=[10.0, -3.3, 0.7], yaw_deg=yaw_deg)
     one = Read(tmp_path, [octomap_entry(file, T0)], place=place, ned=ned).only
     still = READER.read_map(tmp_path / "site" / "map.bt")
     centres = occupied_centres(still)
@@ -277,7 +277,7 @@ def test_right_angles_keep_every_voxel(tmp_path: Path, yaw_deg: float, ned: bool
 @pytest.mark.parametrize("yaw_deg", [30.0, 45.0, -100.0])
 def test_other_turns_lose_no_obstacle_and_grow_by_a_voxel_at_most(tmp_path: Path, yaw_deg: float) -> None:
     file = as_bt(box(), tmp_path / "site")
-    place = WorldFromLog(translation=[1.0, 2.0, 3.0], yaw_deg=yaw_deg)
+    place = Placement(translation=[1.0, 2.0, 3.0], yaw_deg=yaw_deg)
     one = Read(tmp_path, [octomap_entry(file, T0)], place=place).only
     c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
     true = occupied_centres(READER.read_map(tmp_path / "site" / "map.bt"))
@@ -528,7 +528,7 @@ def test_cloud_of_a_sensor_without_transforms_is_refused(tmp_path: Path) -> None
 
 
 def test_clouds_of_any_turn_are_turned_point_by_point(tmp_path: Path) -> None:
-    place = WorldFromLog(translation=[1, 2, 3], yaw_deg=30)
+    place = Placement(translation=[1, 2, 3], yaw_deg=30)
     one = Read(tmp_path, [cloud_entry(cloud_fields(POINTS[:3], kind="f8"), T0)], place=place).only
     c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
     turned = POINTS[:3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [1, 2, 3]

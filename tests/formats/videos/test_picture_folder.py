@@ -161,7 +161,7 @@ cameras:
   drone1:
     video: film
     frame_times: {times}
-    pose: {{dji: film}}
+    pose: {{file: film}}
     intrinsics: {{width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5}}
 """
 
@@ -181,7 +181,7 @@ def test_a_flight_of_pictures_has_their_times_and_poses(tmp_path: Path) -> None:
 def test_pictures_without_times_need_a_rate(tmp_path: Path) -> None:
     write(tmp_path / "film", exif=False)
     manifest = tmp_path / "flight.yaml"
-    text = MANIFEST.format(times="{start: 0}").replace("pose: {dji: film}", "pose: {tum: poses.tum}")
+    text = MANIFEST.format(times="{start: 0}").replace("pose: {file: film}", "pose: {file: poses.tum}")
     manifest.write_text(text)
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n5 1 0 0 0 0 0 1\n")
     assert "fps" in refused("ingest", manifest)

@@ -69,7 +69,7 @@ cameras:
   drone1:
     video: drone1.mp4
     frame_times: {start_from: motion}
-    pose: {tum: drone1.tum}
+    pose: {file: drone1.tum}
     intrinsics: {width: 320, height: 240, fx: 300, fy: 300, cx: 159.5, cy: 119.5}
 """,
         encoding="utf-8",

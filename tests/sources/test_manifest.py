@@ -1,0 +1,171 @@
+"""Sources of a manifest: their formats by content, the options of each, and the spellings of old files."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.session import manifest as manifest_module
+from pipelines.session import source_options
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Source, read_flight
+from pipelines.session.old_spellings import OLD_SPELLINGS
+from pipelines.session.yaml_files import Part
+from pipelines.sources.files import FlightFiles
+from pipelines.sources.logs import FlightLogs
+from pipelines.sources.poses import FlightPoses
+from tests.synthetic.drone_logs import drone_of, px4_entries, write_dataflash, write_srt
+from tests.synthetic.flights import SyntheticFlight, write_flight
+from tests.synthetic.logs import write_mcap
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> SyntheticFlight:
+    return write_flight(tmp_path_factory.mktemp("flight"), cameras=2, seconds=0.2, clean=True)
+
+
+def models() -> list[type[Part]]:
+    every = [*vars(manifest_module).values(), *vars(source_options).values()]
+    return [kind for kind in every if inspect.isclass(kind) and issubclass(kind, Part) and kind is not Part]
+
+
+def test_every_key_is_described_in_a_sentence() -> None:
+    for model in models():
+        for name, field in model.model_fields.items():
+            assert (field.description or "").endswith("."), f"{model.__name__}.{name}"
+
+
+def test_a_manifest_has_few_keys() -> None:
+    """The keys of a source are counted once, and options belong to the formats."""
+    own = [
+        name
+        for _, model in inspect.getmembers(manifest_module, inspect.isclass)
+        if issubclass(model, Part) and model.__module__ == manifest_module.__name__
+        for name in model.__annotations__
+        if name in model.model_fields and (model is Source or name not in Source.model_fields)
+    ]
+    assert len(own) + 1 <= 90  # and `assumed`
+
+
+@pytest.mark.parametrize("old", OLD_SPELLINGS)
+def test_an_old_spelling_is_refused_with_the_new_one(
+    flight: SyntheticFlight, tmp_path: Path, old: str
+) -> None:
+    place = [{"cameras.*": "drone1"}.get(part, part) for part in old.split(".")]
+    names = iter(["drone1"])
+    keys = [next(names) if part == "*" else part for part in place]
+    stated: Any = "x"
+    for key in reversed(keys):
+        stated = {key: stated}
+    path = tmp_path / "flight.yaml"
+    other = SyntheticFlight(path, stated, *list(vars(flight).values())[2:])
+    other.save()
+    with pytest.raises(DataError) as caught:
+        read_flight(path)
+    last = OLD_SPELLINGS[old].rpartition(".")[2]
+    assert f"{'.'.join(keys)}: is now" in caught.value.problem
+    assert last.replace("*", "drone1") in caught.value.problem
+
+
+def checked(flight: SyntheticFlight, change: dict[str, Any]) -> None:
+    """Check the sources of a flight whose first camera is changed."""
+    stated = flight.settings["cameras"]["drone1"]
+    camera = {**stated, **change}
+    settings = {**flight.settings, "cameras": {**flight.settings["cameras"], "drone1": camera}}
+    path = flight.manifest.with_name("changed.yaml")
+    SyntheticFlight(path, settings, *list(vars(flight).values())[2:]).save()
+    read = read_flight(path)
+    files = FlightFiles(read, path)
+    files.refuse_other_options()
+    with FlightLogs(read, path.parent, lambda _: None) as logs:
+        FlightPoses(read, path, logs, files, max_gap_ns=10**9, note=lambda _: None).refuse_unfit()
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "code", "key"),
+    [
+        ("a.SRT", {"instance": 1}, "wrong-option", "instance"),
+        ("a.SRT", {"preset": "mavros"}, "wrong-option", "preset"),
+        ("a.SRT", {"unit": "cm"}, "wrong-option", "unit"),
+        ("a.SRT", {"axes": "ned"}, "wrong-option", "axes"),
+        ("a.SRT", {"topic": "/pose"}, "wrong-option", "topic"),
+        ("a.SRT", {"altitude": "high"}, "bad-value", "altitude"),
+        ("a.bin", {"altitude": 3}, "wrong-option", "altitude"),
+        ("a.mcap", {"preset": "mavos"}, "bad-value", "preset"),
+        ("a.mcap", {"preset": "px4", "topic": "/pose"}, "wrong-option", "topic"),
+        ("a.mcap", {"attitude": "/imu"}, "wrong-option", "attitude"),
+        ("a.mcap", {"parent": "map"}, "bad-value", "parent"),
+        ("drone1.tum", {"camera": "left"}, "wrong-option", "camera"),
+        ("drone1.tum", {"instanc": 1}, "bad-value", "'instance'"),
+    ],
+)
+def test_an_option_belongs_to_the_format_of_its_file(
+    flight: SyntheticFlight, file: str, options: dict[str, Any], code: str, key: str
+) -> None:
+    folder, truth = flight.manifest.parent, drone_of(flight, 0)
+    write_srt(folder / "a.SRT", truth)
+    write_dataflash(folder / "a.bin", truth)
+    write_mcap(folder / "a.mcap", px4_entries(truth))
+    with pytest.raises(DataError) as caught:
+        checked(flight, {"pose": {"file": file, **options}, "mount": None})
+    assert caught.value.code == code
+    assert key in caught.value.problem
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"file": "a.SRT", "altitude": 30},
+        {"file": "a.bin", "position": "local", "instance": 1, "time": "boot"},
+        {"file": "a.mcap", "preset": "px4", "position": "gps"},
+        {"file": "drone1.tum", "inverse": True, "quaternion": "wxyz", "z": "down", "unit": "mm"},
+        {"file": "drone1.tum", "format": "tum"},
+    ],
+)
+def test_an_option_is_taken_by_the_format_of_its_file(
+    flight: SyntheticFlight, options: dict[str, Any]
+) -> None:
+    folder, truth = flight.manifest.parent, drone_of(flight, 0)
+    write_srt(folder / "a.SRT", truth)
+    write_dataflash(folder / "a.bin", truth)
+    write_mcap(folder / "a.mcap", px4_entries(truth))
+    checked(flight, {"pose": options})
+
+
+@pytest.mark.parametrize(
+    ("gimbal", "key"),
+    [
+        ({"relative_to": "world"}, "gimbal"),
+        ({"file": "a.bag", "topic": "/g"}, "relative_to"),
+        ({"topic": "/g", "relative_to": "world"}, "topic"),
+        ({"yaw_deg": 3, "pitch_deg": 2, "file": "a.bag"}, "file"),
+        ({"yaw_deg": 3}, "pitch_deg"),
+        ({}, "relative_to"),
+    ],
+)
+def test_angles_of_a_gimbal_come_from_one_place(
+    flight: SyntheticFlight, gimbal: dict[str, Any], key: str
+) -> None:
+    with pytest.raises(DataError) as caught:
+        checked(flight, {"pose": {"file": "drone1.tum", "of": "body"}, "gimbal": gimbal})
+    assert key in caught.value.problem
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"pose": {"file": "drone1.tum"}, "mount": {"looks": "forward"}},
+        {"pose": {"file": "still.toml", "of": "body"}, "mount": {"looks": "forward"}},
+        {"pose": {"file": "still.toml", "world_from_source": {"yaw_deg": 3}}},
+    ],
+)
+def test_a_mount_belongs_to_the_pose_of_a_body(flight: SyntheticFlight, change: dict[str, Any]) -> None:
+    still = write_flight(flight.manifest.parent / "still", cameras=1, seconds=0.1, static=True)
+    calibration = (still.manifest.parent / "calibration.toml").read_text(encoding="utf-8")
+    flight.manifest.with_name("still.toml").write_text(calibration, encoding="utf-8")
+    with pytest.raises(DataError) as caught:
+        checked(flight, change)
+    assert caught.value.code == "wrong-option"
