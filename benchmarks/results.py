@@ -202,7 +202,7 @@ def fixed(value: float | None, digits: int = 0) -> str:
 
 
 def with_interval(stated: Mapping[str, Any], digits: int = 1) -> str:
-    """Format a mean with its 95 % interval, as metrics.json and summary.json have it."""
+    """Format a mean with its 95 % interval, as metrics.json has it."""
     if stated["mean"] is None or stated["interval"] is None:
         return fixed(stated["mean"], digits)
     low, high = stated["interval"]

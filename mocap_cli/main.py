@@ -11,12 +11,16 @@ from mocap_cli.terminal import one_line, say
 from pipelines.session.errors import MocapError
 
 COMMANDS = (
-    *("init", "ingest", "check", "reconstruct", "replan-compare", "replan-sweep", "report"),
-    *("batch", "export", "simulate", "ablate"),
+    *("init", "ingest", "check", "reconstruct", "replan-compare", "report"),
+    *("batch", "export", "simulate", "study"),
     *("info", "models"),
 )
 """The commands in the order of their use. Each is `NAME_command` in the module `mocap_cli.NAME`."""
 
+_GONE = {
+    "ablate": "`mocap study tilt_deg=0:60:15`, robots=... or noise=...",
+    "replan-sweep": "`mocap study range_m=8,10 SESSION`",
+}
 _INTERRUPTED = 130  # the exit status that shells expect after Ctrl-C
 
 
@@ -32,7 +36,7 @@ class Mocap(click.Group):
             ctx.exit(1)
         except click.UsageError as error:
             if error.ctx is not None and error.message == error.ctx.get_help():
-                raise  # `mocap ablate` alone: click shows its help this way
+                raise  # `mocap models` alone: click shows its help this way
             # Patterns of the shell expand to file names, which may hold any character.
             raise click.UsageError(one_line(error.format_message()), error.ctx) from None
         except KeyboardInterrupt:
@@ -54,6 +58,8 @@ class _Lazy(Mocap):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command; for an unknown name all of them, from which click suggests the nearest."""
+        if cmd_name in _GONE:
+            raise click.UsageError(f"{cmd_name} does not exist any more: write {_GONE[cmd_name]}.", ctx)
         for name in (cmd_name,) if cmd_name in COMMANDS else COMMANDS:
             module = name.replace("-", "_")
             self.add_command(getattr(import_module(f"mocap_cli.{module}"), f"{module}_command"))

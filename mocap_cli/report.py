@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     type=any_path,
     multiple=True,
     metavar="FOLDER",
-    help="Show a study of `mocap ablate` on each session's page, too; repeat it for several.",
+    help="Show a study of `mocap study` on each session's page, too; repeat it for several.",
 )
 @click.option(
     "--figures",

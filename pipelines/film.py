@@ -43,7 +43,7 @@ from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight import Set, build_set
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
-from pipelines.simulation.study.sightings import (
+from pipelines.simulation.sightings import (
     Formation,
     Sightings,
     Walk,

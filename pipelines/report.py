@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
@@ -57,7 +58,6 @@ from pipelines.session.tables import (
 )
 from pipelines.session.urls import is_there
 from pipelines.session.whole_folders import STUDY_MARK, is_made, whole_folder
-from pipelines.simulation.study.settings import command_of
 from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def report(
     """Write report/index.html of a session.
 
     Args:
-        studies: folders of `mocap ablate` that the page shows as well.
+        studies: folders of `mocap study` that the page shows as well.
         video: the pictures beside the 3D view.
 
     Raises:
@@ -169,7 +169,7 @@ def write_figures_of(
     Args:
         folders: the sessions; two or more are compared, each with the first.
         target: the folder; figures that an earlier run wrote there are replaced.
-        studies: folders of `mocap ablate` that the page of a single session shows as well.
+        studies: folders of `mocap study` that the page of a single session shows as well.
         overwrite: replace also a folder with other things in it, but never a session.
 
     Raises:
@@ -217,29 +217,29 @@ def write_figures_of(
 
 
 def read_study(folder: Path) -> StudyContent:
-    """Read the result of `mocap ablate` in a folder.
+    """Read the result of `mocap study` in a folder.
 
     Raises:
         DataError: it holds no study, or a damaged one.
     """
-    remedy = "name a folder that `mocap ablate ... -o FOLDER` wrote"
+    remedy = "name a folder that `mocap study ... -o FOLDER` wrote"
     if not (folder / STUDY_MARK).is_file():
         raise DataError(folder, f"holds no study (no {STUDY_MARK})", remedy, code="wrong-kind")
-    summary = read_json(folder / STUDY_MARK, remedy)
+    metrics = read_json(folder / "metrics.json", remedy)
     try:
-        command = command_of(summary["settings"], folder.resolve().name)
-        study = StudyContent(summary, command, sha256_of(folder / STUDY_MARK))
+        words = ["mocap", "study", *metrics["command"], "-o", folder.resolve().name]
+        study = StudyContent(metrics, shlex.join(words), sha256_of(folder / "metrics.json"))
         summarise_studies([study])
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise DataError(
-            folder / STUDY_MARK, "is not the summary of a study", remedy, code="wrong-kind"
+            folder / "metrics.json", "is not the result of a study", remedy, code="wrong-kind"
         ) from error
     return study
 
 
 def _named(studies: Sequence[StudyContent]) -> list[dict[str, object]]:
     """Describe studies for the settings: their command, and the hash of their results."""
-    return [{"command": each.command, STUDY_MARK: each.digest} for each in studies]
+    return [{"command": each.command, "metrics.json": each.digest} for each in studies]
 
 
 def _labels(resolved: Sequence[Path]) -> list[str]:
@@ -263,7 +263,7 @@ def _refuse_foreign(page: Path) -> None:
 
 
 def _finished_stages(session: Session) -> dict[str, StageRecord]:
-    names = ("ingest", "detect", "reconstruct", "replan", "sweep")
+    names = ("ingest", "detect", "reconstruct", "replan")
     records = {name: session.intact_record(name) for name in names}
     if records["ingest"] is None:
         raise DataError(
@@ -422,7 +422,6 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         keypoints=keypoints,
         stages={name: asdict(record) for name, record in records.items()},
         replan=_load_replan(folder, records["replan"], maps) if "replan" in records else None,
-        sweep=read_json(folder / "sweep" / "metrics.json") if "sweep" in records else None,
         refined=_by_camera(shown, "reconstruct/cameras.parquet", records.get("reconstruct")),
         true_poses=_by_camera(shown, "truth_poses.parquet", records["ingest"]),
         hidden=_load_hidden(folder, description, records, maps),

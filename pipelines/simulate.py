@@ -86,7 +86,7 @@ def simulate(
     if not overwrite:
         _refuse_to_lose_others(folder)
     noise = noise_models(f"{scenario_path}: drones.pose_noise", scenario.drones.pose_noise)
-    motions = _motions(scenario, scenario_path)
+    motions = recorded_motions(scenario, scenario_path)
     planner = _planner(scenario, scenario_path)
 
     with whole_folder(folder, key, mark=SIMULATION_MARK, overwrite=overwrite) as making:
@@ -151,8 +151,8 @@ def _key(scenario: Scenario, path: Path, video: bool) -> str:
     return hash_of(ingredients)
 
 
-def _motions(scenario: Scenario, path: Path) -> dict[str, SkeletalMotion]:
-    """The recorded motions by actor."""
+def recorded_motions(scenario: Scenario, path: Path) -> dict[str, SkeletalMotion]:
+    """Read the recorded motions that a scenario names, by actor."""
     return {
         name: read_motion(file, unit=motion.unit, axes=motion.axes)
         for name, (file, motion) in scenario.motion_files(path.parent).items()

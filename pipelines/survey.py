@@ -98,10 +98,10 @@ def _of_session(path: Path) -> dict[str, Any]:
 
 
 def _of_summary(path: Path) -> Survey | None:
-    """Describe a folder of `mocap simulate` or `mocap ablate`, or its summary; None if it is neither."""
+    """Describe a folder of `mocap simulate` or `mocap study`, or its summary; None if it is neither."""
     for mark, title, reader in (
         (SIMULATION_MARK, "simulated flight", _of_simulation),
-        (STUDY_MARK, "study of simulated flights", _of_study),
+        (STUDY_MARK, "study, simulated", _of_study),
     ):
         file = path / mark if path.is_dir() else path
         if file.name != mark or not file.is_file():
@@ -110,6 +110,9 @@ def _of_summary(path: Path) -> Survey | None:
         with suppress(DataError):  # damaged, or another program's file of that name: described as any file
             summary = read_json(file)
         if summary.get("simulated") is True:
+            if mark == STUDY_MARK:
+                file = file.with_name("metrics.json")
+                summary = read_json(file)
             return Survey(path, title, _described(file, summary, reader))
     return None
 
@@ -134,21 +137,18 @@ def _of_simulation(summary: Mapping[str, Any]) -> dict[str, Any]:
     return {name: summary[name] for name in ("name", "seed", "duration_s", "pictures", "frames", "poses")}
 
 
-def _of_study(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Describe the settings of a study, and the mean error of every condition and method."""
-    asked = summary["settings"]
-    names = ("tilts_deg", "drones", "noise", "methods", "seconds", "rate_hz", "trials", "seed")
-    errors: dict[str, dict[str, Any]] = {}
-    for cell in summary["cells"]:
-        condition = f"{cell['tilt_deg']:g} deg, {cell['drones']} drones, noise {cell['noise']}"
-        error = cell["metrics"]["mpjpe_mm"]
-        errors.setdefault(condition, {})[cell["method"]] = None if error is None else error["mean"]
-    return {
-        "study": summary["study"],
-        "keypoints": summary["keypoints"],
-        **{name: asked[name] for name in names},
-        "mpjpe_mm": errors,
-    }
+def _of_study(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe the command of a study, and the mean error of every condition."""
+    errors: dict[str, Any] = {}
+    for cell in metrics["cells"]:
+        condition = f"{cell['tilt_deg']:g} deg, {cell['robots']} drones"
+        if metrics["kind"] == "session":
+            errors[f"{cell['arm']}, {cell['range_m']:g} m, {condition}"] = cell["mpjpe_mm"]
+        else:
+            error = cell["metrics"]["mpjpe_mm"]
+            own = errors.setdefault(f"{condition}, noise {cell['noise']}", {})
+            own[cell["method"]] = None if error is None else error["mean"]
+    return {"study": " ".join(metrics["command"]), "keypoints": metrics["keypoints"], "mpjpe_mm": errors}
 
 
 # --- what users write for it ---------------------------------------------------------------------------

@@ -27,7 +27,7 @@ class Refuse:
             raise ImportError(name)
 sys.meta_path.insert(0, Refuse())
 import pipelines.ingest, pipelines.reconstruct, pipelines.report, pipelines.export, pipelines.survey
-import pipelines.replan, pipelines.simulate, pipelines.ablate
+import pipelines.replan, pipelines.simulate, pipelines.study
 """
 
 LIGHT_HELP = """

@@ -1,13 +1,12 @@
-"""The figures of a comparison of planners: over time, the formations' yaw, the list of all; and of a sweep.
+"""The figures of a comparison of planners: over time, the formations' yaw, the list of all.
 
 The colour is the arm's in every figure and in the 3D viewer; the stroke is the drone's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,6 @@ from pipelines.reporting.from_above import draw_from_above
 from pipelines.reporting.plates import (
     CAMERAS,
     LINE_STYLES,
-    MUTED,
     PAPER,
     Plate,
     new_figure,
@@ -29,10 +27,9 @@ from pipelines.reporting.plates import (
     stacked,
     stride_for,
     table,
-    tabled,
 )
 from pipelines.reporting.replanned import Arm, CostMap, Replan, span_s
-from pipelines.reporting.wording import fixed, percent, plural, quantity, shortened, significant
+from pipelines.reporting.wording import fixed, percent, quantity, shortened, significant
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -303,79 +300,3 @@ def _describe_yaw(arm: Arm) -> str:
         f"{arm.name}: from {quantity(float(found[0]), 'deg')} to {quantity(float(found[-1]), 'deg')}, "
         f"turning by {quantity(way, 'deg')} in all."
     )
-
-
-# --- the trade-off of a sweep --------------------------------------------------------------------------
-
-
-def draw_tradeoff(sweep: Mapping[str, Any]) -> Plate:
-    """Draw error against way for each combination of a sweep (its metrics.json).
-
-    Colours show the range, markers the number of drones, and texts the arm and the tilt where they differ.
-    """
-    rows = sweep["cells"]
-    radii = sorted({row["radius_m"] for row in rows})
-    counts = sorted({row["drones"] for row in rows})
-    several_arms, several_tilts = (len({row[key] for row in rows}) > 1 for key in ("arm", "tilt_deg"))
-    with page_style():
-        figure = new_figure(4.2)
-        axes = figure.subplots()
-        for row in rows:
-            colour = CAMERAS[radii.index(row["radius_m"]) % len(CAMERAS)]
-            error = row["capped_mm"]
-            low, high = (row[end] if row[end] is not None else error for end in ("low_mm", "high_mm"))
-            marker = _MARKERS[counts.index(row["drones"]) % len(_MARKERS)]
-            axes.plot([row["path_m"]] * 2, [low, high], "-", color=colour, linewidth=0.8)
-            axes.plot(
-                row["path_m"],
-                error,
-                marker,
-                color=colour,
-                markersize=5.0,
-                markerfacecolor=colour if row["tradeoff"] else PAPER,
-            )
-            words = [row["arm"]] if several_arms else []
-            words += [f"{row['tilt_deg']:g}°"] if several_tilts else []
-            axes.annotate(
-                " ".join(words),
-                (row["path_m"], error),
-                xytext=(4, 2),
-                textcoords="offset points",
-                color=MUTED,
-                fontsize=6.4,
-            )
-        axes.set_xlabel("way of all drones, m")
-        axes.set_ylabel("error over all joints, at most 150 mm each, mm")
-        for k, radius_m in enumerate(radii):
-            axes.plot([], [], "s", color=CAMERAS[k % len(CAMERAS)], label=f"{radius_m:g} m")
-        for k, count in enumerate(counts):
-            marker = _MARKERS[k % len(_MARKERS)]
-            axes.plot([], [], marker, color=MUTED, markerfacecolor=PAPER, label=plural(count, "drone"))
-        axes.plot([], [], "o", color=MUTED, label="trade-off")
-        figure.legend(loc="outside upper left", ncols=min(len(radii) + len(counts) + 1, 7))
-        quiet(axes, "both")
-    best = next((row for row in rows if row["best"]), rows[0])
-    on_it = sum(row["tradeoff"] for row in rows)
-    caption = (
-        f"Simulated: {plural(len(rows), 'combination')} of range, tilt and number of drones. "
-        "A joint that was not measured counts as 150 mm off. Strokes are the intervals over draws of noise. "
-        "Filled: no other combination is better or equal in error, way and range together."
-    )
-    description = (
-        f"{plural(on_it, 'combination')} of {len(rows)} on the trade-off; the least error is "
-        f"{quantity(best['capped_mm'], 'mm')}, of {best['arm']} from {quantity(best['radius_m'], 'm')} with "
-        f"{plural(best['drones'], 'drone')} over {quantity(best['path_m'], 'm', 0)}."
-    )
-    columns = (
-        "arm",
-        "radius_m",
-        "tilt_deg",
-        "drones",
-        "capped_mm",
-        "low_mm",
-        "high_mm",
-        "path_m",
-        "tradeoff",
-    )
-    numbers = {"": tabled(columns, [[row[name] for name in columns] for row in rows])}
-    return Plate("tradeoff", "Error against way", caption, description, figure, numbers)

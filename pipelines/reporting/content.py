@@ -28,9 +28,9 @@ class ReplanContent:
 
 @dataclass(frozen=True)
 class StudyContent:
-    """Results of `mocap ablate` in a folder."""
+    """Results of `mocap study` in a folder."""
 
-    summary: dict[str, Any]  # its summary.json
+    metrics: dict[str, Any]  # its metrics.json
     command: str  # that makes it again
     digest: str  # SHA-256 of that file
 
@@ -49,7 +49,6 @@ class SessionContent:
     keypoints: dict[str, pd.DataFrame]  # camera: tables.KEYPOINTS, of cameras that have any
     stages: dict[str, dict[str, object]]  # stage: its stage.json
     replan: ReplanContent | None = None
-    sweep: dict[str, Any] | None = None  # sweep/metrics.json
     refined: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where refined
     true_poses: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where known
     hidden: dict[str, float] = field(default_factory=dict)  # camera: share of moments, where a map is

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting import wording
-from pipelines.reporting.arm_figures import draw_arms, draw_tradeoff
+from pipelines.reporting.arm_figures import draw_arms
 from pipelines.reporting.content import SessionContent, as_reconstructed, number, section, text
 from pipelines.reporting.figures import draw_all
 from pipelines.reporting.overlays import ReadFrame, collect_moments, residuals_over_time
@@ -67,7 +67,6 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None, vi
             tracking=section(summary.metrics, "tracking"),
             plates=plates,
             replan=replan,
-            sweep=content.sweep,
             studies=summarise_studies(content.studies),
             scene=make_scene(summary, content.poses | content.refined, replan, strips),
             refined=bool(content.refined),
@@ -99,8 +98,6 @@ def draw_session(content: SessionContent, read_frame: ReadFrame | None = None) -
 
 def _draw(summary: Summary, content: SessionContent, replan: Replan | None) -> dict[str, Plate]:
     of_arms = draw_arms(replan) if replan is not None else {}
-    if content.sweep is not None:
-        of_arms["tradeoff"] = draw_tradeoff(content.sweep)
     residuals = residuals_over_time(as_reconstructed(content), summary, MOST_BINS)
     return (
         draw_all(summary, content.poses, residuals, content.angles) | of_arms | draw_studies(content.studies)

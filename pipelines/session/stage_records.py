@@ -21,7 +21,7 @@ from pipelines.session.storage import hash_of, read_json, write_json
 SCHEMA = 1
 """Version of session.json and stage.json. Older ones are read, newer ones refused."""
 
-STAGES = ("ingest", "detect", "background", "reconstruct", "replan", "sweep", "film", "report")
+STAGES = ("ingest", "detect", "background", "reconstruct", "replan", "film", "report")
 """The stages in the order in which they may run."""
 
 COMMANDS = {
@@ -30,7 +30,6 @@ COMMANDS = {
     "background": "mocap reconstruct",
     "reconstruct": "mocap reconstruct",
     "replan": "mocap replan-compare",
-    "sweep": "mocap replan-sweep",
     "film": "mocap replan-compare --render 5",
     "report": "mocap report",
 }

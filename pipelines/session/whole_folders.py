@@ -24,8 +24,8 @@ from pipelines.session.storage import as_data_error, make_folder, read_json, rem
 SIMULATION_MARK = "simulation.json"
 """The file that is in every folder of `mocap simulate`."""
 
-STUDY_MARK = "summary.json"
-"""The file that is in every folder of `mocap ablate`."""
+STUDY_MARK = "study.json"
+"""The file that is in every folder of `mocap study`."""
 
 _LOCK = "lock"
 _RELEASED_S = 0.2  # a killed process can be gone some moments before the kernel has released its lock

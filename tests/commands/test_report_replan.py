@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.study import study
 from tests.commands.runner import succeeds
 
 SCENARIO = """
@@ -59,12 +60,11 @@ def test_the_report_shows_the_comparison_of_the_session(tmp_path: Path) -> None:
     assert page.read_bytes() == first
 
     succeeds("replan-compare", session, "--trials", "2", "--arms", "adaptive,fixed")
-    succeeds("replan-sweep", session, "--trials", "2", "--radius", "8,10")
-    succeeds("report", session)
+    studied = session.with_name("ranges")
+    verdict = study(["range_m=8,10", "trials=2"], session, studied).metrics["verdict"]
+    succeeds("report", session, "--study", studied)
     assert 'dir="auto">flown</th>' in shown
-    assert 'id="sweep"' not in shown
-    swept = json.loads((session / "sweep" / "metrics.json").read_text(encoding="utf-8"))
     shown = unescape(page.read_text(encoding="utf-8"))
     assert 'dir="auto">flown</th>' not in shown
-    assert swept["verdict"][1:] in shown
-    assert 'id="figure-tradeoff"' in shown
+    assert verdict[1:] in shown
+    assert 'id="figure-study-1"' in shown

@@ -19,8 +19,8 @@ _ATTEMPTS, _QUICKER = 5, 0.7  # to hit a command before it ends
 _FRAMES = 40  # replaying takes a second at the least
 _EXPORTED = "trc,c3d,bvh,csv,tum,mcap"
 SMALL_STUDY = (
-    *("--seconds", "8", "--rate", "5", "--trials", "2", "--workers", "1"),
-    *("--methods", "dlt,robust", "--levels", "medium"),
+    *("tilt_deg=0:60:15", "noise=medium", "method=dlt,robust"),
+    *("seconds=8", "rate_hz=5", "trials=2", "--workers", "1"),
 )
 SCENARIO = """\
 schema: 1
@@ -84,7 +84,7 @@ def commands_on(folder: Path) -> dict[str, Command]:
         "report": Command(["report", reported], reported, before=replanned),
         "export": Command(["export", reconstructed, "-o", exported, "--to", _EXPORTED], exported, ()),
         "simulate": Command(["simulate", folder / "scenario.yaml", "-o", simulated], simulated),
-        "ablate": Command(["ablate", "tilt", *SMALL_STUDY, "-o", studied], studied),
+        "study": Command(["study", *SMALL_STUDY, "-o", studied], studied),
         "batch": Command(
             [
                 "batch",

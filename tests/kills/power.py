@@ -589,10 +589,10 @@ def _simulate(name: str, place: Path) -> Case:
     return Case(name, ["simulate", scenario, "-o", target], partial(_made, target), files, before)
 
 
-def _ablate(name: str, place: Path) -> Case:
+def _study(name: str, place: Path) -> Case:
     target = place / "studied"
     files = partial(_files_beside, target)
-    return Case(name, ["ablate", "tilt", *SMALL_STUDY, "-o", target], partial(_made, target), files)
+    return Case(name, ["study", *SMALL_STUDY, "-o", target], partial(_made, target), files)
 
 
 def _store(name: str, place: Path) -> Case:
@@ -615,7 +615,7 @@ _CASES: Mapping[str, Callable[[str, Path], Case]] = {
     "report": _report,
     "export": _export,
     "simulate": _simulate,
-    "ablate": _ablate,
+    "study": _study,
     "store": _store,
 }
 

@@ -8,7 +8,7 @@ between formations are not due to chance. Stage `film` measures the arms of a co
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,10 +21,11 @@ from pipelines.geometry.poses import matrix_from_quaternion, rates
 from pipelines.geometry.triangulation import Views, estimate_noise, reprojection_px, triangulate_pictures
 from pipelines.simulation.body import Person, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
+from pipelines.simulation.flight import Performer
 from pipelines.simulation.flying import orbit
 from pipelines.simulation.motion.script import perform
 from pipelines.simulation.rig import BodyMotion
-from pipelines.simulation.scenario import Body, DetectorErrors, Lens, Step, Travel
+from pipelines.simulation.scenario import Body, DetectorErrors, Lens, Scenario, Step, Travel
 
 RANGE_M = 10.0
 """Distance from the person to every camera, m."""
@@ -58,6 +59,8 @@ class Walk:
     motion: BodyMotion  # at those moments
     joints: Float  # [T, J, 3] m, world, of `person.joints`
     aim: Float  # [T, 3] m, world: the hip, smoothed
+    lens: Intrinsics = field(default_factory=lambda: Lens().intrinsics())
+    errors: DetectorErrors = field(default_factory=DetectorErrors)  # of modelled keypoints
 
 
 @dataclass(frozen=True)
@@ -98,10 +101,28 @@ def walk(seconds: float, rate_hz: float, seed: int) -> Walk:
             seed=seed,
         )
 
-    t_ns = np.round(np.arange(max(round(seconds * rate_hz), 2)) * (1e9 / rate_hz)).astype(np.int64)
+    t_ns = _times_ns(seconds, rate_hz)
     t_s = t_ns / 1e9
     motion = at(t_s)
     return Walk(t_ns, person, look.height_m, motion, person.keypoints(motion), _smoothed(at, t_s))
+
+
+def walk_of(performer: Performer, scenario: Scenario, seconds: float, rate_hz: float) -> Walk:
+    """Return the way of a scenario's person, whom cameras without obstacles film with the scenario's lens."""
+    t_ns = _times_ns(min(seconds, scenario.duration_s), rate_hz)
+    person, t_s = performer.person, t_ns / 1e9
+    motion = performer.moving(t_s)
+    height_m, joints, aim = (
+        performer.look.body.height_m,
+        person.keypoints(motion),
+        _smoothed(performer.moving, t_s),
+    )
+    lens = replace(scenario.lens.intrinsics(), readout_s=0.0)
+    return Walk(t_ns, person, height_m, motion, joints, aim, lens, scenario.keypoints)
+
+
+def _times_ns(seconds: float, rate_hz: float) -> Int64:
+    return np.round(np.arange(max(round(seconds * rate_hz), 2)) * (1e9 / rate_hz)).astype(np.int64)
 
 
 def _smoothed(at: Callable[[Float], BodyMotion], t_s: Float) -> Float:
@@ -125,7 +146,7 @@ def formation(of: Walk, *, cameras: int, tilt_deg: float) -> Formation:
         tilt_deg=tilt_deg,
         yaw_rate_deg_per_s=0.0,
     )
-    return Formation(position, quaternion, Lens().intrinsics())
+    return Formation(position, quaternion, of.lens)
 
 
 def exact_keypoints(of: Walk, seen_by: Formation) -> Sightings:
@@ -144,7 +165,6 @@ def model_keypoints(of: Walk, seen_by: Formation, exact: Sightings, *, seed: int
 
     The errors grow with tilt. They include joints that the body itself hides; there are no obstacles.
     """
-    errors = DetectorErrors()
     found = []
     for camera, pixels in enumerate(exact.xy):
         tilt_deg, height_px = view_of(
@@ -156,7 +176,7 @@ def model_keypoints(of: Walk, seen_by: Formation, exact: Sightings, *, seed: int
                 np.ones(pixels.shape[:-1], dtype=np.bool_),
                 tilt_deg,
                 height_px,
-                errors,
+                of.errors,
                 np.random.default_rng([seed, _KEYPOINTS, trial, camera]),
                 joints=of.person.joints,
             )

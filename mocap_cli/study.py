@@ -1,0 +1,73 @@
+"""`mocap study`: how an error depends on what is varied."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from mocap_cli.options import Shown, any_path, force_option, output_options, overwrite_option, workers_option
+from mocap_cli.several import session_here
+from mocap_cli.terminal import print_json, print_table, say, say_warnings, watching
+
+
+@click.command("study", short_help="Study an error against tilt, range, drones, noise, settings.")
+@click.argument("words", nargs=-1, required=True, metavar="VARIABLE=VALUES... [SESSION|SCENARIO.yaml]")
+@click.option("-o", "--output", type=any_path, required=True, help="Folder of the results.")
+@workers_option("Conditions of a walk worked on at once; the results do not depend on them.")
+@overwrite_option
+@force_option
+@output_options
+def study_command(
+    words: tuple[str, ...], output: Path, workers: int, overwrite: bool, force: bool, shown: Shown
+) -> None:
+    r"""Measure an error for every combination of values, and write a table, metrics.json and a figure.
+
+    VALUES are separated by commas, or numbers as START:STOP:STEP. An interrupted study goes on where it
+    stopped. Everything is simulated.
+
+    \b
+    mocap study tilt_deg=0:60:15 -o tilt/
+    mocap study robots=2,3,4,5 noise=none,high scenario.yaml -o robots/
+    mocap study noise=white,bias,drift robots=3 trials=40 method=dlt,robust -o noise/
+    mocap study range_m=8,10,12 arm=adaptive,joint flight.session -o ranges/
+
+    Without a session, ideal cameras film a person who walks on a circle, or the first one of a scenario, and
+    every method reconstructs the same data. Variables: tilt_deg, robots (the number of drones), method, and
+    noise: a level (none, low: 0.1 m and 0.5 deg per axis, medium: 0.3, 1, high: 0.5, 2), a kind (white, bias,
+    body-bias, drift, gauss-markov, or as in bias@high), or models as in --pose-noise, between semicolons.
+    With a single value: keypoints (model, exact), detector (looks at rendered pictures), seconds, rate_hz,
+    trials, seed.
+
+    On a session, planner arms fly again against the log. Variables: arm, range_m, tilt_deg, robots, every
+    setting of the planner. With a single value: config (PLANNER.yaml), pose_noise, trials, seed.
+    """
+    from pipelines.reporting.studies import setting, tables
+    from pipelines.study import study
+
+    variables = [word for word in words if "=" in word.partition("/")[0]]
+    places = [Path(word) for word in words if word not in variables]
+    if not variables or len(places) > 1:
+        raise click.UsageError("State VARIABLE=VALUES, and at most one session or scenario.")
+    run = {"workers": workers, "overwrite": overwrite, "force": force}
+    with watching(shown.level) as progress:
+        if places:
+            with session_here(places[0]) as place:
+                result = study(variables, place, output, progress=progress, **run)
+        else:
+            result = study(variables, None, output, progress=progress, **run)
+    metrics = result.metrics
+    say_warnings(metrics.get("warnings", []), shown.quiet)
+    if shown.as_json:
+        print_json(metrics)
+        return
+    if not shown.quiet:
+        say(f"Simulated: {setting(metrics)}")
+        for table in tables(metrics):
+            say()
+            say(table.title)
+            print_table(table.header, table.rows)
+        if metrics.get("verdict"):
+            say()
+            say(metrics["verdict"])
+    say(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")

@@ -1,0 +1,662 @@
+"""Stage `study`: how an error depends on what is varied, over a simulated walk or over a session.
+
+A study of a walk films a walking person from ideal positions, disturbs poses and keypoints in several trials,
+triangulates by every method, and computes errors on the joint-frames that all methods have. A study of a
+session flies planner arms against its log with other settings; every combination is one replay, with the same
+draws. Both write one folder: study.json, metrics.json, table.csv and a figure. All figures are simulated.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
+from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.triangulation import Views, locate
+from pipelines.keypoints.hints import project_actor
+from pipelines.keypoints.tracking import FollowedPeople
+from pipelines.planning.comparison import capped_mm, mean_of_trials, measure_alone
+from pipelines.planning.config import SETTINGS, PlannerConfig, planner_config
+from pipelines.planning.loading import load_flight
+from pipelines.planning.scene import ReplanSettings, ReplayScene, build_scene
+from pipelines.reconstruction.refining import refined_points
+from pipelines.replan import (
+    detector_errors,
+    error_model,
+    fly_and_measure,
+    inputs_of,
+    read_result,
+    refuse_unknown,
+    settings_by_name,
+    settings_of,
+)
+from pipelines.reporting.studies import Row, draw, estimates, rows_csv
+from pipelines.session.errors import DataError
+from pipelines.session.maps import load_maps
+from pipelines.session.progress import Halt, Progress, Silent, side_by_side
+from pipelines.session.registries import Detector, find_detector, hashes_of_models
+from pipelines.session.stages import locked
+from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
+from pipelines.session.whole_folders import STUDY_MARK, Making, is_made, refuse_sessions, whole_folder
+from pipelines.simulate import recorded_motions
+from pipelines.simulation.detector_errors import errors_of
+from pipelines.simulation.flight import build_set
+from pipelines.simulation.rendering.renderer import Renderer
+from pipelines.simulation.scenario import World, read_scenario
+from pipelines.simulation.sightings import (
+    IMITATED,
+    Formation,
+    Sightings,
+    Walk,
+    exact_keypoints,
+    formation,
+    model_keypoints,
+    triangulate_robustly,
+    views_of,
+    walk,
+    walk_of,
+)
+from pipelines.simulation.studies import StudiedNoise, StudyMethod, WalkStudy, numbers, walk_study
+from pipelines.simulation.world.scene import build_world
+
+_REVISION = 6
+_PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
+# The camera looks exactly at the person, so that the hint of the person's position is nearly exact.
+_HINT_SIGMA_M = 0.1
+# A study with more combinations would take days.
+_MAX_CELLS = 500
+_RANGE = re.compile(r"(-?[0-9.]+):(-?[0-9.]+):([0-9.]+)")
+_UNDIVIDED = ("detector", "config")  # variables whose value may hold commas
+_OF_SESSION = ("arm", "robots", "range_m", "tilt_deg", "config", "trials", "seed", "pose_noise")
+_SETTINGS = {"range_m": "radius_m", "tilt_deg": "tilt_deg"}  # variables with the names of planner settings
+
+Stated = Mapping[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Studied:
+    """Result of a study."""
+
+    folder: Path
+    metrics: dict[str, Any]
+    skipped: bool  # True if the study existed already
+
+
+def values_of(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Parse `VARIABLE=VALUES` words: values between commas, or START:STOP:STEP with both ends.
+
+    Noise models, which hold commas, are separated by semicolons.
+
+    Raises:
+        DataError: a word has another form, a variable is stated twice, or a range is empty.
+    """
+    stated: dict[str, tuple[str, ...]] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        if name in stated:
+            raise DataError(word, f"states {name} twice", "state it once", code="stated-twice")
+        found = _RANGE.fullmatch(text)
+        if found is not None:
+            start, stop, step = map(float, found.groups())
+            count = int((stop - start) / step + 1e-9) + 1 if step > 0 else 0
+            values = tuple(f"{start + k * step:.12g}" for k in range(min(count, _MAX_CELLS)))
+        elif name in _UNDIVIDED:
+            values = (text,)
+        else:
+            models = name.endswith("noise") and ":" in text
+            values = tuple(part.strip() for part in text.split(";" if models else ","))
+        if not values or not all(values):
+            raise DataError(word, "states no value", "write 2,3,4 or 0:60:15", code="bad-value")
+        stated[name] = values
+    return stated
+
+
+def study(
+    words: Sequence[str],
+    place: Path | None,
+    folder: Path,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Studied:
+    """Run a study; conditions that an interrupted run finished are kept.
+
+    Args:
+        words: the variables with their values, as `values_of` reads them.
+        place: a session, or the scenario of the walk; None for a walk on a circle.
+        folder: the output folder; an earlier study there is replaced.
+        workers: the number of conditions of a walk in parallel; the results do not depend on it.
+        overwrite: replace a folder that is no study.
+
+    Raises:
+        DataError: a variable or value is wrong, the folder cannot be written or is a session's, the session
+            or the scenario cannot be used, the detector is missing, or nothing was reconstructed.
+        BusyError: another process makes the same folder, or writes the session.
+    """
+    progress = progress or Silent()
+    stated = values_of(words)
+    refuse_sessions(folder, mark=STUDY_MARK, option="--output")
+    command = [f"{name}={_joined(values)}" for name, values in stated.items()]
+    command += [place.name] if place is not None else []
+    store = partial(_stored, folder, command=command, overwrite=overwrite, force=force)
+    if place is not None and place.is_dir():
+        return _study_session(stated, place, store, progress)
+    return _study_walk(stated, place, store, workers, progress)
+
+
+def _joined(values: Sequence[str]) -> str:
+    return (";" if any("," in value for value in values) and len(values) > 1 else ",").join(values)
+
+
+Produce = Callable[[Making], tuple[dict[str, Any], Sequence[Row]]]
+Store = Callable[[dict[str, object], Produce], Studied]
+
+
+def _stored(
+    folder: Path,
+    ingredients: dict[str, object],
+    produce: Produce,
+    *,
+    command: list[str],
+    overwrite: bool,
+    force: bool,
+) -> Studied:
+    """Return the study of this key if it exists, else make it: its metrics, its rows and its figure."""
+    key = hash_of({"revision": _REVISION, **ingredients})
+    if not force and is_made(folder, key, mark=STUDY_MARK):
+        return Studied(folder, read_json(folder / "metrics.json"), skipped=True)
+    with whole_folder(folder, key, mark=STUDY_MARK, overwrite=overwrite) as making:
+        metrics, rows = produce(making)
+        metrics = jsonable({"schema": 1, "simulated": True, "command": command, **metrics})
+        (making.folder / "table.csv").write_text(rows_csv(rows), encoding="utf-8", newline="\n")
+        draw(making.folder, metrics)
+        write_json(making.folder / "metrics.json", metrics)
+        write_json(
+            making.folder / STUDY_MARK, {"schema": 1, "simulated": True, "key": key, "command": command}
+        )
+        making.publish()
+    return Studied(folder, metrics, skipped=False)
+
+
+# --- a walk --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Condition:
+    """One condition of a study of a walk."""
+
+    tilt_deg: float
+    robots: int
+    noise: StudiedNoise
+
+    @property
+    def filmed(self) -> tuple[float, int]:
+        """The settings on which its keypoints depend: tilt in deg and number of drones."""
+        return self.tilt_deg, self.robots
+
+    def row(self) -> Row:
+        """Return its columns."""
+        model = self.noise.model
+        return {
+            "tilt_deg": self.tilt_deg,
+            "robots": self.robots,
+            "noise": self.noise.label,
+            "noise_model": model,
+        }
+
+
+def _study_walk(
+    stated: Stated, place: Path | None, store: Store, workers: int, progress: Progress
+) -> Studied:
+    scenario = None if place is None else read_scenario(place)
+    if scenario is not None and "seconds" not in stated:
+        stated = {**stated, "seconds": (f"{scenario.duration_s:g}",)}
+    settings = walk_study(stated)
+    detector = None if settings.detector is None else find_detector(settings.detector)
+    ingredients: dict[str, object] = {"settings": asdict(settings)}
+    motions = {}
+    if scenario is not None and place is not None:
+        motions = recorded_motions(scenario, place)
+        ingredients["scenario"] = scenario.identity()
+        ingredients["motions"] = {
+            name: sha256_of(file) for name, (file, _) in scenario.motion_files(place.parent).items()
+        }
+    if detector is None:
+        imitated = IMITATED if scenario is None else scenario.keypoints.detector
+        ingredients["errors"] = sha256_of(errors_of(imitated))
+        keypoints = "exact" if settings.keypoints == "exact" else f"modelled after {imitated}"
+    else:
+        ingredients["detector"] = detector.name
+        ingredients["models"] = hashes_of_models(detector)
+        detector.load(threads=1)  # raises an error at once if a file is missing
+        keypoints = f"{settings.detector} on rendered pictures"
+
+    def produce(making: Making) -> tuple[dict[str, Any], Sequence[Row]]:
+        if scenario is None:
+            filmed = walk(settings.seconds, settings.rate_hz, settings.seed)
+        else:
+            scenery = build_set(scenario, bvh=motions)
+            filmed = walk_of(scenery.people[0], scenario, settings.seconds, settings.rate_hz)
+        conditions = [
+            _Condition(*each)
+            for noise in settings.noise
+            for each in product(settings.tilts_deg, settings.robots, [noise])
+        ]
+        seen: dict[tuple[float, int], Sightings] = {}
+        if detector is not None:
+            sun = np.array((World() if scenario is None else scenario.world).sun)
+            if scenario is None:
+                world = build_world(World(), settings.seed, keep_clear=filmed.motion.root[:, :2])
+            else:
+                world = scenery.world
+            renderer = Renderer(world.surfaces(), filmed.lens, sun=sun, seed=settings.seed)
+            seen = _detect_all(filmed, conditions, detector, renderer, workers, making, progress)
+        progress.start("Measuring", len(conditions) * settings.trials)
+        halt = Halt()
+        work = [
+            (f"cell-{k:04d}", partial(_measure_condition, settings, filmed, each, seen, halt, progress))
+            for k, each in enumerate(conditions)
+        ]
+        parts = _parts(work, making, workers, halt)
+        rows = [row for part in parts for row in read_json(part / "rows.json")["rows"]]
+        cells = estimates(rows, settings.axis, seed=settings.seed)
+        if not any(cell["metrics"]["mpjpe_mm"] for cell in cells):
+            raise DataError(
+                "study",
+                "nothing was reconstructed by all methods",
+                "film longer, or at lower tilts",
+                code="nothing-reconstructed",
+            )
+        noise = {each.label: each.model for each in settings.noise}
+        metrics = {
+            "kind": "walk",
+            "axis": settings.axis,
+            "scenario": None if scenario is None else scenario.name,
+            "keypoints": keypoints,
+            "settings": {**asdict(settings), "noise": noise},
+            "cells": cells,
+        }
+        return metrics, rows
+
+    return store(ingredients, produce)
+
+
+def _parts(
+    work: Sequence[tuple[str, Callable[[Path], None]]], making: Making, workers: int, halt: Halt
+) -> list[Path]:
+    """Run the work in parallel and return the folders of the parts, in the order of the work."""
+    return side_by_side(lambda each: making.part(*each), work, workers=workers, halt=halt)
+
+
+def _measure_condition(
+    settings: WalkStudy,
+    filmed: Walk,
+    condition: _Condition,
+    seen: Mapping[tuple[float, int], Sightings],
+    halt: Halt,
+    progress: Progress,
+    folder: Path,
+) -> None:
+    """Write the rows of every trial and method."""
+    cameras = formation(filmed, cameras=condition.robots, tilt_deg=condition.tilt_deg)
+    exact = exact_keypoints(filmed, cameras)
+    models = condition.noise.models()
+    rows: list[Row] = []
+    for trial in range(settings.trials):
+        halt.check()
+        if settings.detector is not None:
+            sightings = seen[condition.filmed]
+        elif settings.keypoints == "model":
+            sightings = model_keypoints(filmed, cameras, exact, seed=settings.seed, trial=trial)
+        else:
+            sightings = exact
+        views = views_of(filmed, cameras, sightings, models, seed=settings.seed, trial=trial)
+        points, fell_back = {}, {}
+        for method in settings.methods:
+            points[method], doubt = _reconstructed(method, views, filmed, models)
+            fell_back[method] = float(doubt is not None)
+        for method, errors in _compared(points, filmed).items():
+            own = {"trial": trial, "method": method, **errors, "fell_back": fell_back[method]}
+            rows.append({**condition.row(), **own})
+        progress.advance()
+    write_json(folder / "rows.json", {"rows": rows})
+
+
+def _reconstructed(
+    method: StudyMethod, views: Views, filmed: Walk, models: Sequence[NoiseModel]
+) -> tuple[Float, str | None]:
+    """Triangulate views by a method: points [N, 3] m, NaN where there is none, and the reason for a fallback.
+
+    All methods know the standard deviations of the poses. `robust` and `auto` also estimate the noise of
+    keypoints. `auto` also knows the noise models, and so the correlation of pose errors in time.
+    """
+    if method == "auto":
+        elapsed_s = (filmed.t_ns - filmed.t_ns[0]) / 1e9
+        return refined_points(views, elapsed_s, tuple(filmed.person.joints), models)[1:]
+    if method == "robust":
+        return triangulate_robustly(views)[1], None
+    return locate(views, method=method).points, None
+
+
+def _compared(points: Mapping[StudyMethod, Float], filmed: Walk) -> dict[StudyMethod, Row]:
+    """Compute the errors of several methods on one walk, from points [T * J, 3] m of each, joints fastest.
+
+    Returns:
+        By method the result of `measure` on the joint-frames that all methods have (per joint only the three
+        MPJPEs). These figures are for all joint-frames of the method itself: `reconstructed_share`,
+        `own_mpjpe_mm`, and `pck150` and `pck150_auc`, which count missing joints as wrong.
+    """
+    truth = filmed.joints[:, None]
+    found = {method: own.reshape(truth.shape) for method, own in points.items()}
+    shared = common(*found.values())
+    rows: dict[StudyMethod, Row] = {}
+    for method, own in found.items():
+        errors = measure(np.where(shared[..., None], own, np.nan), truth, filmed.person.joints, filmed.t_ns)
+        distance = np.linalg.norm(own - truth, axis=-1)
+        there = distance[np.isfinite(distance)]
+        errors["common_share"] = errors["reconstructed_share"]
+        errors["reconstructed_share"] = there.size / distance.size
+        errors["own_mpjpe_mm"] = 1e3 * float(there.mean()) if there.size else None
+        errors["pck150"] = int((there <= PCK_THRESHOLD_M).sum()) / distance.size
+        near = np.maximum(0.0, 1 - there / PCK_THRESHOLD_M)
+        errors["pck150_auc"] = float(near.sum()) / distance.size
+        of_joints: Any = errors["per_joint"]
+        errors["per_joint"] = {
+            joint: {name: own[name] for name in _PER_JOINT} for joint, own in of_joints.items()
+        }
+        rows[method] = errors
+    return rows
+
+
+# --- pictures of a walk --------------------------------------------------------------------------------
+
+
+def _detect_all(
+    filmed: Walk,
+    conditions: Sequence[_Condition],
+    detector: Detector,
+    renderer: Renderer,
+    workers: int,
+    making: Making,
+    progress: Progress,
+) -> dict[tuple[float, int], Sightings]:
+    """Film the walk from every formation and detect keypoints in the pictures."""
+    geometries = sorted({condition.filmed for condition in conditions})
+    cameras = [(tilt, robots, k) for tilt, robots in geometries for k in range(robots)]
+    progress.start("Filming", len(cameras) * len(filmed.t_ns))
+    halt = Halt()
+
+    def film(tilt_deg: float, robots: int, camera: int) -> Callable[[Path], None]:
+        seen_by = formation(filmed, cameras=robots, tilt_deg=tilt_deg)
+        return partial(_film, filmed, seen_by, camera, renderer, detector, halt, progress)
+
+    work = [(f"pictures-{tilt:g}-{robots}-{k}", film(tilt, robots, k)) for tilt, robots, k in cameras]
+    found: dict[tuple[float, int], list[tuple[Float, Float]]] = {}
+    for (tilt, robots, _), made in zip(cameras, _parts(work, making, workers, halt), strict=True):
+        with np.load(made / "keypoints.npz") as stored:
+            found.setdefault((tilt, robots), []).append((stored["xy"], stored["confidence"]))
+    return {
+        geometry: Sightings(*(np.stack(each) for each in zip(*own, strict=True)))
+        for geometry, own in found.items()
+    }
+
+
+def _film(
+    filmed: Walk,
+    seen_by: Formation,
+    camera: int,
+    renderer: Renderer,
+    detector: Detector,
+    halt: Halt,
+    progress: Progress,
+    folder: Path,
+) -> None:
+    """Write the keypoints of a detector in the pictures of one camera: xy [T, J, 2], confidence [T, J]."""
+    names = filmed.person.joints
+    follower = FollowedPeople(detector.load(threads=1), names, only_one=True)
+    xy = np.full((len(filmed.t_ns), len(names), 2), np.nan)
+    confidence = np.zeros(xy.shape[:-1])
+    for frame in range(len(filmed.t_ns)):
+        halt.check()
+        pose = seen_by.position[camera, frame], seen_by.quaternion_xyzw[camera, frame]
+        surface = filmed.person.surface(filmed.motion.root[frame], filmed.motion.rotation[frame])
+        picture = renderer.picture(*pose, [surface], frame)
+        hint = project_actor(filmed.aim[frame], pose, seen_by.lens, sigma_m=_HINT_SIGMA_M, sigma_rad=0.0)
+        found, sure = follower.step(picture, hints=[hint])
+        if len(found):
+            xy[frame], confidence[frame] = found[0], sure[0]
+        progress.advance()
+    np.savez(folder / "keypoints.npz", xy=xy, confidence=confidence)
+
+
+# --- a session -----------------------------------------------------------------------------------------
+
+
+def _study_session(stated: Stated, place: Path, store: Store, progress: Progress) -> Studied:
+    settings = _replay_settings(stated)
+    varied = {name: values for name, values in stated.items() if name in _varied(stated)}
+    with locked(place) as session:
+        description, reconstructed, inputs = inputs_of(session)
+        cells = list(_cells(varied))
+        ingredients = {"settings": settings_by_name(settings), "cells": cells, "inputs": inputs}
+
+        def produce(making: Making) -> tuple[dict[str, Any], Sequence[Row]]:
+            flight = load_flight(place, description, reconstructed, pose_noise=settings.pose_noise)
+            if flight.skeleton is None:
+                raise _no_skeleton(place)
+            errors = detector_errors(session)
+            model = error_model(errors, flight.skeleton.joints)
+            maps = load_maps(place) if description.map else []
+            scenes: dict[str, ReplayScene] = {}
+            progress.start("Replaying", len(cells))
+            rows, capped = [], []
+            for k, cell in enumerate(cells):
+                own = replace(settings, planner=_planner_of(settings.planner, cell))
+                # Distance, tilt and number change nothing that the replays share.
+                shared = {name: cell[name] for name in cell if name not in ("arm", "robots", *_SETTINGS)}
+                name = hash_of(shared)
+                if name not in scenes:
+                    scenes[name] = build_scene(flight, maps, description, own, errors=model)
+                scene = _scene_of(scenes[name], cell)
+                flown = making.part(f"cell-{k:04d}", partial(fly_and_measure, scene, errors, _arm_of(cell)))
+                result = read_result(flown)
+                if result.error_m is None:
+                    raise _no_skeleton(place)
+                capped.append(capped_mm(result.error_m, result.joint_frames))
+                scores = measure_alone(scene, _arm_of(cell), result)
+                rows.append(_figures(scene, cell, scores, capped[-1]))
+                progress.advance()
+            best = _mark_tradeoff(rows, capped, settings.seed)
+            metrics = {
+                "kind": "session",
+                "varied": list(varied),
+                "trials": settings.trials,
+                "seed": settings.seed,
+                "keypoints": f"modelled after {errors.detector}",
+                "best": best,
+                "cells": rows,
+                "verdict": _verdict(rows, best),
+                "warnings": list(flight.warnings),
+            }
+            return metrics, rows
+
+        return store(ingredients, produce)
+
+
+def _no_skeleton(place: Path) -> DataError:
+    return DataError(
+        place, "has no skeleton to measure", "run `mocap reconstruct` first", code="nothing-reconstructed"
+    )
+
+
+def _varied(stated: Stated) -> list[str]:
+    """List the variables of a cell: the arm, the planner settings, and how many drones fly."""
+    return [name for name in stated if name not in ("config", "trials", "seed", "pose_noise")]
+
+
+def _replay_settings(stated: Stated) -> ReplanSettings:
+    """Return the settings that all replays share.
+
+    Raises:
+        DataError: a variable or a value is wrong.
+    """
+    names = set(SETTINGS) - {"radius_m", "zones"}
+    unknown = [name for name in stated if name not in {*_OF_SESSION, *names}]
+    if unknown:
+        raise DataError(
+            unknown[0],
+            "is no variable of a study of a session",
+            f"there are {', '.join(_OF_SESSION)}, and the settings of the planner",
+            code="no-such-name",
+        )
+    refuse_unknown(stated.get("arm", ()), logged=False)
+    numbers(stated, "range_m", float, 0.5, 500)
+    numbers(stated, "tilt_deg", float, -10, 85)
+    numbers(stated, "robots", int, 2, 8)
+    settings = settings_of(
+        stated.get("config", ()),
+        arms=None,
+        trials=_whole(stated, "trials", 1, 10_000, 10),
+        seed=_whole(stated, "seed", 0, 2**32 - 1, 0),
+        pose_noise=" + ".join(stated["pose_noise"]) if "pose_noise" in stated else None,
+    )
+    for cell in _cells({name: values for name, values in stated.items() if name in _varied(stated)}):
+        _planner_of(settings.planner, cell)
+    return settings
+
+
+def _whole(stated: Stated, name: str, least: int, most: int, default: int) -> int:
+    found = numbers(stated, name, int, least, most, (str(default),))
+    if len(found) > 1:
+        raise DataError(name, "takes one value", "leave the others out", code="bad-value")
+    return int(found[0])
+
+
+def _cells(varied: Stated) -> Iterator[dict[str, Any]]:
+    """Yield every combination of the values, by variable; the arm is `adaptive` if none is stated."""
+    stated = {"arm": ("adaptive",), **varied}
+    count = int(np.prod([len(set(values)) for values in stated.values()]))
+    if count > _MAX_CELLS:
+        raise DataError("study", f"{count} combinations", f"ask for at most {_MAX_CELLS}", code="too-large")
+    kept = [list(dict.fromkeys(values)) for values in stated.values()]
+    for values in product(*kept):
+        yield {
+            name: value if name == "arm" else yaml.safe_load(value)
+            for name, value in zip(stated, values, strict=True)
+        }
+
+
+def _planner_of(planner: PlannerConfig, cell: Mapping[str, Any]) -> PlannerConfig:
+    """Change the planner settings that a cell states.
+
+    Raises:
+        DataError: a value is of another type, or out of range.
+    """
+    changes = {
+        _SETTINGS.get(name, name): value for name, value in cell.items() if name not in ("arm", "robots")
+    }
+    checked = planner_config(changes, "study")
+    return replace(planner, **{name: getattr(checked, name) for name in changes})
+
+
+def _arm_of(cell: Mapping[str, Any]) -> str:
+    return str(cell["arm"])
+
+
+def _scene_of(scene: ReplayScene, cell: Mapping[str, Any]) -> ReplayScene:
+    planner = _planner_of(scene.config, cell)
+    robots = cell.get("robots", scene.drones)
+    return replace(scene, drones=robots, settings=replace(scene.settings, planner=planner))
+
+
+def _figures(
+    scene: ReplayScene, cell: Mapping[str, Any], scores: dict[str, Any], capped: np.ndarray[Any, Any]
+) -> Row:
+    """Return the figures of one combination; way and energy are those of all drones together."""
+    errors = scores["reconstruction_error"]
+    estimate = mean_of_trials(capped, scene.settings.seed)
+    low, high = estimate.interval if estimate is not None and estimate.interval else (None, None)
+    mpjpe, share, covered = (errors[key] for key in ("mpjpe_mm", "pck150", "coverage"))
+    return {
+        "arm": cell["arm"],
+        "range_m": scene.config.radius_m,
+        "tilt_deg": scene.config.tilt_deg,
+        "robots": scene.drones,
+        **{name: value for name, value in cell.items() if name not in _OF_SESSION},
+        "best": False,
+        "tradeoff": False,
+        "capped_mm": None if estimate is None else estimate.mean,
+        "low_mm": low,
+        "high_mm": high,
+        "mpjpe_mm": None if mpjpe is None else mpjpe["mean"],
+        "pck150": None if share is None else share["mean"],
+        "coverage": None if covered is None else covered["mean"],
+        "mean_range_m": scores["range_m"]["mean"],
+        "mean_tilt_deg": scores["tilt_deg"]["mean"],
+        "hidden_share": scores["occluded_share"],
+        "blind_s": scores["blind_s"],
+        "path_m": scene.drones * scores["path_m"],
+        "energy_kj": scene.drones * scores["energy_kj"],
+        "min_clearance_m": scores["min_clearance_m"],
+        "min_separation_m": scores["min_separation_m"],
+        "min_actor_distance_m": scores["min_actor_distance_m"],
+        "violations": sum(scores["limit_violations"].values()),
+    }
+
+
+def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any], seed: int) -> dict[str, Any]:
+    """Mark the best combination and the trade-off; return the best and those that noise does not tell apart.
+
+    Combinations that violate a limit are left out, unless all do. The trade-off is between the error, the way
+    of all drones and the range asked for: nothing on it is beaten or equalled in all three by another.
+    """
+    kept = [k for k, row in enumerate(rows) if not row["violations"]] or list(range(len(rows)))
+    best = min(kept, key=lambda k: float(rows[k]["capped_mm"]))
+    rows[best]["best"] = True
+
+    def costs(k: int) -> tuple[float, float, float]:
+        return rows[k]["capped_mm"], rows[k]["path_m"], -rows[k]["range_m"]
+
+    for k in kept:
+        beaten = any(
+            costs(j) != costs(k) and all(a <= b for a, b in zip(costs(j), costs(k), strict=True))
+            for j in kept
+        )
+        rows[k]["tradeoff"] = not beaten
+    alike = []
+    for k in kept:
+        found = mean_of_trials(capped[k] - capped[best], seed)
+        if k != best and found is not None and found.interval and found.interval[0] <= 0.0:
+            alike.append(k)
+    return {"cell": best, "alike": alike}
+
+
+def _verdict(rows: Sequence[dict[str, Any]], best: dict[str, Any]) -> str:
+    own = rows[best["cell"]]
+    words = [
+        f"best is {_named(own)}: {own['capped_mm']:.1f} mm over all joints,"
+        f" {100 * own['pck150']:.1f} % within 150 mm,"
+        f" {own['path_m']:.0f} m and {own['energy_kj']:.0f} kJ of all drones (simulated)"
+    ]
+    if best["alike"]:
+        words.append(f"Noise does not tell apart {'; '.join(_named(rows[k]) for k in best['alike'])}")
+    least = min((row for row in rows if row["tradeoff"]), key=lambda row: float(row["path_m"]))
+    if least is not own:
+        words.append(f"Shortest is {_named(least)}: {least['path_m']:.0f} m, {least['capped_mm']:.1f} mm")
+    return ". ".join(words)
+
+
+def _named(row: dict[str, Any]) -> str:
+    return f"{row['arm']} from {row['range_m']:g} m at {row['tilt_deg']:g} deg with {row['robots']} drones"
