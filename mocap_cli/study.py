@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import click
 
 from mocap_cli.options import Shown, any_path, force_option, output_options, overwrite_option, workers_option
-from mocap_cli.several import session_here
 from mocap_cli.terminal import print_json, print_table, say, say_warnings, watching
 
 
@@ -43,19 +43,23 @@ def study_command(
     setting of the planner. With a single value: config (PLANNER.yaml), pose_noise, trials, seed.
     """
     from pipelines.reporting.studies import setting, tables
+    from pipelines.session.urls import session_here
     from pipelines.study import study
 
     variables = [word for word in words if "=" in word.partition("/")[0]]
     places = [Path(word) for word in words if word not in variables]
     if not variables or len(places) > 1:
         raise click.UsageError("State VARIABLE=VALUES, and at most one session or scenario.")
-    run = {"workers": workers, "overwrite": overwrite, "force": force}
-    with watching(shown.level) as progress:
-        if places:
-            with session_here(places[0]) as place:
-                result = study(variables, place, output, progress=progress, **run)
-        else:
-            result = study(variables, None, output, progress=progress, **run)
+    with watching(shown.level) as progress, ExitStack() as stack:
+        result = study(
+            variables,
+            stack.enter_context(session_here(places[0])) if places else None,
+            output,
+            workers=workers,
+            overwrite=overwrite,
+            force=force,
+            progress=progress,
+        )
     metrics = result.metrics
     say_warnings(metrics.get("warnings", []), shown.quiet)
     if shown.as_json:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
@@ -48,6 +47,7 @@ from pipelines.session.registries import Detector, find_detector, hashes_of_mode
 from pipelines.session.stages import locked
 from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import STUDY_MARK, Making, is_made, refuse_sessions, whole_folder
+from pipelines.session.yaml_files import plain_yaml
 from pipelines.simulate import recorded_motions
 from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import build_set
@@ -450,7 +450,11 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
     with locked(place) as session:
         description, reconstructed, inputs = inputs_of(session)
         cells = list(_cells(varied))
-        ingredients = {"settings": settings_by_name(settings), "cells": cells, "inputs": inputs}
+        ingredients: dict[str, object] = {
+            "settings": settings_by_name(settings),
+            "cells": cells,
+            "inputs": inputs,
+        }
 
         def produce(making: Making) -> tuple[dict[str, Any], Sequence[Row]]:
             flight = load_flight(place, description, reconstructed, pose_noise=settings.pose_noise)
@@ -553,7 +557,7 @@ def _cells(varied: Stated) -> Iterator[dict[str, Any]]:
     kept = [list(dict.fromkeys(values)) for values in stated.values()]
     for values in product(*kept):
         yield {
-            name: value if name == "arm" else yaml.safe_load(value)
+            name: value if name == "arm" else plain_yaml(Path("study"), value)
             for name, value in zip(stated, values, strict=True)
         }
 

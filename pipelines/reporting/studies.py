@@ -222,9 +222,9 @@ def tables(metrics: Mapping[str, Any]) -> list[StudyTable]:
 
 
 def _column(cell: Mapping[str, Any], axis: str) -> str:
-    return {"tilt_deg": f"{cell['tilt_deg']:g} deg", "robots": f"{cell['robots']} drones"}.get(
-        axis, cell["noise"]
-    )
+    if axis == "noise":
+        return str(cell["noise"])
+    return f"{cell['tilt_deg']:g} deg" if axis == "tilt_deg" else f"{cell['robots']} drones"
 
 
 def _names(metrics: Mapping[str, Any]) -> list[str]:
