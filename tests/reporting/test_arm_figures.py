@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.reporting.arm_figures import draw_arms, draw_tradeoff, hidden_spans
+from pipelines.reporting.arm_figures import draw_arms, hidden_spans
 from pipelines.reporting.from_above import KEYFRAMES, draw_from_above
 from pipelines.reporting.plates import Plate
 from pipelines.reporting.replanned import Replan, summarise_replan
@@ -113,26 +113,6 @@ def test_heights_of_the_map_are_shaded_as_far_as_they_go(plates: dict[str, Plate
     bare = draw_arms(summarise_replan(replace(make_comparison(), map=None), START_NS, 2))["arms-top"]
     assert "above 0.5 m" not in bare.svg
     assert "map" not in bare.caption
-
-
-def test_the_trade_off_fills_what_nothing_beats() -> None:
-    def cell(radius_m: float, drones: int, error_mm: float, *, best: bool, on_it: bool) -> dict[str, object]:
-        ends = {"low_mm": error_mm - 2, "high_mm": error_mm + 2}
-        where = {"arm": "adaptive", "radius_m": radius_m, "tilt_deg": 15.0, "drones": drones}
-        return (
-            where | ends | {"capped_mm": error_mm, "path_m": 30.0 * drones, "best": best, "tradeoff": on_it}
-        )
-
-    cells = [
-        cell(8.0, 2, 60.0, best=False, on_it=True),
-        cell(8.0, 3, 40.0, best=True, on_it=True),
-        cell(12.0, 3, 90.0, best=False, on_it=False),
-    ]
-    plate = draw_tradeoff({"cells": cells})
-    assert numbers(plate.description)[:4] == [2, 3, 40, 8]
-    assert plate.numbers[""]["capped_mm"].tolist() == [60, 40, 90]
-    assert plate.numbers[""]["tradeoff"].tolist() == [True, True, False]
-    assert all(text in plate.svg for text in (">8 m<", ">12 m<", ">2 drones<", ">3 drones<"))
 
 
 def test_no_fly_zones_are_hatched_and_named() -> None:

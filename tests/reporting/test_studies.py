@@ -78,3 +78,27 @@ def test_a_method_that_measured_nothing_is_not_spoken_of() -> None:
     assert "robust" not in what_it_shows(metrics_of("robots", cells))
     with pytest.raises(ValueError, match="empty"):
         what_it_shows(metrics_of("robots", cells[:1]))
+
+
+def test_a_study_of_a_session_shows_the_tradeoff() -> None:
+    def cell(range_m: float, robots: int, error_mm: float, *, best: bool, on_it: bool) -> dict[str, Any]:
+        figures = dict.fromkeys(("mpjpe_mm", "pck150", "coverage", "mean_range_m", "hidden_share"), 0.5)
+        figures |= dict.fromkeys(("blind_s", "energy_kj", "min_separation_m"), 1.0)
+        where = {"arm": "adaptive", "range_m": range_m, "tilt_deg": 15.0, "robots": robots}
+        ends = {"capped_mm": error_mm, "low_mm": error_mm - 2, "high_mm": error_mm + 2}
+        way = {"path_m": 30.0 * robots, "violations": 0, "best": best, "tradeoff": on_it}
+        return where | ends | figures | way
+
+    cells = [
+        cell(8.0, 2, 60.0, best=False, on_it=True),
+        cell(8.0, 3, 40.0, best=True, on_it=True),
+        cell(12.0, 3, 90.0, best=False, on_it=False),
+    ]
+    words = {"kind": "session", "varied": ["range_m", "robots"], "verdict": "best is 40 mm"}
+    content = StudyContent(words | {"cells": cells, "keypoints": "modelled", "trials": 4}, "", "")
+    (plate,) = draw_studies([content]).values()
+    assert plate.numbers[""]["capped_mm"].tolist() == [60, 40, 90]
+    assert plate.numbers[""]["tradeoff"].tolist() == [True, True, False]
+    assert all(text in plate.svg for text in (">8 m<", ">12 m<", ">2 drones<", ">3 drones<"))
+    (table,) = summarise_studies([content])[0].tables
+    assert [row[-1] for row in table.rows] == ["trade-off", "best", ""]
