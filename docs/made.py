@@ -102,16 +102,18 @@ def _text_of(node: ast.stmt | None) -> str:
 
 def flight() -> str:
     """List the keys of flight.yaml, part by part."""
-    parts: list[tuple[str, type[BaseModel]]] = [("", Manifest)]
-    sections: dict[type[BaseModel], str] = {}
-    for place, model in parts:
-        rows, nested = _rows_of(model, place, "")
+    parts: list[tuple[str, type[BaseModel]]] = [("The flight", Manifest), ("A source", Source)]
+    sections = []
+    for title, model in parts:
+        rows, nested = _rows_of(model, "" if model is Manifest else title, "")
         parts += [part for part in nested if part[1] not in dict.fromkeys(each for _, each in parts)]
-        title = f"### {place}" if place else "### The flight"
-        sections[model] = f"{title}\n\n{_first_line(model)}\n\n{table(('key', 'value', 'meaning'), rows)}"
-    rows, _ = _rows_of(Source, "", "")
-    sections[Source] = f"### A source\n\n{_first_line(Source)}\n\n{table(('key', 'value', 'meaning'), rows)}"
-    return "\n" + "\n".join([*sections.values(), _options()]) + "\n"
+        is_source = issubclass(model, Source) and model is not Source
+        said = _first_line(model) + (" It is [a source](#a-source)." if is_source else "")
+        sections.append("\n\n".join([f"### {title}", said, *([table(_KEYS, rows)] if rows else [])]).rstrip())
+    return "\n" + "\n\n".join([*sections, _options()]) + "\n"
+
+
+_KEYS = ("key", "value", "meaning")
 
 
 def _options() -> str:

@@ -204,6 +204,18 @@ def test_every_made_table_is_shown() -> None:
     assert sorted(marked) == sorted(runpy.run_path(str(_DOCS / "made.py"))["TABLES"])
 
 
+@pytest.mark.parametrize("name", ["flight", "noise", "tables", "codes", "planner"])
+def test_every_key_column_and_code_has_a_meaning(name: str) -> None:
+    made = runpy.run_path(str(_DOCS / "made.py"))["TABLES"][name]()
+    for lines in re.findall(r"(?:^\|.*\n)+", made, re.MULTILINE):
+        header, _, *rows = ([cell.strip() for cell in line.split(" | ")] for line in lines.splitlines())
+        (column,) = (
+            k for k, cell in enumerate(header) if cell.strip("| ") in {"meaning", "is", "holds", "means"}
+        )
+        assert rows
+        assert not [row[0] for row in rows if not row[column].strip("| ")]
+
+
 def test_every_status_is_explained() -> None:
     section = _text("session.md").partition("| status | means |")[2].partition("\n\n")[0]
     assert re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE) == list(STATUS)
