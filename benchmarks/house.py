@@ -21,6 +21,7 @@ import xml.etree.ElementTree as ET
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,9 @@ SAMPLE = ROOT / "demo" / "mound_walk.session"
 CONSTANTS_ARE = """\
 A constant is a number in capitals at the top of a module of pipelines/ or mocap_cli/, or a field of a frozen
 table (a frozen dataclass whose fields all have numbers as defaults). Its reason is the comment directly above
-it, or the one behind it: a sentence with a capital letter first, at least four words, and a full stop at the
-end. A heading `# --- tuning ---` is no reason. In pipelines/formats, constants on consecutive lines
-share the comment above the first: a standard fixes them together."""
+it or behind it, or the text below it: a sentence with a capital letter first, at least four words, and a
+full stop at the end. A heading `# --- tuning ---` is no reason. In pipelines/formats, constants on
+consecutive lines share the comment above the first: a standard fixes them together."""
 
 
 @dataclass(frozen=True)
@@ -188,6 +189,13 @@ def constants_without_reason(module: Module) -> tuple[list[str], int]:
         if token.type == tokenize.COMMENT
     }
     alone = {number for number in comments if lines[number - 1].lstrip().startswith("#")}
+    documented = {
+        before.end_lineno or before.lineno: " ".join(str(after.value.value).split())
+        for before, after in pairwise(module.tree.body)
+        if isinstance(after, ast.Expr)
+        and isinstance(after.value, ast.Constant)
+        and isinstance(after.value.value, str)
+    }
     missing: list[str] = []
     reasoned: set[int] = set()  # last lines of constants whose comment above is a sentence
     count = 0
@@ -201,7 +209,7 @@ def constants_without_reason(module: Module) -> tuple[list[str], int]:
         shared = module.room == "pipelines/formats" and not above and node.lineno - 1 in reasoned
         if is_sentence(above) or shared:
             reasoned.add(end)
-        elif not is_sentence(comments.get(end, "")):
+        elif not is_sentence(comments.get(end, "")) and not is_sentence(documented.get(end, "")):
             missing.append(
                 f"{module.place}:{node.lineno} {name}  # {above or comments.get(end, '')}".rstrip(" #")
             )

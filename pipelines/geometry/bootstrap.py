@@ -18,6 +18,7 @@ from pipelines.geometry.arrays import Float, Int64
 Series = tuple[Float, Float]
 """Sums [T] and weights [T] of a figure at every moment or trial: the figure is the ratio of their totals."""
 
+# Papers of the field state intervals of 95 %.
 LEVEL = 0.95
 STRETCH_S = 5.0
 """Length of a stretch: the longest time over which the figures of a flight correlate.
@@ -30,15 +31,18 @@ stretch makes the interval too narrow. Too long a one makes only its ends less c
 RESAMPLES = 2000
 """Draws; the ends of an interval scatter by 4 % of half its width."""
 
+# An interval of `LEVEL` leaves 2.5 % of the draws on either side.
 _TAIL_PERCENT = 2.5
-_FEWEST_STRETCHES = 5
-_FEWEST_SAMPLES, _FEWEST_TRIALS = 10, 2
+# Draws from fewer stretches repeat each other, and the interval would be too narrow.
+_MIN_STRETCHES = 5
+# Fewer samples or trials do not tell how a figure scatters.
+_MIN_SAMPLES, _MIN_TRIALS = 10, 2
 
 
 def stretch_samples(t_ns: Int64) -> int:
     """Return the samples of a stretch: `STRETCH_S`, at most a fifth of the flight, and at least one."""
     step_s = float(np.median(np.diff(t_ns))) / 1e9
-    return max(min(round(STRETCH_S / step_s), len(t_ns) // _FEWEST_STRETCHES), 1)
+    return max(min(round(STRETCH_S / step_s), len(t_ns) // _MIN_STRETCHES), 1)
 
 
 def intervals(
@@ -63,7 +67,7 @@ def resampled(series: Mapping[str, Series], t_ns: Int64 | None, *, seed: int = 0
     are NaN with fewer than ten samples or two trials.
     """
     count = len(next(iter(series.values()))[0]) if series else 0
-    if count < (_FEWEST_TRIALS if t_ns is None else _FEWEST_SAMPLES):
+    if count < (_MIN_TRIALS if t_ns is None else _MIN_SAMPLES):
         return {name: np.full(RESAMPLES, np.nan) for name in series}
     length = 1 if t_ns is None else stretch_samples(t_ns)
     first = np.random.default_rng([seed, count]).integers(count, size=(RESAMPLES, math.ceil(count / length)))

@@ -14,10 +14,48 @@ import numpy as np
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.poses import conjugate, interpolate_poses, matrix_from_quaternion, multiply, rotate
 
-_MOST_PAIRS = 400  # events whose pairs give the slopes: 80,000 pairs
-_CLEAR = 4.0  # standard deviations from which a drift, or a difference of log-likelihoods, is significant
-_LARGEST_DRIFT_PPM = 1000.0  # quartz is off by 100 at most; more is a jump or a wrong unit
-_CORRELATED_S = 10.0  # correlation time of the delays of one link
+# --- tuning ---
+
+# The slopes are those of all pairs of events, and so many events have 80,000 pairs.
+_MAX_EVENTS = 400
+# A drift, or a difference of log-likelihoods, is significant from this many standard deviations on.
+_SIGNIFICANT_SIGMAS = 4.0
+# Quartz is off by 100 ppm at most, so a larger drift is a jump or a wrong unit.
+_MAX_DRIFT_PPM = 1000.0
+# Delays of one radio link correlate over about this time.
+_DELAY_CORRELATION_S = 10.0
+# The approximate start of a video must be right to this time.
+_START_TOLERANCE_S = 1.0
+# This grid of poses is finer than the pictures of a video at 30 Hz.
+_STEP_S = 0.02
+# Poses of a log are noisy from row to row, so they are smoothed by a window of this standard deviation.
+_SMOOTHING_SIGMA_S = 0.1
+# Next to gaps and ends the mean of a window is biased, so this share of the window must be known.
+_MIN_WINDOW_WEIGHT = 0.9
+# Drones stay at least this far from anything that they film.
+_MIN_DISTANCE_M = 2.0
+# No picture shows points beside the camera, so directions have at least this share of their length as depth.
+_MIN_DEPTH_SHARE = 0.1
+# Tracking, and the poses between pictures, err by 0.4 px of pictures that are 320 px wide.
+_SCATTER_RAD = 2e-3
+# Starts are tried in these steps, and Newton's method refines the best of them.
+_SEARCH_STEP_S = 0.08
+# During the search the scatter is this share of the motion of points, so that the peak is wide enough.
+_SEARCH_SCATTER_SHARE = 0.25
+# All starts are tried with at most this many points, to bound the time.
+_MAX_SEARCH_POINTS = 500
+# A start at which the log covers less of the video cannot be compared with the others.
+_MIN_COVERED_SHARE = 0.5
+# A start this far from the best one counts as another one.
+_OTHER_START_S = 0.5
+# If every other step is halved, this many steps of Newton's method end shorter than 1e-5 s.
+_MAX_NEWTON_STEPS = 30
+# Finite differences span one step of the grid of poses.
+_DIFFERENCE_STEP_S = 0.01
+# Errors within a second may correlate.
+_BLOCK_S = 1.0
+# Three pictures of a 30 Hz video: a start known less well is of no use.
+_MAX_START_SIGMA_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -58,7 +96,7 @@ def fit_clock(this_ns: Int64, other_ns: Int64) -> ClockFit | None:
     t_s = (this_ns - at_ns) / 1e9
     lead_s = (lead_ns - middle_ns) / 1e9
     drift = _median_slope(t_s, lead_s)
-    if abs(drift) > _LARGEST_DRIFT_PPM * 1e-6:
+    if abs(drift) > _MAX_DRIFT_PPM * 1e-6:
         drift = 0.0
     inside, scatter = _inside(lead_s - drift * t_s)
     spread = float(np.std(t_s[inside]))
@@ -66,9 +104,9 @@ def fit_clock(this_ns: Int64, other_ns: Int64) -> ClockFit | None:
         drift = float(np.polyfit(t_s[inside], lead_s[inside], 1)[0])
         inside, scatter = _inside(lead_s - drift * t_s)
     # Neighbouring delays correlate: there are at most as many independent ones as correlation times.
-    independent = max(1.0, min(float(inside.sum()), np.ptp(t_s) / _CORRELATED_S))
+    independent = max(1.0, min(float(inside.sum()), np.ptp(t_s) / _DELAY_CORRELATION_S))
     sigma = max(scatter, 1e-9) / (spread * np.sqrt(independent)) if spread > 0 else np.inf
-    if abs(drift) < _CLEAR * sigma:
+    if abs(drift) < _SIGNIFICANT_SIGMAS * sigma:
         drift = 0.0
     offset_s = float(np.median((lead_s - drift * t_s)[inside]))
     return ClockFit(
@@ -92,7 +130,7 @@ def _inside(residual_s: Float) -> tuple[Bool, float]:
 def _median_slope(t_s: Float, lead_s: Float) -> float:
     """Compute the median slope over all pairs of events, which are thinned out evenly."""
     order = np.argsort(t_s, kind="stable")
-    kept = order[np.unique(np.linspace(0, len(order) - 1, min(len(order), _MOST_PAIRS)).astype(np.intp))]
+    kept = order[np.unique(np.linspace(0, len(order) - 1, min(len(order), _MAX_EVENTS)).astype(np.intp))]
     first, second = np.triu_indices(len(kept), 1)
     step = t_s[kept][second] - t_s[kept][first]
     rise = lead_s[kept][second] - lead_s[kept][first]
@@ -102,24 +140,6 @@ def _median_slope(t_s: Float, lead_s: Float) -> float:
 
 
 # --- start of a video ----------------------------------------------------------------------------------
-
-
-_WITHIN_S = 1.0  # largest distance of a start from the approximate one
-_STEP_S = 0.02
-_SMOOTHED_S = 0.1  # standard deviation of the window: a log's poses are noisy from row to row
-_LEAST_WEIGHT = 0.9  # known share of a window: next to gaps and ends its mean is biased
-_NEAREST_M = 2.0  # smallest distance from the drone to anything that it films
-_LEAST_DEPTH = 0.1  # of a direction, as a share of its length: no picture shows points beside the camera
-_SCATTER = 2e-3  # rad: 0.4 px of pictures 320 px wide; error of tracking and of the poses between pictures
-_SEARCHED_S = 0.08  # step between the starts that are tried
-_SEARCHED_SHARE = 0.25  # scatter during the search, as a share of the motion of points
-_MOST_SEARCHED = 500  # points that are used while all starts are tried
-_LEAST_COVERED = 0.5  # share of the stretches that the log must cover
-_ELSEWHERE_S = 0.5  # a start this far from the best counts as another one
-_MOST_STEPS = 30  # of Newton's method: if every other one is halved, they end shorter than 1e-5 s
-_REFINED_S = 0.01  # step of the finite differences that refine a start
-_BLOCK_S = 1.0  # errors within a second may correlate
-_LARGEST_SIGMA_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -170,8 +190,8 @@ class _Search:
 
     def explained(self, start_s: float) -> Float:
         """Compute the log-likelihood gain of a start for each stretch [S]; 0 where the log has no poses."""
-        still = _still(self.followed, _SCATTER)
-        return np.nan_to_num(still - _misfits(self.path, self.followed, start_s, _SCATTER))
+        still = _still(self.followed, _SCATTER_RAD)
+        return np.nan_to_num(still - _misfits(self.path, self.followed, start_s, _SCATTER_RAD))
 
 
 def fit_start(
@@ -208,35 +228,39 @@ def fit_start(
     if not np.isfinite(search.gain).any():
         raise ValueError("the poses cover less than half of them")
     near_s = None if near_ns is None else (near_ns - int(t_ns[0])) / 1e9
-    possible = np.isfinite(search.gain) & (near_s is None or np.abs(search.starts_s - near_s) <= _WITHIN_S)
+    possible = np.isfinite(search.gain) & (
+        near_s is None or np.abs(search.starts_s - near_s) <= _START_TOLERANCE_S
+    )
     if not possible.any():
-        raise ValueError(f"the poses cover less than half of them within {_WITHIN_S:g} s of the stated start")
+        raise ValueError(
+            f"the poses cover less than half of them within {_START_TOLERANCE_S:g} s of the stated start"
+        )
 
     start_s, sigma_s = search.likeliest(possible)
     explained = search.explained(start_s)
     if near_s is not None:
         likeliest_s, _ = search.likeliest(np.ones(len(possible), np.bool_))
         apart_s = likeliest_s - near_s
-        if abs(apart_s) > _WITHIN_S and _is_clear(search.explained(likeliest_s) - explained):
+        if abs(apart_s) > _START_TOLERANCE_S and _is_clear(search.explained(likeliest_s) - explained):
             raise ValueError(
                 f"they move as the poses do {apart_s:+.2f} s from the stated start, which must be right to"
-                f" {_WITHIN_S:g} s"
+                f" {_START_TOLERANCE_S:g} s"
             )
     if not _is_clear(explained):
         raise ValueError("they do not move as the poses do")
-    elsewhere = possible & (np.abs(search.starts_s - start_s) > _ELSEWHERE_S)
+    elsewhere = possible & (np.abs(search.starts_s - start_s) > _OTHER_START_S)
     if elsewhere.any():
         other_s, _ = search.likeliest(elsewhere)
         apart_s = abs(other_s - start_s)
-        if apart_s > _ELSEWHERE_S / 2 and not _is_clear(explained - search.explained(other_s)):
+        if apart_s > _OTHER_START_S / 2 and not _is_clear(explained - search.explained(other_s)):
             raise ValueError(
                 f"they move as the poses do at several times, {apart_s:.2f} s apart: too little, too evenly,"
                 " or again and again"
             )
     if not np.isfinite(sigma_s):
         raise ValueError("no start explains their motion better than those shortly before and after it")
-    if sigma_s > _LARGEST_SIGMA_S:
-        raise ValueError(f"their motion says when to {sigma_s:.2g} s only, not to {_LARGEST_SIGMA_S:g} s")
+    if sigma_s > _MAX_START_SIGMA_S:
+        raise ValueError(f"their motion says when to {sigma_s:.2g} s only, not to {_MAX_START_SIGMA_S:g} s")
     return StartFit(
         start_ns=int(t_ns[0]) + round(start_s * 1e9),
         sigma_s=sigma_s,
@@ -287,7 +311,7 @@ def _path(t_ns: Int64, position: Float, quaternion_xyzw: Float, max_gap_ns: int)
         t_ns, position, quaternion_xyzw, at_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=0
     )
     there: Bool = np.asarray(np.isfinite(moved).all(axis=1))
-    width = _SMOOTHED_S / _STEP_S
+    width = _SMOOTHING_SIGMA_S / _STEP_S
     weight = gaussian_filter1d(there.astype(np.float64), width, mode="constant")
 
     def smoothed(values: Float) -> Float:
@@ -300,23 +324,23 @@ def _path(t_ns: Int64, position: Float, quaternion_xyzw: Float, max_gap_ns: int)
     return _Path(
         position=smoothed(moved - centre),
         quaternion=quaternion / np.maximum(norm, 1e-9),
-        known=there & np.asarray(weight > _LEAST_WEIGHT),
+        known=there & np.asarray(weight > _MIN_WINDOW_WEIGHT),
     )
 
 
 def _search(path: _Path, followed: Followed) -> _Search:
     """Try all starts at which the video overlaps the log."""
     last_s, length_s = float(followed.end_ns[-1]) / 1e9, _STEP_S * (len(path.known) - 1)
-    starts_s = np.arange(-last_s, length_s, _SEARCHED_S)
+    starts_s = np.arange(-last_s, length_s, _SEARCH_STEP_S)
     moved = float(np.median(np.linalg.norm(followed.end - followed.begin, axis=1)))
-    scatter = max(_SCATTER, _SEARCHED_SHARE * moved)
+    scatter = max(_SCATTER_RAD, _SEARCH_SCATTER_SHARE * moved)
     gain = _gains(path, _thinned(followed), starts_s, scatter)
     return _Search(path, followed, moved, scatter, starts_s, gain)
 
 
 def _thinned(followed: Followed) -> Followed:
     """Keep every n-th point, so that many starts can be tried."""
-    every = slice(None, None, max(1, len(followed.stretch) // _MOST_SEARCHED))
+    every = slice(None, None, max(1, len(followed.stretch) // _MAX_SEARCH_POINTS))
     return Followed(
         followed.begin_ns,
         followed.end_ns,
@@ -333,7 +357,7 @@ def _gains(path: _Path, followed: Followed, starts_s: Float, scatter: float) -> 
     for k, start_s in enumerate(starts_s.tolist()):
         better = still - _misfits(path, followed, start_s, scatter)
         known = np.isfinite(better)
-        if known.mean() >= _LEAST_COVERED:
+        if known.mean() >= _MIN_COVERED_SHARE:
             gain[k] = better[known].sum()
     return gain
 
@@ -359,7 +383,7 @@ def _distances(path: _Path, followed: Followed, start_s: float) -> Float:
     from_position, from_quaternion = _at(path, start_s + followed.begin_ns / 1e9)
     to_position, to_quaternion = _at(path, start_s + followed.end_ns / 1e9)
     turn = matrix_from_quaternion(multiply(conjugate(to_quaternion), from_quaternion))
-    shift = rotate(conjugate(to_quaternion), from_position - to_position) / _NEAREST_M
+    shift = rotate(conjugate(to_quaternion), from_position - to_position) / _MIN_DISTANCE_M
     ray = np.einsum(
         "pij,pj->pi", turn[followed.stretch], np.column_stack([followed.begin, np.ones(len(followed.begin))])
     )
@@ -371,7 +395,7 @@ def _distances(path: _Path, followed: Followed, start_s: float) -> Float:
 
 
 def _in_picture(ray: Float) -> Float:
-    return ray[:, :2] / np.maximum(ray[:, 2:], _LEAST_DEPTH)
+    return ray[:, :2] / np.maximum(ray[:, 2:], _MIN_DEPTH_SHARE)
 
 
 def _at(path: _Path, at_s: Float) -> tuple[Float, Float]:
@@ -391,7 +415,7 @@ def _is_clear(differences: Float) -> bool:
     """Test if a sum of differences of log-likelihoods is significantly above zero."""
     known = differences[np.isfinite(differences)]
     sigma = float(np.std(known, ddof=1)) * np.sqrt(len(known)) if len(known) > 1 else np.inf
-    return float(known.sum()) > max(_CLEAR * sigma, _CLEAR**2 / 2)
+    return float(known.sum()) > max(_SIGNIFICANT_SIGMAS * sigma, _SIGNIFICANT_SIGMAS**2 / 2)
 
 
 def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) -> tuple[float, float]:
@@ -405,13 +429,13 @@ def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) ->
     block = (followed.begin_ns / 1e9 / _BLOCK_S).astype(np.int64)
     sigma_s = np.inf
     while True:
-        longest_s, before_s = _SEARCHED_S, 0.0
-        for _ in range(_MOST_STEPS):
+        longest_s, before_s = _SEARCH_STEP_S, 0.0
+        for _ in range(_MAX_NEWTON_STEPS):
             less, here, more = (
-                _misfits(path, followed, start_s + k * _REFINED_S, scatter) for k in (-1, 0, 1)
+                _misfits(path, followed, start_s + k * _DIFFERENCE_STEP_S, scatter) for k in (-1, 0, 1)
             )
-            slope = np.nan_to_num((more - less) / (2 * _REFINED_S))
-            bend = float(np.nansum(more - 2 * here + less)) / _REFINED_S**2
+            slope = np.nan_to_num((more - less) / (2 * _DIFFERENCE_STEP_S))
+            bend = float(np.nansum(more - 2 * here + less)) / _DIFFERENCE_STEP_S**2
             spread = float(np.sqrt((np.bincount(block, slope) ** 2).sum()))
             sigma_s = spread / bend if bend > 0 else np.inf
             downhill = -float(slope.sum())
@@ -424,6 +448,6 @@ def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) ->
             start_s, before_s = start_s + step_s, step_s
             if abs(step_s) < 1e-5:
                 break
-        if scatter <= _SCATTER:
+        if scatter <= _SCATTER_RAD:
             return start_s, sigma_s
-        scatter = max(scatter / 2, _SCATTER)
+        scatter = max(scatter / 2, _SCATTER_RAD)

@@ -45,7 +45,8 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-_WAIT_S = 600.0  # for another process; the largest function takes some ten seconds
+# The largest function compiles in ten seconds, and a slow machine may take many times as long.
+_WAIT_S = 600.0
 
 _UNREADABLE = (EOFError, UnpicklingError, OSError, ImportError, AttributeError)
 """Errors of code that was cut short, or whose types are in other modules by now."""

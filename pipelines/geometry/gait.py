@@ -18,14 +18,21 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 SIDES = ("left", "right")
 HEEL_STRIKE, TOE_OFF = "heel_strike", "toe_off"
 
-_CUTOFF_HZ = 6.0  # of the feet; Zeni's low-pass filter of markers
-_TREND_HZ = 0.5  # of the pelvis, below the rate of strides: it sways with every step
-_LEAST_SPEED_MPS = 0.4  # a slow walk; somebody who shifts weight stays below
-_LEAST_SWING_M = 0.2  # of a foot against the pelvis between two events, a third of a slow step
+# Zeni et al. filter the feet with this low pass.
+_CUTOFF_HZ = 6.0
+# The pelvis sways with every step, so its trend lies below the rate of strides.
+_TREND_HZ = 0.5
+# Somebody who shifts weight stays below the speed of a slow walk.
+_MIN_SPEED_MPS = 0.4
+# A foot swings by a third of a slow step at least, against the pelvis.
+_MIN_SWING_M = 0.2
 _STEP_S = (0.2, 1.2)  # shortest and longest time between strikes of both feet: a sprint, a slow walk
-_LEAST_RUN_S = 1.0  # below it, a run of frames has no stride, and its filters no start
-_LONGEST_STEP = 1.5  # in frame steps: frames further apart are in different runs
-_LEAST_STRIKES = 3  # two steps
+# A shorter run of frames has no stride, and its filters have no start.
+_MIN_RUN_S = 1.0
+# Frames that are further apart than this many frame steps are in different runs.
+_MAX_GAP_STEPS = 1.5
+# Three strikes are two steps, the fewest that give a cadence.
+_MIN_STRIKES = 3
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,7 @@ def gait_events(joints: Sequence[str], t_ns: Int64, position: Float) -> GaitEven
     found.sort(key=lambda event: event[:2])
     walked = _with_steps(found, t_ns)
     strikes = np.count_nonzero(np.isfinite(walked.step_s))
-    return walked if strikes >= _LEAST_STRIKES - 1 else None
+    return walked if strikes >= _MIN_STRIKES - 1 else None
 
 
 def summary(events: GaitEvents, t_ns: Int64, joints: Sequence[str]) -> dict[str, object]:
@@ -110,13 +117,13 @@ def _points(joints: Sequence[str], position: Float, name: str) -> Float:
 
 def _runs(t_ns: Int64, known: Bool, step_ns: float) -> list[slice]:
     """List the runs of known frames without pauses that are long enough."""
-    begins = known & np.concatenate([[True], ~known[:-1] | (np.diff(t_ns) > _LONGEST_STEP * step_ns)])
+    begins = known & np.concatenate([[True], ~known[:-1] | (np.diff(t_ns) > _MAX_GAP_STEPS * step_ns)])
     starts = np.flatnonzero(begins)
     runs = []
     limits = [*starts[1:], len(known)][: len(starts)]  # none where no frame is known
     for start, limit in zip(starts, limits, strict=True):
         stop = start + int(np.argmin(np.append(known[start:limit], False)))
-        if (stop - start) * step_ns >= _LEAST_RUN_S * 1e9:
+        if (stop - start) * step_ns >= _MIN_RUN_S * 1e9:
             runs.append(slice(int(start), stop))
     return runs
 
@@ -136,8 +143,8 @@ def _events_of(
         for is_strike, feet in ((True, heels), (False, toes)):
             ahead = np.einsum("td,td->t", feet[side, :, :2] - hips[:, :2], forward)
             smooth = _low_pass(ahead, _CUTOFF_HZ, rate_hz)
-            rows, _ = find_peaks(smooth if is_strike else -smooth, prominence=_LEAST_SWING_M)
-            for row in rows[speed[rows] >= _LEAST_SPEED_MPS].tolist():
+            rows, _ = find_peaks(smooth if is_strike else -smooth, prominence=_MIN_SWING_M)
+            for row in rows[speed[rows] >= _MIN_SPEED_MPS].tolist():
                 apart = heels[side, row, :2] - heels[1 - side, row, :2]
                 length = float(apart @ forward[row])
                 found.append((start + row, side, is_strike, feet[side, row], length, float(speed[row])))

@@ -15,8 +15,11 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 
+# WGS 84 defines its ellipsoid by this semi-major axis.
 _SEMI_MAJOR_M = 6_378_137.0
+# WGS 84 defines its ellipsoid by this flattening.
 _FLATTENING = 1 / 298.257223563
+# The eccentricity of an ellipse follows from its flattening.
 _ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
 
 

@@ -62,13 +62,20 @@ ANGLE_STATUS = (*STATUS, UNDETERMINED, ABSENT)
 """The words of a status: those of joints, and two of angles."""
 
 _OK, _FILLED = STATUS.index("ok"), STATUS.index("filled")
-_BENT = np.radians(20.0)  # the least bend that shows the axis of a hinge: 1 cm of 0.4 m sin(20 deg) is 4 deg
-_RAISED = np.radians(20.0)  # the least elevation of an arm that shows its plane
-_HINGE = np.sin(np.radians(15.0))  # bend at which a knee's own plane and the hips' line weigh the same
-_UPRIGHT = 0.3  # of a line's length: with less of it level, the hips' line has no heading
-_STEP_M = 1e-6  # of the derivatives: their relative error is about this step over a segment's length
-_UNKNOWN_M2 = 1e12  # the variance of a place on Earth that nobody knows
-_AT_ONCE = 2048  # person-times: what a processor's cache holds
+# A hinge bent by less does not show its axis: 1 cm of 0.4 m sin(20 deg) is already 4 deg.
+_MIN_BEND_RAD = np.radians(20.0)
+# An arm raised by less does not show its plane.
+_MIN_ELEVATION_RAD = np.radians(20.0)
+# At this bend a knee's own plane and the line of the hips weigh the same.
+_EQUAL_WEIGHT_SINE = np.sin(np.radians(15.0))
+# The line of the hips has no heading if less of its length is level.
+_MIN_LEVEL_SHARE = 0.3
+# Finite differences have a relative error of about this step over a segment's length.
+_STEP_M = 1e-6
+# A place on Earth that nobody knows has this variance.
+_UNKNOWN_M2 = 1e12
+# A processor's cache holds this many person-times.
+_BLOCK = 2048
 
 
 @dataclass(frozen=True)
@@ -109,8 +116,8 @@ def joint_angles(
     spread = None if covariance is None else covariance.reshape(count, len(joints), 6)
     statuses = status.reshape(count, len(joints))
     groups = [group for group in _groups() if set(group.joints).issubset(joints)]
-    for start in range(0, count, _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
+    for start in range(0, count, _BLOCK):
+        part = slice(start, start + _BLOCK)
         points = np.ascontiguousarray(flat[part].transpose(1, 2, 0))
         spreads = None if spread is None else np.ascontiguousarray(_known(spread[part]).transpose(1, 2, 0))
         for group in groups:
@@ -204,7 +211,7 @@ def _trunk(points: Float) -> Float:
     up = _unit(points[2] + points[3] - points[0] - points[1])
     level = np.hypot(hips[0], hips[1])
     with np.errstate(invalid="ignore"):
-        known = level > _UPRIGHT * np.sqrt(_dot(hips, hips))
+        known = level > _MIN_LEVEL_SHARE * np.sqrt(_dot(hips, hips))
     right = np.stack([hips[0] / level, hips[1] / level, np.zeros_like(level)])
     forward = np.stack([-right[1], right[0], right[2]])  # the vertical times the right
     t_x, t_y, t_z = _dot(up, forward), up[2], _dot(up, right)
@@ -250,7 +257,7 @@ def _hip_rotation(points: Float, side: float) -> Float:
     x = -_unit(_across(shank, up))
     z = _cross(x, up)
     found = np.arctan2(-x[2], z[2])
-    return np.where(_bend(thigh, shank) > _BENT, found, np.nan)[None]
+    return np.where(_bend(thigh, shank) > _MIN_BEND_RAD, found, np.nan)[None]
 
 
 def _knee(points: Float, side: float) -> Float:
@@ -263,7 +270,7 @@ def _knee(points: Float, side: float) -> Float:
     lateral = _unit(_across(points[1] - points[0], thigh))
     backwards = _dot(thigh, shank) < 0  # beyond a right angle the plane is sure
     bend = np.where(backwards, 1.0, np.sqrt(_dot(normal, normal)))
-    axis = _unit(bend * normal + _HINGE**2 * np.where(backwards, 0.0, 1.0) * lateral)
+    axis = _unit(bend * normal + _EQUAL_WEIGHT_SINE**2 * np.where(backwards, 0.0, 1.0) * lateral)
     return np.arctan2(_dot(normal, axis), _dot(thigh, shank))[None]
 
 
@@ -289,13 +296,13 @@ def _shoulder_rotation(points: Float, side: float) -> Float:
     x = _unit(_across(forearm, up))
     z = _cross(x, up)
     elevation = np.arctan2(np.hypot(arm[0], arm[2]), -arm[1])
-    known = _is_raised(elevation) & (_bend(arm, forearm) > _BENT)
+    known = _is_raised(elevation) & (_bend(arm, forearm) > _MIN_BEND_RAD)
     return np.where(known, np.arctan2(-x[1], z[1]), np.nan)[None]
 
 
 def _is_raised(elevation: Float) -> NDArray[np.bool_]:
     """Test if the upper arm is away from both poles, where it has no plane."""
-    return np.asarray((elevation > _RAISED) & (elevation < np.pi - _RAISED))
+    return np.asarray((elevation > _MIN_ELEVATION_RAD) & (elevation < np.pi - _MIN_ELEVATION_RAD))
 
 
 def _elbow(points: Float) -> Float:

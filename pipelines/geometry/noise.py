@@ -30,7 +30,8 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
 )
 
-_LARGEST = 1e6  # of any parameter: larger ones make no sense, and their squares may overflow
+# Larger parameters make no sense, and their squares may overflow.
+_MAX_PARAMETER = 1e6
 
 Frame = Literal["world", "body"]
 
@@ -121,8 +122,8 @@ class _RandomProcess(NoiseModel):
 class _Stationary(_RandomProcess):
     """A process whose standard deviation is the same at any time."""
 
-    position_m: float = 0.0
-    rotation_deg: float = 0.0
+    position_m: float = 0.0  # Nothing is added unless it is stated.
+    rotation_deg: float = 0.0  # Nothing is added unless it is stated.
 
     def _scale(self) -> tuple[float, float]:
         return self.position_m, math.radians(self.rotation_deg)
@@ -174,8 +175,8 @@ class GaussMarkov(_Stationary):
 class Drift(_RandomProcess):
     """A random walk that starts at zero with the first pose."""
 
-    position_m_per_sqrt_s: float = 0.0
-    rotation_deg_per_sqrt_s: float = 0.0
+    position_m_per_sqrt_s: float = 0.0  # Nothing is added unless it is stated.
+    rotation_deg_per_sqrt_s: float = 0.0  # Nothing is added unless it is stated.
 
     def _scale(self) -> tuple[float, float]:
         return self.position_m_per_sqrt_s, math.radians(self.rotation_deg_per_sqrt_s)
@@ -454,8 +455,8 @@ def _check_parameter(name: str, value: object) -> None:
             raise ValueError(f"frame is {value!r} instead of world or body")
     elif not isinstance(value, (int, float)) or isinstance(value, bool):
         raise ValueError(f"{name} is {value!r} instead of a number")
-    elif not 0 <= value <= _LARGEST:
-        raise ValueError(f"{name} is {value}; it must lie between 0 and {_LARGEST:g}")
+    elif not 0 <= value <= _MAX_PARAMETER:
+        raise ValueError(f"{name} is {value}; it must lie between 0 and {_MAX_PARAMETER:g}")
 
 
 def _parse_one(part: str) -> tuple[str, dict[str, object]]:

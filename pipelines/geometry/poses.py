@@ -312,7 +312,8 @@ def _slerp(start: Float, end: Float, fraction: Float) -> Float:
 
 # --- covariances ---------------------------------------------------------------------------------------
 
-_BLOCK = 4096  # poses at a time, so that intermediate arrays stay small for any length of log
+# Intermediate arrays stay small for any length of log with this many poses at a time.
+_BLOCK = 4096
 
 
 def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> Float:

@@ -59,13 +59,16 @@ GATE = 4.0
 STATUS = ("ok", "filled", "few_views", "low_parallax", "rejected", "not_detected", "no_pose")
 """Meanings of `Triangulation.status`; the words of a session's skeleton."""
 
-_MAX_PAIRS = 28  # all of 8 views; above, enough that with half the views bad one pair in 1000 cases is clean
-_BLOCK = 4096  # joint-frames that a thread takes at once
-_NOISE_SAMPLE = 20_000  # joint-frames; a median over them is accurate to one per cent
+# These are all pairs of 8 views. Of more views, even if half are bad, 28 nearly always hold a clean pair.
+_MAX_PAIRS = 28
+# A thread takes this many joint-frames at once.
+_BLOCK = 4096
+# A median over this many joint-frames is accurate to one per cent.
+_NOISE_SAMPLE = 20_000
+# The inliers of the first round set the gate of the second.
 _NOISE_ROUNDS = 2
-_START_WIDTH = (
-    2.0  # a constant pose error gives few different pairs: undoubled, 2 % of draws at n = 3 lost all
-)
+# A constant pose error gives few different pairs: undoubled, 2 % of draws of three cameras lost all joints.
+_START_WIDTH = 2.0
 
 
 @dataclass(frozen=True)
@@ -361,15 +364,16 @@ def _golden_step(n: int) -> int:
 
 # --- gross errors that pose noise would hide -----------------------------------------------------------
 
-_GROSS = 2 * GATE
+_GROSS_GATE = 2 * GATE
 """Gate for gross errors, in standard deviations of the joints' residuals after their picture is moved. A
 rotation of the camera about its axis, or an error of its distance, moves joints by different amounts; these
 are not gross errors."""
 
-_FEWEST = 5
+_MIN_JOINTS = 5
 """Joints that a picture must have: the median of fewer may follow the bad ones."""
 
-_ROUNDS = 2  # the second has residuals of points without gross errors
+# The second round has residuals of points without gross errors.
+_GROSS_ROUNDS = 2
 
 
 def triangulate_pictures(
@@ -407,10 +411,10 @@ def triangulate_pictures(
 def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float, threads: int) -> Bool:
     """Find views [N, C] with gross errors; `points` are approximate positions of the joint-frames."""
     gross = np.zeros(views.weight.shape, dtype=np.bool_)
-    for _ in range(_ROUNDS):
+    for _ in range(_GROSS_ROUNDS):
         moved, judged = _moved(replace(views, pixel_sigma=pixel_sigma), picture, points)
         moved = replace(moved, pixel_sigma=estimate_noise(moved, threads=threads))
-        agreed = locate(moved, method="robust", gate=_GROSS, threads=threads)
+        agreed = locate(moved, method="robust", gate=_GROSS_GATE, threads=threads)
         located = np.isin(agreed.status, (STATUS.index("ok"), STATUS.index("rejected")))
         before, gross = gross, located[:, None] & judged & ~agreed.inlier
         if np.array_equal(before, gross):
@@ -432,7 +436,7 @@ def _moved(views: Views, picture: Int64, points: Float) -> tuple[Views, Bool]:
     move_pictures(
         order,
         starts,
-        _FEWEST,
+        _MIN_JOINTS,
         np.ascontiguousarray(points),
         np.ascontiguousarray(views.rays, np.float64),
         np.ascontiguousarray(views.weight, np.float64),

@@ -25,6 +25,7 @@ OK, FILLED, FEW_VIEWS, LOW_PARALLAX, REJECTED, NOT_DETECTED, NO_POSE = range(7) 
 # Measured on the walk at 5 views, the remaining error is at most 3e-4 standard deviations for pixel noise
 # and 0.1 for 0.5 m / 2 deg (where the covariance changes with the depth); one step more would cost 40 %.
 CONVERGED = 1e-2
+# Shortened steps count as well, so that the loop always ends.
 MAX_STEPS = 10
 
 
