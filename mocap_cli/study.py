@@ -21,7 +21,7 @@ from mocap_cli.terminal import print_json, print_table, say, say_warnings, watch
 def study_command(
     words: tuple[str, ...], output: Path, workers: int, overwrite: bool, force: bool, shown: Shown
 ) -> None:
-    r"""Measure an error for every combination of values, and write a table, metrics.json and a figure.
+    """Measure an error for every combination of values, and write a table, metrics.json and a figure.
 
     VALUES are separated by commas, or numbers as START:STOP:STEP. An interrupted study goes on where it
     stopped. Everything is simulated.
@@ -41,7 +41,7 @@ def study_command(
 
     On a session, planner arms fly again against the log. Variables: arm, range_m, tilt_deg, robots, every
     setting of the planner. With a single value: config (PLANNER.yaml), pose_noise, trials, seed.
-    """
+    """  # noqa: D301  # click keeps the lines of a paragraph that begins with the character \b
     from pipelines.reporting.studies import setting, tables
     from pipelines.session.urls import session_here
     from pipelines.study import study
