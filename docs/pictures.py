@@ -27,7 +27,7 @@ from PIL import Image
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.session.skeletons import bones_of
+from pipelines.session.people import bones_of
 
 DOCS = Path(__file__).parent
 HEIGHT, PANEL, SCENE = 330, 250, 400  # px: of the picture, and widths of a camera's panel and of the scene

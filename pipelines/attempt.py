@@ -82,7 +82,7 @@ from pipelines.session.memory import Waiting
 from pipelines.session.people import LoggedActor, logged_people, true_joints_at
 from pipelines.session.progress import Progress
 from pipelines.session.records import JointMotion
-from pipelines.session.stage_records import StageRecord
+from pipelines.session.stages import StageRecord
 from pipelines.session.tables import ANGLES, CAMERA_POSES, GAIT, SKELETON, Span, join_tables, write_table
 
 if TYPE_CHECKING:

@@ -28,8 +28,7 @@ from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.memory import return_freed_arrays, return_unused
 from pipelines.session.people import logged_people
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.stage_records import StageRecord
-from pipelines.session.stages import WritableSession, locked
+from pipelines.session.stages import StageRecord, WritableSession, locked
 from pipelines.session.tables import Span
 
 _LOOK_S = 8.0

@@ -47,8 +47,7 @@ from pipelines.session.registries import (
     find_detector,
     hashes_of_models,
 )
-from pipelines.session.stage_records import Stage, StageRecord
-from pipelines.session.stages import Run, WritableSession
+from pipelines.session.stages import Run, Stage, StageRecord, WritableSession
 from pipelines.session.storage import hash_of, read_json, write_json
 from pipelines.session.tables import (
     FRAMES,

@@ -51,6 +51,7 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import PoseSample
 from pipelines.session.registries import (
     FORMATS,
+    AttitudeFormat,
     CalibrationFormat,
     Format,
     JointFormat,
@@ -58,11 +59,12 @@ from pipelines.session.registries import (
     Log,
     LogFormat,
     MapFormat,
+    TelemetryChoice,
+    TelemetryFormat,
     TrajectoryFormat,
     VideoFormat,
 )
 from pipelines.session.storage import as_data_error
-from pipelines.session.telemetry import AttitudeFormat, TelemetryChoice, TelemetryFormat
 from pipelines.session.unknown_files import EXPECTED, describe_unknown
 
 # Coordinates beyond it are those of a map projection, m.

@@ -30,8 +30,7 @@ from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Recording
 from pipelines.session.registries import ChoiceOfAxes, ChoiceOfTime, Export, find_export
-from pipelines.session.stage_records import StageRecord
-from pipelines.session.stages import open_session, session_name
+from pipelines.session.stages import StageRecord, open_session, session_name
 from pipelines.session.storage import (
     as_data_error,
     make_folder,
@@ -39,11 +38,11 @@ from pipelines.session.storage import (
     remove_tree,
     sha256_of,
     sync,
+    working_folder,
     write_json,
 )
 from pipelines.session.tables import ANGLES, FRAMES, POSES, SKELETON, read_motion, read_table, trajectory_from
 from pipelines.session.urls import is_there
-from pipelines.session.whole_folders import working_folder
 from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:

@@ -34,11 +34,9 @@ from pipelines.session.people import LoggedActor, logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
 from pipelines.session.registries import Detector, advice_on, find_detector, hashes_of_models
-from pipelines.session.stage_records import Stage, StageRecord
-from pipelines.session.stages import locked
-from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
+from pipelines.session.stages import Stage, StageRecord, locked
+from pipelines.session.storage import SIMULATION_MARK, hash_of, jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import REPLAN, TRUTH, motion_table, read_table, write_table
-from pipelines.session.whole_folders import SIMULATION_MARK
 from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight import Set, build_set
 from pipelines.simulation.rendering.renderer import Renderer

@@ -27,8 +27,7 @@ from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.parallel import SharedSession, contents_of, each_part, write_contents
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.stage_records import Stage, StageRecord
-from pipelines.session.stages import WritableSession
+from pipelines.session.stages import Stage, StageRecord, WritableSession
 from pipelines.session.storage import hash_of, read_json, write_json
 from pipelines.session.tables import FRAMES, TRACKS, join_tables, read_table, rows_between, write_table
 from pipelines.sources.pictures import open_pictures, refuse_changed_pictures

@@ -16,6 +16,7 @@ import numpy as np
 
 from pipelines.formats.common.files import leads_out
 from pipelines.geometry.arrays import Float
+from pipelines.reconstruction.doubts.logs import doubts_of_logs, doubts_of_places
 from pipelines.session.description import (
     ActorEntry,
     CameraEntry,
@@ -31,14 +32,12 @@ from pipelines.session.description import (
     said_doubts,
 )
 from pipelines.session.errors import DataError, MocapError
-from pipelines.session.log_doubts import doubts_of_logs, doubts_of_places
 from pipelines.session.manifest import Axes, CameraSources, LogSource, Manifest, Source, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
 from pipelines.session.registries import MapFormat, noise_models, recognise
-from pipelines.session.stage_records import Stage, StageRecord, note_sources
-from pipelines.session.stages import Run, locked
+from pipelines.session.stages import Run, Stage, StageRecord, locked, note_sources
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.tables import (
     ACTOR,

@@ -40,8 +40,7 @@ from pipelines.session.description import Description, Doubt, read_description, 
 from pipelines.session.errors import DataError
 from pipelines.session.memory import Waiting, return_freed_arrays
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.stage_records import Stage, StageRecord
-from pipelines.session.stages import Run, WritableSession, locked
+from pipelines.session.stages import Run, Stage, StageRecord, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of
 
 __all__ = ["RECONSTRUCT", "Reconstructed", "Settings", "reconstruct"]

@@ -41,8 +41,7 @@ from pipelines.session.maps import load_maps
 from pipelines.session.memory import return_freed_arrays, return_unused
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
-from pipelines.session.stage_records import Stage, StageRecord, key_of, usable_record
-from pipelines.session.stages import WritableSession, locked
+from pipelines.session.stages import Stage, StageRecord, WritableSession, key_of, locked, usable_record
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import (
     ACTOR,

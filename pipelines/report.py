@@ -35,9 +35,26 @@ from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.memory import return_freed_arrays, return_unused
 from pipelines.session.records import Occupancy
-from pipelines.session.stage_records import Stage, StageRecord, outdated, versions_of
-from pipelines.session.stages import Session, locked, open_session, session_name
-from pipelines.session.storage import as_data_error, hash_of, read_json, sha256_of, write_whole
+from pipelines.session.stages import (
+    Session,
+    Stage,
+    StageRecord,
+    locked,
+    open_session,
+    outdated,
+    session_name,
+    versions_of,
+)
+from pipelines.session.storage import (
+    STUDY_MARK,
+    as_data_error,
+    hash_of,
+    is_made,
+    read_json,
+    sha256_of,
+    whole_folder,
+    write_whole,
+)
 from pipelines.session.tables import (
     ACTOR,
     ANGLES,
@@ -57,7 +74,6 @@ from pipelines.session.tables import (
     read_table,
 )
 from pipelines.session.urls import is_there
-from pipelines.session.whole_folders import STUDY_MARK, is_made, whole_folder
 from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:

@@ -29,8 +29,15 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Occupancy, SkeletalMotion
 from pipelines.session.registries import noise_models
-from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
-from pipelines.session.whole_folders import SIMULATION_MARK, is_made, whole_folder
+from pipelines.session.storage import (
+    SIMULATION_MARK,
+    hash_of,
+    is_made,
+    read_json,
+    sha256_of,
+    whole_folder,
+    write_json,
+)
 from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario
 from pipelines.simulation.flight_files import logged_messages, manifest_text, write_keypoints, write_truth

@@ -45,8 +45,18 @@ from pipelines.session.maps import load_maps
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.registries import Detector, find_detector, hashes_of_models
 from pipelines.session.stages import locked
-from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
-from pipelines.session.whole_folders import STUDY_MARK, Making, is_made, refuse_sessions, whole_folder
+from pipelines.session.storage import (
+    STUDY_MARK,
+    Making,
+    hash_of,
+    is_made,
+    jsonable,
+    read_json,
+    refuse_sessions,
+    sha256_of,
+    whole_folder,
+    write_json,
+)
 from pipelines.session.yaml_files import plain_yaml
 from pipelines.simulate import recorded_motions
 from pipelines.simulation.detector_errors import errors_of

@@ -30,8 +30,8 @@ from pipelines.keypoints.calibration import (
     fit,
     write_calibration,
 )
+from pipelines.session.people import get_skeleton
 from pipelines.session.registries import find_detector
-from pipelines.session.skeletons import get_skeleton
 from pipelines.session.stages import locked
 from pipelines.simulate import simulate
 from pipelines.simulation.detector_errors import ANY_JOINT, COLUMNS, MODELLED, errors_of, see, view_of

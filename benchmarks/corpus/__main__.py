@@ -29,8 +29,7 @@ from pipelines.detect import detect
 from pipelines.follow import Following
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import tracks_path
-from pipelines.session.stage_records import StageRecord
-from pipelines.session.stages import locked
+from pipelines.session.stages import StageRecord, locked
 from pipelines.session.tables import KEYPOINTS, TRACKS, read_table
 from pipelines.simulate import simulate
 

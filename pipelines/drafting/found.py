@@ -18,7 +18,7 @@ from pipelines.drafting.labels import (
     label_of,
     label_of_place,
 )
-from pipelines.session.telemetry import Height, Telemetry
+from pipelines.session.records import Height, Telemetry
 
 Kind = Literal[
     "video",

@@ -30,8 +30,8 @@ from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.crops import sampled
 from pipelines.session.errors import DataError
 from pipelines.session.model_files import ModelFile, NpmPackage, PackagedModels, Wheel, find_file
+from pipelines.session.people import get_skeleton
 from pipelines.session.registries import Measured, Person, Region
-from pipelines.session.skeletons import get_skeleton
 
 if TYPE_CHECKING:
     from ai_edge_litert.interpreter import Interpreter

@@ -35,8 +35,8 @@ from pipelines.keypoints.onnx_network import (
     written_shapes,
 )
 from pipelines.session.errors import DataError
+from pipelines.session.people import SKELETONS, get_skeleton, skeleton_with
 from pipelines.session.registries import Person, Region
-from pipelines.session.skeletons import SKELETONS, get_skeleton, skeleton_with
 
 USAGE = """\
 onnx:MODEL.onnx[,option=value...]

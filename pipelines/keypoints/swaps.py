@@ -25,8 +25,8 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.compilation import cached
+from pipelines.session.people import mirrored
 from pipelines.session.records import Detections
-from pipelines.session.skeletons import mirrored
 
 Pair = tuple[int, int]
 

@@ -17,7 +17,7 @@ from pipelines.session.description import CameraEntry, Description, Interpolatio
 from pipelines.session.errors import DataError
 from pipelines.session.people import logged_people
 from pipelines.session.records import JointMotion, Trajectory
-from pipelines.session.stage_records import StageRecord
+from pipelines.session.stages import StageRecord
 from pipelines.session.tables import (
     CAMERA_POSES,
     PLAN,

@@ -24,7 +24,7 @@ from pipelines.session.camera_poses import stated_models, stated_noise
 from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.records import JointMotion, Trajectory
-from pipelines.session.stage_records import StageRecord
+from pipelines.session.stages import StageRecord
 from pipelines.session.tables import (
     FRAMES,
     KEYPOINTS,

@@ -38,7 +38,7 @@ from pipelines.reconstruction.results import poses_table
 from pipelines.reconstruction.solving import pictures_of
 from pipelines.session.description import Interpolation
 from pipelines.session.memory import Waiting
-from pipelines.session.skeletons import bones_of
+from pipelines.session.people import bones_of
 
 if TYPE_CHECKING:
     import pandas as pd

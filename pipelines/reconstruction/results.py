@@ -23,8 +23,8 @@ from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.observations import Camera, Observations
 from pipelines.session.description import Interpolation
+from pipelines.session.people import bones_of
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
-from pipelines.session.skeletons import bones_of
 from pipelines.session.storage import write_json
 from pipelines.session.tables import BONES, JOINT_ERRORS, write_table
 

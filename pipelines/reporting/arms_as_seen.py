@@ -24,7 +24,7 @@ from pipelines.reporting.plates import (
 )
 from pipelines.reporting.replanned import Arm, Replan, Seen
 from pipelines.reporting.wording import listing, plural, quantity, shortened
-from pipelines.session.skeletons import bones_of
+from pipelines.session.people import bones_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -22,7 +22,7 @@ from pipelines.reporting.content import SessionContent, text
 from pipelines.reporting.motion import Motion, middles
 from pipelines.reporting.summary import Summary, summarise
 from pipelines.session.camera_poses import poses_at
-from pipelines.session.skeletons import bones_of
+from pipelines.session.people import bones_of
 from pipelines.session.tables import trajectory_from
 
 _PCK_M = 0.15

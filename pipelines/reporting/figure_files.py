@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.plates import WIDTH_IN, Plate, page_style, settled
 from pipelines.session.errors import DataError
-from pipelines.session.storage import read_json, write_json
-from pipelines.session.whole_folders import refuse_sessions
+from pipelines.session.storage import read_json, refuse_sessions, write_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -48,7 +48,7 @@ from pipelines.reporting.wording import (
     quantity,
     shortened,
 )
-from pipelines.session.skeletons import bones_of, with_derived
+from pipelines.session.people import bones_of, with_derived
 
 if TYPE_CHECKING:
     import pandas as pd

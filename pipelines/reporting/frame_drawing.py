@@ -9,7 +9,7 @@ from pipelines.geometry.arrays import Float, Picture
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.motion import side_of
 from pipelines.reporting.overlays import View
-from pipelines.session.skeletons import bones_of
+from pipelines.session.people import bones_of
 
 Colour = tuple[int, int, int]
 

@@ -25,9 +25,9 @@ from pipelines.reporting.motion import Motion, full_covariance
 from pipelines.reporting.summary import Summary
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Description, Interpolation
+from pipelines.session.people import with_derived
 from pipelines.session.records import Trajectory
-from pipelines.session.skeletons import with_derived
-from pipelines.session.stage_records import StageRecord
+from pipelines.session.stages import StageRecord
 from pipelines.session.storage import read_json
 from pipelines.session.tables import (
     CAMERA_POSES,

@@ -44,7 +44,7 @@ from pipelines.reporting.plates import (
 )
 from pipelines.reporting.summary import Summary
 from pipelines.reporting.wording import listing, quantity, shortened
-from pipelines.session.skeletons import bones_of
+from pipelines.session.people import bones_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -23,8 +23,8 @@ from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.terrain import Surface, surface
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at
+from pipelines.session.people import DERIVED, bones_of
 from pipelines.session.records import Trajectory
-from pipelines.session.skeletons import DERIVED, bones_of
 from pipelines.session.tables import trajectory_from
 
 if TYPE_CHECKING:

@@ -1,4 +1,13 @@
-"""Positions of people that are known without a reconstruction: the logged actor, and true joints."""
+"""Skeletons, and positions of people that are known without a reconstruction: logged actors and true joints.
+
+All skeletons share joint names, so that converting one into another only needs the names. Detectors place
+some of these joints at slightly different points; the differences are constant over time:
+
+* `neck` is the midpoint of the shoulders in body25; body25b's lies above it by 3 % of the body's height.
+* `hip` is the midpoint of the hips; in body25 it is what OpenPose calls MidHip.
+* BlazePose's `foot_index`, the tip of the foot, is called `big_toe`, the nearest joint that others have. Its
+  mouth corners are `left_mouth` and `right_mouth`.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +18,174 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.description import Description
+from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion
 from pipelines.session.tables import ACTOR, Span, read_table
+
+Bone = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """The joints of one detector in the order of its files, and the bones between them."""
+
+    name: str
+    joints: tuple[str, ...]
+    bones: tuple[Bone, ...]
+
+
+DERIVED: tuple[tuple[str, tuple[str, str]], ...] = (
+    ("neck", ("left_shoulder", "right_shoulder")),
+    ("hip", ("left_hip", "right_hip")),
+)
+"""Joints that are computed if a skeleton lacks them: each is the midpoint of its two parents."""
+
+
+def mirrored(joint: str) -> str:
+    """Return the joint on the other side of the body; a joint of the middle is its own mirror."""
+    if joint.startswith("left_"):
+        return "right_" + joint.removeprefix("left_")
+    if joint.startswith("right_"):
+        return "left_" + joint.removeprefix("right_")
+    return joint
+
+
+_LEFT_BONES: tuple[Bone, ...] = (
+    ("left_shoulder", "left_elbow"),
+    ("left_elbow", "left_wrist"),
+    ("left_wrist", "left_pinky"),
+    ("left_wrist", "left_index"),
+    ("left_wrist", "left_thumb"),
+    ("left_shoulder", "left_hip"),
+    ("left_hip", "left_knee"),
+    ("left_knee", "left_ankle"),
+    ("left_ankle", "left_heel"),
+    ("left_ankle", "left_big_toe"),
+    ("left_big_toe", "left_small_toe"),
+    ("nose", "left_eye"),
+    ("left_eye_inner", "left_eye"),
+    ("left_eye", "left_eye_outer"),
+    ("left_eye", "left_ear"),
+)
+_MIDDLE_BONES: tuple[Bone, ...] = (
+    ("left_shoulder", "right_shoulder"),
+    ("left_hip", "right_hip"),
+    ("left_mouth", "right_mouth"),
+    ("neck", "head"),
+    ("neck", "nose"),
+    ("hip", "neck"),
+)
+_ALL_BONES = (*_MIDDLE_BONES, *_LEFT_BONES, *((mirrored(a), mirrored(b)) for a, b in _LEFT_BONES))
+
+
+def bones_of(joints: tuple[str, ...]) -> tuple[Bone, ...]:
+    """Return the bones whose two ends are among `joints`, for drawing and for bone lengths."""
+    there = set(joints)
+    return tuple(bone for bone in _ALL_BONES if there.issuperset(bone))
+
+
+def _both(*parts: str) -> tuple[str, ...]:
+    """List the left and the right joint of each part, side by side."""
+    return tuple(f"{side}_{part}" for part in parts for side in ("left", "right"))
+
+
+def _one_side(side: str, *parts: str) -> tuple[str, ...]:
+    return tuple(f"{side}_{part}" for part in parts)
+
+
+_COCO17 = ("nose", *_both("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle"))
+
+_JOINTS: dict[str, tuple[str, ...]] = {
+    "coco17": _COCO17,
+    "halpe26": (*_COCO17, "head", "neck", "hip", *_both("big_toe", "small_toe", "heel")),
+    "body25": (
+        *("nose", "neck"),
+        *_one_side("right", "shoulder", "elbow", "wrist"),
+        *_one_side("left", "shoulder", "elbow", "wrist"),
+        "hip",
+        *_one_side("right", "hip", "knee", "ankle"),
+        *_one_side("left", "hip", "knee", "ankle"),
+        *("right_eye", "left_eye", "right_ear", "left_ear"),
+        *_one_side("left", "big_toe", "small_toe", "heel"),
+        *_one_side("right", "big_toe", "small_toe", "heel"),
+    ),
+    "coco23": (
+        *_COCO17,
+        *_one_side("left", "big_toe", "small_toe", "heel"),
+        *_one_side("right", "big_toe", "small_toe", "heel"),
+    ),
+    "body25b": (
+        *(*_COCO17, "neck", "head"),
+        *_one_side("left", "big_toe", "small_toe", "heel"),
+        *_one_side("right", "big_toe", "small_toe", "heel"),
+    ),
+    "blazepose33": (
+        "nose",
+        *_one_side("left", "eye_inner", "eye", "eye_outer"),
+        *_one_side("right", "eye_inner", "eye", "eye_outer"),
+        *_both("ear", "mouth", "shoulder", "elbow", "wrist", "pinky", "index", "thumb"),
+        *_both("hip", "knee", "ankle", "heel", "big_toe"),
+    ),
+}
+
+SKELETONS: dict[str, Skeleton] = {
+    name: Skeleton(name, joints, bones_of(joints)) for name, joints in _JOINTS.items()
+}
+"""Every skeleton by the name that `flight.yaml` uses; of two with equal counts the likelier comes first."""
+
+
+def get_skeleton(name: str) -> Skeleton:
+    """Return the skeleton of a name.
+
+    Raises:
+        DataError: no such name; the message lists the existing ones.
+    """
+    if name not in SKELETONS:
+        raise DataError(name, "no such skeleton", f"there are {', '.join(SKELETONS)}", code="no-such-name")
+    return SKELETONS[name]
+
+
+def skeleton_with(count: int) -> tuple[Skeleton, ...]:
+    """Return the skeletons of `count` keypoints, the likelier first: for 25, body25 before body25b."""
+    return tuple(skeleton for skeleton in SKELETONS.values() if len(skeleton.joints) == count)
+
+
+def take_joints(values: Float, joints: tuple[str, ...], wanted: tuple[str, ...], axis: int = -2) -> Float:
+    """Select the entries of the `wanted` joints, in their order.
+
+    Args:
+        values: any floats with one entry per joint along `axis` (positions [..., J, 3] by default).
+        joints: the J joints of `values`.
+        wanted: the joints to return; one that is absent from `joints` is NaN.
+        axis: the axis of the joints.
+    """
+    column = {joint: index for index, joint in enumerate(joints)}
+    source = np.array([column.get(joint, -1) for joint in wanted], dtype=np.int64)
+    by_joint = np.moveaxis(values, axis, 0)
+    taken = np.full((len(wanted), *by_joint.shape[1:]), np.nan)
+    taken[source >= 0] = by_joint[source[source >= 0]]
+    return np.moveaxis(taken, 0, axis)
+
+
+def with_derived(joints: tuple[str, ...], position: Float) -> tuple[tuple[str, ...], Float]:
+    """Append the joints of `DERIVED` that are absent and whose parents are there.
+
+    Args:
+        joints: the J joints of `position`.
+        position: [..., J, D] in any unit; NaN is missing.
+
+    Returns:
+        The joints with the derived ones at the end, and their positions. A derived joint is NaN where a
+        parent is.
+    """
+    for joint, parents in DERIVED:
+        if joint in joints or not set(parents).issubset(joints):
+            continue
+        middle = take_joints(position, joints, parents).mean(axis=-2, keepdims=True)
+        joints = (*joints, joint)
+        position = np.concatenate([position, middle], axis=-2)
+    return joints, position
+
 
 _GAP_NS = 2_000_000_000  # no interpolation between two stamps that are further apart
 

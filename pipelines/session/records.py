@@ -6,15 +6,18 @@ quaternions xyzw, transforms named target_from_source, missing is NaN and never 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.clocks import ClockFit
+from pipelines.geometry.geodesy import Place
+from pipelines.geometry.mounting import RelativeTo
 from pipelines.session.progress import Progress, Silent
 
 if TYPE_CHECKING:
@@ -267,3 +270,68 @@ class Occupancy:
     from_ns: int = 0  # the time from which it holds
     dropped: dict[str, int] = field(default_factory=dict)
     crs: str | None = None
+
+
+# --- drones' own logs ---
+
+Height = Literal["sea level", "ellipsoid", "take-off", "stated", "unknown"]
+"""The zero level of the heights of geodetic positions."""
+
+
+@dataclass(frozen=True)
+class PositionTrack:
+    """A drone's positions over time: on Earth, or in metres from the origin of its estimator.
+
+    Stamps strictly increase and every number is finite, as in `Trajectory`.
+    """
+
+    name: str  # as the log calls it, for messages
+    t_ns: Int64  # [N]
+    values: Float  # [N, 3] latitude deg, longitude deg, height m; or metres east, north, up
+    on_earth: bool  # True for latitude, longitude, height; False for metres
+    height: Height = "unknown"  # of positions on Earth
+    origin: Place | None = None  # of metres: the place on Earth of their zero, if known
+    accuracy_m: tuple[float, float] | None = None  # horizontal and vertical sigma from the log itself
+
+
+@dataclass(frozen=True)
+class AttitudeTrack:
+    """The attitude of a body or a gimbal over time; stamps strictly increase.
+
+    A body (FLU) is relative to an ENU world. A gimbal (FLU, x along the camera's view) is relative to the
+    world, to its body, or to a level frame with the heading of the body.
+    """
+
+    name: str
+    t_ns: Int64  # [N]
+    quaternion_xyzw: Float  # [N, 4] unit
+    relative_to: RelativeTo = "world"
+    stated: Mapping[RelativeTo, Float] = field(default_factory=dict)
+    """[N, 4] of a gimbal: its logged angles (FRD), by the reference frame that the user may state."""
+    dropped: dict[str, int] = field(default_factory=dict)  # for a log that holds only this track
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """A drone's positions, attitudes and gimbal angles from its own log, at times of one clock."""
+
+    position: PositionTrack
+    body: AttitudeTrack | None
+    gimbal: AttitudeTrack | None
+    clock: str  # zero of the times: "UTC by GPS", "boot", "the drone's clock", "the video's start"
+    fit: ClockFit | None = None  # of the log's own clock to GPS time, if it was used
+    notes: tuple[str, ...] = ()  # choices that the reader made, and doubts
+    dropped: dict[str, int] = field(default_factory=dict)
+    video_began: tuple[int, float] | None = None
+    """Start of the video that holds the log, ns, by the clock of its times, with standard deviation, s."""
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """Attitudes of a camera by the telemetry of its video, or by another log, which may lack positions."""
+
+    camera: AttitudeTrack  # relative to the world
+    clock: str  # as in `Telemetry`
+    knows_north: bool = True  # False: it looks north in the first picture, and only its turns are known
+    video_began_ns: int | None = None  # by the clock of the times; None for a log that is no video
+    notes: tuple[str, ...] = ()

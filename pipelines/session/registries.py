@@ -15,27 +15,31 @@ from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points, requires
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.noise import NoiseModel, build, parse
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
+    Attitudes,
     CalibratedCamera,
     Detections,
     JointMotion,
     Message,
     Occupancy,
     Recording,
+    Telemetry,
     Topic,
     Trajectory,
     VideoIndex,
 )
 from pipelines.session.storage import refuse_special, sha256_of
 from pipelines.session.unknown_files import describe_unknown
+from pipelines.session.yaml_files import Part
 
 T = TypeVar("T")
 
@@ -84,6 +88,46 @@ class CalibrationFormat(Format, Protocol):
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
         """Read every camera; the world's axes are those of the file."""
+
+
+class TelemetryChoice(Part):
+    """Options of a drone's own log."""
+
+    position: Literal["local", "global", "gps"] | None = None
+    """Estimate of the position that is read."""
+    instance: int | None = Field(None, ge=0, le=255)
+    """Number of the estimator, receiver or vehicle."""
+    time: Literal["gps", "boot"] | None = None
+    """Clock of the times: UTC by GPS, or seconds since the start of the autopilot."""
+    altitude: Literal["relative", "absolute"] | float | None = None
+    """Heights above the take-off, above the sea, or a height in metres that was held throughout."""
+
+
+@runtime_checkable
+class TelemetryFormat(Format, Protocol):
+    """Logs that drones write themselves: positions, attitudes, gimbal angles, moments of pictures.
+
+    An attribute `choices` lists the fields of `TelemetryChoice` that users may state; without it, none.
+    """
+
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Read position and attitudes, in ENU and FLU; raise DataError if there is no position."""
+
+
+@runtime_checkable
+class AttitudeFormat(Format, Protocol):
+    """Logs whose angles of the camera are of use without their positions."""
+
+    def read_attitudes(self, path: Path) -> Attitudes:
+        """Read the attitudes of the camera, in ENU and FLU; raise DataError if there are none."""
+
+
+@runtime_checkable
+class TriggerFormat(Format, Protocol):
+    """Logs with the times at which pictures were triggered."""
+
+    def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
+        """Read the trigger times of pictures, ns, increasing; raise DataError if the log has none."""
 
 
 @runtime_checkable

@@ -17,9 +17,10 @@ from pipelines.session.registries import (
     Format,
     KeypointFormat,
     LogFormat,
+    TelemetryChoice,
+    TelemetryFormat,
     TrajectoryFormat,
 )
-from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat
 from pipelines.session.yaml_files import Part, describe_problem
 
 O = TypeVar("O", bound=Part)

@@ -25,13 +25,13 @@ from pipelines.session.registries import need
 from pipelines.session.storage import (
     as_data_error,
     hash_of,
+    held,
     read_json,
     remove_tree,
     sha256_of,
     sync_tree,
     write_json,
 )
-from pipelines.session.whole_folders import held
 
 # fsspec has many more, some of which open files of this machine, archives, or other URLs.
 SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "http", "https", "file")
@@ -387,7 +387,7 @@ class _PrivateAddressError(OSError):
 
 async def _public_client(**options: Any) -> Any:
     """Make a web client that connects to public addresses alone, also after a redirection."""
-    aiohttp = need("aiohttp", "s3")
+    import aiohttp  # s3fs brings it
 
     def connect(address: tuple[Any, ...]) -> socket.socket:
         family, kind, protocol, _, place = address

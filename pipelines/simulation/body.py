@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
 from pipelines.geometry.poses import matrix_from_quaternion, multiply
-from pipelines.session.skeletons import get_skeleton
+from pipelines.session.people import get_skeleton
 from pipelines.simulation.body_outfits import (
     BUILDS,
     OUTFITS,

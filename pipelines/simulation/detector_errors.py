@@ -17,7 +17,7 @@ from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import invert, transform
 from pipelines.session.errors import DataError
-from pipelines.session.skeletons import mirrored
+from pipelines.session.people import mirrored
 from pipelines.simulation.scenario import DetectorErrors, ModelledDetector
 
 MODELLED: tuple[str, ...] = get_args(ModelledDetector)

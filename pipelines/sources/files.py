@@ -11,19 +11,21 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import CameraSources, KeypointSource, Manifest, Source, TruthSource
 from pipelines.session.records import CalibratedCamera, Detections, JointMotion, VideoIndex
 from pipelines.session.registries import (
+    AttitudeFormat,
     CalibrationFormat,
     Format,
     JointFormat,
     KeypointFormat,
     LogFormat,
     MapFormat,
+    TelemetryFormat,
     TrajectoryFormat,
+    TriggerFormat,
     VideoFormat,
     recognise,
     recognise_any,
 )
 from pipelines.session.source_options import CameraOfCalibration, DetectorOutput, options_of
-from pipelines.session.telemetry import AttitudeFormat, TelemetryFormat, TriggerFormat
 from pipelines.session.urls import located
 from pipelines.session.yaml_files import Part
 from pipelines.sources.world import losses

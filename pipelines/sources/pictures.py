@@ -15,7 +15,7 @@ from pipelines.session.description import Description, MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample
 from pipelines.session.registries import Log, LogFormat, recognise
-from pipelines.session.stage_records import noted_stamps
+from pipelines.session.stages import noted_stamps
 from pipelines.session.storage import file_stamp, sha256_of
 from pipelines.session.urls import located
 

@@ -47,23 +47,18 @@ from pipelines.session.manifest import (
     PlanSource,
     PoseSource,
 )
-from pipelines.session.records import Occupancy, Trajectory
+from pipelines.session.records import AttitudeTrack, Occupancy, PositionTrack, Telemetry, Trajectory
 from pipelines.session.registries import (
+    AttitudeFormat,
     CalibrationFormat,
     Format,
+    TelemetryChoice,
+    TelemetryFormat,
     TrajectoryFormat,
+    TriggerFormat,
     recognise,
 )
 from pipelines.session.source_options import FiledPose, LoggedAngles, LoggedPose
-from pipelines.session.telemetry import (
-    AttitudeFormat,
-    AttitudeTrack,
-    PositionTrack,
-    Telemetry,
-    TelemetryChoice,
-    TelemetryFormat,
-    TriggerFormat,
-)
 from pipelines.session.urls import located
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs

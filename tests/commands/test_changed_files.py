@@ -22,7 +22,7 @@ from pipelines.reconstruct import Settings, reconstruct
 from pipelines.report import compare_sessions
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
-from pipelines.session.stage_records import COMMANDS
+from pipelines.session.stages import COMMANDS
 from pipelines.session.storage import read_json, sha256_of
 from tests.commands.runner import content, refused, succeeds
 from tests.commands.test_overlay import filmed_flight

@@ -17,8 +17,7 @@ from pipelines.keypoints.hints import Hint, actor_hints, hint_sigma
 from pipelines.session.description import read_description
 from pipelines.session.people import logged_actor
 from pipelines.session.records import Trajectory
-from pipelines.session.stage_records import StageRecord
-from pipelines.session.stages import locked
+from pipelines.session.stages import StageRecord, locked
 from pipelines.session.storage import read_json
 from pipelines.session.tables import trajectory_from
 from tests.commands.runner import mocap

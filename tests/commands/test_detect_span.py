@@ -11,8 +11,7 @@ from pipelines.detect import detect
 from pipelines.formats.videos.video import VideoReader
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
-from pipelines.session.stage_records import StageRecord
-from pipelines.session.stages import locked
+from pipelines.session.stages import StageRecord, locked
 from tests.commands.runner import mocap, refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, FPS, spot_detector, write_spotted_flight
 from tests.synthetic.flights import write_flight

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from pipelines.reconstruction import refining
-from pipelines.session.skeletons import mirrored
+from pipelines.session.people import mirrored
 from tests.commands.runner import mocap, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 

@@ -18,7 +18,7 @@ import pytest
 from pipelines.geometry.cameras import project
 from pipelines.session.description import read_description
 from pipelines.session.registries import EXPORTS, FORMATS, NOISE_MODELS
-from pipelines.session.stage_records import COMMANDS
+from pipelines.session.stages import COMMANDS
 from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 

@@ -12,7 +12,7 @@ import pytest
 from pipelines import report as stage
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
-from pipelines.session.whole_folders import STUDY_MARK
+from pipelines.session.storage import STUDY_MARK
 from pipelines.study import study
 from tests.commands.runner import content, refused, succeeds
 from tests.synthetic.flights import write_flight

@@ -19,8 +19,8 @@ from pipelines.keypoints.tracking import TrackedPerson
 from pipelines.planning.comparison import capped_mm
 from pipelines.replan import fly_and_measure
 from pipelines.session.errors import DataError
+from pipelines.session.people import get_skeleton
 from pipelines.session.registries import Person, Region
-from pipelines.session.skeletons import get_skeleton
 from pipelines.simulation import studies
 from pipelines.simulation.sightings import RANGE_M, exact_keypoints, formation, views_of, walk
 from pipelines.study import Studied, study, values_of

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pipelines.geometry.triangulation import STATUS
+from pipelines.session.people import SKELETONS
 from pipelines.session.records import JointMotion
-from pipelines.session.skeletons import SKELETONS
 
 NAMES = sorted({joint for skeleton in SKELETONS.values() for joint in skeleton.joints} | {"C7", "RASI"})
 

@@ -16,16 +16,19 @@ from pipelines.report import report
 from pipelines.session.errors import MocapError
 from pipelines.session.registries import (
     FORMATS,
+    AttitudeFormat,
     CalibrationFormat,
     Format,
     JointFormat,
     KeypointFormat,
     LogFormat,
     MapFormat,
+    TelemetryChoice,
+    TelemetryFormat,
     TrajectoryFormat,
+    TriggerFormat,
     VideoFormat,
 )
-from pipelines.session.telemetry import AttitudeFormat, TelemetryChoice, TelemetryFormat, TriggerFormat
 
 
 class NotOneLineError(AssertionError):

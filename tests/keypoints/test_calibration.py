@@ -19,7 +19,7 @@ from pipelines.keypoints.calibration import (
     write_calibration,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.skeletons import get_skeleton
+from pipelines.session.people import get_skeleton
 
 COCO17 = get_skeleton("coco17").joints
 WRISTS = [joint.endswith("wrist") for joint in COCO17]

@@ -14,8 +14,8 @@ from pipelines.geometry.arrays import Picture
 from pipelines.keypoints.onnx_network import OnnxNetwork
 from pipelines.keypoints.onnx_pose import DETECTOR, OnnxPose
 from pipelines.session.errors import DataError
+from pipelines.session.people import get_skeleton
 from pipelines.session.registries import Region
-from pipelines.session.skeletons import get_skeleton
 from tests.keypoints.onnx_graphs import constant_model, heatmap_model, simcc_model, spots
 
 GREY = "mean=0/0/0,std=255/255/255"  # brightness as it is: 0..1

@@ -30,8 +30,7 @@ from unittest.mock import patch
 import numpy as np
 
 from pipelines.session.errors import DataError
-from pipelines.session.stage_records import STAGES
-from pipelines.session.stages import open_session
+from pipelines.session.stages import STAGES, open_session
 from tests.commands.runner import content, mocap, succeeds
 from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 from tests.kills.killing import SCENARIO, SMALL_STUDY, kept

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.session.errors import DataError
-from pipelines.session.skeletons import (
+from pipelines.session.people import (
     DERIVED,
     SKELETONS,
     bones_of,

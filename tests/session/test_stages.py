@@ -22,8 +22,17 @@ import numpy as np
 import pytest
 
 from pipelines.session.errors import BusyError, DataError
-from pipelines.session.stage_records import COMMANDS, SCHEMA, NewerSchemaError, Stage, key_of, versions_of
-from pipelines.session.stages import Run, locked, open_session
+from pipelines.session.stages import (
+    COMMANDS,
+    SCHEMA,
+    NewerSchemaError,
+    Run,
+    Stage,
+    key_of,
+    locked,
+    open_session,
+    versions_of,
+)
 from pipelines.session.storage import read_json, sha256_of, write_json
 
 INGEST = Stage("ingest", 1)

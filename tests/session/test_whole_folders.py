@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.session.errors import BusyError, DataError
-from pipelines.session.storage import write_json
-from pipelines.session.whole_folders import Making, is_made, whole_folder
+from pipelines.session.storage import Making, is_made, whole_folder, write_json
 
 MARK = "mark.json"
 
@@ -103,7 +102,7 @@ def test_a_kill_between_the_two_renames_is_mended(tmp_path: Path, monkeypatch: p
 
     with monkeypatch.context() as patched:
         patched.setattr(Making, "publish", killed)
-        patched.setattr("pipelines.session.whole_folders._put_back", lambda *_: None)
+        patched.setattr("pipelines.session.storage._put_back", lambda *_: None)
         with pytest.raises(SystemExit):
             make(target, "new")
     assert not target.exists()

@@ -11,8 +11,8 @@ import pytest
 
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
+from pipelines.session.people import mirrored
 from pipelines.session.registries import find_detector
-from pipelines.session.skeletons import mirrored
 from pipelines.simulation.detector_errors import (
     COLUMNS,
     HIDDEN_CONFIDENCE,

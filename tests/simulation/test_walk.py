@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
-from pipelines.session.skeletons import mirrored
+from pipelines.session.people import mirrored
 from tests.synthetic.walk import COCO17, route, stride_m, walk
 
 LIMBS = {  # fractions of the body's height, Drillis & Contini

@@ -36,7 +36,7 @@ from pipelines.reconstruct import Settings, reconstruct
 from pipelines.reconstruction.doubts.diagnosis import Diagnosis
 from pipelines.reconstruction.doubts.scene import Sampled
 from pipelines.session.errors import MocapError
-from pipelines.session.skeletons import SKELETONS
+from pipelines.session.people import SKELETONS
 from pipelines.session.tables import POSES, read_table, trajectory_from
 from pipelines.simulate import simulate
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.session.skeletons import get_skeleton
+from pipelines.session.people import get_skeleton
 
 SIDES = ("left", "right")
 COCO17 = get_skeleton("coco17").joints

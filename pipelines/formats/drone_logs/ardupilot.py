@@ -37,8 +37,8 @@ from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import RelativeTo, attitude_in_enu
 from pipelines.session.errors import DataError
-from pipelines.session.registries import need
-from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
+from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
+from pipelines.session.registries import TelemetryChoice, need
 
 _START = b"\xa3\x95\x80"  # a FMT message: the first of every log
 _MOST_DEFINITIONS = 10_000  # a log has one for each of up to 256 types, and chance makes one in 16 MB

@@ -38,8 +38,9 @@ from pipelines.formats.drone_logs.dji_subtitles import (
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
+from pipelines.session.records import Attitudes, Telemetry
+from pipelines.session.registries import TelemetryChoice
 from pipelines.session.storage import as_data_error, refuse_special, text_encoding
-from pipelines.session.telemetry import Attitudes, Telemetry, TelemetryChoice
 
 _FIRST_YEAR, _LAST_YEAR = 1970, 2200  # of dates; others are damage
 _LONGEST_S = 1e6  # of a record, from its start: more is damage

@@ -36,8 +36,9 @@ from pipelines.formats.drone_logs.telemetry_rows import (
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
+from pipelines.session.records import Attitudes, AttitudeTrack, Height, Telemetry
+from pipelines.session.registries import TelemetryChoice
 from pipelines.session.storage import code_of, plain_text
-from pipelines.session.telemetry import Attitudes, AttitudeTrack, Height, Telemetry, TelemetryChoice
 
 _HIGHEST_M = 500  # above the take-off: the largest height that DJI's drones reach
 

@@ -43,7 +43,8 @@ from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.geometry.poses import conjugate, interpolate_points, multiply, rotate
 from pipelines.session.errors import DataError, NoPositionsError
-from pipelines.session.telemetry import Attitudes, Height, Telemetry, TelemetryChoice
+from pipelines.session.records import Attitudes, Height, Telemetry
+from pipelines.session.registries import TelemetryChoice
 
 _KINDS = {
     "b": "i1",

@@ -19,8 +19,9 @@ from pipelines.geometry.poses import (
     multiply,
 )
 from pipelines.session.errors import DataError, NoPositionsError
+from pipelines.session.records import AttitudeTrack, Height, PositionTrack, Telemetry
+from pipelines.session.registries import TelemetryChoice
 from pipelines.session.storage import code_of
-from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry, TelemetryChoice
 
 _UNEVEN_S = 0.5  # scatter of GPS times beyond what late messages explain
 _HELD_NS = 1_000_000_000  # receivers on drones report at least once a second

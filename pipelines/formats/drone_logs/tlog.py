@@ -33,8 +33,8 @@ from pipelines.formats.drone_logs.ulog import Columns, Topic, telemetry_of
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.session.errors import DataError
-from pipelines.session.registries import need
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import TelemetryChoice, need
 
 _STAMP = 8  # bytes of the station's clock before each packet
 _MARKS = re.compile(rb"[\xfd\xfe]")

@@ -37,8 +37,8 @@ from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place, enu_from_enu
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
-from pipelines.session.registries import need
-from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
+from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
+from pipelines.session.registries import TelemetryChoice, need
 
 _FAR_OFF_NS = 5_000_000_000  # a stamp this far from most others is wrong
 _3D_FIX = 3

@@ -13,8 +13,8 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
+from pipelines.session.people import SKELETONS, Skeleton, get_skeleton, skeleton_with
 from pipelines.session.records import Detections
-from pipelines.session.skeletons import SKELETONS, Skeleton, get_skeleton, skeleton_with
 from pipelines.session.storage import code_of
 
 _SAMPLED_FILES = 8

@@ -21,7 +21,7 @@ from pipelines.formats.keypoint_files.keypoint_people import (
 )
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.skeletons import SKELETONS
+from pipelines.session.people import SKELETONS
 
 
 class OpenPose(KeypointFile):

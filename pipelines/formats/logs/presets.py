@@ -40,15 +40,8 @@ from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes
-from pipelines.session.records import Message, Topic
-from pipelines.session.registries import Log
-from pipelines.session.telemetry import (
-    AttitudeTrack,
-    Height,
-    PositionTrack,
-    Telemetry,
-    TelemetryChoice,
-)
+from pipelines.session.records import AttitudeTrack, Height, Message, PositionTrack, Telemetry, Topic
+from pipelines.session.registries import Log, TelemetryChoice
 
 Preset = Literal["dji_osdk", "mavros", "px4"]
 Position = Literal["local", "global", "gps"]

@@ -18,8 +18,8 @@ from pipelines.formats.logs.messages import FAULTS, Stamps, unreadable
 from pipelines.geometry.arrays import Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.session.errors import DataError
-from pipelines.session.registries import Log
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import Log, TelemetryChoice
 
 _STAMPS = ("timestamp", "timestamp_sample")
 _FIELDS: dict[str, tuple[str, ...]] = {

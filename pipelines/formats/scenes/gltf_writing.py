@@ -23,8 +23,8 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import multiply
 from pipelines.session.errors import DataError
+from pipelines.session.people import bones_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
-from pipelines.session.skeletons import bones_of, with_derived
 
 _HZ = 30.0
 _JOINT_M, _BONE_M = 0.022, 0.014  # radius of the spheres, half the width of the bars

@@ -48,8 +48,8 @@ from pipelines.formats.videos.video_writing import H264Stream
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, rescaled
 from pipelines.session.errors import DataError
+from pipelines.session.people import bones_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
-from pipelines.session.skeletons import bones_of, with_derived
 
 _CHUNK_BYTES = 1 << 20
 _STAMPS = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}

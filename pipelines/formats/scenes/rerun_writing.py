@@ -34,9 +34,9 @@ from pipelines.formats.videos.video_writing import H264Stream
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics, camera_matrix, rescaled
 from pipelines.session.errors import DataError
+from pipelines.session.people import bones_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import need
-from pipelines.session.skeletons import bones_of, with_derived
 
 _PATH_HZ = 10.0
 _JOINT_M, _PICTURE_PLANE_M = 0.025, 1.0

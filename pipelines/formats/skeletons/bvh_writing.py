@@ -39,8 +39,8 @@ from pipelines.geometry.poses import (
     rotate,
 )
 from pipelines.session.errors import DataError
+from pipelines.session.people import take_joints, with_derived
 from pipelines.session.records import JointMotion, Recording, SkeletalMotion
-from pipelines.session.skeletons import take_joints, with_derived
 
 _IN_FILE = {"y-up": [1, 2, 0], "z-up": [0, 1, 2]}  # indices of the world's axes that are the file's x, y, z
 _DECIMALS = 6  # of a degree and of the unit

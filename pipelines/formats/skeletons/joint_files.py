@@ -26,9 +26,9 @@ from pipelines.formats.poses.trajectory_files import write_pose_csv
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.errors import DataError
+from pipelines.session.people import SKELETONS
 from pipelines.session.progress import Progress
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording, Trajectory
-from pipelines.session.skeletons import SKELETONS
 from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, pose_table, write_table
 
 if TYPE_CHECKING:

@@ -23,9 +23,9 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.joint_angles import ANGLES
 from pipelines.session.errors import DataError
 from pipelines.session.model_files import ModelFile, PackagedModels, Wheel
+from pipelines.session.people import SKELETONS
 from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import need
-from pipelines.session.skeletons import SKELETONS
 
 if TYPE_CHECKING:
     import pandas as pd

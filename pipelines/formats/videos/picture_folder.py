@@ -17,8 +17,8 @@ import numpy as np
 from pipelines.formats.drone_logs.dji_subtitles import DjiRows, any_finite, telemetry_of_rows
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.session.errors import DataError
-from pipelines.session.records import VideoIndex
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.records import Telemetry, VideoIndex
+from pipelines.session.registries import TelemetryChoice
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 _HEAD = 512 * 1024  # bytes in which cameras write XMP

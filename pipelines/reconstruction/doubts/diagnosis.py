@@ -42,6 +42,7 @@ from pipelines.reconstruction.doubts.hypotheses import (
     relative_to,
     turn_about,
 )
+from pipelines.reconstruction.doubts.logs import doubts_of_logs
 from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
 from pipelines.reconstruction.doubts.score import (
     STATURE_M,
@@ -60,7 +61,6 @@ from pipelines.reconstruction.doubts.turning import (
     turns_of,
 )
 from pipelines.session.description import Description, Doubt
-from pipelines.session.log_doubts import doubts_of_logs
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
 

@@ -18,8 +18,8 @@ from pipelines.formats.drone_logs.dji_records import BINARY, FORMAT, recordings_
 from pipelines.geometry.geodesy import Place, enu_from_geodetic
 from pipelines.geometry.poses import rotate
 from pipelines.session.errors import DataError
-from pipelines.session.registries import FORMATS
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import FORMATS, TelemetryChoice
 from tests.commands.runner import refused
 from tests.formats.refusals import refuses
 from tests.real_data import real_data

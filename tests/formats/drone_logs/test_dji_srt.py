@@ -13,7 +13,8 @@ from pipelines.formats.drone_logs.dji_subtitles import DJI_SRT as FORMAT
 from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
 from pipelines.formats.drone_logs.telemetry_rows import between_refreshed_angles, between_repeats
 from pipelines.geometry.poses import rotate
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import TelemetryChoice
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 

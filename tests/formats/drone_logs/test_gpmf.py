@@ -19,8 +19,8 @@ from pipelines.geometry.poses import (
     rotate,
     rotation_vector_from_quaternion,
 )
-from pipelines.session.registries import VideoFormat, recognise
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import TelemetryChoice, VideoFormat, recognise
 from tests.commands.runner import succeeds
 from tests.formats.refusals import refuses
 from tests.real_data import real_data

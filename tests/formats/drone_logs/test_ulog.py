@@ -14,7 +14,8 @@ import pytest
 from pipelines.formats.drone_logs.ulog import FORMAT
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import conjugate, multiply
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import TelemetryChoice
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from pipelines.formats.keypoint_files.result_files import MMPOSE as FORMAT
 from pipelines.session.errors import DataError
+from pipelines.session.people import get_skeleton
 from pipelines.session.registries import FORMATS, KeypointFormat, recognise
-from pipelines.session.skeletons import get_skeleton
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 

@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.keypoint_files.result_files import OPENPOSE as FORMAT
+from pipelines.session.people import take_joints
 from pipelines.session.registries import KeypointFormat, recognise
-from pipelines.session.skeletons import take_joints
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 

@@ -22,8 +22,8 @@ from pipelines.formats.logs.px4_topics import read_px4
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import rotate
 from pipelines.session.errors import DataError
-from pipelines.session.registries import LogFormat, recognise
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import LogFormat, TelemetryChoice, recognise
 from tests.real_data import real_data
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap, write_ros2

@@ -18,9 +18,9 @@ from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.skeletons.bvh_writing import fit_rig
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, multiply, rotate
+from pipelines.session.people import take_joints, with_derived
 from pipelines.session.records import JointMotion, SkeletalMotion
 from pipelines.session.registries import ChoiceOfAxes
-from pipelines.session.skeletons import take_joints, with_derived
 from tests.formats.exported import Listener, recording, walking, without
 from tests.formats.refusals import refuses
 

@@ -19,8 +19,7 @@ from pipelines.formats.videos.picture_folder import (
     picture_times,
 )
 from pipelines.geometry.poses import rotate
-from pipelines.session.registries import VideoFormat, recognise
-from pipelines.session.telemetry import TelemetryChoice
+from pipelines.session.registries import TelemetryChoice, VideoFormat, recognise
 from tests.commands.runner import mocap, refused, succeeds
 from tests.formats.refusals import refuses
 
