@@ -351,7 +351,9 @@ class _FlightReader:
         motion = self._files.true_joints(truth) if truth.file else None
         if motion is not None and truth.file is not None:
             place = located(base, truth.file)
-            motion = replace(motion, position=self._poses.joints(place, motion.position))
+            own_axes = truth.axes is not None
+            position = self._poses.joints(place, motion.position, own_axes=own_axes)
+            motion = replace(motion, position=position)
             refuse_no_overlap(named(base, truth.file), motion.t_ns, entries)
             write_table(folder / "truth.parquet", motion_table(motion), TRUTH)
         missing, dropped = self._note_truth_missing(motion) if motion else (0, {})

@@ -72,6 +72,8 @@ class PlaceEntry(Entry):
 
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m
     yaw_deg: float = 0.0
+    rotation_xyzw: tuple[float, float, float, float] | None = None  # in place of the yaw
+    scale: float = 1.0
 
 
 class PosesEntry(Entry):

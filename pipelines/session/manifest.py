@@ -35,6 +35,7 @@ SCHEMA = 1
 _MAX_FRAME_NUMBER = 10**9
 
 Axes = Literal["enu", "ned"]
+Up = Literal["z", "-z", "y", "-y", "x", "-x"]
 Unit = Literal["m", "cm", "mm", "ft"]
 Side = Annotated[int, Field(gt=0, le=100_000)]
 """Pixels along one side of a picture."""
@@ -124,10 +125,20 @@ class WorldAxes(Guess):
 
     frame: Axes = "enu"
     """Axes of all sources that do not state their own: east, north, up or north, east, down."""
+    up: Up = "z"
+    """Axis that points up in all sources that do not state their own axes."""
+    scale: float = Field(1.0, gt=0)
+    """Metres in a unit of all sources that do not state their own axes."""
     origin: WorldOrigin | None = None
     """Place on Earth of the world's origin; without it, the first position of the first camera."""
     crs: str | None = None
     """Map projection of all positions that are coordinates of one, `EPSG:32632` for example."""
+
+    @model_validator(mode="after")
+    def _one_way_up(self) -> WorldAxes:
+        if self.frame == "ned" and self.up != "z":
+            raise ValueError("up: frame: ned has z down: leave one of them out")
+        return self
 
 
 class LogClock(Part):
@@ -146,6 +157,16 @@ class Placement(Part):
     """Place in the world of the source's zero, m."""
     yaw_deg: float = 0.0
     """Angle from the world's axes to the source's about the vertical, degrees."""
+    rotation_xyzw: Quaternion | None = None
+    """Rotation from the source's axes to the world's, in place of `yaw_deg`."""
+    scale: float = Field(1.0, gt=0)
+    """Metres in the world for a metre of the source."""
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> Placement:
+        if self.yaw_deg and self.rotation_xyzw is not None:
+            raise ValueError("has yaw_deg and rotation_xyzw: leave one of them out")
+        return self
 
 
 class LogSource(Guess):
@@ -410,8 +431,10 @@ class TruthSource(Source):
 
     unit: Literal["m", "cm", "mm"] | None = None
     """Unit of the joints, where the file does not state it."""
+    subject: str | None = None
+    """Name of the person before the joints' names, in a file of several."""
     axes: Literal["z-up", "y-up", "ned"] | None = None
-    """Axes of the joints, where the file does not state them."""
+    """Axes of the joints, where they are neither the file's own nor those of the world."""
     offset_s: Seconds = 0.0
     """Seconds that are added to the times of the joints."""
     poses: dict[str, str] = {}

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from pipelines.formats.skeletons.joint_files import joint_names
 from pipelines.formats.videos.frame_times import FrameTimesFormat
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import CameraSources, KeypointSource, Manifest, Source, TruthSource
@@ -158,6 +159,10 @@ class FlightFiles:
             )
         return cameras[camera or name]
 
+    def has_world_axes(self, source: TruthSource) -> bool:
+        """Return True if joints are in axes of the world that are not z up."""
+        return source.axes is None and self._flight.world.up != "z"
+
     def true_joints(self, source: TruthSource) -> JointMotion:
         """Read the true joints; drop and count positions too far from the others to be true.
 
@@ -174,7 +179,9 @@ class FlightFiles:
                 code="axes-unknown",
             )
         is_ned = source.axes == "ned"
-        motion = reader.read_joints(path, unit=source.unit, axes="z-up" if is_ned else source.axes)
+        axes = "z-up" if is_ned or self.has_world_axes(source) else source.axes
+        motion = reader.read_joints(path, unit=source.unit, axes=axes)
+        motion = _of_subject(path, motion, source.subject)
         if is_ned:
             motion = replace(motion, position=motion.position[..., [1, 0, 2]] * [1, 1, -1])
         motion = _without_far_joints(motion)
@@ -184,6 +191,30 @@ class FlightFiles:
                 path, f"holds no position of a joint{lost}", "check what wrote it", code="no-positions"
             )
         return replace(motion, t_ns=motion.t_ns + round(source.offset_s * 1e9))
+
+
+def _of_subject(path: Path, motion: JointMotion, subject: str | None) -> JointMotion:
+    """Keep the joints of one subject, whose name stands before a colon in the names of its joints.
+
+    Raises:
+        DataError: several subjects and none is stated, or no joint is of the stated one.
+    """
+    parted = [joint.rpartition(":") for joint in motion.joints]
+    subjects = list(dict.fromkeys(name for name, colon, _ in parted if colon))
+    if subject is None and len(subjects) < 2:
+        subject = subjects[0] if subjects and all(colon for _, colon, _ in parted) else None
+        if subject is None:
+            return motion
+    if subject not in subjects:
+        problem = f"holds joints of {', '.join(subjects) or 'nobody by name'}"
+        remedy = f"say which: truth: {{subject: {subjects[0]}}}" if subjects else "leave truth.subject out"
+        raise DataError(path, problem, remedy, code="no-such-name" if subject else "ambiguous")
+    chosen = [k for k, (name, _, _) in enumerate(parted) if name == subject]
+    return replace(
+        motion,
+        joints=joint_names(tuple(parted[k][2] for k in chosen)),
+        position=motion.position[:, :, chosen],
+    )
 
 
 def _without_far_joints(motion: JointMotion) -> JointMotion:

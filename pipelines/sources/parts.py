@@ -202,9 +202,7 @@ def _poses_entry(
         in_gimbal=_mount_entry(camera) if camera.gimbal else None,
         inverse=bool(pose.options.get("inverse")),
         z="down" if pose.options.get("z") == "down" else "up",
-        world_from_source=PlaceEntry(
-            translation=tuple(pose.world_from_source.translation), yaw_deg=pose.world_from_source.yaw_deg
-        ),
+        world_from_source=PlaceEntry.model_validate(pose.world_from_source.model_dump()),
     )
 
 

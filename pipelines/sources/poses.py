@@ -14,6 +14,7 @@ import numpy as np
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
 from pipelines.formats.logs.presets import FIXES, px4_names, read_pair, read_positions, read_preset
 from pipelines.formats.logs.px4_topics import read_px4
+from pipelines.formats.maps.voxel_grids import placed
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
@@ -27,6 +28,7 @@ from pipelines.geometry.poses import (
     compose,
     interpolate_points,
     interpolate_poses,
+    matrix_from_quaternion,
     mounted_covariance,
     multiply,
     quaternion_from_matrix,
@@ -65,6 +67,7 @@ from pipelines.sources.logs import FlightLogs
 from pipelines.sources.parts import CameraFrames
 from pipelines.sources.projections import Projection, is_usable
 from pipelines.sources.world import (
+    METRES,
     as_stated,
     body_in_enu,
     in_enu,
@@ -72,6 +75,9 @@ from pipelines.sources.world import (
     losses,
     mounted,
     refuse_projected,
+    scaled,
+    turn_of,
+    upright,
     world_times,
 )
 
@@ -121,6 +127,7 @@ class FlightPoses:
         self._origin: Origin | None = None
         self._telemetry: dict[str, Telemetry] = {}
         self._stated: dict[str, tuple[Path, Trajectory]] = {}  # read for the origin
+        self._upright = upright(flight.world)
         crs = flight.world.crs
         self._projection = Projection(crs, f"{manifest}: world.crs") if crs else None
         self.map_doubts: list[Doubt] = []
@@ -142,7 +149,8 @@ class FlightPoses:
         if self.is_still(camera):
             source, still = self._stated_poses(name, camera)
             first_ns = int(frames.t_ns[0]) if frames is not None else 0
-            return replace(self._local(source, still), t_ns=np.array([first_ns]))
+            placed = in_world(self._local(source, still), pose.world_from_source)
+            return replace(placed, t_ns=np.array([first_ns]))
         angles = None if camera.gimbal is None else self._stated_angles(name, camera, frames)
         if self._is_joined(pose):
             return in_world(self._joined_trajectory(name, camera, angles), pose.world_from_source)
@@ -152,10 +160,11 @@ class FlightPoses:
             self._note(
                 f"{name}: poses in {pose.file} are taken as the camera's (say `of: body` with a mount if not)"
             )
-        local = self._local(source, stated)
+        # The lever arm of the mount is in metres: positions are scaled before it is added.
+        local = scaled(self._local(source, stated), pose.world_from_source.scale)
         if not of_camera:
             local = self._on_body(name, camera, local, angles)
-        return in_world(local, pose.world_from_source)
+        return in_world(local, pose.world_from_source.model_copy(update={"scale": 1.0}))
 
     def _stated_poses(self, name: str, camera: CameraSources) -> tuple[Path, Trajectory]:
         """Read poses of a camera or of its body, in ENU axes, but not yet out of a map projection."""
@@ -177,17 +186,17 @@ class FlightPoses:
                 position=calibrated.position[None],
                 quaternion_xyzw=calibrated.quaternion_xyzw[None],
             )
-            return path, in_enu(still, self._axes(pose.axes))
+            return path, self._enu(scaled(still, METRES[pose.unit]), pose.axes)
         if self._is_log(pose):
             settings, options = self._logs.settings(pose.file), self._logged(pose)
             logged = self._logs.trajectory(
                 pose.file, pose.topic, options.parent, options.child, max_gap_ns=self._max_gap_ns
             )
             logged = as_stated(logged, pose, options)
-            turned = self._turned(camera, logged, self._axes(pose.axes, settings.axes))
+            turned = self._turned(camera, logged, pose.axes, settings.axes)
             return path, in_world(turned, settings.world_from_source)
         filed = as_stated(self._filed_trajectory(pose), pose, self._files.options("pose", pose, FiledPose))
-        return path, self._turned(camera, filed, self._axes(pose.axes))
+        return path, self._turned(camera, filed, pose.axes)
 
     # --- kinds of sources ------------------------------------------------------------------------------
 
@@ -224,8 +233,6 @@ class FlightPoses:
         if self.is_still(camera):
             if pose.of == "body" or camera.is_carried:
                 yield "pose: a still camera's pose is its own", "leave `of: body` and the mount out"
-            if pose.world_from_source != Placement():
-                yield "pose: world_from_source: only a pose that moves has that", "leave it out"
         elif self._is_joined(pose):
             if pose.unit != "m":
                 yield f"pose: unit: a file of this kind ({title}) states its own", "leave it out"
@@ -256,8 +263,18 @@ class FlightPoses:
             return not camera.is_carried
         return camera.pose.of != "body"
 
-    def _turned(self, camera: CameraSources, poses: Trajectory, axes: Axes) -> Trajectory:
-        return in_enu(poses, axes) if self._is_of_camera(camera) else body_in_enu(poses, axes)
+    def _turned(self, camera: CameraSources, poses: Trajectory, *stated: Axes | None) -> Trajectory:
+        return self._enu(poses, *stated, convert=in_enu if self._is_of_camera(camera) else body_in_enu)
+
+    def _enu(
+        self,
+        trajectory: Trajectory,
+        *stated: Axes | None,
+        convert: Callable[[Trajectory, Axes], Trajectory] = in_enu,
+    ) -> Trajectory:
+        """Convert poses to east, north, up: from the axes that are stated for them, else from the world's."""
+        turned = convert(trajectory, self._axes(*stated))
+        return turned if any(stated) else in_world(turned, self._upright)
 
     def _filed_trajectory(self, pose: PoseSource) -> Trajectory:
         path, reader = self._files.path(pose.file), self._files.format_of("pose", pose)
@@ -351,6 +368,8 @@ class FlightPoses:
         logged = self._logs.attitudes(log, topic, order=options.order, units=options.units)
         axes = self._axes(gimbal.axes, self._logs.settings(log).axes)
         turned = attitude_in_enu(logged.quaternion_xyzw, relative_to=relative_to, axes=axes)
+        if relative_to == "world" and not (gimbal.axes or self._logs.settings(log).axes):
+            turned = multiply(turn_of(self._upright), turned)
         lost = {f"gimbal angles: {cause}": count for cause, count in logged.dropped.items()}
         return AttitudeTrack(topic, logged.t_ns, turned, relative_to, dropped=lost)
 
@@ -433,8 +452,11 @@ class FlightPoses:
         self.refuse_projected(source, trajectory.position, self._projection)
         return trajectory
 
-    def joints(self, source: Path, position: Float) -> Float:
+    def joints(self, source: Path, position: Float, *, own_axes: bool) -> Float:
         """Return positions [..., 3] of people in the world; errors as for poses."""
+        if not own_axes and self._upright != Placement():
+            turn = matrix_from_quaternion(turn_of(self._upright))
+            position = self._upright.scale * position @ turn.T
         origin = self.origin()
         if self._projection is not None and origin is not None:
             position = self._projection.points(source, position, origin.place)
@@ -450,6 +472,10 @@ class FlightPoses:
             DataError: as for poses; also if a CRS is stated and the world's origin on Earth is not known.
         """
         origin = self.origin()
+        if self._upright != Placement():
+            scale = self._upright.scale
+            grid = replace(grid, origin=scale * grid.origin, resolution_m=scale * grid.resolution_m)
+            grid = placed(str(source), grid, (np.zeros(3), turn_of(self._upright)))
         stated = Projection(crs, f"{self._manifest}: map.crs") if crs else None
         own = self._own_crs(source, grid) if grid.crs and origin is not None else None
         projection = stated or own or self._projection
@@ -526,7 +552,7 @@ class FlightPoses:
         trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return self._local(
             self._logs.paths(log)[0],
-            in_world(in_enu(trajectory, self._axes(settings.axes)), settings.world_from_source),
+            in_world(self._enu(trajectory, settings.axes), settings.world_from_source),
         )
 
     def planned(self, plan: PlanSource) -> Trajectory:
@@ -535,21 +561,21 @@ class FlightPoses:
         reader = self._files.format_of("plan", plan)
         if isinstance(reader, TrajectoryFormat):
             path = self._files.path(log)
-            return self._local(path, in_enu(reader.read_trajectory(path), self._flight.world.frame))
+            return self._local(path, self._enu(reader.read_trajectory(path)))
         settings = self._logs.settings(log)
         sent = self._logs.commands(log, topic)
         if sent is None:
             sent = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return self._local(
             self._logs.paths(log)[0],
-            in_world(in_enu(sent, self._axes(settings.axes)), settings.world_from_source),
+            in_world(self._enu(sent, settings.axes), settings.world_from_source),
         )
 
     def true_poses(self, stated: str) -> Trajectory:
         """Read the true poses of one camera."""
         path = located(self._base, stated)
         trajectory = recognise(path, TrajectoryFormat, "camera trajectory").read_trajectory(path)
-        return self._local(path, in_enu(trajectory, self._flight.world.frame))
+        return self._local(path, self._enu(trajectory))
 
     # --- drones' own logs ------------------------------------------------------------------------------
 

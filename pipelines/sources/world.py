@@ -15,17 +15,37 @@ from pipelines.geometry.poses import (
     invert,
     matrix_from_quaternion,
     multiply,
+    quaternion_from_matrix,
     quaternion_from_rotation_vector,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, LogClock, Mount, Placement, PoseSource
+from pipelines.session.manifest import Axes, LogClock, Mount, Placement, PoseSource, Up, WorldAxes
 from pipelines.session.records import Trajectory
 from pipelines.session.source_options import FiledPose
 
 _FASTEST_MPS = 100.0  # no camera that films a person flies faster
 _FROZEN_S, _FROZEN_POSES = 1.0, 10  # a frozen pose stays the same for longer, and for as many messages
-_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 _FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and UTM eastings begin at 166 km
+
+
+UP_ROWS: dict[Up, tuple[tuple[int, int, int], ...]] = {
+    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "y": ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
+    "-y": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
+    "x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
+    "-x": ((0, 1, 0), (0, 0, -1), (-1, 0, 0)),
+}
+"""Rotations from a world in which an axis points up to one with z up; y up turns as files of joints do."""
+
+
+def upright(world: WorldAxes) -> Placement:
+    """Return the placement that turns the files' world upright, in metres."""
+    if world.up == "z":
+        return Placement(scale=world.scale)
+    turn = quaternion_from_matrix(np.array(UP_ROWS[world.up], dtype=np.float64))
+    return Placement(rotation_xyzw=turn.tolist(), scale=world.scale)
 
 
 def as_stated(trajectory: Trajectory, pose: PoseSource, options: FiledPose) -> Trajectory:
@@ -39,16 +59,23 @@ def as_stated(trajectory: Trajectory, pose: PoseSource, options: FiledPose) -> T
     if options.inverse:
         position, quaternion = invert(position, quaternion)
         covariance = None
-    if (metres := _METRES[pose.unit]) != 1.0:
-        position = position * metres
-        scale = np.diag([metres] * 3 + [1.0] * 3)
-        covariance = None if covariance is None else carried_covariance(scale, covariance)
     if options.z == "down":
         flip = np.array([1.0, 1.0, -1.0])
         position = position * flip
         turned = np.diag([*flip, 1.0, 1.0, 1.0])
         covariance = None if covariance is None else carried_covariance(turned, covariance)
-    return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
+    stated = replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
+    return scaled(stated, METRES[pose.unit])
+
+
+def scaled(trajectory: Trajectory, factor: float) -> Trajectory:
+    """Multiply the positions of a trajectory, with their covariances."""
+    if factor == 1.0:
+        return trajectory
+    scale = np.diag([factor] * 3 + [1.0] * 3)
+    covariance = trajectory.covariance
+    covariance = None if covariance is None else carried_covariance(scale, covariance)
+    return replace(trajectory, position=trajectory.position * factor, covariance=covariance)
 
 
 def world_times(clock: LogClock, t_ns: Int64, since_ns: int) -> Int64:
@@ -81,15 +108,16 @@ def body_in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
 
 
 def in_world(trajectory: Trajectory, place: Placement) -> Trajectory:
-    """Move a trajectory in the ENU axes of its source to where the source has its origin in the world."""
+    """Scale and move a trajectory in the ENU axes of its source to where the source lies in the world."""
     if place == Placement():
         return trajectory
-    turn = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(place.yaw_deg)]))
+    trajectory = scaled(trajectory, place.scale)
+    turn = turn_of(place)
     position, quaternion = compose(
         (np.array(place.translation), turn), (trajectory.position, trajectory.quaternion_xyzw)
     )
     covariance = trajectory.covariance
-    if covariance is not None and place.yaw_deg:
+    if covariance is not None and (place.yaw_deg or place.rotation_xyzw):
         rotated = np.eye(6)
         rotated[:3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
         covariance = carried_covariance(rotated, covariance)
@@ -101,6 +129,13 @@ def in_world(trajectory: Trajectory, place: Placement) -> Trajectory:
         covariance=covariance,
         body_xyzw=None if body is None else multiply(turn, body),
     )
+
+
+def turn_of(place: Placement) -> Float:
+    """Return the rotation [4] from a source's axes to the world's."""
+    if place.rotation_xyzw is not None:
+        return np.array(place.rotation_xyzw)
+    return quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(place.yaw_deg)]))
 
 
 def refuse_projected(source: Path | str, position: Float, origin: Place, crs: str = "") -> None:

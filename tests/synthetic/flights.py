@@ -115,7 +115,7 @@ def write_flight(
         rng = np.random.default_rng([seed, k])
         logged = disturb(noise, log_ns, true_position[k], true_quaternion[k], rng)
         if static:
-            calibrations.append(_pose2sim_table(name, *(rows[0] for rows in logged)))
+            calibrations.append(pose2sim_table(name, *(rows[0] for rows in logged)))
             pose: dict[str, str] = {"file": "calibration.toml"}
         else:
             file = f"{name}.{pose_format}"
@@ -207,7 +207,7 @@ def _inline(lens: Intrinsics) -> dict[str, Any]:
     return {**numbers, "distortion": list(lens.distortion)}
 
 
-def _pose2sim_table(name: str, position: Float, quaternion: Float) -> str:
+def pose2sim_table(name: str, position: Float, quaternion: Float) -> str:
     """Format a camera of a Pose2Sim calibration: rotation vector and translation are camera_from_world."""
     translation, rotation = invert(position, quaternion)
     return "\n".join(
