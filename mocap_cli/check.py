@@ -42,7 +42,6 @@ def check_command(
     `mocap reconstruct` does the same. A flight without keypoints is looked at for a few seconds.
     """
     from pipelines.check import check
-    from pipelines.session.description import said_remedy
 
     with watching(shown.level) as progress:
         result = check(path, pose_noise=pose_noise, detector=detector, workers=workers, progress=progress)
@@ -55,7 +54,7 @@ def check_command(
     for doubt in result.doubts:
         say(f"{doubt.code}: {doubt.what}")
         say("  " + ", ".join(f"{name} {value:g}" for name, value in doubt.evidence.items()))
-        for line in said_remedy(doubt.remedy):
+        for line in doubt.instructions:
             say(f"  {line}")
     if not result.doubts:
         looked = f" (looked at: {result.pictures})" if result.pictures else ""

@@ -75,7 +75,7 @@ from pipelines.reconstruction.solving import (
     solver_for,
     views_with_noise,
 )
-from pipelines.session.description import Description, Doubt, Interpolation, said_remedy
+from pipelines.session.description import Description, Doubt, Interpolation
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.memory import Waiting
@@ -729,12 +729,10 @@ def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, di
 def refuse_doubted(folder: Path, doubts: Sequence[Mapping[str, Any]], *, strict: bool) -> None:
     """Refuse a flight with a doubt if `strict`."""
     if strict and doubts:
-        first = doubts[0]
+        first = Doubt.model_validate(doubts[0])
         more = f", the first of {len(doubts)} doubts" if len(doubts) > 1 else ""
-        remedy = "; ".join(said_remedy(str(first["remedy"])))
-        raise DataError(
-            folder, f"is doubted: {first['what']} ({first['code']}){more}", remedy, code="doubted"
-        )
+        remedy = "; ".join(first.instructions)
+        raise DataError(folder, f"is doubted: {first.what} ({first.code}){more}", remedy, code="doubted")
 
 
 def unused_cameras(cameras: list[Camera], result: Triangulation) -> list[str]:

@@ -23,7 +23,7 @@ from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.loading import common_joints, load_cameras, load_time_base
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.segments import divided, doubts_of_flight
-from pipelines.session.description import Description, Doubt, read_description, said_doubts
+from pipelines.session.description import Description, Doubt, read_description
 from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.memory import return_freed_arrays, return_unused
 from pipelines.session.people import logged_people
@@ -118,9 +118,7 @@ def _checked(
         if not found:
             raise nothing
         often, seldom = doubts_of_flight([[doubt.as_json() for doubt in doubts] for doubts in found])
-        warnings = [
-            f"{count} of {len(found)} segments: {said_doubts([doubt])[0]}" for doubt, count, _ in seldom
-        ]
+        warnings = [f"{count} of {len(found)} segments: {doubt.as_warning()}" for doubt, count, _ in seldom]
     return Checked(often, [*description.warnings, *warnings], pictures)
 
 

@@ -24,7 +24,7 @@ from pipelines.reporting.overlays import (
     status_at,
     views_of,
 )
-from pipelines.session.description import Description, Doubt, read_description, said_doubts
+from pipelines.session.description import Description, Doubt, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
@@ -233,7 +233,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         angles=lambda: (
             None if record is None else read_table(folder / "reconstruct" / "angles.parquet", ANGLES)
         ),
-        doubts=lambda: said_doubts(_doubts(folder, description, record)),
+        doubts=lambda: [doubt.as_warning() for doubt in _doubts(folder, description, record)],
         zero_ns=description.start_ns,
         people=() if motion is None else tuple(description.names_of_people(motion.position.shape[1])),
     )

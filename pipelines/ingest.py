@@ -27,9 +27,8 @@ from pipelines.session.description import (
     OriginEntry,
     PlannedEntry,
     TruthEntry,
+    assumptions_as_warnings,
     read_description,
-    said_assumptions,
-    said_doubts,
 )
 from pipelines.session.errors import DataError, MocapError
 from pipelines.session.manifest import Axes, CameraSources, LogSource, Manifest, Source, read_flight
@@ -154,13 +153,13 @@ def ingest(
             origin = reader.origin()
             check_sources()
             warnings += reader.take_notes()
-            warnings += said_assumptions(flight.assumptions)
+            warnings += assumptions_as_warnings(flight.assumptions)
             warnings += [f"{path}: {losses(causes)}: copy it again" for path, causes in damage.items()]
 
             tracks = {name: _track(run, name) for name in entries}
             doubts = doubts_of_logs({name: (entry, tracks[name]) for name, entry in entries.items()})
             doubts += doubts_of_places(tracks, reader.map_box) + reader.map_doubts
-            warnings += said_doubts(doubts)
+            warnings += [doubt.as_warning() for doubt in doubts]
 
             description = Description(
                 schema_version=1,

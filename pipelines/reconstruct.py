@@ -36,7 +36,7 @@ from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import noise_text
 from pipelines.reconstruction.trials import PoseDisturbance, disturbed, summary_of_trials
 from pipelines.segmented import by_segments, stated_segments
-from pipelines.session.description import Description, Doubt, read_description, said_assumptions, said_doubts
+from pipelines.session.description import Description, Doubt, assumptions_as_warnings, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.memory import Waiting, return_freed_arrays
 from pipelines.session.progress import Progress, Silent
@@ -128,8 +128,8 @@ def reconstruct(
         record = run.publish(
             counts=outcome.counts,
             warnings=[
-                *said_doubts(outcome.doubts),
-                *said_assumptions(description.assumptions),
+                *(doubt.as_warning() for doubt in outcome.doubts),
+                *assumptions_as_warnings(description.assumptions),
                 *_hint_warnings(description, ingested, detected),
                 *outcome.warnings,
             ],

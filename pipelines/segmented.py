@@ -53,7 +53,7 @@ from pipelines.reconstruction.segments import (
     sampled,
     warnings_of_flight,
 )
-from pipelines.session.description import Description, Doubt, read_description, said_doubts
+from pipelines.session.description import Description, Doubt, read_description
 from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.memory import Waiting, available_bytes, return_freed_arrays, return_unused
 from pipelines.session.parallel import SharedSession, contents_of, each_part, write_contents
@@ -421,7 +421,7 @@ class _Joined:
         made = [k for k, part in enumerate(self.parts) if part["metrics"]]
         told += [
             f"{count} of {len(made)} segments, first that from {begins_s[made[k]]:.0f} s to"
-            f" {ends_s[made[k]]:.0f} s: {said_doubts([doubt])[0]}"
+            f" {ends_s[made[k]]:.0f} s: {doubt.as_warning()}"
             for doubt, count, k in self._doubts[1]
         ]
         return told + warnings_of_flight([part["warnings"] for part in self.parts if part["metrics"]])

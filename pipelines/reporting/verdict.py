@@ -19,7 +19,7 @@ from pipelines.reporting.wording import (
     quantity,
     whole,
 )
-from pipelines.session.description import said_doubt, said_doubts
+from pipelines.session.description import Doubt
 
 # Below this share of measured times a joint is named among the doubts.
 DOUBTFUL_COVERAGE = 0.8
@@ -294,7 +294,8 @@ def doubts_of_flight(summary: Summary) -> list[dict[str, object]]:
 
 def _stated(doubt: Mapping[str, object]) -> str:
     """State a doubt of the flight as `reconstruct` warns of it."""
-    return said_doubt(text(doubt, "code"), text(doubt, "what"), text(doubt, "remedy"))
+    code, what, remedy = (text(doubt, key) for key in ("code", "what", "remedy"))
+    return Doubt(code=code, cameras=[], what=what, evidence={}, remedy=remedy).as_warning()
 
 
 def _doubts(content: SessionContent, summary: Summary) -> list[str]:
@@ -321,7 +322,7 @@ def _doubts(content: SessionContent, summary: Summary) -> list[str]:
     doubts += _large_errors(summary)
     doubts += _odd_cameras(summary)
     doubts += [f"The inputs of {stage} have changed since: run it again." for stage in content.outdated]
-    told = said_doubts(summary.description.doubts)  # reconstruct says them again
+    told = [doubt.as_warning() for doubt in summary.description.doubts]  # reconstruct says them again
     doubts += [warning for warning in summary.description.warnings if warning not in told]
     for record in content.stages.values():
         doubts += [str(warning) for warning in items(record, "warnings")]

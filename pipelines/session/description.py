@@ -322,6 +322,21 @@ class Doubt(Entry):
         """Return the mapping that is stored."""
         return self.model_dump(mode="json")
 
+    def as_warning(self) -> str:
+        """State the doubt in one line, with the lines that mend it."""
+        remedy = f"; {as_instruction(self.remedy)}" if self.remedy else ""
+        return f"doubt ({self.code}): {self.what}{remedy}"
+
+    @property
+    def instructions(self) -> list[str]:
+        """The lines of the remedy, each as an instruction."""
+        return [as_instruction(line) for line in self.remedy.split("; ")] if self.remedy else []
+
+
+def as_instruction(remedy: str) -> str:
+    """Return a remedy as an instruction: keys of flight.yaml are set, anything else is said as it is."""
+    return f"set {remedy}" if remedy.startswith(("cameras.", "map.")) else remedy
+
 
 class Description(Entry):
     """The whole of session.json."""
@@ -397,29 +412,10 @@ class Description(Entry):
         return min(entry.frames.first_t_ns for entry in self.cameras.values())
 
 
-def said_assumptions(assumptions: Sequence[str]) -> list[str]:
+def assumptions_as_warnings(assumptions: Sequence[str]) -> list[str]:
     """State what `mocap init` guessed and nobody has confirmed, as one warning if there is anything."""
     remedy = "confirm it in flight.yaml and take `assumed: true` away"
     return [f"assumed by `mocap init`: {', '.join(assumptions)}; {remedy}"] if assumptions else []
-
-
-def said_doubts(doubts: list[Doubt]) -> list[str]:
-    """State doubts as warnings of a stage, with the lines that mend them."""
-    return [said_doubt(doubt.code, doubt.what, doubt.remedy) for doubt in doubts]
-
-
-def said_doubt(code: str, what: str, remedy: str) -> str:
-    """State a doubt in one line."""
-    return f"doubt ({code}): {what}" + (f"; {_said_to_do(remedy)}" if remedy else "")
-
-
-def said_remedy(remedy: str) -> list[str]:
-    """State the lines of a remedy: keys of flight.yaml are set, anything else is said as it is."""
-    return [_said_to_do(line) for line in remedy.split("; ")] if remedy else []
-
-
-def _said_to_do(remedy: str) -> str:
-    return f"set {remedy}" if remedy.startswith(("cameras.", "map.")) else remedy
 
 
 def read_description(session: Path) -> Description:
