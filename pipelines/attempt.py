@@ -20,7 +20,7 @@ from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.triangulation import Method, Triangulation, Views
 from pipelines.keypoints.association import Association, associate
 from pipelines.keypoints.calibration import measured_for, read_calibration
-from pipelines.keypoints.no_people import Ground, Scene, level_of
+from pipelines.keypoints.no_people import Ground, Surroundings, level_of
 from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
 from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
@@ -484,7 +484,7 @@ def _observe(flight: Flight, cameras: list[Camera], settings: Settings) -> _Seen
         flight.actors,
         people=settings.people if isinstance(settings.people, int) else None,
         pixel_sigma=pixel_sigma,
-        scene=Scene(flight.ground, np.array([camera.field for camera in cameras])),
+        scene=Surroundings(flight.ground, np.array([camera.field for camera in cameras])),
     )
     base = flight.time_base(cameras, settings.rate_hz)
     observations = observe(cameras, found, association.choice, base, between)
@@ -503,7 +503,7 @@ def find_people(
     *,
     people: int | None = 1,
     pixel_sigma: float = Settings.pixel_sigma,
-    scene: Scene | None = None,
+    scene: Surroundings | None = None,
 ) -> tuple[Candidates, Association, Float]:
     """Collect all detections at common times, and associate them with people; those logged come first.
 

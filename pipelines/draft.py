@@ -40,7 +40,7 @@ from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
 from pipelines.formats.videos.video import created_ns, followed_points, index_video
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.geometry.clocks import Followed, explain_motion
+from pipelines.geometry.clocks import TrackedPoints, explain_motion
 from pipelines.geometry.geodesy import Place, enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import interpolate_points, multiply
@@ -531,7 +531,7 @@ class _Comparison:
     """Comparison of videos with drones' logs by their motion; each video is followed once."""
 
     def __init__(self) -> None:
-        self._followed: dict[Path, Followed] = {}
+        self._followed: dict[Path, TrackedPoints] = {}
 
     def __call__(self, film: Film, log: Flown) -> Alike | None:
         """Return how well the poses in a log explain the motion in a video's pictures; None without poses.

@@ -143,7 +143,7 @@ def _median_slope(t_s: Float, lead_s: Float) -> float:
 
 
 @dataclass(frozen=True)
-class Followed:
+class TrackedPoints:
     """Points tracked through stretches of a video, in normalised coordinates (x/z, y/z)."""
 
     begin_ns: Int64  # [S] of the video's own stamps, rising
@@ -173,11 +173,11 @@ class _Path:
 
 
 @dataclass(frozen=True)
-class _Search:
+class _StartSearch:
     """Starts on a grid, and the log-likelihood gain of each over a camera that stands still."""
 
     path: _Path
-    followed: Followed
+    followed: TrackedPoints
     moved: float  # median motion of points in a stretch, rad
     scatter: float  # rad: expected residual of the best start of the grid
     starts_s: Float  # [K] after the first pose
@@ -198,7 +198,7 @@ def fit_start(
     t_ns: Int64,
     position: Float,
     quaternion_xyzw: Float,
-    followed: Followed,
+    followed: TrackedPoints,
     *,
     max_gap_ns: int,
     near_ns: int | None = None,
@@ -270,7 +270,7 @@ def fit_start(
 
 
 def explain_motion(
-    t_ns: Int64, position: Float, quaternion_xyzw: Float, followed: Followed, *, max_gap_ns: int
+    t_ns: Int64, position: Float, quaternion_xyzw: Float, followed: TrackedPoints, *, max_gap_ns: int
 ) -> tuple[Float, int] | None:
     """Compute how well a camera's poses explain the motion of points, at the start that fits best.
 
@@ -328,20 +328,20 @@ def _path(t_ns: Int64, position: Float, quaternion_xyzw: Float, max_gap_ns: int)
     )
 
 
-def _search(path: _Path, followed: Followed) -> _Search:
+def _search(path: _Path, followed: TrackedPoints) -> _StartSearch:
     """Try all starts at which the video overlaps the log."""
     last_s, length_s = float(followed.end_ns[-1]) / 1e9, _STEP_S * (len(path.known) - 1)
     starts_s = np.arange(-last_s, length_s, _SEARCH_STEP_S)
     moved = float(np.median(np.linalg.norm(followed.end - followed.begin, axis=1)))
     scatter = max(_SCATTER_RAD, _SEARCH_SCATTER_SHARE * moved)
     gain = _gains(path, _thinned(followed), starts_s, scatter)
-    return _Search(path, followed, moved, scatter, starts_s, gain)
+    return _StartSearch(path, followed, moved, scatter, starts_s, gain)
 
 
-def _thinned(followed: Followed) -> Followed:
+def _thinned(followed: TrackedPoints) -> TrackedPoints:
     """Keep every n-th point, so that many starts can be tried."""
     every = slice(None, None, max(1, len(followed.stretch) // _MAX_SEARCH_POINTS))
-    return Followed(
+    return TrackedPoints(
         followed.begin_ns,
         followed.end_ns,
         followed.stretch[every],
@@ -350,7 +350,7 @@ def _thinned(followed: Followed) -> Followed:
     )
 
 
-def _gains(path: _Path, followed: Followed, starts_s: Float, scatter: float) -> Float:
+def _gains(path: _Path, followed: TrackedPoints, starts_s: Float, scatter: float) -> Float:
     """Compute each start's log-likelihood gain over a still camera; -inf where the log covers too little."""
     still = _still(followed, scatter)
     gain = np.full(len(starts_s), -np.inf)
@@ -362,23 +362,23 @@ def _gains(path: _Path, followed: Followed, starts_s: Float, scatter: float) -> 
     return gain
 
 
-def _still(followed: Followed, scatter: float) -> Float:
+def _still(followed: TrackedPoints, scatter: float) -> Float:
     """Compute the misfits [S] of a camera that stands still."""
     return _summed(followed, np.linalg.norm(followed.end - followed.begin, axis=1), scatter)
 
 
-def _misfits(path: _Path, followed: Followed, start_s: float, scatter: float) -> Float:
+def _misfits(path: _Path, followed: TrackedPoints, start_s: float, scatter: float) -> Float:
     """Compute the misfits [S] of a start, in s after the first pose; NaN where the log has no poses."""
     return _summed(followed, _distances(path, followed, start_s), scatter)
 
 
-def _summed(followed: Followed, distance: Float, scatter: float) -> Float:
+def _summed(followed: TrackedPoints, distance: Float, scatter: float) -> Float:
     """Sum the negative log-likelihoods of the points of each stretch, up to a constant."""
     each = np.log1p((distance / scatter) ** 2)
     return np.bincount(followed.stretch, each, len(followed.begin_ns)).astype(np.float64)
 
 
-def _distances(path: _Path, followed: Followed, start_s: float) -> Float:
+def _distances(path: _Path, followed: TrackedPoints, start_s: float) -> Float:
     """Compute the distances [P] of points from where a start allows them; NaN where the log has no poses."""
     from_position, from_quaternion = _at(path, start_s + followed.begin_ns / 1e9)
     to_position, to_quaternion = _at(path, start_s + followed.end_ns / 1e9)
@@ -418,7 +418,7 @@ def _is_clear(differences: Float) -> bool:
     return float(known.sum()) > max(_SIGNIFICANT_SIGMAS * sigma, _SIGNIFICANT_SIGMAS**2 / 2)
 
 
-def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) -> tuple[float, float]:
+def _refined(path: _Path, followed: TrackedPoints, start_s: float, scatter: float) -> tuple[float, float]:
     """Refine a start to a fraction of a step, with smaller and smaller scatter; return also its sigma in s.
 
     The limit on Newton's steps is halved each time they change direction. If points scatter little, their

@@ -24,7 +24,7 @@ class Link(NamedTuple):
     static: bool = False  # if True, the last row is valid at all times
 
 
-class Chain(NamedTuple):
+class FrameChain(NamedTuple):
     """parent_from_child at some times; NaN where a link on the way has no pose."""
 
     t_ns: Int64  # [M]
@@ -47,7 +47,7 @@ def chain(
     *,
     max_gap_ns: int,
     max_extrapolation_ns: int = 0,
-) -> Chain:
+) -> FrameChain:
     """Compute the pose of `child` in `parent`: interpolate every link on the shortest path and compose them.
 
     Args:
@@ -72,7 +72,7 @@ def chain(
     for step, edge, link in zip(pairwise(route.frames), route.edges, on_the_way, strict=True):
         stated = _at(link, t_ns, max_gap_ns, max_extrapolation_ns)
         position, quaternion = compose((position, quaternion), stated if step == edge else invert(*stated))
-    return Chain(t_ns, position, quaternion)
+    return FrameChain(t_ns, position, quaternion)
 
 
 def find_route(edges: Collection[tuple[str, str]], parent: str, child: str) -> Route:

@@ -46,7 +46,7 @@ import numpy as np
 from pipelines.geometry.arrays import Bool, Float, Int8, Int64
 
 if TYPE_CHECKING:
-    from pipelines.geometry.triangulation_kernels import Found
+    from pipelines.geometry.triangulation_kernels import TriangulationArrays
 
 Method = Literal["dlt", "midpoint", "robust"]
 
@@ -169,14 +169,16 @@ def locate(views: Views, *, method: Method, gate: float = GATE, threads: int = 1
     return Points(*_run(views, method, 2, gate, threads, 0)[:3])
 
 
-def _run(views: Views, method: Method, min_views: int, gate: float, threads: int, described: int) -> Found:
+def _run(
+    views: Views, method: Method, min_views: int, gate: float, threads: int, described: int
+) -> TriangulationArrays:
     """Run the kernel over blocks of joint-frames; `described` is the length of the last three results."""
     if min_views < 2 or not gate > 0:
         raise ValueError(f"min_views={min_views}, gate={gate}: out of range")
     from pipelines.geometry import triangulation_kernels as kernels
 
     n, cameras = views.weight.shape
-    found = kernels.Found(
+    found = kernels.TriangulationArrays(
         _linear_points(views) if method == "dlt" else np.empty((n, 3)),
         np.empty((n, cameras), np.bool_),
         np.empty(n, np.int8),

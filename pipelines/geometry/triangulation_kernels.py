@@ -53,7 +53,7 @@ class Gates(NamedTuple):
     pair_count: Int64  # [m]
 
 
-class Found(NamedTuple):
+class TriangulationArrays(NamedTuple):
     """Results; see `triangulation.Triangulation`."""
 
     points: Float  # [N, 3]; for DLT it holds the points before the call
@@ -620,7 +620,9 @@ def _describe(
 
 
 @cached
-def triangulate_range(first: int, last: int, views: ViewArrays, gates: Gates, found: Found) -> None:
+def triangulate_range(
+    first: int, last: int, views: ViewArrays, gates: Gates, found: TriangulationArrays
+) -> None:
     """Triangulate the joint-frames first <= n < last."""
     rays, weight, pose_index, position, rotation, focal, pixel_sigma, pose_sigma = views
     method, min_views, cos2_min, gate2, pair_table, pair_count = gates

@@ -14,11 +14,11 @@ from scipy.optimize import linear_sum_assignment
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.keypoints.common_errors import without_common_errors
 from pipelines.keypoints.exchanges import undo_exchanges
-from pipelines.keypoints.grouping import Followed, follow
+from pipelines.keypoints.grouping import TracksOfDetections, follow
 from pipelines.keypoints.no_people import (
-    Body,
-    Scene,
-    Views,
+    PossiblePerson,
+    SightLines,
+    Surroundings,
     level_of_most_seen,
     tell_no_people,
     why_no_body,
@@ -27,15 +27,24 @@ from pipelines.keypoints.no_people import (
 
 Int64 = NDArray[np.int64]
 
-_NEAR = 9.0  # within 3 sigma of the logged actor counts for a track, beyond against it
-_FAR = 25.0  # beyond 5 sigma a track is not the actor at that time
-_BODY_M = 0.5  # the log's point (hip, a tag, a phone) against the middle of the joints seen
-_LEAST_SIGMA_M = 0.2  # of a log
-_MEDIAN_OF_THREE = 1.54  # median length of a vector whose three components have a standard deviation of 1
-_PACE_M_PER_S = 3.0  # a lost person is not resumed further away than a run
-_REACH_M = 1.0
-_MOST_PEOPLE = 12
-_OVERLAP = 0.05  # largest share of a track's frames that may overlap with the person it continues
+# Within 3 sigma of the logged actor counts for a track, beyond it against the track.
+_NEAR_CHI2 = 9.0
+# Beyond 5 sigma a track is not the actor at that time.
+_FAR_CHI2 = 25.0
+# The log's point (hip, a tag, a phone) lies this far from the middle of the joints.
+_LOGGED_POINT_M = 0.5
+# Logs of people claim less error than they have, so at least this is assumed.
+_MIN_LOG_SIGMA_M = 0.2
+# A vector of three components with a standard deviation of 1 has this median length.
+_MEDIAN_NORM_3D = 1.54
+# A lost person is not resumed further away than a run.
+_RUN_M_PER_S = 3.0
+# The middle of a body moves by this much with the joints that are seen.
+_RESUME_REACH_M = 1.0
+# More people than this are a crowd, which no formation films apart.
+_MAX_PEOPLE = 12
+# A track that continues a person may overlap with them in this share of its frames.
+_MAX_OVERLAP_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -60,7 +69,7 @@ class Association:
 
 
 @dataclass(frozen=True)
-class _Track:
+class _BodyTrack:
     """Track of one body while it could be followed; rows are the times when two cameras saw it."""
 
     identity: int
@@ -82,7 +91,7 @@ def associate(
     actors: Float | None = None,
     actor_sigma_m: float = 1.0,
     people: int | None = 1,
-    scene: Scene | None = None,
+    scene: Surroundings | None = None,
 ) -> Association:
     """Choose the detections of the people who were logged, then of others, most seen first.
 
@@ -121,7 +130,7 @@ def associate(
     logged = [] if actors is None else [actors[:, k] for k in range(actors.shape[1])]
     if logged:
         logs = np.stack([np.c_[log, np.full(len(log), actor_sigma_m)] for log in logged], axis=1)
-    views = Views(xy, confidence, position, rotation, sigma)
+    views = SightLines(xy, confidence, position, rotation, sigma)
     seen = follow(time_s, *views, logs)
     dropped: dict[str, Int64] = {}
     kept = seen.track >= 0
@@ -161,7 +170,7 @@ def associate(
     return _counted(chosen, seen, resumed, dropped, refused, doubts, unseen, tuple(reasons))
 
 
-def _noise_of_logs_m(seen: Followed, logs: Float, most_m: float) -> float:
+def _noise_of_logs_m(seen: TracksOfDetections, logs: Float, most_m: float) -> float:
     """Estimate the standard deviation on each axis (m) of the logs [T, A, 3] of several people.
 
     Bodies that three cameras or more place are right. Their median distance to the nearest log gives one
@@ -173,11 +182,11 @@ def _noise_of_logs_m(seen: Followed, logs: Float, most_m: float) -> float:
     apart = apart[np.isfinite(apart).any(axis=1)]
     if not len(apart):
         return most_m
-    return float(np.clip(np.median(np.nanmin(apart, axis=1)) / _MEDIAN_OF_THREE, _LEAST_SIGMA_M, most_m))
+    return float(np.clip(np.median(np.nanmin(apart, axis=1)) / _MEDIAN_NORM_3D, _MIN_LOG_SIGMA_M, most_m))
 
 
 def _near_logs(
-    tracks: list[_Track], logged: list[Float], usual_m: float, most_m: float
+    tracks: list[_BodyTrack], logged: list[Float], usual_m: float, most_m: float
 ) -> tuple[list[tuple[Float, float]], tuple[int, ...], list[str]]:
     """Give each log [T, 3] its standard deviation: `usual_m`, or `most_m` where no track is near by that.
 
@@ -192,11 +201,11 @@ def _near_logs(
     return logs, (unseen if len(logs) > 1 else ()), []
 
 
-def _is_near(tracks: list[_Track], log: Float, sigma_m: float) -> bool:
+def _is_near(tracks: list[_BodyTrack], log: Float, sigma_m: float) -> bool:
     return any(_likeness(track, log, sigma_m) > 0 for track in tracks)
 
 
-def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
+def _tracks(seen: TracksOfDetections, confidence: Float) -> list[_BodyTrack]:
     """Collect the tracks as rows over time, from the values of each detection."""
     time, camera, detection = np.nonzero(np.isfinite(seen.spread))
     identity = seen.track[time, camera, detection]
@@ -213,28 +222,28 @@ def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
         at = (time[rows], camera[rows], detection[rows])
         trust = mean_confidence[time[start:stop], camera[start:stop], detection[start:stop]].mean()
         found.append(
-            _Track(
+            _BodyTrack(
                 int(identity[start]), at[0], seen.views[at], seen.middle[at], seen.spread[at], float(trust)
             )
         )
     return found
 
 
-def _squares(track: _Track, log: Float, sigma_m: float) -> Float:
+def _squares(track: _BodyTrack, log: Float, sigma_m: float) -> Float:
     """Compute the squared, whitened distance of a track from the log; NaN where the log has no value."""
-    variance = sigma_m**2 + _BODY_M**2 + track.spread**2
+    variance = sigma_m**2 + _LOGGED_POINT_M**2 + track.spread**2
     squares: Float = ((track.middle - log[track.time]) ** 2).sum(-1) / variance
     return squares
 
 
-def _likeness(track: _Track, log: Float | None, sigma_m: float) -> float:
+def _likeness(track: _BodyTrack, log: Float | None, sigma_m: float) -> float:
     """Compute the evidence that a track is the logged actor; 0 without a log."""
     if log is None:
         return 0.0
-    return float(np.nansum(track.views * (_NEAR - np.minimum(_squares(track, log, sigma_m), _FAR))))
+    return float(np.nansum(track.views * (_NEAR_CHI2 - np.minimum(_squares(track, log, sigma_m), _FAR_CHI2))))
 
 
-class _Chain:
+class _PersonTracks:
     """Tracks that are one person, one after the other."""
 
     def __init__(self, time_s: Float, log: Float | None, sigma_m: float) -> None:
@@ -243,39 +252,39 @@ class _Chain:
         self.taken: list[int] = []
         self._time_s, self._log, self._sigma_m = time_s, log, sigma_m
 
-    def likeness(self, track: _Track) -> float:
+    def likeness(self, track: _BodyTrack) -> float:
         """Compute the evidence that a track is this person by the log; 0 without a log."""
         return _likeness(track, self._log, self._sigma_m)
 
-    def offer(self, track: _Track) -> bool:
+    def offer(self, track: _BodyTrack) -> bool:
         """Take a track for the times at which no camera saw the person, if it has any."""
         free = self.owner[track.time] < 0
         if not free.any():
             return False
         far = np.zeros(len(track.time), bool)
         if self._log is not None:
-            far = _squares(track, self._log, self._sigma_m) > _FAR
+            far = _squares(track, self._log, self._sigma_m) > _FAR_CHI2
         self.owner[track.time[free & ~far]] = track.identity
         self.owner[track.time[free & far]] = -2
         self.place[track.time[free]] = track.middle[free]
         self.taken.append(track.identity)
         return True
 
-    def offer_without_log(self, track: _Track) -> bool:
+    def offer_without_log(self, track: _BodyTrack) -> bool:
         """Take a track on which the log says nothing, if nobody or this person was seen before it."""
         if self.taken and not _continues(track, self.owner, self.place, self._time_s):
             return False
         return self.offer(track)
 
-    def body(self, track: Int64) -> Body:
+    def body(self, track: Int64) -> PossiblePerson:
         """Return the detections and places of the person, from the track [T, C, D] of each detection."""
         middle = np.where((self.owner >= 0)[:, None], self.place, np.nan)
-        return Body(_detections(track, self.owner, self.taken), middle)
+        return PossiblePerson(_detections(track, self.owner, self.taken), middle)
 
 
 def _chains(
-    tracks: list[_Track], time_s: Float, logs: list[tuple[Float, float]], people: int | None
-) -> tuple[list[_Chain], list[_Track]]:
+    tracks: list[_BodyTrack], time_s: Float, logs: list[tuple[Float, float]], people: int | None
+) -> tuple[list[_PersonTracks], list[_BodyTrack]]:
     """Chain tracks into people: those with logs together, each of the others after the one before.
 
     Args:
@@ -288,7 +297,7 @@ def _chains(
         The people (at least one), and the tracks that are nobody's.
     """
     tracks = sorted(tracks, key=lambda one: (-one.views.sum(), -one.confidence, one.identity))
-    chains = [_Chain(time_s, log, sigma_m) for log, sigma_m in logs]
+    chains = [_PersonTracks(time_s, log, sigma_m) for log, sigma_m in logs]
     tracks = _by_logs(tracks, chains)
     chains = chains[:people]  # all of them for None
     while len(chains) < (people or 1):
@@ -297,19 +306,19 @@ def _chains(
     return chains, tracks
 
 
-def _next_chain(tracks: list[_Track], time_s: Float) -> tuple[_Chain, list[_Track]]:
+def _next_chain(tracks: list[_BodyTrack], time_s: Float) -> tuple[_PersonTracks, list[_BodyTrack]]:
     """Chain the track seen most, and what continues it, into a person; also return the tracks left over."""
-    chain = _Chain(time_s, None, 1.0)
+    chain = _PersonTracks(time_s, None, 1.0)
     return chain, [one for one in tracks if not chain.offer_without_log(one)]
 
 
 def _add_people(
-    chains: list[_Chain],
-    tracks: list[_Track],
+    chains: list[_PersonTracks],
+    tracks: list[_BodyTrack],
     time_s: Float,
     track: Int64,
-    views: Views,
-    scene: Scene | None,
+    views: SightLines,
+    scene: Surroundings | None,
 ) -> Counter[str]:
     """Add everybody else who is a person; return how many bodies are left out, by `why_no_person`.
 
@@ -318,7 +327,7 @@ def _add_people(
     """
     refused: Counter[str] = Counter()
     people = [chain.body(track) for chain in chains if chain.taken]
-    while tracks and len(chains) < _MOST_PEOPLE:
+    while tracks and len(chains) < _MAX_PEOPLE:
         chain, tracks = _next_chain(tracks, time_s)
         candidate = chain.body(track)
         cause = why_no_person(candidate, people, time_s, views, scene)
@@ -332,7 +341,7 @@ def _add_people(
     return refused
 
 
-def _by_logs(tracks: list[_Track], chains: list[_Chain]) -> list[_Track]:
+def _by_logs(tracks: list[_BodyTrack], chains: list[_PersonTracks]) -> list[_BodyTrack]:
     """Give tracks to logged people, as many at once as there are people, best sum first; return the rest."""
     if not chains or not tracks:
         return tracks
@@ -353,15 +362,15 @@ def _by_logs(tracks: list[_Track], chains: list[_Chain]) -> list[_Track]:
     return [one for k, one in enumerate(tracks) if left[k]]
 
 
-def _continues(track: _Track, owner: Int64, place: Float, time_s: Float) -> bool:
+def _continues(track: _BodyTrack, owner: Int64, place: Float, time_s: Float) -> bool:
     """Test if a lost person can be this track: not beside it, and within reach before and after."""
-    if np.mean(owner[track.time] >= 0) > _OVERLAP:
+    if np.mean(owner[track.time] >= 0) > _MAX_OVERLAP_SHARE:
         return False
     owned = np.flatnonzero(owner >= 0)
     for row, neighbour in ((0, owned[owned < track.time[0]][-1:]), (-1, owned[owned > track.time[-1]][:1])):
         for near in neighbour:
             gap_s = abs(time_s[track.time[row]] - time_s[near])
-            reach = _REACH_M + 3.0 * track.spread[row] + _PACE_M_PER_S * gap_s
+            reach = _RESUME_REACH_M + 3.0 * track.spread[row] + _RUN_M_PER_S * gap_s
             if np.linalg.norm(track.middle[row] - place[near]) > reach:
                 return False
     return True
@@ -377,7 +386,7 @@ def _detections(track: Int64, owner: Int64, taken: list[int]) -> Int64:
     return np.where(mine.any(-1), mine.argmax(-1), -1)
 
 
-def _far_from_log(tracks: list[_Track], log: Float) -> str:
+def _far_from_log(tracks: list[_BodyTrack], log: Float) -> str:
     distances = [np.linalg.norm(one.middle - log[one.time], axis=-1) for one in tracks]
     distance = np.concatenate(distances)
     distance = distance[np.isfinite(distance)]
@@ -401,7 +410,7 @@ def _nobody(nearest: Float) -> str:
 
 def _counted(
     chosen: Int64,
-    seen: Followed,
+    seen: TracksOfDetections,
     resumed: Int64,
     dropped: dict[str, Int64],
     phantoms: Mapping[str, int],

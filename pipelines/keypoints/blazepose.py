@@ -72,14 +72,20 @@ HEAVY_MODELS = PackagedModels(
     ),
 )
 
-_PICTURE_SIDE = 224  # of the person detector's input
-_CROP_SIDE = 256  # of the landmark network's input
-_CELL = 4  # crop pixels for each cell of a heatmap
+# The person detector's input has this side in pixels.
+_PICTURE_SIDE = 224
+# The landmark network's input has this side in pixels.
+_CROP_SIDE = 256
+# Each cell of a heatmap covers this many pixels of the crop.
+_CELL = 4
 _CELLS = _CROP_SIDE // _CELL
-_LANDMARKS = 39  # 33 joints, the two that place the next region, and 4 that MediaPipe does not use either
+# The network gives 33 joints, two that place the next region, and 4 that MediaPipe does not use.
+_LANDMARKS = 39
 _CENTRE, _TOP = 33, 34
-_SURE = 0.5  # a person, or a heatmap's peak, of at least this counts
-_SAME_PERSON = 0.3  # intersection over union
+# MediaPipe counts a person, or the peak of a heatmap, from this score on.
+_MIN_SCORE = 0.5
+# MediaPipe joins boxes of persons from this intersection over union on.
+_SAME_PERSON_IOU = 0.3
 PERSON_CONFIDENCE = 0.55
 """Least upper quartile of the confidences of a person's joints, on the mean of a few pictures.
 
@@ -87,7 +93,8 @@ Measured with both networks on the sample flight, a real recording of four camer
 degrees of tilt: medians of people are 0.67 to 0.93, those of tree crowns and furniture 0.29 to 0.55, but for
 one of 0.65. `presence` does not tell them apart: most crowns have more than 0.9.
 """
-_MARGIN = 1.25  # a region's side over the diameter of the circle around the person
+# The side of a region is this many diameters of the circle around the person.
+_REGION_MARGIN = 1.25
 
 
 class PersonFinder:
@@ -111,7 +118,7 @@ class PersonFinder:
         fitted = sampled(picture, placed, (_PICTURE_SIDE, _PICTURE_SIDE), beyond="black")
         raw = self._people(fitted)
         score = _sigmoid(raw["Identity_1"][0, :, 0])
-        sure = score >= _SURE
+        sure = score >= _MIN_SCORE
         numbers = raw["Identity"][0, sure].astype(np.float64) / _PICTURE_SIDE
         points = numbers.reshape(-1, 6, 2)
         points[:, [0, 2, 3, 4, 5]] += self._anchors[sure, None]
@@ -302,7 +309,7 @@ def _merged(points: Float, score: Float) -> Iterator[tuple[Float, np.float64]]:
         common = np.prod(
             np.clip(np.minimum(high[best], high[left]) - np.maximum(low[best], low[left]), 0, None), 1
         )
-        same = common > _SAME_PERSON * (area[best] + area[left] - common)
+        same = common > _SAME_PERSON_IOU * (area[best] + area[left] - common)
         same[0] = True
         group = left[same]
         yield np.average(points[group, 2:4], axis=0, weights=score[group]), score[best]
@@ -317,7 +324,7 @@ def _region(centre: Float, top: Float) -> Region:
     right, down = top - centre
     return Region(
         centre=(float(centre[0]), float(centre[1])),
-        side=float(2 * np.hypot(right, down) * _MARGIN),
+        side=float(2 * np.hypot(right, down) * _REGION_MARGIN),
         angle_rad=float(np.arctan2(right, -down)),
     )
 
@@ -362,7 +369,7 @@ def _refined(in_crop: Float, heatmap: NDArray[np.floating[Any]]) -> tuple[Float,
     peak = here.max(axis=(1, 2))
     total = np.maximum(here.sum(axis=(1, 2)), np.finfo(float).tiny)
     middle = np.stack([np.einsum("lrc,lc->l", here, x), np.einsum("lrc,lr->l", here, y)], 1) / total[:, None]
-    return np.where((peak >= _SURE)[:, None], middle * _CELL, in_crop), peak
+    return np.where((peak >= _MIN_SCORE)[:, None], middle * _CELL, in_crop), peak
 
 
 def _sigmoid(logit: NDArray[np.floating[Any]]) -> Float:

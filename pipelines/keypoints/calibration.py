@@ -21,7 +21,8 @@ from pipelines.session.errors import DataError
 _MEASURED = Path(__file__).parent / "data"
 COLUMNS = ("joints", "confidence", "probability", "count")
 ANY_JOINT = "*"
-_FEWEST = 20  # keypoints behind a knot: its probability is then known to about 0.1
+# The probability of a knot is known to about 0.1 with this many keypoints behind it.
+_MIN_KEYPOINTS = 20
 
 
 @dataclass(frozen=True)
@@ -99,10 +100,10 @@ def fit(
     for group, columns in sets.items():
         raw, outcome = confidence[:, columns].ravel(), is_good[:, columns].ravel()
         found = np.isfinite(raw) & (raw > 0)
-        if found.sum() >= _FEWEST:
+        if found.sum() >= _MIN_KEYPOINTS:
             knots[group] = _isotonic_knots(raw[found], outcome[found].astype(np.float64))
     if ANY_JOINT not in knots:
-        raise ValueError(f"fewer than {_FEWEST} keypoints to calibrate with")
+        raise ValueError(f"fewer than {_MIN_KEYPOINTS} keypoints to calibrate with")
     return Calibration(origin, good, knots)
 
 
@@ -189,7 +190,9 @@ def _isotonic_knots(confidence: Float, outcome: Float) -> Float:
     level, inverse = np.unique(confidence, return_inverse=True)
     count = np.bincount(inverse).astype(np.float64)
     good = np.bincount(inverse, weights=outcome)
-    bins = np.minimum((np.cumsum(count) - count) // _FEWEST, max(count.sum() // _FEWEST - 1, 0)).astype(int)
+    bins = np.minimum(
+        (np.cumsum(count) - count) // _MIN_KEYPOINTS, max(count.sum() // _MIN_KEYPOINTS - 1, 0)
+    ).astype(int)
     _, bins = np.unique(bins, return_inverse=True)
     total, middle, share = (
         np.bincount(bins, weights=w).astype(np.float64) for w in (count, count * level, good)

@@ -13,21 +13,28 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
-from pipelines.keypoints.grouping import Followed
-from pipelines.keypoints.no_people import Views
+from pipelines.keypoints.grouping import TracksOfDetections
+from pipelines.keypoints.no_people import SightLines
 
 Int64 = NDArray[np.int64]
 
-_WINDOW_S = 0.5  # the errors of keypoints average out, and those of poses hardly change
-_ROUNDS = 3  # the last changes the disagreement by less than a tenth
-_JOINTS = 8  # about as many are used
-_AT_ONCE = 2_000  # times whose rays are in memory: 30 MB
-_MOST_SIGMAS = 3.0  # of a correction: the person may be none
-_LASTING = 0.4  # of the first squares: at most so many remain, else the errors change from picture to picture
-_REMAINING = 0.7  # of the noise of rays: position errors move the far less than the near
+# The errors of keypoints average out over this time, and those of poses hardly change.
+_WINDOW_S = 0.5
+# The last round changes the disagreement by less than a tenth.
+_ROUNDS = 3
+# About this many joints are used, which is enough to average their errors.
+_JOINTS = 8
+# The rays of this many times take 30 MB of memory.
+_BLOCK = 2_000
+# A larger correction means that the person may be none.
+_MAX_CORRECTION_SIGMAS = 3.0
+# If more of the first squares remains, the errors change from picture to picture.
+_MAX_REMAINING_SHARE = 0.4
+# Position errors move the far less than the near, so this share of the noise of rays remains.
+_REMAINING_NOISE_SHARE = 0.7
 
 
-def without_common_errors(time_s: Float, views: Views, seen: Followed) -> Views:
+def without_common_errors(time_s: Float, views: SightLines, seen: TracksOfDetections) -> SightLines:
     """Turn the cameras so that the views of the person seen most agree.
 
     Args:
@@ -51,8 +58,8 @@ def without_common_errors(time_s: Float, views: Views, seen: Followed) -> Views:
     for _ in range(_ROUNDS):
         missed = np.concatenate(
             [
-                _missed(few, rotation, detection, slice(start, start + _AT_ONCE))
-                for start in range(0, len(time_s), _AT_ONCE)
+                _missed(few, rotation, detection, slice(start, start + _BLOCK))
+                for start in range(0, len(time_s), _BLOCK)
             ]
         )
         left.append(
@@ -62,16 +69,16 @@ def without_common_errors(time_s: Float, views: Views, seen: Followed) -> Views:
         turn = np.stack([_mean(time_s, _mean(time_s, missed[:, c])) for c in range(missed.shape[1])], axis=1)
         total += turn
         rotation = rotation @ _turned(turn)
-    small = np.hypot(*np.moveaxis(total, -1, 0)) <= _MOST_SIGMAS * views.sigma
-    if not left[-1] < _LASTING * left[0]:
+    small = np.hypot(*np.moveaxis(total, -1, 0)) <= _MAX_CORRECTION_SIGMAS * views.sigma
+    if not left[-1] < _MAX_REMAINING_SHARE * left[0]:
         return views
     return views._replace(
         rotation=np.where(small[..., None, None], rotation, views.rotation),
-        sigma=np.where(small, _REMAINING, 1.0) * views.sigma,
+        sigma=np.where(small, _REMAINING_NOISE_SHARE, 1.0) * views.sigma,
     )
 
 
-def _most_seen(seen: Followed) -> Bool | None:
+def _most_seen(seen: TracksOfDetections) -> Bool | None:
     """Find the detections [T, C, D] of the track whom two cameras or more see most; None without one."""
     tracks, views = np.unique(seen.track[np.isfinite(seen.spread)], return_counts=True)
     if not len(tracks):
@@ -79,7 +86,7 @@ def _most_seen(seen: Followed) -> Bool | None:
     return np.asarray(np.isfinite(seen.spread) & (seen.track == tracks[views.argmax()]))
 
 
-def _missed(views: Views, rotation: Float, detection: Int64, rows: slice) -> Float:
+def _missed(views: SightLines, rotation: Float, detection: Int64, rows: slice) -> Float:
     """Compute how far a person's joints are from where they are seen, median over joints [N, C, 2]; or NaN.
 
     Joints are the points nearest to their rays by least squares.

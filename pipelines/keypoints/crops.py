@@ -10,7 +10,8 @@ from pipelines.geometry.arrays import Float, Picture
 from pipelines.geometry.compilation import cached, helper
 from pipelines.session.registries import Region
 
-_STEPS = 32  # of a position between two pixels, as OpenCV 4 rounds it
+# OpenCV 4 rounds a position between two pixels to this many steps.
+_STEPS_PER_PIXEL = 32
 
 
 def sampled(picture: Picture, picture_from_crop: Float, size: tuple[int, int], *, beyond: str) -> Picture:
@@ -57,7 +58,7 @@ def fixed_point_maps(
     """
     whole = np.empty((height, width, 2), np.int16)
     part = np.empty((height, width), np.uint16)
-    steps = np.float32(_STEPS)
+    steps = np.float32(_STEPS_PER_PIXEL)
     for row in range(height):
         x_begin = picture_from_crop[0, 1] * row + picture_from_crop[0, 2]
         y_begin = picture_from_crop[1, 1] * row + picture_from_crop[1, 2]
@@ -66,7 +67,7 @@ def fixed_point_maps(
             x = np.int64(np.rint(np.float32(picture_from_crop[0, 0] * column + x_begin) * steps))
             y = np.int64(np.rint(np.float32(picture_from_crop[1, 0] * column + y_begin) * steps))
             whole[row, column] = _as_int16(x >> 5), _as_int16(y >> 5)
-            part[row, column] = (y & 31) * _STEPS + (x & 31)
+            part[row, column] = (y & 31) * _STEPS_PER_PIXEL + (x & 31)
     return whole, part
 
 

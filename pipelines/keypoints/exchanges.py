@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.compilation import cached, helper
-from pipelines.keypoints.grouping import Followed
+from pipelines.keypoints.grouping import TracksOfDetections
 from pipelines.keypoints.grouping_rays import (
     Nodes,
     collect_nodes,
@@ -26,22 +26,26 @@ from pipelines.keypoints.grouping_rays import (
     place_group,
     views_of_group,
 )
-from pipelines.keypoints.no_people import Views
+from pipelines.keypoints.no_people import SightLines
 
 Int64 = NDArray[np.int64]
 
-_STEP_S = 0.1  # between the times that are judged: evidence in between is hardly independent
-_MOST_TRACKS = 12  # those seen most
-_FEWEST = 5  # judged times at which two cameras see a track
-_EXCHANGES = 20
-_LEAST_GAIN = (
-    25.0  # in the squares of sigma; the surplus of one right pair over one wrong is up to 109 a time
-)
+# Evidence of times that are nearer to each other is hardly independent.
+_STEP_S = 0.1
+# Only the tracks that are seen most are judged, because pairs grow with the square.
+_MAX_TRACKS = 12
+# Two cameras must see a track at this many judged times.
+_MIN_JUDGED_TIMES = 5
+# Each round undoes one exchange, and a flight with more is not understood.
+_MAX_EXCHANGES = 20
+# An exchange must save this many squares of sigma: one right pair has up to 109 a time more than a wrong one.
+_MIN_GAIN = 25.0
 _APART, _UNSEEN, _OVERLAPPING = 30.0, 6.0, 2.0  # costs to begin or end an exchange
-_OVERLAP = 0.3  # heights of a body between two that overlap in a picture
+# Two people overlap in a picture if they are nearer than this many heights of a body.
+_OVERLAP_HEIGHTS = 0.3
 
 
-def undo_exchanges(time_s: Float, views: Views, seen: Followed) -> Followed:
+def undo_exchanges(time_s: Float, views: SightLines, seen: TracksOfDetections) -> TracksOfDetections:
     """Exchange detections of two tracks in one camera where the views of the whole flight fit better so.
 
     Args:
@@ -50,9 +54,9 @@ def undo_exchanges(time_s: Float, views: Views, seen: Followed) -> Followed:
         seen: their tracks; its arrays are changed.
     """
     judged = np.flatnonzero(np.diff(np.floor((time_s - time_s[0]) / _STEP_S + 1e-9), prepend=-1.0) > 0)
-    for _ in range(_EXCHANGES):
+    for _ in range(_MAX_EXCHANGES):
         tracks = _tracks(seen, judged)
-        best, camera, pair, times = _LEAST_GAIN, -1, (-1, -1), np.zeros(0, np.bool_)
+        best, camera, pair, times = _MIN_GAIN, -1, (-1, -1), np.zeros(0, np.bool_)
         if len(tracks) < 2:
             break
         fit, there, near = _evidence(views, seen, judged, tracks)
@@ -76,13 +80,13 @@ def undo_exchanges(time_s: Float, views: Views, seen: Followed) -> Followed:
     return seen
 
 
-def _tracks(seen: Followed, judged: Int64) -> Int64:
+def _tracks(seen: TracksOfDetections, judged: Int64) -> Int64:
     """Return the tracks that two cameras see most."""
     track = seen.track[judged]
     tracks, count = np.unique(track[seen.views[judged] > 1], return_counts=True)
-    enough = count >= 2 * _FEWEST
+    enough = count >= 2 * _MIN_JUDGED_TIMES
     order = np.argsort(-count[enough], kind="stable")
-    return np.asarray(tracks[enough][order[:_MOST_TRACKS]])
+    return np.asarray(tracks[enough][order[:_MAX_TRACKS]])
 
 
 def _nearest(judged: Int64, times: int) -> Int64:
@@ -91,7 +95,9 @@ def _nearest(judged: Int64, times: int) -> Int64:
     return np.searchsorted(middles, np.arange(times), side="right")
 
 
-def _evidence(views: Views, seen: Followed, judged: Int64, tracks: Int64) -> tuple[Float, Bool, Float]:
+def _evidence(
+    views: SightLines, seen: TracksOfDetections, judged: Int64, tracks: Int64
+) -> tuple[Float, Bool, Float]:
     """Compare the detection of every track in every camera with all tracks' detections in other cameras.
 
     Returns:
@@ -113,7 +119,7 @@ def _evidence(views: Views, seen: Followed, judged: Int64, tracks: Int64) -> tup
     return found
 
 
-def _arrays(views: Views, rows: Int64) -> tuple[Float, Float, Float, Float, Float]:
+def _arrays(views: SightLines, rows: Int64) -> tuple[Float, Float, Float, Float, Float]:
     """Return the detections at some times, as `collect_nodes` takes them."""
     posed = np.isfinite(views.position[rows]).all(-1) & np.isfinite(views.rotation[rows]).all((-1, -2))
     sigma = np.where(posed & (views.sigma[rows] > 0), views.sigma[rows], np.nan)
@@ -172,7 +178,7 @@ def _heights_apart(nodes: Nodes, a: int, b: int, scratch: Float) -> float:
 
 def _best_times(gain: Float, seen: Bool, near: Float) -> Bool:
     """Find the times [N] at which an exchange is worth most (Viterbi, two states)."""
-    cost = np.where(seen, np.where(near < _OVERLAP, _OVERLAPPING, _APART), _UNSEEN)
+    cost = np.where(seen, np.where(near < _OVERLAP_HEIGHTS, _OVERLAPPING, _APART), _UNSEEN)
     change = np.minimum(cost[1:], cost[:-1])
     score = np.array([0.0, gain[0]])
     came = np.zeros((len(gain), 2), np.int64)
@@ -189,7 +195,9 @@ def _best_times(gain: Float, seen: Bool, near: Float) -> Bool:
     return states
 
 
-def _exchange(views: Views, seen: Followed, camera: int, pair: tuple[int, int], times: Bool) -> None:
+def _exchange(
+    views: SightLines, seen: TracksOfDetections, camera: int, pair: tuple[int, int], times: Bool
+) -> None:
     """Exchange the detections of two tracks in one camera at some times [T], and place both again."""
     own = seen.track[:, camera]
     first, second = (times[:, None] & (own == track) for track in pair)

@@ -42,12 +42,15 @@ from pipelines.keypoints.grouping_rays import (
 
 Int64 = NDArray[np.int64]
 
-_HOLD_S = 0.5  # a picture is compared with later ones for this long
-_PACE_M_PER_S = 0.7  # random part of a walk, for taking up a track again
-_BODY_RADIUS_M = 0.3  # the middle of a body depends on which joints are seen
+# A picture is compared with later ones for this long.
+_HOLD_S = 0.5
+# The random part of a walk has this speed, for taking up a track again.
+_RANDOM_WALK_M_PER_S = 0.7
+# The middle of a body depends on which joints are seen.
+_BODY_RADIUS_M = 0.3
 
 
-class Tracks(NamedTuple):
+class TrackSlots(NamedTuple):
     """State of the people seen so far: arrays of S slots."""
 
     identity: Int64  # [S] number of the track, -1 free
@@ -60,9 +63,9 @@ class Tracks(NamedTuple):
     apart: Bool  # [S, S] seen side by side in one picture: two people
 
 
-def empty_tracks(slots: int, cameras: int, joints: int) -> Tracks:
+def empty_tracks(slots: int, cameras: int, joints: int) -> TrackSlots:
     """Allocate tracks without any person; the logged people are one more camera."""
-    return Tracks(
+    return TrackSlots(
         identity=np.full(slots, -1, np.int64),
         views=np.zeros(slots, np.int64),
         seen_s=np.zeros(slots),
@@ -75,7 +78,7 @@ def empty_tracks(slots: int, cameras: int, joints: int) -> Tracks:
 
 
 @helper
-def recognise_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, scratch: Float) -> None:
+def recognise_tracks(nodes: Nodes, n: int, tracks: TrackSlots, now: float, scratch: Float) -> None:
     """Rate, 0..1, how well each detection continues each track's last picture in the same camera."""
     slots, cameras = tracks.held_s.shape[0], tracks.held_s.shape[1] - 1
     for a in range(n):
@@ -105,7 +108,7 @@ def recognise_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, scratch: 
 
 
 @helper
-def resume_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Float, spread: Float) -> None:
+def resume_tracks(nodes: Nodes, n: int, tracks: TrackSlots, now: float, middle: Float, spread: Float) -> None:
     """Assign lost tracks to groups without a track, nearest first."""
     slots = len(tracks.identity)
     while True:
@@ -118,7 +121,7 @@ def resume_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Floa
                 if free and math.isfinite(tracks.spread[k]):
                     wait = now - tracks.seen_s[k]
                     variance = spread[label] ** 2 + tracks.spread[k] ** 2
-                    variance += _BODY_RADIUS_M**2 + (_PACE_M_PER_S * wait) ** 2
+                    variance += _BODY_RADIUS_M**2 + (_RANDOM_WALK_M_PER_S * wait) ** 2
                     square = 0.0
                     for axis in range(3):
                         square += (middle[label, axis] - tracks.middle[k, axis]) ** 2 / variance
@@ -143,7 +146,7 @@ def _rename(nodes: Nodes, old: int, new: int, middle: Float, spread: Float) -> N
 
 @helper
 def found_tracks(
-    nodes: Nodes, n: int, tracks: Tracks, now: float, identity: int, middle: Float, spread: Float
+    nodes: Nodes, n: int, tracks: TrackSlots, now: float, identity: int, middle: Float, spread: Float
 ) -> int:
     """Start a track for every group that has none and return the next free identity."""
     slots = len(tracks.identity)
@@ -164,7 +167,7 @@ def found_tracks(
 
 
 @helper
-def _vacant(nodes: Nodes, tracks: Tracks, now: float) -> int:
+def _vacant(nodes: Nodes, tracks: TrackSlots, now: float) -> int:
     """Choose a slot: a free one, else one that no person can return to, else the least seen."""
     best, score = 0, np.inf
     for k in range(len(tracks.identity)):
@@ -182,7 +185,9 @@ def _vacant(nodes: Nodes, tracks: Tracks, now: float) -> int:
 
 
 @helper
-def remember_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Float, spread: Float) -> None:
+def remember_tracks(
+    nodes: Nodes, n: int, tracks: TrackSlots, now: float, middle: Float, spread: Float
+) -> None:
     """Store the pictures and places of this frame."""
     slots, cameras = tracks.held_s.shape
     for k in range(slots):
@@ -210,7 +215,7 @@ def remember_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Fl
 
 
 @helper
-def _hand_over(nodes: Nodes, n: int, tracks: Tracks, k: int, c: int) -> None:
+def _hand_over(nodes: Nodes, n: int, tracks: TrackSlots, k: int, c: int) -> None:
     """Forget a track's picture when its continuation was given to another track.
 
     Otherwise both tracks would claim the detection while the old picture is held.
@@ -236,10 +241,14 @@ def is_most_like(nodes: Nodes, a: int, track: int) -> bool:
     return bool(nodes.known[a, track] >= greatest)
 
 
-_KNOWN = 1.0  # each side of a pair that continues the track adds this; 8 locked wrong starts in for good
-_LOYAL = 14.0  # on top, for leaving company for none: a known detection is refused beyond 5 sigma
-_STAY = 4.0  # score of continuing a track for a detection that is alone in its group
-_SURE = 0.3  # likeness 0..1 with a track's last picture above which the detection is a known person
+# Each side of a pair that continues the track adds this score. With 8, wrong starts are never left.
+_KNOWN_SCORE = 1.0
+# A known detection that leaves its group for none is refused beyond 5 sigma.
+_LOYALTY_SCORE = 14.0
+# A detection that is alone in its group gets this score for continuing a track.
+_STAY_SCORE = 4.0
+# A detection more like a track's last picture than this (0..1) is a known person.
+_KNOWN_LIKENESS = 0.3
 
 
 @helper
@@ -283,7 +292,7 @@ def _affinity(nodes: Nodes, one: int, two: int) -> float:
 
 
 @helper
-def join_groups(nodes: Nodes, n: int, tracks: Tracks) -> None:
+def join_groups(nodes: Nodes, n: int, tracks: TrackSlots) -> None:
     """Join groups that agree, best first, until none does; joined tracks become the one seen more."""
     slots = len(tracks.identity)
     while True:
@@ -313,7 +322,7 @@ def join_groups(nodes: Nodes, n: int, tracks: Tracks) -> None:
 
 
 @helper
-def bind_known(nodes: Nodes, n: int, tracks: Tracks) -> None:
+def bind_known(nodes: Nodes, n: int, tracks: TrackSlots) -> None:
     """Compute the bond of each detection to each track: continuity minus that of the best other track.
 
     If a detection continues a person who was once seen beside the track in one picture, it is not assigned
@@ -337,18 +346,18 @@ def bind_known(nodes: Nodes, n: int, tracks: Tracks) -> None:
                 nodes.bond[a, k] = best - next_best
             else:
                 nodes.bond[a, k] = nodes.known[a, k] - best
-            nodes.barred[a, k] = best > _SURE and k != first and tracks.apart[first, k]
+            nodes.barred[a, k] = best > _KNOWN_LIKENESS and k != first and tracks.apart[first, k]
 
 
 @helper
 def _gain(nodes: Nodes, a: int, label: int) -> float:
     """Compute a detection's contribution to a group's score; ignore others of its own camera in the group."""
     bond = float(nodes.bond[a, label])
-    total = _STAY * bond
+    total = _STAY_SCORE * bond
     for c in range(nodes.member.shape[1]):
         b = nodes.member[label, c]
         if c != nodes.camera[a] and b >= 0:
-            total += nodes.weight[a, b] + _KNOWN * (bond + nodes.bond[b, label])
+            total += nodes.weight[a, b] + _KNOWN_SCORE * (bond + nodes.bond[b, label])
     return total
 
 
@@ -377,7 +386,7 @@ def settle_nodes(nodes: Nodes, n: int, slots: int) -> None:
                 rival = nodes.member[label, c]
                 if empty and label >= slots:
                     mates = max(0, size_of_group(nodes, here) - 1)
-                    gain -= _LOYAL * mates * nodes.known[a, here] if here < slots else 0.0
+                    gain -= _LOYALTY_SCORE * mates * nodes.known[a, here] if here < slots else 0.0
                 barred = label < slots and nodes.barred[a, label]
                 if rival < 0:
                     if gain > best and not barred:
@@ -387,7 +396,7 @@ def settle_nodes(nodes: Nodes, n: int, slots: int) -> None:
                 swapped = gain + _gain(nodes, rival, here)
                 if swapped > best:
                     best, target, exchange = swapped, label, True
-                evicted = gain + _STAY * nodes.bond[rival, labels - 1]
+                evicted = gain + _STAY_SCORE * nodes.bond[rival, labels - 1]
                 if evicted > best and not barred:
                     best, target, exchange = evicted, label, False
             if target < 0:
@@ -410,10 +419,11 @@ def _empty_label(nodes: Nodes, slots: int, labels: int) -> int:
     return labels - 1  # never reached: an evicted node leaves fewer than N others for N labels
 
 
-_SPARE = 16  # tracks remembered beyond one for each possible detection
+# This many tracks are remembered beyond one for each possible detection.
+_SPARE_TRACKS = 16
 
 
-class Followed(NamedTuple):
+class TracksOfDetections(NamedTuple):
     """Identity of each detection: T times, C cameras, D detections."""
 
     track: Int64  # [T, C, D] number of the track, -1 where the detection was not usable
@@ -467,8 +477,8 @@ def _follow(
     sigma: Float,
     logs: Float,
     nodes: Nodes,
-    tracks: Tracks,
-    followed: Followed,
+    tracks: TrackSlots,
+    followed: TracksOfDetections,
 ) -> None:
     times, cameras, _, joints = confidence.shape
     needed = min(3, joints)
@@ -516,7 +526,7 @@ def follow(
     rotation: Float,
     sigma: Float,
     logs: Float | None = None,
-) -> Followed:
+) -> TracksOfDetections:
     """Group the detections of every frame into people and follow these over time.
 
     Args:
@@ -533,8 +543,8 @@ def follow(
     times, cameras, detections, joints = confidence.shape
     logs = np.full((times, 1, 4), np.nan) if logs is None else np.ascontiguousarray(logs, np.float64)
     room = cameras * detections + logs.shape[1]
-    slots = room + _SPARE
-    followed = Followed(
+    slots = room + _SPARE_TRACKS
+    followed = TracksOfDetections(
         track=np.full(confidence.shape[:3], -1, np.int64),
         views=np.zeros(confidence.shape[:3], np.int64),
         middle=np.full((times, cameras, detections, 3), np.nan),

@@ -11,13 +11,19 @@ from pipelines.geometry.compilation import helper
 
 Int64 = NDArray[np.int64]
 
-_AGREE = 9.0  # a pair of detections without history is one person within 3 sigma
-_CAP = 100.0  # squared: beyond 10 sigma the penalty does not grow
-FEW_JOINTS = 3.0  # common joints at which a pair has half the weight of a complete one
-_BODY_M = 0.05  # rays that pass this near are one body: joint definitions, left/right swaps, blur
+# A pair of detections without history is one person within 3 sigma.
+_AGREE_CHI2 = 9.0
+# Beyond 10 sigma the penalty does not grow.
+_MAX_CHI2 = 100.0
+# A pair with this many common joints has half the weight of a complete one.
+FEW_JOINTS = 3.0
+# Rays of one body pass within this: joint definitions, swaps of left and right, blur.
+_SAME_BODY_M = 0.05
 _SIZE_M = (0.03, 1.5)  # median distance of joints from their middle: 0.4 m for an adult, 0.06 for a face
-_LOGGED_POINT_M = 0.5  # the log's point (a tag, a phone, the hip) against the joints of a body
-_EXACT_LOG_M = 0.5  # largest standard deviation of a log that tells apart people who stand together
+# The log's point (a tag, a phone, the hip) lies this far from the joints of a body.
+_LOGGED_POINT_M = 0.5
+# Logs with a larger standard deviation do not tell apart people who stand together.
+_EXACT_LOG_M = 0.5
 # As _LOGGED_POINT_M: the noise of such a log is estimated from bodies, and contains some of it.
 _EXACT_POINT_M = 0.3
 
@@ -183,11 +189,11 @@ def compare_nodes(
                 pass
             elif nodes.camera[a] == len(sigma):
                 log = logs[nodes.detection[a]]
-                weight = _AGREE - _distance_from_log(nodes, b, position, sigma, log, scratch)
+                weight = _AGREE_CHI2 - _distance_from_log(nodes, b, position, sigma, log, scratch)
             else:
                 square, joints = _disagreement(nodes, a, b, position, sigma, scratch)
                 if joints >= needed:
-                    weight = (_AGREE - square) * joints / (joints + FEW_JOINTS)
+                    weight = (_AGREE_CHI2 - square) * joints / (joints + FEW_JOINTS)
                     nearest = min(nearest, square)
             nodes.weight[a, b] = weight
             nodes.weight[b, a] = weight
@@ -226,15 +232,15 @@ def _disagreement(
         if possible and check_size:
             small, large = za * nodes.size[a], zb * nodes.size[b]
             possible = min(small, large) > _SIZE_M[0] and max(small, large) < _SIZE_M[1]
-        square = _CAP
+        square = _MAX_CHI2
         if possible:
             distance2 = (bx * nx + by * ny + bz * nz) ** 2 / sine2
-            variance = (sigma[ca] * za) ** 2 + (sigma[cb] * zb) ** 2 + _BODY_M**2
-            square = min(distance2 / variance, _CAP)
+            variance = (sigma[ca] * za) ** 2 + (sigma[cb] * zb) ** 2 + _SAME_BODY_M**2
+            square = min(distance2 / variance, _MAX_CHI2)
         squares[count] = square
         count += 1
     if count == 0:
-        return _CAP, 0
+        return _MAX_CHI2, 0
     median_of(squares, count)
     kept = max(1, (3 * count) // 4)
     total = 0.0
@@ -259,10 +265,10 @@ def _distance_from_log(
             sight = log[axis] - position[c, axis]
             depth += sight * nodes.rays[a, j, axis]
             range2 += sight * sight
-        squares[count] = _CAP
+        squares[count] = _MAX_CHI2
         if depth > 0.0:
             square = (range2 - depth * depth) / ((sigma[c] * depth) ** 2 + log[3] ** 2 + point_m**2)
-            squares[count] = min(square, _CAP)
+            squares[count] = min(square, _MAX_CHI2)
         count += 1
     return median_of(squares, count)
 

@@ -13,8 +13,10 @@ from pipelines.session.description import CameraEntry, Interpolation
 from pipelines.session.people import LoggedActor
 from pipelines.session.records import Trajectory
 
-_SIGMAS = 3.0
-_STEP = 1e-4  # of the range: small against a body, large against rounding
+# The actor lies within this many standard deviations of the log, but for 3 of 1,000 times.
+_MARGIN_SIGMAS = 3.0
+# This share of the range is small against a body and large against rounding.
+_RANGE_STEP = 1e-4
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,13 @@ def project_actor(
         return None
     distance = float(np.linalg.norm(actor))
     across = np.linalg.svd(actor[None, :])[2][1:]  # two unit vectors at right angles to the line of sight
-    points = np.vstack([actor, actor + _STEP * distance * across])
+    points = np.vstack([actor, actor + _RANGE_STEP * distance * across])
     pixels = project(points, intrinsics)
     if not np.isfinite(pixels).all():
         return None
-    px_per_rad = float(np.sqrt(abs(np.linalg.det(pixels[1:] - pixels[0])))) / _STEP
-    nearest = distance - _SIGMAS * sigma_m
-    margin = _SIGMAS * px_per_rad * float(np.hypot(sigma_m / distance, sigma_rad))
+    px_per_rad = float(np.sqrt(abs(np.linalg.det(pixels[1:] - pixels[0])))) / _RANGE_STEP
+    nearest = distance - _MARGIN_SIGMAS * sigma_m
+    margin = _MARGIN_SIGMAS * px_per_rad * float(np.hypot(sigma_m / distance, sigma_rad))
     x, y = float(pixels[0, 0]), float(pixels[0, 1])
     if not (-margin <= x <= intrinsics.width - 1 + margin and -margin <= y <= intrinsics.height - 1 + margin):
         return None

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
-from pipelines.keypoints.grouping import Followed
+from pipelines.keypoints.grouping import TracksOfDetections
 
 Int64 = NDArray[np.int64]
 Ground = Callable[[Float], tuple[Float, Float]]
@@ -28,37 +28,52 @@ _EXTENT_M = (0.4, 2.6)  # diagonal of the box about a body's joints: curled up, 
 _HEIGHT_M = (-1.0, 2.0)  # of the middle of a body above the ground: lying in a hollow, and jumping
 _USUAL_EXTENT_M = (0.8, 2.2)  # crouching, and a tall person
 _USUAL_HEIGHT_M = (-0.3, 1.6)
-_SIGMAS = 3.0
-_JUDGED = 5  # pictures before a track is judged, as in `tracking`
-_MOST = 0.5  # of the pictures that can be judged must be refused
-_COMPANY = 0.05  # of the pictures: another camera that sees a track more rarely does not see it
-_PLACED_M = 1.0  # a group's place counts if its standard deviation is smaller
-_STEPS = 48  # places along a line of sight: at 60 m, and 45 degrees from above, one in each 1.7 m of height
-_EDGE = 0.1  # of a picture: a body so near its edge may not be found
-_BETWEEN = 8  # points on the way from another camera to a place
-_SLOPE = 0.3  # by which the ground may rise from where somebody went
-_HIP_M = 0.95  # above the ground, of a standing actor
-_BESIDE_M = 1.0  # error of the ground under a person: posture and log
-_AT_ONCE = 1_000  # detections whose places are in memory: 100 MB
+# A detection is left out only if it contradicts the ground beyond this many standard deviations.
+_MARGIN_SIGMAS = 3.0
+# A track is judged after this many pictures, as in `tracking`.
+_JUDGED_PICTURES = 5
+# More than this share of the pictures that can be judged must be refused.
+_MIN_REFUSED_SHARE = 0.5
+# A camera that sees a track in a smaller share of the pictures does not see it.
+_MIN_COMPANY_SHARE = 0.05
+# A group's place counts if its standard deviation is smaller.
+_MAX_PLACE_SIGMA_M = 1.0
+# Along a line of sight of 60 m, 45 deg from above, a place lies in each 1.7 m of height.
+_SIGHT_STEPS = 48
+# A body this near the edge of a picture (a share of it) may not be found.
+_EDGE_SHARE = 0.1
+# The way from another camera to a place is tested at this many points.
+_BETWEEN_POINTS = 8
+# The ground may rise this much from where somebody went.
+_MAX_SLOPE = 0.3
+# The hip of a standing actor is this high above the ground.
+_HIP_HEIGHT_M = 0.95
+# The ground under a person is this uncertain, by posture and log.
+_GROUND_SIGMA_M = 1.0
+# The places of this many detections take 100 MB of memory.
+_BLOCK = 1_000
 
 
-class Scene(NamedTuple):
+class Surroundings(NamedTuple):
     """Surroundings of the people, as far as they are known."""
 
     ground: Ground | None  # of a map or a log; without either it is that under who is seen most
     fields: Float  # [C, 4] left, top, right, bottom of each camera's picture, normalised
 
 
-_LEAST_S = 1.0  # of sight by two cameras before somebody counts as a person
-_ALONGSIDE_M = (
-    0.5  # a second body nearer than this to a person, and never beside them in a picture, is theirs
-)
-_LARGEST_MISFIT = 4.0  # median of chi-square per degree of freedom; its expectation is 1
-_SAMPLES = 200  # times at which a body is triangulated
-_DOUBTED = 0.5  # of the ground's doubt: where a level is all that is known, a crown at 3 m is not on it
+# Two cameras must see somebody for this long before they count as a person.
+_MIN_SIGHT_S = 1.0
+# A second body nearer to a person than this, never beside them in a picture, is theirs.
+_SAME_PERSON_M = 0.5
+# The median of chi-square per degree of freedom has an expectation of 1.
+_MAX_MISFIT = 4.0
+# A body is triangulated at this many times, which suffices for medians.
+_SAMPLES = 200
+# Where a level is all that is known, a crown at 3 m is not on the ground.
+_DOUBTED_SHARE = 0.5
 
 
-class Views(NamedTuple):
+class SightLines(NamedTuple):
     """All detections of a flight, as `tell_no_people` takes them."""
 
     xy: Float  # [T, C, D, J, 2]
@@ -68,14 +83,20 @@ class Views(NamedTuple):
     sigma: Float  # [T, C]
 
 
-class Body(NamedTuple):
+class PossiblePerson(NamedTuple):
     """Detections that may be one person over time."""
 
     choice: Int64  # [T, C] index of the detection in each camera, -1 none
     middle: Float  # [T, 3] m, NaN where fewer than two cameras see the body
 
 
-def why_no_person(body: Body, people: list[Body], time_s: Float, views: Views, scene: Scene | None) -> str:
+def why_no_person(
+    body: PossiblePerson,
+    people: list[PossiblePerson],
+    time_s: Float,
+    views: SightLines,
+    scene: Surroundings | None,
+) -> str:
     """Say why a body that two cameras see is no further person to reconstruct; empty if it is one.
 
     Args:
@@ -99,16 +120,20 @@ def why_no_person(body: Body, people: list[Body], time_s: Float, views: Views, s
         together |= both
         side_by_side: Bool = np.asarray(((body.choice >= 0) & (other.choice >= 0)).any(axis=1))
         apart = np.linalg.norm(body.middle - other.middle, axis=1)
-        if both.any() and np.median(apart[both]) < _ALONGSIDE_M and np.mean(side_by_side[both]) < _COMPANY:
+        if (
+            both.any()
+            and np.median(apart[both]) < _SAME_PERSON_M
+            and np.mean(side_by_side[both]) < _MIN_COMPANY_SHARE
+        ):
             return "same"
-    if (there if not people else together).sum() * step_s < _LEAST_S:
+    if (there if not people else together).sum() * step_s < _MIN_SIGHT_S:
         return "short"
     if cause := why_no_body(body, views, scene):
         return cause
     return "bystander" if scene is not None and _is_bystander(body, people, views, scene.fields) else ""
 
 
-def why_no_body(body: Body, views: Views, scene: Scene | None) -> str:
+def why_no_body(body: PossiblePerson, views: SightLines, scene: Surroundings | None) -> str:
     """Say why detections are not one person's body; empty if they are, or if two cameras never see it.
 
     Returns:
@@ -120,17 +145,19 @@ def why_no_body(body: Body, views: Views, scene: Scene | None) -> str:
     if scene is not None and scene.ground is not None:
         height, doubt = _heights(scene.ground, body.middle[rows])
         known = np.isfinite(height)
-        slack = _DOUBTED * doubt[known]
+        slack = _DOUBTED_SHARE * doubt[known]
         off = (height[known] - slack > _USUAL_HEIGHT_M[1]) | (height[known] + slack < _HEIGHT_M[0])
-        if known.any() and off.mean() > _MOST:
+        if known.any() and off.mean() > _MIN_REFUSED_SHARE:
             return "ground"
     extent_m, misfit = _body_of(body.choice, rows[:: -(-len(rows) // _SAMPLES)], views)
     if not _USUAL_EXTENT_M[0] <= extent_m <= _EXTENT_M[1]:
         return "size"
-    return "misfit" if misfit > _LARGEST_MISFIT else ""
+    return "misfit" if misfit > _MAX_MISFIT else ""
 
 
-def _is_bystander(body: Body, people: list[Body], views: Views, fields: Float) -> bool:
+def _is_bystander(
+    body: PossiblePerson, people: list[PossiblePerson], views: SightLines, fields: Float
+) -> bool:
     """Test if a body stands beyond the cameras that film the people, and never in all of their pictures.
 
     Cameras about a person look inwards. Whoever is further from everybody taken for a person than half of the
@@ -152,10 +179,10 @@ def _is_bystander(body: Body, people: list[Body], views: Views, fields: Float) -
         shown = _in_picture(body.middle[rows, None], position[:, c], rotation[:, c], field)[:, 0]
         whole &= shown | ~posed[:, c]
     beyond = apart > np.nanmedian(ring, axis=1)
-    return bool(beyond.mean() > _MOST and whole.mean() < _COMPANY)
+    return bool(beyond.mean() > _MIN_REFUSED_SHARE and whole.mean() < _MIN_COMPANY_SHARE)
 
 
-def _body_of(choice: Int64, rows: NDArray[np.intp], views: Views) -> tuple[float, float]:
+def _body_of(choice: Int64, rows: NDArray[np.intp], views: SightLines) -> tuple[float, float]:
     """Triangulate a body at some times [N] by least squares on its viewing rays.
 
     Returns:
@@ -208,19 +235,19 @@ def level_of(hips: Float) -> Ground:
     def ground(points: Float) -> tuple[Float, Float]:
         away = np.stack([np.hypot(*(points[:, :2] - place[:2]).T) for place in way])
         nearest = away.argmin(axis=0)
-        return way[nearest, 2] - _HIP_M, _BESIDE_M + _SLOPE * away.min(axis=0)
+        return way[nearest, 2] - _HIP_HEIGHT_M, _GROUND_SIGMA_M + _MAX_SLOPE * away.min(axis=0)
 
     return ground
 
 
 def tell_no_people(
-    seen: Followed,
+    seen: TracksOfDetections,
     xy: Float,
     confidence: Float,
     position: Float,
     rotation: Float,
     sigma: Float,
-    scene: Scene,
+    scene: Surroundings,
 ) -> NoPeople:
     """Tell which detections are no people.
 
@@ -242,17 +269,17 @@ def tell_no_people(
             continue
         parts = [
             _verdicts(seen, (at[0][rows], c, at[1][rows]), (xy, confidence, position, rotation, sigma), scene)
-            for rows in (slice(k, k + _AT_ONCE) for k in range(0, len(at[0]), _AT_ONCE))
+            for rows in (slice(k, k + _BLOCK) for k in range(0, len(at[0]), _BLOCK))
         ]
         refused, judged, looked = (np.concatenate(each) for each in zip(*parts, strict=True))
         weight = np.nan_to_num(confidence[:, c][at]).sum(axis=-1)
         _, track = np.unique(seen.track[:, c][at], return_inverse=True)
         surest = np.bincount(track, weight).argmax()
 
-        off = _shares(track, refused, judged) > _MOST
+        off = _shares(track, refused, judged) > _MIN_REFUSED_SHARE
         company = seen.views[:, c][at] > 1
         share = _shares(track, company, looked | company)
-        alone = (share < _COMPANY) & bool(share[surest] > _MOST)
+        alone = (share < _MIN_COMPANY_SHARE) & bool(share[surest] > _MIN_REFUSED_SHARE)
         ground = off & (not off[surest])
         found.ground[at[0], c, at[1]] = ground[track]
         found.alone[at[0], c, at[1]] = (alone & ~ground)[track]
@@ -260,9 +287,9 @@ def tell_no_people(
     return found
 
 
-def level_of_most_seen(seen: Followed) -> Ground | None:
+def level_of_most_seen(seen: TracksOfDetections) -> Ground | None:
     """Return the level of the person whom several cameras see most; None without one."""
-    placed = seen.spread < _PLACED_M
+    placed = seen.spread < _MAX_PLACE_SIGMA_M
     people, views = np.unique(seen.track[placed], return_counts=True)
     if not len(people):
         return None
@@ -272,14 +299,14 @@ def level_of_most_seen(seen: Followed) -> Ground | None:
 def _shares(track: NDArray[np.intp], said: Bool, judged: Bool) -> Float:
     """Return the share of each track's judged pictures that say so, NaN for fewer than five of them."""
     count = np.bincount(track, judged).astype(np.float64)
-    return np.bincount(track, said & judged) / np.where(count >= _JUDGED, count, np.nan)
+    return np.bincount(track, said & judged) / np.where(count >= _JUDGED_PICTURES, count, np.nan)
 
 
 def _verdicts(
-    seen: Followed,
+    seen: TracksOfDetections,
     at: tuple[Int64, int, Int64],
     seen_by: tuple[Float, Float, Float, Float, Float],
-    scene: Scene,
+    scene: Surroundings,
 ) -> tuple[Bool, Bool, Bool]:
     """Judge detections of one camera.
 
@@ -297,17 +324,17 @@ def _verdicts(
     time, camera, _ = at
     points = np.where((confidence[at] > 0)[..., None], xy[at], np.nan)
     reach, places = _line_of_sight(points, position[time, camera], rotation[time, camera])
-    error = _SIGMAS * sigma[time, camera, None] * reach
-    extent = np.geomspace(*_EXTENT_M, _STEPS)
+    error = _MARGIN_SIGMAS * sigma[time, camera, None] * reach
+    extent = np.geomspace(*_EXTENT_M, _SIGHT_STEPS)
     usual = np.tile((extent >= _USUAL_EXTENT_M[0]) & (extent <= _USUAL_EXTENT_M[1]), (len(places), 1))
     if scene.ground is None:
         nothing = np.zeros(len(places), np.bool_)
         return nothing, nothing, _others_look(places, usual, time, camera, position, rotation, scene)
     height, doubt = _heights(scene.ground, places)
     above, off_by = _heights(scene.ground, seen.middle[at])
-    off_by = off_by + _SIGMAS * seen.spread[at]
+    off_by = off_by + _MARGIN_SIGMAS * seen.spread[at]
     with np.errstate(invalid="ignore"):
-        placed = (seen.spread[at] < _PLACED_M) & np.isfinite(above)
+        placed = (seen.spread[at] < _MAX_PLACE_SIGMA_M) & np.isfinite(above)
         known = np.isfinite(height).all(axis=1)
         low, high = height - error - doubt, height + error + doubt
         nowhere = (low.min(axis=1) > _HEIGHT_M[1]) | (high.max(axis=1) < _HEIGHT_M[0])
@@ -321,7 +348,7 @@ def _line_of_sight(points: Float, position: Float, rotation: Float) -> tuple[Flo
     """Return the distances [N, K] m at which a body may be, by its extent, and the places [N, K, 3] there."""
     low, high = np.nanmin(points, axis=1), np.nanmax(points, axis=1)
     middle = np.column_stack([np.nanmedian(points, axis=1), np.ones(len(points))])
-    depth = np.geomspace(*_EXTENT_M, _STEPS) / np.maximum(np.hypot(*(high - low).T), 1e-6)[:, None]
+    depth = np.geomspace(*_EXTENT_M, _SIGHT_STEPS) / np.maximum(np.hypot(*(high - low).T), 1e-6)[:, None]
     places = position[:, None] + depth[..., None] * np.einsum("nij,nj->ni", rotation, middle)[:, None]
     return depth * np.linalg.norm(middle, axis=1)[:, None], places
 
@@ -333,7 +360,13 @@ def _heights(ground: Ground, points: Float) -> tuple[Float, Float]:
 
 
 def _others_look(
-    places: Float, usual: Bool, time: Int64, camera: int, position: Float, rotation: Float, scene: Scene
+    places: Float,
+    usual: Bool,
+    time: Int64,
+    camera: int,
+    position: Float,
+    rotation: Float,
+    scene: Surroundings,
 ) -> Bool:
     """Test if one other camera has every usual place of [N, K, 3] in its picture, and in sight."""
     looked = np.zeros(len(places), np.bool_)
@@ -341,7 +374,7 @@ def _others_look(
         if c == camera:
             continue
         origin = position[time, c]
-        inside = _in_picture(places, origin, rotation[time, c], scene.fields[c], margin=_EDGE)
+        inside = _in_picture(places, origin, rotation[time, c], scene.fields[c], margin=_EDGE_SHARE)
         whole = (inside | ~usual).all(axis=1) & np.isfinite(origin).all(axis=1)
         rows = np.flatnonzero(whole & ~looked)
         looked[rows] = ~_hidden(origin[rows], places[rows], usual[rows], scene.ground)
@@ -365,7 +398,7 @@ def _hidden(origin: Float, places: Float, usual: Bool, ground: Ground | None) ->
     hidden = np.zeros(places.shape[:2], np.bool_)
     if ground is not None:
         row, step = np.nonzero(usual)
-        for share in np.arange(1, _BETWEEN) / _BETWEEN:
+        for share in np.arange(1, _BETWEEN_POINTS) / _BETWEEN_POINTS:
             height, _ = _heights(ground, origin[row] + share * (places[row, step] - origin[row]))
             hidden[row, step] |= height < 0
     return np.asarray(hidden.any(axis=1))

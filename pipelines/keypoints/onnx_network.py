@@ -32,7 +32,8 @@ Layout = Literal["nchw", "nhwc"]
 _PROVIDER_OPTIONS = {"cuda": {"cudnn_conv_algo_search": "HEURISTIC"}}
 """Their settings. Unasked, CUDA times its algorithms and takes the fastest, so that two runs may differ."""
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
-_FATAL = 4  # ONNX Runtime's quietest level: failures are reported here as DataError
+# This is ONNX Runtime's quietest level, because failures are reported here as DataError.
+_FATAL = 4
 
 
 @dataclass(frozen=True)
@@ -225,7 +226,9 @@ def _line(error: Exception) -> str:
 HeatmapCells = Literal["udp", "msra"]
 
 _SMOOTHING_CELLS, _SMOOTHING_SIGMA = 11, 2.0  # DARK's kernel for 64 x 48 cells
-_REACH = 2  # bins on either side of the best one
+# The refinement looks at this many bins on either side of the best one.
+_REACH_BINS = 2
+# The logarithm of a heatmap needs values above 0, as in DARK.
 _FLOOR = 1e-10
 
 
@@ -304,13 +307,13 @@ def _line_peaks(scores: Float) -> tuple[Float, Float]:
     """
     last = scores.shape[-1] - 1
     best = scores.argmax(axis=-1)
-    offset = np.arange(-_REACH, _REACH + 1)
+    offset = np.arange(-_REACH_BINS, _REACH_BINS + 1)
     around = np.take_along_axis(scores, np.clip(best[..., None] + offset, 0, last), axis=-1)
     slope = np.einsum("nkd,d->nk", around, offset) / 10
     bend = np.einsum("nkd,d->nk", around, offset**2 - 2) / 14
-    inside = (best >= _REACH) & (best <= last - _REACH) & (bend < 0)
+    inside = (best >= _REACH_BINS) & (best <= last - _REACH_BINS) & (bend < 0)
     shift = np.where(inside, -slope / np.where(inside, 2 * bend, 1.0), 0.0)
-    return best + np.clip(shift, -1.0, 1.0), around[..., _REACH]
+    return best + np.clip(shift, -1.0, 1.0), around[..., _REACH_BINS]
 
 
 def heatmap_peaks(maps: Float) -> tuple[Float, Float]:

@@ -172,11 +172,15 @@ _READERS: dict[str, Callable[[str, str], object]] = {
 }
 
 
-_SURE_BOX = 0.3  # as RTMLib draws boxes
-_SAME_PERSON = 0.45  # intersection over union, YOLOX's own
+# RTMLib draws boxes from this score on.
+_MIN_BOX_SCORE = 0.3
+# YOLOX joins boxes from this intersection over union on.
+_SAME_PERSON_IOU = 0.45
 _STRIDES = (8, 16, 32)
-_AROUND = 114  # grey beside the picture, which these networks were trained with
-_PERSON = 0  # the class, in COCO and in every list of persons alone
+# YOLOX was trained with this grey beside the picture.
+_PADDING_GREY = 114
+# This is the class of persons in COCO, and in every list of persons alone.
+_PERSON_CLASS = 0
 
 
 class OnnxPeople:
@@ -203,10 +207,10 @@ class OnnxPeople:
         scale = max(picture.shape[1] / width, picture.shape[0] / height)
         placed = np.array([[scale, 0.0, (scale - 1) / 2], [0.0, scale, (scale - 1) / 2]])
         fitted = sampled(picture, placed, (width, height), beyond="edge")
-        fitted[int(np.ceil(picture.shape[0] / scale)) :] = _AROUND
-        fitted[:, int(np.ceil(picture.shape[1] / scale)) :] = _AROUND
+        fitted[int(np.ceil(picture.shape[0] / scale)) :] = _PADDING_GREY
+        fitted[:, int(np.ceil(picture.shape[1] / scale)) :] = _PADDING_GREY
         boxes, score = self._read(self._network.single(fitted))
-        sure = score >= _SURE_BOX
+        sure = score >= _MIN_BOX_SCORE
         boxes, score = boxes[sure], score[sure]
         kept = distinct(boxes, score)
         return boxes[kept] * scale - 0.5, score[kept]
@@ -222,10 +226,12 @@ class OnnxPeople:
             if columns >= 6 and count == len(self._grid):
                 return _raw_yolox(table, self._grid)
             if columns == 5 and len(labels) <= 1:
-                persons = labels[0] == _PERSON if labels and len(labels[0]) == count else np.full(count, True)
+                persons = (
+                    labels[0] == _PERSON_CLASS if labels and len(labels[0]) == count else np.full(count, True)
+                )
                 return table[persons, :4], table[persons, 4]
             if columns == 6 and not labels:
-                persons = table[:, 5] == _PERSON
+                persons = table[:, 5] == _PERSON_CLASS
                 return table[persons, :4], table[persons, 4]
         shapes = {name: values.shape for name, values in outputs.items()}
         raise DataError(
@@ -248,7 +254,7 @@ def distinct(boxes: Float, score: Float) -> NDArray[np.intp]:
         low = np.maximum(boxes[best, :2], boxes[rest, :2])
         high = np.minimum(boxes[best, 2:], boxes[rest, 2:])
         common = np.prod(np.maximum(high - low, 0.0), axis=1)
-        left = rest[common <= _SAME_PERSON * (area[best] + area[rest] - common)]
+        left = rest[common <= _SAME_PERSON_IOU * (area[best] + area[rest] - common)]
     return np.array(kept, dtype=np.intp)
 
 
@@ -269,12 +275,14 @@ def _raw_yolox(table: Float, grid: Float) -> tuple[Float, Float]:
     stride = grid[:, 2:]
     centre = (table[:, :2] + grid[:, :2]) * stride
     half = np.exp(np.minimum(table[:, 2:4], 20.0)) * stride / 2
-    is_person = table[:, 5:].argmax(axis=1) == _PERSON
+    is_person = table[:, 5:].argmax(axis=1) == _PERSON_CLASS
     return np.hstack([centre - half, centre + half]), np.where(is_person, table[:, 4] * table[:, 5], 0.0)
 
 
-_PADDING = 1.25
-_SURE = 0.3  # joints above it are drawn by MMPose, and place the next region here
+# MMPose enlarges boxes by this factor before it cuts them out.
+_BOX_PADDING = 1.25
+# MMPose draws joints above this score, and they place the next region here.
+_MIN_JOINT_SCORE = 0.3
 _EYES, _ANKLES = 0.936, 0.039  # heights above the ground, as shares of the body's (Drillis & Contini)
 
 
@@ -329,7 +337,7 @@ class OnnxPose:
         ]
 
     def _person(self, xy: Float, score: Float, region: Region) -> Person:
-        sure = score >= _SURE
+        sure = score >= _MIN_JOINT_SCORE
         return Person(xy, score, float(sure.mean()), self._next_region(xy[sure], region))
 
     def _next_region(self, xy: Float, region: Region) -> Region:
@@ -342,7 +350,7 @@ class OnnxPose:
         low, high = xy.min(axis=0), xy.max(axis=0)
         width, height = (high - low) / self._share
         x, y = (low + high) / 2
-        return Region((float(x), float(y)), side_of_box(width, height, self._network.size, _PADDING))
+        return Region((float(x), float(y)), side_of_box(width, height, self._network.size, _BOX_PADDING))
 
 
 class _BoxedPeople:
@@ -357,7 +365,9 @@ class _BoxedPeople:
         middle = (boxes[:, :2] + boxes[:, 2:]) / 2
         return [
             (
-                Region((float(x), float(y)), side_of_box(right - left, bottom - top, self._size, _PADDING)),
+                Region(
+                    (float(x), float(y)), side_of_box(right - left, bottom - top, self._size, _BOX_PADDING)
+                ),
                 float(sure),
             )
             for (x, y), (left, top, right, bottom), sure in zip(middle, boxes.tolist(), score, strict=True)

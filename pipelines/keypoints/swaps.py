@@ -39,16 +39,26 @@ _LIMBS = {
     "legs": ("hip", "knee", "ankle", "heel", "toe"),
 }
 _PARTS = {"hand": ("wrist", "pinky", "index", "thumb"), "foot": ("ankle", "heel", "toe")}
-_CHANGE = 16.0  # cost of a change between the hypotheses: four standard deviations of one coordinate
-_HIDDEN_CHANGE = 4.0  # the same where joints cross, which is where detectors change most
-_EXCHANGED = 2.0  # cost of each exchanged picture: the majority is right
-_JUMP = 45.0  # each end of an exchange must save this against continuing unchanged
-_TAIL = 16.0  # variances from which on an error of prediction counts by its logarithm: limbs accelerate
-_LEAST_NOISE = 0.01  # of the body's size (median distance of joints from their middle), 4 mm
-_LONGEST_S = 0.3  # the longest exchange with one visible end: walkers' legs cross every half second
-_GAP_S = 0.5  # longer gaps are not predicted over
-_MOST = 0.6  # of the pairs usually seen: pictures with fewer are decided by the pictures beside them
-_APART = 0.3  # of the body's size: left and right nearer to each other than this are crossing
+# A change between the hypotheses costs four standard deviations of one coordinate.
+_CHANGE_COST = 16.0
+# Detectors change most where joints cross, so a change costs less there.
+_HIDDEN_CHANGE_COST = 4.0
+# Each exchanged picture costs this, because the majority is right.
+_EXCHANGED_COST = 2.0
+# Each end of an exchange must save this against continuing unchanged.
+_JUMP_GAIN = 45.0
+# Limbs accelerate, so larger errors of prediction count by their logarithm.
+_TAIL_VARIANCES = 16.0
+# Keypoints err by this share of the body's size at least, 4 mm.
+_MIN_NOISE_SHARE = 0.01
+# Walkers' legs cross every half second, so an exchange with one visible end is shorter.
+_MAX_EXCHANGE_S = 0.3
+# Nothing is predicted over longer gaps.
+_MAX_GAP_S = 0.5
+# Pictures with a smaller share of the usual pairs are decided by the pictures beside them.
+_MIN_PAIRS_SHARE = 0.6
+# Left and right nearer to each other than this share of the body's size are crossing.
+_CROSSING_SHARE = 0.3
 
 
 def undo_swaps(
@@ -161,14 +171,14 @@ def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: fl
     seen = (np.isfinite(left) & np.isfinite(right)).all(-1).sum(-1)
     # In a picture with few of the joints the others would jump unseen: nothing predicts them in the next one.
     usual = np.median(seen[seen > 0]) if seen.any() else 0.0
-    (rows,) = np.nonzero((seen > 0) & (seen >= _MOST * usual))
+    (rows,) = np.nonzero((seen > 0) & (seen >= _MIN_PAIRS_SHARE * usual))
     exchanged = np.zeros(len(t_s), dtype=np.bool_)
     if len(rows) < 3:
         return exchanged
     t_s, left, right = t_s[rows], left[rows], right[rows]
-    cost, linked, noise = _costs(t_s, left, right, _LEAST_NOISE * size)
+    cost, linked, noise = _costs(t_s, left, right, _MIN_NOISE_SHARE * size)
     distance2 = ((left - right) ** 2).sum(-1)
-    least2 = (_APART * size) ** 2
+    least2 = (_CROSSING_SHARE * size) ** 2
     # Neither hypothesis may gain by a prediction from or of a pair that is crossing.
     apart = distance2 > least2
     predictable = apart & np.roll(apart, 1, axis=0) & np.roll(apart, 2, axis=0)
@@ -177,8 +187,8 @@ def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: fl
     together2 = np.nansum(distance2, axis=-1)
     visible = together2 > np.maximum(least2 * np.isfinite(distance2).sum(-1), VISIBLE * noise**2)
     crossing = ~(visible & np.roll(visible, 1))
-    change = np.where(linked, np.where(crossing, _HIDDEN_CHANGE, _CHANGE), 0.0)
-    path = _shortest_path(total, change, _EXCHANGED)
+    change = np.where(linked, np.where(crossing, _HIDDEN_CHANGE_COST, _CHANGE_COST), 0.0)
+    path = _shortest_path(total, change, _EXCHANGED_COST)
     kept = _with_visible_ends(t_s, path, linked, crossing, total)
     exchanged[rows] = kept
     for first, stop, both in zip(rows[:-1], rows[1:], kept[:-1] & kept[1:] & linked[1:], strict=True):
@@ -197,7 +207,7 @@ def _with_visible_ends(t_s: Float, path: Bool, linked: Bool, crossing: Bool, cos
     for first, stop in edges.reshape(-1, 2):
         visible = [0 < end < len(path) and linked[end] and not crossing[end] for end in (first, stop)]
         jumps = [_jumps(end, path, linked, crossing, cost) for end in (first, stop)]
-        short = t_s[stop - 1] - t_s[first] < _LONGEST_S
+        short = t_s[stop - 1] - t_s[first] < _MAX_EXCHANGE_S
         if not (all(jumps) or (any(jumps) and jumps == visible and short)):
             kept[first:stop] = False
     return kept
@@ -212,7 +222,7 @@ def _jumps(end: int, path: Bool, linked: Bool, crossing: Bool, cost: Float) -> b
     if end + 1 < len(path) and linked[end + 1]:
         changed += cost[end + 1, before, now, int(path[end + 1])]
         kept += cost[end + 1, before, before, before]
-    return bool(kept - changed > _JUMP)
+    return bool(kept - changed > _JUMP_GAIN)
 
 
 def _body_size(xy: Float) -> float:
@@ -241,7 +251,7 @@ def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[F
     """
     step = np.diff(t_s)
     ratio = step[1:] / step[:-1]
-    linked = np.concatenate([[False], step <= _GAP_S])
+    linked = np.concatenate([[False], step <= _MAX_GAP_S])
     predicted = linked & np.concatenate([[False], linked[:-1]])
     # x(t) - x(t-1) - r (x(t-1) - x(t-2)) of positions of equal noise.
     variance = 1.0 + (1.0 + ratio) ** 2 + ratio**2
@@ -257,7 +267,7 @@ def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[F
     usual = usual[np.isfinite(usual)]
     # The median of a chi-squared of two degrees of freedom is 2 ln 2.
     noise2 = max(float(np.median(usual)) / (2 * np.log(2)) if usual.size else 0.0, least_noise**2)
-    squares = _TAIL * np.log1p(error / (_TAIL * max(noise2, np.finfo(float).tiny)))
+    squares = _TAIL_VARIANCES * np.log1p(error / (_TAIL_VARIANCES * max(noise2, np.finfo(float).tiny)))
     return np.nansum(squares, axis=-2), linked, float(np.sqrt(noise2))
 
 
@@ -304,11 +314,15 @@ def _shortest_path(cost: Float, change: Float, exchanged: float) -> Bool:
     return path
 
 
-_MOST_CAMERAS = 2  # cameras that are wrong at once
-_GAIN = 16.0  # squared misses, in variances, that an exchange must save
+# At most this many cameras are tried as wrong at once.
+_MAX_WRONG_CAMERAS = 2
+# An exchange must save this many variances of squared misses.
+_MIN_GAIN = 16.0
 _BAD, _GOOD = 5.0, 4.0  # mean squared miss of the rays of one camera before and after it; 2 is expected
-_AT_ONCE = 4096  # times whose rays are in memory together
-_CAP = 25.0  # a single ray counts up to five standard deviations
+# The rays of this many times are in memory together.
+_BLOCK = 4096
+# A single ray counts up to five standard deviations.
+_MAX_MISS = 25.0
 
 
 def swaps_across_views(
@@ -338,7 +352,7 @@ def swaps_across_views(
             _wrong_views(
                 xy[rows][:, np.ravel(group)], position[rows], rotation[rows], sigma[rows], len(group)
             )
-            for rows in (slice(k, k + _AT_ONCE) for k in range(0, max(len(xy), 1), _AT_ONCE))
+            for rows in (slice(k, k + _BLOCK) for k in range(0, max(len(xy), 1), _BLOCK))
         ]
         flipped, undecided = (np.concatenate(each) for each in zip(*parts, strict=True))
         for left, right in group:
@@ -373,9 +387,9 @@ def _wrong_views(xy: Float, position: Float, rotation: Float, sigma: Float, pair
     apart2 = np.nansum((xy[rows, ::2] - xy[rows, 1::2]) ** 2, axis=(1, 3)) / sigma**2
     whole &= apart2 > VISIBLE
     before = _capped(misses[rows])
-    least = before - _GAIN
+    least = before - _MIN_GAIN
     best = np.zeros((len(rows), cameras), np.bool_)
-    for count in range(1, _MOST_CAMERAS + 1):
+    for count in range(1, _MAX_WRONG_CAMERAS + 1):
         for chosen in combinations(range(cameras), count):
             own = list(chosen)
             allowed = whole[:, own].all(1) & (2 * count <= views)
@@ -383,7 +397,7 @@ def _wrong_views(xy: Float, position: Float, rotation: Float, sigma: Float, pair
             other[..., own, :] = rays[:, :, ::-1, own]
             there[..., own] = seen[:, :, ::-1, own]
             tried = _misses(other, there, position, sigma)
-            after = _capped(tried) + _GAIN * (count - 1)
+            after = _capped(tried) + _MIN_GAIN * (count - 1)
             better = allowed & (after < least) & (_mean(tried[..., own]) < _GOOD)
             least = np.where(better, after, least)
             best[better] = np.isin(np.arange(cameras), own)
@@ -434,5 +448,5 @@ def _mean(misses: Float) -> Float:
 
 
 def _capped(misses: Float) -> Float:
-    total: Float = np.nansum(np.minimum(misses, _CAP), axis=(1, 2, 3))
+    total: Float = np.nansum(np.minimum(misses, _MAX_MISS), axis=(1, 2, 3))
     return total

@@ -17,7 +17,7 @@ from pipelines.geometry.arrays import Picture
 from pipelines.session.registries import KeypointNetworks, Region
 
 
-class Candidate(NamedTuple):
+class FoundPerson(NamedTuple):
     """A person that the person detector found, in pixels of the whole picture."""
 
     region: Region
@@ -32,9 +32,12 @@ SIDE_PER_HEIGHT = 1.25
 """Side of the region that joints come from: 1.1 to 1.4 are as good, 1.8 is bad (measured with BlazePose)."""
 
 _SHARES = (1.0, 0.5, 0.25)  # sides of the tiles, as shares of the picture's short side
-_OVERLAP = 1 / CROP_PER_HEIGHT  # so that a body of the size that is found is whole in one of the tiles
-_SMALLEST_PX = 150
-_SAME = 0.2  # of a region's side: nearer centres are one person
+# A body of the size that is found is whole in one of the tiles with this overlap.
+_OVERLAP = 1 / CROP_PER_HEIGHT
+# Smaller tiles would be enlarged for the person detector, which shows nothing new.
+_MIN_TILE_PX = 150
+# Centres nearer than this share of a region's side are one person.
+_SAME_PERSON_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ def tiles(width: int, height: int) -> list[Tile]:
     cover = [Tile(0, 0, width, height)]
     for share in _SHARES:
         side = round(short * share)
-        if side < _SMALLEST_PX:
+        if side < _MIN_TILE_PX:
             break
         cover += [
             Tile(left, top, side, side) for top, left in product(_starts(height, side), _starts(width, side))
@@ -93,7 +96,7 @@ def squares_about(
     return list(dict.fromkeys(squares))
 
 
-def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile]) -> list[Candidate]:
+def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile]) -> list[FoundPerson]:
     """Find people in parts of a picture, each person once.
 
     Args:
@@ -104,11 +107,11 @@ def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile])
         overlapping tiles) the first of these.
     """
     found = [
-        Candidate(_moved(region, part), score, _is_cut(region, part, picture))
+        FoundPerson(_moved(region, part), score, _is_cut(region, part, picture))
         for part in parts
         for region, score in networks.find_people(part.cut(picture))
     ]
-    kept: list[Candidate] = []
+    kept: list[FoundPerson] = []
     for candidate in sorted(found, key=lambda each: (each.cut, -each.score)):
         if not any(same_place(candidate.region, other.region) for other in kept):
             kept.append(candidate)
@@ -121,7 +124,7 @@ def same_place(a: Region, b: Region) -> bool:
     The test uses centres and not overlap: regions are much wider than people, so the regions of two people
     side by side overlap by more than half.
     """
-    return math.dist(a.centre, b.centre) < _SAME * max(a.side, b.side)
+    return math.dist(a.centre, b.centre) < _SAME_PERSON_SHARE * max(a.side, b.side)
 
 
 def _starts(length: int, side: int) -> list[int]:

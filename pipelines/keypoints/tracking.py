@@ -17,7 +17,7 @@ from pipelines.keypoints.hints import Hint
 from pipelines.keypoints.tiles import (
     CROP_PER_HEIGHT,
     SIDE_PER_HEIGHT,
-    Candidate,
+    FoundPerson,
     Tile,
     find_in,
     same_place,
@@ -27,27 +27,46 @@ from pipelines.keypoints.tiles import (
 )
 from pipelines.session.registries import KeypointNetworks, Person, Region
 
+# MediaPipe tracks a person from this presence on.
 _PRESENT = 0.5
-_STILL_PRESENT = 0.2  # of who was seen in the last picture, if the score is that of a person
-_CENTRED = 0.3  # a margin (3 sigma) of this many heights, 0.1 per sigma, leaves the region good enough
-_SMALLEST_PX = 8.0
+# Who was seen in the last picture counts from this presence on, with the score of a person.
+_STILL_PRESENT = 0.2
+# A margin (3 sigma) of this many heights leaves the region good enough.
+_CENTRED_HEIGHTS = 0.3
+# A smaller region shows no person.
+_MIN_REGION_PX = 8.0
 _WIDER = (1.3, 1.0)  # factors on the last region of a person just lost
-_PATIENCE = 5  # a person not seen is searched at the last place for this many pictures
-_MEMORY = 30  # pictures after which a number is not given to the same place again
-_ONE_BODY = 0.06  # median distance of joints, in region sides: about the scatter of one body's two estimates
-_TILES_BESIDE = 8  # tiles searched in one picture while a person is followed
-_TILES_ALONE = 24  # the same while nobody is followed
-_SEARCH_EVERY = 5  # pictures from one search of the whole picture to the next
-_SEARCH_OF_ONE = 10  # the same if one person is wanted
-_TILES_OF_ONE = 4  # tiles searched in one picture while a person is followed and one is wanted
-_JUDGED = 5  # pictures whose mean score decides if a track is a person
-_ONE_PICTURE = 0.9  # of the least score: enough in a single picture
+# A person who is not seen is searched at the last place for this many pictures.
+_PATIENCE_PICTURES = 5
+# A number is not given to the same place again after this many pictures.
+_MEMORY_PICTURES = 30
+# Two estimates of one body scatter by this median distance of joints, in region sides.
+_ONE_BODY_SIDES = 0.06
+# While a person is followed, one picture has this many tiles searched, to save time.
+_TILES_BESIDE = 8
+# While nobody is followed, one picture has this many tiles searched.
+_TILES_ALONE = 24
+# The whole picture is searched once in this many pictures, because newcomers walk in slowly.
+_SEARCH_EVERY = 5
+# If one person is wanted, the whole picture is searched less often.
+_SEARCH_OF_ONE = 10
+# If one person is wanted and followed, fewer tiles are searched.
+_TILES_OF_ONE = 4
+# The mean score of this many pictures decides if a track is a person.
+_JUDGED_PICTURES = 5
+# This share of the least score is enough in a single picture.
+_SINGLE_SCORE_SHARE = 0.9
 _BODY = (0.2, 0.5)  # of a region's side, across and along: the body in it; what a tile cuts there is a part
-_TALLER = 1.3  # a region's side over that of the hint: bodies differ, and arms are raised
-_SURE = 0.7  # score of the person detector: of a body that a tile cuts, below it is searched once more
-_LOST = 30  # pictures without a logged person after which the place of the hint is searched less often
-_SEARCH_LOST = 5  # pictures from one such search to the next
-_NOT_THEY = 1e6  # px: further than a hint is from any region
+# A region's side is this much larger than the hint's: bodies differ, and arms are raised.
+_TALLER = 1.3
+# A body that a tile cuts is searched once more below this score of the person detector.
+_SURE_SCORE = 0.7
+# After this many pictures without a logged person, the place of the hint is searched less often.
+_LOST_PICTURES = 30
+# The place of a lost person is searched once in this many pictures.
+_SEARCH_LOST = 5
+# This distance is larger than that of any hint from any region.
+_IMPOSSIBLE_PX = 1e6
 
 Hints = Mapping[int, Hint]  # by the number of the logged person; only those whose place is known
 
@@ -72,11 +91,11 @@ class TrackedPerson:
 
 
 @dataclass
-class _Track:
+class _PictureTrack:
     number: int
     person: Person
     missing: int = 0  # pictures since last seen
-    scores: deque[float] = field(default_factory=lambda: deque(maxlen=_JUDGED))
+    scores: deque[float] = field(default_factory=lambda: deque(maxlen=_JUDGED_PICTURES))
 
     def see(self, person: Person) -> None:
         self.person, self.missing = person, 0
@@ -128,7 +147,7 @@ class PeopleTracker:
         self._only_one = only_one
         self._most_people = most_people
         self._search_every = search_every or (_SEARCH_OF_ONE if only_one else _SEARCH_EVERY)
-        self._tracks: list[_Track] = []
+        self._tracks: list[_PictureTrack] = []
         self._next_number = 0
         self._next_tile = 0
         self._next_square = 0
@@ -177,12 +196,12 @@ class PeopleTracker:
                 # A person hidden behind another one must not return as that one.
                 if person is not None and not self._is_followed(person):
                     track.see(person)
-        self.counts["lost"] += sum(track.missing == _PATIENCE + 1 for track in self._tracks)
-        self._tracks = [track for track in self._tracks if track.missing <= _MEMORY]
+        self.counts["lost"] += sum(track.missing == _PATIENCE_PICTURES + 1 for track in self._tracks)
+        self._tracks = [track for track in self._tracks if track.missing <= _MEMORY_PICTURES]
 
     def _merge(self) -> None:
         """Merge tracks on one body; the older one stays."""
-        kept: list[_Track] = []
+        kept: list[_PictureTrack] = []
         for track in sorted(self._seen(), key=lambda track: track.number):
             if any(_one_body(track.person, older.person) for older in kept):
                 self._tracks.remove(track)
@@ -201,16 +220,16 @@ class PeopleTracker:
         can_be = [[t for t in actors if _agrees(t.person.region, hint)] for hint in logged.values()]
         for rivals in can_be if actors else [seen]:
             if rivals and all(track in no_people for track in rivals):
-                no_people.remove(max(rivals, key=_Track.mean_score))
+                no_people.remove(max(rivals, key=_PictureTrack.mean_score))
         self._remove(no_people, "no people")
 
-    def _remove(self, tracks: Sequence[_Track], cause: str) -> None:
+    def _remove(self, tracks: Sequence[_PictureTrack], cause: str) -> None:
         self._tracks = [track for track in self._tracks if track not in tracks]
         self.counts[cause] += len(tracks)
 
-    def _is_no_person(self, track: _Track) -> bool:
+    def _is_no_person(self, track: _PictureTrack) -> bool:
         """Test the mean score of a few pictures, or of those seen so far if the track is lost."""
-        known = len(track.scores) == _JUDGED or track.missing
+        known = len(track.scores) == _JUDGED_PICTURES or track.missing
         return bool(known) and track.mean_score() < self._least_score
 
     # --- those to be found -----------------------------------------------------------------------------
@@ -226,7 +245,7 @@ class PeopleTracker:
         if parts:
             self._take_up(picture, find_in(self._networks, picture, dict.fromkeys(parts)), logged)
         for k in self._unseen(logged):
-            if logged[k].margin_px <= _CENTRED * logged[k].height_px:
+            if logged[k].margin_px <= _CENTRED_HEIGHTS * logged[k].height_px:
                 region = Region(logged[k].centre, SIDE_PER_HEIGHT * logged[k].height_px)
                 self._take_up_one(picture, region, logged)
         due = frame % self._search_every == 0
@@ -255,7 +274,7 @@ class PeopleTracker:
 
     def _is_due(self, k: int) -> bool:
         """Test if a logged person who is not seen is searched in this picture."""
-        return self._unseen_for[k] < _LOST or (self.counts["frames"] + k) % _SEARCH_LOST == 0
+        return self._unseen_for[k] < _LOST_PICTURES or (self.counts["frames"] + k) % _SEARCH_LOST == 0
 
     def _search_tiles(self, picture: Picture, logged: Hints) -> None:
         """Search the next tiles in turn; in the first picture all of them, until a person is found."""
@@ -274,7 +293,7 @@ class PeopleTracker:
             if not first or self._seen() or self._next_tile >= len(cover):
                 break
 
-    def _take_up(self, picture: Picture, found: Iterable[Candidate], logged: Hints) -> None:
+    def _take_up(self, picture: Picture, found: Iterable[FoundPerson], logged: Hints) -> None:
         """Follow the people found who are not followed already, best first."""
         only_actor = self._only_one and bool(logged)
         if only_actor:
@@ -284,7 +303,7 @@ class PeopleTracker:
                 break
             if self._is_part_of_seen(each, logged):
                 continue
-            if each.cut and each.score < _SURE and self._seen():
+            if each.cut and each.score < _SURE_SCORE and self._seen():
                 # A search about the place is cheaper than the landmarks of a limb or a tree.
                 about = square_about(each.region.centre, _detector_side(each.region), *picture.shape[1::-1])
                 again = find_in(self._networks, picture, [about])
@@ -300,13 +319,13 @@ class PeopleTracker:
         if person is None or self._is_followed(person, logged):
             return
         if (known := self._lost_at(person.region)) is not None and self._has_place_for(known):
-            self.counts["found again"] += known.missing > _PATIENCE
+            self.counts["found again"] += known.missing > _PATIENCE_PICTURES
             known.see(person)
             return
         if not self._has_place_for(None) and _can_be(person.region, logged):
             self._make_place(logged)
         if self._has_place_for(None):
-            track = _Track(self._next_number, person)
+            track = _PictureTrack(self._next_number, person)
             track.see(person)
             self._tracks.append(track)
             self._next_number += 1
@@ -314,7 +333,7 @@ class PeopleTracker:
         else:
             self.counts["beyond the most"] += 1
 
-    def _lost_at(self, region: Region) -> _Track | None:
+    def _lost_at(self, region: Region) -> _PictureTrack | None:
         """Find the track lost nearest to that place, within the region's side; None if there is none."""
         reach = [
             (math.dist(track.person.region.centre, region.centre), track.number, track)
@@ -324,14 +343,14 @@ class PeopleTracker:
         distance, _, track = min(reach, default=(math.inf, 0, None))
         return track if distance < region.side else None
 
-    def _has_place_for(self, track: _Track | None) -> bool:
+    def _has_place_for(self, track: _PictureTrack | None) -> bool:
         """Test if another person may be followed; people just lost keep their place."""
-        held = [other for other in self._tracks if other.missing <= _PATIENCE]
+        held = [other for other in self._tracks if other.missing <= _PATIENCE_PICTURES]
         return track in held or len(held) < self._most_people
 
     def _make_place(self, logged: Hints) -> None:
         """Drop the newest track that cannot be a logged person: bystanders must not keep them out."""
-        held = [track for track in self._tracks if track.missing <= _PATIENCE]
+        held = [track for track in self._tracks if track.missing <= _PATIENCE_PICTURES]
         others = [track for track in held if not _can_be(track.person.region, logged)]
         if others:
             self._tracks.remove(max(others, key=lambda track: track.number))
@@ -339,13 +358,13 @@ class PeopleTracker:
 
     # --- small questions -------------------------------------------------------------------------------
 
-    def _seen(self) -> list[_Track]:
+    def _seen(self) -> list[_PictureTrack]:
         return [track for track in self._tracks if track.missing == 0]
 
-    def _missed(self) -> list[_Track]:
+    def _missed(self) -> list[_PictureTrack]:
         """List those just lost who were seen for a few pictures; the others too while nobody is seen."""
-        lost = [track for track in self._tracks if 0 < track.missing <= _PATIENCE]
-        return [track for track in lost if len(track.scores) == _JUDGED] if self._seen() else lost
+        lost = [track for track in self._tracks if 0 < track.missing <= _PATIENCE_PICTURES]
+        return [track for track in lost if len(track.scores) == _JUDGED_PICTURES] if self._seen() else lost
 
     def _unseen(self, logged: Hints) -> list[int]:
         """List the logged people who are not seen, where each track can be one of them."""
@@ -355,7 +374,7 @@ class PeopleTracker:
         apart_px = np.array(
             [
                 [
-                    math.dist(region.centre, hint.centre) if _agrees(region, hint) else _NOT_THEY
+                    math.dist(region.centre, hint.centre) if _agrees(region, hint) else _IMPOSSIBLE_PX
                     for region in regions
                 ]
                 for hint in logged.values()
@@ -363,10 +382,10 @@ class PeopleTracker:
         )
         # As many as possible are seen, and of such choices the nearest.
         chosen = zip(*linear_sum_assignment(apart_px), strict=True)
-        seen = {row for row, track in chosen if apart_px[row, track] < _NOT_THEY}
+        seen = {row for row, track in chosen if apart_px[row, track] < _IMPOSSIBLE_PX}
         return [k for row, k in enumerate(logged) if row not in seen]
 
-    def _is_part_of_seen(self, candidate: Candidate, logged: Hints) -> bool:
+    def _is_part_of_seen(self, candidate: FoundPerson, logged: Hints) -> bool:
         return any(_is_part_of(candidate, track) for track in self._seen_at(candidate.region, logged))
 
     def _is_followed(self, person: Person, logged: Hints = _NOBODY) -> bool:
@@ -376,7 +395,7 @@ class PeopleTracker:
             for track in self._seen_at(person.region, logged)
         )
 
-    def _seen_at(self, region: Region, logged: Hints) -> list[_Track]:
+    def _seen_at(self, region: Region, logged: Hints) -> list[_PictureTrack]:
         """List those seen; if the region can be a logged person's, those alone who can be one, too."""
         return [
             track
@@ -424,7 +443,7 @@ class PeopleTracker:
             if (
                 self._seen()
                 and not _can_be(person.region, logged)
-                and _score(person) < _ONE_PICTURE * self._least_score
+                and _score(person) < _SINGLE_SCORE_SHARE * self._least_score
             ):
                 self.counts["no people"] += 1
                 return None
@@ -438,7 +457,7 @@ def _is_within(person: Person, picture: Picture) -> bool:
     x, y = region.centre
     reach = region.side / 2
     within = -reach <= x <= width + reach and -reach <= y <= height + reach
-    return _SMALLEST_PX <= region.side < math.inf and within
+    return _MIN_REGION_PX <= region.side < math.inf and within
 
 
 def _one_body(a: Person, b: Person) -> bool:
@@ -447,10 +466,10 @@ def _one_body(a: Person, b: Person) -> bool:
     distance = distance[np.isfinite(distance)]
     if not distance.size:
         return False
-    return float(np.median(distance)) < _ONE_BODY * max(a.region.side, b.region.side)
+    return float(np.median(distance)) < _ONE_BODY_SIDES * max(a.region.side, b.region.side)
 
 
-def _is_part_of(candidate: Candidate, track: _Track) -> bool:
+def _is_part_of(candidate: FoundPerson, track: _PictureTrack) -> bool:
     """Test if a candidate is a person who is followed, whole or cut by a tile."""
     followed = track.person.region
     apart = np.abs(np.subtract(candidate.region.centre, followed.centre)) / followed.side

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.clocks import Followed, StartFit, fit_start
+from pipelines.geometry.clocks import StartFit, TrackedPoints, fit_start
 
 Motion = Callable[[Float], tuple[Float, Rotation]]
 """Positions m [N, 3] and attitudes [N] of a camera at times s [N]."""
@@ -42,7 +42,7 @@ def swinging(amplitude_rad: float, period_s: float) -> Motion:
     )
 
 
-def seen(motion: Motion, start_s: float, seconds: float, scatter: float = SCATTER) -> Followed:
+def seen(motion: Motion, start_s: float, seconds: float, scatter: float = SCATTER) -> TrackedPoints:
     """Make points 5 to 50 m away, new ones in every stretch, with some scatter in the picture."""
     rng = np.random.default_rng(8)
     begin_s = np.arange(0.0, seconds - STRETCH_S, STRETCH_S)
@@ -53,7 +53,7 @@ def seen(motion: Motion, start_s: float, seconds: float, scatter: float = SCATTE
     depth = rng.uniform(5, 50, (len(stretch), 1))
     in_world = from_attitude[stretch].apply(depth * np.column_stack([begin, np.ones(len(begin))]))
     there = to_attitude[stretch].inv().apply(in_world + from_place[stretch] - to_place[stretch])
-    return Followed(
+    return TrackedPoints(
         np.round(begin_s * 1e9).astype(np.int64),
         np.round(end_s * 1e9).astype(np.int64),
         stretch,
@@ -62,7 +62,7 @@ def seen(motion: Motion, start_s: float, seconds: float, scatter: float = SCATTE
     )
 
 
-def fitted(motion: Motion, log_s: Float, followed: Followed, near_s: float | None = None) -> StartFit:
+def fitted(motion: Motion, log_s: Float, followed: TrackedPoints, near_s: float | None = None) -> StartFit:
     place, attitude = motion(log_s)
     return fit_start(
         EPOCH_NS + np.round(log_s * 1e9).astype(np.int64),
@@ -134,7 +134,7 @@ def test_pictures_of_another_flight_are_refused() -> None:
     with pytest.raises(ValueError, match="do not move as the poses do"):
         fitted(turning, LOG_S, seen(swinging(0.4, 3.7), START_S, 10.0))
     followed = seen(turning, START_S, 10.0)
-    nothing = Followed(
+    nothing = TrackedPoints(
         followed.begin_ns, followed.end_ns, followed.stretch[:0], followed.begin[:0], followed.end[:0]
     )
     with pytest.raises(ValueError, match="nothing in them can be followed"):

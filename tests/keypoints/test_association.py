@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.keypoints.association import Association, associate
-from pipelines.keypoints.no_people import Scene as Surroundings
+from pipelines.keypoints.no_people import Surroundings
 
 Int64 = NDArray[np.int64]
 Path = Callable[[Float], Float]  # seconds [T] to places on the ground [T, 2]

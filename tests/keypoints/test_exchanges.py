@@ -6,15 +6,15 @@ import numpy as np
 
 from pipelines.keypoints.common_errors import without_common_errors
 from pipelines.keypoints.exchanges import undo_exchanges
-from pipelines.keypoints.grouping import Followed, follow
-from pipelines.keypoints.no_people import Views
+from pipelines.keypoints.grouping import TracksOfDetections, follow
+from pipelines.keypoints.no_people import SightLines
 from tests.keypoints.test_association import ACTOR, CROSSING, Scene, film, straight
 
 BESIDE = straight((-3.0, 1.5), (1.0, 0.0))
 
 
-def followed(scene: Scene) -> tuple[Views, Followed]:
-    views = Views(scene.xy, scene.confidence, scene.position, scene.rotation, scene.sigma)
+def followed(scene: Scene) -> tuple[SightLines, TracksOfDetections]:
+    views = SightLines(scene.xy, scene.confidence, scene.position, scene.rotation, scene.sigma)
     return views, follow(scene.time_s, *views)
 
 
@@ -79,7 +79,7 @@ def test_lone_detections_are_given_back_under_constant_pose_errors() -> None:
     assert sum(mended) >= 36
 
 
-def disagreement(scene: Scene, views: Views, person: int) -> float:
+def disagreement(scene: Scene, views: SightLines, person: int) -> float:
     """Compute the root mean square, in sigma of the scene, of a person's rays about their nearest points."""
     squares = []
     for t in range(0, len(scene.time_s), 10):

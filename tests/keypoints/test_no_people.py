@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Bool, Float
-from pipelines.keypoints.grouping import Followed
-from pipelines.keypoints.no_people import Ground, NoPeople, Scene, level_of, tell_no_people
+from pipelines.keypoints.grouping import TracksOfDetections
+from pipelines.keypoints.no_people import Ground, NoPeople, Surroundings, level_of, tell_no_people
 
 TIMES, JOINTS = 6, 17
 CAMERAS = np.array([[0.0, -10.0, 3.0], [-10.0, 0.0, 3.0]])
@@ -63,7 +63,7 @@ def told(
         return np.repeat(values[None], times, axis=0)
 
     return tell_no_people(
-        Followed(
+        TracksOfDetections(
             track=always(np.where(followed, np.arange(len(bodies)), -1)),
             views=always(views),
             middle=always(middle),
@@ -77,7 +77,7 @@ def told(
         always(CAMERAS),
         always(rotation),
         np.full((times, 2), sigma),
-        Scene(ground, FIELDS),
+        Surroundings(ground, FIELDS),
     )
 
 

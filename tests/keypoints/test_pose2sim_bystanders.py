@@ -10,7 +10,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.keypoints.association import associate
-from pipelines.keypoints.no_people import Scene
+from pipelines.keypoints.no_people import Surroundings
 from tests.real_data import real_data
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
@@ -72,6 +72,6 @@ def test_the_person_of_interest_is_the_one_the_peer_associated() -> None:
     assert agreed >= 398
     assert result.views[0] == 400
     assert np.all(result.people == 2)  # one bystander stands in the view of two cameras
-    everybody = associate(*seen, people=None, scene=Scene(None, np.array(fields)))
+    everybody = associate(*seen, people=None, scene=Surroundings(None, np.array(fields)))
     assert np.array_equal(everybody.choice, result.choice)  # and is behind the other two: no second person
     assert everybody.phantoms == {"bystander": 1}

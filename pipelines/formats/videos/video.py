@@ -22,7 +22,7 @@ from pipelines.formats.common.rows import describe_times
 from pipelines.formats.videos.picture_folder import FolderPictures
 from pipelines.geometry.arrays import Float, Float32, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics, rescaled, undistort
-from pipelines.geometry.clocks import Followed
+from pipelines.geometry.clocks import TrackedPoints
 from pipelines.session.errors import DataError
 from pipelines.session.records import VideoIndex
 from pipelines.session.storage import code_of
@@ -581,7 +581,7 @@ _Grey = Picture
 _Pixels = Float32  # [C, 1, 2], OpenCV's layout
 
 
-def followed_points(path: Path, intrinsics: Intrinsics, pts_ns: Int64) -> Followed:
+def followed_points(path: Path, intrinsics: Intrinsics, pts_ns: Int64) -> TrackedPoints:
     """Find corners in the first pictures, and track each for a fifth of a second.
 
     Tracking is from picture to picture, with pyramids (Lucas and Kanade 1981; Bouguet 2000). A stretch that
@@ -641,10 +641,14 @@ def _followed(before: _Grey, after: _Grey, begin: _Pixels, here: _Pixels) -> tup
     return begin[follows], np.asarray(there[follows], np.float32)
 
 
-def _joined(pts_ns: Int64, spans: list[tuple[int, int]], begins: list[Float], ends: list[Float]) -> Followed:
+def _joined(
+    pts_ns: Int64, spans: list[tuple[int, int]], begins: list[Float], ends: list[Float]
+) -> TrackedPoints:
     nothing = np.zeros((0, 2))
     begin, end = np.concatenate([nothing, *begins]), np.concatenate([nothing, *ends])
     stretch = np.repeat(np.arange(len(begins)), [len(points) for points in begins])
     known = np.isfinite(begin).all(axis=1) & np.isfinite(end).all(axis=1)  # a lens may not cover all pixels
     pictures = np.array(spans, np.int64).reshape(-1, 2)
-    return Followed(pts_ns[pictures[:, 0]], pts_ns[pictures[:, 1]], stretch[known], begin[known], end[known])
+    return TrackedPoints(
+        pts_ns[pictures[:, 0]], pts_ns[pictures[:, 1]], stretch[known], begin[known], end[known]
+    )
