@@ -200,7 +200,7 @@ class FrameTimes(Source):
     start_ns: SecondsAsNs = Field(0, alias="start")
     """Time of the first picture, s."""
     start_from: Literal["container", "motion"] | None = None
-    """What tells the time of the first picture: the video's metadata, or the motion in the pictures."""
+    """Source of the time of the first picture: the video's metadata, or the motion in the pictures."""
     fps: Fps | None = None
     """Frame rate, which replaces the stamps of the video: 30, 29.97 or 30000/1001."""
 
@@ -449,7 +449,7 @@ class PlanSource(Source):
 
 
 class Manifest(Part):
-    """One flight, as `flight.yaml` states it."""
+    """One flight, as `flight.yaml` describes it."""
 
     schema_version: Literal[1] = Field(alias="schema")
     """Version of this description: 1."""
