@@ -36,7 +36,8 @@ pictures: demo
 # The bytecode first: where Python may not write any, every command under test would compile all modules.
 test: setup
 	$(BIN)/python -m compileall -qq mocap_cli pipelines
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 20 --durations-min 5
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder \
+	    --durations 20 --durations-min 5 --junitxml build/tests.xml
 
 # Lint and the tests that need the least time: under a minute on two cores, once mypy and Numba have their caches.
 QUICK := session drafting geometry planning $(addprefix formats/,calibrations common keypoint_files poses skeletons)

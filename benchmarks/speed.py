@@ -275,27 +275,28 @@ def logs() -> Iterator[Row]:
 
 # --- planner ---------------------------------------------------------------------------------------------
 
-_SIZES = ((8, 5, 2), (32, 10, 2), (72, 20, 5))
+_SIZES = ((5.0, 2), (10.0, 2), (20.0, 5))  # horizon in seconds, drones
 
 
 def planner() -> Iterator[Row]:
     """Time central plans, closed-loop flights, and the distance field of a large map."""
     field = mound(resolution_m=0.2)
     for arm, sizes in ((ADAPTIVE, _SIZES), (JOINT, _SIZES[1:2])):
-        for yaws, knots, drones in sizes:
-            config = replace(PlannerConfig(), yaws=yaws, horizon_knots=knots, knot_s=10.0 / knots)
+        for horizon_s, drones in sizes:
+            config = replace(PlannerConfig(), horizon_s=horizon_s)
+            knots = round(horizon_s / config.tuning.knot_s)
             plans = arm.start(config, drones=drones, yaw_rad=0.7)
             slots = formation_slots(
                 np.array([0.7]), drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
             )
             took_ms = []
             for k in range(201):
-                walked = 0.2 * k + 1.2 * config.knot_s * np.arange(1, knots + 1)
+                walked = 0.2 * k + 1.2 * config.tuning.knot_s * np.arange(1, knots + 1)
                 actor: Float = np.stack([walked, 0 * walked, 0 * walked + 1], axis=1)
                 started = time.thread_time()
                 plans.plan(1.0 + k, slots[0], Forecast(actor, np.zeros(knots)), field)  # each is due
                 took_ms.append(1e3 * (time.thread_time() - started))
-            size = f"{yaws} yaws, {knots} knots, {drones} drones"
+            size = f"{horizon_s:g} s ahead, {drones} drones"
             said = "Ho et al. 2021: 1.3 ms" if drones == 5 else ""
             yield f"plan of {arm.name}, {size}", f"{np.median(took_ms[1:]):.2f} ms", said
     for arm in (FIXED, ADAPTIVE, JOINT):
