@@ -30,10 +30,10 @@ TIMES = ROOT / "build" / "tests.xml"
 SAMPLE = ROOT / "demo" / "mound_walk.session"
 CONSTANTS_ARE = """\
 A constant is a number in capitals at the top of a module of pipelines/ or mocap_cli/, or a field of a frozen
-table (a frozen dataclass with numbers as most of its defaults). Its reason is the comment directly above it or
-behind it, or the text below it: a sentence with a capital letter first, at least four words, and a full stop
-at the end. A heading `# --- tuning ---` is no reason. In frozen tables and in pipelines/formats, numbers on
-consecutive lines share the comment above the first."""
+table (a frozen dataclass with numbers as most of its defaults). Its reason is the comment directly above it
+or behind it, or the text below it: a sentence with a capital letter first, at least four words, and a full
+stop at the end. A heading `# --- tuning ---` is no reason. In frozen tables and in pipelines/formats, numbers
+on consecutive lines share the comment above the first."""
 
 
 @dataclass(frozen=True)
@@ -241,16 +241,11 @@ def command_options(name: str) -> tuple[str, ...]:
 
 
 def manifest_keys() -> tuple[str, ...]:
-    """Return the keys of flight.yaml, with the model that has each; options that a format declares count."""
-    from importlib.metadata import entry_points
-
+    """Return the keys of flight.yaml with the model that declares each; options beside a file count."""
     from pydantic import BaseModel
 
-    from pipelines.session import manifest
+    from pipelines.session import manifest, source_options
     from pipelines.session.yaml_files import Part
-
-    for entry in entry_points(group="mocap.formats"):
-        entry.load()
 
     def named(annotation: Any) -> Iterator[type[BaseModel]]:
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -258,23 +253,21 @@ def manifest_keys() -> tuple[str, ...]:
         for argument in typing.get_args(annotation):
             yield from named(argument)
 
-    def subclasses(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
-        for child in model.__subclasses__():
-            yield from (child, *subclasses(child))
-
-    waiting: list[type[BaseModel]] = [manifest.Flight]
-    waiting += [model for model in subclasses(Part) if model.__module__.startswith("pipelines.formats")]
+    options = [value for value in vars(source_options).values() if isinstance(value, type)]
+    waiting: list[type[BaseModel]] = [model for model in options if issubclass(model, Part)]
+    waiting.append(manifest.Manifest)
     models: list[type[BaseModel]] = []
     while waiting:
         model = waiting.pop()
         if model not in models:
             models.append(model)
-            for field in model.model_fields.values():
-                waiting += named(field.annotation)
+            waiting += [base for base in model.__bases__ if issubclass(base, Part)]
+            waiting += [inner for field in model.model_fields.values() for inner in named(field.annotation)]
     return tuple(
         f"{model.__name__}.{field.alias or key}"
         for model in models
         for key, field in model.model_fields.items()
+        if key in vars(model).get("__annotations__", {})
     )
 
 
