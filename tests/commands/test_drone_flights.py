@@ -19,7 +19,6 @@ from pipelines.session.errors import DataError
 from pipelines.session.maps import write_grid
 from pipelines.session.records import Occupancy, Trajectory
 from tests.commands.runner import refused, succeeds
-from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
     HOME,
     LEVER_ARM,
@@ -291,15 +290,6 @@ def test_coordinates_of_a_map_projection_are_refused_beside_gps(tmp_path: Path, 
     ingest(flight.manifest)
 
 
-def test_a_cloud_in_utm_is_refused_beside_gps(tmp_path: Path) -> None:
-    flight = with_poses(tmp_path, _osdk, ON_GIMBAL)
-    flight.settings["map"] = {"file": str(real_data("second/isprs_samp11-utm.pcd")), "resolution_m": 2.0}
-    flight.save()
-    said = refused("ingest", flight.manifest)
-    assert "isprs_samp11-utm.pcd" in said
-    assert "UTM" in said
-
-
 def test_one_origin_for_all_where_none_is_stated(tmp_path: Path) -> None:
     flight = with_poses(tmp_path, _osdk, ON_GIMBAL)
     del flight.settings["world"]["origin"]
@@ -315,35 +305,6 @@ def test_one_origin_for_all_where_none_is_stated(tmp_path: Path) -> None:
     true = flight.camera_position[1][0] - flight.camera_position[0][0]
     # 15 m from HOME the vertical is turned by 2.4e-6: 15 m apart, 0.04 mm.
     np.testing.assert_allclose(second - first, true, atol=1e-4)
-
-
-def test_missing_gimbal_angles_are_refused_with_the_remedy(tmp_path: Path) -> None:
-    flight = with_poses(tmp_path, _srt)
-    write_srt(tmp_path / "drone1.SRT", drone_of(flight, 0), gimbal=False)
-    line = refused("ingest", flight.manifest)
-    assert "gimbal:" in line
-    camera = flight.settings["cameras"]["drone1"]
-    camera["gimbal"] = {"yaw_deg": 1, "pitch_deg": 1, "relative_to": "body"}
-    flight.save()
-    with pytest.raises(DataError, match=r"\bbody\b.*\bdrone1\b"):
-        ingest(flight.manifest)
-    camera["gimbal"] = {"relative_to": "world"}
-    flight.save()
-    with pytest.raises(DataError, match=r"\bdrone1\b.*\bangles\b"):
-        ingest(flight.manifest)
-
-
-def test_a_camera_that_never_turned_has_fixed_angles(tmp_path: Path) -> None:
-    flight = with_poses(tmp_path, _srt)
-    write_srt(tmp_path / "drone1.SRT", drone_of(flight, 0), gimbal=False)
-    yaw, pitch, roll = drone_of(flight, 0).gimbal_ypr_deg[0].tolist()
-    fixed = {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}
-    flight.settings["cameras"]["drone1"]["gimbal"] = fixed
-    flight.save()
-    ingest(flight.manifest)
-    turned = poses_of(flight, "drone1")[["qx", "qy", "qz", "qw"]].to_numpy()
-    off = multiply(conjugate(flight.camera_quaternion[0][:1]), turned)
-    assert np.abs(off[:, :3]).max() < 1e-7
 
 
 def test_fixes_and_attitudes_of_any_driver_an_actor_with_a_receiver_and_triggers(tmp_path: Path) -> None:
@@ -428,28 +389,6 @@ def test_frames_at_the_triggers_of_an_autopilot(tmp_path: Path, write: Any) -> N
         )  # two clocks of whole microseconds
 
 
-def test_a_recorder_whose_clock_drifts_is_noted(tmp_path: Path) -> None:
-    # 200 s at 10 Hz: header stamps gain 60 us a second on those of receipt, which come 4 ms late.
-    stamps = [1_700_000_000_000_000_000 + k * 100_000_000 for k in range(2000)]
-    turned = {"position": {"x": 1.0}, "orientation": {"w": 1.0}}
-    entries = [
-        Entry(
-            "/pose",
-            "geometry_msgs/msg/PoseStamped",
-            t + 4_000_000,
-            {"header": header(t + (t - stamps[0]) * 60 // 1_000_000, "map"), "pose": turned},
-        )
-        for t in stamps
-    ]
-    write_log(tmp_path, "drone1", "mcap-cdr", entries)
-    flight = write_flight(tmp_path, cameras=1, seconds=1.0, clean=True)
-    flight.settings["cameras"]["drone1"]["pose"] = {"file": "drone1.mcap", "topic": "/pose", "of": "camera"}
-    flight.save()
-    warnings = ingest(flight.manifest).description.warnings
-    (said,) = [line for line in warnings if "drift" in line]
-    assert "60.0 ppm" in said
-
-
 def test_a_video_starts_at_the_time_of_its_container(tmp_path: Path) -> None:
     import av
 
@@ -506,20 +445,3 @@ def test_attitudes_in_a_video_turn_the_camera_of_another_log(tmp_path: Path, kin
             conjugate(flight.camera_quaternion[k][nearest]), poses[["qx", "qy", "qz", "qw"]].to_numpy()
         )
         assert float(np.degrees(2 * np.abs(turned[:, :3])).max()) < 0.02
-
-
-def test_attitudes_from_elsewhere_are_refused_where_nothing_places_them(tmp_path: Path) -> None:
-    flight = with_poses(tmp_path, _srt)
-    name = flight.cameras[0]
-    truth = drone_of(flight, 0)
-    camera = flight.settings["cameras"][name]
-    camera["gimbal"] = _of_gopro(tmp_path, name, truth, flight.camera_quaternion[0])
-    flight.save()
-    assert "is not the camera's video" in refused("ingest", flight.manifest)
-    del camera["gimbal"]["yaw_deg"]
-    flight.save()
-    assert "yaw_deg" in refused("ingest", flight.manifest)
-    camera["gimbal"] = None
-    camera["pose"] = {"file": f"{name}_own.mp4"}
-    flight.save()
-    assert f"gimbal: {{file: {name}_own.mp4, yaw_deg: 90}}" in refused("ingest", flight.manifest)

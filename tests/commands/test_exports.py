@@ -36,20 +36,6 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return session_of(filmed_flight(tmp_path_factory.mktemp("filmed")))
 
 
-def test_help_lists_every_format_with_one_line() -> None:
-    text = " ".join(succeeds("export", "--help").split())
-    for line in (
-        "bvh a rig of constant bones that follows the skeleton, for Blender; cm|m|mm|inch, y-up|z-up",
-        "angles joint angles with standard deviations, as CSV and for OpenSim (STO)",
-        "trc markers for OpenSim and Pose2Sim; m|cm|mm, y-up|z-up",
-        "parquet the same tables",
-        "osim scaled model and inverse kinematics by OpenSim (extra opensim)",
-        "rerun a recording",
-        "tum trajectories",
-    ):
-        assert line in text
-
-
 def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     names = "angles,bvh,c3d,csv,mcap,parquet,rerun,trc,tum"
@@ -109,41 +95,6 @@ def test_pictures_lie_where_the_skeleton_does(filmed: Path) -> None:
         changed = np.abs(picture.astype(int) - plain[stamp]).max(axis=2) > 40
         assert 500 < changed.sum() < changed.size / 10  # bones, joints and the caption
     assert not dict(load_recording(filmed).overlays("drone2")), "none unless they are asked for"
-
-
-def test_many_files_are_listed_in_a_few_lines(filmed: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    command = ("export", filmed, "--to", "tum", "-o", out)
-    for what in ("written", "unchanged"):
-        lines = succeeds(*command).splitlines()
-        files = sorted(out.glob("*.tum"))
-        assert len(files) == 2 + 17  # cameras and joints
-        assert lines[:3] == [f"{what}: {path}" for path in files[:3]]
-        assert len(lines) == 4
-        assert str(len(files) - 3) in lines[3]
-    printed = json.loads(succeeds(*command, "--json"))
-    assert printed["unchanged"] == [str(path) for path in files]
-    few = succeeds("export", filmed, "--to", "csv,trc", "-o", out).splitlines()
-    assert [line.split(": ")[0] for line in few] == ["written"] * 4
-
-
-def test_files_of_an_earlier_export_are_replaced_others_are_not(filmed: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    first = export(filmed, ["trc", "csv"], out)
-    assert len(first.written) == 4
-    trc = next(path for path in first.written if path.suffix == ".trc")
-    assert "Units" in trc.read_text(encoding="utf-8")
-    again = json.loads(succeeds("export", filmed, "--to", "trc", "--unit", "mm", "-o", out, "--json"))
-    assert again["written"] == [str(trc)]
-    trc.write_text("changed by hand", encoding="utf-8")
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
-    assert "add --overwrite" in refused("export", filmed, "--to", "csv,c3d,trc", "-o", out)
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before, "all of them, or none"
-    succeeds("export", filmed, "--to", "trc", "-o", out, "--overwrite")
-    record = json.loads((out / RECORD).read_text(encoding="utf-8"))["files"]
-    assert set(record) == {path.name for path in first.written}
-    (out / "export.json").write_text("{", encoding="utf-8")
-    assert "add --overwrite" in refused("export", filmed, "--to", "trc", "--unit", "cm", "-o", out)
 
 
 def test_what_a_killed_export_left_goes_and_a_second_one_at_once_is_refused(

@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
-import pytest
 
 from pipelines.formats.videos.video import VideoReader
 from tests.commands.runner import mocap, refused, succeeds
@@ -131,13 +130,6 @@ def test_a_letterboxed_video_gets_the_intrinsics_of_what_lies_between_its_bars(t
     expected = [lens[f"f{axis}"] * point[k] / 4 + lens[f"c{axis}"] for k, axis in enumerate("xy")]
     np.testing.assert_allclose(bright.mean(axis=0)[::-1], expected, atol=0.1)
     assert any("drone1" in line and "240 x 180" in line for line in stored["warnings"])
-
-
-@pytest.mark.parametrize("content", [b"", b"no video at all", b"\0\0\0\x18ftypisom" + bytes(40)])
-def test_video_that_is_none(tmp_path: Path, content: bytes) -> None:
-    flight = with_videos(tmp_path)
-    (tmp_path / "drone1.mp4").write_bytes(content)
-    assert "drone1.mp4" in refused("ingest", flight.manifest)
 
 
 def test_video_without_keypoints_is_ingested_and_reconstruct_says_what_is_missing(tmp_path: Path) -> None:

@@ -13,9 +13,7 @@ import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 
-from pipelines.draft import draft
 from pipelines.ingest import ingest
-from pipelines.session.errors import DataError
 from tests.commands.runner import mocap
 from tests.real_data import real_data
 
@@ -104,36 +102,6 @@ def test_subtitles_without_gimbal_angles(tmp_path: Path, name: str, start_s: flo
 
 
 @pytest.mark.parametrize(
-    ("stated", "from_take_off"),
-    [({}, True), ({"altitude": "relative"}, True), ({"altitude": "absolute"}, False)],
-)
-def test_init_and_ingest_both_note_an_altitude_without_a_reference(
-    tmp_path: Path, stated: dict[str, str], from_take_off: bool
-) -> None:
-    name = "second/mavic_air2.srt"
-    path = write_flight(tmp_path, name, 1651417318.6, {"file": "", **stated}, **FIXED)
-    ingest(path)
-    z = poses_of(path)["z"]
-    first = 0.0 if from_take_off else 27.3  # absolute heights: the first one is the world's origin
-    assert (z.min(), z.max()) == pytest.approx((27.3 - first, 29.2 - first), abs=1e-6)
-    warnings = " ".join(session_of(path)["warnings"])
-    assert ("altitude: absolute" in warnings) == (not stated)
-    if not stated:
-        (tmp_path / "logs").mkdir()
-        shutil.copyfile(real_data(name), tmp_path / "logs" / "air2.srt")
-        assumed = draft([tmp_path / "logs"]).assumed
-        assert any("take-off" in line for line in assumed)
-
-
-def test_init_notes_absolute_heights(tmp_path: Path) -> None:
-    text = real_data("second/mavic_air2.srt").read_text(encoding="utf-8").replace("[altitude", "[abs_alt")
-    (tmp_path / "air2.srt").write_text(text, encoding="utf-8")
-    result = draft([tmp_path])
-    assert any("absolute" in line for line in result.assumed)
-    assert not any("take-off" in line for line in result.assumed)
-
-
-@pytest.mark.parametrize(
     ("name", "position", "topic"),
     [
         ("sample.ulg", "local", "vehicle_local_position:0"),
@@ -173,25 +141,3 @@ def test_px4_at_gps_time_as_a_command(tmp_path: Path) -> None:
     assert clock["events"] == told["gps_samples"]
     # The first attitude after the first fix: those come every 5 ms, with pauses.
     assert 0 <= poses_of(path)["t_ns"].iloc[0] / 1e9 - first_s < 0.05
-
-
-def test_what_is_left_open_is_drafted_as_comments(tmp_path: Path) -> None:
-    for name in ("dji_srt/air2s.srt", "dji_srt/old_format.SRT", "ulog/sample_px4_events.ulg"):
-        shutil.copyfile(real_data(f"logs/{name}"), tmp_path / Path(name).name)
-    result = draft([tmp_path])
-    stated = YAML(typ="safe", pure=True).load(result.text)["cameras"]
-    assert stated["air2"]["pose"] == {"file": "air2s.srt", "assumed": True}
-    assert stated["air2"]["frame_times"] == "air2s.srt"
-    assert stated["sample"]["pose"] == "sample_px4_events.ulg"
-    assert stated["sample"]["mount"]["looks"] == "forward"
-    assert "--max-pose-gap 1.5" in result.text
-    assert "# gimbal: {yaw_deg: 90, pitch_deg: -30}  # missing" in result.text
-    assert "gauss-markov: {position_m: 1.5" in result.text
-    assert "origin: {latitude_deg: 0" in result.text
-    assert any("how the camera was turned" in line for line in result.missing)
-
-
-def test_a_flight_of_unknown_attitude_is_refused(tmp_path: Path) -> None:
-    path = write_flight(tmp_path, "logs/dji_srt/air2s.srt", 1659879640.8, {"file": ""})
-    with pytest.raises(DataError, match="not how it was turned"):
-        ingest(path)

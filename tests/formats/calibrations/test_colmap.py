@@ -97,16 +97,6 @@ def test_a_real_model() -> None:
     assert (lens.width, lens.height, lens.fx, lens.cx, lens.model) == (1919, 1079, 1847.53, 959.0, "none")
 
 
-def test_the_middle_of_a_picture_is_that_of_its_pixels(tmp_path: Path) -> None:
-    # COLMAP's own guess of the principal point is half the size; the middle of pixels 0 to 4 is 2.
-    guessed = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.PINHOLE, 700.0, 5, 3)
-    assert guessed.params.tolist() == [700, 700, 2.5, 1.5]
-    cameras = f"1 PINHOLE 5 3 {' '.join(map(str, guessed.params))}\n"
-    lens = READER.read_calibration(write(tmp_path, cameras))["a"].intrinsics
-    assert lens is not None
-    assert (lens.cx, lens.cy) == (2, 1)
-
-
 def test_images_that_share_a_name_keep_their_folder(tmp_path: Path) -> None:
     images = {"cam1/000.jpg": 1, "cam2/000.jpg": 1, "cam2/001.jpg": 1}
     model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, images).write_binary(str(tmp_path))

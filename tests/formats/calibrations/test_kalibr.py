@@ -71,13 +71,6 @@ def test_it_projects_as_opencv_does(tmp_path: Path, model: str) -> None:
     np.testing.assert_allclose(project(points, lens), expected.reshape(-1, 2), rtol=0, atol=1e-9)
 
 
-def test_the_header_of_old_files_is_skipped(tmp_path: Path) -> None:
-    path = chain(tmp_path / "c.yaml")
-    path.write_text("%YAML:1.0\n" + path.read_text())
-    assert READER.recognises(path)
-    assert list(READER.read_calibration(path)) == ["cam0"]
-
-
 @pytest.mark.parametrize(
     ("keys", "problem"),
     [
@@ -109,22 +102,3 @@ def test_faulty_content_is_refused(tmp_path: Path, keys: dict[str, str | None], 
         READER.read_calibration(chain(tmp_path / "c.yaml", **keys))
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500
-
-
-@pytest.mark.parametrize("content", ["", "cam0: 3", "other: {a: 1}", "- cam0", "cam0:\n  camera_model:\n"])
-def test_what_is_no_chain(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "c.yaml"
-    path.write_text(content)
-    READER.recognises(path)
-    with pytest.raises(DataError):
-        READER.read_calibration(path)
-
-
-def test_truncated_files_are_refused_or_hold_less(tmp_path: Path) -> None:
-    whole = chain(tmp_path / "whole.yaml", rostopic=None).read_text()
-    path = tmp_path / "cut.yaml"
-    needed = whole.index("T_cam_imu")
-    for size in range(0, needed - 3, 11):
-        path.write_text(whole[:size])
-        with pytest.raises(DataError):
-            READER.read_calibration(path)

@@ -13,8 +13,6 @@ from pipelines.geometry.cameras import project
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 from pipelines.session.registries import CalibrationFormat
-from tests.formats.refusals import refuses
-from tests.real_data import real_data
 
 READER: CalibrationFormat = opencv_yaml.OPENCV
 K = np.array([[800.0, 0, 330.5], [0, 790.0, 241.25], [0, 0, 1]])
@@ -80,15 +78,6 @@ def test_pose(tmp_path: Path, as_vector: bool) -> None:
     np.testing.assert_allclose(camera.position, (-matrix.T @ tvec).ravel(), atol=1e-12)
 
 
-def test_name_and_size_list(tmp_path: Path) -> None:
-    path = tmp_path / "c.yml"
-    store(path, camera_name="left", image_width=None, image_height=None)
-    path.write_text(path.read_text() + "image_size: [ 1920, 1080 ]\n")
-    lens = READER.read_calibration(path)["left"].intrinsics
-    assert lens is not None
-    assert (lens.width, lens.height) == (1920, 1080)
-
-
 def test_without_a_size_the_pictures_decide(tmp_path: Path) -> None:
     """The size is then that of which the principal point is the middle: 2 * 330.5 + 1, 2 * 241.25 + 1."""
     camera = only(store(tmp_path / "c.yml", image_width=None, image_height=None))
@@ -117,27 +106,3 @@ def test_without_a_size_the_pictures_decide(tmp_path: Path) -> None:
 def test_faulty_content_is_refused(tmp_path: Path, values: dict[str, object], problem: str) -> None:
     with pytest.raises(DataError, match=problem):
         READER.read_calibration(store(tmp_path / "c.yml", **values))
-
-
-def test_stated_sizes_beyond_the_numbers_are_refused(tmp_path: Path) -> None:
-    path = store(tmp_path / "c.yml")
-    path.write_text(path.read_text().replace("rows: 3", "rows: 300000000", 1))
-    with refuses(path, "3e+08", 3, 9):
-        READER.read_calibration(path)
-
-
-@pytest.mark.parametrize("suffix", [".yml", ".xml"])
-def test_truncated_and_foreign_files(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
-    whole = store(tmp_path / f"c{suffix}").read_text()
-    path = tmp_path / f"t{suffix}"
-    for size in range(0, len(whole) - 40, 37):
-        path.write_text(whole[:size])
-        READER.recognises(path)
-        with pytest.raises(DataError):
-            READER.read_calibration(path)
-    assert capfd.readouterr().err == "", "OpenCV's own words would stand beside our one line"
-
-
-def test_ros_camera_info_is_another_format() -> None:
-    for other in ("calib/ros_camera_info_manager_test.yaml", "calib/kalibr_euroc_voxblox_T_cam_imu.yaml"):
-        assert not READER.recognises(real_data(other))

@@ -117,10 +117,6 @@ def test_models(tmp_path: Path, model: str, cells: int, expected: str) -> None:
     assert list(lens.distortion) == data
 
 
-def test_without_a_name_or_model(tmp_path: Path) -> None:
-    only(stored(tmp_path / "c.yaml", camera_name=None, distortion_model=None), "camera")
-
-
 @pytest.mark.parametrize(
     ("keys", "problem"),
     [
@@ -150,50 +146,3 @@ def test_faulty_content_is_refused(tmp_path: Path, keys: dict[str, str | None], 
     with pytest.raises(DataError, match=problem) as caught:
         READER.read_calibration(path)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "problem"),
-    [
-        ("640", "wide", "lacks width"),
-        ("640", "6x", "width is no table"),
-        ("0.0 790.0 241.25", "0.0 790.0", "camera matrix is no table"),
-        ("800.0 0.0", "8e2 0x1", "camera matrix is no table"),
-        ("distortion\n", "", "lacks distortion"),
-        ("-0.21 0.08 0.001 -0.002 0.01", "nan 0 0 0 0", "not all finite"),
-        ("800.0 0.0", "-800.0 0.0", "focal lengths"),
-        ("640", "640 640", "size of two"),
-    ],
-)
-def test_what_is_wrong_with_an_ini(tmp_path: Path, old: str, new: str, problem: str) -> None:
-    path = tmp_path / "c.ini"
-    path.write_text(INI.replace(old, new, 1))
-    with pytest.raises(DataError, match=problem) as caught:
-        READER.read_calibration(path)
-    assert "\n" not in str(caught.value)
-
-
-def test_truncated_files_are_refused(tmp_path: Path) -> None:
-    yaml = stored(tmp_path / "whole.yaml", rectification_matrix=None).read_text()
-    for name, whole, needed in (
-        ("c.yaml", yaml, len(yaml) - 2),
-        ("c.ini", INI, INI.index("distortion\n") + 11),
-    ):
-        path = tmp_path / name
-        for size in range(0, needed, 13):
-            path.write_text(whole[:size])
-            READER.recognises(path)
-            with pytest.raises(DataError):
-                READER.read_calibration(path)
-
-
-def test_opencvs_own_files_and_manifests_are_others(tmp_path: Path) -> None:
-    storage = cv2.FileStorage(str(tmp_path / "cv.yaml"), cv2.FILE_STORAGE_WRITE)
-    for key, value in {"image_width": 640, "image_height": 480, "camera_matrix": MATRIX}.items():
-        storage.write(key, value)
-    storage.release()
-    stored_by_opencv = tmp_path / "cv.yaml"
-    assert not READER.recognises(stored_by_opencv)
-    (tmp_path / "flight.yaml").write_text("schema: 1\ncameras:\n  cam0:\n    intrinsics: left.yaml\n")
-    flight = tmp_path / "flight.yaml"
-    assert not any(format_.recognises(flight) for format_ in FORMATS.all())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from pipelines.formats.common.rows import (
     MILLISECONDS,
     NANOSECONDS,
     SECONDS,
-    cell_name,
     format_seconds,
     parse_stamps,
     parse_table,
@@ -39,14 +37,6 @@ def test_formatted_stamps_read_back_exactly(stamps: list[int]) -> None:
     assert t_ns.tolist() == stamps
 
 
-@given(st.lists(st.integers(-(10**18), 10**18), min_size=1, max_size=20), st.sampled_from([0, 3, 6, 9]))
-def test_exponents_and_plain_forms_agree(values: list[int], unit: int) -> None:
-    plain = [str(Decimal(value).scaleb(-unit)) for value in values]
-    exponent = [f"{value}e-{unit}" for value in values]
-    assert parse_stamps("log", plain, unit)[0].tolist() == values
-    assert parse_stamps("log", exponent, unit)[0].tolist() == values
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -69,18 +59,6 @@ def test_odd_forms(text: str, expected: int) -> None:
     assert t_ns.tolist() == [expected]
 
 
-@pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "abc", ".", "-", "1e999999999", "1.2.3", "0x10"])
-def test_what_is_no_stamp_is_unreadable(text: str) -> None:
-    t_ns, readable = parse_stamps("log", ["1.0", "2.0", text])
-    assert readable.tolist() == [True, True, False]
-    assert t_ns.tolist() == [1_000_000_000, 2_000_000_000, 0]
-
-
-def test_one_impossible_stamp_does_not_condemn_the_rest() -> None:
-    _, readable = parse_stamps("log", ["1.0", "2.0", "1700000000000.0"])
-    assert readable.tolist() == [True, True, False]
-
-
 @pytest.mark.parametrize(
     ("stamp", "word"),
     [
@@ -92,11 +70,6 @@ def test_one_impossible_stamp_does_not_condemn_the_rest() -> None:
 def test_epoch_stamps_that_are_not_seconds_are_refused(stamp: str, word: str) -> None:
     with refuses("log", word):
         parse_stamps("log", [stamp, stamp])
-
-
-def test_units() -> None:
-    assert parse_stamps("log", ["1700000000123456789"], NANOSECONDS)[0].tolist() == [1700000000123456789]
-    assert parse_stamps("log", ["1700000000123.456"], MILLISECONDS)[0].tolist() == [1700000000123456000]
 
 
 @pytest.mark.parametrize(
@@ -113,14 +86,6 @@ def test_units() -> None:
 )
 def test_time_columns(header: str, expected: tuple[int, int] | None) -> None:
     assert stamp_column(header.split(",")) == expected
-
-
-def test_cell_names() -> None:
-    assert cell_name(" #timestamp [ns]") == ("timestamp", "ns")
-    assert cell_name('"p_RS_R_x [m]"') == ("p_rs_r_x", "m")
-    dotted = "pose.position.x"
-    assert cell_name(dotted) == ("pose_position_x", "")
-    assert cell_name("q_RS_w []") == ("q_rs_w", "")
 
 
 @pytest.mark.parametrize(
@@ -188,17 +153,3 @@ def test_numbers_whose_commas_may_separate_thousands_are_refused(
             read()
     else:
         assert read() == expected
-
-
-@pytest.mark.parametrize("text", ["Doe, Jane", "2023-11-14 22:13:20.500000"])
-def test_beside_decimal_commas_names_and_dates_are_kept(text: str) -> None:
-    table = parse_table(
-        Path("a.csv"),
-        f"{text};1,5\n",
-        delimiter=";",
-        columns=2,
-        text={"n": 0},
-        numbers={"x": 1},
-        first_line=2,
-    )
-    assert (table.text["n"].to_pylist(), table.numbers["x"].tolist()) == ([text], [1.5])

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 from pipelines.formats.drone_logs.ardupilot import FORMAT
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import conjugate, multiply, rotate
-from pipelines.session.errors import DataError
-from pipelines.session.records import Telemetry
-from pipelines.session.registries import TelemetryChoice
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
@@ -110,20 +107,6 @@ def test_time_by_gps(tmp_path: Path, truth: DroneTruth) -> None:
     assert int(read(no_gps).position.t_ns[0]) == BOOT_NS
 
 
-def test_a_clock_that_drifts_is_found(tmp_path: Path) -> None:
-    t_ns = 1_700_000_000_000_000_000 + np.arange(600, dtype=np.int64) * 1_000_000_000
-    still = np.zeros((600, 3))
-    level = np.tile([0.0, 0.0, 0.0, 1.0], (600, 1))
-    place = np.full(600, HOME.latitude_deg), np.full(600, HOME.longitude_deg), np.full(600, HOME.altitude_m)
-    truth = DroneTruth(t_ns, still, *place, level, still, still)
-    path = write_dataflash(tmp_path / "a.bin", truth, kinds=("GPS", "POS", "ATT"), drift_ppm=35.0)
-    telemetry = read(path)
-    assert telemetry.fit is not None
-    assert telemetry.fit.drift_ppm == pytest.approx(35.0, abs=1.0)
-    # 35 ppm of 600 s are 21 ms; the truncation of GPS to whole ms remains.
-    assert np.abs(telemetry.position.t_ns - t_ns).max() < 1_500_000
-
-
 def test_a_log_from_2014_as_pymavlink_reads_it() -> None:
     # Stamps are ms since boot, but ms of the GPS week in GPS messages.
     path = real_data("second/erle_25.bin")
@@ -179,33 +162,6 @@ def test_damage(tmp_path: Path, truth: DroneTruth, capfd: pytest.CaptureFixture[
         read(path)
 
 
-def test_a_mount_whose_only_message_is_cut_off_gives_no_angles(tmp_path: Path, truth: DroneTruth) -> None:
-    path = write_dataflash(tmp_path / "a.bin", truth, kinds=("GPS", "POS", "ATT"))
-    message = dataflash("MNT", 83_000_000, 0, 0, 0.0, 0, -90.0, 0, 0.0, 0, 0.0)
-    path.write_bytes(path.read_bytes() + definition("MNT") + message[:-8])
-    telemetry = read(path)
-    assert telemetry.gimbal is None
-    assert telemetry.body is not None
-
-
-def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
-    path = write_dataflash(tmp_path / "a.bin", truth, kinds=("GPS", "ATT"))
-    with refuses(path, "local", "gps"):
-        read(path, position="local")
-    with refuses(path, "CAM", "TRIG"):
-        FORMAT.picture_times(path, TelemetryChoice())
-    assert read(path).gimbal is None
-
-
-def test_without_pymavlink_the_refusal_names_the_extra(
-    tmp_path: Path, truth: DroneTruth, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write_dataflash(tmp_path / "a.bin", truth)
-    monkeypatch.setitem(sys.modules, "pymavlink.DFReader", None)
-    with pytest.raises(DataError, match=r'"pymavlink\S*" "pyulog\S*"`$'):
-        read(path)
-
-
 def test_an_instance_is_that_of_an_estimator_and_never_that_of_a_mount(
     tmp_path: Path, truth: DroneTruth
 ) -> None:
@@ -228,25 +184,6 @@ def test_an_instance_is_that_of_an_estimator_and_never_that_of_a_mount(
             read(path, position=position, instance=1)
     with refuses(path, 2, "local"):
         read(path, instance=2)
-
-
-def test_the_old_estimator_is_read_if_it_is_asked_for() -> None:
-    """Read EKF1 of a real log from 2014; the drone flew by another estimate, so it is no default."""
-    path = real_data("second/erle_25.bin")
-    mavutil = pytest.importorskip("pymavlink.mavutil")
-    theirs = mavutil.mavlink_connection(str(path))
-    rows = {}
-    while (message := theirs.recv_match(type="EKF1")) is not None:
-        rows[message.TimeMS] = (message.PE, message.PN, -message.PD)
-    theirs.close()
-    track = read(path, position="local", time="boot").position
-    assert (track.on_earth, track.origin) == (False, None)
-    assert len(track.t_ns) == len(rows)
-    np.testing.assert_allclose(track.values, [rows[t // 10**6] for t in track.t_ns.tolist()], rtol=1e-6)
-    assert read(path, time="boot").position.name == "GPS"
-    # Its clock loses 9 % on GPS time: 181 s are 198 s by the fixes.
-    uneven = [note for note in read(path).notes if "does not keep step with GPS time" in note]
-    assert len(uneven) == 1
 
 
 def test_pictures_of_2014_have_gps_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

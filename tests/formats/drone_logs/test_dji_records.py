@@ -123,18 +123,6 @@ def test_airdata_is_placed_by_its_clock_and_its_gimbal_looks_where_it_says(tmp_p
     assert (first_ns - int(telemetry.position.t_ns[0]), last_ns - first_ns) == (2_000_000_000, 1_900_000_000)
 
 
-def test_a_record_saved_in_utf16_is_the_same(tmp_path: Path) -> None:
-    path = airdata(tmp_path / "a.csv")
-    expected = read(path).position.values
-    path.write_bytes(path.read_text().encode("utf-16"))
-    assert FORMAT.recognises(path)
-    np.testing.assert_array_equal(read(path).position.values, expected)
-
-
-def test_a_gimbal_that_is_zero_throughout_is_none(tmp_path: Path) -> None:
-    assert read(airdata(tmp_path / "a.csv", gimbal=False)).gimbal is None
-
-
 @pytest.mark.parametrize(
     ("date", "name", "expected"),
     [
@@ -161,14 +149,6 @@ def test_semicolons_and_decimal_commas(tmp_path: Path) -> None:
     assert german.gimbal is not None
     ahead = rotate(german.gimbal.quaternion_xyzw[0], np.array([1.0, 0, 0]))
     assert np.degrees(np.arctan2(ahead[0], ahead[1])) == pytest.approx(-80)
-
-
-@pytest.mark.parametrize("height", ['"1,234"', '"1,234.0"', "1234"])
-def test_thousands_beside_decimal_dots(tmp_path: Path, height: str) -> None:
-    path = tmp_path / "a.csv"
-    heading = "time(millisecond),latitude,longitude,height_above_takeoff(feet)\n"
-    path.write_text(f"{heading}0,47.5,8.25,{height}\n100,47.5,8.25,{height}\n", encoding="utf-8")
-    assert read(path).position.values[0, 2] == pytest.approx(1234 * FOOT_M)
 
 
 LITCHI = (

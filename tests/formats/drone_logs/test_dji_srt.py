@@ -83,13 +83,6 @@ def test_the_gimbal_of_a_real_phantom_looks_where_it_flew() -> None:
     assert telemetry.position.t_ns[0] < 10**15  # since the video's start, not since 1970
 
 
-def test_an_empty_file_is_none_of_them() -> None:
-    path = real_data("logs/dji_srt/broken_empty.SRT")
-    assert not FORMAT.recognises(path)
-    with refuses(path, "empty"):
-        read(path)
-
-
 BLOCK = (
     '{n}\n00:00:0{n},000 --> 00:00:0{n},040\n<font size="36">2024-05-01 10:00:0{n}.000\n{text} </font>\n\n'
 )
@@ -142,31 +135,6 @@ def test_where_a_gimbal_looks(
     np.testing.assert_allclose(rotate(turned, np.array([0, 0, 1.0])), up, atol=1e-12)
 
 
-def test_yaw_is_followed_across_north(tmp_path: Path) -> None:
-    texts = [
-        f"[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5] [gb_yaw: {yaw} gb_pitch: 0.0 gb_roll: 0.0]"
-        for yaw in (179.0, 179.0, -179.0)
-    ]
-    gimbal = read(subtitles(tmp_path / "a.srt", *texts)).gimbal
-    assert gimbal is not None
-    ahead = rotate(gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
-    np.testing.assert_allclose(ahead[:, 1], -1, atol=2e-4)  # south throughout, never through north
-
-
-def test_angles_whose_clock_goes_back_are_dropped(tmp_path: Path) -> None:
-    text = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5] [gb_yaw: 1.0 gb_pitch: 0.0 gb_roll: 0.0]"
-    path = tmp_path / "a.srt"
-    blocks = "".join(
-        f"{n}\n00:00:00,{n * 40:03d} --> 00:00:00,{n * 40 + 40:03d}\n2024-05-01 {clock}\n{text}\n\n"
-        for n, clock in enumerate(("10:00:01.000", "09:00:00.000", "10:00:01.080"))
-    )
-    path.write_text(blocks)
-    telemetry = read(path)
-    assert telemetry.gimbal is not None
-    assert len(telemetry.gimbal.t_ns) == 2
-    assert list(telemetry.dropped.values()) == [1, 1]
-
-
 def test_which_height(tmp_path: Path) -> None:
     text = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]"
     path = subtitles(tmp_path / "a.srt", text, text)
@@ -214,20 +182,6 @@ def test_a_mavic_air_2_counts_from_its_take_off() -> None:
     assert read(path, altitude="absolute").position.height == "unknown"
 
 
-def test_subtitles_of_one_moment(tmp_path: Path) -> None:
-    path = tmp_path / "a.srt"
-    text = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5]"
-    blocks = [f"{n}\n00:00:01,000 --> 00:00:01,040\n2024-05-01 10:00:01.000\n{text}\n\n" for n in (1, 2, 3)]
-    path.write_text("".join(blocks))
-    described = FORMAT.describe(path)
-    assert (described["subtitles"], described["span_s"]) == (3, 0.0)
-    assert "rate_hz" not in described
-    assert list(read(path).dropped.values()) == [2]
-    # A subtitle without a clock, among others with one, has an unknown time, not the year 1970.
-    path.write_text("".join(blocks).replace("2024-05-01 10:00:01.000", "", 1))
-    assert FORMAT.describe(path)["first_ns"] == 1_714_557_601_000_000_000
-
-
 def test_losses_are_counted(tmp_path: Path) -> None:
     good = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]"
     path = subtitles(
@@ -244,16 +198,6 @@ def test_losses_are_counted(tmp_path: Path) -> None:
     # Cut in the middle of a two-byte character.
     path.write_bytes(path.read_bytes()[:-60] + b"\xc2")
     assert len(read(path).position.t_ns) == 1
-
-
-def test_times_are_those_of_frame_times(tmp_path: Path) -> None:
-    every_second = read_subtitles(subtitles(tmp_path / "a.srt", "x", "x", "x"))
-    assert every_second.are_slow
-    start_ns = every_second.start_ns()
-    t_ns, known = every_second.times()
-    assert known.all()
-    assert start_ns is not None
-    np.testing.assert_array_equal(t_ns, start_ns + every_second.media_ns)
 
 
 def test_repeated_measurements_become_lines() -> None:
@@ -293,12 +237,6 @@ def test_an_angle_that_is_held_and_steps_does_so_where_it_was_logged(tmp_path: P
     np.testing.assert_allclose(np.degrees(np.arcsin(ahead[:, 2])), pitch, atol=1e-5)
 
 
-def test_a_slew_that_every_picture_shows_stays_where_it_was_logged() -> None:
-    t_ns = np.arange(200, dtype=np.int64) * 33_000_000
-    pitch = np.interp(np.arange(200), [0, 100, 120, 200], [0.0, 0.0, -60.0, -60.0])[:, None]
-    np.testing.assert_array_equal(between_refreshed_angles(t_ns, pitch), pitch)
-
-
 @pytest.mark.parametrize("rows", [2, 3, 6])
 def test_angles_that_are_repeated_become_lines_and_their_holds_stay(rows: int) -> None:
     """Turn yaw evenly; hold pitch, turn it and hold it again. Both are refreshed at a lower rate."""
@@ -315,27 +253,3 @@ def test_angles_that_are_repeated_become_lines_and_their_holds_stay(rows: int) -
     held = number < 31 * rows - (rows + 1)
     np.testing.assert_array_equal(found[held, 1], 0)
     np.testing.assert_allclose(found[31 * rows :, 1], true[31 * rows :, 1], atol=1e-9)
-
-
-def test_angles_whose_refresh_does_not_keep_step_with_the_pictures_become_lines() -> None:
-    """Use 10 Hz in 29.97 pictures a second: usually three rows each, sometimes two or four."""
-    number = np.arange(600)
-    t_ns = np.round(number * 1e9 / 29.97).astype(np.int64)
-    at_s = np.floor(t_ns / 1e8) / 10
-    found = between_refreshed_angles(t_ns, (20 * at_s)[:, None])[:, 0]
-    behind = 20 * (t_ns / 1e9) - found
-    # Each measurement is shown up to a picture late, and none follows the last one.
-    assert np.ptp(behind[:-4]) < 20 / 29.97 + 1e-6
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
-def test_subtitles_of_other_programs(tmp_path: Path, encoding: str) -> None:
-    """Decimal commas and dates with slashes are the same numbers; an editor may have saved UTF-16."""
-    path = subtitles(tmp_path / "a.srt", "[latitude: 47,25] [longitude: -8,125] [rel_alt: 3,5 abs_alt: 400]")
-    expected_ns = read(path).position.t_ns.tolist()
-    assert "2024-05-01" in path.read_text()
-    path.write_bytes(path.read_text().replace("2024-05-01", "2024/05/01").encode(encoding))
-    assert FORMAT.recognises(path)
-    track = read(path).position
-    assert track.values.tolist() == [[47.25, -8.125, 3.5]]
-    assert track.t_ns.tolist() == expected_ns

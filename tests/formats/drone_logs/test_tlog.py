@@ -7,12 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 from pipelines.formats.drone_logs.tlog import FORMAT
 from pipelines.geometry.poses import rotate
-from pipelines.session.errors import DataError
-from pipelines.session.records import Telemetry
-from pipelines.session.registries import FORMATS, TelemetryChoice
+from pipelines.session.registries import FORMATS
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import DroneTruth, drone_of, mavlink, tlog_pictures, write_tlog
@@ -71,24 +70,6 @@ def test_a_real_log_has_the_messages_that_pymavlink_finds() -> None:
     assert late_s == pytest.approx(1533737145.465009 - 608.582, abs=2e-3)
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_both_versions_of_mavlink(tmp_path: Path, truth: DroneTruth, version: int) -> None:
-    telemetry = read(write_tlog(tmp_path / "a.tlog", truth, version=version))
-    assert (telemetry.gimbal is None) == (version == 1)
-    assert telemetry.dropped == {}
-    assert np.abs(telemetry.position.t_ns - truth.t_ns).max() <= 1_000_001
-    np.testing.assert_allclose(telemetry.position.values[:, 0], truth.latitude_deg, atol=0.51e-7)
-
-
-@pytest.mark.parametrize("position", ["global", "local", "gps"])
-def test_every_position(tmp_path: Path, truth: DroneTruth, position: str) -> None:
-    track = read(write_tlog(tmp_path / "a.tlog", truth), position=position).position
-    assert track.on_earth == (position != "local")
-    assert (track.origin is None) == track.on_earth
-    expected = truth.enu if position == "local" else np.stack([truth.latitude_deg, truth.longitude_deg], 1)
-    np.testing.assert_allclose(track.values[:, : expected.shape[1]], expected, atol=1e-6)
-
-
 def test_without_gps_time_the_station_s_clock_counts(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_tlog(tmp_path / "a.tlog", truth, gps_time=False)
     telemetry = read(path)
@@ -141,39 +122,6 @@ def test_times_of_pictures(
             FORMAT.picture_times(path, TelemetryChoice(time="boot"))
 
 
-def test_without_gps_time_pictures_follow_the_station_s_clock(tmp_path: Path, truth: DroneTruth) -> None:
-    path = write_tlog(tmp_path / "a.tlog", truth, gps_time=False)
-    with_pictures(path, truth, "CAMERA_TRIGGER", "boot")
-    late_ns = FORMAT.picture_times(path, TelemetryChoice()) - truth.t_ns
-    assert np.abs(late_ns - 4_000_000_000).max() < 1_500_000
-
-
-def test_pictures_that_cannot_be_counted(tmp_path: Path, truth: DroneTruth) -> None:
-    path = write_tlog(tmp_path / "a.tlog", truth)
-    with refuses(path, "CAMERA_FEEDBACK", "CAMERA_TRIGGER"):
-        FORMAT.picture_times(path, TelemetryChoice())
-    with_pictures(path, truth, "CAMERA_FEEDBACK", "utc", lost=3)
-    with refuses(path, 1, 300, 300 + len(truth.t_ns) - 1):
-        FORMAT.picture_times(path, TelemetryChoice())
-    without = write_tlog(tmp_path / "b.tlog", truth)
-    without.write_bytes(without.read_bytes() + mavlink("CAMERA_TRIGGER", 0, 1, stamp_ns=int(truth.t_ns[0])))
-    with refuses(without):
-        FORMAT.picture_times(without, TelemetryChoice())
-
-
-def test_a_log_whose_head_is_lost_is_read_by_its_name(tmp_path: Path, truth: DroneTruth) -> None:
-    whole = write_tlog(tmp_path / "whole.tlog", truth)
-    path = tmp_path / "a.tlog"
-    path.write_bytes(whole.read_bytes()[11:])
-    assert FORMAT.recognises(path)
-    telemetry = read(path)
-    assert len(telemetry.position.t_ns) >= len(truth.t_ns) - 1
-    assert sum(telemetry.dropped.values()) >= 1
-    unnamed = tmp_path / "a.dat"
-    unnamed.write_bytes(path.read_bytes())
-    assert not FORMAT.recognises(unnamed)
-
-
 def test_several_vehicles_are_asked_for(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_tlog(tmp_path / "a.tlog", truth)
     other = write_tlog(tmp_path / "b.tlog", truth, system=7)
@@ -200,20 +148,6 @@ def test_damage_costs_the_packets_that_it_hits(tmp_path: Path, truth: DroneTruth
     assert list(read(hit).dropped.values()) == [1]
     hit.write_bytes(whole.read_bytes()[: len(data) // 2])
     assert rows // 2 <= len(read(hit).position.t_ns) <= rows // 2 + 1
-
-
-def test_a_log_without_right_checksums_is_given_up(
-    tmp_path: Path, truth: DroneTruth, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("pipelines.formats.drone_logs.tlog._MOST_WRONG", 100)
-    whole = write_tlog(tmp_path / "a.tlog", truth).read_bytes()
-    path, wrong = tmp_path / "wrong.tlog", bytes(8) + b"\xfe" + bytes(7)
-    path.write_bytes(whole + wrong * 101)
-    described = FORMAT.describe(path)
-    assert described["dropped: damaged stretch"] == 1
-    path.write_bytes(whole + wrong * (102 + 10 * int(str(described["messages"]))))
-    with pytest.raises(DataError):
-        read(path)
 
 
 def test_refusals(tmp_path: Path, truth: DroneTruth) -> None:

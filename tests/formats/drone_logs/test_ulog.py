@@ -67,19 +67,6 @@ def test_real_logs_are_read_as_their_facts_state(name: str) -> None:
         assert described["first_position"] == told["gps_lat_lon_alt_first"]
 
 
-def test_one_message_stamped_twenty_minutes_late() -> None:
-    described = FORMAT.describe(real_data("logs/ulog/sample_log_small.ulg"))
-    assert described["messages_stamped_far_off"] == 1
-    assert described["span_s"] == pytest.approx(6.5, abs=0.05)
-
-
-def test_a_drone_without_a_valid_position_is_doubted() -> None:
-    telemetry = read(real_data("logs/ulog/sample.ulg"))
-    assert any("vehicle_local_position never" in note for note in telemetry.notes)
-    assert telemetry.clock == "boot"
-    assert not telemetry.position.values[:, :2].any()
-
-
 def test_local_positions_before_the_estimator_was_ready_are_dropped() -> None:
     path, told = real_data("logs/ulog/sample_px4_events.ulg"), facts("sample_px4_events.ulg")
     telemetry = read(path)
@@ -145,21 +132,6 @@ def test_triggers(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_ulog(tmp_path / "b.ulg", rows)
     with refuses(path, "camera_capture", "camera_trigger"):
         FORMAT.picture_times(path, TelemetryChoice())
-
-
-def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
-    rows = [row for row in ulog_rows(truth) if row[0] == "vehicle_attitude"]
-    path = write_ulog(tmp_path / "a.ulg", rows)
-    with refuses(path, "vehicle_local_position", "vehicle_global_position"):
-        read(path)
-    path = write_ulog(tmp_path / "b.ulg", ulog_rows(truth))
-    with refuses(path, "global", "local, gps"):
-        read(path, position="global")
-    with refuses(path, 3, "vehicle_local_position 0"):
-        read(path, position="local", instance=3)
-    no_gps = write_ulog(tmp_path / "c.ulg", [row for row in ulog_rows(truth) if "gps" not in row[0]])
-    with refuses(no_gps, "GPS", "time: gps"):
-        read(no_gps, time="gps")
 
 
 def test_an_instance_is_taken_or_refused(tmp_path: Path, truth: DroneTruth) -> None:

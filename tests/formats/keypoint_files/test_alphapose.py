@@ -7,13 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipelines.formats.keypoint_files.result_files import ALPHAPOSE as FORMAT
 from pipelines.session.errors import DataError
-from pipelines.session.registries import FORMATS, KeypointFormat, recognise
-from tests.formats.refusals import refuses
+from pipelines.session.registries import FORMATS, KeypointFormat
 from tests.real_data import real_data
 
 KIND = "keypoint file"
@@ -51,15 +48,6 @@ def test_the_real_file_holds_what_is_known_of_it() -> None:
     assert sorted(set(found.person.tolist())) == [0, 1]
 
 
-def test_the_real_file_is_recognised_and_described() -> None:
-    path = real_data("keypoints/alphapose_halpe26_video.json")
-    assert recognise(path, KeypointFormat, KIND).name == "alphapose"
-    facts = FORMAT.describe(path)
-    assert (facts["frames"], facts["last frame"], facts["people"]) == (809, 808, 810)
-    assert facts["skeleton"] == "halpe26 (26 keypoints)"
-    assert json.loads(json.dumps(facts)) == facts
-
-
 def test_frames_and_tracks(tmp_path: Path) -> None:
     merged = entry("cam1_0012.jpg", [[3.0], [4.0]])
     path = written(tmp_path, [merged, entry("cam1_0010.jpg", [7]), entry("cam1_0010.jpg", 3)])
@@ -67,24 +55,6 @@ def test_frames_and_tracks(tmp_path: Path) -> None:
     assert found.frame.tolist() == [0, 0, 2]
     assert found.person.tolist() == [3, 7, 3]
     assert found.frames_listed.tolist() == [0, 2]
-
-
-def test_a_track_twice_in_a_frame_keeps_the_first(tmp_path: Path) -> None:
-    path = written(tmp_path, [entry("1.jpg", 1, x=5.0), entry("1.jpg", 2), entry("1.jpg", 1, x=9.0)])
-    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-    assert found.person.tolist() == [1, 2]
-    assert found.xy[0, 0, 0] == 5.0
-    assert list(found.dropped.values()) == [1]
-
-
-def test_values_that_are_missing_or_not_finite(tmp_path: Path) -> None:
-    one = entry("1.jpg")
-    one["keypoints"] = [None, 2, 0.5, 0, 0, 0, 3, float("inf"), 0.5, 4, 5, float("nan"), *[1.0] * 39]
-    found = FORMAT.read_keypoints(written(tmp_path, [one]), skeleton=None, first_frame=0)
-    assert np.isnan(found.xy[0, :3]).all()
-    assert found.confidence[0, :4].tolist() == [0, 0, 0, 0]
-    assert found.xy[0, 3].tolist() == [4, 5]
-    assert sorted(found.dropped.values()) == [1, 2]
 
 
 @pytest.mark.parametrize("absurd", [1e9, -1e9, 1e308, -1e308, 1_000_001])
@@ -101,40 +71,6 @@ def test_joints_far_beyond_any_picture_are_left_out_and_counted(
     assert found.confidence[0, 4] == 0
     assert np.isfinite(np.delete(found.xy[0], 4, axis=0)).all()
     assert list(found.dropped.values()) == [1]
-
-
-def test_a_file_of_nothing_but_absurd_joints_is_refused_with_their_number(tmp_path: Path) -> None:
-    one = entry("1.jpg") | {"keypoints": [1e9, -1e9, 0.5] * 17}
-    path = written(tmp_path, [one])
-    with refuses(path, 17, 1_000_000):
-        FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-
-
-def test_confidences_outside_0_to_1_are_counted(tmp_path: Path) -> None:
-    one = entry("1.jpg")
-    given = [-0.1, -1e308, 1.07, 97.0, 1e308, 0.0, 1.0, *[0.5] * 10]
-    one["keypoints"] = [value for confidence in given for value in (5.0, 6.0, confidence)]
-    found = FORMAT.read_keypoints(written(tmp_path, [one]), skeleton=None, first_frame=0)
-    assert found.confidence[0].tolist() == [0, 0, 1, 1, 1, 0, 1, *[0.5] * 10]
-    assert np.isnan(found.xy[0]).any(axis=1).tolist() == [value == 0 for value in given]  # 0: not found
-    assert list(found.dropped.values()) == [2]
-    assert list(found.adjusted.values()) == [3]
-
-
-@pytest.mark.parametrize("ids", [(0, 0), (None, None), (7, 7)])
-def test_a_detection_listed_twice_is_one_person(tmp_path: Path, ids: tuple[object, object]) -> None:
-    path = written(tmp_path, [entry("1.jpg", idx) for idx in ids] + [entry("2.jpg", ids[0])])
-    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-    assert found.frame.tolist() == [1, 2]
-    assert len(set(found.person.tolist())) == 1
-    assert list(found.dropped.values()) == [1]
-
-
-def test_frames_before_the_first_are_left_out_and_counted(tmp_path: Path) -> None:
-    path = written(tmp_path, [entry(f"{n}.jpg") for n in range(5)])
-    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=2)
-    assert found.frame.tolist() == found.frames_listed.tolist() == [0, 1, 2]
-    assert list(found.dropped.values()) == [2]
 
 
 @pytest.mark.parametrize(
@@ -161,14 +97,6 @@ def test_bad_content_is_one_clear_line(tmp_path: Path, content: object, message:
     assert "\n" not in str(caught.value)
 
 
-def test_the_stated_skeleton_must_fit(tmp_path: Path) -> None:
-    path = written(tmp_path, [entry("1.jpg")])
-    with refuses(path, 17, "halpe26", 26):
-        FORMAT.read_keypoints(path, skeleton="halpe26", first_frame=0)
-    with refuses(path, 2, 1):
-        FORMAT.read_keypoints(path, skeleton="coco17", first_frame=2)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -189,23 +117,3 @@ def test_damaged_files_are_one_clear_line_and_belong_to_no_format(
         assert not reader.recognises(path)
         with pytest.raises(DataError, match=message):
             reader.read_keypoints(path, skeleton=None, first_frame=0)
-
-
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(
-    st.lists(st.tuples(st.integers(0, 30), st.integers(1, 5)), min_size=1, max_size=12, unique=True),
-    st.randoms(use_true_random=False),
-)
-def test_the_order_of_entries_does_not_matter_for_tracked_people(
-    tmp_path: Path, seen: list[tuple[int, int]], random: object
-) -> None:
-    entries = [entry(f"{frame}.jpg", idx, x=100.0 * frame + idx) for frame, idx in [(0, 6), *seen]]
-    shuffled = list(entries)
-    random.shuffle(shuffled)  # type: ignore[attr-defined]  # hypothesis does not export the type
-    one, other = (
-        FORMAT.read_keypoints(written(tmp_path, content), skeleton=None, first_frame=0)
-        for content in (entries, shuffled)
-    )
-    assert list(zip(one.frame.tolist(), one.person.tolist(), strict=True)) == sorted([(0, 6), *seen])
-    np.testing.assert_array_equal(one.person, other.person)
-    np.testing.assert_array_equal(one.xy, other.xy)

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipelines.formats.keypoint_files.result_files import COCO as FORMAT
 from pipelines.session.errors import DataError
@@ -44,15 +42,6 @@ def written(folder: Path, content: object) -> Path:
     return path
 
 
-def test_a_file_that_was_appended_to_itself_holds_nobody_twice(tmp_path: Path) -> None:
-    once = [result(0, 10.0), result(0, 300.0), result(1, 11.0)]
-    found = FORMAT.read_keypoints(written(tmp_path, once + once), skeleton=None, first_frame=0)
-    assert found.frame.tolist() == [0, 0, 1]
-    assert found.person.tolist() == [0, 1, 0]
-    assert found.xy[:, 0, 0].tolist() == [10, 300, 11]
-    assert list(found.dropped.values()) == [3]
-
-
 def test_the_real_annotations_hold_what_is_known_of_them() -> None:
     path = real_data("keypoints/coco_gt_mmpose_test_coco.json")
     facts = json.loads(real_data("facts.json").read_text())["keypoints/coco_gt_mmpose_test_coco.json"]
@@ -84,28 +73,6 @@ def test_results_by_number_or_name(tmp_path: Path) -> None:
     assert found.xy[:, 0, 0].tolist() == [2.0, 1.0, 3.0]
 
 
-def test_a_joint_of_confidence_zero_was_not_found(tmp_path: Path) -> None:
-    # pycocotools counts the joints with a third value above 0; the positions of the others have no meaning.
-    entry = result(1)
-    keypoints = entry["keypoints"]
-    assert isinstance(keypoints, list)
-    keypoints[2] = keypoints[3 * 5 + 2] = 0.0
-    found = FORMAT.read_keypoints(written(tmp_path, [entry]), skeleton="coco17", first_frame=0)
-    missing = np.isnan(found.xy[0]).all(axis=1)
-    assert np.flatnonzero(missing).tolist() == [0, 5]
-    assert np.flatnonzero(found.confidence[0] == 0).tolist() == [0, 5]
-    assert found.dropped == {}
-    described = FORMAT.describe(tmp_path / "results.json")
-    assert round(15 / 17, 3) in described.values()
-
-
-def test_some_entries_without_keypoints_are_counted(tmp_path: Path) -> None:
-    box = {"image_id": 3, "category_id": 1, "bbox": [1, 2, 3, 4]}
-    found = FORMAT.read_keypoints(written(tmp_path, [result(1), box]), skeleton=None, first_frame=0)
-    assert found.frames_listed.tolist() == [1, 3]
-    assert list(found.dropped.values()) == [1]
-
-
 def test_annotations_give_visibility_size_and_frames(tmp_path: Path) -> None:
     found = FORMAT.read_keypoints(written(tmp_path, dataset()), skeleton=None, first_frame=0)
     assert found.frames_listed.tolist() == [2, 4]
@@ -113,13 +80,6 @@ def test_annotations_give_visibility_size_and_frames(tmp_path: Path) -> None:
     assert found.image_size == (640, 480)
     assert np.isnan(found.xy[0, :2]).all()
     assert found.confidence[0, :4].tolist() == [0, 0, 0.5, 1]
-
-
-def test_tracks_of_annotations(tmp_path: Path) -> None:
-    keypoints = [1, 2, 2] * 17
-    tracked = [{"image_id": 100, "track_id": track, "keypoints": keypoints} for track in (5, 3)]
-    path = written(tmp_path, dataset(annotations=tracked))
-    assert FORMAT.read_keypoints(path, skeleton=None, first_frame=0).person.tolist() == [3, 5]
 
 
 def test_joint_names_of_the_file_are_heeded(tmp_path: Path) -> None:
@@ -152,21 +112,3 @@ def test_bad_content_is_one_clear_line(tmp_path: Path, content: object, message:
     assert FORMAT.recognises(path)
     with pytest.raises(DataError, match=message):
         FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-
-
-def test_alphapose_lists_are_left_to_alphapose_but_can_be_read(tmp_path: Path) -> None:
-    path = written(tmp_path, [result("0003.jpg")])
-    assert not FORMAT.recognises(path)
-    assert FORMAT.read_keypoints(path, skeleton=None, first_frame=0).frame.tolist() == [3]
-
-
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(st.lists(st.integers(0, 20), min_size=1, max_size=15))
-def test_every_person_arrives_once_in_the_order_of_the_file(tmp_path: Path, frames: list[int]) -> None:
-    entries = [result(frame, x=1000.0 * index + 1) for index, frame in enumerate(frames)]
-    found = FORMAT.read_keypoints(written(tmp_path, entries), skeleton=None, first_frame=0)
-    assert found.frame.tolist() == sorted(frames)
-    expected = sorted(range(len(frames)), key=lambda index: (frames[index], index))
-    assert found.xy[:, 0, 0].tolist() == [1000.0 * index + 1 for index in expected]
-    ranks = [frames[:index].count(frames[index]) for index in expected]
-    assert found.person.tolist() == ranks

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipelines.formats.keypoint_files.result_files import MMPOSE as FORMAT
 from pipelines.session.errors import DataError
@@ -83,32 +81,6 @@ def test_a_folder_of_pictures(tmp_path: Path) -> None:
     assert described["people per frame, at most"] == 2
 
 
-def test_missing_joints(tmp_path: Path) -> None:
-    one = instance()
-    one["keypoints"] = [[0, 0], [None, 3], [0, 0], *[[1, 2]] * 14]
-    one["keypoint_scores"] = [0, 0.5, 0.25, *[0.5] * 14]
-    path = written(tmp_path / "walk.json", video([one]))
-    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-    assert np.isnan(found.xy[0, :2]).all()
-    assert found.xy[0, 2].tolist() == [0, 0]  # its score shows that the corner is a real position
-    assert found.confidence[0, :3].tolist() == [0, 0, 0.25]
-    assert list(found.dropped.values()) == [1]
-
-
-def test_a_frame_twice_keeps_the_first(tmp_path: Path) -> None:
-    content = [*video([instance(1.0)]), *video([instance(2.0)])]
-    found = FORMAT.read_keypoints(written(tmp_path / "walk.json", content), skeleton=None, first_frame=0)
-    assert found.xy[:, 0, 0].tolist() == [1.0]
-    assert list(found.dropped.values()) == [1]
-
-
-def test_two_videos_in_a_folder_are_refused(tmp_path: Path) -> None:
-    written(tmp_path / "both" / "a.json", video([instance()]))
-    written(tmp_path / "both" / "b.json", video([instance()]))
-    with refuses(tmp_path / "both", "'a.json, 0'", "'b.json, 0'", 0):
-        FORMAT.read_keypoints(tmp_path / "both", skeleton=None, first_frame=0)
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -152,14 +124,6 @@ def test_of_whole_body_keypoints_the_body_is_kept_and_the_rest_counted(
     assert list(found.dropped.values()) == [2 * (count - len(joints))]
 
 
-def test_a_folder_with_one_json_among_logs_is_no_folder_of_keypoints(tmp_path: Path) -> None:
-    written(tmp_path / "walk.json", video([instance()]))
-    assert FORMAT.recognises(tmp_path)
-    for index in range(4):
-        (tmp_path / f"{index}.bag").touch()
-    assert not FORMAT.recognises(tmp_path)
-
-
 @pytest.mark.parametrize(
     "relative",
     [
@@ -178,21 +142,3 @@ def test_real_files_are_of_one_keypoint_format_at_most(relative: str) -> None:
     matches = [name for name in names if FORMATS.get(name).recognises(path)]
     assert len(matches) == relative.startswith("keypoints/")
     assert "mmpose" not in matches
-
-
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(st.lists(st.integers(0, 3), min_size=1, max_size=8), st.integers(-3, 3))
-def test_a_video_and_its_pictures_give_the_same_people(
-    tmp_path_factory: pytest.TempPathFactory, crowd: list[int], first_frame: int
-) -> None:
-    frames = [[instance(100.0 * k + n) for n in range(count)] for k, count in enumerate([*crowd, 1, 1, 1, 1])]
-    folder = tmp_path_factory.mktemp("predictions")
-    for k, people in enumerate(frames):
-        written(folder / f"{k:06}.json", people)
-    path = written(tmp_path_factory.mktemp("video") / "walk.json", video(*frames))
-    one = FORMAT.read_keypoints(path, skeleton=None, first_frame=first_frame)
-    other = FORMAT.read_keypoints(folder, skeleton=None, first_frame=first_frame)
-    for field in ("frame", "person", "xy", "confidence", "frames_listed"):
-        np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
-    assert one.frames_listed.tolist() == [k - first_frame for k in range(max(0, first_frame), len(frames))]
-    assert one.dropped == other.dropped

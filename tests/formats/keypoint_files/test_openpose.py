@@ -64,15 +64,6 @@ def test_the_real_four_camera_recording_is_recognised_as_body25b(camera: str, ki
     assert np.all(np.diff(np.nanmedian(first_person[..., 1], axis=0)) > 0)
 
 
-def test_a_person_who_was_not_seen_keeps_the_places_of_the_others() -> None:
-    found = FORMAT.read_keypoints(
-        real_data("pose2sim_single/pose-associated/cam03_json"), skeleton=None, first_frame=0
-    )
-    assert 52 not in found.frame  # cam03.0052.json holds people: [{}]
-    assert 52 in found.frames_listed
-    assert found.dropped == {}
-
-
 def test_places_frames_and_missing_joints(tmp_path: Path) -> None:
     folder = tmp_path / "cam1"
     unseen = person()
@@ -98,22 +89,6 @@ def test_tracks_are_used_where_openpose_gives_them(tmp_path: Path) -> None:
     assert found.person.tolist() == [2, 4]
     frame_file(tmp_path / "b", "cam.0001.json", person(track=0), person(50.0, track=0))
     assert FORMAT.read_keypoints(tmp_path / "b", skeleton=None, first_frame=0).person.tolist() == [0, 1]
-
-
-@pytest.mark.parametrize(("count", "joint"), [(17, "right_ankle"), (26, "right_heel"), (25, "right_heel")])
-def test_other_detectors_in_this_shape(tmp_path: Path, count: int, joint: str) -> None:
-    frame_file(tmp_path / "a", "cam.0001.json", person(count=count))
-    assert FORMAT.read_keypoints(tmp_path / "a", skeleton=None, first_frame=0).joints[-1] == joint
-
-
-def test_one_frame_alone_and_the_mess_of_a_mac(tmp_path: Path) -> None:
-    folder = tmp_path / "a"
-    frame_file(folder, "cam.0003.json", person())
-    (folder / "._cam.0003.json").write_bytes(b"\x00\x05\x16\x07")
-    assert FORMAT.recognises(folder / "cam.0003.json")
-    one = FORMAT.read_keypoints(folder / "cam.0003.json", skeleton=None, first_frame=0)
-    assert one.frame.tolist() == [3]
-    assert FORMAT.read_keypoints(folder, skeleton=None, first_frame=0).dropped == {}
 
 
 def test_damaged_files_among_many_are_left_out_and_counted(tmp_path: Path) -> None:

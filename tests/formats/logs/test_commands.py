@@ -88,11 +88,6 @@ def test_a_plan_holds_until_the_next_one_begins(tmp_path: Path, container: Conta
     assert found.dropped == {}
 
 
-def test_by_receipt_plans_begin_when_they_came(tmp_path: Path) -> None:
-    found = read(write_log(tmp_path, "d1", "ros2-mcap", [path_entry(plan(0, 0.0))]), "receive")
-    np.testing.assert_array_equal(found.t_ns, START + LATE + np.arange(9) * SECOND // 4)
-
-
 def target(k: int, mask: int = 0b111111111000, frame: int = 1) -> tuple[int, Any]:
     stamp = SimpleNamespace(sec=START // SECOND + k, nanosec=0)
     value = SimpleNamespace(

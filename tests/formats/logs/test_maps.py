@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import array_shapes, arrays
+from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from pipelines.formats.logs import maps as log_maps
@@ -26,8 +26,7 @@ from pipelines.session.records import Occupancy
 from pipelines.session.registries import MapFormat
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.maps import maps_of_log
-from tests.formats.maps.test_octomap import at, file_of, ot_body
-from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log, write_ros2
+from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
 from tests.synthetic.map_logs import (
     Pose,
     as_bt,
@@ -113,25 +112,6 @@ def test_octomap_is_that_of_its_file(tmp_path: Path, container: Container) -> No
     assert (found.only.from_ns, found.dropped) == (T0, {})
 
 
-def test_octomap_of_a_log_without_definitions(tmp_path: Path) -> None:
-    """Omit the definitions, as ROS 2 up to Humble does; octomap_msgs is not part of ROS itself."""
-    file = as_bt(box(), tmp_path / "site")
-    path = write_ros2(tmp_path / "bag", [octomap_entry(file, T0)], definitions=False)
-    camera = {"pose": {"file": "x"}, "intrinsics": "x", "keypoints": "y"}
-    flight = Manifest.model_validate({"schema": 1, "cameras": {"c": camera}})
-    with FlightLogs(flight, tmp_path, lambda _: None) as logs:
-        (one,) = maps_of_log(flight, MapSource(file=path.name), logs, max_gap_ns=SECOND, note=print).maps
-    same(one, READER.read_map(tmp_path / "site" / "map.bt"))
-
-
-@pytest.mark.parametrize(("tree", "colour"), [("OcTree", b""), ("ColorOcTree", b"\x01\xff\x80")])
-def test_full_octomap_keeps_its_probabilities(tmp_path: Path, tree: str, colour: bytes) -> None:
-    node = at([1] * 14, [-0.4, 0.3, [2.0, None, -1.5, *[None] * 5], *[None] * 5])
-    file = file_of(node, "ot", tree=tree, body=ot_body(node, colour))
-    (tmp_path / "a.ot").write_bytes(file)
-    same(Read(tmp_path, [octomap_entry(file, T0)]).only, READER.read_map(tmp_path / "a.ot"))
-
-
 @pytest.mark.parametrize("binary", [True, False])
 def test_octomap_of_octomap_itself(tmp_path: Path, binary: bool) -> None:
     """Read trees that OctoMap's own library made and wrote."""
@@ -164,19 +144,6 @@ def test_maps_that_follow_each_other(tmp_path: Path) -> None:
     assert any(re.search(r"\b3 maps\b.*\b3\b", note) for note in found.notes)
 
 
-def test_no_more_maps_than_a_replay_can_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = [as_bt(box(p), tmp_path / "site") for p in (0.971, 0.1192)]
-    entries = [octomap_entry(files[k % 2], T0 + k * SECOND) for k in range(10)]
-    monkeypatch.setattr(log_maps, "MOST_MAPS", 4)
-    found = Read(tmp_path, entries)
-    # Of rows 0 to 9 four, evenly spaced.
-    assert [(one.from_ns - T0) // SECOND for one in found.maps] == [0, 3, 6, 9]
-    assert found.dropped == {log_maps.NOT_KEPT: 6}
-    assert any(re.search(r"\b4 of 10\b", note) for note in found.notes)
-    monkeypatch.setattr(log_maps, "MOST_VOXELS", 2 * box().probability.size)
-    assert [(one.from_ns - T0) // SECOND for one in Read(tmp_path, entries).maps] == [0, 9]
-
-
 @given(st.integers(1, 300), st.integers(1, 120))
 def test_what_is_kept_is_spread_evenly(count: int, most: int) -> None:
     rows = evenly(count, most)
@@ -186,20 +153,6 @@ def test_what_is_kept_is_spread_evenly(count: int, most: int) -> None:
     steps = np.diff(rows)
     # Each of the equal steps is rounded at both ends.
     assert not len(steps) or (steps.min() >= 1 and np.ptp(steps) <= 2)
-
-
-def test_stamps_that_stand_still_are_counted(tmp_path: Path) -> None:
-    files = [as_bt(box(p), tmp_path / "site") for p in (0.971, 0.1192)]
-    entries = [octomap_entry(files[k % 2], T0, received_ns=T0 + k * SECOND) for k in range(4)]
-    found = Read(tmp_path, entries)
-    assert found.dropped == {log_maps.LATE: 2}
-    assert any("`stamps: receive`" in note for note in found.notes)
-    assert len(Read(tmp_path, entries, stamps="receive").maps) == 4
-
-
-def test_header_without_a_stamp_takes_that_of_receipt(tmp_path: Path) -> None:
-    file = as_bt(box(), tmp_path / "site")
-    assert Read(tmp_path, [octomap_entry(file, 0, received_ns=T0)]).only.from_ns == T0
 
 
 def test_damaged_and_empty_maps_are_counted(tmp_path: Path) -> None:
@@ -234,14 +187,6 @@ def test_unusable_octomaps_are_one_clear_line(
         Read(tmp_path, [octomap_entry(file, T0)])
     assert "\n" not in str(caught.value)
     assert "/octomap" in str(caught.value)
-
-
-def test_coarser_octomap(tmp_path: Path) -> None:
-    file = as_bt(box(), tmp_path / "site")
-    one = Read(tmp_path, [octomap_entry(file, T0)], resolution_m=0.4).only
-    same(one, READER.read_map(tmp_path / "site" / "map.bt", resolution_m=0.4))
-    with pytest.raises(DataError, match=r"0\.2 m\b.*\b0\.3 m"):
-        Read(tmp_path, [octomap_entry(file, T0)], resolution_m=0.3)
 
 
 # --- the log's world -----------------------------------------------------------------------------------
@@ -354,40 +299,6 @@ def test_plan_is_raised_from_its_origin(tmp_path: Path, container: Container) ->
     assert (one.origin.tolist(), one.resolution_m) == ([-3.0, 7.0, 1.25], 0.5)
 
 
-def test_cells_are_as_wide_as_was_meant(tmp_path: Path) -> None:
-    """Write 0.05, which the message's float32 turns into 0.0500000007."""
-    one = Read(tmp_path, [grid_entry(plan(), T0, cell_m=0.05)]).only
-    assert one.resolution_m == 0.05
-    assert one.probability.shape == (4, 3, 50)  # 2.5 m
-
-
-@settings(deadline=None, max_examples=20)
-@given(
-    cells=arrays(np.int8, array_shapes(min_dims=2, max_dims=2, max_side=5), elements=st.integers(-1, 100)),
-    turns=st.integers(0, 3),
-    ned=st.booleans(),
-)
-def test_turned_plans(tmp_path_factory: pytest.TempPathFactory, cells: Cells, turns: int, ned: bool) -> None:
-    """Check that every known cell is where its corner, its turn and the axes put it, extruded upwards."""
-    cells[0, 0] = 100
-    angle = turns * math.pi / 2
-    origin: Pose = ((4.0, -2.0, 1.5), (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)))
-    entries = [grid_entry(cells, T0, origin=origin)]
-    one = Read(tmp_path_factory.mktemp("plan"), entries, ned=ned, height_m=1.0).only
-    assert one.probability.shape[2] == 2
-    assert one.origin[2] == pytest.approx(-1.5 if ned else 1.5, abs=1e-9)
-    centre = (np.argwhere(cells >= 0) + 0.5) * 0.5
-    c, s = round(math.cos(angle)), round(math.sin(angle))
-    x = centre[:, 0] * c - centre[:, 1] * s + 4.0
-    y = centre[:, 0] * s + centre[:, 1] * c - 2.0
-    if ned:
-        x, y = y, x
-    index = np.floor((np.stack([x, y], axis=1) - one.origin[:2]) / 0.5 + 1e-6).astype(int)
-    assert int((~np.isnan(one.probability)).sum()) == 2 * len(centre)
-    for layer in (0, 1):
-        np.testing.assert_allclose(one.probability[*index.T, layer], cells[cells >= 0] / 100, atol=1e-7)
-
-
 def test_yawed_plan_loses_no_wall(tmp_path: Path) -> None:
     cells = np.full((20, 3), 0, np.int8)
     cells[:, 1] = 100
@@ -423,12 +334,6 @@ def test_unusable_plans_are_one_clear_line(tmp_path: Path, change: dict[str, Any
     entry = grid_entry(plan(), T0)
     with pytest.raises(DataError, match=problem):
         Read(tmp_path, [Entry(entry.topic, entry.type, T0, {**entry.fields, **change})])
-
-
-def test_plan_on_edge_is_refused(tmp_path: Path) -> None:
-    upright: Pose = ((0.0, 0.0, 0.0), (ROOT_HALF, 0.0, 0.0, ROOT_HALF))
-    with pytest.raises(DataError, match=r"\b90 deg"):
-        Read(tmp_path, [grid_entry(plan(), T0, origin=upright)])
 
 
 # --- clouds --------------------------------------------------------------------------------------------
@@ -494,11 +399,6 @@ def test_clouds_add_up_and_nothing_is_known_before_it_was_seen(
     same(few.maps[1], found.maps[3])
 
 
-def test_clouds_that_show_nothing_new_make_no_map(tmp_path: Path) -> None:
-    entries = [cloud_entry(cloud_fields(POINTS), T0 + k * SECOND) for k in range(5)]
-    assert Read(tmp_path, entries).only.from_ns == T0
-
-
 def test_cloud_of_a_moving_sensor_is_placed_by_transforms(tmp_path: Path) -> None:
     """Observe one point from a sensor that moves along x and turns round between clouds."""
     wall = np.array([5.05, 1.05, 2.05])
@@ -520,21 +420,6 @@ def test_cloud_of_a_moving_sensor_is_placed_by_transforms(tmp_path: Path) -> Non
     assert found.dropped == {log_maps.PLACELESS: 1}
 
 
-def test_cloud_of_a_sensor_without_transforms_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"'lidar'.*'map'") as caught:
-        Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0, frame="lidar")])
-    assert "parent" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_clouds_of_any_turn_are_turned_point_by_point(tmp_path: Path) -> None:
-    place = Placement(translation=[1, 2, 3], yaw_deg=30)
-    one = Read(tmp_path, [cloud_entry(cloud_fields(POINTS[:3], kind="f8"), T0)], place=place).only
-    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
-    turned = POINTS[:3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [1, 2, 3]
-    same(one, occupancy_of("turned", turned, None))
-
-
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
@@ -553,27 +438,3 @@ def test_unusable_clouds_are_one_clear_line(tmp_path: Path, change: dict[str, An
         found = Read(tmp_path, [bad, cloud_entry(cloud_fields(POINTS), T0 + 1)])
         assert found.only.from_ns == T0 + 1
         assert found.dropped[log_maps.DAMAGED] == 1
-
-
-def test_stray_points_are_one_clear_line(tmp_path: Path) -> None:
-    stray = np.array([[0.0, 0, 0], [9e3, 9e3, 9e3], [1e300, 0, 0]])
-    with pytest.raises(DataError, match="45001 x 45001 x 45001"):
-        Read(tmp_path, [cloud_entry(cloud_fields(stray, kind="f8"), T0)])
-    found = Read(tmp_path, [cloud_entry(cloud_fields(stray[[0, 2]], kind="f8"), T0)])
-    ((cause, count),) = found.dropped.items()
-    assert "104858 m" in cause
-    assert count == 1
-
-
-def test_only_plans_take_a_height(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"PointCloud2.*`height_m`"):
-        Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0)], height_m=3.0)
-
-
-def test_no_topic_of_maps(tmp_path: Path) -> None:
-    pose = {"header": {"stamp": T0, "frame_id": "odom"}, "pose": {"orientation": {"w": 1.0}}}
-    poses = [Entry("/pose", "geometry_msgs/msg/PoseStamped", T0, pose)]
-    with pytest.raises(DataError, match=r"\b0 topics\b.*maps"):
-        Read(tmp_path, poses)
-    with pytest.raises(DataError, match=r"/pose.*geometry_msgs/msg/PoseStamped.*maps"):
-        Read(tmp_path, poses, topic="/pose")

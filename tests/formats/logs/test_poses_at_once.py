@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -79,55 +77,3 @@ def test_frames_that_change_are_left_to_the_slow_way(
     rng = np.random.default_rng(6)
     entries = [entry("nav_msgs/msg/Odometry", k, rng, **(changed if k == 7 else {})) for k in range(9)]
     assert at_once(write_log(tmp_path, "log", container, entries)) is None
-
-
-def test_other_types_are_left_to_the_slow_way(tmp_path: Path) -> None:
-    gimbal = Entry(TOPIC, "geometry_msgs/msg/QuaternionStamped", START_NS, {"quaternion": {"w": 1.0}})
-    assert at_once(write_log(tmp_path, "log", "mcap-cdr", [gimbal])) is None
-
-
-def test_many_more_than_one_batch(tmp_path: Path) -> None:
-    rng = np.random.default_rng(7)
-    entries = [entry("nav_msgs/msg/Odometry", k, rng) for k in range(9000)]
-    read = at_once(write_log(tmp_path, "log", "mcap-cdr", entries))
-    assert read is not None
-    assert read.values[8999].tolist() == [
-        *entries[8999].fields["pose"]["pose"]["position"].values(),
-        *entries[8999].fields["pose"]["pose"]["orientation"].values(),
-    ]
-
-
-@pytest.mark.parametrize("container", CONTAINERS)
-def test_the_order_of_receipt_over_several_files(tmp_path: Path, container: Container) -> None:
-    """Interleave the messages of two files; some have equal stamps of receipt, some are not in order."""
-    rng = np.random.default_rng(8)
-    entries = [entry("geometry_msgs/msg/PoseStamped", k, rng) for k in range(40)]
-    received = rng.integers(0, 15, len(entries)).tolist()
-    entries = [replace(e, stamp_ns=START_NS + r) for e, r in zip(entries, received, strict=True)]
-    paths = [
-        write_log(tmp_path, name, container, part)
-        for name, part in (("first", entries[:20]), ("second", entries[20:]))
-    ]
-    with recognise(paths[0], LogFormat, "log").open_log(paths) as log:
-        expected = [sample.stamp_ns for sample in all_samples(log.messages([TOPIC]), "log")]
-        read = poses_at_once(log, TOPIC)
-    assert read is not None
-    assert read.header_ns.tolist() == expected
-
-
-def test_a_long_log_is_not_copied_over_and_over() -> None:
-    """Limit the memory: only the result's covariances, the largest part, may be added to the input."""
-    count, rng = 40_000, np.random.default_rng(6)
-    t_ns = START_NS + 10_000_000 * np.arange(count)
-    turned = rng.standard_normal((count, 4))
-    turned /= np.linalg.norm(turned, axis=1)[:, None]
-    pose = np.hstack([rng.standard_normal((count, 3)), turned])
-    poses = LoggedRows(t_ns, t_ns, pose, rng.standard_normal((count, 36)), ("odom", "base"))
-    tracemalloc.start()
-    found = poses.trajectory("log", "header")
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert found.covariance is not None
-    # Besides the covariances: stamps, positions, rotations, a few numbers and flags for each pose, and one
-    # block of 4096 poses with intermediate results. Together they are less than another copy.
-    assert peak < 2 * found.covariance.nbytes

@@ -11,7 +11,6 @@ import pytest
 from pipelines.formats.logs.presets import (
     Preset,
     namespaces,
-    pairs_of,
     parts_of,
     px4_names,
     read_pair,
@@ -26,7 +25,7 @@ from pipelines.session.records import Telemetry
 from pipelines.session.registries import LogFormat, TelemetryChoice, recognise
 from tests.real_data import real_data
 from tests.synthetic.logged_flights import header
-from tests.synthetic.logs import Entry, write_log, write_mcap, write_ros2
+from tests.synthetic.logs import Entry, write_log, write_mcap
 
 START_NS = 1_700_000_000_000_000_000
 ROWS = 8
@@ -184,20 +183,6 @@ def test_what_a_receiver_says_of_itself(tmp_path: Path) -> None:
         read(tmp_path / "lost", "mavros", lost, imu("/mavros/imu/data", (0, 0, 0, 1)))
 
 
-def test_the_recorder_against_gps_time(tmp_path: Path) -> None:
-    ticks = [
-        Entry(
-            "/mavros/time_reference",
-            "sensor_msgs/msg/TimeReference",
-            t,
-            {"header": header(t, ""), "time_ref": t + 2_500_000_000},
-        )
-        for t in stamps()
-    ]
-    telemetry = read(tmp_path, "mavros", poses("/mavros/local_position/pose", (0, 0, 1)), ticks)
-    assert any(" 2.500 s " in note for note in telemetry.notes)
-
-
 def test_several_drones(tmp_path: Path) -> None:
     topics = ["/a/mavros/local_position/pose", "/b/mavros/local_position/pose", "/dji_sdk/gps_position"]
     assert namespaces(topics) == [("dji_osdk", ""), ("mavros", "/a"), ("mavros", "/b")]
@@ -221,59 +206,12 @@ def _pair(path: Path, position: str, attitude: str) -> Telemetry:
         return read_pair(log, str(path), position, attitude, "enu", "header")
 
 
-@pytest.mark.parametrize(
-    ("position", "attitude", "fault", "type_"),
-    [
-        (
-            "/novatel/oem7/inspva",
-            "/novatel/oem7/odom",
-            "/novatel/oem7/inspva",
-            "novatel_oem7_msgs/msg/INSPVA",
-        ),
-        ("/gps/fix", "/gps/gps", "/gps/gps", "gps_common/msg/GPSFix"),
-    ],
-)
-def test_topics_of_other_types_are_refused_by_name(
-    position: str, attitude: str, fault: str, type_: str
-) -> None:
-    path = real_data("second/novatel_bestpos.bag")
-    assert len(_pair(path, "/gps/fix", "/novatel/oem7/odom").position.t_ns)
-    with pytest.raises(DataError) as refused:
-        _pair(path, position, attitude)
-    assert fault in refused.value.problem
-    assert type_ in refused.value.problem
-    assert "attribute" not in str(refused.value)
-    # The remedy: the only topics of the bag with positions or attitudes.
-    assert "/novatel/oem7/odom" in refused.value.remedy
-    assert ("/gps/fix" in refused.value.remedy) == (fault == position)
-
-
 def test_a_real_gps_fix_is_where_the_nav_sat_fix_beside_it_is() -> None:
     path = real_data("second/novatel_bestpos.bag")
     own, other = (_pair(path, topic, "/novatel/oem7/odom").position for topic in ("/gps/gps", "/gps/fix"))
     assert (own.on_earth, own.height, len(own.t_ns)) == (True, "ellipsoid", len(other.t_ns))
     np.testing.assert_array_equal(own.values, other.values)
     assert np.abs(own.t_ns - other.t_ns).max() < 1_000_000  # the driver stamps one after the other
-
-
-@pytest.mark.parametrize("package", ["gps_common", "gps_msgs"])
-def test_a_gps_fix_without_a_fix_is_dropped(tmp_path: Path, package: str) -> None:
-    place = {"latitude": 47.5, "longitude": 8.5, "altitude": 400.0}
-    entries = [
-        Entry(
-            "/gps",
-            f"{package}/msg/GPSFix",
-            t,
-            {"header": header(t, ""), "status": {"status": -(k < 2)}, **place},
-        )
-        for k, t in enumerate(stamps())
-    ]
-    turned = imu("/imu", (0, 0, 0, 1))
-    path = write_log(tmp_path, "a", "mcap-cdr", sorted([*entries, *turned], key=lambda e: e.stamp_ns))
-    telemetry = _pair(path, "/gps", "/imu")
-    assert (len(telemetry.position.t_ns), list(telemetry.dropped.values())) == (ROWS - 2, [2])
-    with recognise(path, LogFormat, "log").open_log([path]) as log:
-        assert pairs_of(log.topics) == [("/gps", "/imu")]
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
@@ -290,26 +228,6 @@ def test_fixes_of_foxglove(tmp_path: Path, encoding: Any) -> None:
         track = read_positions(log, "a", "/place", "header", {})
     assert (track.on_earth, track.t_ns.tolist()) == (True, stamps())
     np.testing.assert_array_equal(track.values, [[47.5 + k, 8.5, 400.0] for k in range(ROWS)])
-
-
-def test_vectors_are_no_positions(tmp_path: Path) -> None:
-    ros = sorted([*vectors("/v", "", 1, 2, 3), *imu("/imu", (0, 0, 0, 1))], key=lambda entry: entry.stamp_ns)
-    as_ros = write_log(tmp_path, "b", "ros1", ros)
-    with pytest.raises(DataError, match=r" /v .*NavSatFix") as refused:
-        _pair(as_ros, "/v", "/imu")
-    assert "attribute" not in str(refused.value)
-    with pytest.raises(DataError, match=r" /v .*NavSatFix"):
-        _pair(as_ros, "/v", "/v")
-
-
-def test_a_time_reference_of_another_type_is_left_aside(tmp_path: Path) -> None:
-    telemetry = read(
-        tmp_path,
-        "mavros",
-        poses("/mavros/local_position/pose", (1.0, 2.0, 3.0)),
-        vectors("/mavros/time_reference", "", 1, 2, 3),
-    )
-    assert telemetry.position.values[0].tolist() == [1, 2, 3]
 
 
 def odometry(frame: int, **more: Any) -> list[Entry]:
@@ -354,9 +272,3 @@ def test_the_odometry_of_px4_is_turned_to_enu(tmp_path: Path) -> None:
             read_px4(
                 log, str(path), px4_names(log, str(path), None), TelemetryChoice(position="gps"), "header"
             )
-
-
-def test_px4_without_definitions_asks_for_mcap(tmp_path: Path) -> None:
-    path = write_ros2(tmp_path / "old", odometry(1), definitions=False)
-    with recognise(path, LogFormat, "log").open_log([path]) as log, pytest.raises(DataError, match="MCAP"):
-        read_px4(log, str(path), px4_names(log, str(path), None), TelemetryChoice(), "header")

@@ -17,9 +17,7 @@ from pipelines.formats.logs.recordings import (
     TAIL,
     TRUNCATED,
     UNCLOSED,
-    UNDECODABLE,
     UNDEFINED,
-    UNREADABLE_FILES,
 )
 from pipelines.formats.logs.ros2_bag import BAD_METADATA, MISSING_FILES, NOT_IN_FILES, UNMERGED
 from tests.formats.log_entries import (
@@ -34,12 +32,10 @@ from tests.formats.log_entries import (
     positions,
     recognised_by,
 )
-from tests.formats.refusals import refuses
 from tests.synthetic.logs import (
     CONTAINERS,
     ROS2,
     Container,
-    Entry,
     cut,
     write_log,
     write_ros1,
@@ -115,22 +111,6 @@ def test_describe_says_what_is_inside(tmp_path: Path) -> None:
     assert pose["size_bytes"] < 70 * 704 + 10_000
 
 
-def test_topics_that_are_not_asked_for_are_not_decoded(tmp_path: Path) -> None:
-    path = write_ros2(tmp_path / "bag", FLIGHT)
-    database = sqlite3.connect(path / "bag.db3")
-    with database:
-        database.execute("UPDATE messages SET data = x'00010000ffffffff' WHERE length(data) < 100")
-    database.close()
-    with log_format(path).open_log([path]) as log:
-        assert len(list(log.messages([POSE]))) == 100
-        assert not log.dropped
-        assert not list(log.messages([OTHER]))
-        assert log.dropped == {UNDECODABLE: 10}
-        list(log.messages([OTHER]))  # a second reading has the same losses
-        assert log.dropped == {UNDECODABLE: 10}
-        assert not list(log.messages(["/nothing"]))
-
-
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 @pytest.mark.parametrize("metadata", [True, False])
 def test_split_bags_are_merged(tmp_path: Path, storage: Literal["sqlite3", "mcap"], metadata: bool) -> None:
@@ -186,41 +166,6 @@ def test_metadata_cannot_name_files_outside_the_bag(tmp_path: Path) -> None:
     assert dropped[MISSING_FILES] == 1
 
 
-def test_a_bag_without_its_files_is_refused(tmp_path: Path) -> None:
-    path = write_ros2(tmp_path / "bag", FLIGHT)
-    (path / "bag.db3").unlink()
-    with refuses(path, ".db3", ".mcap"):
-        log_format(path).open_log([path])
-
-
-def test_the_logs_of_several_drones_in_a_folder_are_not_one_bag(tmp_path: Path) -> None:
-    for drone in ("drone_1", "drone_2"):
-        write_log(tmp_path, drone, "mcap-cdr", FLIGHT)
-    assert recognised_by(tmp_path) == []
-    assert recognised_by(tmp_path / "drone_1.mcap") == ["mcap"]
-
-
-def test_types_without_definitions_are_those_of_ros2(tmp_path: Path) -> None:
-    path = write_ros2(tmp_path / "bag", FLIGHT, definitions=False)
-    database = sqlite3.connect(path / "bag.db3")
-    with database:
-        database.execute("UPDATE topics SET type = 'my_msgs/msg/Own' WHERE name = ?", (OTHER,))
-    database.close()
-    assert positions(path) == ([float(k) for k in range(100)], {})
-    _, dropped = everything(path)
-    assert dropped == {UNDEFINED: 10}
-    topics = log_format(path).describe(path)["topics"]
-    assert isinstance(topics, dict)
-    assert "'my_msgs/msg/Own'" in topics[OTHER][PROBLEM]
-
-
-def test_chunks_out_of_order_are_sorted(tmp_path: Path) -> None:
-    shuffled = FLIGHT[60:] + FLIGHT[:60]
-    path = write_ros1(tmp_path / "a.bag", shuffled, chunk_size=5_000)
-    found, _ = everything(path)
-    assert [stamp for _, stamp in found] == sorted(e.stamp_ns for e in FLIGHT)
-
-
 @pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0, 0.999))
@@ -260,17 +205,6 @@ def test_a_cut_database_gives_what_its_pages_hold(tmp_path: Path, share: float) 
     assert dropped
 
 
-def test_most_of_a_cut_database_is_read(tmp_path: Path) -> None:
-    path = write_ros2(tmp_path / "bag", entries(10.0))
-    cut(path / "bag.db3", 0.6)
-    found, dropped = everything(path)
-    assert len(found) > 0.55 * 1200
-    assert dropped[TRUNCATED] == 1
-    # Every message, listed or not, is either read or counted with a reason.
-    listed = dropped[NOT_IN_FILES]
-    assert len(found) + listed + dropped.get(DAMAGED, 0) == 1200
-
-
 @pytest.mark.parametrize("name", ["a.bag", "bag.db3"])
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
@@ -302,21 +236,6 @@ def test_a_length_of_gigabytes_is_damage(tmp_path: Path) -> None:
     assert len(found) + lost == len(ALL)
 
 
-def test_bags_that_are_not_read_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "old.bag"
-    path.write_bytes(b"#ROSBAG V1.2\n" + bytes(100))
-    with refuses(path, "1.2", "rosbag fix"):
-        log_format(path).open_log([path])
-
-
-def test_one_unreadable_part_among_others_is_counted(tmp_path: Path) -> None:
-    path = write_split_ros2(tmp_path / "flight", [FLIGHT[:60], FLIGHT[60:]])
-    (path / "flight_1.db3").write_bytes(b"SQLite format 3\0" + bytes(200))
-    found, dropped = everything(path)
-    assert found == ALL[:60]
-    assert dropped[UNREADABLE_FILES] == 1
-
-
 def test_messages_only_in_the_write_ahead_log_are_counted(tmp_path: Path) -> None:
     path = write_ros2(tmp_path / "bag", FLIGHT)
     (path / "bag.db3-wal").write_bytes(bytes(4152))
@@ -333,18 +252,6 @@ def test_type_names_cannot_carry_code(tmp_path: Path) -> None:
     database.close()
     _, dropped = everything(path)
     assert dropped == {UNDEFINED: 10}
-
-
-def test_an_index_of_two_types_under_one_name(tmp_path: Path) -> None:
-    odd = [Entry("/t", "std_msgs/msg/String", 5, {"data": "a"})]
-    first = write_ros1(tmp_path / "a.bag", odd)
-    second = write_ros1(tmp_path / "b.bag", [Entry("/t", "std_msgs/msg/Float64", 3, {"data": 2.0})])
-    with log_format(first).open_log([first, second]) as log:
-        assert [(t.name, t.type, t.count) for t in log.topics] == [
-            ("/t", "std_msgs/msg/Float64", 1),
-            ("/t", "std_msgs/msg/String", 1),
-        ]
-        assert [m.value.data for m in log.messages(["/t"])] == [2.0, "a"]
 
 
 def test_big_endian_messages(tmp_path: Path) -> None:

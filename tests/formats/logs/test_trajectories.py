@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
@@ -87,34 +84,6 @@ def test_a_clock_jump_is_told_with_its_place_and_size(jump_s: float) -> None:
         assert found.trajectory.dropped == {}
 
 
-@given(st.lists(st.integers(-3 * S, 3 * S), min_size=1, max_size=30))
-def test_leads_and_jumps_as_a_loop_would_find_them(leads: list[int]) -> None:
-    stated = [
-        PoseSample(EPOCH + k * S + lead, EPOCH + k * S, "w", "b", (0.0, 0.0, 0.0), LEVEL)
-        for k, lead in enumerate(leads)
-    ]
-    check = trajectory_of(stated, "d1", stamps="receive").stamps
-    assert check.disagreeing == sum(abs(lead) > S / 2 for lead in leads)
-    assert abs(check.largest_disagreement_s) == max(abs(lead) for lead in leads) / S
-    jumps = [b - a for a, b in pairwise(leads)]
-    assert [round(jump.jump_s * S) for jump in check.jumps] == [jump for jump in jumps if abs(jump) > S]
-    assert [jump.index for jump in check.jumps] == [k + 1 for k, jump in enumerate(jumps) if abs(jump) > S]
-
-
-def test_losses_are_counted_by_the_rules_of_every_pose_file() -> None:
-    stated = flown()
-    stated[2] = replace(stated[2], position=(np.nan, 0.0, 0.0))
-    stated[4] = replace(stated[4], quaternion_xyzw=(0.0, 0.0, 0.0, 0.0))
-    stated.append(replace(stated[-1]))
-    found = trajectory_of(stated, "d1", stamps="header")
-    assert [(cause.split()[-1], count) for cause, count in found.trajectory.dropped.items()] == [
-        ("finite", 1),
-        ("quaternion", 1),
-        ("stamp", 1),
-    ]
-    assert len(found.trajectory.t_ns) == 8
-
-
 def test_covariances_turn_with_the_body() -> None:
     """Head north: a variance about the world's x (east) is then one about the body's y, to the right."""
     north = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
@@ -125,15 +94,6 @@ def test_covariances_turn_with_the_body() -> None:
     np.testing.assert_allclose(found, np.tile(np.diag([1.0, 2, 3, 5, 4, 6]), (10, 1, 1)), atol=1e-14)
     unknown = [replace(s, covariance=np.zeros((6, 6))) for s in flown()]
     assert trajectory_of(unknown, "d1", stamps="header").trajectory.covariance is None
-
-
-def test_poses_of_several_things_or_of_none_are_refused() -> None:
-    with refuses("d1", "frames", "'base' in 'odom'", "'tag' in 'odom'"):
-        trajectory_of(flown() + flown(frames=("odom", "tag")), "d1", stamps="header")
-    with refuses("d1", "topic", "poses"):
-        trajectory_of([AngleSample(1, 1, (0, 0, 0), None)], "d1", stamps="header")
-    with refuses("d1", "rows"):
-        trajectory_of([], "d1", stamps="header")
 
 
 # --- gimbals -------------------------------------------------------------------------------------------
@@ -157,14 +117,6 @@ def test_gimbal_angles_and_quaternions_say_the_same() -> None:
             matrix_from_quaternion(found.quaternion_xyzw), turned.as_matrix(), rtol=0, atol=1e-12
         )
         assert not found.position.any()
-
-
-def test_angles_that_are_no_numbers_are_dropped_and_counted() -> None:
-    stated = [AngleSample(k, k, (0.0, value, 0.0), None) for k, value in ((1, 0.0), (2, np.inf), (3, np.nan))]
-    found = attitudes_of(stated, "d1", stamps="header")
-    assert list(found.trajectory.dropped.values()) == [2]
-    with refuses("d1", "gimbal", "quaternions"):
-        attitudes_of(flown(), "d1", stamps="header")
 
 
 # --- transforms ----------------------------------------------------------------------------------------
@@ -192,23 +144,6 @@ def test_chains_of_moving_and_static_transforms() -> None:
     )
     assert found.frames == ("map", "camera")
     assert found.stamps.count == 55  # static ones have no time to compare
-
-
-def test_what_is_stated_once_holds_always() -> None:
-    transforms = transforms_of([*flown(), static(("base", "camera"), (0.5, 0.0, 0.0))], "d1")
-    found = chained(transforms, "d1", parent="odom", child="camera", stamps="header", max_gap_ns=S)
-    assert len(found.trajectory.t_ns) == 10
-    assert found.stamps.without_header == 0
-
-
-def test_losses_of_a_chain_say_which_transform_they_are_of() -> None:
-    stated = flown()
-    stated[2] = replace(stated[2], position=(np.inf, 0.0, 0.0))
-    transforms = transforms_of([*stated, *flown(frames=("odom", "other"))], "d1")
-    found = chained(transforms, "d1", parent="base", child="other", stamps="header", max_gap_ns=S)
-    ((cause, count),) = found.trajectory.dropped.items()
-    assert "('base' in 'odom')" in cause
-    assert count == 1
 
 
 def test_frames_that_cannot_be_chained_are_refused() -> None:

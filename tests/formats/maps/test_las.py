@@ -15,7 +15,6 @@ from pipelines.formats.maps import las
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat, need, recognise
-from tests.formats.refusals import refuses
 
 READER: MapFormat = las.FORMAT
 # Two voxels of 0.5 m beside each other and one above, in UTM 32 north.
@@ -92,17 +91,6 @@ def test_damaged_headers_are_refused(tmp_path: Path, size: int) -> None:
         READER.read_map(path)
 
 
-@pytest.mark.parametrize("scale", [1e305, 1.7e308])
-def test_points_of_an_absurd_scale_are_refused(tmp_path: Path, scale: float) -> None:
-    """The scale of x stands behind byte 131; numpy's warning must not reach the terminal."""
-    path = write(tmp_path / "cloud.las")
-    content = bytearray(path.read_bytes())
-    content[131:139] = struct.pack("<d", scale)
-    path.write_bytes(content)
-    with refuses(path, "crop it"):
-        READER.read_map(path, resolution_m=1e-3)
-
-
 def test_a_decompressor_that_ends_its_process_ends_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,29 +107,3 @@ def test_a_decompressor_that_ends_its_process_ends_no_other(
         else:
             with pytest.raises(DataError):
                 READER.read_map(path, resolution_m=0.5)
-
-
-@pytest.mark.parametrize("size", [240, 370])
-def test_a_header_that_is_cut_is_refused_and_not_empty(tmp_path: Path, size: int) -> None:
-    """The number of points stands behind byte 247 of a header of LAS 1.4."""
-    path = write(tmp_path / "cloud.las")
-    path.write_bytes(path.read_bytes()[:size])
-    with refuses(path, size):
-        READER.describe(path)
-
-
-def test_points_within_the_header_are_damage_and_no_cut(tmp_path: Path) -> None:
-    path = write(tmp_path / "cloud.las")
-    content = bytearray(path.read_bytes())
-    content[96:100] = (17).to_bytes(4, "little")
-    path.write_bytes(content)
-    with refuses(path, 17):
-        READER.describe(path)
-
-
-def test_without_a_decompressor_the_refusal_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain, compressed = (write(tmp_path / f"a{suffix}") for suffix in (".las", ".laz"))
-    monkeypatch.setattr(need("laspy", "las").LazBackend, "detect_available", staticmethod(lambda: ()))
-    with refuses(compressed, "lazrs", "pip install"):
-        READER.read_map(compressed)
-    assert READER.read_map(plain, resolution_m=0.5).resolution_m == 0.5

@@ -159,14 +159,6 @@ def test_merged_voxels_keep_the_largest_probability(
     assert found == pytest.approx(best, abs=2e-7)
 
 
-def test_colours_of_a_tree_are_passed_over(tmp_path: Path) -> None:
-    node = at([0] * 15, [1.5, None, -0.5, *[None] * 5])
-    file = tmp_path / "a.ot"
-    file.write_bytes(file_of(node, "ot", tree="ColorOcTree", body=ot_body(node, b"\x01\xff\x80")))
-    occupancy = READER.read_map(file)
-    np.testing.assert_allclose(occupancy.probability, 1 / (1 + np.exp([[[-1.5], [0.5]]])), rtol=0, atol=2e-7)
-
-
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
@@ -213,14 +205,6 @@ def test_a_box_that_would_not_fit_is_refused_before_it_is_made(tmp_path: Path) -
     assert int((~np.isnan(coarse.probability)).sum()) == 2
 
 
-@pytest.mark.parametrize("resolution_m", [0.1, 0.3, 0.0, math.nan, -0.2])
-def test_voxels_merge_by_powers_of_two_only(tmp_path: Path, resolution_m: float) -> None:
-    file = tmp_path / "a.bt"
-    file.write_bytes(file_of(at([1] * 15, 3.5)))
-    with refuses(file, f"{resolution_m:g}"):
-        READER.read_map(file, resolution_m=resolution_m)
-
-
 @pytest.mark.parametrize("kind", ["bt", "ot"])
 def test_damage_is_refused_or_read(tmp_path: Path, kind: Literal["bt", "ot"]) -> None:
     content = file_of(at([3] * 13, [[-2.0, 3.5, None, 3.5] * 2, 3.5, *[None] * 6]), kind)
@@ -249,19 +233,3 @@ def test_real_maps_are_read_as_by_octomap(name: str) -> None:
     ):
         assert said[f"{ours}_min_m"] == pytest.approx(facts[theirs]["min"], abs=1e-9)
         assert said[f"{ours}_max_m"] == pytest.approx(facts[theirs]["max"], abs=1e-9)
-
-
-@pytest.mark.parametrize("name", ["octomap_geb079.bt", "octomap_simple.bt", "octomap_ecmrv4_withfree.ot"])
-def test_real_grids_agree_with_their_leaves(name: str) -> None:
-    file = real_data(f"maps/{name}")
-    occupancy, said = READER.read_map(file), READER.describe(file)
-    assert int((occupancy.probability >= 0.5).sum()) == said["occupied_voxels"]
-    assert int((occupancy.probability < 0.5).sum()) == said["free_voxels"]
-    assert list(occupancy.probability.shape) == said["size_voxels"]
-    assert occupancy.origin.tolist() == pytest.approx(said["box_min_m"], abs=1e-9)
-
-
-def test_no_probability_overflows(tmp_path: Path) -> None:
-    file = tmp_path / "sure.ot"
-    file.write_bytes(file_of(at([1] * 15, [-3e38, 3e38, *[None] * 6]), "ot"))
-    assert sorted(READER.read_map(file).probability.ravel().tolist()) == [0.0, 1.0]

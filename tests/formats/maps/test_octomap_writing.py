@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -55,26 +54,6 @@ def test_our_reader_gets_every_voxel_back(
     np.testing.assert_allclose(known, np.where(known >= 0.5, OCCUPIED, FREE), rtol=0, atol=2e-7)
 
 
-@settings(deadline=None, max_examples=60)
-@given(grids, corners)
-def test_octomap_itself_would_write_the_same_tree(
-    tmp_path_factory: pytest.TempPathFactory, grid: NDArray[np.float32], corner: tuple[int, int, int]
-) -> None:
-    """Compare byte by byte with a tree that OctoMap filled voxel by voxel and pruned."""
-    pyoctomap = pytest.importorskip("pyoctomap")
-    folder = tmp_path_factory.mktemp("map")
-    occupancy = Occupancy(grid, np.array(corner) * 0.25, 0.25)
-    write_octomap(folder / "ours.bt", occupancy)
-    tree = pyoctomap.OcTree(0.25)
-    for index, state in voxels_of(occupancy).items():
-        tree.updateNode((np.array(index) + 0.5) * 0.25, state)
-    theirs_path = folder / "theirs.bt"
-    assert tree.writeBinary(str(theirs_path))
-    ours, theirs = ((folder / name).read_bytes().partition(b"data\n") for name in ("ours.bt", "theirs.bt"))
-    assert ours[2] == theirs[2]
-    assert ours[0].split() == theirs[0].split()
-
-
 def test_octomap_reads_the_same_leaves(tmp_path: Path) -> None:
     pyoctomap = pytest.importorskip("pyoctomap")
     rng = np.random.default_rng(7)
@@ -97,21 +76,6 @@ def test_octomap_reads_the_same_leaves(tmp_path: Path) -> None:
     described = octomap.FORMAT.describe(file)
     assert described["nodes"] == tree.size()
     assert described["leaves"] == tree.getNumLeafNodes()
-
-
-def test_a_large_map_takes_seconds_at_most(tmp_path: Path) -> None:
-    """Write 2 million voxels, half of them noise, the worst case for pruning; some 0.2 s on an idle core."""
-    rng = np.random.default_rng(3)
-    grid = np.zeros((200, 200, 50), dtype=np.float32)
-    grid[..., :25] = rng.integers(0, 2, (200, 200, 25))
-    occupancy = Occupancy(grid, np.array([-25.0, -25.0, -0.25]), 0.25)
-    write_octomap(tmp_path / "warm.bt", Occupancy(grid[:2, :2, :2], np.zeros(3), 0.25))
-    began = time.process_time()
-    write_octomap(tmp_path / "a.bt", occupancy)
-    assert time.process_time() - began < 4
-    read = octomap.FORMAT.read_map(tmp_path / "a.bt")
-    np.testing.assert_array_equal(read.probability >= 0.5, grid >= 0.5)
-    assert read.origin.tolist() == occupancy.origin.tolist()
 
 
 def test_the_corners_of_the_tree_can_be_reached_and_not_passed(tmp_path: Path) -> None:

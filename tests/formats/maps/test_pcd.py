@@ -18,7 +18,6 @@ from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
 from tests.formats import clouds
 from tests.formats.damaged_maps import refuse_or_read
-from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
 READER: MapFormat = point_files.PCD
@@ -119,13 +118,6 @@ def test_voxels_hold_the_points(tmp_path: Path, encoding: str) -> None:
     assert READER.read_map(path, resolution_m=0.1).probability.shape == (3, 3, 11)
 
 
-def test_oldest_headers_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.pcd"
-    path.write_text("VERSION .5\nCOLUMNS x y z\nWIDTH 2\nDATA ascii\n1 2 3\n1.5 2 3\n")
-    assert READER.recognises(path)
-    assert READER.describe(path)["points_box_max_m"] == [1.5, 2, 3]
-
-
 def test_lzf_reads_what_liblzf_wrote() -> None:
     points = np.tile(np.array([[1, 2, 3], [4, 5, 6], [1, 2, 3.5]], "<f4"), (12, 1))
     points[7, 1] = -9.25
@@ -140,18 +132,6 @@ def test_lzf_round_trip(parts: list[bytes]) -> None:
     content = b"".join(parts)
     assert unpacked(squeezed(content), len(content)) == content
     assert unpacked(literals(content), len(content)) == content
-
-
-@pytest.mark.parametrize(
-    "packed", [b"\x05abc", b"\x20\x00", b"\x00a\x20", b"\x00a\xe0\x05", b"\x00a\xe0", b"\x00a\x20\x05"]
-)
-def test_lzf_never_leaves_its_arrays(packed: bytes) -> None:
-    assert unpacked(packed, 64) is None
-
-
-def test_lzf_stops_at_the_end_of_the_target() -> None:
-    assert unpacked(b"\x00a\xe0\xff\x00", 100) is None
-    assert unpacked(b"\x03abcd", 3) is None
 
 
 XYZ = ("x y z", "4 4 4", "F F F", "1 1 1")
@@ -197,13 +177,6 @@ def test_unusable_files_are_one_clear_line(tmp_path: Path, content: bytes, probl
     path.write_bytes(content)
     with pytest.raises(DataError, match=problem):
         READER.read_map(path)
-
-
-@pytest.mark.parametrize("resolution_m", [0.0, -1.0, np.nan, np.inf, 1e-9])
-def test_impossible_resolutions_are_refused(tmp_path: Path, resolution_m: float) -> None:
-    path = write(tmp_path / "a.pcd", "binary")
-    with refuses(path, f"{resolution_m:g}"):
-        READER.read_map(path, resolution_m=resolution_m)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])

@@ -60,13 +60,6 @@ def test_voxels_hold_the_vertices(tmp_path: Path, encoding: str) -> None:
     assert (said["points"], said["finite_points"], said["occupied_voxels"]) == (5, 3, 2)
 
 
-def test_lines_may_end_as_on_windows(tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    path.write_bytes((head("ascii", f"element vertex 1\n{XYZ}") + b"1 2 3\n").replace(b"\n", b"\r\n"))
-    assert READER.recognises(path)
-    assert READER.describe(path)["centroid_m"] == [1, 2, 3]
-
-
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
@@ -125,10 +118,3 @@ def test_the_real_cloud_is_read_as_by_other_readers() -> None:
     assert said["points_box_min_m"] == pytest.approx(facts["bbox"]["min"], abs=1.01e-4)
     assert said["points_box_max_m"] == pytest.approx(facts["bbox"]["max"], abs=1.01e-4)
     assert said["centroid_m"] == pytest.approx(facts["centroid"], abs=1.01e-4)
-
-
-def test_the_same_points_make_the_same_map_from_ply_and_pcd() -> None:
-    from_ply = READER.read_map(real_data("maps/small_gicp_target.ply"))
-    from_pcd = point_files.PCD.read_map(real_data("maps/ndt_omp_251370668.pcd"))
-    np.testing.assert_array_equal(from_ply.probability, from_pcd.probability)
-    np.testing.assert_array_equal(from_ply.origin, from_pcd.origin)

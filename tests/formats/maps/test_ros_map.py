@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipelines.formats.maps import ros_map
 from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
-from tests.formats.damaged_maps import damaged, refuse_or_read
+from tests.formats.damaged_maps import refuse_or_read
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
@@ -88,11 +88,6 @@ def test_every_kind_of_picture_gives_the_same_map(tmp_path: Path, picture: bytes
     np.testing.assert_array_equal(floor(write(tmp_path, picture)), [[0, 1], [0, 0], [0, np.nan]])
 
 
-def test_negate_takes_white_for_walls(tmp_path: Path) -> None:
-    path = write(tmp_path, pgm(255 - PICTURE), negate=1)
-    np.testing.assert_array_equal(floor(path), [[0, 1], [0, 0], [0, np.nan]])
-
-
 def test_scale_is_in_proportion_between_the_thresholds(tmp_path: Path) -> None:
     # Darkness 0.5 between 0.2 and 0.6 is 75 percent; a transparent pixel is unknown.
     grey = np.array([[255 * 0.5, 0, 255, 0]]).round().astype(np.uint8)
@@ -106,12 +101,6 @@ def test_scale_is_in_proportion_between_the_thresholds(tmp_path: Path) -> None:
         free_thresh=0.2,
     )
     np.testing.assert_allclose(floor(path), np.array([[0.75], [1], [0], [np.nan]]), rtol=0, atol=1e-7)
-
-
-def test_raw_values_are_percent(tmp_path: Path) -> None:
-    path = write(tmp_path, pgm(np.array([[0, 30, 100, 101, 255]])), mode="raw")
-    expected = np.array([[0], [0.3], [1], [np.nan], [np.nan]])
-    np.testing.assert_allclose(floor(path), expected, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3, -1])
@@ -147,14 +136,6 @@ def test_turned_walls_are_neither_lost_nor_moved(
     reach = (0.5 + side) * math.sqrt(0.5) + 1e-9
     assert gaps.min(axis=1).max() <= reach
     assert gaps.min(axis=0).max() <= reach
-
-
-def test_coarser_voxels_keep_every_wall(tmp_path: Path) -> None:
-    picture = np.full((8, 8), 254)
-    picture[0, 5] = 0
-    path = write(tmp_path, pgm(picture), origin=[0.0, 0.0, 0.0])
-    level = floor(path, 2.0)
-    assert np.argwhere(level == 1).tolist() == [[1, 1]]  # x 2.5, y 3.5 of 4 m
 
 
 def test_a_renamed_picture_is_found_beside_its_plan(tmp_path: Path) -> None:
@@ -232,36 +213,10 @@ def test_unusable_pictures_are_one_clear_line(tmp_path: Path, picture: bytes, pr
         READER.read_map(path)
 
 
-def test_plans_without_content_are_refused(tmp_path: Path) -> None:
-    path = write(tmp_path, pgm(np.full((2, 2), 180)))
-    with refuses(path, "pixel", "thresholds"):
-        READER.read_map(path)
-
-
-def test_a_building_that_would_not_fit_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path, pgm(np.zeros((1500, 1500), np.uint8)), resolution=0.01)
-    with refuses(path, "1500 x 1500 x 250", 0.01, "resolution_m: 0.02"):
-        READER.read_map(path)
-    assert READER.describe(path)["occupied_voxels"] == 1500 * 1500 * 250
-
-
 def test_damage_is_refused_or_read(tmp_path: Path) -> None:
     content = write(tmp_path, origin=[0.0, 0.0, 0.3]).read_bytes()
     damaged = tmp_path / "map.yaml"
     assert refuse_or_read(READER, damaged, content, tries=120) > 50
-
-
-@pytest.mark.parametrize("suffix", ["pgm", "png"])
-def test_damaged_pictures_are_refused_or_read(tmp_path: Path, suffix: str) -> None:
-    content = pgm(PICTURE) if suffix == "pgm" else PNG
-    refused = 0
-    for seed in range(60):
-        path = write(tmp_path, damaged(content, seed))
-        try:
-            READER.read_map(path)
-        except DataError:
-            refused += 1
-    assert refused > 20
 
 
 @pytest.mark.parametrize("name", ["nav2_depot", "nav2_testmap"])

@@ -49,17 +49,6 @@ def test_poses_stand_upright_and_have_their_times(tmp_path: Path, times: str) ->
     np.testing.assert_allclose(down, np.tile([0, 0, -1], (5, 1)), atol=1e-9)
 
 
-def test_rows_of_whole_matrices_are_the_same_poses(tmp_path: Path) -> None:
-    path = write(tmp_path)
-    twelve = READER.read_trajectory(path)
-    last = np.tile([0.0, 0.0, 0.0, 1.0], (5, 1))
-    np.savetxt(path, np.hstack([matrices().reshape(5, 12), last]), fmt="%.12e")
-    assert READER.recognises(path)
-    sixteen = READER.read_trajectory(path)
-    np.testing.assert_array_equal(sixteen.position, twelve.position)
-    np.testing.assert_array_equal(sixteen.quaternion_xyzw, twelve.quaternion_xyzw)
-
-
 def test_rows_that_are_no_rotation_are_dropped_and_counted(tmp_path: Path) -> None:
     rows = matrices()
     rows[2, 0, 0] = 3.0
@@ -77,20 +66,3 @@ def test_too_few_times_or_none_are_refused(tmp_path: Path) -> None:
     (tmp_path / "times.txt").unlink()
     with refuses(path, "times.txt"):
         READER.read_trajectory(path)
-
-
-def test_a_cut_last_line_is_left_out_and_counted(tmp_path: Path) -> None:
-    path = write(tmp_path)
-    path.write_text(path.read_text()[:-40])
-    poses = READER.read_trajectory(path)
-    assert len(poses.t_ns) == 4
-    assert list(poses.dropped.values()) == [1]
-
-
-@pytest.mark.parametrize(
-    "line", ["1 2 3", " ".join(["1"] * 12), "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 2", " ".join(["nan"] * 12), ""]
-)
-def test_other_text_is_not_recognised(tmp_path: Path, line: str) -> None:
-    path = tmp_path / "a.txt"
-    path.write_text(line + "\n")
-    assert not READER.recognises(path)

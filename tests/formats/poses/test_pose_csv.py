@@ -66,14 +66,6 @@ def test_the_real_euroc_file_agrees_with_numpy() -> None:
     np.testing.assert_allclose(poses.quaternion_xyzw, quaternion, rtol=0, atol=1e-12)
 
 
-def test_the_order_of_columns_is_free_and_others_are_ignored(tmp_path: Path) -> None:
-    text = "note,qw,qx,qy,qz,pos_z,pos_y,pos_x,Time,vx\nhello,0.8,0,0,0.6,3,2,1,1700000000.123456789,9\n"
-    poses = READER.read_trajectory(write(tmp_path, text))
-    assert poses.t_ns.tolist() == [1700000000123456789]
-    assert poses.position.tolist() == [[1, 2, 3]]
-    np.testing.assert_allclose(poses.quaternion_xyzw, [[0, 0, 0.6, 0.8]], atol=1e-16)
-
-
 @pytest.mark.parametrize(
     "header",
     [
@@ -126,27 +118,6 @@ def test_tables_of_ros_tools(tmp_path: Path, heading: str, row: str, t_ns: int) 
     assert poses.quaternion_xyzw.tolist() == [[0, 0, 0, 1]]
 
 
-def test_seconds_without_their_nanoseconds_are_dropped_and_counted(tmp_path: Path) -> None:
-    rows = "".join(f"{k},{part},1,2,3,0,0,0,1\n" for k, part in enumerate(["0", "", "-5", "2.5", "7"]))
-    poses = READER.read_trajectory(write(tmp_path, f"sec,nanosec,x,y,z,qx,qy,qz,qw\n{rows}"))
-    assert poses.t_ns.tolist() == [0, 4_000_000_007]
-    assert poses.dropped == {"not finite": 3}
-
-
-def test_blank_cells_are_not_finite_and_counted(tmp_path: Path) -> None:
-    text = "t_ns,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n2,,0,0,0,0,0,1\n,0,0,0,0,0,0,1\n3,0,0,0,0,0,0,1\n4,0,"
-    poses = READER.read_trajectory(write(tmp_path, text))
-    assert poses.t_ns.tolist() == [1, 3]
-    assert list(poses.dropped.values()) == [1, 2]
-
-
-def test_a_short_line_in_the_middle_is_named(tmp_path: Path) -> None:
-    text = "t_ns,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n2,0,0\n3,0,0,0,0,0,0,1\n"
-    path = write(tmp_path, text)
-    with refuses(path, "line 3", 8):
-        READER.read_trajectory(path)
-
-
 def test_covariance_is_symmetric_and_blank_means_unknown(tmp_path: Path) -> None:
     upper = np.arange(1.0, 22.0)
     header = "t_ns,x,y,z,qx,qy,qz,qw," + ",".join(COVARIANCE_COLUMNS)
@@ -167,23 +138,6 @@ def test_covariance_is_symmetric_and_blank_means_unknown(tmp_path: Path) -> None
     np.testing.assert_array_equal(poses.covariance[0][np.triu_indices(6)], upper)
     np.testing.assert_array_equal(poses.covariance[0], poses.covariance[0].T)
     np.testing.assert_array_equal(poses.covariance[1], np.zeros((6, 6)))
-
-
-def test_half_a_covariance_is_refused(tmp_path: Path) -> None:
-    text = "t_ns,x,y,z,qx,qy,qz,qw,c00,c11\n1,0,0,0,0,0,0,1,1,1\n"
-    path = write(tmp_path, text)
-    with refuses(path, "c01", "c55", 21):
-        READER.read_trajectory(path)
-
-
-def test_other_tables_are_not_recognised(tmp_path: Path) -> None:
-    assert not READER.recognises(write(tmp_path, "t,x,y,z\n1,2,3,4\n"))
-    assert not READER.recognises(write(tmp_path, "1,2,3,4,5,6,7,8\n"))
-    assert not READER.recognises(write(tmp_path, ""))
-    other = real_data("logs/csv/px4_ekf_iris_gps.csv")
-    assert not READER.recognises(other)
-    with refuses(other, "t_ns,x,y,z,qx,qy,qz,qw"):
-        READER.read_trajectory(other)
 
 
 @given(trajectory=trajectories(with_covariance=True))

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.scenes.gltf_writing import EXPORT, _turned_to
+from pipelines.formats.scenes.gltf_writing import EXPORT
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import rotate
 from pipelines.session.records import JointMotion
 from tests.formats.exported import START_NS, recording, walking, without
-from tests.formats.refusals import refuses
 
 FLOAT32_M = 1e-5  # float32 of lengths below 50 m
 
@@ -95,16 +94,3 @@ def test_the_same_recording_gives_the_same_bytes(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
     first, second = (written(tmp_path / name)[0].read_bytes() for name in ("a", "b"))
     assert first == second
-
-
-def test_turns_lead_to_their_directions() -> None:
-    rng = np.random.default_rng(1)
-    direction = np.concatenate([rng.normal(size=(50, 3)), [[0.0, -1.0, 0.0], [0.0, 2.0, 0.0]]])
-    turned = rotate(_turned_to(direction), np.array([0.0, 1.0, 0.0]))
-    expected = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-7)
-
-
-def test_a_recording_without_joints_is_refused(tmp_path: Path) -> None:
-    with refuses(recording().name, "joints"):
-        EXPORT.write(replace(recording(), motion=None), tmp_path)

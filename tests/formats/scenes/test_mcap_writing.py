@@ -2,39 +2,19 @@
 
 from __future__ import annotations
 
-import re
-import shutil
-import struct
-import subprocess
-import zlib
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
 import pytest
-from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    Message,
-    MessageIndex,
-    Schema,
-    Statistics,
-)
-from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipelines.formats.common.exporting import CHI2_95
 from pipelines.formats.scenes import mcap_writing
-from pipelines.session.records import Recording
 from pipelines.session.registries import Export
 from tests.formats.exported import (
     LENS,
@@ -42,13 +22,11 @@ from tests.formats.exported import (
     SIGMA_M,
     START_NS,
     VOXEL_M,
-    Listener,
     angles_of_two,
     flown,
     recording,
     stamps,
 )
-from tests.formats.refusals import refuses
 
 WRITER: Export = mcap_writing.EXPORT
 LINE_LIST, SPHERE_LIST, DELETE_ALL = 5, 7, 3
@@ -100,101 +78,6 @@ def test_the_mcap_reader_finds_every_topic_with_a_schema_that_parses(log: Path) 
         assert stated[schema.name][1] == reference.fielddefs[schema.name][1]
 
 
-def test_the_log_is_as_the_mcap_program_demands(log: Path) -> None:
-    """The checks of `mcap doctor`, which no package of Python's brings, by the library's strict reader."""
-    data = log.read_bytes()
-    with log.open("rb") as file:
-        records = list(StreamReader(file, emit_chunks=True, validate_crcs=True).records)
-    at, places = len(b"\x89MCAP0\r\n"), []
-    for _ in records:
-        length = 9 + struct.unpack_from("<Q", data, at + 1)[0]
-        places.append((at, length))
-        at += length
-    header, footer = records[0], records[-1]
-    assert isinstance(header, Header)
-    assert (header.profile, header.library) == ("ros2", "mocap")
-    assert isinstance(footer, Footer)
-    end = next(k for k, record in enumerate(records) if isinstance(record, DataEnd))
-    assert {type(record) for record in records[1:end]} == {Chunk, MessageIndex}
-
-    known: dict[tuple[type, int], Any] = {}
-    counts: dict[int, int] = {}
-    indexed: list[ChunkIndex] = []
-    last_ns = 0
-    chunks = [k for k, record in enumerate(records) if isinstance(record, Chunk)]
-    for k, following in zip(chunks, [*chunks[1:], end], strict=True):
-        chunk = records[k]
-        assert isinstance(chunk, Chunk)
-        stamps_ns = []
-        for record in breakup_chunk(chunk, validate_crc=True):
-            if isinstance(record, Message):
-                assert (Channel, record.channel_id) in known
-                stamps_ns.append(record.log_time)
-                counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
-                continue
-            assert isinstance(record, Schema | Channel)
-            assert record.id > 0 or isinstance(record, Channel)
-            assert asdict(known.setdefault((type(record), record.id), record)) == asdict(record)
-            if isinstance(record, Channel):
-                assert (Schema, record.schema_id) in known
-        assert stamps_ns == sorted(stamps_ns)
-        assert last_ns <= stamps_ns[0] == chunk.message_start_time
-        assert stamps_ns[-1] == chunk.message_end_time
-        last_ns = stamps_ns[-1]
-        indexes = records[k + 1 : following]
-        rows = []
-        for index in indexes:
-            assert isinstance(index, MessageIndex)
-            rows += [(index.channel_id, *row) for row in index.records]
-        assert len(rows) == len(stamps_ns)
-        for channel, stamp_ns, offset in rows:
-            stream, _ = get_chunk_data_stream(chunk)
-            stream.read(offset)
-            stream.read1()
-            message = Message.read(ReadDataStream(stream._stream), stream.read8())
-            assert (message.channel_id, message.log_time) == (channel, stamp_ns)
-        start, length = places[k]
-        indexed.append(
-            ChunkIndex(
-                chunk_length=length,
-                chunk_start_offset=start,
-                compression=chunk.compression,
-                compressed_size=len(chunk.data),
-                message_end_time=chunk.message_end_time,
-                message_index_length=sum(size for _, size in places[k + 1 : following]),
-                message_index_offsets={
-                    index.channel_id: place
-                    for index, (place, _) in zip(indexes, places[k + 1 : following], strict=True)
-                    if isinstance(index, MessageIndex)
-                },
-                message_start_time=chunk.message_start_time,
-                uncompressed_size=chunk.uncompressed_size,
-            )
-        )
-    summary = records[end + 1 : -1]
-    assert [asdict(record) for record in summary if isinstance(record, ChunkIndex)] == [
-        asdict(index) for index in indexed
-    ]
-    (statistics,) = (record for record in summary if isinstance(record, Statistics))
-    assert statistics.channel_message_counts == counts
-    assert statistics.message_count == sum(counts.values())
-    assert (statistics.channel_count, statistics.schema_count) == tuple(
-        sum(kind is each for each, _ in known) for kind in (Channel, Schema)
-    )
-    assert statistics.chunk_count == len(indexed)
-    assert statistics.message_end_time == last_ns
-    assert footer.summary_start == places[end + 1][0]
-    # All of the summary and the footer up to the sum itself.
-    assert footer.summary_crc == zlib.crc32(data[footer.summary_start : places[-1][0] + 9 + 16])
-
-
-@pytest.mark.skipif(shutil.which("mcap") is None, reason="the mcap program is not installed")
-def test_the_mcap_program_finds_nothing_wrong(log: Path) -> None:
-    command = ["mcap", "doctor", "--strict-message-order", str(log)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 0, done.stderr
-
-
 def test_the_skeleton_is_there_at_its_own_times(log: Path) -> None:
     motion = recording().motion
     assert motion is not None
@@ -232,14 +115,6 @@ def test_sigmas_and_angles_are_series_by_name(tmp_path: Path) -> None:
     assert [len(message.name) for _, message in read] == [17 - (row == 7) for row in range(60)]
     # The root mean square of the three axes.
     np.testing.assert_allclose(read[0][1].position, np.sqrt(np.mean(np.square(SIGMA_M))), rtol=1e-12)
-
-
-def test_doubts_are_warnings_at_the_beginning(tmp_path: Path) -> None:
-    (path,) = WRITER.write(replace(recording(), doubts=lambda: ["one", "two"]), tmp_path)
-    read = messages(path, "/doubts")
-    assert [(stamp, entry.level, entry.msg) for stamp, entry in read] == [
-        (START_NS, entry.WARN, text) for (_, entry), text in zip(read, ["one", "two"], strict=True)
-    ]
 
 
 def test_ellipsoids_hold_95_percent(log: Path) -> None:
@@ -308,20 +183,3 @@ def test_the_map_is_its_surface(log: Path) -> None:
 def test_the_same_recording_gives_the_same_bytes(log: Path, tmp_path: Path) -> None:
     (again,) = WRITER.write(recording(), tmp_path)
     assert again.read_bytes() == log.read_bytes()
-
-
-def test_poses_from_before_the_zero_of_a_clock_are_left_out_and_counted(tmp_path: Path) -> None:
-    listener, track = Listener(), flown(10)
-    early = replace(track, t_ns=track.t_ns - START_NS - 100_000_000)
-    (path,) = WRITER.write(Recording("x", None, {"a": early}, progress=listener), tmp_path)
-    assert len(messages(path, "/tf")) == 7
-    assert re.search(r"\b3\b.* a .*\b0\b", listener.notes[0])
-
-
-def test_times_that_ros_cannot_count_are_refused(tmp_path: Path) -> None:
-    late = replace(flown(2), t_ns=np.array([2**31 * 10**9, 2**31 * 10**9 + 1]))
-    with refuses("x", 1970, 2038):
-        WRITER.write(Recording("x", None, {"a": late}), tmp_path)
-    with refuses("x", "reconstruct"):
-        WRITER.write(Recording("x", None, {}), tmp_path)
-    assert not list(tmp_path.iterdir())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import av
@@ -13,8 +12,6 @@ import numpy as np
 import pytest
 
 from pipelines.formats.scenes import rerun_writing
-from pipelines.session import registries
-from pipelines.session.errors import DataError
 from pipelines.session.registries import Export
 from tests.formats.exported import LENS, SIGMA_M, angles_of_two, flown, recording, stamps
 
@@ -56,11 +53,6 @@ def test_sigmas_and_angles_are_series(chunks: dict[str, list[Any]]) -> None:
     np.testing.assert_allclose(wrist, np.sqrt(np.mean(np.square(SIGMA_M))), rtol=1e-12)
 
 
-def test_doubts_are_warnings(chunks: dict[str, list[Any]]) -> None:
-    assert column(chunks, "/doubts", "TextLog:text") == [["one"], ["two"]]
-    assert column(chunks, "/doubts", "TextLog:level") == [["WARN"], ["WARN"]]
-
-
 def test_joints_and_ellipsoids_come_back(chunks: dict[str, list[Any]]) -> None:
     motion = recording().motion
     assert motion is not None
@@ -81,15 +73,6 @@ def test_joints_and_ellipsoids_come_back(chunks: dict[str, list[Any]]) -> None:
         np.testing.assert_allclose(points[: len(measured)], measured, rtol=FLOAT32)
     half = np.array(column(chunks, "/world/person0/uncertainty", "Ellipsoids3D:half_sizes")[0])
     np.testing.assert_allclose(np.sort(half[0]), np.sqrt(7.815) * np.sort(SIGMA_M), rtol=1e-6)
-
-
-def test_bones_are_connections_of_keypoints(chunks: dict[str, list[Any]]) -> None:
-    (((described_class,),),) = column(chunks, "/world", "AnnotationContext:context")
-    described = described_class["class_description"]
-    labels = [entry["label"] for entry in described["keypoint_annotations"]]
-    pairs = {(pair["keypoint0"], pair["keypoint1"]) for pair in described["keypoint_connections"]}
-    assert labels[:2] == ["nose", "left_eye"]
-    assert (labels.index("left_elbow"), labels.index("left_wrist")) in pairs
 
 
 def test_cameras_move_and_show_their_pictures(chunks: dict[str, list[Any]]) -> None:
@@ -115,20 +98,3 @@ def test_cameras_move_and_show_their_pictures(chunks: dict[str, list[Any]]) -> N
     assert matrix[0] == pytest.approx(LENS.fx * 0.75)  # stored column by column
     ((resolution,),) = column(chunks, images, "Pinhole:resolution")
     assert resolution == [960, 540]
-
-
-def test_the_map_is_there(chunks: dict[str, list[Any]]) -> None:
-    (points,) = column(chunks, "/world/map", "Points3D:positions")
-    assert len(points) == 26
-
-
-def test_without_rerun_the_refusal_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> None:
-        raise ImportError(name)
-
-    monkeypatch.setattr(registries, "import_module", absent)
-    with pytest.raises(DataError) as caught:
-        WRITER.write(recording(), tmp_path)
-    assert caught.value.source == "rerun"
-    assert '"rerun-sdk>=0.24"' in caught.value.remedy
-    assert not list(tmp_path.iterdir())

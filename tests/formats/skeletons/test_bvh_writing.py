@@ -22,7 +22,6 @@ from pipelines.session.people import take_joints, with_derived
 from pipelines.session.records import JointMotion, SkeletalMotion
 from pipelines.session.registries import ChoiceOfAxes
 from tests.formats.exported import Listener, recording, walking, without
-from tests.formats.refusals import refuses
 
 WRITER: ChoiceOfAxes = bvh_writing.EXPORT
 WRITTEN_M = 1e-6  # six decimals of a degree over 2 m of bones, and of a centimetre: 0.04 micrometres
@@ -125,16 +124,6 @@ def test_what_is_missing_is_held_left_out_and_counted(tmp_path: Path) -> None:
     assert re.findall(r"(\d+) of (\d+)", note) == [("3", "30"), ("1", "27"), ("5", "351")]
 
 
-def test_no_hips_no_rig(tmp_path: Path) -> None:
-    motion = JointMotion(np.array([0]), ("nose", "left_shoulder", "right_shoulder"), np.ones((1, 1, 3, 3)))
-    with refuses("Mound_walk.bvh", "left_hip, right_hip"):
-        WRITER.write(replace(recording(), motion=motion), tmp_path)
-    apart = without(without(walking(4), "nose", [0]), "left_hip", [0, 1])
-    without(apart, "left_shoulder", [2, 3])
-    with refuses("Mound_walk.bvh", "hips", "neck"):
-        WRITER.write(replace(recording(), motion=apart), tmp_path)
-
-
 @given(st.integers(0, 2**32 - 1), st.sampled_from([None, 90.0, -90.0]))
 def test_angles_are_the_rotation_locked_or_not(seed: int, x_deg: float | None) -> None:
     turns = Rotation.random(5, rng=np.random.default_rng(seed))
@@ -145,8 +134,3 @@ def test_angles_are_the_rotation_locked_or_not(seed: int, x_deg: float | None) -
     back = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
     # Locked within 1e-7: the turn that is left out of y is as small.
     np.testing.assert_allclose(back, matrix_from_quaternion(turns.as_quat()), atol=3e-7)
-
-
-def test_angles_go_on_without_jumps() -> None:
-    around = Rotation.from_euler("Z", np.arange(0, 1000, 7.0)[:, None], degrees=True).as_quat()[:, None]
-    np.testing.assert_allclose(np.diff(bvh_writing.euler_zxy_deg(around)[:, 0, 0]), 7.0, atol=1e-9)

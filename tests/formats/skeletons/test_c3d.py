@@ -11,7 +11,6 @@ import pytest
 
 from pipelines.formats.skeletons import c3d
 from pipelines.formats.skeletons.joint_files import at_even_times
-from pipelines.session import registries
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
@@ -78,14 +77,6 @@ def test_ezc3d_reads_unit_axes_rate_labels_and_residuals(tmp_path: Path) -> None
     np.testing.assert_allclose(file["data"]["points"][1, 0], asked.motion.position[:, 0, 0, 2], rtol=FLOAT32)
 
 
-def test_an_uncertainty_beyond_the_scale_is_its_end(tmp_path: Path) -> None:
-    motion = walking(2)
-    assert motion.covariance is not None
-    motion.covariance[:] *= 1000  # 680 mm
-    file = need("ezc3d", "c3d").c3d(str(write(tmp_path / "a.c3d", motion)))
-    assert set(file["data"]["meta_points"]["residuals"].ravel()) == {255}
-
-
 def test_long_names_are_shortened_for_others_and_whole_for_us(tmp_path: Path) -> None:
     long = [f"{'très' * 10}_{k}" for k in range(2)]
     motion = JointMotion(stamps(2), (*long, "nose"), np.ones((2, 1, 3, 3)))
@@ -150,25 +141,6 @@ def test_damaged_parameters_are_refused_before_ezc3d_sees_them(tmp_path: Path, n
     (tmp_path / "a.c3d").write_bytes(damaged)
     with refuses(tmp_path / "a.c3d", "parameters"):
         read(tmp_path / "a.c3d")
-
-
-def test_the_same_motion_gives_the_same_bytes(tmp_path: Path) -> None:
-    first, second = (write(tmp_path / name, walking(30)).read_bytes() for name in ("a.c3d", "b.c3d"))
-    assert first == second
-
-
-def test_without_ezc3d_the_refusal_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(tmp_path / "a.c3d", walking(2))
-
-    def absent(name: str) -> None:
-        raise ImportError(name)
-
-    monkeypatch.setattr(registries, "import_module", absent)
-    for attempt in (lambda: read(path), lambda: WRITER.write(recording(), tmp_path)):
-        with pytest.raises(DataError) as caught:
-            attempt()
-        assert caught.value.source == "ezc3d"
-        assert '"ezc3d>=1.5"' in caught.value.remedy
 
 
 def test_pauses_are_frames_without_points_and_counted(tmp_path: Path) -> None:

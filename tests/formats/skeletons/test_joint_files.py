@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from pipelines.formats.common.exporting import thinned
-from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints
+from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session.records import JointMotion
 from tests.formats.exported import START_NS, Listener
-from tests.formats.refusals import refuses
 
 
 def moving(t_ns: np.ndarray) -> JointMotion:
@@ -52,31 +51,6 @@ def beside(t_ns: np.ndarray, frame: int) -> bool:
     at = (t_ns[0] + t_ns[-1] * 0) + round(frame * 200_000_000 / 6)
     after = int(np.searchsorted(t_ns, at))
     return bool(t_ns[after] != at) and 3 in (after - 1, after)
-
-
-def test_bones_of_acclaim_begin_at_our_joints() -> None:
-    bones = (
-        "root",
-        "lhipjoint",
-        "lfemur",
-        "ltibia",
-        "lfoot",
-        "rhumerus",
-        "rradius",
-        "rwrist",
-        "lowerneck",
-        "head",
-    )
-    joints = ("hip", "lhipjoint", "left_hip", "left_knee", "left_ankle", "right_shoulder", "right_elbow",
-              "right_wrist", "neck", "head_base")  # fmt: skip
-    assert bone_joints(bones) == joints
-    assert bone_joints(("hip", "head")) == ("hip", "head")  # ours are joints already
-
-
-def test_times_without_a_rate_are_refused() -> None:
-    t_ns = START_NS + np.array([0, 1, 2, 10**9]) * 1000
-    with refuses("x", 4, 1_000_000_001):
-        at_even_times("x", moving(t_ns), Listener())
 
 
 def test_thinning_keeps_the_first_of_every_period() -> None:

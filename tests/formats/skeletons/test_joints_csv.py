@@ -73,29 +73,6 @@ def test_faulty_content_is_refused(tmp_path: Path, text: str, problem: str) -> N
         read(write(tmp_path, text))
 
 
-def test_units_and_axes_are_checked(tmp_path: Path) -> None:
-    path = write(tmp_path, "t_ns,joint,x,y,z\n1,nose,1,2,3\n")
-    with pytest.raises(DataError, match="unit 'inch'"):
-        read(path, unit="inch")
-    with pytest.raises(DataError, match="axes 'x-up'"):
-        read(path, axes="x-up")
-
-
-def test_scattered_rows_cannot_exhaust_memory(tmp_path: Path) -> None:
-    rows = "\n".join(f"{k},{k},joint{k},1,2,3" for k in range(2000))
-    path = write(tmp_path, f"t_ns,person,joint,x,y,z\n{rows}\n")
-    with refuses(path, "2000 rows", "2000 times", "2000 people", "2000 joints"):
-        read(path)
-
-
-def test_describe(tmp_path: Path) -> None:
-    summary = READER.describe(write(tmp_path, "t,joint,x,y,z\n0,a,1,2,3\n0.5,a,4,5,6\n0.5,b,,,\n"))
-    assert summary["joints"] == ["a", "b"]
-    assert summary["rate_hz"] == 2.0
-    assert summary["missing_share"] == 0.5
-    assert summary["box_max_m"] == [4, 5, 6]
-
-
 @given(motion=motions())
 def test_writing_and_reading_gives_the_same(
     tmp_path_factory: pytest.TempPathFactory, motion: JointMotion
@@ -113,13 +90,6 @@ def test_writing_and_reading_gives_the_same(
     assert motion.reprojection_px is not None
     assert table["status"].tolist() == motion.status.ravel().tolist()
     np.testing.assert_allclose(table["reprojection_px"], motion.reprojection_px.ravel(), rtol=1e-14)
-
-
-def test_a_motion_of_no_times_has_the_columns(tmp_path: Path) -> None:
-    joint_files.write_joints(
-        tmp_path / "none.csv", JointMotion(np.empty(0, np.int64), ("nose",), np.empty((0, 1, 1, 3)))
-    )
-    assert (tmp_path / "none.csv").read_text() == "t_ns,person,joint,x,y,z\n"
 
 
 def test_export_writes_skeleton_and_cameras(tmp_path: Path) -> None:

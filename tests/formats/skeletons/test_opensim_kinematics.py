@@ -13,10 +13,9 @@ from pipelines.formats.skeletons import opensim_kinematics
 from pipelines.formats.skeletons.opensim_kinematics import MODELS, Kinematics, scale_model, solve
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import JointMotion, Recording
+from pipelines.session.records import JointMotion
 from pipelines.session.registries import Export, FetchesModels
 from tests.formats.exported import recording
-from tests.formats.refusals import refuses
 from tests.formats.skeletons.test_trc import opensim
 
 WRITER: Export = opensim_kinematics.EXPORT
@@ -112,110 +111,6 @@ def test_a_body_is_scaled_by_the_median_of_its_bone() -> None:
     assert scale_model(library, model, tool, motion, 0) == []
     place = model.getMarkerSet().get("RAnkle").get_location().to_numpy()
     np.testing.assert_allclose(place, 1.25 * np.array(PLACES["RAnkle"]), rtol=1e-9)
-
-
-class _Coordinate:
-    """A coordinate of a model with two arms."""
-
-    def __init__(self, name: str, state: dict[str, float]) -> None:
-        self.name = name
-        state[name] = 0.0
-
-    def getName(self) -> str:  # noqa: N802  # OpenSim's name
-        return self.name
-
-    def getDefaultValue(self) -> float:  # noqa: N802
-        return 0.0
-
-    def getRangeMin(self) -> float:  # noqa: N802
-        return 0.0
-
-    def getValue(self, state: Any) -> float:  # noqa: N802
-        value: float = state.values[self.name]
-        return value
-
-    def setValue(self, state: Any, value: float, _enforce: bool) -> None:  # noqa: N802
-        state.values[self.name] = value
-
-
-class _State:
-    def __init__(self) -> None:
-        self.values: dict[str, float] = {}
-        self.time_s = -1.0
-
-    def setTime(self, time_s: float) -> None:  # noqa: N802
-        self.time_s = time_s
-
-
-class _Solver:
-    """A solver that never turns an upper arm by more than a right angle; its elbows cannot bend backwards.
-
-    The right arm, turned as at rest, is half a turn away from its markers. Elbows are bent by 0.5 rad at
-    2 s and by 0.3 before.
-    """
-
-    def __init__(self) -> None:
-        self.error = {"RWrist": 0.0, "LWrist": 0.0}
-
-    def assemble(self, state: Any) -> None:
-        for side, target in (("r", np.pi), ("l", 0.0)):
-            bend = 0.5 if state.time_s == 2.0 else 0.3
-            near = np.cos(state.values[f"arm_rot_{side}"] - target) > 0
-            state.values[f"elbow_flex_{side}"] = bend if near else 0.0
-            self.error[f"{side.upper()}Wrist"] = 0.0 if near else bend
-
-    def computeCurrentMarkerError(self, name: str) -> float:  # noqa: N802
-        return self.error[name]
-
-
-def test_both_arms_begin_turned_so_that_their_elbows_bend() -> None:
-    state = _State()
-    coordinates = [_Coordinate(name, state.values) for name in ("pelvis_tx", *opensim_kinematics._ARMS)]
-    solver = _Solver()
-    solver.assemble(state)
-    assert (state.values["elbow_flex_r"], state.values["elbow_flex_l"]) == (0.0, 0.3)  # from rest alone
-    opensim_kinematics._assemble(solver, state, coordinates, ["RWrist", "LWrist"], 2.0, 0.0)
-    assert (state.values["elbow_flex_r"], state.values["elbow_flex_l"]) == (0.3, 0.3)
-    assert state.time_s == 0.0
-
-
-def test_an_arm_is_stuck_if_its_elbow_is_straight_at_most_times() -> None:
-    state = _State()
-    coordinates = [_Coordinate(name, state.values) for name in ("arm_rot_r", "elbow_flex_r", "elbow_flex_l")]
-    bend = np.radians([[0.0, 0.5, 60.0], [0.0, 0.0, 0.0], [0.0, 40.0, 0.0]])  # [coordinates, times]
-    assert opensim_kinematics._is_arm_stuck(coordinates, bend.T)
-    bend[2, 0] = np.radians(40.0)  # two times of three are bent
-    bend[1, 1] = np.radians(40.0)
-    assert not opensim_kinematics._is_arm_stuck(coordinates[:2], bend[:2].T + np.radians([0.0, 2.0]))
-    assert opensim_kinematics._is_arm_stuck(coordinates[:2], bend[:2].T * 0.0)
-
-
-def test_the_arms_begin_where_both_elbows_are_bent() -> None:
-    joints = tuple(
-        f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "wrist")
-    )
-    bends_deg = np.array([[5.0, 5.0], [120.0, 0.0], [40.0, 50.0], [np.nan, 90.0]])
-    position = np.zeros((4, 1, 6, 3))
-    for side in range(2):
-        bend = np.radians(bends_deg[:, side])
-        position[:, 0, 3 * side + 1, 2] = -0.3
-        position[:, 0, 3 * side + 2] = np.stack(
-            [0.25 * np.sin(bend), 0 * bend, -0.3 - 0.25 * np.cos(bend)], axis=1
-        )
-    motion = JointMotion(T_NS[:4], joints, position)
-    # 120 deg of one arm count as 57: less than 40 and 50.
-    assert opensim_kinematics._most_bent(motion, 0, np.arange(4)) == 2
-    assert opensim_kinematics._most_bent(swung(np.zeros(5)), 0, np.arange(5)) == 0
-
-
-def test_a_missing_model_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    opensim()
-    monkeypatch.setenv("MOCAP_MODELS", str(tmp_path / "none"))
-    with refuses(tmp_path / "none" / "osim" / "LICENSE", "mocap models fetch osim"):
-        WRITER.write(recording(8), tmp_path)
-    with refuses("osim", "body25"):
-        WRITER.write(Recording("x", swung(np.zeros(5)), {}), tmp_path)
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_person_gets_a_model_and_its_motion(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import Export, JointFormat
 from tests.formats.exported import recording
 from tests.formats.motions import motions
-from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
 READER: JointFormat = trc.FORMAT
@@ -78,12 +77,6 @@ def test_real_files(relative: str) -> None:
     assert 1.4 < height["head"] < 1.9
 
 
-def test_a_real_first_row_to_the_digit() -> None:
-    motion = read(real_data("motion/pose2sim_markers.trc"))
-    # Values of an independent reader in the file's own axes: RHip -0.065, 0.90151, -1.40057.
-    np.testing.assert_allclose(motion.position[0, 0, 0], [-1.40057, -0.065, 0.90151], atol=1e-5)
-
-
 def test_the_header_of_a_real_file_may_count_wrong() -> None:
     """Read a file of Pose2Sim's filter, which states one row too many: the rows themselves are counted."""
     path = real_data("pose2sim_single/pose-3d/single_0-99_filt_butterworth.trc")
@@ -109,23 +102,6 @@ def test_the_header_of_a_real_file_may_count_wrong() -> None:
 def test_faulty_content_is_refused(tmp_path: Path, text: str, problem: str) -> None:
     with pytest.raises(DataError, match=problem):
         read(write(tmp_path, text))
-
-
-def test_marker_names() -> None:
-    assert joint_files.marker_name("right_hip") == "RHip"
-    assert joint_files.marker_name("left_small_toe") == "LSmallToe"
-    assert joint_files.marker_name("nose") == "Nose"
-    assert joint_files.marker_name("C7") == "C7"
-
-
-def test_of_two_names_for_one_joint_the_second_is_kept(tmp_path: Path) -> None:
-    text = HEADER.replace("RBigToe", "MidHip").replace("C7", "Hip") + "1\t0\t1\t2\t3\t4\t5\t6\n"
-    assert read(write(tmp_path, text)).joints == ("hip", "Hip")
-
-
-def test_other_files_are_not_recognised(tmp_path: Path) -> None:
-    assert not READER.recognises(write(tmp_path, "t,x\n"))
-    assert not READER.recognises(write(tmp_path, ""))
 
 
 @given(motion=motions(people=1))
@@ -239,20 +215,6 @@ def test_opensim_and_we_read_every_pattern_of_gaps(tmp_path: Path, gaps: list[An
     ]
     np.testing.assert_array_equal(np.isnan(older), np.isnan(turned))
     np.testing.assert_array_equal(np.isnan(read(path).position[:, 0]), np.isnan(position))
-
-
-@pytest.mark.parametrize(
-    "motion", [None, JointMotion(np.array([0]), ("nose",), np.full((1, 1, 1, 3), np.nan))]
-)
-def test_nothing_to_export(tmp_path: Path, motion: JointMotion | None) -> None:
-    with refuses("x", "mocap reconstruct"):
-        WRITER.write(Recording("x", motion, {}), tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
-def test_one_person_keeps_the_plain_name(tmp_path: Path) -> None:
-    motion = JointMotion(np.array([0]), ("nose",), np.zeros((1, 1, 1, 3)))
-    assert [path.name for path in WRITER.write(Recording("../x:y", motion, {}), tmp_path)] == ["x_y.trc"]
 
 
 def as_pose2sim_reads(path: Path) -> tuple[list[str], pd.DataFrame]:

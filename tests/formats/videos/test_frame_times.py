@@ -7,13 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pipelines.formats.videos import frame_times
 from pipelines.formats.videos.frame_times import FrameStamps, read_frame_times, times_of_frames
 from pipelines.session.errors import DataError
-from pipelines.session.registries import FORMATS
 from tests.real_data import real_data
 
 
@@ -58,26 +55,6 @@ def test_forms_of_a_csv(tmp_path: Path, text: str) -> None:
     assert stamps.t_ns.tolist() == [1700000000123456789, 1700000000223456789, 1700000000423456789]
     assert stamps.media_ns is None
     assert stamps.dropped == {}
-
-
-@settings(max_examples=40)
-@given(data=st.data())
-def test_any_times_come_back(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    t_ns = sorted(data.draw(st.lists(st.integers(0, 2**62), min_size=1, max_size=20, unique=True)))
-    frame = sorted(data.draw(st.sets(st.integers(0, 10**6), min_size=len(t_ns), max_size=len(t_ns))))
-    rows = list(zip(frame, t_ns, strict=True))
-    order = data.draw(st.permutations(rows))
-    text = "frame,t_ns\n" + "".join(f"{k},{t}\n" for k, t in order)
-    stamps = read_frame_times(written(tmp_path_factory.mktemp("f") / "f.csv", text))
-    assert list(zip(stamps.frame.tolist(), stamps.t_ns.tolist(), strict=True)) == rows
-    assert stamps.dropped == {}
-
-
-def test_a_lone_column_counts_its_rows(tmp_path: Path) -> None:
-    stamps = read_frame_times(written(tmp_path / "f.csv", "timestamp\n0.5\n\nbad\n2\n2.5\n"))
-    assert stamps.frame.tolist() == [0, 3, 4]
-    assert stamps.t_ns.tolist() == [500_000_000, 2_000_000_000, 2_500_000_000]
-    assert list(stamps.dropped.values()) == [2]
 
 
 def test_rows_that_cannot_be_used_are_counted_by_cause(tmp_path: Path) -> None:
@@ -159,14 +136,6 @@ def test_real_subtitles_without_frame_times(name: str, problem: str) -> None:
         read_frame_times(real_data(f"logs/dji_srt/{name}"))
 
 
-@pytest.mark.parametrize("year", ["0001", "2262", "9999"])
-def test_a_clock_beyond_all_times_is_none(tmp_path: Path, year: str) -> None:
-    clocks = ["2022-08-07 13:40:40,774,808", f"{year}-08-07 13:40:40,814,808", "2022-08-07 13:40:40,854,808"]
-    stamps = read_frame_times(written(tmp_path / "a.srt", subtitles(clocks)))
-    assert stamps.frame.tolist() == [0, 2]
-    assert list(stamps.dropped.values()) == [1]
-
-
 def test_clocks_of_every_spelling(tmp_path: Path) -> None:
     clocks = ["2022-08-07 13:40:40,774,808", "2022-08-07 13:40:40.875", "2022.8.7 13:40:41"]
     stamps = read_frame_times(written(tmp_path / "f.srt", subtitles(clocks)))
@@ -177,24 +146,6 @@ def test_clocks_of_every_spelling(tmp_path: Path) -> None:
     ]
     assert stamps.media_ns is not None
     assert stamps.media_ns.tolist() == [0, 40_000_000, 80_000_000]
-
-
-def test_subtitles_without_a_clock_are_counted(tmp_path: Path) -> None:
-    clocks = [f"2022-08-07 13:40:40.{40 * k:03d}" for k in range(10)]
-    clocks[3], clocks[5] = "nothing here", "2022-13-07 13:40:40.200"
-    clocks[8] = clocks[7]
-    text = subtitles(clocks)
-    stamps = read_frame_times(written(tmp_path / "f.srt", text[: text.index("10\n00:00")] + "10\n00:00:0"))
-    assert stamps.frame.tolist() == [0, 1, 2, 4, 6, 7]
-    assert list(stamps.dropped.values()) == [2, 1]
-
-
-def test_a_missing_subtitle_leaves_a_hole(tmp_path: Path) -> None:
-    text = subtitles([f"2022-08-07 13:40:40.{33 * k:03d}" for k in range(9)], step_ms=33)
-    start = text.index("5\n00:00:00,132")
-    text = text[:start] + text[text.index("6\n00:00:00,165") :]
-    stamps = read_frame_times(written(tmp_path / "f.srt", text))
-    assert stamps.frame.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
 
 
 # --- to a video's frames --------------------------------------------------------------------------------
@@ -215,24 +166,3 @@ def test_times_by_place_in_the_video() -> None:
     t_ns, known = times_of_frames(stamps, pts_ns)
     assert known.tolist() == [True, True, True, True, False]
     assert t_ns.tolist() == [5, 45, 125, 165, 0]
-
-
-def test_what_is_recognised(tmp_path: Path) -> None:
-    yes = {
-        "a.csv": "frame,t_ns\n0,1\n",
-        "b.txt": "timestamp\n1\n",
-        "c.srt": subtitles(["2022-08-07 13:40:40,774"]),
-    }
-    no = {
-        "d.csv": "t,x\n0,1\n",
-        "e.csv": "t_ns,x,y,z,qx,qy,qz,qw\n",
-        "f.csv": "0,1\n",
-        "g.srt": "",
-        "h.csv": "",
-    }
-    for name, text in (yes | no).items():
-        names = [
-            format_.name for format_ in FORMATS.all() if format_.recognises(written(tmp_path / name, text))
-        ]
-        assert ("frame_times" in names) == (name in yes), name
-        assert len(names) == 1 or name in no

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
+from pipelines.session.telemetry import TelemetryChoice
 
 from pipelines.formats.videos import picture_folder
 from pipelines.formats.videos.picture_folder import (
-    SHARED_SECONDS,
     UNTIMED,
     FolderPictures,
     Tags,
     picture_times,
 )
 from pipelines.geometry.poses import rotate
-from pipelines.session.registries import TelemetryChoice, VideoFormat, recognise
-from tests.commands.runner import mocap, refused, succeeds
-from tests.formats.refusals import refuses
+from pipelines.session.registries import VideoFormat, recognise
+from tests.commands.runner import succeeds
 
 READER: VideoFormat = picture_folder.PICTURES
 TAGS = picture_folder.PICTURE_TAGS
@@ -98,10 +96,6 @@ def test_pictures_are_in_the_order_of_their_numbers_with_exif_times(tmp_path: Pa
     np.testing.assert_allclose(grey, [0, 40, 80, 120], atol=1.5)  # JPEG of an even grey
 
 
-def test_a_stated_zone_moves_to_utc(tmp_path: Path) -> None:
-    assert READER.index(write(tmp_path / "film", offset="+01:00")).start_ns == START_NS - 3600 * 10**9
-
-
 def test_tags_of_dji_are_poses(tmp_path: Path) -> None:
     folder = write(tmp_path / "film")
     assert TAGS.recognises(folder)
@@ -144,17 +138,6 @@ def test_damaged_pictures_are_counted_and_missing_pictures_keep_the_numbers(tmp_
     assert READER.index(folder).codec == UNTIMED
 
 
-@pytest.mark.parametrize("others", [0, 5])
-def test_folders_of_other_files_are_no_sequence(tmp_path: Path, others: int) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4, 3), np.uint8))
-    if others:
-        cv2.imwrite(str(tmp_path / "b.png"), np.zeros((4, 4, 3), np.uint8))
-    for k in range(others):
-        (tmp_path / f"{k}.bag").touch()
-    assert not READER.recognises(tmp_path)
-    assert not TAGS.recognises(tmp_path)
-
-
 MANIFEST = """schema: 1
 cameras:
   drone1:
@@ -177,17 +160,6 @@ def test_a_flight_of_pictures_has_their_times_and_poses(tmp_path: Path) -> None:
     assert poses["z"].iloc[-1] - poses["z"].iloc[0] == pytest.approx(0.3, abs=1e-5)
 
 
-def test_pictures_without_times_need_a_rate(tmp_path: Path) -> None:
-    write(tmp_path / "film", exif=False)
-    manifest = tmp_path / "flight.yaml"
-    text = MANIFEST.format(times="{start: 0}").replace("pose: {file: film}", "pose: {file: poses.tum}")
-    manifest.write_text(text)
-    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n5 1 0 0 0 0 0 1\n")
-    assert "fps" in refused("ingest", manifest)
-    manifest.write_text(text.replace("{start: 0}", "{start: 0, fps: 2}"))
-    succeeds("ingest", manifest)
-
-
 S_NS = 1_000_000_000
 
 
@@ -207,30 +179,3 @@ def test_pictures_of_one_second_are_spread_over_it(seconds: list[int], expected:
     assert shared is (expected != seconds)
     fine, shared = picture_times([Tags(4 * S_NS), Tags(4 * S_NS + 1), Tags(4 * S_NS + 1)])
     assert (fine[-1] - fine[0], shared) == (1, False)
-
-
-def test_pictures_and_their_poses_share_the_times_within_a_second(tmp_path: Path) -> None:
-    folder = write(tmp_path / "film", parts=False)  # at 5.25, 5.75, 6.25 and 6.75 s
-    index = READER.index(folder)
-    assert index.codec == SHARED_SECONDS
-    assert index.pts_ns.tolist() == [500_000_000 * k for k in range(COUNT)]
-    telemetry = TAGS.read_telemetry(folder, TelemetryChoice())
-    assert telemetry.position.t_ns.tolist() == (index.start_ns + index.pts_ns).tolist()
-    assert any("sigma_s" in note for note in telemetry.notes)
-    matrix = "[[50.0, 0, 32], [0, 50.0, 24], [0, 0, 1]]"
-    lens = f"[cam_0]\nsize = [64, 48]\nmatrix = {matrix}\ndistortions = [0, 0, 0, 0, 0]\n"
-    (tmp_path / "lens.toml").write_text(lens, encoding="utf-8")
-    succeeds("init", tmp_path)
-    text = (tmp_path / "flight.yaml").read_text(encoding="utf-8")
-    assert "clock: {offset_s: 0, sigma_s: 1}" in text
-    succeeds("ingest", tmp_path / "flight.yaml")
-
-
-def test_pictures_without_times_are_drafted_as_lacking_them(tmp_path: Path) -> None:
-    folder = write(tmp_path / "film", exif=False)
-    with refuses(folder, "not when"):
-        TAGS.read_telemetry(folder, TelemetryChoice())
-    drafted = mocap("init", tmp_path)
-    assert "not when" in drafted.stdout + drafted.stderr
-    text = (tmp_path / "flight.yaml").read_text(encoding="utf-8")
-    assert "# frame_times: {start: SECONDS, fps: 30}  # missing" in text

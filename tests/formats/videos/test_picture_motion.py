@@ -104,19 +104,6 @@ def test_a_video_begins_when_its_pictures_turn_as_the_poses_do(filmed: Path) -> 
     assert any("motion" in line for line in described["warnings"])
 
 
-def test_a_drone_that_does_not_move_is_refused(filmed: Path, tmp_path: Path) -> None:
-    manifest = (filmed / "flight.yaml").read_text(encoding="utf-8").replace("drone1.", f"{filmed}/drone1.")
-    still = tmp_path / "still.tum"
-    rows = (filmed / "drone1.tum").read_text(encoding="utf-8").splitlines()
-    stamps = [row.split()[0] for row in rows if not row.startswith("#")]
-    still.write_text("".join(f"{stamp} 0 0 0 0 0 0 1\n" for stamp in stamps), encoding="utf-8")
-    path = tmp_path / "flight.yaml"
-    path.write_text(manifest.replace(f"{filmed}/drone1.tum", str(still)), encoding="utf-8")
-    line = refused("ingest", path)
-    assert "drone1" in line
-    assert "poses" in line
-
-
 def test_a_start_that_is_known_roughly_is_refined(filmed: Path, tmp_path: Path) -> None:
     manifest = (filmed / "flight.yaml").read_text(encoding="utf-8").replace("drone1.", f"{filmed}/drone1.")
     path = tmp_path / "flight.yaml"
@@ -132,25 +119,6 @@ def test_a_start_that_is_known_roughly_is_refined(filmed: Path, tmp_path: Path) 
         described = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
         frames = described["cameras"]["drone1"]["frames"]
         assert frames["first_t_ns"] / 1e9 == pytest.approx(START_S + BEGINS_S, abs=0.01)
-
-
-def test_the_offset_of_a_clock_counts_once(filmed: Path, tmp_path: Path) -> None:
-    """Check that start and offset together say where to search; the estimate by motion is world time."""
-    manifest = (filmed / "flight.yaml").read_text(encoding="utf-8").replace("drone1.", f"{filmed}/drone1.")
-    path = tmp_path / "flight.yaml"
-    stated = f"{{start: {START_S + BEGINS_S - 5.4}, start_from: motion}}\n    clock: {{offset_s: 5.5}}"
-    path.write_text(manifest.replace("{start_from: motion}", stated), encoding="utf-8")
-    succeeds("ingest", path)
-    described = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
-    camera = described["cameras"]["drone1"]
-    assert camera["frames"]["first_t_ns"] / 1e9 == pytest.approx(START_S + BEGINS_S, abs=0.01)
-    assert camera["clock"]["sigma_s"] < 2e-3  # the estimate, not the default of a clock without a sigma
-    alone = "{start_from: motion}\n    clock: {offset_s: 5.5}"
-    path.write_text(manifest.replace("{start_from: motion}", alone), encoding="utf-8")
-    line = refused("ingest", path)
-    assert "cameras.drone1" in line
-    assert "clock.offset_s" in line
-    assert "start_from: motion" in line
 
 
 def test_a_camera_that_flies_beside_a_person_is_timed_by_what_it_passes(tmp_path: Path) -> None:

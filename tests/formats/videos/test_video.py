@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from fractions import Fraction
 from pathlib import Path
 from typing import cast
@@ -18,7 +17,7 @@ from pipelines.formats.videos import video
 from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames, index_video, is_shown
 from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
-from pipelines.session.registries import FORMATS, VideoFormat
+from pipelines.session.registries import VideoFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.videos import (
@@ -27,7 +26,6 @@ from tests.synthetic.videos import (
     even_ticks,
     read_bar_code,
     uneven_ticks,
-    write_sound,
     write_video,
 )
 
@@ -79,36 +77,6 @@ def test_any_stamps_come_back(tmp_path_factory: pytest.TempPathFactory, steps: l
     assert index.pts_ns.tolist() == relative_ns(ticks)
     # The container states the first stamp in its movie clock of 1 ms, rounded up or down.
     assert abs(index.start_ns - first * 100_000 / 9) < 1_000_001
-
-
-def test_ntsc_rate_is_rounded_once(tmp_path: Path) -> None:
-    tick_s = Fraction(1, 30_000)
-    ticks = even_ticks(50, step=1001)
-    index = index_video(write_video(tmp_path / "v.mp4", ticks, tick_s=tick_s))
-    assert index.pts_ns.tolist() == relative_ns(ticks, tick_s)
-    assert index.rate_hz == pytest.approx(30_000 / 1001, rel=1e-8)
-    assert not index.variable
-
-
-def test_a_start_offset_is_kept_apart(tmp_path: Path) -> None:
-    index = index_video(write_video(tmp_path / "v.mp4", even_ticks(10, first=45_000)))
-    assert index.start_ns == 500_000_000
-    assert index.pts_ns[0] == 0
-
-
-def test_a_coarse_clock_is_no_variable_rate(tmp_path: Path) -> None:
-    # Matroska counts milliseconds: 33, 33, 34.
-    index = index_video(write_video(tmp_path / "v.mkv", even_ticks(40)))
-    assert not index.variable
-    assert np.abs(index.pts_ns - relative_ns(even_ticks(40))).max() <= 500_000
-
-
-def test_one_frame(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "v.mp4", [0])
-    index = index_video(path)
-    assert (index.count, index.rate_hz, index.span_s, index.variable) == (1, None, 0.0, False)
-    assert [number for number, _ in frames(path)] == [0]
-    assert READER.describe(path)["rate_hz"] is None
 
 
 def test_frames_that_an_edit_list_hides_are_none(tmp_path: Path) -> None:
@@ -219,39 +187,6 @@ def test_pictures_are_opencvs(tmp_path: Path, turned_deg: int) -> None:
     assert max(np.abs(a.astype(int) - b).max() for a, b in zip(mine, pictures, strict=True)) <= 2
 
 
-def test_ranges(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "v.mp4", uneven_ticks(60))
-    assert [number for number, _ in frames(path, 17, 51, 9)] == [17, 26, 35, 44]
-    assert [read_bar_code(picture) for _, picture in frames(path, 30)] == list(range(30, 60))
-    assert list(frames(path, 20, 20)) == []
-    with VideoReader(path) as reader:
-        last = reader.read(59)
-        assert last is not None
-        assert read_bar_code(last) == 59
-        for start, stop, step in [(-1, 5, 1), (0, 61, 1), (5, 4, 1), (0, 5, 0)]:
-            with refuses(path, 0, 59):
-                list(reader.frames(start, stop, step))
-        with refuses(path, 60, 59):
-            reader.read(60)
-
-
-def test_iterations_take_turns(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "v.mp4", uneven_ticks(60))
-    with VideoReader(path) as reader:
-        pairs = zip(reader.frames(0, 20), reader.frames(35, 55), strict=True)
-        numbers = [(a, read_bar_code(x), b, read_bar_code(y)) for (a, x), (b, y) in pairs]
-        assert numbers == [(k, k, k + 35, k + 35) for k in range(20)]
-        assert reader.missing == set()
-
-
-def test_pictures_are_not_kept(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "v.mp4", even_ticks(30))
-    alive: list[weakref.ref[Picture]] = []
-    for _, picture in frames(path):
-        alive = [kept for kept in alive if kept() is not None] + [weakref.ref(picture)]
-        assert len(alive) <= 2  # this one, and the one before, which the loop's variable held
-
-
 # --- damage --------------------------------------------------------------------------------------------
 
 
@@ -339,13 +274,6 @@ def test_a_stated_size_beyond_reason_is_refused(tmp_path: Path) -> None:
         index_video(path)
 
 
-def test_stamps_beyond_reason_are_refused(tmp_path: Path) -> None:
-    ticks = even_ticks(3, step=40, first=5 * 10**12)
-    path = write_video(tmp_path / "v.mkv", ticks, tick_s=Fraction(1, 1000), b_frames=0)
-    with refuses(path, "5e+09"):
-        index_video(path)
-
-
 def test_pictures_that_change_their_size(tmp_path: Path) -> None:
     small = write_video(tmp_path / "a.mov", even_ticks(3), codec="mjpeg", b_frames=0)
     width, height = SIZE
@@ -381,25 +309,6 @@ def test_what_is_no_video_is_one_line(tmp_path: Path, content: bytes, problem: s
     assert "\n" not in str(caught.value)
 
 
-def test_more_that_cannot_be_used(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "v.mp4", even_ticks(10))
-    content = path.read_bytes()
-    cases = {
-        "cut in its table": (content[: content.index(b"moov") + 100], "no table of its frames"),
-        "cut after its table": (content[: packets(path)[0][0] + 5], "before its first frame ends"),
-        "of a foreign codec": (content.replace(b"avc1", b"zzzz").replace(b"avcC", b"zzzC"), "FFmpeg cannot"),
-    }
-    for name, (bad, problem) in cases.items():
-        path = tmp_path / f"{name}.mp4"
-        path.write_bytes(bad)
-        with pytest.raises(DataError, match=problem):
-            index_video(path)
-    sound, empty = write_sound(tmp_path / "sound.mp4"), write_video(tmp_path / "none.mp4", [])
-    for path in (sound, empty, tmp_path / "absent.mp4"):
-        with refuses(path):
-            index_video(path)
-
-
 @settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_no_damage_escapes_as_anything_but_a_data_error(
@@ -420,16 +329,6 @@ def test_no_damage_escapes_as_anything_but_a_data_error(
 
 
 # --- registry and real recordings -------------------------------------------------------------------------
-
-
-def test_only_this_format_recognises_a_video(tmp_path: Path) -> None:
-    for name in ("v.mp4", "v.mkv", "v.ts", "v.avi", "named_wrongly.txt.mp4"):
-        path = write_video(tmp_path / name, even_ticks(12))
-        assert [format_.name for format_ in FORMATS.all() if format_.recognises(path)] == ["video"]
-    assert isinstance(FORMATS.get("video"), VideoFormat)
-    (tmp_path / "empty.mp4").write_bytes(b"")
-    assert READER.recognises(tmp_path / "empty.mp4"), "so that the refusal can say that it is empty"
-    assert not READER.recognises(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -500,11 +399,6 @@ def test_black_bars_are_counted_to_a_pixel(tmp_path: Path, bars: tuple[int, int,
         return picture
 
     assert black_bars(write_video(tmp_path / "v.mp4", even_ticks(9), draw=draw)) == bars
-
-
-def test_a_black_video_has_no_bars(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "v.mp4", even_ticks(2), draw=lambda _: np.zeros((48, 64, 3), np.uint8))
-    assert black_bars(path) == (0, 0, 0, 0)
 
 
 def test_the_real_letterboxed_videos() -> None:
