@@ -8,22 +8,29 @@ proportion, transparent pixels unknown; raw - values 0 to 100 are percent, other
 A plan has no heights: it is extruded from z = 0 to `HEIGHT_M`.
 """
 
+from __future__ import annotations
+
 import math
 import re
-import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.formats.common.files import first_bytes, leads_out, numbers, read_bytes, read_head, read_yaml
-from pipelines.formats.maps.voxel_grids import sampled
+from pipelines.formats.common.files import leads_out, numbers, read_head, read_yaml
+from pipelines.formats.maps.voxel_grids import extruded
 from pipelines.geometry.arrays import Bool, Float, Float32
 from pipelines.session.errors import DataError
-from pipelines.session.maps import check_resolution, check_size, describe_grid
+from pipelines.session.maps import check_resolution, describe_grid
 from pipelines.session.records import Occupancy
+from pipelines.session.storage import refuse_special
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 HEIGHT_M = 2.5
 """Height of the walls: an ordinary storey. Drones above it are above the map."""
@@ -31,10 +38,8 @@ HEIGHT_M = 2.5
 _MOST_PIXELS = 100_000_000
 _MODES = ("trinary", "scale", "raw")
 _SUFFIXES = (".pgm", ".png")
-_PNG = b"\x89PNG\r\n\x1a\n"
-_PNG_HEADER = 33  # bytes: the signature and the chunk IHDR
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
-_DEFLATE_MOST = 1032  # bytes that one compressed byte can stand for
+# White in each of Pillow's modes without colours.
+_GREYS = {"1": 1, "L": 255, "I": 65535, "I;16": 65535, "I;16B": 65535}
 _MEND = "correct the YAML file"
 
 
@@ -90,25 +95,27 @@ class RosMap:
             "unknown_pixels": pixels.size - occupied - free,
             "extruded_m": HEIGHT_M,
         }
-        corner, shape = _box(plan, pixels.shape, plan.resolution_m)
-        plane = _plane(plan, pixels, plan.resolution_m)
-        return summary | describe_grid(
-            plan.resolution_m,
-            corner,
-            shape,
-            occupied=int((plane >= 0.5).sum()) * shape[2],
-            free=int((plane < 0.5).sum()) * shape[2],
-        )
+        try:
+            grid = _grid(path, plan, pixels, plan.resolution_m)
+        except DataError as error:  # too large
+            return summary | {"voxels": error.problem}
+        known = {"occupied": grid.probability >= 0.5, "free": grid.probability < 0.5}
+        counts = {name: int(np.count_nonzero(which)) for name, which in known.items()}
+        return summary | describe_grid(grid.resolution_m, grid.origin, grid.probability.shape, **counts)
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
         """Read, turn and extrude the plan; the grid's axes are the world's."""
         plan = _read_plan(path)
         side = plan.resolution_m if resolution_m is None else check_resolution(path, resolution_m)
-        pixels = _probabilities(path, plan)
-        corner, shape = _box(plan, pixels.shape, side)
-        check_size(path, shape, side)
-        plane = _plane(plan, pixels, side)
-        return Occupancy(np.repeat(plane[:, :, None], shape[2], axis=2), corner, side)
+        return _grid(path, plan, _probabilities(path, plan), side)
+
+
+def _grid(path: Path, plan: _Plan, pixels: Float32, side_m: float) -> Occupancy:
+    position = np.array([*plan.origin, 0.0])
+    turned = np.array([0.0, 0.0, math.sin(plan.yaw / 2), math.cos(plan.yaw / 2)])
+    return extruded(
+        str(path), pixels, plan.resolution_m, (position, turned), side_m=side_m, height_m=HEIGHT_M
+    )
 
 
 def _read_plan(path: Path) -> _Plan:
@@ -196,109 +203,39 @@ def _probabilities(path: Path, plan: _Plan) -> Float32:
 
 def _picture(image: Path) -> tuple[Float, Bool]:
     """Read the mean of the colours [H, W], 0 black to 1 white, and True where the picture is opaque."""
-    head = first_bytes(image, 32)
-    if head[:2] in {b"P2", b"P5"}:
-        shade = _read_pgm(image)
-        return shade, np.ones(shade.shape, dtype=bool)
-    if head.startswith(_PNG):
-        return _read_png(image)
-    raise DataError(image, "is no PGM or PNG picture", "convert it to one of them", code="wrong-kind")
+    from PIL import Image, UnidentifiedImageError
 
-
-def _read_pgm(image: Path) -> Float:
-    content = read_bytes(image)
-    # Four words (P5, width, height, largest value) with comments between them, and one blank after them.
-    head = re.match(rb"P[25](?:(?:\s|#[^\n]*\n)+(\d{1,9})){3}\s", content)
-    words = re.sub(rb"#[^\n]*\n", b" ", head[0]).split() if head else []
-    if not head or len(words) != 4:
-        raise DataError(image, "is a PGM whose header cannot be read", "save it again", code="damaged")
-    width, height, most = (int(word) for word in words[1:])
-    if not 0 < most < 1 << 16:
-        raise DataError(image, f"is a PGM of values up to {most}", "save it again with 255")
-    _check_pixels(image, width, height)
-    body = content[head.end() :]
-    if words[0] == b"P5":
-        kind = np.dtype(">u2" if most > 255 else "u1")
-        values: NDArray[Any] = np.frombuffer(
-            body, kind, count=min(width * height, len(body) // kind.itemsize)
-        )
-    else:
-        try:
-            values = np.array([int(word) for word in body.split()[: width * height]], dtype=np.float64)
-        except (ValueError, OverflowError) as error:
-            raise DataError(
-                image, f"is damaged ({str(error)[:100]})", "save it again", code="damaged"
-            ) from error
-    if len(values) < width * height:
-        raise DataError(
-            image,
-            f"breaks off: {len(values)} of {width * height} pixels are there",
-            "copy it again",
-            code="damaged",
-        )
-    shade: Float = values.reshape(height, width) / most
-    if shade.min() < 0 or shade.max() > 1:
-        raise DataError(image, f"has values beyond {most}", "save it again")
-    return shade
-
-
-def _read_png(image: Path) -> tuple[Float, Bool]:
-    import cv2
-
-    content = read_bytes(image)
-    if len(content) < _PNG_HEADER:
-        raise DataError(image, "is a PNG that breaks off", "copy it again", code="damaged")
-    width, height, bits, kind = struct.unpack_from(">IIBB", content, 16)
-    _check_pixels(image, width, height)
-    if width * height * bits * _PNG_CHANNELS.get(kind, 1) > 8 * _DEFLATE_MOST * len(content):
-        raise DataError(
-            image,
-            f"does not hold the {width} x {height} pixels that it states",
-            "copy it again",
-            code="damaged",
-        )
+    refuse_special(image)
     try:
-        decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise DataError(image, f"is damaged ({error.err})", "save it again", code="damaged") from error
-    if decoded is None:
-        raise DataError(image, "is a damaged PNG", "save it again", code="damaged")
-    values = np.asarray(decoded).astype(np.float64) / np.iinfo(decoded.dtype).max
-    if values.ndim == 2:
-        return values, np.ones(values.shape, dtype=bool)
-    opaque = values[..., 3] == 1 if values.shape[2] == 4 else np.ones(values.shape[:2], dtype=bool)
-    return values[..., :3].mean(axis=2), opaque
-
-
-def _check_pixels(image: Path, width: int, height: int) -> None:
-    if not 0 < width * height <= _MOST_PIXELS:
+        with warnings.catch_warnings(), _opened(image) as picture:
+            warnings.simplefilter("ignore")  # of Pillow, about damaged tags
+            if picture.mode in _GREYS:
+                values = np.asarray(picture, dtype=np.float64) / _GREYS[picture.mode]
+                return values, np.ones(values.shape, dtype=bool)
+            colours = np.asarray(picture.convert("RGBA"), dtype=np.float64) / 255
+            return colours[..., :3].mean(axis=2), colours[..., 3] == 1
+    except UnidentifiedImageError as error:
         raise DataError(
-            image, f"is {width} x {height} pixels", f"1 to {_MOST_PIXELS / 1e6:g} million are read: crop it"
-        )
+            image, "is no PGM or PNG picture", "convert it to one of them", code="wrong-kind"
+        ) from error
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        problem = f"cannot be read as a picture ({str(error)[:100]})"
+        raise DataError(image, problem, "copy it again, or save it again", code="damaged") from error
 
 
-def _box(plan: _Plan, pixels: tuple[int, ...], side: float) -> tuple[Float, tuple[int, int, int]]:
-    """Return the lowest corner of the grid that holds the turned plan, and its voxels along x, y, z."""
-    extent = np.array(pixels) * plan.resolution_m
-    corners = _world_from_plan(plan) @ (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * extent).T
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    # Less a millionth, so that 3.0000000001 voxels count as three.
-    columns, rows, layers = np.ceil(np.array([*(high - low), HEIGHT_M]) / side - 1e-6).astype(int).tolist()
-    return np.array([*(low + plan.origin), 0.0]), (max(columns, 1), max(rows, 1), max(layers, 1))
+@contextmanager
+def _opened(image: Path) -> Iterator[Image.Image]:
+    """Open a picture; refuse too large a one before it is decoded."""
+    from PIL import Image
 
-
-def _world_from_plan(plan: _Plan) -> Float:
-    c, s = math.cos(plan.yaw), math.sin(plan.yaw)
-    return np.array([[c, -s], [s, c]])
-
-
-def _plane(plan: _Plan, pixels: Float32, side: float) -> Float32:
-    """Turn the plan to the world's axes, [X, Y] from the corner that `_box` returns."""
-    if plan.yaw == 0 and side == plan.resolution_m:
-        return pixels
-    corner, (columns, rows, _) = _box(plan, pixels.shape, side)
-    layer = Occupancy(pixels[:, :, None], np.zeros(3), plan.resolution_m)
-    return sampled(layer, _world_from_plan(plan), corner[:2] - plan.origin, (columns, rows), side)[:, :, 0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with Image.open(image, formats=("PPM", "PNG")) as picture:
+            width, height = picture.size
+            if not 0 < width * height <= _MOST_PIXELS:
+                remedy = f"1 to {_MOST_PIXELS / 1e6:g} million are read: crop it"
+                raise DataError(image, f"is {width} x {height} pixels", remedy, code="too-large")
+            yield picture
 
 
 FORMAT = RosMap()

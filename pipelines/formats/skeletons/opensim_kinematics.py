@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _SETUP = "Pose2Sim/OpenSim_Setup/"
+_LICENCE = "pose2sim-0.10.49.dist-info/licenses/LICENSE"
 _MODEL = "Model_Pose2Sim_simple.osim"
 _SET_OF = {
     "blazepose33": ("BlazePose", "Blazepose"),
@@ -41,96 +42,33 @@ _SET_OF = {
 }
 """Pose2Sim's names of the marker set, and of the settings, of our skeletons."""
 
+# SHA-256, size in bytes and name of each file; all but the licence lie in the folder of the set-up.
+_FILES = """
+7f8a9ede713463b96d261a39c3ec404748c8e4f528c795e5f8cb18898ed944cf 1521 LICENSE
+0b25e3efb09f1a6e8c35dbc9a90afe7248895cc74263e3f4f0dbd29519034707 270672 Model_Pose2Sim_simple.osim
+0de8eb64eaa25683caa4d6a9ddf1430009e56233faa4faad91e65b49cf2578a0 15482 Markers_BlazePose.xml
+1ea233cbb29ff8dc32e7ffe7d56c631dc291386e0cd65c9ecf46294b959cfc37 14393 Markers_Body25.xml
+23f28b33dcb7fd0ad1fd1b28ceef7256eb84a3dc0599be591384773431e92acb 14357 Markers_Body25b.xml
+81c2aa3fbf9b717de4d3612d8e0f910e0822086fba6e340075c694f809fbb96e 9619 Markers_Coco17.xml
+8261886fcc028f60736a80e3aad80c81a83cb30c234823b46b9ae395363df3e2 14805 Markers_Halpe26.xml
+a2ef85eca690d04697d3f328fda9c1cb9d978c750080de458d97d8a15b682e85 24135 Scaling_Setup_Pose2Sim_Blazepose.xml
+8f3d332a06e132180e622dad9521518c23d064a643cf9c1ebdb1d6376455f357 30498 Scaling_Setup_Pose2Sim_Body25.xml
+315ef2e64b2b6afea0701120d562c2e39f7d83e198acbd5d5dab2de1f619a8fe 30754 Scaling_Setup_Pose2Sim_Body25b.xml
+999338029c24d7b22d76e9265e2a04e5a7f7a9849ba534da53cdae62ce114075 26122 Scaling_Setup_Pose2Sim_Coco17.xml
+cdabbae2e8346ffd942b30bd588e0e0f8341c8d4d9a55f8bb9b70e1c5c3fb2de 31481 Scaling_Setup_Pose2Sim_Halpe26.xml
+2ca03a9c9add43e83eda3f62cd6f749e06d271f9e6351a343e6f3cc94e3ac314 10952 IK_Setup_Pose2Sim_Blazepose.xml
+3434fc69f0e874fdad50f69ae54ca43933f9b46196f73bac58f9e1cb542b0f1a 9734 IK_Setup_Pose2Sim_Body25.xml
+a3621365a4d030fde68c2ff7fb02c955871919f4971a76877f570f016b9513ee 9754 IK_Setup_Pose2Sim_Body25b.xml
+b8f0ac9155cc38d4726ce562cef1c635405e73f23e6f8994a6a7c0ef0410d31c 7661 IK_Setup_Pose2Sim_Coco17.xml
+8dda7dce47fbde0c268cd1052213a0013b1240873d9e334dbf0a8515b3ed3769 9939 IK_Setup_Pose2Sim_Halpe26.xml
+"""
+
 MODELS = PackagedModels(
     detector="osim",
     package=Wheel("pose2sim", "0.10.49", tags=("3.11", "cp311", "manylinux_2_28_x86_64")),
-    files=(
-        ModelFile(
-            "pose2sim-0.10.49.dist-info/licenses/LICENSE",
-            1521,
-            "7f8a9ede713463b96d261a39c3ec404748c8e4f528c795e5f8cb18898ed944cf",
-        ),
-        *(
-            ModelFile(f"{_SETUP}{name}", size, sha256)
-            for name, size, sha256 in (
-                (_MODEL, 270672, "0b25e3efb09f1a6e8c35dbc9a90afe7248895cc74263e3f4f0dbd29519034707"),
-                (
-                    "Markers_BlazePose.xml",
-                    15482,
-                    "0de8eb64eaa25683caa4d6a9ddf1430009e56233faa4faad91e65b49cf2578a0",
-                ),
-                (
-                    "Markers_Body25.xml",
-                    14393,
-                    "1ea233cbb29ff8dc32e7ffe7d56c631dc291386e0cd65c9ecf46294b959cfc37",
-                ),
-                (
-                    "Markers_Body25b.xml",
-                    14357,
-                    "23f28b33dcb7fd0ad1fd1b28ceef7256eb84a3dc0599be591384773431e92acb",
-                ),
-                (
-                    "Markers_Coco17.xml",
-                    9619,
-                    "81c2aa3fbf9b717de4d3612d8e0f910e0822086fba6e340075c694f809fbb96e",
-                ),
-                (
-                    "Markers_Halpe26.xml",
-                    14805,
-                    "8261886fcc028f60736a80e3aad80c81a83cb30c234823b46b9ae395363df3e2",
-                ),
-                (
-                    "Scaling_Setup_Pose2Sim_Blazepose.xml",
-                    24135,
-                    "a2ef85eca690d04697d3f328fda9c1cb9d978c750080de458d97d8a15b682e85",
-                ),
-                (
-                    "Scaling_Setup_Pose2Sim_Body25.xml",
-                    30498,
-                    "8f3d332a06e132180e622dad9521518c23d064a643cf9c1ebdb1d6376455f357",
-                ),
-                (
-                    "Scaling_Setup_Pose2Sim_Body25b.xml",
-                    30754,
-                    "315ef2e64b2b6afea0701120d562c2e39f7d83e198acbd5d5dab2de1f619a8fe",
-                ),
-                (
-                    "Scaling_Setup_Pose2Sim_Coco17.xml",
-                    26122,
-                    "999338029c24d7b22d76e9265e2a04e5a7f7a9849ba534da53cdae62ce114075",
-                ),
-                (
-                    "Scaling_Setup_Pose2Sim_Halpe26.xml",
-                    31481,
-                    "cdabbae2e8346ffd942b30bd588e0e0f8341c8d4d9a55f8bb9b70e1c5c3fb2de",
-                ),
-                (
-                    "IK_Setup_Pose2Sim_Blazepose.xml",
-                    10952,
-                    "2ca03a9c9add43e83eda3f62cd6f749e06d271f9e6351a343e6f3cc94e3ac314",
-                ),
-                (
-                    "IK_Setup_Pose2Sim_Body25.xml",
-                    9734,
-                    "3434fc69f0e874fdad50f69ae54ca43933f9b46196f73bac58f9e1cb542b0f1a",
-                ),
-                (
-                    "IK_Setup_Pose2Sim_Body25b.xml",
-                    9754,
-                    "a3621365a4d030fde68c2ff7fb02c955871919f4971a76877f570f016b9513ee",
-                ),
-                (
-                    "IK_Setup_Pose2Sim_Coco17.xml",
-                    7661,
-                    "b8f0ac9155cc38d4726ce562cef1c635405e73f23e6f8994a6a7c0ef0410d31c",
-                ),
-                (
-                    "IK_Setup_Pose2Sim_Halpe26.xml",
-                    9939,
-                    "8dda7dce47fbde0c268cd1052213a0013b1240873d9e334dbf0a8515b3ed3769",
-                ),
-            )
-        ),
+    files=tuple(
+        ModelFile(_LICENCE if name == "LICENSE" else f"{_SETUP}{name}", int(size), sha256)
+        for sha256, size, name in map(str.split, _FILES.strip().splitlines())
     ),
 )
 
@@ -452,8 +390,9 @@ _DECIMALS = 6  # of a degree or a metre
 class AnglesExport:
     """Writer of `<name>_angles.csv` (the session's table) and `<name>_angles.sto` (`_<person>` of several).
 
-    A STO has the angles in degrees and after them their standard deviations (`<angle>_sigma`), NaN where an
-    angle is not known. Its seconds count from `recording.zero_ns`; the CSV keeps `t_ns`.
+    A STO has the angles in degrees and after them their standard deviations (`<angle>_sigma`). Its seconds
+    count from `recording.zero_ns`; the CSV keeps `t_ns`. OpenSim stops reading at a NaN: times at which an
+    angle is not known are left out of the STO, and before that angles that are rarely known.
     """
 
     name = "angles"
@@ -478,7 +417,9 @@ class AnglesExport:
         for person in known:
             which = f"_{named[person]}" if value.shape[1] > 1 else ""
             paths.append(folder / f"{name}_angles{which}.sto")
-            write_sto(paths[-1], t_ns - recording.zero_ns, value[:, person], sigma[:, person])
+            left_out = write_sto(paths[-1], t_ns - recording.zero_ns, value[:, person], sigma[:, person])
+            if left_out:
+                recording.progress.note(f"angles: {paths[-1].name} leaves out {left_out}, not known")
         return sorted(paths)
 
 
@@ -491,10 +432,20 @@ def _dense(table: pd.DataFrame) -> tuple[Int64, Float, Float]:
     return t_ns, value, sigma
 
 
-def write_sto(path: Path, t_ns: Int64, value_deg: Float, sigma_deg: Float) -> None:
-    """Write angles and standard deviations [T, A] deg in the order of `ANGLES`."""
-    columns = [*ANGLES, *(f"{name}_sigma" for name in ANGLES)]
-    write_storage(path, t_ns, columns, np.hstack([value_deg, sigma_deg]), degrees=True)
+def write_sto(path: Path, t_ns: Int64, value_deg: Float, sigma_deg: Float) -> str:
+    """Write angles and standard deviations [T, A] deg in the order of `ANGLES`; say what is left out."""
+    kept = np.flatnonzero(np.isfinite(value_deg).any(axis=0))
+    whole: Bool = np.asarray(np.isfinite(value_deg[:, kept]).all(axis=1))
+    while len(kept) > 1 and 2 * np.count_nonzero(whole) < len(t_ns):
+        kept = np.delete(kept, np.isfinite(value_deg[:, kept]).sum(axis=0).argmin())
+        whole = np.asarray(np.isfinite(value_deg[:, kept]).all(axis=1))
+    value, sigma = value_deg[np.ix_(whole, kept)], sigma_deg[np.ix_(whole, kept)]
+    known = np.flatnonzero(np.isfinite(sigma).all(axis=0))
+    names = [list(ANGLES)[k] for k in kept]
+    columns = [*names, *(f"{names[k]}_sigma" for k in known)]
+    write_storage(path, t_ns[whole], columns, np.hstack([value, sigma[:, known]]), degrees=True)
+    lost = {"times": int(np.count_nonzero(~whole)), "angles": len(ANGLES) - len(kept)}
+    return ", ".join(f"{count} {what}" for what, count in lost.items() if count)
 
 
 def write_storage(path: Path, t_ns: Int64, columns: Sequence[str], values: Float, *, degrees: bool) -> None:

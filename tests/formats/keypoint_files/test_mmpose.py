@@ -82,22 +82,18 @@ def test_a_folder_of_pictures(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    "content",
     [
-        ([], "holds no keypoints"),
-        (video([], []), "holds no keypoints .2 x frame without people."),
-        (video([{"keypoints": [[1, 2, 3]], "keypoint_scores": [1]}]), r"of shape \[1, 3\] and \[1\]"),
-        (video([{"keypoints": [[1, 2]], "keypoint_scores": [1, 1]}]), r"of shape \[1, 2\] and \[2\]"),
-        (video([{"keypoints": [[1, 2], [1]], "keypoint_scores": [1, 1]}]), "not plain numbers"),
-        (video([{"keypoints": [[1, 2]]}]), "of shape"),
-        ([{"frame_id": 0, "instances": None}], "the instances are not a list"),
-        ([{"frame_id": "x", "instances": []}], "'x' has no frame number"),
-        ({"instance_info": 3}, "file without predictions"),
-        (video([instance(count=134)]), "has 134 keypoints per person, as no known skeleton"),
+        [],
+        video([{"keypoints": [[1, 2, 3]], "keypoint_scores": [1]}]),
+        video([{"keypoints": [[1, 2], [1]], "keypoint_scores": [1, 1]}]),
+        video([{"keypoints": [[1, 2]]}]),
+        [{"frame_id": "x", "instances": []}],
+        video([instance(count=134)]),
     ],
 )
-def test_bad_content_is_one_clear_line(tmp_path: Path, content: object, message: str) -> None:
-    with pytest.raises(DataError, match=message) as caught:
+def test_bad_content_is_one_clear_line(tmp_path: Path, content: object) -> None:
+    with pytest.raises(DataError) as caught:
         FORMAT.read_keypoints(written(tmp_path / "walk.json", content), skeleton=None, first_frame=0)
     assert "\n" not in str(caught.value)
 

@@ -123,7 +123,7 @@ def test_faulty_content_is_refused(tmp_path: Path) -> None:
     for size in (600, 1400, len(whole) - 4000):
         cut = tmp_path / f"{size}.c3d"
         cut.write_bytes(whole[:size])
-        with pytest.raises(DataError, match="readable C3D"):
+        with pytest.raises(DataError):
             read(cut)
     other = foreign(tmp_path / "b.c3d", np.ones((3, 1, 2)), ["A"], unit="furlong")
     with refuses(other, "'furlong'"):
