@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 from pipelines.formats.drone_logs.ardupilot import FORMAT
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import conjugate, multiply, rotate
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import TelemetryChoice
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (

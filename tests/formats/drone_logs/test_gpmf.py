@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 from pipelines.formats.drone_logs import gpmf
 from pipelines.formats.videos.video import FORMAT as VIDEO
@@ -20,7 +19,8 @@ from pipelines.geometry.poses import (
     rotate,
     rotation_vector_from_quaternion,
 )
-from pipelines.session.registries import VideoFormat, recognise
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import TelemetryChoice, VideoFormat, recognise
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import DroneTruth, drone_of

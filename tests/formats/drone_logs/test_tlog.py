@@ -7,11 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 from pipelines.formats.drone_logs.tlog import FORMAT
 from pipelines.geometry.poses import rotate
-from pipelines.session.registries import FORMATS
+from pipelines.session.records import Telemetry
+from pipelines.session.registries import FORMATS, TelemetryChoice
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import DroneTruth, drone_of, mavlink, tlog_pictures, write_tlog

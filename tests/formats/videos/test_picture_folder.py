@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
-from pipelines.session.telemetry import TelemetryChoice
 
 from pipelines.formats.videos import picture_folder
 from pipelines.formats.videos.picture_folder import (
@@ -18,7 +17,7 @@ from pipelines.formats.videos.picture_folder import (
     picture_times,
 )
 from pipelines.geometry.poses import rotate
-from pipelines.session.registries import VideoFormat, recognise
+from pipelines.session.registries import TelemetryChoice, VideoFormat, recognise
 from tests.commands.runner import succeeds
 
 READER: VideoFormat = picture_folder.PICTURES
