@@ -102,14 +102,19 @@ def _text_of(node: ast.stmt | None) -> str:
 
 def flight() -> str:
     """List the keys of flight.yaml, part by part."""
-    parts: list[tuple[str, type[BaseModel]]] = [("The flight", Manifest), ("A source", Source)]
+    places: dict[type[BaseModel], list[str]] = {Manifest: ["The flight"], Source: ["A source"]}
+    rows = {}
+    for model in iter(lambda: next((each for each in places if each not in rows), None), None):
+        (place, *_) = places[model]
+        rows[model], nested = _rows_of(model, "" if model is Manifest else place, "")
+        for inside, part in nested:
+            places.setdefault(part, []).append(inside)
     sections = []
-    for title, model in parts:
-        rows, nested = _rows_of(model, "" if model is Manifest else title, "")
-        parts += [part for part in nested if part[1] not in dict.fromkeys(each for _, each in parts)]
+    for model, named in places.items():
         is_source = issubclass(model, Source) and model is not Source
         said = _first_line(model) + (" It is [a source](#a-source)." if is_source else "")
-        sections.append("\n\n".join([f"### {title}", said, *([table(_KEYS, rows)] if rows else [])]).rstrip())
+        keys = [table(_KEYS, rows[model])] if rows[model] else []
+        sections.append("\n\n".join([f"### {', '.join(named)}", said, *keys]).rstrip())
     return "\n" + "\n\n".join([*sections, _options()]) + "\n"
 
 
