@@ -55,30 +55,6 @@ def test_a_rigid_alignment_keeps_the_size() -> None:
     np.testing.assert_allclose(doubled.apply(source).mean(axis=0), 2 * source.mean(axis=0), atol=1e-12)
 
 
-@pytest.mark.parametrize("with_scale", [True, False])
-def test_no_motion_nearby_fits_better(with_scale: bool) -> None:
-    rng = np.random.default_rng(5)
-    source = cloud()
-    target = 1.3 * source @ rotation_of((0.5, 0.1, -0.7)).T + rng.normal(size=source.shape) * 0.1
-    found = align_each(source, target, with_scale=with_scale)
-    best = np.sum((found.apply(source) - target) ** 2)
-    for _ in range(50):
-        scale = found.scale * (1 + with_scale * rng.normal() * 1e-3)
-        rotation = found.rotation @ rotation_of(tuple(rng.normal(size=3) * 1e-3))
-        moved = scale * source @ rotation.T + found.translation + rng.normal(size=3) * 1e-3
-        assert np.sum((moved - target) ** 2) > best
-
-
-def test_a_triangle_mirrored_in_its_plane_is_turned_over_in_space() -> None:
-    # The points of the paper's section IV. In the plane they are mirror images; in space the half turn
-    # about y maps (1, 0, 0) to (-1, 0, 0) and keeps (0, 2, 0), which is exact.
-    source = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0]])
-    target = np.array([[0.0, 0, 0], [-1, 0, 0], [0, 2, 0]])
-    found = align_each(source, target, with_scale=True)
-    np.testing.assert_allclose(found.apply(source), target, atol=1e-12)
-    np.testing.assert_allclose(found.rotation, np.diag([-1.0, 1, -1]), atol=1e-12)
-
-
 def test_a_mirror_image_is_not_matched_by_a_reflection() -> None:
     source = cloud()
     found = align_each(source, source * [-1, 1, 1], with_scale=True)

@@ -55,12 +55,6 @@ def test_errors_that_last_widen_the_interval_by_what_their_memory_asks_for() -> 
     assert mean_width(series) > 3 * NORMAL_95 * float(series.std()) / np.sqrt(SAMPLES)
 
 
-def test_a_figure_is_the_ratio_of_its_sums() -> None:
-    weights = np.random.default_rng(3).integers(1, 20, SAMPLES).astype(np.float64)
-    found = intervals({"constant": (3 * weights, weights)}, stamps())["constant"]
-    assert found == pytest.approx((3, 3), abs=1e-12)
-
-
 def test_nothing_to_draw_from_has_no_interval() -> None:
     nothing = np.zeros(SAMPLES)
     assert intervals({"a": (nothing, nothing)}, stamps()) == {"a": None}

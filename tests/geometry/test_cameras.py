@@ -102,15 +102,6 @@ def test_a_projected_ray_comes_back_or_is_nan(
         np.testing.assert_allclose(back, ray, rtol=0, atol=1e-6)
 
 
-def test_nothing_behind_the_camera_or_unknown_has_a_pixel() -> None:
-    points = np.array(
-        [[0.0, 0, 0], [1, 1, -5], [np.nan, 0, 1], [0, 0, np.nan], [1e300, 0, 1e-300], [0, 0, 2]]
-    )
-    pixels = project(points, BARREL)
-    assert np.isnan(pixels[:5]).all()
-    np.testing.assert_array_equal(pixels[5], [BARREL.cx, BARREL.cy])
-
-
 def test_beyond_the_fold_there_is_no_ray_and_no_pixel() -> None:
     # r (1 + k r^2) with k = -0.3 turns at r = sqrt(1 / 0.9) = 1.0541, where the distorted radius is 0.7027.
     camera = replace(PINHOLE, fx=100.0, fy=100.0, model="radtan", distortion=(-0.3, 0.0, 0.0, 0.0))
@@ -135,24 +126,6 @@ def test_a_pole_of_the_rational_model_bounds_its_rays() -> None:
     assert np.isnan(project(np.array([2.1, 0.0, 1.0]), camera)).all()
 
 
-def test_undistort_keeps_shapes_and_missing_pixels() -> None:
-    pixels = np.full((2, 3, 4, 2), 100.0)
-    pixels[1, 2, 3, 0] = np.nan
-    rays = undistort(pixels, FISHEYE)
-    assert rays.shape == pixels.shape
-    assert np.isnan(rays[1, 2, 3]).all()
-    assert np.isfinite(rays).sum() == pixels.size - 2
-    assert undistort(np.empty((0, 2)), BARREL).shape == (0, 2)
-
-
-def test_resized_pictures_show_the_same_rays() -> None:
-    half = rescaled(BARREL, 640, 360)
-    points = points_in_view(BARREL)
-    # Corners stay corners: -0.5 is both pictures' left edge, 1279.5 and 639.5 are their right ones.
-    expected = (project(points, BARREL) + 0.5) / 2 - 0.5
-    np.testing.assert_allclose(project(points, half), expected, rtol=0, atol=1e-10)
-
-
 def test_resized_pictures_are_opencvs() -> None:
     picture = np.zeros((60, 80), dtype=np.float32)
     picture[21:27, 40:52] = 1.0  # its centre is (45.5, 23.5)
@@ -162,10 +135,6 @@ def test_resized_pictures_are_opencvs() -> None:
     lens = Intrinsics(80, 60, 100.0, 100.0, 45.5, 23.5, "none", ())
     half = rescaled(lens, 40, 30)
     np.testing.assert_allclose([half.cx, half.cy], centre, atol=1e-6)
-
-
-def test_a_calibration_fits_its_own_size_silently() -> None:
-    assert fit_to_size(BARREL, 1280, 720) == (BARREL, None)
 
 
 def test_the_same_shape_at_another_size_is_rescaled() -> None:
@@ -238,11 +207,6 @@ def test_another_shape_is_refused_with_both_sizes(size: tuple[int, int]) -> None
 def test_impossible_intrinsics_are_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(PINHOLE, **change)  # type: ignore[arg-type]  # wrong on purpose
-
-
-def test_all_problems_come_in_one_message() -> None:
-    with pytest.raises(ValueError, match=r"picture size.*focal lengths.*principal point"):
-        replace(PINHOLE, width=-1, fx=0.0, cy=np.nan)
 
 
 def test_rows_are_read_from_the_top_about_the_middle() -> None:

@@ -52,7 +52,3 @@ def test_stamps_since_the_epoch_stay_exact() -> None:
     fit = fit_clock(t_ns, t_ns - 3_000_000_001)
     assert fit is not None
     np.testing.assert_array_equal(fit.other_ns(t_ns), t_ns - 3_000_000_001)
-
-
-def test_one_event_says_nothing() -> None:
-    assert fit_clock(np.array([1]), np.array([5])) is None

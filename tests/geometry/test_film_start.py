@@ -100,11 +100,6 @@ def test_the_sigma_is_that_of_the_errors() -> None:
     assert np.abs(errors).max() > 0.2  # nor is it far too large
 
 
-def test_pictures_that_begin_before_the_log() -> None:
-    found = fitted(turning, LOG_S[500:], seen(turning, 2.0, 10.0))
-    assert (found.start_ns - EPOCH_NS) / 1e9 == pytest.approx(2.0, abs=4 * found.sigma_s + 1e-3)
-
-
 def even(t_s: Float) -> tuple[Float, Rotation]:
     return np.zeros((len(t_s), 3)), Rotation.from_euler("Y", 0.3 * t_s[:, None])
 

@@ -85,8 +85,3 @@ def test_no_step_reaches_over_a_gap() -> None:
 def test_who_is_never_seen_has_no_gait() -> None:
     t_ns, position = walk()
     assert gait_events(JOINTS, t_ns, np.full_like(position, np.nan)) is None
-
-
-def test_a_skeleton_without_ankles_has_no_gait() -> None:
-    t_ns, position = walk()
-    assert gait_events(("nose", *JOINTS[:3]), t_ns, position) is None

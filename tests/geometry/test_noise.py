@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from importlib.metadata import entry_points
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from pipelines.geometry.noise import (
     build,
     disturb,
     parse,
-    sum_sigma,
 )
 from pipelines.geometry.poses import (
     conjugate,
@@ -146,30 +144,6 @@ def test_latency_shows_where_the_camera_was() -> None:
     np.testing.assert_allclose(sigma, np.tile([0.5, 0.04], (40, 1)))
 
 
-def test_models_add_up() -> None:
-    t_s = np.array([0.0, 4.0])
-    models: list[NoiseModel] = [
-        White(position_m=0.3),
-        Drift(position_m_per_sqrt_s=0.2, rotation_deg_per_sqrt_s=1.0),
-        Latency(latency_ms=100),
-    ]
-    sigma = sum_sigma(models, t_s, np.full(2, 3.0), np.zeros(2))
-    # 0.3^2 + 0.2^2 * 4 + (0.1 * 3)^2 = 0.34
-    np.testing.assert_allclose(sigma[:, 0], [math.sqrt(0.18), math.sqrt(0.34)])
-    np.testing.assert_allclose(sigma[:, 1], [0, math.radians(2)])
-    assert not sum_sigma([], t_s, t_s, t_s).any()
-
-
-def test_no_models_and_no_rows_change_nothing() -> None:
-    log = circling(np.linspace(0, 1, 5))
-    position, quaternion = disturb([], *log, np.random.default_rng(0))
-    np.testing.assert_array_equal(position, log[1])
-    np.testing.assert_array_equal(quaternion, log[2])
-    nothing = circling(np.empty(0))
-    every = [*SCATTERED, Latency(latency_ms=5)]
-    assert disturb(every, *nothing, np.random.default_rng(0))[1].shape == (0, 4)
-
-
 def test_the_same_seed_gives_the_same_log() -> None:
     log = circling(np.linspace(0, 1, 5))
     first, second = (disturb(SCATTERED, *log, np.random.default_rng(9)) for _ in range(2))
@@ -178,11 +152,6 @@ def test_the_same_seed_gives_the_same_log() -> None:
 
 
 # --- from what users write -----------------------------------------------------------------------------
-
-
-def test_the_models_are_registered_under_their_names() -> None:
-    registered = {entry.name: entry.load() for entry in entry_points(group="mocap.noise_models")}
-    assert registered == CLASSES
 
 
 def test_a_flight_s_pose_noise_becomes_models() -> None:
@@ -225,20 +194,6 @@ def test_the_text_form_becomes_the_same_models() -> None:
 def test_nonsense_is_refused_by_name(name: str, parameters: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build([(name, parameters)], CLASSES)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "white", "white:", "white:position_m", "white:position_m=", ":a=1", "white:a=1,", "white:a=1 +"],
-)
-def test_texts_of_another_form_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="model:parameter=value"):
-        build(parse(text), CLASSES)
-
-
-def test_a_parameter_given_twice_is_refused() -> None:
-    with pytest.raises(ValueError, match="position_m twice"):
-        parse("white:position_m=1,position_m=2")
 
 
 @given(position=st.floats(0, 1e6), rotation=st.floats(0, 360), frame=st.sampled_from(["world", "body"]))

@@ -67,12 +67,6 @@ def test_matrices_are_scipy_s() -> None:
     same_rotation(quaternion_from_matrix(expected), quaternions)
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_half_turns_survive_the_matrix(axis: int) -> None:
-    quaternion = np.eye(4)[axis]
-    same_rotation(quaternion_from_matrix(matrix_from_quaternion(quaternion)), quaternion)
-
-
 @given(rotation_vectors)
 def test_rotation_vectors_are_scipy_s_and_come_back(vector: Float) -> None:
     quaternion = quaternion_from_rotation_vector(vector)
@@ -92,13 +86,6 @@ def test_multiplying_applies_the_right_one_first(a: Float, b: Float, vector: Flo
     )
 
 
-def test_missing_rotations_stay_missing() -> None:
-    missing = np.full(4, np.nan)
-    assert np.isnan(matrix_from_quaternion(missing)).all()
-    assert np.isnan(quaternion_from_matrix(np.full((3, 3), np.nan))).all()
-    assert np.isnan(rotation_vector_from_quaternion(missing)).all()
-
-
 # --- chains --------------------------------------------------------------------------------------------
 
 
@@ -116,14 +103,6 @@ def test_chains_of_transforms(p: Float, r: Float, q: Float, s: Float, point: Flo
     np.testing.assert_allclose(
         transform(invert(*world_from_b), transform(world_from_b, point)), point, rtol=0, atol=1e-11
     )
-
-
-def test_one_mount_composes_with_a_whole_log() -> None:
-    positions, quaternions = turning(np.linspace(0, 2, 7))
-    mount = (np.array([0.1, 0.0, -0.05]), quaternion_from_rotation_vector(np.array([0.0, 0.3, 0.0])))
-    camera_positions, camera_quaternions = compose((positions, quaternions), mount)
-    assert camera_positions.shape == (7, 3)
-    same_rotation(multiply(camera_quaternions, conjugate(mount[1])), quaternions)
 
 
 def test_north_east_down_becomes_east_north_up() -> None:
@@ -156,15 +135,6 @@ def test_constant_motion_is_interpolated_exactly() -> None:
     np.testing.assert_allclose(got_quaternion, quaternion_true, rtol=0, atol=1e-14)
 
 
-def test_a_stamp_gives_its_own_row_to_the_last_bit() -> None:
-    rng = np.random.default_rng(1)
-    t_ns = EPOCH + np.cumsum(rng.integers(1, 50 * MS, 40))
-    position, quaternion = rng.normal(size=(40, 3)) * 1e3, random_quaternions(40)
-    got = interpolate_poses(t_ns, position, quaternion, t_ns, max_gap_ns=0, max_extrapolation_ns=0)
-    np.testing.assert_array_equal(got[0], position)
-    np.testing.assert_array_equal(np.abs(got[1]), np.abs(quaternion))
-
-
 def test_a_nanosecond_is_not_lost_on_the_epoch() -> None:
     t_ns = np.array([EPOCH, EPOCH + 8], dtype=np.int64)
     values = np.array([[0.0], [8.0]])
@@ -195,22 +165,6 @@ def test_outside_the_log_the_nearest_pose_is_held_within_the_tolerance() -> None
     np.testing.assert_array_equal(got[1][1:3], quaternion)
     assert np.isnan(got[0][[0, 3]]).all()
     assert np.isnan(got[1][[0, 3]]).all()
-
-
-def test_logs_of_one_row_or_none() -> None:
-    at_ns = EPOCH + np.array([-1, 0, 1], dtype=np.int64)
-    one = (np.array([[1.0, 2, 3]]), np.array([[0.0, 0, 0, 1]]))
-    got = interpolate_poses(
-        np.array([EPOCH], dtype=np.int64), *one, at_ns, max_gap_ns=5, max_extrapolation_ns=0
-    )
-    assert np.isfinite(got[0]).all(axis=1).tolist() == [False, True, False]
-    nothing = np.empty(0, dtype=np.int64)
-    empty = interpolate_poses(
-        nothing, np.empty((0, 3)), np.empty((0, 4)), at_ns, max_gap_ns=5, max_extrapolation_ns=5
-    )
-    assert np.isnan(empty[0]).all()
-    assert np.isnan(empty[1]).all()
-    assert np.isnan(interpolate_points(nothing, np.empty((0, 2, 3)), at_ns, max_gap_ns=5)).all()
 
 
 @pytest.mark.parametrize("stamps", [[0, 5, 5], [0, 5, 4]])

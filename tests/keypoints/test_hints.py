@@ -37,13 +37,6 @@ def test_the_tallest_is_the_actor_nearer_by_three_sigma() -> None:
     assert anywhere.tallest_px == math.inf, "three sigma reach behind the camera"
 
 
-def test_left_and_up_in_the_world_are_left_and_up_in_the_picture() -> None:
-    hint = _hint(10, 2, 1)
-
-    assert hint is not None
-    assert hint.centre == pytest.approx((639.5 - 160, 359.5 - 80))
-
-
 @pytest.mark.parametrize("place", [(-10, 0, 0), (0, 1, 0), (10, 9, 0), (10, 0, -6), (10, math.nan, 0)])
 def test_no_hint_behind_beside_outside_or_unknown(place: tuple[float, float, float]) -> None:
     assert _hint(*place) is None

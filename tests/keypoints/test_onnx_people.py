@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.keypoints.onnx_network import OnnxNetwork
-from pipelines.keypoints.onnx_pose import DETECTOR, OnnxPeople, distinct
-from pipelines.session.errors import DataError
+from pipelines.keypoints.onnx_pose import DETECTOR, OnnxPeople
 from tests.keypoints.onnx_graphs import constant_model, heatmap_model
 
 SIZE = (320, 320)
@@ -58,12 +57,6 @@ def test_persons_of_every_export_come_best_first(tmp_path: Path, outputs: object
     np.testing.assert_allclose(score, [0.9, 0.6], atol=1e-6)
 
 
-def test_outputs_that_are_not_understood_are_listed(tmp_path: Path) -> None:
-    path = constant_model(tmp_path / "m.onnx", SIZE, {"boxes": np.zeros((1, 9, 4), np.float32)})
-    with pytest.raises(DataError, match=r"boxes \[1,9,4\]; expected boxes with scores"):
-        people(path).find(PICTURE)
-
-
 def test_the_picture_is_fitted_into_the_top_left(tmp_path: Path) -> None:
     class Seen(OnnxNetwork):
         def single(self, rgb: NDArray[np.uint8]) -> Outputs:
@@ -92,14 +85,6 @@ def test_boxes_become_regions_with_the_aspect_of_the_pose_model(tmp_path: Path) 
     networks = DETECTOR.configured(f"{pose},people={wide}").load(threads=1)
     ((region, _),) = networks.find_people(PICTURE)
     assert region.side == pytest.approx(1.25 * 4 * 100 * 128 / 96)
-
-
-def test_nobody_is_no_error(tmp_path: Path) -> None:
-    path = constant_model(tmp_path / "m.onnx", SIZE, {"dets": np.zeros((1, 1, 5), np.float32)})
-    boxes, score = people(path).find(PICTURE)
-    assert boxes.shape == (0, 4)
-    assert score.shape == (0,)
-    assert distinct(boxes, score).shape == (0,)
 
 
 def people(path: Path, kind: type[OnnxNetwork] = OnnxNetwork) -> OnnxPeople:

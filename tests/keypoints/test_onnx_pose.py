@@ -57,13 +57,6 @@ def test_simcc_peaks_are_where_the_spots_are(tmp_path: Path) -> None:
     assert_spots(load(simcc_model(tmp_path / "m.onnx")), SIMCC_PX)
 
 
-def test_the_wrong_cells_would_be_seen(tmp_path: Path) -> None:
-    # Cells of one kind read as the other: 4 k against 4 k 95 / 92 in x, up to 3 pixels of the input.
-    networks = load(heatmap_model(tmp_path / "m.onnx", cells="msra"), f"{GREY},heatmap=udp")
-    with pytest.raises(AssertionError):
-        assert_spots(networks, HEATMAP_PX)
-
-
 @pytest.mark.parametrize("batch", ["n", 1, 2])
 @pytest.mark.parametrize("layout", ["nchw", "nhwc"])
 def test_any_batch_and_layout_gives_the_same(tmp_path: Path, batch: int | str, layout: str) -> None:
@@ -96,13 +89,6 @@ def test_the_people_of_a_picture_are_one_batch_where_the_graph_takes_it(
     assert lengths == [3 if batch == "n" else batch] * runs
 
 
-def test_an_open_size_is_stated(tmp_path: Path) -> None:
-    path = heatmap_model(tmp_path / "m.onnx", open_size=True)
-    assert_spots(load(path, f"{GREY},size=96x128"), HEATMAP_PX)
-    with pytest.raises(DataError, match="size=192x256"):
-        load(path)
-
-
 @pytest.mark.parametrize(("order", "bgr"), [("rgb", 2), ("bgr", 0)])
 def test_colours_come_in_the_order_stated(tmp_path: Path, order: str, bgr: int) -> None:
     """Use a network that reads its first channel only: red as RGB, blue as BGR."""
@@ -113,16 +99,6 @@ def test_colours_come_in_the_order_stated(tmp_path: Path, order: str, bgr: int) 
     other = load(path, f"{GREY},colours={'bgr' if order == 'rgb' else 'rgb'}").locate(picture, [REGION])
     assert other[0].presence == 0.0
     assert np.isnan(other[0].xy).all()
-
-
-def test_imagenet_is_the_default_norm(tmp_path: Path) -> None:
-    """Expect (255 - mean) / std in each channel of a white picture; cells hold the weighted channels."""
-    path = heatmap_model(tmp_path / "m.onnx", channel=(0.25, 0.0, 0.0))
-    white = np.full((400, 640, 3), 255, np.uint8)
-    (person,) = load(path, "").locate(white, [REGION])
-    assert person.confidence[0] == pytest.approx(0.25 * (255 - 123.675) / 58.395, rel=1e-5)
-    (person,) = load(path, "colours=bgr").locate(white, [REGION])
-    assert person.confidence[0] == pytest.approx(0.25 * (255 - 103.53) / 57.375, rel=1e-5)
 
 
 def test_the_next_region_is_the_body_around_the_joints(tmp_path: Path) -> None:
@@ -141,17 +117,6 @@ def test_the_skeleton_is_that_of_the_number(tmp_path: Path, joints: int, skeleto
     assert load(path).joints == get_skeleton(skeleton).joints
 
 
-def test_of_more_joints_the_first_are_taken_when_stated(tmp_path: Path) -> None:
-    path = simcc_model(tmp_path / "m.onnx", joints=133)
-    with pytest.raises(DataError, match="133 joints"):
-        load(path)
-    networks = load(path, f"{GREY},skeleton=coco17")
-    (person,) = networks.locate(spots(640, 400, [UPPER, LOWER], SPOT_PX), [REGION])
-    assert person.xy.shape == (17, 2)
-    with pytest.raises(DataError, match="state another skeleton"):
-        load(simcc_model(tmp_path / "n.onnx"), "skeleton=halpe26")
-
-
 def test_outputs_that_are_not_understood_are_listed(tmp_path: Path) -> None:
     path = constant_model(tmp_path / "m.onnx", (96, 128), {"coordinates": np.zeros((1, 17, 3), np.float32)})
     with pytest.raises(DataError, match=r"coordinates \[1,17,3\] for an input of 96x128"):
@@ -165,36 +130,6 @@ def test_files_that_are_no_models_are_refused(tmp_path: Path) -> None:
     text.write_text("no model")
     with pytest.raises(DataError, match="is no model that ONNX Runtime can run"):
         load(text)
-
-
-def test_without_onnx_runtime_the_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = simcc_model(tmp_path / "m.onnx")
-    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
-    with pytest.raises(DataError, match=r'pip install "onnxruntime\S*"`$'):
-        load(path)
-
-
-def test_what_decides_the_result_is_in_the_name_and_paths_are_not(tmp_path: Path) -> None:
-    path = simcc_model(tmp_path / "m.onnx")
-    a = DETECTOR.configured(f"{path},skeleton=coco17,heatmap=msra,provider=cpu")
-    b = DETECTOR.configured(f"{path},provider=cpu,heatmap=msra,skeleton=coco17")
-    assert a.name == b.name == "onnx:heatmap=msra,provider=cpu,skeleton=coco17"
-    assert a.models()["pose"] == path
-
-
-def test_the_processor_runs_models_unless_another_provider_is_asked_for(tmp_path: Path) -> None:
-    path = simcc_model(tmp_path / "m.onnx")
-    assert DETECTOR.configured(str(path)).name == "onnx:provider=cpu"
-    assert DETECTOR.configured(f"{path},provider=CPUExecutionProvider").name == "onnx:provider=cpu"
-    cuda = {DETECTOR.configured(f"{path},provider={it}").name for it in ("cuda", "CUDAExecutionProvider")}
-    # What it is told to do otherwise than by itself is part of what decides the result.
-    assert cuda == {"onnx:provider=cuda:cudnn_conv_algo_search=HEURISTIC"}
-
-
-def test_a_provider_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
-    detector = DETECTOR.configured(f"{simcc_model(tmp_path / 'm.onnx')},provider=QuantumExecutionProvider")
-    with pytest.raises(DataError, match=r"^--provider quantum: .*there are .*\bcpu\b"):
-        detector.load(threads=1)
 
 
 @pytest.mark.parametrize(
@@ -217,8 +152,3 @@ def test_bad_options_are_refused_with_what_there_is(tmp_path: Path, options: str
     path = simcc_model(tmp_path / "m.onnx")
     with pytest.raises(DataError, match=said):
         DETECTOR.configured(f"{path},{options}")
-
-
-def test_a_path_may_hold_commas(tmp_path: Path) -> None:
-    path = simcc_model(tmp_path / "a,b.onnx")
-    assert DETECTOR.configured(f"{path},skeleton=coco17").models()["pose"] == path

@@ -95,12 +95,3 @@ def test_of_two_cameras_neither_is_believed() -> None:
     assert not dropped[:20].any()
     assert not dropped[120:].any()
     assert (np.isnan(found).any(-1).all(-1) == np.isnan(found).any(-1).any(-1)).all()  # both views or none
-
-
-def test_what_is_not_seen_is_no_exchange() -> None:
-    views = Views(4)
-    views.xy[np.random.default_rng(1).random(views.xy.shape[:-1]) < 0.3] = np.nan
-    views.position[:30, 2] = np.nan
-    found, counts = views.undone(views.xy)
-    np.testing.assert_array_equal(found, views.xy)
-    assert counts == {}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.keypoints.tiles import Tile, find_in, square_about, squares_about, tiles
+from pipelines.keypoints.tiles import Tile, find_in, squares_about, tiles
 from tests.keypoints.bars import Bar, BarNetworks, draw
 
 
@@ -44,25 +44,6 @@ def test_tiles_lie_in_the_picture_and_start_with_the_whole(width: int, height: i
     for tile in cover:
         assert 0 <= tile.left <= size[0] - tile.width
         assert 0 <= tile.top <= size[1] - tile.height
-
-
-@pytest.mark.parametrize("size", [(1280, 720), (1920, 1080), (3840, 2160)])
-def test_the_number_of_tiles_does_not_grow_with_the_picture(size: tuple[int, int]) -> None:
-    # By hand at 16:9, steps of 2/3 of a side: 1 + 3 + 5 x 3 + 11 x 6.
-    assert len(tiles(*size)) == 1 + 3 + 15 + 66
-
-
-def test_small_pictures_are_not_cut_into_crumbs() -> None:
-    assert tiles(100, 80) == [Tile(0, 0, 100, 80)]
-
-
-@given(centre=st.tuples(st.floats(-500, 2500), st.floats(-500, 1500)), side=st.floats(1, 5000))
-def test_a_square_is_moved_into_the_picture(centre: tuple[float, float], side: float) -> None:
-    square = square_about(centre, side, 1920, 1080)
-
-    assert 0 <= square.left <= 1920 - square.width
-    assert 0 <= square.top <= 1080 - square.height
-    assert (square.width, square.height) == (min(round(side), 1920), min(round(side), 1080))
 
 
 @given(
