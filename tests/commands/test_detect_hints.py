@@ -18,10 +18,7 @@ from pipelines.session.description import read_description
 from pipelines.session.people import logged_actor
 from pipelines.session.records import Trajectory
 from pipelines.session.stages import StageRecord, locked
-from pipelines.session.storage import read_json
 from pipelines.session.tables import trajectory_from
-from tests.commands.runner import mocap
-from tests.keypoints.onnx_graphs import constant_model
 from tests.keypoints.spotted_flights import CAMERAS, FPS, LENS, START_S, spot_detector, write_spotted_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log
@@ -100,23 +97,6 @@ def test_the_hint_is_at_the_hips_whatever_point_was_logged(
     assert actor.hips_at(np.array([START_S * 10**9])) == pytest.approx(np.array([[0.0, 0.0, 1.0]]))
 
 
-def test_the_margin_is_what_is_stated_of_the_poses(tmp_path: Path) -> None:
-    flight = Flight(tmp_path)
-    flight.log_actor("hip", 1.0)
-
-    def margin() -> float:
-        hint = flight.hints()[0]
-        assert hint is not None
-        return hint.margin_px
-
-    # Three sigma of angle times the focal length; the actor's log has 1 m, unknown poses 1 deg.
-    assert margin() == pytest.approx(3 * LENS.fx * math.hypot(1 / DISTANCE_M, math.radians(1)), rel=1e-3)
-    flight.settings["cameras"]["left"]["pose_noise"] = NOISE
-    apart_m = math.sqrt(1 + 0.4**2 + 0.3**2)
-    stated = math.hypot(apart_m / DISTANCE_M, math.radians(2))
-    assert margin() == pytest.approx(3 * LENS.fx * stated, rel=1e-3)
-
-
 def test_logged_covariances_count_where_nothing_is_stated(tmp_path: Path) -> None:
     flight = Flight(tmp_path)
     flight.log_actor("hip", 1.0)
@@ -166,50 +146,6 @@ def test_only_another_log_of_the_actor_has_the_keypoints_detected_anew(tmp_path:
     feet = flight.detected(detector)
     found_with = [record.inputs["hints_from"] for record in (hinted, higher, feet)]
     assert len(set(found_with)) == 3
-
-
-def test_the_logs_of_all_people_say_where_to_look(tmp_path: Path) -> None:
-    flight, detector = Flight(tmp_path), spot_detector(tmp_path)
-    flight.log_actor("hip", 1.0)
-    log = flight.settings.pop("actor")
-    flight.settings["actors"] = {"anna": log, "ben": dict(log)}
-    before = flight.detected(detector)
-    flight.settings["actors"]["ben"]["point"] = "feet"
-
-    assert flight.detected(detector).inputs["hints_from"] != before.inputs["hints_from"]
-
-
-def test_earlier_hints_are_said_until_the_keypoints_are_detected_anew(tmp_path: Path) -> None:
-    flight, detector = Flight(tmp_path), spot_detector(tmp_path)
-    # The actor stands in the middle of the square about the hint: row 120 of 240, 142 of the network's 320.
-    box = np.array([(100.0, 82.0, 220.0, 202.0, 0.9)], np.float32)
-    constant_model(tmp_path / "people.onnx", (320, 320), {"dets": box})
-    flight.log_actor("hip", 1.0)
-    flight.ingest()
-    reconstruct = ("reconstruct", flight.session, "--detector", detector)
-    assert "--force" not in told(reconstruct)
-    before = read_json(flight.session / "detect" / "stage.json")
-    flight.settings["cameras"]["left"]["pose_noise"] = NOISE
-    flight.ingest()
-    assert "--force" in told(reconstruct)
-    assert read_json(flight.session / "detect" / "stage.json") == before
-    assert any("earlier ingest" in line for line in warnings(flight.session))
-    assert "--force" in told(reconstruct), "unchanged, and still so"
-    assert "--force" not in told((*reconstruct, "--force"))
-    assert not any("earlier ingest" in line for line in warnings(flight.session))
-    after = read_json(flight.session / "detect" / "stage.json")
-    assert after["inputs"]["hints_from"] != before["inputs"]["hints_from"]
-
-
-def told(arguments: tuple[str | Path, ...]) -> str:
-    """Run a command that must succeed; return its stderr."""
-    done = mocap(*arguments)
-    assert done.returncode == 0, done.stderr
-    return done.stderr
-
-
-def warnings(session: Path) -> list[str]:
-    return list(read_json(session / "reconstruct" / "stage.json")["warnings"])
 
 
 def test_a_camera_that_gets_anothers_pictures_is_looked_at_again(tmp_path: Path) -> None:

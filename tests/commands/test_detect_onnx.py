@@ -98,13 +98,6 @@ def provider(session: Path) -> str:
     return str(stated["provider"])
 
 
-def test_models_tells_how_to_use_your_own() -> None:
-    listed = succeeds("models")
-    assert "--detector onnx:MODEL.onnx" in listed
-    families = json.loads(succeeds("models", "--json"))["families"]
-    assert [family["name"] for family in families] == ["onnx"]
-
-
 @pytest.mark.slow
 def test_stopped_in_the_middle_it_goes_on_with_what_is_finished(tmp_path: Path) -> None:
     frames = 450  # two blocks for each camera

@@ -86,11 +86,6 @@ def test_auto_goes_on_without_a_video_that_is_exchanged_while_it_is_followed(
     assert content(session) == expected
 
 
-def test_robust_alone_follows_nothing(session: Path) -> None:
-    succeeds("reconstruct", session, "--method", "robust")
-    assert not (session / "background").exists()
-
-
 def test_blocks_share_a_picture_and_no_points(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Follow in blocks of 15 pictures: points move as the texture does, to some tenths of a pixel."""
     monkeypatch.setattr(follow, "BLOCK", 15)

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.session.errors import DataError
-from pipelines.session.registries import advice_on, find_detector
 from tests.commands.runner import refused, succeeds
 
 FILES = ("pose_detection.tflite", "pose_landmark_full.tflite")
@@ -36,13 +34,6 @@ def test_what_is_missing_is_listed_with_the_command_that_gets_it(empty_cache: Pa
         "blazepose": dict.fromkeys(FILES),
         "blazepose-heavy": dict.fromkeys((FILES[0], HEAVY)),
     }
-
-
-def test_list_is_the_same_as_no_subcommand(empty_cache: Path) -> None:
-    assert succeeds("models", "list") == succeeds("models")
-    assert succeeds("models", "list", "--json") == succeeds("models", "--json")
-    assert succeeds("models", "--json", "list") == succeeds("models", "--json")
-    assert "list" in succeeds("models", "--help")
 
 
 def test_what_is_there_is_listed_with_its_place(empty_cache: Path) -> None:
@@ -80,23 +71,6 @@ def test_heavy_from_a_tarball_of_something_else_is_refused(empty_cache: Path, tm
     assert "of 15 bytes" in line
     assert "of 27709200" in line
     assert not empty_cache.exists()
-
-
-def test_heavy_that_is_missing_is_refused_before_anything_runs(empty_cache: Path) -> None:
-    with pytest.raises(DataError, match="is missing; run `mocap models fetch blazepose-heavy`"):
-        find_detector("blazepose-heavy").load(threads=1)
-
-
-def test_only_the_default_says_that_there_is_a_more_accurate_one() -> None:
-    (line,) = advice_on(find_detector("blazepose"))
-    assert "--detector blazepose-heavy" in line
-    assert advice_on(find_detector("blazepose-heavy")) == []
-
-
-def test_fetching_from_a_file_that_is_no_wheel_is_refused(empty_cache: Path, tmp_path: Path) -> None:
-    text = tmp_path / "mediapipe.whl"
-    text.write_text("not a wheel")
-    assert "is no readable wheel" in refused("models", "fetch", "blazepose", "--from", text)
 
 
 def test_fetching_an_unknown_name_lists_what_has_models(empty_cache: Path) -> None:

@@ -16,7 +16,6 @@ from mocap_cli.main import Mocap
 from mocap_cli.reconstruct import GONE, reconstruct_command
 from tests.commands.runner import succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
-from tests.synthetic.logged_flights import write_logged_flight
 
 
 @pytest.fixture(scope="module")
@@ -160,45 +159,6 @@ def test_smoothing_is_said_and_lowers_what_noise_does(tmp_path: Path) -> None:
         assert smooth["reprojection_px"]["mean"] != rough["reprojection_px"]["mean"]
 
 
-def test_a_logged_covariance_is_the_prior_unless_noise_is_stated(tmp_path: Path) -> None:
-    """Check that logged sigmas of 0.2, 0.2, 0.3 m and 0.01 rad make the skeleton's heights less certain."""
-    flight = write_logged_flight(tmp_path, "mcap-cdr", seconds=0.4)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    spread = {}
-    level_m, turn_deg = np.sqrt((0.04 + 0.04 + 0.09) / 3), np.degrees(0.01)
-    for name, options in {
-        "log": (),
-        "level": ("--pose-noise", f"white:position_m={level_m},rotation_deg={turn_deg}"),
-    }.items():
-        run(session, *options)
-        skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
-        spread[name] = skeleton[["cxx", "cyy", "czz"]].mean().to_numpy()
-    logged, stated = np.diag([0.04, 0.04, 0.09]), np.eye(3) * level_m**2
-    # First order, without 3 px of the image (0.04 m at 10 m) but for their square; the body's lever arm of
-    # 0.1 m adds 1e-6 m^2. Joints are up to 1 m from the middle: some per cent.
-    np.testing.assert_allclose(spread["log"], point_variances(flight, logged), rtol=0.08)
-    np.testing.assert_allclose(spread["level"], point_variances(flight, stated), rtol=0.08)
-    assert spread["log"][2] > 1.3 * spread["level"][2]
-
-
-def point_variances(flight: SyntheticFlight, position_covariance: Any) -> Any:
-    """Compute the variances [3] of a point in the middle of the body, from errors across each ray."""
-    middle = flight.position.mean(axis=1)
-    variances = []
-    for t, point in enumerate(middle):
-        information = np.zeros((3, 3))
-        for position in flight.camera_position[:, t]:
-            away = point - position
-            across = np.linalg.svd(away[None])[2][1:]  # two directions across the ray
-            range_m = float(np.linalg.norm(away))
-            shake = (0.01 * range_m) ** 2 + (3.0 / 762.5 * range_m) ** 2
-            off = across @ position_covariance @ across.T + shake * np.eye(2)
-            information += across.T @ np.linalg.inv(off) @ across
-        variances.append(np.diag(np.linalg.inv(information)))
-    return np.mean(variances, axis=0)
-
-
 def test_the_terminal_shows_the_figures_that_matter_in_a_table(clean: tuple[SyntheticFlight, Path]) -> None:
     _, session = clean
     text = command(session, "--smooth", "butterworth").stdout
@@ -263,29 +223,3 @@ def test_nonsense_is_refused_in_a_line(
     assert done.exit_code == 1, (done.output, done.exception)
     (line,) = done.stderr.strip().splitlines()
     assert said in line
-
-
-def test_a_thing_in_the_sky_is_left_out_counted_and_said(tmp_path: Path) -> None:
-    """Expect a skeleton as without it: a body thrice as large as the actor at the upper edge of a picture.
-
-    No other camera sees it, and at the distance of somebody of usual size, 3 m, it is higher than people are.
-    """
-    flight = write_flight(tmp_path, cameras=2, clean=True)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    before = run(session)
-    path = tmp_path / "drone1.json"
-    keypoints = json.loads(path.read_text(encoding="utf-8"))
-    for entry in list(keypoints):
-        points = np.array(entry["keypoints"]).reshape(-1, 3)
-        points[:, :2] = 3 * (points[:, :2] - points[:, :2].mean(axis=0)) + (640.0, 0.0)
-        keypoints.append(entry | {"keypoints": points.ravel().tolist()})
-    path.write_text(json.dumps(keypoints), encoding="utf-8")
-    succeeds("ingest", flight.manifest, "-o", session)
-    after = run(session)
-    told = {cause: cameras for cause, cameras in after["people"]["no_people"].items() if cameras}
-    assert told == {"alone": {"drone1": len(flight.t_ns)}}
-    assert after["people"]["detections_not_used"] == before["people"]["detections_not_used"]
-    assert after["mpjpe_mm"] == pytest.approx(before["mpjpe_mm"], rel=1e-9)  # rounding of longer rows
-    assert stage(session)["counts"]["no_people"] == after["people"]["no_people"]
-    assert any(f"drone1 {len(flight.t_ns)}" in line for line in stage(session)["warnings"])

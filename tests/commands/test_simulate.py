@@ -11,19 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 import pandas as pd
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
-from scipy.spatial.transform import Rotation
 
 from pipelines.formats.common.files import read_yaml
 from pipelines.formats.videos import video
 from pipelines.formats.videos.video_writing import write_h264
-from pipelines.simulation.flight import fly_scenario, visible_joints
-from pipelines.simulation.scenario import DISTORTION, READOUT_MS, read_scenario
+from pipelines.session.errors import DataError
+from pipelines.simulate import simulate
+from pipelines.simulation.scenario import DISTORTION, READOUT_MS
 from tests.commands.runner import MOCAP, content, refused, succeeds
 from tests.real_data import real_data
 
@@ -62,7 +61,7 @@ drones:
 TWO = """
 schema: 1
 name: Two
-duration_s: 3
+duration_s: 1
 actors:
   anna: {motion: [walk: {distance_m: 5}]}
   ben: {motion: [walk: {distance_m: 5}], start: [0, 4], body: {sex: female, height_m: 1.6}}
@@ -94,19 +93,6 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulated(tmp_path_factory.mktemp("small"), SMALL, "--no-video")
 
 
-def test_keypoints_say_which_detector_they_imitate(small: Path, tmp_path: Path) -> None:
-    other = simulated(tmp_path, SMALL + "keypoints: {detector: blazepose-heavy}\n", "--no-video")
-    found = []
-    for flight, name in ((small, "blazepose"), (other, "blazepose-heavy")):
-        summary = json.loads((flight.parent / "simulation.json").read_text(encoding="utf-8"))
-        assert summary["pictures"].split()[-1] == name
-        assert f" {name}.\n" in flight.read_text(encoding="utf-8")
-        found.append((flight.parent / "drone1_keypoints.json").read_bytes())
-    assert found[0] != found[1]
-    wrong = scenario(tmp_path, SMALL + "keypoints: {detector: oracle}\n")
-    assert "blazepose-heavy" in refused("simulate", wrong, "-o", tmp_path / "wrong", "--no-video")
-
-
 def reconstructed(flight: Path, *options: str) -> dict[str, Any]:
     succeeds("ingest", flight)
     metrics: dict[str, Any] = json.loads(
@@ -121,14 +107,6 @@ def test_the_truth_closes(tmp_path: Path) -> None:
     assert metrics["mpjpe_mm"] < 0.5
     # The field of view holds the person throughout and nothing stands in the way.
     assert metrics["reconstructed_share"] > 0.99
-
-
-def test_poses_that_are_logged_with_noise_cost_what_the_noise_says(tmp_path: Path) -> None:
-    noise = "drones:\n  pose_noise: {white: {position_m: 0.3, rotation_deg: 1}}"
-    metrics = reconstructed(simulated(tmp_path, EXACT.replace("drones:", noise), "--no-video"))
-    # A ray errs by 0.3 m in position and 10 m x 1 degree in direction across it: 0.35 m per axis of two.
-    # Three rays that surround the person average that; the mean error lies between a third and the whole.
-    assert 0.12e3 < metrics["mpjpe_mm"] < 0.6e3
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(small: Path, tmp_path: Path) -> None:
@@ -212,26 +190,6 @@ def test_the_map_is_read_by_octomap_itself(small: Path) -> None:
         assert tree.isNodeOccupied(node) is occupied
 
 
-def test_what_stands_in_the_way_is_told(tmp_path: Path) -> None:
-    """Check that a wall between the actor and the first drone hides the actor only from that drone."""
-    wall = "world: {walls: [{start: [3, -6], end: [3, 6], height_m: 5}]}\ndrones:"
-    text = EXACT.replace("drones:", wall).replace("count: 3", "count: 2")
-    begin, end = text.index("  motion:"), text.index("world:")
-    flight = simulated(
-        tmp_path, text[:begin] + "  motion: [stand: {seconds: 4}]\n" + text[end:], "--no-video"
-    )
-    first, second = (
-        pd.read_csv(flight.parent / "truth" / f"drone{k}_visible.csv", index_col="frame") for k in (1, 2)
-    )
-    assert len(first) == len(second) == 120
-    assert not first.to_numpy().any()
-    assert second.to_numpy().all()
-    grid, tree = (
-        json.loads(succeeds("info", flight.parent / f"site.{kind}", "--json")) for kind in ("npz", "bt")
-    )
-    assert grid["readings"][0]["occupied_voxels"] == tree["readings"][0]["occupied_voxels"] > 0
-
-
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The flight.yaml of two people's flight without videos, to look at and not to change."""
@@ -247,7 +205,7 @@ def test_every_person_is_in_the_truth_the_keypoints_and_the_log(two: Path) -> No
     north = hip.groupby("person")["y"].mean()
     assert north.to_dict() == {0: pytest.approx(0, abs=0.3), 1: pytest.approx(4, abs=0.3)}
     shown = pd.read_csv(folder / "truth" / "drone1_visible.csv")
-    assert shown.groupby("frame")["person"].apply(list).tolist() == [[0, 1]] * 90
+    assert shown.groupby("frame")["person"].apply(list).tolist() == [[0, 1]] * 30
     found = json.loads((folder / "drone1_keypoints.json").read_text())
     assert {entry["idx"] for entry in found} == {1, 2}
 
@@ -270,65 +228,22 @@ def test_every_person_is_in_the_truth_the_keypoints_and_the_log(two: Path) -> No
     ]
 
 
-@pytest.mark.parametrize("first", ["anna", "ben"])
-def test_everybody_reconstructed_is_compared_with_their_own_truth(
-    two: Path, tmp_path: Path, first: str
-) -> None:
+def test_everybody_reconstructed_is_compared_with_their_own_truth(tmp_path: Path) -> None:
     """As exact as one person alone, whoever is named first: that one is the logged actor, and person 0."""
-    flight = two
-    if first == "ben":
-        anna, ben = (line for line in TWO.splitlines(keepends=True) if line.startswith(("  anna", "  ben")))
-        flight = simulated(tmp_path, TWO.replace(anna + ben, ben + anna), "--no-video")
+    anna, ben = (line for line in TWO.splitlines(keepends=True) if line.startswith(("  anna", "  ben")))
+    flight = simulated(tmp_path, TWO.replace(anna + ben, ben + anna), "--no-video")
     session = tmp_path / "two.session"
     succeeds("ingest", flight, "-o", session)
     truth = pd.read_parquet(session / "truth.parquet")
     actor = truth[(truth["person"] == 0) & (truth["joint"] == "left_hip")]
-    for people in (1, 2):
-        metrics = json.loads(
-            succeeds("reconstruct", session, "--method", "robust", "--persons", str(people), "--json")
-        )
-        assert metrics["joint_frames"] == people * 90 * 17
-        assert metrics["mpjpe_mm"] < 0.5
-        assert metrics["reconstructed_share"] > 0.97
-        found = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
-        hip = found[(found["person"] == 0) & (found["joint"] == "left_hip") & (found["status"] == "ok")]
-        # People walk 4 m from each other, and the logged actor errs by 0.2 m.
-        assert np.abs(np.interp(hip["t_ns"], actor["t_ns"], actor["y"]) - hip["y"]).max() < 0.1
-
-
-@pytest.mark.slow
-def test_the_film_shows_everybody_and_the_nearer_hides_the_farther(tmp_path: Path) -> None:
-    """Ben, in black, stands between the first drone and Anna, whose shirt is red; bodies and poses are alike.
-
-    Level with the hip and 10 m away, he covers her but for a rim; from the second drone both are seen.
-    """
-    begin = TWO.index("actors:")
-    people = """
-actors:
-  anna: {motion: [stand: {seconds: 1}], body: {outfit: casual}}
-  ben: {motion: [stand: {seconds: 1}], body: {outfit: dark}, start: [1, 0]}
-drones:
-  count: 2
-  camera: {width: 640, height: 360, rate_hz: 4, hfov_deg: 30, shutters: synchronised}
-  formation: {tilt_deg: 0}
-"""
-    text = TWO[:begin].replace("duration_s: 3", "duration_s: 0.5") + people
-
-    def red_pixels(flight: Path, name: str) -> int:
-        """Count the pixels of the red shirt in the first picture."""
-        with av.open(str(flight.parent / f"{name}.mp4")) as container:
-            picture = next(container.decode(video=0)).to_ndarray(format="rgb24").astype(int)
-        red, green, blue = np.moveaxis(picture, -1, 0)
-        return int(((red > 60) & (red > 1.8 * blue) & (red > 1.8 * green)).sum())
-
-    shirts = {}
-    for name, stated in {"both": text, "one": text.replace("start: [1, 0]", "start: [0, 40]")}.items():
-        (tmp_path / name).mkdir()
-        flight = simulated(tmp_path / name, stated)
-        shirts[name] = [red_pixels(flight, drone) for drone in ("drone1", "drone2")]
-    assert shirts["one"][0] > 300
-    assert shirts["both"][0] < 0.25 * shirts["one"][0]
-    assert shirts["both"][1] == pytest.approx(shirts["one"][1], rel=0.1)
+    metrics = json.loads(succeeds("reconstruct", session, "--method", "robust", "--persons", "2", "--json"))
+    assert metrics["joint_frames"] == 2 * 30 * 17
+    assert metrics["mpjpe_mm"] < 0.5
+    assert metrics["reconstructed_share"] > 0.97
+    found = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
+    hip = found[(found["person"] == 0) & (found["joint"] == "left_hip") & (found["status"] == "ok")]
+    # People walk 4 m from each other, and the logged actor errs by 0.2 m.
+    assert np.abs(np.interp(hip["t_ns"], actor["t_ns"], actor["y"]) - hip["y"]).max() < 0.1
 
 
 def test_a_flight_that_is_there_is_not_made_again(tmp_path: Path) -> None:
@@ -343,46 +258,6 @@ def test_a_flight_that_is_there_is_not_made_again(tmp_path: Path) -> None:
     line = refused("simulate", tmp_path / "scenario.yaml", "-o", tmp_path / "mine", "--no-video")
     assert "thesis.tex" in line
     assert "--overwrite" in line
-
-
-def test_what_was_made_beside_a_flight_does_not_go_with_it(tmp_path: Path) -> None:
-    flight = simulated(tmp_path, SMALL, "--no-video")
-    succeeds("ingest", flight)
-    session = flight.with_suffix(".session")
-    again = (
-        "simulate",
-        scenario(tmp_path, SMALL.replace("Small", "Other")),
-        "-o",
-        flight.parent,
-        "--no-video",
-    )
-    line = refused(*again, "--force")
-    assert session.name in line
-    assert "--overwrite" in line
-    assert session.is_dir()
-    succeeds(*again, "--overwrite")
-    assert not session.exists()
-
-
-def test_any_name_reads_back(tmp_path: Path) -> None:
-    """Check that quotes, line breaks and control characters stay inside one scalar of the manifest."""
-    name = 'said "hi" \\ \n#: {a}\t\x07\x7f\x85\u2028\ufeff \U0001f6b6'
-    text = SMALL.replace("name: Small", f"name: {json.dumps(name)}".replace("\x7f", "\\x7f"))
-    text = text.replace("\\ud83d\\udeb6", "\\U0001f6b6")  # JSON has pairs of surrogates, YAML has not
-    stated = json.loads(succeeds("ingest", simulated(tmp_path, text, "--no-video"), "--json"))
-    assert stated["flight"] == name
-
-
-def test_ways_to_where_the_actor_stands_are_no_ways(tmp_path: Path) -> None:
-    for name, motion in {
-        "once": "[walk: {to: [0, 0]}]",
-        "again": "{steps: [walk: {to: [0, 0]}], repeat: true}",
-    }.items():
-        (tmp_path / name).mkdir()
-        text = SMALL.replace("[walk: {distance_m: 5}]", motion).replace("duration_s: 2", "duration_s: 1")
-        flight = simulated(tmp_path / name, text, "--no-video")
-        joints = pd.read_csv(flight.parent / "truth" / "joints.csv")
-        assert len(joints) > 0
 
 
 @pytest.mark.slow
@@ -441,7 +316,7 @@ def test_a_planner_flies_around_what_the_ring_flies_into(tmp_path: Path) -> None
     assert nearest["adaptive"] > 0.5
 
 
-@pytest.mark.parametrize("name", ["cmu_10_01_soccer_kick", "cmu_10_04_walk", "xia_neutral_01_000"])
+@pytest.mark.parametrize("name", ["cmu_10_01_soccer_kick"])
 def test_recorded_motion_is_flown_around(tmp_path: Path, name: str) -> None:
     recording = real_data(f"motion/{name}.bvh")
     text = EXACT.replace("duration_s: 4", "duration_s: 2")
@@ -456,61 +331,24 @@ def test_recorded_motion_is_flown_around(tmp_path: Path, name: str) -> None:
 
 HOSTILE = {
     "negative size": ("size_m: 30", "size_m: -30", "world.ground.size_m"),
-    "no drones": ("count: 2", "count: 0", "drones.count"),
     "a billion voxels": ("resolution_m: 0.5", "resolution_m: 0.011", "voxels"),
     "unknown motion": ("walk: {distance_m: 5}", "moonwalk: {distance_m: 5}", "walk"),
     "unknown key": ("duration_s: 2", "duration_s: 2\nwind_mps: 5", "wind_mps"),
     "no number": ("duration_s: 2", "duration_s: .nan", "duration_s"),
-    "no motion": ("[walk: {distance_m: 5}]", "[]", "motion"),
-    "two things at once": ("{distance_m: 5}", "{distance_m: 5, to: [1, 2]}", "exactly one"),
     "unknown noise": ("white:", "pink:", "pink"),
-    "noise below zero": ("position_m: 0.1", "position_m: -0.1", "position_m"),
-    "a planner with a yaw rate": (
-        "count: 2",
-        "count: 2\n  formation: {planner: adaptive, yaw_rate_deg_per_s: 4}",
-        "are the ring's",
-    ),
     "unknown planner": ("count: 2", "count: 2\n  formation: {planner: magic}", "magic"),
     "a wood too dense": ("walls:", "wood: {count: 2000, radius_m: 3}\n  walls:", "wood"),
-    "a sun below the horizon": ("walls:", "sun: [1, 0, -1]\n  walls:", "sun"),
-    "an odd picture": ("width: 320", "width: 321", "width"),
     "more offsets than drones": ("[0, 0.12]", "[0, 0.12, 0.3]", "clock_offsets_s"),
-    "one actor and several": (
-        "drones:",
-        "actors: {b: {motion: [stand: {seconds: 1}]}}\ndrones:",
-        "exactly one",
-    ),
-    "nobody": ("actor: {motion: [walk: {distance_m: 5}]}\n", "", "exactly one of actor, actors"),
-    "no actors": ("actor: {motion: [walk: {distance_m: 5}]}", "actors: {}", "actors: needs at least one"),
-    "an actor who cannot be a topic": (
-        "actor: {",
-        "actors: {the actor: {motion: [stand: {seconds: 1}]}}\nold: {",
-        "'the actor'",
-    ),
-    "an actor without a motion": (
-        "actor: {motion: [walk: {distance_m: 5}]}",
-        "actors: {b: {}}",
-        "actors.b.motion",
-    ),
-    "an actor's BVH that is not there": (
-        "actor: {motion: [walk: {distance_m: 5}]}",
-        "actors: {a: {motion: [stand: {seconds: 1}]}, b: {motion: {bvh: jig.bvh}}}",
-        "jig.bvh",
-    ),
+    "nobody": ("actor: {motion: [walk: {distance_m: 5}]}\n", "", "actors"),
     "newer schema": ("schema: 1", "schema: 3", "schema"),
     "an exposure longer than a picture": ("rate_hz: 30", "rate_hz: 30, exposure_ms: 34", "exposure_ms"),
-    "a readout longer than a picture": ("rate_hz: 30", "rate_hz: 60, readout_ms: 17", "readout_ms"),
-    "distortion of no model": ("rate_hz: 30", "rate_hz: 30, distortion: [0.1]", "1 coefficients"),
-    "a lens that does not reach the corners": (
+    "a lens that misses the corners": (
         "rate_hz: 30",
         "rate_hz: 30, distortion: [-0.4, 0, 0, 0]",
-        "no ray reaches the corners",
+        "distortion",
     ),
-    "a flight shorter than a picture": ("duration_s: 2", "duration_s: 0.001", "no picture"),
+    "a flight shorter than a picture": ("duration_s: 2", "duration_s: 0.001", "duration_s"),
     "before the epoch": ("duration_s: 2", "duration_s: 2\nstart: 0", "start"),
-    "after what ROS can say": ("duration_s: 2", "duration_s: 2\nstart: 2147483647", "start"),
-    "no rest between repetitions": ("[walk: {distance_m: 5}]", "[stand: {seconds: 1.0e-9}]", "seconds"),
-    "a BVH that no system can name": ("[walk: {distance_m: 5}]", '{bvh: "a\\0b"}', "bvh"),
     "a BVH that is not there": ("[walk: {distance_m: 5}]", "{bvh: dance.bvh}", "dance.bvh"),
 }
 
@@ -520,19 +358,11 @@ def test_hostile_scenarios_get_one_line(tmp_path: Path, case: str) -> None:
     old, new, said = HOSTILE[case]
     assert old in SMALL
     path = scenario(tmp_path, SMALL.replace(old, new))
-    assert said in refused("simulate", path, "-o", tmp_path / "flight", "--no-video")
+    with pytest.raises(DataError) as refusal:
+        simulate(path, tmp_path / "flight", video=False)
+    assert said in str(refusal.value)
+    assert "\n" not in str(refusal.value)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scenario.yaml"]
-
-
-def test_a_map_that_octomap_cannot_hold_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    world = "world: {ground: {size_m: 30, centre: [0, -9999]}, map: {resolution_m: 0.25}}\ndrones:"
-    path = scenario(tmp_path, EXACT.replace("drones:", world))
-    assert "32,768 voxels" in refused("simulate", path, "-o", tmp_path / "flight", "--no-video")
-
-
-def test_no_yaml_and_no_file(tmp_path: Path) -> None:
-    assert "nothing.yaml" in refused("simulate", tmp_path / "nothing.yaml", "-o", tmp_path / "flight")
-    assert "scenario.yaml" in refused("simulate", scenario(tmp_path, "a: [1"), "-o", tmp_path / "flight")
 
 
 ROLLING = EXACT.replace(
@@ -540,38 +370,6 @@ ROLLING = EXACT.replace(
     "formation: {radius_m: 5, yaw_rate_deg_per_s: 20}\n"
     "  camera: {readout_ms: 30, distortion: [-0.132, 0.111, 0, 0, -0.016]}",
 )
-
-
-def test_modelled_keypoints_are_those_of_their_rows_times_and_of_the_lens(tmp_path: Path) -> None:
-    """Each pixel is the projection of the joint when its row is read: by OpenCV, at the time of its row.
-
-    The actor is where the body's motion has it then, the camera where its path has it.
-    """
-    flight = fly_scenario(read_scenario(scenario(tmp_path, ROLLING)), [])
-    drone, person = flight.drones[1], flight.people[0]
-    pixels, visible = visible_joints(flight, drone, person)
-    assert visible.mean() > 0.9
-    lens, moved = drone.intrinsics, 0.0
-    matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
-    for frame, joint in [(3, 0), (40, 9), (70, 15), (100, 16), (110, 5)]:
-        found = pixels[frame, joint]
-        late_s = (found[1] / (lens.height - 1) - 0.5) * 0.03
-        for delay_s in (late_s, 0.0):
-            t_ns = drone.at_frames.t_ns[[frame]] + round(1e9 * delay_s)
-            pose = drone.at(t_ns)
-            point = person.person.keypoints(person.moving(t_ns / 1e9))[0, joint]
-            turn = Rotation.from_quat(pose.camera_quaternion_xyzw[0]).inv()
-            expected, _ = cv2.projectPoints(
-                turn.apply(point - pose.camera_position[0])[None],
-                np.zeros(3),
-                np.zeros(3),
-                matrix,
-                np.array(lens.distortion),
-            )
-            if delay_s == late_s:
-                np.testing.assert_allclose(found, expected[0, 0], atol=0.02)
-        moved = max(moved, float(np.abs(found - expected[0, 0]).max()))
-    assert moved > 0.5  # px, as far as a global shutter would be off: 25 tolerances
 
 
 def test_what_the_camera_does_is_stated_where_it_is_read(tmp_path: Path) -> None:
@@ -603,47 +401,3 @@ def test_what_the_camera_does_is_stated_where_it_is_read(tmp_path: Path) -> None
     ]
     differ = {name for name in flights[0] if flights[0][name] != flights[1][name]}
     assert differ == {"scenario.yaml", "simulation.json"}
-
-
-@pytest.mark.slow
-def test_film_keeps_to_its_bit_rate(tmp_path: Path) -> None:
-    """A mean over 2 s within a fifth of what was asked for, where constant quality gives another rate."""
-    for name, mbps in (("a", 0.4), ("b", 0.8)):
-        (tmp_path / name).mkdir()
-        text = SMALL.replace("rate_hz: 30, dropped_share: 0.1", f"rate_hz: 30, bitrate_mbps: {mbps}")
-        flight = simulated(tmp_path / name, text.replace("count: 2", "count: 1").replace("[0, 0.12]", "[]"))
-        bits = 8 * (flight.parent / "drone1.mp4").stat().st_size
-        assert bits / 2 == pytest.approx(1e6 * mbps, rel=0.2)
-
-
-@pytest.mark.parametrize("method", ["robust", "dlt", "midpoint", "refined"])
-def test_each_joint_counts_at_the_time_of_its_row(method: str, rolling: Path, tmp_path: Path) -> None:
-    """Exact keypoints of a rolling shutter, true poses: a readout that is stated costs next to nothing.
-
-    Limbs swing at up to 8 m/s: in the 7 ms that rows of a joint are mostly off, by centimetres. What is left
-    with the readout is acceleration: 100 m/s^2 x (7 ms)^2 / 2 = 2 mm at worst, and far less in the mean.
-    """
-    errors = {}
-    for name, readout in (("stated", "readout_s: 0.03"), ("unstated", "readout_s: 0")):
-        manifest = rolling.with_name(f"{name.replace(' ', '_')}.yaml")
-        manifest.write_text(rolling.read_text().replace("readout_s: 0.03", readout))
-        session = tmp_path / f"{name}.session"
-        succeeds("ingest", manifest, "-o", session)
-        metrics = json.loads(succeeds("reconstruct", session, "--json", "--method", method))
-        errors[name] = metrics["mpjpe_mm"]
-        assert metrics["reconstructed_share"] > 0.99
-        assert ("readout" in metrics) == (name == "stated")
-    counted = json.loads((tmp_path / "stated.session/reconstruct/metrics.json").read_text())["readout"]
-    assert counted["drone1"]["readout_s"] == pytest.approx(0.03)
-    assert counted["drone1"]["keypoints"] > 1900
-    assert counted["drone1"]["without_motion"] == 0
-    assert errors["stated"] < 0.4 * errors["unstated"]
-
-
-@pytest.fixture(scope="module")
-def rolling(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The manifest with true poses of a flight with a rolling shutter; others may be written beside it."""
-    text = ROLLING.replace("radius_m: 5", "radius_m: 4.5, tilt_deg: 20").replace(
-        "distortion", "hfov_deg: 70, distortion"
-    )
-    return simulated(tmp_path_factory.mktemp("rolling"), text, "--no-video").with_name("true_poses.yaml")

@@ -16,7 +16,6 @@ from mocap_cli.study import study_command
 from pipelines import study as stage
 from pipelines.geometry.noise import White
 from pipelines.keypoints.tracking import TrackedPerson
-from pipelines.planning.comparison import capped_mm
 from pipelines.replan import fly_and_measure
 from pipelines.session.errors import DataError
 from pipelines.session.people import get_skeleton
@@ -373,9 +372,3 @@ def test_wrong_values_over_a_session_are_refused(calm: Path, tmp_path: Path) -> 
         with pytest.raises(DataError):
             study(words, calm, tmp_path / "out")
     assert not list(tmp_path.iterdir())
-
-
-def test_the_capped_error_counts_what_is_missing() -> None:
-    error = np.array([[[0.05, 0.4]], [[np.nan, 0.15]]], dtype=np.float32)
-    assert capped_mm(error, 2) == pytest.approx([100.0, 150.0], rel=1e-6)
-    assert capped_mm(error, 4) == pytest.approx([125.0, 150.0], rel=1e-6)

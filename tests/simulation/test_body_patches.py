@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
-from pipelines.simulation.body_outfits import Patch, cut, normals, pick, together, triangles
+from pipelines.simulation.body_outfits import Patch, cut, together, triangles
 
 
 def sheet(n: int = 6) -> Patch:
@@ -41,25 +41,3 @@ def test_both_sides_of_a_cut_make_the_whole(offset: float, angle: float) -> None
     sides = [cut(whole, side * along) for side in (1.0, -1.0)]
     parts = together(sides, ("place",))
     np.testing.assert_allclose(area_upward(parts).sum(), 1.0, atol=1e-12)
-
-
-def test_a_cut_makes_each_vertex_once_and_leaves_none_unused() -> None:
-    whole = sheet()
-    kept = cut(whole, 0.37 - whole.values["place"][:, 0])
-    place = kept.values["place"]
-    assert len(np.unique(place, axis=0)) == len(place)
-    np.testing.assert_array_equal(np.unique(kept.faces), np.arange(len(place)))
-
-
-def test_nothing_to_cut_is_the_same_and_nothing_to_keep_is_empty() -> None:
-    whole = sheet()
-    count = len(whole.values["place"])
-    np.testing.assert_array_equal(cut(whole, np.ones(count)).faces, whole.faces)
-    assert len(cut(whole, -np.ones(count)).faces) == 0
-    assert len(pick(whole, np.zeros(len(whole.faces), dtype=np.bool_)).values["place"]) == 0
-
-
-def test_normals_point_to_where_the_corners_run_counterclockwise() -> None:
-    whole = sheet()
-    up = np.tile([0.0, 0.0, 1.0], (len(whole.values["place"]), 1))
-    np.testing.assert_allclose(normals(whole.values["place"], whole.faces), up, atol=1e-12)

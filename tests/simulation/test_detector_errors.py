@@ -12,7 +12,6 @@ import pytest
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.people import mirrored
-from pipelines.session.registries import find_detector
 from pipelines.simulation.detector_errors import (
     COLUMNS,
     HIDDEN_CONFIDENCE,
@@ -80,14 +79,6 @@ def write(path: Path, *rows: str) -> Path:
 
 
 @pytest.mark.parametrize("detector", MODELLED)
-def test_the_tables_that_come_along_say_where_they_are_from(detector: str) -> None:
-    lines = errors_of(detector).read_text(encoding="utf-8").splitlines()
-    assert "# Made by: python tools/detector_errors.py --write" in lines
-    assert f"# The detector: {find_detector(detector).title}" in lines
-    assert {"*", *COCO17} == set(read_errors(errors_of(detector)).rows)
-
-
-@pytest.mark.parametrize("detector", MODELLED)
 def test_a_joint_is_found_worse_the_steeper_the_camera_looks(detector: str) -> None:
     """As in the seed: alike up to 30 degrees, worse above; of all joints together."""
     error, missed, confidence = read_errors(errors_of(detector)).at(
@@ -97,33 +88,6 @@ def test_a_joint_is_found_worse_the_steeper_the_camera_looks(detector: str) -> N
     assert (np.diff(missed[1:, 0]) > 0).all()
     assert (np.diff(confidence[1:, 0]) < 0).all()
     assert error[1, 0] == pytest.approx(error[0, 0], rel=0.1)
-
-
-def test_between_tilts_it_goes_straight_and_beyond_them_it_holds() -> None:
-    error, missed, confidence = EXAMPLE.at(np.array([-20.0, 15.0, 22.5, 60.0, 90.0]), ("nose",))
-    assert error[:, 0] == pytest.approx([0.0206, 0.0192, (0.0192 + 0.0239) / 2, 0.0407, 0.0407])
-    assert missed[:, 0] == pytest.approx([0.036, 0.028, 0.05, 0.14, 0.14])
-    assert confidence[:, 0] == pytest.approx([0.89, 0.89, 0.88, 0.74, 0.74])
-
-
-def test_a_table_may_have_rows_of_its_own_for_a_joint(tmp_path: Path) -> None:
-    table = read_errors(
-        write(tmp_path / "t.csv", "30,nose,0.01,0,0.9", "0,nose,0.03,0.5,0.7", "0,*,0.02,0.1,0.8")
-    )
-    error, missed, _ = table.at(np.array([15.0]), ("left_hip", "nose"))
-    assert error[0] == pytest.approx([0.02, 0.02])
-    assert missed[0] == pytest.approx([0.1, 0.25])
-    # 6,000 errors of one joint count as 1,060: 1 / (2 ln 2 sqrt(1,060)) = 2 % of the median.
-    xy, _ = detect(CLEAN, tilt_deg=30.0, table=table)
-    away = np.median(lengths(xy), axis=0) / HEIGHT_PX
-    assert away[COCO17.index("nose")] == pytest.approx(0.01, rel=0.08)
-    assert away[COCO17.index("left_hip")] == pytest.approx(0.02, rel=0.08)
-
-
-def test_a_joint_without_measurement_is_named(tmp_path: Path) -> None:
-    table = read_errors(write(tmp_path / "t.csv", "0,nose,0.03,0.5,0.7"))
-    with pytest.raises(ValueError, match="left_eye, right_eye"):
-        table.at(np.zeros(1), COCO17[:3])
 
 
 @pytest.mark.parametrize(
@@ -143,16 +107,6 @@ def test_a_bad_table_is_refused(tmp_path: Path, row: str, complaint: str) -> Non
         read_errors(write(tmp_path / "t.csv", row))
 
 
-def test_a_table_that_is_not_there_or_another_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError) as error:
-        read_errors(tmp_path / "none.csv")
-    assert error.value.source == tmp_path / "none.csv"
-    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(DataError, match="tilt_deg") as error:
-        read_errors(tmp_path / "other.csv")
-    assert error.value.source == tmp_path / "other.csv"
-
-
 # --- the view ------------------------------------------------------------------------------------------
 
 
@@ -166,16 +120,6 @@ def test_tilt_and_apparent_height() -> None:
 
 
 # --- errors --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("detector", MODELLED)
-def test_errors_are_those_of_the_detector_that_is_named(detector: str) -> None:
-    """A table of its own for each, with the tolerance of the test below."""
-    xy, _ = detect(CLEAN.model_copy(update={"detector": detector}), tilt_deg=45.0, table=None)
-    share, _, _ = read_errors(errors_of(detector)).at(np.array([45.0]), COCO17)
-    for joint in ("nose", "left_knee", "right_wrist"):
-        column = COCO17.index(joint)
-        assert np.median(lengths(xy)[:, column]) == pytest.approx(share[0, column] * HEIGHT_PX, rel=0.08)
 
 
 @pytest.mark.parametrize(("tilt_deg", "median_share"), [(15.0, 0.0192), (60.0, 0.0407), (52.5, 0.03545)])
@@ -208,14 +152,6 @@ def test_a_detector_without_errors_is_exact() -> None:
     assert (lengths(xy)[found] == 0).all()
     assert (confidence[found] > 0).all()
     assert 0.08 < 1 - found.mean() < 0.12
-
-
-def test_without_shares_nothing_is_missed_or_confused() -> None:
-    """The longest of 102,000 errors stays below sigma sqrt(2 ln(102,000 * 10^4)) with 0.9999."""
-    length = lengths(detect(CLEAN, tilt_deg=60.0)[0])
-    sigma_px = 0.0407 * HEIGHT_PX / math.sqrt(2 * math.log(2))
-    assert np.isfinite(length).all()
-    assert length.max() < sigma_px * math.sqrt(2 * math.log(length.size * 1e4))
 
 
 @pytest.mark.parametrize(("tilt_deg", "growth"), [(15.0, 1.0), (60.0, 0.140 / 0.028)])
@@ -265,22 +201,13 @@ def test_a_swap_exchanges_one_pair_of_limbs_for_a_few_frames() -> None:
     assert np.mean(np.array(runs) > SWAP_FRAMES[1]) < 0.1
 
 
-@pytest.mark.parametrize("share", [0.05, 0.5])
+@pytest.mark.parametrize("share", [0.1])
 def test_as_many_frames_are_swapped_as_asked_for(share: float) -> None:
     """Runs of 4 frames: 60,000 frames have 60,000 share / 4 of them, whose count scatters by its root."""
     swaps = CLEAN.model_copy(update={"swap_share": share})
-    frames = 60_000
+    frames = 20_000
     swapped = (detect(swaps, frames=frames)[0] != detect(CLEAN, frames=frames)[0]).any(axis=(1, 2))
     assert swapped.mean() == pytest.approx(share, rel=4 / math.sqrt(frames * share / 4))
-
-
-def test_a_skeleton_without_limbs_has_nothing_to_swap() -> None:
-    errors = DetectorErrors(swap_share=0.9, missed_share=0, outlier_share=0)
-    arguments = np.zeros((50, 2, 2)), np.ones((50, 2), dtype=np.bool_), np.zeros(50), np.ones(50)
-    names = ("nose", "left_wrist")
-    xy, _ = detect_keypoints(*arguments, errors, np.random.default_rng(0), joints=names)
-    without = errors.model_copy(update={"swap_share": 0.0})
-    assert (xy == detect_keypoints(*arguments, without, np.random.default_rng(0), joints=names)[0]).all()
 
 
 # --- confidence ----------------------------------------------------------------------------------------
@@ -298,18 +225,6 @@ def test_confidence_has_the_measured_mean_and_falls_with_the_error(tilt_deg: flo
     assert tenths[0] - tenths[-1] > 0.9 * 0.14 - 0.01  # from the middle of the first to that of the last
 
 
-@pytest.mark.parametrize("tilt_deg", [15.0, 30.0, 45.0, 60.0])
-def test_confidence_tells_bad_joints_as_well_as_the_measured_one(tilt_deg: float) -> None:
-    """The measured area under the ROC curve, for errors above 5 % of the height, is 0.88 over all tilts."""
-    xy, confidence = detect(WITHOUT_SWAPS, tilt_deg=tilt_deg)
-    found = np.isfinite(xy).all(axis=-1)
-    bad = lengths(xy)[found] > 0.05 * HEIGHT_PX
-    rank = np.argsort(np.argsort(-confidence[found], kind="stable"), kind="stable") + 1.0
-    pairs = float(bad.sum()) * float((~bad).sum())
-    area = (rank[bad].sum() - bad.sum() * (bad.sum() + 1) / 2) / pairs
-    assert area == pytest.approx(0.88, abs=0.05)
-
-
 @pytest.mark.parametrize(
     ("tilt_deg", "pck"), [(0.0, 0.96), (15.0, 0.97), (30.0, 0.91), (45.0, 0.81), (60.0, 0.61)]
 )
@@ -321,15 +236,6 @@ def test_the_measured_share_of_correct_keypoints_comes_out(tilt_deg: float, pck:
     """
     xy, _ = detect(WITHOUT_SWAPS, tilt_deg=tilt_deg)
     assert (lengths(xy) < 0.0576 * HEIGHT_PX).mean() == pytest.approx(pck, abs=0.04)
-
-
-def test_confidence_tells_most_outliers_but_not_all() -> None:
-    errors = DetectorErrors(missed_share=0.0, outlier_share=0.05, swap_share=0.0)
-    xy, confidence = detect(errors)
-    outlier = lengths(xy) > OUTLIER_SHARES[0] * HEIGHT_PX * 0.999
-    good, bad = confidence[~outlier], confidence[outlier]
-    assert good.mean() - bad.mean() > 0.2
-    assert 0.03 < (bad > np.quantile(good, 0.1)).mean() < 0.5
 
 
 # --- edges ---------------------------------------------------------------------------------------------
@@ -344,31 +250,3 @@ def test_what_is_not_in_the_picture_is_never_found() -> None:
     assert np.isnan(xy).all()
     assert (confidence == 0).all()
     assert np.isnan(pixels).all()
-
-
-def test_what_is_seen_does_not_depend_on_what_is_not() -> None:
-    errors = WITHOUT_SWAPS
-    pixels = np.tile(PLACES, (40, 1, 1))
-    rest = np.full(40, 15.0), np.full(40, HEIGHT_PX), errors
-    everything = detect_keypoints(
-        pixels, np.ones((40, 17), dtype=np.bool_), *rest, np.random.default_rng(0), joints=COCO17
-    )
-    pixels[:, 5:] = np.nan
-    visible = np.ones((40, 17), dtype=np.bool_)
-    visible[:, 9:] = False
-    some = detect_keypoints(pixels, visible, *rest, np.random.default_rng(0), joints=COCO17)
-    assert np.array_equal(everything[0][:, :5], some[0][:, :5], equal_nan=True)
-    assert (everything[1][:, :5] == some[1][:, :5]).all()
-
-
-def test_no_frames_give_no_keypoints() -> None:
-    xy, confidence = detect(USUAL, frames=0)
-    assert xy.shape == (0, 17, 2)
-    assert confidence.shape == (0, 17)
-
-
-def test_the_same_seed_gives_the_same_keypoints() -> None:
-    first, second, other = (detect(USUAL, seed=seed, frames=50) for seed in (4, 4, 5))
-    assert first[0].tobytes() == second[0].tobytes()
-    assert first[1].tobytes() == second[1].tobytes()
-    assert not np.array_equal(first[0], other[0], equal_nan=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.geometry.poses import look_at, matrix_from_quaternion
+from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flying import orbit
 from tests.synthetic.flights import LENS
@@ -28,15 +28,6 @@ def test_slots_of_the_formation(cameras: int, apart_deg: float | None) -> None:
         assert np.degrees(yaw[1] - yaw[0]) % 360 == pytest.approx(apart_deg)
 
 
-def test_variation_changes_the_formation_within_its_bounds() -> None:
-    position, _ = orbit(T_S, TARGET, cameras=3, variation=1.0)
-    distance = np.linalg.norm(position - TARGET, axis=-1)
-    tilt = np.degrees(np.arcsin((position - TARGET)[..., 2] / distance))
-    assert 1.0 < np.ptp(distance) <= 2.0
-    assert 3.0 < np.ptp(tilt) <= 6.0
-    assert np.ptp(distance[0] - distance[1]) > 0.5  # not all by the same amount
-
-
 def test_cameras_look_at_the_target_and_stand_upright() -> None:
     position, quaternion = orbit(T_S, TARGET, cameras=3, variation=1.0)
     right, down, forward = np.moveaxis(matrix_from_quaternion(quaternion), -1, 0)
@@ -45,11 +36,6 @@ def test_cameras_look_at_the_target_and_stand_upright() -> None:
     assert right[..., 2] == pytest.approx(0.0, abs=1e-12)
     assert (down[..., 2] < 0).all()
     assert np.linalg.norm(quaternion, axis=-1) == pytest.approx(1.0)
-
-
-def test_looking_east_has_south_on_the_right() -> None:
-    axes = matrix_from_quaternion(look_at(np.zeros(3), np.array([5.0, 0.0, 0.0])))
-    assert axes == pytest.approx(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), abs=1e-15)
 
 
 def test_the_actor_is_near_the_middle_of_every_picture() -> None:

@@ -13,8 +13,6 @@ from pipelines.simulation.flying import (
     ATTITUDE_LAG_S,
     GIMBAL_LAG_S,
     GIMBAL_RATE_RADPS,
-    HEADING_LAG_S,
-    LEVER_ARM,
     POSITION_GAIN_PER_S,
     STEP_S,
     VELOCITY_GAIN_PER_S,
@@ -23,7 +21,6 @@ from pipelines.simulation.flying import (
     fly,
     fly_with,
     moments,
-    orbit,
     ring_slots,
 )
 from pipelines.simulation.scenario import Formation, Limits
@@ -54,28 +51,6 @@ def angle_deg(one: Float, other: Float) -> Float:
 # --- slots and moments ---------------------------------------------------------------------------------
 
 
-def test_moments_cover_their_span() -> None:
-    assert moments(-1.0, 0.02)[[0, 99, -1]] == pytest.approx([-1.0, -0.01, 0.02])
-    assert len(moments(-1.0, 0.02)) == 103
-    assert moments(0.0, 0.001) == pytest.approx([0.0, 0.01])
-    assert moments(3.0, 3.0) == pytest.approx([3.0])
-
-
-def test_slots_are_those_of_the_orbit() -> None:
-    formation = Formation(radius_m=7.0, tilt_deg=30.0, yaw_deg=20.0, yaw_rate_deg_per_s=5.0, variation=0.5)
-    expected, _ = orbit(
-        T_S,
-        MIDDLE,
-        cameras=4,
-        range_m=7.0,
-        tilt_deg=30.0,
-        yaw_deg=20.0,
-        yaw_rate_deg_per_s=5.0,
-        variation=0.5,
-    )
-    assert (ring_slots(formation, 4, MIDDLE, T_S) == expected).all()
-
-
 # --- tracking ------------------------------------------------------------------------------------------
 
 
@@ -94,22 +69,6 @@ def test_behind_a_circling_slot_a_drone_lags_as_its_loops_say() -> None:
     # The rule of thumb of the docstring: the slot's acceleration over both gains.
     rule_m = RADIUS_M * TURN_RADPS**2 / (POSITION_GAIN_PER_S * VELOCITY_GAIN_PER_S)
     assert expected_m == pytest.approx(rule_m, rel=0.1)
-
-
-def test_behind_a_slot_that_moves_evenly_there_is_no_error() -> None:
-    slots = (np.array([3.0, -4.0, 0.5]) * T_S[:, None])[None]
-    paths = fly(slots, MIDDLE, T_S, Limits())
-    assert paths.position == pytest.approx(slots, abs=1e-9)
-    assert norm(paths.velocity) == pytest.approx(math.sqrt(25.25))
-
-
-def test_where_a_slot_stands_a_drone_hovers_level() -> None:
-    slots = np.tile([[[4.0, 3.0, 6.0]]], (1, len(T_S), 1))
-    paths = fly(slots, MIDDLE, T_S, Limits())
-    assert paths.position == pytest.approx(slots, abs=1e-12)
-    assert paths.velocity == pytest.approx(0.0, abs=1e-12)
-    up = matrix_from_quaternion(paths.body_xyzw)[..., 2]
-    assert up == pytest.approx(np.broadcast_to([0.0, 0.0, 1.0], up.shape), abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -131,55 +90,7 @@ def test_limits_are_never_exceeded(seed: int) -> None:
     assert norm(moved).max() <= limits.speed_mps * np.diff(T_S).max() * (1 + 1e-9)
 
 
-def test_a_far_slot_is_reached_without_shooting_past() -> None:
-    """Half the acceleration limit brakes; what the attitude's lag adds is at most v lag (here 8 * 0.15)."""
-    slots = np.zeros((1, len(T_S), 3))
-    slots[:, 1:] = [60.0, 0.0, 0.0]
-    x = fly(slots, MIDDLE, T_S, Limits()).position[0, :, 0]
-    assert x.max() < 60.0 + 8.0 * ATTITUDE_LAG_S / 10
-    assert x[-1] == pytest.approx(60.0, abs=0.01)
-    # 60 m at 8 m/s, 4 m/s^2 to speed up, 2 m/s^2 to brake: 7.5 + 1 + 2 s, and a second to settle.
-    assert T_S[np.argmax(x > 59.5)] < 11.5
-
-
-def test_moments_may_be_coarse_and_uneven() -> None:
-    """Between moments at most 0.1 s apart slots go straight, off by a dt^2 / 8 = 1.5 mm, and so do their
-    velocities, off by a turn dt^2 / 8 = 0.5 mm/s; the integration itself is as fine as ever.
-    """
-    kept = np.random.default_rng(0).random(len(T_S)) < 0.1
-    kept[::10] = True
-    t_s = T_S[kept]
-    coarse = fly(ring_slots(RING, 3, MIDDLE[kept], t_s), MIDDLE[kept], t_s, Limits())
-    difference = coarse.position[:, SETTLED[kept]] - circling().position[:, SETTLED & kept]
-    assert norm(difference).max() < 0.002
-
-
 # --- a planner on the way ------------------------------------------------------------------------------
-
-
-def swaying(t_s: Float | float) -> tuple[Float, Float]:
-    """Return place and velocity [..., 3] of a slot that swings 2 m along east with 0.2 rad/s, from rest."""
-    t = np.asarray(t_s)[..., None]
-    east = np.array([1.0, 0.0, 0.0])
-    return [5.0, 5.0, 5.0] + 2 * (1 - np.cos(0.2 * t)) * east, 0.4 * np.sin(0.2 * t) * east
-
-
-def test_a_planner_that_knows_the_slots_flies_as_if_they_were_given() -> None:
-    """Between calls a slot's velocity is held: wrong by a / rate, which the loops make a / rate / kp of."""
-    rate_hz, acceleration = 25.0, 2 * 0.2**2
-    given = fly(swaying(T_S)[0][None], MIDDLE, T_S, Limits())
-    planned = fly_with(
-        lambda known: (swaying(known.t_s)[0][None], swaying(known.t_s)[1][None]),
-        given.position[:, 0],
-        MIDDLE,
-        T_S,
-        Limits(),
-        actor_t_s=np.empty(0),
-        actor=np.empty((0, 3)),
-        rate_hz=rate_hz,
-    )
-    difference = norm(planned.position - given.position)
-    assert 0 < difference.max() < acceleration / rate_hz / POSITION_GAIN_PER_S
 
 
 def test_a_planner_knows_the_past_alone() -> None:
@@ -207,21 +118,6 @@ def test_a_planner_knows_the_past_alone() -> None:
     assert paths.velocity[:, -1, 0] == pytest.approx([POSITION_GAIN_PER_S] * 2, rel=0.1)
 
 
-@pytest.mark.parametrize("slots", [np.zeros((2, 3)), np.full((1, 3), np.nan)])
-def test_a_planner_must_give_a_slot_for_each(slots: Float) -> None:
-    with pytest.raises(ValueError, match=r"slots .*\b0 s\b"):
-        fly_with(
-            lambda _: (slots, np.zeros_like(slots)),
-            np.zeros((1, 3)),
-            MIDDLE,
-            T_S,
-            Limits(),
-            actor_t_s=np.empty(0),
-            actor=np.empty((0, 3)),
-            rate_hz=10,
-        )
-
-
 # --- attitudes -----------------------------------------------------------------------------------------
 
 
@@ -240,25 +136,6 @@ def test_bodies_lean_along_their_thrust() -> None:
     assert lean_deg == pytest.approx(expected_deg, rel=0.02)
 
 
-def test_the_nose_turns_to_the_actor() -> None:
-    """A heading that turns at a rate lags by rate times lag."""
-    paths = circling()
-    nose = matrix_from_quaternion(paths.body_xyzw)[..., 0]
-    away = MIDDLE - paths.position
-    off = np.arctan2(nose[..., 1], nose[..., 0]) - np.arctan2(away[..., 1], away[..., 0])
-    lag = np.angle(np.exp(1j * off))[:, SETTLED]
-    assert lag == pytest.approx(-TURN_RADPS * HEADING_LAG_S, rel=0.03)
-
-
-def test_even_a_drone_that_dives_stays_upright() -> None:
-    slots = np.zeros((1, len(T_S), 3))
-    slots[:, :10, 2] = 100.0
-    paths = fly(slots, MIDDLE, T_S, Limits(speed_mps=50, acceleration_mps2=50))
-    assert paths.velocity[0, :, 2].min() < -10
-    assert matrix_from_quaternion(paths.body_xyzw)[..., 2, 2].min() > 0
-    assert norm(paths.body_xyzw) == pytest.approx(1.0)
-
-
 def test_cameras_look_at_their_aim_and_stand_upright() -> None:
     """Seen from the camera the aim turns with the ring; the gimbal lags by that rate times its lag."""
     paths = circling()
@@ -273,15 +150,6 @@ def test_cameras_look_at_their_aim_and_stand_upright() -> None:
     assert (down[..., 2] < -0.9).all()
 
 
-def test_the_camera_sits_at_the_lever_arms_end() -> None:
-    paths = circling()
-    arm = paths.camera_position - paths.position
-    axes = matrix_from_quaternion(paths.body_xyzw)
-    assert (axes.swapaxes(-1, -2) @ arm[..., None])[..., 0] == pytest.approx(
-        np.broadcast_to(LEVER_ARM, arm.shape), abs=1e-12
-    )
-
-
 def test_a_gimbal_turns_no_faster_than_it_can() -> None:
     slots = np.tile([[[10.0, 0.0, 5.0]]], (1, len(T_S), 1))
     aim = np.where(T_S[:, None] < 5, [0.0, 0.0, 1.0], [20.0, 3.0, 1.0])  # jumps behind the drone
@@ -293,27 +161,6 @@ def test_a_gimbal_turns_no_faster_than_it_can() -> None:
 
 
 # --- edges ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("drones", [0, 2])
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_short_flights_and_empty_teams(drones: int, count: int) -> None:
-    slots = np.ones((drones, count, 3)) * [5.0, 0.0, 5.0]
-    given = fly(slots, MIDDLE[:count], T_S[:count], Limits())
-    planned = fly_with(
-        lambda known: (known.position, known.velocity),
-        np.ones((drones, 3)),
-        MIDDLE[:count],
-        T_S[:count],
-        Limits(),
-        actor_t_s=np.empty(0),
-        actor=np.empty((0, 3)),
-        rate_hz=10,
-    )
-    for paths in (given, planned):
-        assert paths.position.shape == paths.camera_position.shape == (drones, count, 3)
-        assert paths.body_xyzw.shape == paths.camera_xyzw.shape == (drones, count, 4)
-        assert np.isfinite(paths.camera_xyzw).all()
 
 
 def test_nonsense_is_refused() -> None:

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.mounting import body_from_camera, compose_gimbal
-from pipelines.geometry.noise import Bias, GaussMarkov, Latency, NoiseModel, White
+from pipelines.geometry.noise import NoiseModel, White
 from pipelines.geometry.poses import conjugate, mounted_covariance, multiply, rotation_vector_from_quaternion
 from pipelines.simulation.flying import LEVER_ARM, DronePaths, fly, moments, ring_slots
 from pipelines.simulation.recording import (
-    ACTOR_CORRELATION_S,
     DronePoses,
     estimate,
-    estimate_actor,
     frame_times,
     log_times,
     poses_at,
@@ -42,13 +40,6 @@ def generator(seed: int = 0) -> np.random.Generator:
 # --- stamps --------------------------------------------------------------------------------------------
 
 
-def test_synchronised_shutters_take_their_pictures_together() -> None:
-    lens = Lens(shutters="synchronised")
-    t_ns = frame_times(lens, 1.0, generator(3))
-    assert t_ns.tolist() == [round(k * 1e9 / 30) for k in range(30)]
-    assert frame_times(Lens(), 1.0, generator(3))[0] > 0
-
-
 def test_a_log_has_stamps_of_its_own() -> None:
     t_ns = log_times(50.0, (-0.5, 9.5), generator())
     assert t_ns.dtype == np.int64
@@ -61,12 +52,6 @@ def test_a_log_has_stamps_of_its_own() -> None:
     assert steps_ms.std() == pytest.approx(0.4 * math.sqrt(2), rel=0.12)
     assert (t_ns == log_times(50.0, (-0.5, 9.5), generator())).all()
     assert t_ns[0] != log_times(50.0, (-0.5, 9.5), generator(1))[0]
-
-
-def test_an_empty_span_has_no_stamps() -> None:
-    assert log_times(50.0, (3.0, 3.0), generator()).shape == (0,)
-    assert log_times(50.0, (3.0, 2.0), generator()).shape == (0,)
-    assert frame_times(Lens(), 0.0, generator()).shape == (0,)
 
 
 def test_frames_are_even_but_for_those_that_were_lost() -> None:
@@ -82,27 +67,7 @@ def test_frames_are_even_but_for_those_that_were_lost() -> None:
     assert 1 - len(t_ns) / len(whole) == pytest.approx(0.2, abs=0.016)
 
 
-def test_the_first_and_last_frame_are_never_lost() -> None:
-    lens = Lens(rate_hz=10, dropped_share=0.49)
-    for seed in range(20):
-        kept = frame_times(lens, 1.0, generator(seed))
-        whole = frame_times(lens.model_copy(update={"dropped_share": 0.0}), 1.0, generator(seed))
-        assert (kept[0], kept[-1]) == (whole[0], whole[-1])
-        assert len(whole) == 10
-
-
 # --- true poses ----------------------------------------------------------------------------------------
-
-
-def test_at_the_paths_own_moments_poses_are_those_of_the_path() -> None:
-    poses = poses_at(PATHS, 1, np.rint(PATHS.t_s * 1e9).astype(np.int64))
-    assert poses.position == pytest.approx(PATHS.position[1], abs=1e-9)
-    assert poses.camera_position == pytest.approx(PATHS.camera_position[1], abs=1e-9)
-    for one, other in (
-        (poses.quaternion_xyzw, PATHS.body_xyzw[1]),
-        (poses.camera_quaternion_xyzw, PATHS.camera_xyzw[1]),
-    ):
-        assert np.abs(np.sum(one * other, axis=1)) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_between_moments_poses_go_on_smoothly() -> None:
@@ -126,13 +91,6 @@ def test_between_moments_poses_go_on_smoothly() -> None:
     ):
         turned = rotation_vector_from_quaternion(multiply(conjugate(one), other))
         assert np.linalg.norm(turned, axis=1).max() < 1 * 0.05**2 / 8
-
-
-def test_before_and_after_the_flight_there_are_no_poses() -> None:
-    for moment in (-1_010_000_000, 10_010_000_000):
-        with pytest.raises(ValueError, match=r"before|after"):
-            poses_at(PATHS, 0, np.array([0, moment]))
-    assert poses_at(PATHS, 0, np.empty(0, dtype=np.int64)).camera_position.shape == (0, 3)
 
 
 # --- estimated poses -----------------------------------------------------------------------------------
@@ -201,65 +159,4 @@ def test_covariances_of_the_body_are_those_of_its_errors() -> None:
     assert np.abs(carried - log.camera.covariance).max() < 1e-15
 
 
-def test_stated_sigmas_are_the_sum_of_all_models() -> None:
-    """A latency's grows with the speed, a bias holds throughout; variances add up."""
-    truth = sample_log(PATHS, 1, 50.0, (0.0, 9.0), generator())
-    log = estimate(truth, [Bias(position_m=0.3), Latency(latency_ms=50.0)], generator(4))
-    step_s = (truth.t_ns[2:] - truth.t_ns[:-2]) / 1e9
-    speed = np.linalg.norm(truth.camera_position[2:] - truth.camera_position[:-2], axis=1) / step_s
-    assert log.camera.covariance is not None
-    # Speeds from two steps or from each differ by the curve within: a percent.
-    assert log.camera.covariance[1:-1, 2, 2] == pytest.approx(0.3**2 + (0.05 * speed) ** 2, rel=0.01)
-
-
-def test_a_log_that_does_not_err_states_no_covariance() -> None:
-    log = estimate(sample_log(PATHS, 0, 50.0, (0.0, 1.0), generator()), [White()], generator())
-    assert log.body.covariance is None
-    assert log.camera.covariance is None
-
-
-def test_an_empty_log_stays_empty() -> None:
-    log = estimate(sample_log(PATHS, 0, 50.0, (1.0, 1.0), generator()), [White(position_m=1.0)], generator())
-    assert log.body.position.shape == log.camera.position.shape == (0, 3)
-    assert log.gimbal_xyzw.shape == (0, 4)
-
-
-def test_the_same_seed_gives_the_same_log() -> None:
-    models = [GaussMarkov(position_m=0.1, rotation_deg=0.5, correlation_s=5.0), White(position_m=0.01)]
-    logs = [
-        estimate(sample_log(flight(), 0, 50.0, (0.0, 9.0), generator(5)), models, generator(6)) for _ in "ab"
-    ]
-    assert logs[0].body.t_ns.tobytes() == logs[1].body.t_ns.tobytes()
-    assert logs[0].body.position.tobytes() == logs[1].body.position.tobytes()
-    assert logs[0].gimbal_xyzw.tobytes() == logs[1].gimbal_xyzw.tobytes()
-
-
 # --- the actor -----------------------------------------------------------------------------------------
-
-
-def test_the_actors_estimate_errs_as_stated() -> None:
-    """10,000 s at 10 Hz: errors correlated over 0.5 s count as 10,000 independent ones per axis
-    (2 * 0.5 s apart, for the mean), so their sigma is known to 1 / sqrt(2 * 30,000) = 0.4 %.
-    """
-    t_s = np.linspace(0.0, 10_000.0, 11)
-    hip = np.stack([t_s, -t_s, 1.0 + 0 * t_s], axis=1)
-    t_ns, position = estimate_actor(
-        t_s, hip, sigma_m=0.2, rate_hz=10.0, span_s=(0.0, 10_000.0), rng=generator()
-    )
-    truth = np.stack([t_ns / 1e9, -t_ns / 1e9, np.ones(len(t_ns))], axis=1)
-    error = position - truth
-    assert error.std() == pytest.approx(0.2, rel=0.016)
-    correlation = (error[1:] * error[:-1]).mean() / error.var()
-    assert correlation == pytest.approx(math.exp(-0.1 / ACTOR_CORRELATION_S), abs=0.01)
-
-
-def test_the_actor_is_estimated_only_where_known() -> None:
-    t_s = np.arange(0.0, 5.0, 0.1)
-    hip = np.zeros((len(t_s), 3))
-    t_ns, position = estimate_actor(t_s, hip, sigma_m=0.0, rate_hz=10.0, span_s=(0.0, 4.0), rng=generator())
-    assert (position == 0).all()
-    assert len(t_ns) in {39, 40}
-    with pytest.raises(ValueError, match="throughout"):
-        estimate_actor(t_s, hip, sigma_m=0.0, rate_hz=10.0, span_s=(0.0, 6.0), rng=generator())
-    empty = estimate_actor(t_s, hip, sigma_m=0.2, rate_hz=10.0, span_s=(0.0, 0.0), rng=generator())
-    assert empty[1].shape == (0, 3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -73,16 +72,6 @@ def test_the_scenario_makes_the_truth_that_stands_in_the_repository(again: Path)
         np.testing.assert_allclose(mine.position, other.position, rtol=0, atol=SAME_PATH_M)
     mapped, stored = (OCTOMAP.read_map(folder / "site.bt") for folder in (again, SAMPLE))
     assert np.array_equal(mapped.probability, stored.probability, equal_nan=True)
-
-
-def test_the_scenario_still_means_the_flight_that_was_made_of_it(tmp_path: Path) -> None:
-    """Keys that scenarios got since, left out, change nothing: the flight is there and is not made again."""
-    shutil.copy(SAMPLE / "simulation.json", tmp_path)
-    assert simulate(example_scenario("mound_walk"), tmp_path).skipped
-
-
-def test_it_is_small() -> None:
-    assert sum(path.stat().st_size for path in SAMPLE.rglob("*") if path.is_file()) < 25_000_000
 
 
 def test_it_is_the_flight_of_its_scenario() -> None:

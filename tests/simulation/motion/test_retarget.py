@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.poses import conjugate, multiply, rotate
-from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
-from pipelines.simulation.motion.retarget import match_bones, retarget
+from pipelines.simulation.motion.retarget import retarget
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, joint_centres
 from tests.simulation.motion.performing import RIG, clearance_m, flat, mound, performed
 
@@ -88,21 +87,6 @@ def recorded(style: str = "mixamo", scale: float = 1.0, arms_up_deg: float = 90.
     return SkeletalMotion(
         motion.t_s, named(style), parent, scale * offset, {}, scale * motion.root, np.stack(own, axis=1)
     )
-
-
-@pytest.mark.parametrize("style", list(NAMES))
-def test_bones_are_known_by_their_names(style: str) -> None:
-    found = match_bones(recorded(style))
-    assert {bone: found[bone] for bone in BONES} == BONE
-
-
-def test_a_bone_that_is_missing_is_named() -> None:
-    source = recorded("letters")
-    strange = tuple(name.replace("Shldr", "Tentacle") for name in source.bones)
-    with pytest.raises(DataError, match=r"\bleft_upper_arm, right_upper_arm\b"):
-        match_bones(replace(source, bones=strange))
-    with pytest.raises(DataError, match=r"\bleft_thigh\b"):
-        match_bones(replace(source, bones=tuple(f"b{i}" for i in range(len(BONES)))))
 
 
 @pytest.mark.parametrize(("scale", "arms_up"), [(1.0, 90.0), (0.056, 90.0), (1.3, 0.0), (1.0, 45.0)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -22,15 +21,8 @@ from pipelines.geometry.poses import (
     transform,
 )
 from pipelines.simulation.body import make_body
-from pipelines.simulation.rendering.camera import EXPOSURE, NOISE, STEP_S, exposed_moments
+from pipelines.simulation.rendering.camera import EXPOSURE, STEP_S, exposed_moments
 from pipelines.simulation.rendering.renderer import Moment, Renderer
-from pipelines.simulation.rendering.shading import (
-    FULL_SCALE,
-    HAZE_M,
-    HORIZON_RGB,
-    TILE_TEXELS,
-    ground_texture,
-)
 from pipelines.simulation.rig import BONES
 from pipelines.simulation.scenario import Body
 from pipelines.simulation.surfaces import Surface, hidden_by
@@ -112,7 +104,7 @@ coordinates = st.floats(-3.0, 3.0)
 
 
 @pytest.mark.slow  # compiles much
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1))
 def test_a_silhouette_is_the_pixels_whose_centres_project_into_a_triangle(seed: int) -> None:
     """Every pixel, but for centres that lie within rounding of an edge."""
@@ -138,28 +130,6 @@ def test_a_silhouette_is_the_pixels_whose_centres_project_into_a_triangle(seed: 
 
 
 @settings(max_examples=20)
-@given(coordinates, coordinates, st.floats(3.0, 12.0), st.floats(0.3, 1.5))
-def test_a_sphere_fills_its_cone(x: float, y: float, away: float, radius: float) -> None:
-    """Rays within the tangent cone hit a ball; the mesh lies between it and the ball inside its faces."""
-    centre = np.array([x, away, y])
-    mesh = sphere(centre, radius)
-    pose = looking((0.0, -2.0, 0.5), (0.0, 5.0, 0.0))
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    normal = np.cross(b - a, c - a)
-    inner = np.min(np.abs(np.sum(normal * (a - centre), axis=1)) / np.linalg.norm(normal, axis=1))
-
-    def within_cone(r: float) -> Bool:
-        direction, to_centre = rays(pose), centre - pose[0]
-        along = direction @ to_centre
-        square = np.sum(direction**2, axis=-1) * (to_centre @ to_centre - r * r)
-        return np.asarray((along > 0) & (along**2 > square))
-
-    silhouette = renderer().silhouette(*pose, mesh)
-    assert not (silhouette & ~within_cone(radius * (1 + 1e-9))).any()
-    assert not (~silhouette & within_cone(inner * (1 - 1e-9))).any()
-
-
-@settings(max_examples=20)
 @given(st.floats(0.5, 30.0), st.floats(-60.0, 60.0))
 def test_depth_of_a_plane(height: float, tilt_deg: float) -> None:
     """Ground that also lies under and behind the camera, so that its triangles cross the near plane."""
@@ -175,18 +145,6 @@ def test_depth_of_a_plane(height: float, tilt_deg: float) -> None:
     assert (np.abs(depth / expected - 1) < np.maximum(tolerance, 4 * FLOAT32))[hit].all()
     assert np.isinf(depth[expected < 0]).all()
     assert hit.any() or tilt_deg < 0
-
-
-@pytest.mark.slow  # compiles much
-def test_nothing_behind_the_camera_is_seen() -> None:
-    pose = looking((0.0, 0.0, 1.0), (0.0, 1.0, 1.0))
-    behind = sphere(np.array([0.0, -3.0, 1.0]), 1.0)
-    around = sphere(np.array([0.0, 0.0, 1.0]), 2.0)
-    one = renderer()
-    assert not one.silhouette(*pose, behind).any()
-    assert np.isinf(one.depth(*pose, [behind])).all()
-    assert np.array_equal(one.picture(*pose, [behind], 0), one.picture(*pose, [], 0))
-    assert one.silhouette(*pose, around).all()
 
 
 def test_the_nearer_one_hides_the_farther() -> None:
@@ -205,16 +163,6 @@ def test_the_nearer_one_hides_the_farther() -> None:
     assert np.array_equal(renderer(half).silhouette(*pose, person), alone & left)
     rest = renderer().silhouette(*pose, half, [person])
     assert not (rest & renderer(half).silhouette(*pose, person)).any()
-
-
-@pytest.mark.parametrize(("aside", "hidden"), [(0.0, True), (0.96, True), (1.01, False)])
-def test_a_sphere_hides_what_is_behind_it(aside: float, hidden: bool) -> None:
-    """A line passes the centre at `aside` radii; the facets' planes are no nearer to it than cos(7.5 deg)."""
-    ball = sphere(np.zeros(3), 2.0)
-    ends = np.array([[30.0, 2 * aside, 0.0], [1e3, 2 * aside, 0.0], [-3.0, 2 * aside, 0.0], [np.nan, 0, 0]])
-    eye = np.array([-30.0, 2 * aside, 0.0])
-    assert hidden_by(ball, eye, ends).tolist() == [hidden, hidden, False, False]
-    assert hidden_by(ball, ends[0], eye[None]).tolist() == [hidden]  # its inside hides as well
 
 
 def test_a_person_hides_what_lies_behind_the_nearest_surface() -> None:
@@ -239,36 +187,6 @@ def linear(picture: NDArray[np.uint8]) -> Float:
     """Convert bytes to light, below the tone curve's shoulder: the inverse of sRGB."""
     value = picture.astype(float) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4) / EXPOSURE
-
-
-def test_a_small_square_appears_where_it_is_projected() -> None:
-    """The centroid of its light is the projection of its centre, which half a pixel of shift would show.
-
-    The four samples of a pixel have x and y a quarter apart, so an edge is off by up to 1/8 px and the
-    centroid, the mean of two edges, too; the deviation over positions is 1/4 / sqrt(12) / sqrt(2) = 0.05.
-    Noise of 1.8 steps on 9 x 9 pixels adds 0.02. The mean of 25 has a deviation of 0.011.
-    """
-    pose = looking((0.0, -5.0, 1.0), (0.0, 0.0, 1.0))
-    dark = rectangle(np.array([0.0, 0.1, 1.0]), np.array([9.0, 0, 0]), np.array([0, 0, 9.0]), 0.0)
-    half = 5.0 / 150 * 1.7
-    errors = []
-    for k in range(25):
-        shift = 5.0 / 150 * np.array([(k % 5) / 5, 0.0, (k // 5) / 5])
-        # Lit from the front: the sun stands at negative y.
-        square = rectangle(
-            np.array([0.4, 0.0, 1.3]) + shift, np.array([half, 0, 0]), np.array([0, 0, half]), 0.5
-        )
-        expected = project(transform(invert(*pose), square.vertices.mean(axis=0)[None]), CAMERA)[0]
-        light = linear(renderer(dark).picture(*pose, [square], k))[..., 1]
-        x0, y0 = np.rint(expected).astype(int) - 4
-        window = light[y0 : y0 + 9, x0 : x0 + 9] - np.median(light)
-        column, row = np.meshgrid(np.arange(9), np.arange(9))
-        centroid = np.array(
-            [x0 + (window * column).sum() / window.sum(), y0 + (window * row).sum() / window.sum()]
-        )
-        errors.append(centroid - expected)
-    assert np.abs(errors).max() < 0.125 + 4 * 0.02
-    assert np.abs(np.mean(errors, axis=0)).max() < 4 * 0.011
 
 
 @pytest.mark.parametrize("moves", [False, True])
@@ -308,85 +226,6 @@ def test_the_shadow_of_a_box_falls_where_its_corners_throw_it(moves: bool) -> No
     assert (light[bright] > between).all()
 
 
-def test_lit_surfaces_do_not_shade_themselves() -> None:
-    """A sphere's light is the sun's cosine on all of its sunny side: no stripes of its own shadow.
-
-    Seen from the direction of the sun, from 4 m, its limb is where the cosine is 0.25: 0.4 keeps off it.
-    """
-    ball = sphere(np.array([0.0, 0.0, 3.0]), 1.0, 96, 48)
-    towards = SUN / np.linalg.norm(SUN)
-    camera = Intrinsics(200, 200, 300.0, 300.0, 99.5, 99.5)
-    eye = np.array([0.0, 0.0, 3.0]) + 4 * towards
-    pose = looking((eye[0], eye[1], eye[2]), (0.0, 0.0, 3.0))
-    one = Renderer([], camera, sun=SUN, seed=0)
-    depth = one.depth(*pose, [ball])
-    light = linear(one.picture(*pose, [ball], 0))[..., 1]
-    normal = (pose[0] + rays(pose, camera) * np.where(np.isfinite(depth), depth, 0)[..., None]) - [0, 0, 3.0]
-    cosine = normal @ towards
-    seen = np.isfinite(depth) & (cosine > 0.4)
-    up = 0.5 + 0.5 * normal[..., 2]
-    expected = 0.5 * (0.79 * cosine + up * 0.25 + (1 - up) * 0.09)
-    away = np.linalg.norm(eye - [0, 0, 3.0])
-    haze = away / (away + HAZE_M)
-    expected = (1 - haze) * expected + haze * HORIZON_RGB[1]
-    # Noise of 1.8 steps: below 1.8 * 5 / 255 * 2.4 / 1.055 of the light above 40 % of full scale.
-    ratio = light[seen] / expected[seen]
-    assert abs(np.median(ratio) - 1) < 0.01
-    assert np.abs(ratio - 1).max() < 5 * NOISE / 255 * 2.4 / 0.4 + 0.02
-
-
-def test_equal_arguments_give_equal_bytes_in_any_thread() -> None:
-    mound = sphere(np.array([2.0, 3.0, -3.0]), 3.6)
-    ground = Surface(level(30.0).vertices, level(30.0).faces, level(30.0).colour, ground=True)
-    people = [sphere(np.array([0.0, 0.3 * k, 1.0]), 0.5) for k in range(4)]
-    pose = looking((4.0, -6.0, 3.0), (0.0, 0.0, 1.0))
-    one, other = renderer(ground, mound), renderer(ground, mound)
-    alone = [one.picture(*pose, [person], k) for k, person in enumerate(people)]
-    with ThreadPoolExecutor(2) as pool:
-        together = list(pool.map(lambda k: other.picture(*pose, [people[k]], k), range(4)))
-    assert all(np.array_equal(a, b) for a, b in zip(alone, together, strict=True))
-
-
-def test_frames_differ_by_noise_alone() -> None:
-    """The difference of two frames has the deviation of two independent noises, and rounding's."""
-    pose = looking((4.0, -6.0, 3.0), (0.0, 0.0, 1.0))
-    one = renderer(level(30.0))
-    first, second = (one.picture(*pose, [], frame).astype(float) for frame in (0, 1))
-    middle = (first > 20) & (first < 235)
-    expected = np.sqrt(2 * (NOISE**2 + 1 / 12))
-    count = middle.sum()
-    assert abs((first - second)[middle].std() / expected - 1) < 5 / np.sqrt(2 * count)
-    assert abs((first - second)[middle].mean()) < 5 * expected / np.sqrt(count)
-
-
-def test_the_ground_texture_is_seamless_and_does_not_change_the_mean() -> None:
-    texture = ground_texture(SEED)
-    sides = [TILE_TEXELS >> level for level in range(len(texture.first))]
-    for side, first in zip(sides, texture.first, strict=True):
-        packed = texture.texels[first : first + side * side].reshape(side, side)
-        values = np.stack([packed >> shift & 0xFF for shift in (0, 8, 16)], axis=-1) * (FULL_SCALE / 255)
-        # Rounding to FULL_SCALE / 255, and what is brighter than FULL_SCALE is cut off.
-        assert np.abs(values.mean(axis=(0, 1)) - 1).max() < 0.5 * FULL_SCALE / 255 + 0.01
-        if side > 100:
-            inner = np.abs(np.diff(values, axis=0)).mean(axis=(1, 2))
-            seam = np.abs(values[0] - values[-1]).mean()
-            assert seam < inner.mean() + 5 * inner.std()
-
-
-def test_far_ground_does_not_shimmer() -> None:
-    """If a pixel covers metres of grass, a shift by a fraction of that changes nothing but the noise.
-
-    The site's slow changes have features of several metres; over 0.05 m they move by less than 2 %.
-    """
-    plane = level(400.0, grey=0.15)
-    ground = Surface(plane.vertices, plane.faces, plane.colour, ground=True)
-    one = renderer(ground)
-    still, moved = (linear(one.picture(*looking((x, 0.0, 80.0), (x, 60.0, 0.0)), [], 0)) for x in (0.0, 0.05))
-    # Noise by itself: a frame of equal noise differs by the position in its key, so twice the deviation.
-    step = 1.8 / 255 * 2.4 * 0.35 / EXPOSURE
-    assert np.std(moved - still) < 2 * step + 0.02 * still.mean()
-
-
 @pytest.mark.parametrize(
     ("camera", "sun", "message"),
     [
@@ -423,8 +262,7 @@ def test_each_row_is_exposed_about_its_own_time(exposure_s: float, readout_s: fl
     assert variance.max() <= STEP_S**2 / 4 + 1e-15
 
 
-@pytest.mark.parametrize("bend", [True, False])
-@pytest.mark.parametrize(("exposure_s", "readout_s"), [(0.0, 0.0), (0.004, 0.0), (0.0, 0.03), (0.004, 0.03)])
+@pytest.mark.parametrize(("exposure_s", "readout_s", "bend"), [(0.0, 0.0, False), (0.004, 0.03, True)])
 def test_markers_lie_where_they_are_projected(exposure_s: float, readout_s: float, bend: bool) -> None:
     """Dark balls fall while the camera turns: each is filmed where it is when its own row is read.
 
@@ -480,22 +318,3 @@ def surface_of_all(parts: list[Surface]) -> Surface:
         ),
         0.0,
     )
-
-
-def test_a_bent_picture_is_as_sharp_as_a_straight_one() -> None:
-    """A lens that bends by nothing that can be seen leaves all but the softness of cubics.
-
-    Half a pixel off, the worst place, cubics keep 0.80 of a quarter of the sampling rate, and bilinear 0.71.
-    """
-    ground = level(40.0)
-    textured = Surface(ground.vertices, ground.faces, ground.colour, ground=True)
-    straight = Intrinsics(240, 180, 170.0, 165.0, 121.0, 88.0)
-    bent = replace(straight, model="radtan", distortion=(1e-9, 0.0, 0.0, 0.0))
-    pose = looking((0.0, 0.0, 3.0), (0.0, 4.0, 0.0))
-    sharp, soft = (
-        np.abs(
-            np.diff(linear(renderer(textured, intrinsics=lens).picture(*pose, [], 0))[100:], axis=1)
-        ).mean()
-        for lens in (straight, bent)
-    )
-    assert soft > 0.8 * sharp

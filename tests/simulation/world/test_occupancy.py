@@ -75,15 +75,3 @@ def test_the_ground_errs_to_occupied_by_a_twentieth_of_a_voxel() -> None:
     unseen = world.terrain.slope * 0.25 / 20 * np.sqrt(0.5)
     assert not occupied[floor > top[..., None] + 0.05 * 0.25 + unseen].any()
     assert (occupied.sum(axis=-1) >= 1).all(), "every column shows a planner its ground"
-
-
-def test_the_grid_covers_the_ground_and_lies_on_multiples_of_its_voxels() -> None:
-    occupancy = site(ground={"centre": [3.1, -2.0], "size_m": 7.0}).occupancy(0.25, 1.1)
-    steps = occupancy.origin / 0.25
-    assert np.array_equal(steps, np.rint(steps))
-    end = occupancy.origin + np.array(occupancy.probability.shape) * 0.25
-    assert (occupancy.origin[:2] <= [-0.4, -5.5]).all()
-    assert (occupancy.origin[:2] > [-0.65, -5.75]).all()
-    assert (end >= [6.6, 1.5, 1.1]).all()
-    assert (end < [6.85, 1.75, 1.35]).all()
-    assert occupancy.probability.dtype == np.float32

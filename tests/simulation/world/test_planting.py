@@ -39,25 +39,6 @@ def test_no_tree_stands_where_it_must_not() -> None:
     assert all(4.5 <= height <= 7.5 for height in heights), "a quarter about 6 m, on level ground"
 
 
-def test_the_seed_decides() -> None:
-    one, same, other = (
-        build_world(spec(count=9), seed, keep_clear=WAY).obstacles.trunks for seed in (1, 1, 2)
-    )
-    assert np.array_equal(one, same)
-    assert not np.array_equal(one[1:], other[1:])
-
-
-def test_trees_are_as_dense_everywhere() -> None:
-    """Half of the trees stand in the inner half of the area, within three sigma of a coin's tosses."""
-    world = build_world(
-        scenario.World.model_validate({"wood": {"count": 1000, "radius_m": 200.0, "clear_m": 0.0}}),
-        1,
-        keep_clear=NOBODY,
-    )
-    inner = np.hypot(*world.obstacles.trunks[:, :2].T) < 200 / np.sqrt(2)
-    assert abs(inner.sum() - 500) < 3 * np.sqrt(1000) / 2
-
-
 def test_a_wood_that_does_not_fit_is_one_clear_line() -> None:
     with pytest.raises(DataError, match=r"^world\.wood: .*\b0 of 3\b.*\b5 m\b.*\bclear_m$"):
         build_world(spec(count=3, radius_m=5.0, clear_m=6.0), 5, keep_clear=WAY)

@@ -36,15 +36,6 @@ def test_heights_are_those_of_the_formula() -> None:
     assert np.array_equal(site().height(xy), np.zeros((20, 20)))
 
 
-def test_normals_are_those_of_finite_differences() -> None:
-    world, xy, step = everything(), scattered(300), 1e-5
-    slopes = [(closed_form(xy + shift) - closed_form(xy - shift)) / (2 * step) for shift in step * np.eye(2)]
-    expected = np.stack([-slopes[0], -slopes[1], np.ones(len(xy))], axis=1)
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    # Central differences err by step^2 / 6 times third derivatives (below 2) and 1e-16 / step: 1e-11 each.
-    np.testing.assert_allclose(world.normal(xy), expected, rtol=0, atol=1e-10)
-
-
 def second_derivatives(terrain: Terrain, xy: Float) -> Float:
     """Compute the largest second derivative in any direction, [N].
 
@@ -74,13 +65,3 @@ def test_no_place_is_steeper_or_more_curved_than_stated() -> None:
         bound = terrain.curvature_within(centre, radius)
         within = np.linalg.norm(xy - centre[:, None], axis=-1) <= radius
         assert all(curved[near].max() <= limit + 1e-6 for near, limit in zip(within, bound, strict=True))
-
-
-def test_one_mound_meets_its_bounds() -> None:
-    """Steepest at one sigma along its short axis, most curved on top."""
-    terrain = site(mounds=[{"centre": [1.0, 2.0], "sigma_m": [3.0, 1.5], "height_m": 2.0}]).terrain
-    flank, top = np.array([1.0, 3.5]), np.array([[1.0, 2.0]])
-    normal = terrain.normal(flank)
-    assert abs(np.hypot(normal[0], normal[1]) / normal[2] - terrain.slope) < 1e-12
-    # Differences err by step^2 / 6 times fourth derivatives (3 h / sigma^4 = 1.2): 2e-9.
-    assert abs(second_derivatives(terrain, top)[0] - terrain.curvature) < 1e-7
