@@ -188,6 +188,11 @@ def test_the_diagram_shows_the_imports() -> None:
     assert _text("architecture.svg") == drawn, "run python docs/diagram.py"
 
 
+@pytest.mark.parametrize("script", sorted(_DOCS.glob("*.py")), ids=lambda script: script.name)
+def test_every_script_of_the_pages_can_be_imported(script: Path) -> None:
+    runpy.run_path(str(script))
+
+
 # --- tables, examples, figures ---------------------------------------------------------------------------
 
 
