@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import json
 import os
 import re
 import runpy
@@ -236,7 +237,7 @@ def test_every_example_of_a_manifest_or_scenario_is_valid() -> None:
     assert {"README.md", "flight.md", "simulation.md"} <= set(kinds)
 
 
-def test_the_lines_for_python_run(tmp_path: Path) -> None:
+def test_the_lines_for_python_run_and_the_page_names_all_figures(tmp_path: Path) -> None:
     (code,) = (block for language, block in _FENCED.findall(_text("session.md")) if language == "python")
     write_flight(tmp_path, seconds=0.5)
     done = subprocess.run(
@@ -252,6 +253,9 @@ def test_the_lines_for_python_run(tmp_path: Path) -> None:
     assert (tmp_path / "knee.png").stat().st_size > 1000
     made = {path.suffix for path in (tmp_path / "notebook.export").iterdir()}
     assert made == {".trc", ".csv", ".sto", ".json"}
+    metrics = json.loads((tmp_path / "notebook.session" / "reconstruct" / "metrics.json").read_text())
+    page = _text("session.md").partition("## metrics.json of reconstruct")[2].partition("\n## ")[0]
+    assert set(metrics) <= set(_spans(page))
 
 
 def test_every_dependency_is_imported() -> None:
