@@ -21,7 +21,7 @@ from mocap_cli.terminal import print_json, say, say_warnings, watching
 from pipelines.session.errors import MocapError
 
 if TYPE_CHECKING:
-    from pipelines.reporting.panels import Video
+    from pipelines.reporting.pictures import Video
 
 
 @click.command("report", short_help="Write a page about each session, and one that compares them.")

@@ -26,7 +26,7 @@ from pipelines.reconstruct import Settings as ReconstructSettings
 from pipelines.reconstruct import reconstruct
 from pipelines.replan import replan
 from pipelines.report import report
-from pipelines.reporting.flights import COLUMNS, FlightRow, render_flights
+from pipelines.reporting.page import COLUMNS, FlightRow, render_flights
 from pipelines.reporting.wording import cell_text
 from pipelines.session.description import read_description
 from pipelines.session.errors import BusyError, DataError, MocapError

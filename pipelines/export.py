@@ -13,9 +13,7 @@ import numpy as np
 
 from pipelines.formats.common.exporting import thinned
 from pipelines.geometry.arrays import Int64, Picture
-from pipelines.reporting.content import estimated_clocks
-from pipelines.reporting.frame_drawing import Label, blank_frame, caption_of, draw_frame
-from pipelines.reporting.motion import Motion, motion_from_skeleton
+from pipelines.reporting.content import MeasuredMotion, estimated_clocks, motion_from_skeleton
 from pipelines.reporting.overlays import (
     FilmedCamera,
     angles_at,
@@ -24,6 +22,7 @@ from pipelines.reporting.overlays import (
     status_at,
     views_of,
 )
+from pipelines.reporting.pictures import Label, blank_frame, caption_of, draw_frame
 from pipelines.session.description import Description, Doubt, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
@@ -279,7 +278,7 @@ class _Overlays:
     record: StageRecord  # of the reconstruction
 
     @cached_property
-    def _drawn(self) -> tuple[Motion, dict[str, FilmedCamera]]:
+    def _drawn(self) -> tuple[MeasuredMotion, dict[str, FilmedCamera]]:
         """The motion and the cameras, loaded when the first picture is requested."""
         frames = {
             name: read_table(self.folder / "cameras" / name / "frames.parquet", FRAMES)
@@ -353,7 +352,7 @@ class _Overlays:
 
 
 def _labels(
-    motion: Motion, table: pd.DataFrame | None, angles: Sequence[str], t_ns: Int64
+    motion: MeasuredMotion, table: pd.DataFrame | None, angles: Sequence[str], t_ns: Int64
 ) -> list[list[Label]]:
     """Write every angle of every person at [N] times, beside its joint."""
     if table is None:

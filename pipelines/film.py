@@ -26,8 +26,8 @@ from pipelines.planning.arm_flights import poses_from
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.loading import LoggedFlight, load_flight
 from pipelines.reconstruction.refining import refined_points
-from pipelines.reporting.frame_drawing import draw_frame, with_inlet
 from pipelines.reporting.overlays import View
+from pipelines.reporting.pictures import draw_frame, with_inlet
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import LoggedActor, logged_people

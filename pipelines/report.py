@@ -16,9 +16,8 @@ import numpy as np
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.planning.loading import load_flight
 from pipelines.planning.scene import hidden_shares
-from pipelines.reporting.comparison import compare, labels_of
-from pipelines.reporting.comparison_figures import draw_comparison
-from pipelines.reporting.comparison_page import GENERATOR, render_comparison
+from pipelines.reporting.chart import MARK, refuse_foreign, write_figures
+from pipelines.reporting.comparison_page import GENERATOR, draw_comparison, render_comparison
 from pipelines.reporting.content import (
     ReplanContent,
     SessionContent,
@@ -26,9 +25,9 @@ from pipelines.reporting.content import (
     estimated_clocks,
     section,
 )
-from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
 from pipelines.reporting.page import draw_session, render_page
-from pipelines.reporting.panels import Video
+from pipelines.reporting.pictures import Video
+from pipelines.reporting.session_comparison import compare, labels_of
 from pipelines.reporting.studies import summarise_studies
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
@@ -80,8 +79,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-REPORT = Stage("report", revision=13)
-_FIGURES_REVISION = 6
+REPORT = Stage("report", revision=14)
+_FIGURES_REVISION = 7
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,40 @@
-"""The page that compares sessions, as one self-contained file, and its verdict in plain sentences."""
+"""The page that compares sessions, as one self-contained file: its tables, figures and verdict.
+
+The colour is the session's in every figure.
+"""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, STRETCH_S
 from pipelines.reporting import wording
-from pipelines.reporting.comparison import (
+from pipelines.reporting.chart import (
+    MUTED,
+    PALETTE,
+    Bars,
+    Line,
+    Panel,
+    Plate,
+    Points,
+    as_csv,
+    chart,
+    means,
+    percentiles,
+    stacked,
+    table,
+    tabled,
+    time_bins,
+)
+from pipelines.reporting.content import SessionContent, section, text
+from pipelines.reporting.figures import colour_and_style
+from pipelines.reporting.session_comparison import (
+    MEASURE_OF,
+    MEASURES,
     Comparison,
     Difference,
     Estimate,
@@ -16,14 +43,36 @@ from pipelines.reporting.comparison import (
     Pair,
     compare,
 )
-from pipelines.reporting.comparison_figures import colour_of, draw_comparison, joints_of, shown_measure
-from pipelines.reporting.content import SessionContent, section, text
-from pipelines.reporting.plates import PALETTE, Plate, as_csv
 from pipelines.reporting.verdict import Verdict, doubts_of_flight
-from pipelines.reporting.wording import THIN, environment, fixed, listing, percent, plural, quantity
+from pipelines.reporting.wording import (
+    ABSENT,
+    THIN,
+    Column,
+    Table,
+    environment,
+    fixed,
+    joint_label,
+    listing,
+    percent,
+    plural,
+    quantity,
+    shortened,
+    whole,
+    with_interval,
+)
+
+# Strips over time show no more stretches.
+MOST_BINS_OF_STRIP = 150
+# Ranges of more sessions would hide each other.
+MAX_BANDS = 3
+# Focal lengths closer than this factor make pixels of the same size.
+SAME_LENS_FACTOR = 1.02
 
 GENERATOR = "mocap: sessions side by side"
 """Mark of a page of ours, which may be overwritten."""
+
+_OVER_TIME = ("predicted", "tilt", "share")
+_ARROW = {"less": " (less is better)", "more": " (more is better)", "": ""}
 
 
 def render_comparison(contents: Mapping[str, SessionContent]) -> tuple[str, dict[str, Plate]]:
@@ -35,8 +84,7 @@ def render_comparison(contents: Mapping[str, SessionContent]) -> tuple[str, dict
     comparison = compare(contents)
     measure = shown_measure(comparison)
     plates = draw_comparison(comparison)
-    shown = [pair.differences.get(measure.key) if measure is not None else None for pair in comparison.pairs]
-    per_joint = [found.per_joint if found is not None else {} for found in shown]
+    colours = [PALETTE[colour_of(comparison, one)] for one in comparison.sessions]
     page = (
         environment()
         .get_template("comparison.html.j2")
@@ -45,27 +93,37 @@ def render_comparison(contents: Mapping[str, SessionContent]) -> tuple[str, dict
             title=_title(comparison),
             simulated=all(one.summary.description.simulated for one in comparison.sessions),
             verdict=judge(comparison),
-            comparison=comparison,
-            measure=measure,
-            per_joint=per_joint if any(per_joint) else [],
-            joints=joints_of(comparison),
+            labels=list(zip([one.label for one in comparison.sessions], colours, strict=True)),
+            measures=[
+                _measures_table(comparison),
+                *map(_pair_table, range(len(comparison.pairs)), comparison.pairs),
+            ]
+            if comparison.measures
+            else [],
+            joints=None if measure is None else _joints_table(comparison, measure),
+            sessions=_sessions_table(comparison),
+            settings=_settings_table(comparison),
             plates=plates,
             # Our own drawing, in which every name was escaped when it was written.
             drawings={key: Markup(plate.svg) for key, plate in plates.items()},  # noqa: S704
-            colour_of=lambda session: PALETTE[colour_of(comparison, session)],
-            judgement=_judgement,
-            moment=wording.moment,
-            tables=_tables(comparison),
-            settings=_differing_settings(comparison),
+            csv=_csv(comparison),
         )
     )
     return page, plates
 
 
-def _tables(comparison: Comparison) -> dict[str, str]:
+# --- tables ---
+
+
+def _csv(comparison: Comparison) -> dict[str, str]:
     """Write the tables of measures and of pairs as CSV; empty cells are missing numbers."""
+
+    def columns(estimate: Estimate) -> dict[str, float | None]:
+        low, high = estimate.interval or (None, None)
+        return {"value": estimate.value, "low": low, "high": high}
+
     measures = [
-        {"measure": measure.key, "unit": measure.unit, "session": one.label, **_columns(found)}
+        {"measure": measure.key, "unit": measure.unit, "session": one.label, **columns(found)}
         for measure in comparison.measures
         for one in comparison.sessions
         if (found := one.estimates.get(measure.key)) is not None
@@ -78,7 +136,7 @@ def _tables(comparison: Comparison) -> dict[str, str]:
             "other": pair.other.label,
             "first_mean": found.first,
             "other_mean": found.other,
-            **_columns(found.estimate),
+            **columns(found.estimate),
             "pairs": found.pairs,
             "joints": found.joints,
             "lower": found.lower,
@@ -89,9 +147,114 @@ def _tables(comparison: Comparison) -> dict[str, str]:
     return {name: as_csv(rows) for name, rows in (("measures", measures), ("pairs", pairs)) if rows}
 
 
-def _columns(estimate: Estimate) -> dict[str, float | None]:
-    low, high = estimate.interval or (None, None)
-    return {"value": estimate.value, "low": low, "high": high}
+def _cell(found: Estimate | None, measure: Measure) -> tuple[str, str]:
+    if found is None:
+        return with_interval(None, None)
+    return with_interval(found.value, found.interval, measure.digits)
+
+
+def _measures_table(comparison: Comparison) -> Table:
+    labels = [Column(one.label) for one in comparison.sessions]
+    rows = [
+        [
+            f"{measure.label}, {measure.unit}",
+            *(_cell(one.estimates.get(measure.key), measure) for one in comparison.sessions),
+            measure.meaning,
+        ]
+        for measure in comparison.measures
+    ]
+    caption = "Means over every session’s own joint-frames, below them the 95 % intervals."
+    return Table(
+        "measures",
+        caption,
+        (Column("Measure", text=True), *labels, Column("Meaning", text=True)),
+        rows,
+        "arms",
+    )
+
+
+def _pair_table(k: int, pair: Pair) -> Table:
+    how = (
+        "moment by moment: means over what both have"
+        if pair.by_time
+        else "joint by joint: every joint with the same weight"
+    )
+    columns = (
+        Column("Measure", text=True),
+        Column(pair.first.label),
+        Column(pair.other.label),
+        Column("Difference", "95 % interval"),
+        Column("Pairs"),
+        Column("Lower", "of the joints"),
+        Column("Verdict", text=True),
+    )
+    rows = [
+        [
+            f"{measure.label}, {measure.unit}",
+            fixed(found.first, measure.digits),
+            fixed(found.other, measure.digits),
+            _cell(found.estimate, measure),
+            whole(found.pairs),
+            f"{found.lower} of {found.joints}" if found.joints > 1 else ABSENT,
+            _judgement(measure, found),
+        ]
+        for measure, found in pair.by_measure
+    ]
+    caption = f"“{pair.other.label}” less “{pair.first.label}”, paired {how}."
+    return Table(f"pair-{k + 1}", caption, columns, rows, "arms")
+
+
+def _joints_table(comparison: Comparison, measure: Measure) -> Table:
+    differences = [pair.differences.get(measure.key) for pair in comparison.pairs]
+    per_joint = [{} if found is None else found.per_joint for found in differences]
+    paired = any(per_joint)
+    columns = [Column("Joint", text=True), *(Column(one.label) for one in comparison.sessions)]
+    columns += [Column(pair.other.label, "difference") for pair in comparison.pairs if paired]
+    rows = [
+        [
+            joint_label(name),
+            *(_cell(one.per_joint.get(measure.key, {}).get(name), measure) for one in comparison.sessions),
+            *(fixed(own.get(name), measure.digits) for own in (per_joint if paired else ())),
+        ]
+        for name in joints_of(comparison)
+    ]
+    caption = f"{measure.label} of every joint in {measure.unit}, below it the 95 % interval"
+    caption += "; and what it is above that of the first session, over the pairs." if paired else "."
+    return Table("joints", caption, columns, rows, "arms")
+
+
+def _sessions_table(comparison: Comparison) -> Table:
+    names = ("Session", "Flight", "Kind", "Method", "Start", "Length", "Cameras", "Times", "Truth")
+    numbers = {"Length": "s", "Cameras": "", "Times": ""}
+    rows = [
+        [
+            one.label,
+            one.summary.description.flight,
+            "simulated" if one.summary.description.simulated else "real",
+            one.method or ABSENT,
+            wording.moment(one.summary.origin_ns),
+            fixed(one.summary.duration_s),
+            str(len(one.summary.cameras)),
+            whole(len(one.t_ns)),
+            "no" if one.summary.errors_mm is None else "yes",
+        ]
+        for one in comparison.sessions
+    ]
+    caption = "The sessions. The key of a stage is the SHA-256 of everything that decides its result."
+    columns = [Column(name, numbers.get(name, ""), text=name not in numbers) for name in names]
+    return Table("sessions", caption, columns, rows, "arms")
+
+
+def _settings_table(comparison: Comparison) -> Table:
+    """List settings, keys and inputs' hashes of the stages that differ between the sessions."""
+    tables = [_settings_of(one) for one in comparison.sessions]
+    names = dict.fromkeys(name for own in tables for name in own)
+    rows = [[name, *(own.get(name, ABSENT) for own in tables)] for name in names]
+    columns = [Column("Setting", text=True), *(Column(one.label, text=True) for one in comparison.sessions)]
+    differing = [row for row in rows if len(set(row[1:])) > 1]
+    return Table(
+        "settings", "Settings and keys of the stages that differ.", columns, differing, "settings differing"
+    )
 
 
 def _title(comparison: Comparison) -> str:
@@ -113,14 +276,6 @@ def _judgement(measure: Measure, found: Difference) -> str:
     return "better" if lower == (measure.better == "less") else "worse"
 
 
-def _differing_settings(comparison: Comparison) -> list[tuple[str, list[str]]]:
-    """List settings, keys and inputs' hashes of the stages that differ between the sessions."""
-    tables = [_settings_of(one) for one in comparison.sessions]
-    names = dict.fromkeys(name for table in tables for name in table)
-    rows = [(name, [table.get(name, wording.ABSENT) for table in tables]) for name in names]
-    return [(name, values) for name, values in rows if len(set(values)) > 1]
-
-
 def _settings_of(session: Judged) -> dict[str, str]:
     found: dict[str, str] = {}
     for stage, record in session.content.stages.items():
@@ -133,12 +288,10 @@ def _settings_of(session: Judged) -> dict[str, str]:
     return found
 
 
-# --- verdict -------------------------------------------------------------------------------------------
+# --- verdict ---
 
 
 _WHAT = {"mpjpe": "from the truth", "reprojection": "from the keypoints in the pictures"}
-_SAME_LENS = 1.02
-"""Focal lengths closer than this factor make pixels of the same size."""
 
 
 def judge(comparison: Comparison) -> Verdict:
@@ -319,7 +472,7 @@ def _other_lenses(pair: Pair) -> bool:
         float(np.median([camera.entry.intrinsics.fx for camera in one.summary.cameras]))
         for one in (pair.first, pair.other)
     )
-    return max(first, other) > _SAME_LENS * min(first, other)
+    return max(first, other) > SAME_LENS_FACTOR * min(first, other)
 
 
 def _unlike(sessions: Sequence[Judged]) -> list[str]:
@@ -342,3 +495,187 @@ def _unlike(sessions: Sequence[Judged]) -> list[str]:
             )
             sentences.append(f"The sessions {what}: {pairs}.")
     return sentences
+
+
+# --- figures ---
+
+
+def draw_comparison(comparison: Comparison) -> dict[str, Plate]:
+    """Draw every figure that has data, by its key."""
+    measure = shown_measure(comparison)
+    plates = []
+    if any(pair.differences for pair in comparison.pairs):
+        plates.append(_differences(comparison))
+    if measure is not None:
+        plates += [_over_time(comparison, measure), _joint_bars(comparison, measure)]
+    return {plate.key: plate for plate in plates}
+
+
+def shown_measure(comparison: Comparison) -> Measure | None:
+    """Return the error from truth if every session with a skeleton has it, else the reprojection."""
+    having = [one for one in comparison.sessions if one.values]
+    for key in ("mpjpe", "reprojection"):
+        if having and all(key in one.estimates for one in having):
+            return MEASURE_OF[key]
+    return None
+
+
+def colour_of(comparison: Comparison, session: Judged) -> str:
+    """Return the colour of a session in all figures."""
+    return colour_and_style(comparison.sessions.index(session))[0]
+
+
+def joints_of(comparison: Comparison) -> list[str]:
+    """List every joint of every session, in the order in which the first names them."""
+    motions = [one.summary.motion for one in comparison.sessions]
+    return list(dict.fromkeys(name for motion in motions if motion is not None for name in motion.joints))
+
+
+def seconds_of(comparison: Comparison, session: Judged) -> Float:
+    """Return the times [T] of a session, in s.
+
+    They count from the first frame of all where the motion is the same, else from its own first frame.
+    """
+    together = {id(comparison.sessions[0])} | {id(pair.other) for pair in comparison.pairs if pair.by_time}
+    same = [one for one in comparison.sessions if id(one) in together]
+    among = same if id(session) in together else [session]
+    return (session.t_ns - min(one.summary.origin_ns for one in among)) / 1e9
+
+
+def _over_time(comparison: Comparison, measure: Measure) -> Plate:
+    there = [one for one in comparison.sessions if one.values]
+    shown = [measure] + [MEASURE_OF[key] for key in _OVER_TIME if any(key in one.values for one in there)]
+    seconds = {one.label: seconds_of(comparison, one) for one in there}
+    bands = len(comparison.sessions) <= MAX_BANDS
+    panels, drawn = [], []
+    for of in shown:
+        lines = []
+        for one in there:
+            if of.key not in one.values:
+                continue
+            bins = time_bins(seconds[one.label], MOST_BINS_OF_STRIP)
+            centres = (bins[:-1] + bins[1:]) / 2
+            colour, style = colour_and_style(comparison.sessions.index(one))
+            values = one.values[of.key].values
+            low = high = np.full(len(centres), np.nan)
+            if of.key in {"share", "tilt"}:
+                middle = means(values, seconds[one.label], bins)
+            else:
+                middle, low, high = percentiles(values, seconds[one.label], bins)
+            band: dict[str, Any] = {"low": low, "high": high} if of is measure and bands else {}
+            name = shortened(one.label) if of is measure else ""
+            lines.append(Line(centres, middle, colour, name, style=style, shade=0.14, **band))
+            what = f"{of.name} ({of.unit})"
+            drawn.append(table(session=one.label, measure=what, t_s=centres, value=middle, p10=low, p90=high))
+        span = (0, 104) if of.unit == "%" else None if of.key == "tilt" else (0, None)
+        label = f"{of.name.replace(' ', chr(10))}\n({of.unit})"
+        panels.append([Panel(lines, "time (s)" if of is shown[-1] else "", label, y_span=span)])
+    first, last = min(s[0] for s in seconds.values()), max(s[-1] for s in seconds.values())
+    panels[-1] = [replace(panels[-1][0], x_span=(float(first), float(last)))]
+    heights = [1.5, *[1.1] * (len(shown) - 1)]
+    caption = f"From above: {listing(of.name for of in shown)}. Errors are medians over joints"
+    if len(there) <= MAX_BANDS:
+        caption += ", the range in the uppermost drawing from the 10th to the 90th percentile"
+    caption += "; tilt and share are means. " + (
+        "Times count from the first frame of all."
+        if all(pair.by_time for pair in comparison.pairs)
+        else "Times of flights that do not hold the same motion count from the first frame of each."
+    )
+    listed = listing(
+        f"{one.label} {quantity(one.estimates[measure.key].value, measure.unit, measure.digits)}"
+        for one in there
+    )
+    return Plate(
+        "compare-time",
+        f"{measure.label} over time, and what goes with it",
+        caption,
+        f"Means over the flights: {listed}.",
+        chart(panels, 0.7 + sum(heights), heights=heights),
+        {"": stacked(drawn)},
+    )
+
+
+def _joint_bars(comparison: Comparison, measure: Measure) -> Plate:
+    there = [one for one in comparison.sessions if one.values]
+    joints = [
+        name
+        for name in joints_of(comparison)
+        if any(name in one.per_joint.get(measure.key, {}) for one in comparison.sessions)
+    ]
+    thick = 0.8 / len(there)
+    panels = []
+    for of in (measure, MEASURE_OF["share"]):
+        marks: list[Bars | Points] = []
+        for k, one in enumerate(there):
+            found = one.per_joint.get(of.key, {})
+            known = [(j, found[name]) for j, name in enumerate(joints) if name in found]
+            rows = [j + (k - (len(there) - 1) / 2) * thick for j, _ in known]
+            values, ends = [each.value for _, each in known], [each.interval for _, each in known]
+            name = shortened(one.label) if of is measure else ""
+            bars = Bars(rows, 0.0, values, colour_of(comparison, one), name, 0.92 * thick)
+            marks += [bars, Points(rows, values, ends, MUTED, width=0.8, marked=False)]
+        labels = {float(j): shortened(joint_label(name)) for j, name in enumerate(joints)}
+        span = (0, None) if of is measure else (0, 100)
+        panels.append(Panel(marks, f"{of.name} ({of.unit})", rows=labels, x_span=span, grid="x"))
+    height = 0.8 + max(0.075 * len(there), 0.15) * 1.25 * max(len(joints), 6)
+    words = [
+        f"{one.label}: "
+        + listing(
+            f"{joint_label(name)} {fixed(found.value, measure.digits)}"
+            for name, found in one.per_joint[measure.key].items()
+        )
+        + f" {measure.unit}."
+        for one in there
+    ]
+    rows_of_csv = [
+        (one.label, f"{of.name} ({of.unit})", name, estimate.value, *(estimate.interval or (np.nan, np.nan)))
+        for of in (measure, MEASURE_OF["share"])
+        for one in there
+        for name, estimate in one.per_joint.get(of.key, {}).items()
+    ]
+    numbers = tabled(("session", "measure", "joint", "value", "low", "high"), rows_of_csv)
+    title = f"{measure.label} of every joint, and how often it was measured"
+    figure = chart([panels], height, widths=[1.5, 1], share_x=False, share_y=True)
+    caption = "Thin lines: the 95 % intervals of the means."
+    return Plate("compare-joints", title, caption, " ".join(words), figure, {"": numbers})
+
+
+def _differences(comparison: Comparison) -> Plate:
+    pairs = comparison.pairs
+    measures = [
+        one
+        for one in MEASURES
+        if any(one.key in pair.differences and pair.differences[one.key].first > 0 for pair in pairs)
+    ]
+    marks, drawn = [], []
+    for p, pair in enumerate(pairs):
+        shift = (p - (len(pairs) - 1) / 2) * 0.7 / len(pairs)
+        rows, values, ends = [], [], []
+        for k, measure in enumerate(measures):
+            found = pair.differences.get(measure.key)
+            if found is None or found.first <= 0:
+                continue
+            scale, interval = 100 / found.first, found.estimate.interval
+            rows.append(k + shift)
+            values.append(scale * found.estimate.value)
+            ends.append(None if interval is None else (scale * interval[0], scale * interval[1]))
+            drawn.append((pair.other.label, measure.label, values[-1], *(ends[-1] or (np.nan, np.nan))))
+        name = shortened(pair.other.label) if len(pairs) > 1 else ""
+        marks.append(Points(rows, values, ends, colour_of(comparison, pair.other), name))
+    panel = Panel(
+        marks,
+        f"difference from {shortened(comparison.sessions[0].label)} (% of its value)",
+        rows={float(k): f"{one.label}{_ARROW[one.better]}" for k, one in enumerate(measures)},
+        grid="x",
+        zero=True,
+    )
+    caption = (
+        "A point is the paired difference from the first session, relative to that one, its line the 95 % "
+        "interval; a line across zero is within noise. Beside each measure stands which way is better."
+    )
+    columns = ("session", "measure", "difference_percent", "low_percent", "high_percent")
+    listed = listing(f"{session} {measure} {fixed(value)} %" for session, measure, value, _, _ in drawn)
+    figure = chart([[panel]], 0.9 + len(measures) * max(0.2, 0.1 * len(pairs)))
+    title = "All differences at a glance"
+    numbers = {"": tabled(columns, drawn)}
+    return Plate("compare-differences", title, caption, f"{listed}.", figure, numbers)

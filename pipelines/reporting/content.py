@@ -1,4 +1,4 @@
-"""Contents of a page, as the stage loads it from a session, and readers of loose JSON."""
+"""Contents of a page, as the stage loads it from a session: tables, dense arrays, readers of loose JSON."""
 
 from __future__ import annotations
 
@@ -6,12 +6,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.metrics import bone_lengths
+from pipelines.geometry.triangulation import STATUS
 from pipelines.session.description import Description
-from pipelines.session.records import Occupancy
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Occupancy
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# Joints are stored as this part of a picture's side, which fits 16 bits and is finer than a pixel.
+FULL_SCALE = 10_000
+# The 95 % quantile of chi-square with 3 degrees of freedom, for a Gaussian in three dimensions.
+CHI2_95_OF_3 = 7.815
 
 
 @dataclass(frozen=True)
@@ -58,10 +68,6 @@ class SessionContent:
     joint_errors: pd.DataFrame | None = None  # tables.JOINT_ERRORS, likewise
     studies: tuple[StudyContent, ...] = ()  # that stand beside the flight
     every: int = 1  # times of the skeleton of which one was loaded, with what was recorded about it
-
-
-FULL_SCALE = 10_000
-"""Joints are stored as this part of a picture's side."""
 
 
 @dataclass(frozen=True)
@@ -116,3 +122,173 @@ def as_reconstructed(content: SessionContent) -> SessionContent:
         for name, table in content.frames.items()
     }
     return replace(content, poses=content.poses | content.refined, frames=frames)
+
+
+# --- the skeleton as dense arrays ---
+
+
+@dataclass(frozen=True)
+class MeasuredMotion:
+    """Joints over time: T stamps, P people, J joints, in the order in which the table first names them."""
+
+    t_ns: Int64  # [T], strictly increasing
+    joints: tuple[str, ...]
+    position: Float  # [T, P, J, 3] m
+    covariance: Float  # [T, P, J, 6] m^2, upper triangle: POINT_COVARIANCE_COLUMNS
+    reprojection_px: Float  # [T, P, J]
+    status: NDArray[np.int8]  # [T, P, J] index into triangulation.STATUS, -1 where the table has no row
+    views: Int64  # [T, P, J] number of cameras that the joint was taken from
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """True [T, P, J] where a joint was reconstructed from pictures; a filled joint was not."""
+        measured: NDArray[np.bool_] = self.status == STATUS.index("ok")
+        return measured
+
+    @property
+    def measured_position(self) -> Float:
+        """Positions [T, P, J, 3] of measured joints, NaN elsewhere."""
+        return np.where(self.measured[..., None], self.position, np.nan)
+
+    @property
+    def sigma_m(self) -> Float:
+        """Standard deviation per axis of measured joints, sqrt(trace / 3), [T, P, J]; NaN if unknown."""
+        trace = self.covariance[..., [0, 3, 5]].sum(axis=-1)
+        return np.where(self.measured, np.sqrt(trace / 3), np.nan)
+
+
+def motion_from_skeleton(table: pd.DataFrame) -> MeasuredMotion:
+    """Make dense arrays of a skeleton table (tables.SKELETON), in any order of its rows."""
+    import pandas as pd
+
+    t_ns, time = np.unique(table["t_ns"].to_numpy(dtype=np.int64), return_inverse=True)
+    persons, person = np.unique(table["person"].to_numpy(dtype=np.int64), return_inverse=True)
+    joint, joints = pd.factorize(table["joint"])
+    shape = (len(t_ns), len(persons), len(joints))
+    cell = (time, person, joint)
+
+    def dense(*columns: str) -> Float:
+        values = np.full((*shape, len(columns)), np.nan)
+        values[cell] = table[list(columns)].to_numpy(dtype=np.float64)
+        return values
+
+    status = np.full(shape, -1, dtype=np.int8)
+    status[cell] = pd.Index(STATUS).get_indexer(pd.Index(table["status"]))
+    return MeasuredMotion(
+        t_ns=t_ns,
+        joints=tuple(str(name) for name in joints),
+        position=dense("x", "y", "z"),
+        covariance=dense(*POINT_COVARIANCE_COLUMNS),
+        reprojection_px=dense("reprojection_px")[..., 0],
+        status=status,
+        views=np.nan_to_num(dense("views")[..., 0]).astype(np.int64),
+    )
+
+
+def full_covariance(upper: Float) -> Float:
+    """Return matrices [..., 3, 3] of their upper triangles [..., 6]: POINT_COVARIANCE_COLUMNS."""
+    return upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*upper.shape[:-1], 3, 3)
+
+
+def middles(position: Float) -> Float:
+    """Return the middles [T, P, 3] of people with joints [T, P, J, 3]; NaN where no joint is known.
+
+    It is the coordinate-wise median: one wrong joint does not bend a path.
+    """
+    there = np.isfinite(position[..., 0]).any(axis=-1)
+    middle = np.full((*position.shape[:2], 3), np.nan)
+    middle[there] = np.nanmedian(position[there], axis=1)
+    return middle
+
+
+def errors_mm(motion: MeasuredMotion, truth: Float) -> Float:
+    """Compute the distance of every measured joint from truth in mm, [T, P, J]; NaN if either is missing."""
+    distance: Float = 1000 * np.linalg.norm(motion.measured_position - truth, axis=-1)
+    return distance
+
+
+def share_inside_95(motion: MeasuredMotion, truth: Float) -> float | None:
+    """Compute the share of true joints inside the 95 % ellipsoids; None if nothing can be compared.
+
+    e' S^-1 e of a Gaussian is chi-square with 3 degrees of freedom: a calibrated covariance gives 0.95.
+    """
+    error = motion.measured_position - truth
+    usable = np.isfinite(error).all(axis=-1) & np.isfinite(motion.covariance).all(axis=-1)
+    covariance = full_covariance(motion.covariance[usable])
+    positive = np.linalg.eigvalsh(covariance)[:, 0] > 0
+    if not positive.any():
+        return None
+    e = error[usable][positive]
+    weighted = np.linalg.solve(covariance[positive], e[:, :, np.newaxis])[:, :, 0]
+    squared = (e * weighted).sum(axis=1)
+    return float(np.mean(squared < CHI2_95_OF_3))
+
+
+_LIMBS = {
+    "upper arm": ("shoulder", "elbow"),
+    "forearm": ("elbow", "wrist"),
+    "trunk side": ("shoulder", "hip"),
+    "thigh": ("hip", "knee"),
+    "shank": ("knee", "ankle"),
+}
+_WATCHED = (
+    *(
+        (name, side, f"{side}_{start}", f"{side}_{end}")
+        for name, (start, end) in _LIMBS.items()
+        for side in ("left", "right")
+    ),
+    ("shoulders", "", "left_shoulder", "right_shoulder"),
+    ("hips", "", "left_hip", "right_hip"),
+)
+
+
+def side_of(*joints: str) -> str:
+    """Return `left` or `right` if all joints lie on that side of the body, else an empty word."""
+    sides = {joint.partition("_")[0] for joint in joints}
+    return side if len(sides) == 1 and (side := sides.pop()) in {"left", "right"} else ""
+
+
+@dataclass(frozen=True)
+class Bone:
+    """The length of one bone over a recording, in metres."""
+
+    name: str
+    side: str  # left, right, or empty for a bone across
+    median_m: float
+    low_m: float  # 10th percentile
+    high_m: float  # 90th percentile
+    spread: float  # half the central 68 % of the lengths, relative to the median: 0 for a rigid bone
+
+
+def watched_bones(motion: MeasuredMotion) -> list[Bone]:
+    """Measure the bones with both ends measured at some time, limb by limb, left before right."""
+    there = [bone for bone in _WATCHED if set(bone[2:]) <= set(motion.joints)]
+    lengths = bone_lengths(
+        motion.measured_position, motion.joints, [(start, end) for *_, start, end in there]
+    )
+    bones = []
+    for b, (name, side, *_) in enumerate(there):
+        measured = lengths[..., b][np.isfinite(lengths[..., b])]
+        if measured.size:
+            low, p16, median, p84, high = (float(p) for p in np.percentile(measured, [10, 16, 50, 84, 90]))
+            spread = (p84 - p16) / 2 / median if median > 0 else 0.0
+            bones.append(Bone(name, side, median, low, high, spread))
+    return bones
+
+
+def standing_heights(motion: MeasuredMotion) -> Float:
+    """Return the height [T, P] on which each person stands, m.
+
+    It is the median over two seconds of the lowest measured joint, so that no single joint lifts a body.
+    Where nothing was measured, it is that of the last time before, else of the first after. Whoever was never
+    measured stands as high as the others do in the median; without anybody it is 0.
+    """
+    import pandas as pd
+
+    height = motion.measured_position[..., 2]
+    lowest = np.where(np.isfinite(height), height, np.inf).min(axis=-1)
+    table = pd.DataFrame(np.where(np.isinf(lowest), np.nan, lowest), index=pd.to_datetime(motion.t_ns))
+    near = table.rolling("2s", center=True, closed="both", min_periods=1).median()
+    heights = near.ffill().bfill().to_numpy(np.float64)
+    known = heights[np.isfinite(heights)]
+    return np.where(np.isfinite(heights), heights, np.median(known) if len(known) else 0.0)

@@ -20,8 +20,14 @@ from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
 from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.content import SessionContent, estimated_clocks, number, section
-from pipelines.reporting.motion import Motion, full_covariance
+from pipelines.reporting.content import (
+    MeasuredMotion,
+    SessionContent,
+    estimated_clocks,
+    full_covariance,
+    number,
+    section,
+)
 from pipelines.reporting.summary import Summary
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Description, Interpolation
@@ -45,11 +51,16 @@ if TYPE_CHECKING:
 ReadFrame = Callable[[str, int], Picture | None]
 """Function that returns the picture of a camera's frame; None where there is none."""
 
+# More moments make the page larger and tell no more.
 MOMENTS = 6
-_LONGEST_STEP = 1.5  # usual steps: the skeleton is not interpolated between times further apart
-_SAME_ERROR_MM = 1.0  # among times with errors this close, the views decide which is the worst
-_STEP = 1e-4  # of a joint's depth: small against lens distortion, large against rounding
-_SAME_PERSON = 0.5  # of a body's size in the picture: a detection further away is another person
+# The skeleton is not interpolated between times that are more than this many usual steps apart.
+MAX_STEPS_INTERPOLATED = 1.5
+# Among times with errors this close, the views decide which is the worst.
+SAME_ERROR_MM = 1.0
+# This part of a joint's depth is small against lens distortion and large against rounding.
+DERIVATIVE_STEP = 1e-4
+# A detection farther away than half of a body's size in the picture is another person.
+SAME_PERSON_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -174,7 +185,7 @@ def _largest_mm(error_mm: Float | None, row: int) -> float | None:
     return float(known.max()) if known.size else None
 
 
-def choose_moments(motion: Motion, error_mm: Float | None = None) -> tuple[list[int], int]:
+def choose_moments(motion: MeasuredMotion, error_mm: Float | None = None) -> tuple[list[int], int]:
     """Choose rows of the motion to show, in order, and the worst of them.
 
     Each of `MOMENTS` equal stretches gives one: the stretch with the worst time gives that, every other the
@@ -193,7 +204,7 @@ def choose_moments(motion: Motion, error_mm: Float | None = None) -> tuple[list[
     eligible = np.isfinite(error) & (steady >= steady.max() / 2)
     if error_mm is not None and np.isfinite(error_mm).any():
         largest = np.nan_to_num(error_mm, nan=-np.inf).max(axis=(1, 2))
-        as_large = largest > largest.max() - _SAME_ERROR_MM
+        as_large = largest > largest.max() - SAME_ERROR_MM
         eligible = eligible & as_large if (eligible & as_large).any() else as_large
         error = np.nan_to_num(error)
     worst = int(np.argmax(np.where(eligible, error, -1.0) if eligible.any() else count))
@@ -223,7 +234,7 @@ def match_people(reprojected: Float, found: Float) -> list[int | None]:
         distance = _row_median(np.linalg.norm(found - body, axis=-1))
         distance[[match for match in matches if match is not None]] = np.nan
         seen = body[np.isfinite(body).all(axis=-1)]
-        reach = _SAME_PERSON * float(np.linalg.norm(np.ptp(seen, axis=0))) if len(seen) else 0.0
+        reach = SAME_PERSON_SHARE * float(np.linalg.norm(np.ptp(seen, axis=0))) if len(seen) else 0.0
         near = np.isfinite(distance) & (distance <= reach)
         matches.append(int(np.argmin(np.where(near, distance, np.inf))) if near.any() else None)
     return matches
@@ -283,7 +294,7 @@ class FilmedCamera:
         return position, matrix_from_quaternion(quaternion)
 
 
-def status_at(motion: Motion, t_ns: Int64) -> NDArray[np.int8]:
+def status_at(motion: MeasuredMotion, t_ns: Int64) -> NDArray[np.int8]:
     """Return every joint's status at the skeleton's time nearest to each of [N] times, [N, P, J].
 
     -1, as where the table has no row, at times for which the skeleton is not interpolated: outside its own,
@@ -297,7 +308,7 @@ def status_at(motion: Motion, t_ns: Int64) -> NDArray[np.int8]:
     return np.where(known[:, None, None], motion.status[_nearest_row(motion, t_ns)], np.int8(-1))
 
 
-def angles_at(motion: Motion, angles: pd.DataFrame, name: str, t_ns: Int64) -> Float:
+def angles_at(motion: MeasuredMotion, angles: pd.DataFrame, name: str, t_ns: Int64) -> Float:
     """Interpolate a joint angle and its standard deviation to [N] times, as the skeleton is; [N, P, 2] deg.
 
     NaN where a neighbour in time is not determined. Values lie within 180 deg of 0.
@@ -319,7 +330,7 @@ def angles_at(motion: Motion, angles: pd.DataFrame, name: str, t_ns: Int64) -> F
     return np.stack([np.degrees(np.arctan2(across, along)), sigma], axis=-1)
 
 
-def _nearest_row(motion: Motion, t_ns: Int64) -> Int64:
+def _nearest_row(motion: MeasuredMotion, t_ns: Int64) -> Int64:
     """Find the skeleton's time nearest to each of [N] times; of two the earlier."""
     after = np.clip(np.searchsorted(motion.t_ns, t_ns), min(1, len(motion.t_ns) - 1), len(motion.t_ns) - 1)
     before = np.maximum(after - 1, 0)
@@ -328,7 +339,7 @@ def _nearest_row(motion: Motion, t_ns: Int64) -> Int64:
 
 
 def views_of(
-    camera: FilmedCamera, at: Int64, motion: Motion, status: NDArray[np.int8], origin_ns: int
+    camera: FilmedCamera, at: Int64, motion: MeasuredMotion, status: NDArray[np.int8], origin_ns: int
 ) -> list[View]:
     """Reproject the skeleton into frames of a camera, beside the detections there; no pictures.
 
@@ -391,7 +402,7 @@ def seen_spread(points: Float, covariance: Float, world_from_camera: Float, lens
     Returns:
         [..., 2, 2] px^2, NaN where a number is missing.
     """
-    step = _STEP * np.abs(points[..., 2])[..., None]
+    step = DERIVATIVE_STEP * np.abs(points[..., 2])[..., None]
     columns = [
         (project(points + step * axis, lens) - project(points - step * axis, lens)) / (2 * step)
         for axis in np.eye(3)
@@ -402,16 +413,21 @@ def seen_spread(points: Float, covariance: Float, world_from_camera: Float, lens
 
 
 def _view(
-    camera: FilmedCamera, at: int, motion: Motion, row: int, origin_ns: int, read_frame: ReadFrame | None
+    camera: FilmedCamera,
+    at: int,
+    motion: MeasuredMotion,
+    row: int,
+    origin_ns: int,
+    read_frame: ReadFrame | None,
 ) -> View:
     (view,) = views_of(camera, np.array([at]), motion, motion.status[[row]], origin_ns)
     return view if read_frame is None else replace(view, picture=read_frame(view.camera, view.frame))
 
 
-def _longest_step_ns(motion: Motion) -> int:
+def _longest_step_ns(motion: MeasuredMotion) -> int:
     """Return the longest step of the skeleton's times that is interpolated."""
     usual_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
-    return round(_LONGEST_STEP * usual_ns)
+    return round(MAX_STEPS_INTERPOLATED * usual_ns)
 
 
 def _row_median(values: Float) -> Float:

@@ -1,30 +1,32 @@
-"""The page of one session: numbers and figures in the template, as one self-contained file."""
+"""The page of one session and the table of many flights, each as one self-contained file."""
 
 import base64
 import hashlib
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
+from urllib.parse import quote
 
 from markupsafe import Markup
 
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting import wording
-from pipelines.reporting.arm_figures import draw_arms
+from pipelines.reporting.arms import Replan, draw_arms, summarise_replan
+from pipelines.reporting.chart import MOST_BINS, Plate
 from pipelines.reporting.content import SessionContent, as_reconstructed, number, section, text
 from pipelines.reporting.figures import draw_all
 from pipelines.reporting.overlays import ReadFrame, collect_moments, residuals_over_time
-from pipelines.reporting.panels import Video, draw_overlays, draw_panel, make_strips, picture_width
-from pipelines.reporting.plates import MOST_BINS, Plate
-from pipelines.reporting.replanned import Replan, summarise_replan
+from pipelines.reporting.pictures import Video, draw_overlays, make_strips, panel_source, panel_width
 from pipelines.reporting.studies import draw_studies, summarise_studies
 from pipelines.reporting.summary import (
     Summary,
-    errors_by_person,
-    errors_per_camera,
-    measures,
-    quality,
     summarise,
+    table_of_cameras,
+    table_of_joints,
+    table_of_quality,
+    tables_of_errors,
 )
 from pipelines.reporting.verdict import at_a_glance, give_verdict
 from pipelines.reporting.viewer import make_scene
@@ -46,6 +48,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None, vi
     script = (files("pipelines.reporting") / "templates" / "viewer.js").read_text(encoding="utf-8")
     overlays = _overlays(as_reconstructed(content), summary, read_frame)
     strips = make_strips(as_reconstructed(content), summary, read_frame, video)
+    started = wording.moment(summary.origin_ns)
     return (
         environment()
         .get_template("page.html.j2")
@@ -53,31 +56,24 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None, vi
             name=content.name,
             title=summary.description.flight or content.name,
             summary=summary,
-            detected=set(content.keypoints),
-            detector=text(section(content.stages.get("detect", {}), "settings"), "detector"),
             description=summary.description,
-            started=wording.moment(summary.origin_ns),
+            started=started,
             method=text(summary.metrics, "method"),
             verdict=give_verdict(content, summary),
             glances=at_a_glance(summary),
             key_figures=_key_figures(summary),
-            measures=measures(summary),
-            errors_per_camera=errors_per_camera(summary),
-            errors_by_person=errors_by_person(summary),
-            tracking=section(summary.metrics, "tracking"),
+            ingested=[table_of_cameras(content, summary, started), table_of_quality(content, summary)],
+            errors=tables_of_errors(summary),
+            joints=table_of_joints(summary),
             plates=plates,
             replan=replan,
             studies=summarise_studies(content.studies),
             scene=make_scene(summary, content.poses | content.refined, replan, strips),
             refined=bool(content.refined),
-            quality=quality(content, summary),
-            hidden=bool(content.hidden),
             made_by=_made_by(content),
             every=content.every,
             viewer_script=Markup(script),  # noqa: S704 - our own file
-            policy=_policy(
-                script, pictures=bool(strips) or (overlays is not None and overlays["pictures"] > 0)
-            ),
+            policy=_policy(script, pictures=bool(strips) or overlays is not None),
             overlays=overlays,
             # Our own drawing, in which every name was escaped when it was written.
             drawings={key: Markup(plate.svg) for key, plate in plates.items()},  # noqa: S704
@@ -125,11 +121,10 @@ def _overlays(
     views = {(m, view.camera): view for m, moment in enumerate(moments) for view in moment.views}
     if not views:
         return None
-    width_px = picture_width(len(views))
+    width_px = panel_width(len(views))
     return {
         "moments": moments,
-        # Our own drawing, without a word from the session's files.
-        "drawings": {key: Markup(draw_panel(view, width_px)) for key, view in views.items()},  # noqa: S704
+        "drawings": {key: panel_source(view, width_px) for key, view in views.items()},
         "pictures": sum(view.picture is not None for view in views.values()),
         "rejected": any(view.rejected.any() for view in views.values()),
         "unmeasured": any(view.unmeasured.any() for view in views.values()),
@@ -184,3 +179,83 @@ def _stage_note(stage: str, record: Mapping[str, object]) -> dict[str, object]:
         "flight": [row for row in wording.flattened(flight) if row[1] != "none"],
         "counts": wording.flattened(section(record, "counts")),
     }
+
+
+# --- many flights ---
+
+
+COLUMNS = (
+    "flight",
+    "name",
+    "status",
+    "failed_stage",
+    "error",
+    "doubt",
+    "reconstructed_share",
+    "mpjpe_mm",
+    "pa_mpjpe_mm",
+    "reprojection_px",
+)
+"""Columns of the table as CSV; then the mean tilt of every planner arm, `warnings` and `report`."""
+
+_FIGURES = COLUMNS[6:]
+_TILT = "tilt_deg_"
+
+
+@dataclass(frozen=True)
+class FlightRow:
+    """One flight."""
+
+    flight: str  # its manifest, as seen from the summary
+    name: str | None  # its own name; None if it was not ingested
+    failed_stage: str | None
+    error: str | None  # one line; None if all went well
+    figures: dict[str, float]  # by column, without figures that were not measured
+    warnings: tuple[str, ...]
+    report: str | None  # path of its page, as seen from the summary
+    doubt: str | None = None  # code of the doubt that explains the most
+
+    @property
+    def status(self) -> str:
+        """`done` or `failed`."""
+        return "done" if self.error is None else "failed"
+
+    @property
+    def arms(self) -> list[str]:
+        """Columns of the planner arms that the flight has."""
+        return [name for name in self.figures if name.startswith(_TILT)]
+
+    @property
+    def link(self) -> str | None:
+        """Address of its page."""
+        return None if self.report is None else quote(os.fsencode(self.report))
+
+    def cells(self) -> list[object]:
+        """Return the values of COLUMNS."""
+        figures = [self.figures.get(name) for name in _FIGURES]
+        return [self.flight, self.name, self.status, self.failed_stage, self.error, self.doubt, *figures]
+
+
+def render_flights(rows: Sequence[FlightRow]) -> str:
+    """Render the complete HTML of the summary; it loads nothing, and text from files is escaped."""
+    arms = list(dict.fromkeys(name for row in rows for name in row.arms))
+    failed = sum(row.error is not None for row in rows)
+    return (
+        wording.environment()
+        .get_template("flights.html.j2")
+        .render(
+            rows=rows,
+            arms={name: name.removeprefix(_TILT) for name in arms},
+            failed=failed,
+            lead=_lead(len(rows), failed, sum(row.doubt is not None for row in rows)),
+            plural=wording.plural,
+        )
+    )
+
+
+def _lead(flights: int, failed: int, doubted: int) -> str:
+    of = f"of {wording.plural(flights, 'flight')}"
+    first = f"{doubted} {of} {'is' if doubted == 1 else 'are'} doubted. " if doubted else ""
+    if failed == 0:
+        return f"{first}{wording.plural(flights, 'flight')} went through all stages that were asked for."
+    return f"{first}{failed} {of} failed; the others went through."

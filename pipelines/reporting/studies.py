@@ -18,8 +18,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.bootstrap import interval_of, resampled
-from pipelines.reporting.content import StudyContent
-from pipelines.reporting.plates import (
+from pipelines.reporting.chart import (
     CAMERAS,
     GRID,
     INK,
@@ -34,6 +33,7 @@ from pipelines.reporting.plates import (
     settled,
     tabled,
 )
+from pipelines.reporting.content import StudyContent
 from pipelines.reporting.wording import fixed, plural, quantity
 
 if TYPE_CHECKING:

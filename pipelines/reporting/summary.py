@@ -11,16 +11,30 @@ import pandas as pd
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, interpolate_poses, multiply, rotation_vector_from_quaternion
 from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.content import SessionContent, number, section
-from pipelines.reporting.motion import (
+from pipelines.reporting.content import (
     Bone,
-    Motion,
+    MeasuredMotion,
+    SessionContent,
     errors_mm,
     motion_from_skeleton,
+    number,
+    section,
     share_inside_95,
     watched_bones,
 )
-from pipelines.reporting.wording import ABSENT, THIN, fixed, percent, quantity, significant
+from pipelines.reporting.wording import (
+    ABSENT,
+    STATUS_LABELS,
+    THIN,
+    Column,
+    Table,
+    fixed,
+    joint_label,
+    percent,
+    quantity,
+    significant,
+    whole,
+)
 from pipelines.session.camera_poses import logged_covariance
 from pipelines.session.description import CameraEntry, ClockEntry, Description
 from pipelines.session.people import true_joints_at
@@ -29,8 +43,36 @@ from pipelines.session.tables import figures_by_joint, motion_from, trajectory_f
 if TYPE_CHECKING:
     import pandas as pd
 
+# People without a common time are matched last: no distance is as large.
+NEVER_TOGETHER_M = 1e9
+# `reconstruct` leaves out keypoints below this confidence where its record states no other.
+DEFAULT_MIN_CONFIDENCE = 0.3
 
-_NEVER_TOGETHER_M = 1e9  # distance of people without a common time: they are matched last
+_NOISE_UNITS = {
+    "position_m": ("", "m"),
+    "rotation_deg": ("", "deg"),
+    "position_m_per_sqrt_s": ("", "m/√s"),
+    "rotation_deg_per_sqrt_s": ("", "deg/√s"),
+    "correlation_s": ("over", "s"),
+    "offset_s": ("", "s"),
+}
+_PCK = "share of joints within 150 mm of truth; missing ones count as wrong"
+_KNOWN_MEASURES = (
+    ("mpjpe_mm", "MPJPE", "mm", 1, "mean distance of joints from truth, in the world"),
+    ("root_mpjpe_mm", "Root-relative MPJPE", "mm", 1, "the same with the hips laid on each other"),
+    ("pa_mpjpe_mm", "PA-MPJPE", "mm", 1, "after the best shift, turn and scale of each frame"),
+    ("pck150", "PCK at 150 mm", "%", 1, _PCK),
+    ("pck150_auc", "PCK area", "%", 1, "mean of PCK over all thresholds from 0 to 150 mm"),
+    ("acceleration_error_mm_s2", "Acceleration error", "mm/s²", 0, "mean difference of accelerations"),
+    ("jerk_m_s3", "Jerk", "m/s³", 0, "median length of the third derivative of the joints' motion"),
+    ("bone_spread_mm", "Bone length spread", "mm", 1, "median over the bones of each one's spread"),
+    ("e_recon_m2", "E_recon", "m²", 3, "sum of squared distances over all joint-frames with truth"),
+    ("e_recon_terms", "E_recon, terms", "", 0, "joint-frames in that sum"),
+    ("e_recon_per_joint_frame_m2", "E_recon per joint-frame", "m²", 6, "the sum divided by its terms"),
+    ("root_frames_left_out", "Frames without root", "", 0, "left out of the root-relative error"),
+    ("pa_frames_left_out", "Frames not aligned", "", 0, "too few joints in common for PA-MPJPE"),
+)
+_STATED_ELSEWHERE = {"reconstructed_share", "reconstructed_share_of_truth", "joint_frames", "schema"}
 
 
 @dataclass(frozen=True)
@@ -63,32 +105,13 @@ class JointRow:
 
 
 @dataclass(frozen=True)
-class Measure:
-    """A number of the error table, and its meaning."""
-
-    label: str
-    value: str
-    meaning: str
-
-
-@dataclass(frozen=True)
-class CameraErrors:
-    """Agreement of one camera's keypoints with the skeleton, in px; None where it was not measured."""
-
-    name: str
-    median_px: float | None
-    mean_px: float | None
-    left_out_median_px: float | None  # against joints that were reconstructed without this camera
-
-
-@dataclass(frozen=True)
 class Summary:
     """A session in numbers."""
 
     origin_ns: int  # the page's zero of time: the first frame of all cameras
     description: Description
     cameras: tuple[CameraRow, ...]
-    motion: Motion | None
+    motion: MeasuredMotion | None
     truth: Float | None  # [T, P, J, 3] m at the motion's times and joints
     errors_mm: Float | None  # [T, P, J]
     share: float | None
@@ -155,7 +178,7 @@ def summarise(content: SessionContent) -> Summary:
     )
 
 
-def truth_at(truth: pd.DataFrame, motion: Motion) -> Float:
+def truth_at(truth: pd.DataFrame, motion: MeasuredMotion) -> Float:
     """Return the true positions at the motion's times and joints, [T, P, J, 3].
 
     Each person is compared with the nearest true one, by `true_joints_at`; NaN also for joints and people
@@ -173,15 +196,13 @@ def _own_truth(position: Float, truth: Float) -> Float:
     shared = np.isfinite(distance)
     count = shared.sum(axis=(0, 3))
     total = np.where(shared, distance, 0.0).sum(axis=(0, 3))
-    person, match = linear_sum_assignment(
-        np.where(count > 0, total / np.maximum(count, 1), _NEVER_TOGETHER_M)
-    )
+    person, match = linear_sum_assignment(np.where(count > 0, total / np.maximum(count, 1), NEVER_TOGETHER_M))
     own: Float = np.full(position.shape, np.nan)
     own[:, person] = truth[:, match]
     return own
 
 
-def _status_counts(motion: Motion) -> dict[str, int]:
+def _status_counts(motion: MeasuredMotion) -> dict[str, int]:
     counted = np.bincount(motion.status[motion.status >= 0], minlength=len(STATUS))
     return {word: int(n) for word, n in zip(STATUS, counted, strict=True) if n}
 
@@ -198,7 +219,7 @@ def _camera_row(name: str, entry: CameraEntry, origin_ns: int) -> CameraRow:
     )
 
 
-def _joint_rows(motion: Motion, error: Float | None, stored: pd.DataFrame | None) -> list[JointRow]:
+def _joint_rows(motion: MeasuredMotion, error: Float | None, stored: pd.DataFrame | None) -> list[JointRow]:
     per_joint = {} if stored is None else figures_by_joint(stored)
     sigma = 1000 * motion.sigma_m
     rows = []
@@ -236,156 +257,204 @@ def finite_median(values: Float) -> float | None:
     return float(np.median(finite)) if finite.size else None
 
 
-def measures(summary: Summary) -> list[Measure]:
-    """Return the rows of the error table: every overall number of the metrics, known ones explained."""
-    reprojection = section(summary.metrics, "reprojection_px")
+# --- tables ---
+
+
+def camera_errors(summary: Summary) -> dict[str, tuple[float | None, ...]]:
+    """Return the distances in px between each camera's keypoints and the joints; empty without metrics.
+
+    They are the median, the mean, and the median from joints that were reconstructed without the camera.
+    """
+    own = section(summary.metrics, "reprojection_px_per_camera")
+    left_out = section(summary.metrics, "leave_one_camera_out_px")
+    return {
+        name: (
+            number(section(own, name), "median"),
+            number(section(own, name), "mean"),
+            number(section(left_out, name), "median"),
+        )
+        for name in own
+    }
+
+
+def tables_of_errors(summary: Summary) -> list[Table]:
+    """Make the tables of all joints and times, of each person, and of each camera."""
+    found = [
+        Table(
+            "measures",
+            "Over all joints and times.",
+            (Column("Measure", text=True), Column("Value"), Column("Meaning", text=True)),
+            _measures(summary),
+            "measures",
+        ),
+        _by_person(summary),
+        Table(
+            "per-camera",
+            "Distance in the picture between a camera’s keypoints and the reconstructed joints, in px.",
+            (
+                Column("Camera", text=True),
+                Column("Median"),
+                Column("Mean"),
+                Column("Median", "joints from the other cameras alone"),
+            ),
+            [[name, *(fixed(px, 2) for px in errors)] for name, errors in camera_errors(summary).items()],
+            "measures",
+        ),
+    ]
+    return [one for one in found if one.rows]
+
+
+def _measures(summary: Summary) -> list[list[str]]:
+    """Return every overall number of the metrics, known ones explained."""
     rows = []
     if summary.share is not None:
-        rows.append(Measure("Reconstructed", percent(summary.share), "share of joint-frames measured"))
+        rows.append(["Reconstructed", percent(summary.share), "share of joint-frames measured"])
     for key, label, unit, digits, meaning in _KNOWN_MEASURES:
         value = number(summary.metrics | section(summary.metrics, "shape"), key)
         if value is not None:
             shown = percent(value) if unit == "%" else f"{fixed(value, digits)} {unit}".strip()
-            rows.append(Measure(label, shown, meaning))
-    for key, label in (("median", "Reprojection, median"), ("mean", "Reprojection, mean")):
+            rows.append([label, shown, meaning])
+    reprojection = section(summary.metrics, "reprojection_px")
+    for key in ("median", "mean"):
         value = number(reprojection, key)
         if value is not None:
             meaning = "distance in the picture from the keypoints, over all views"
-            rows.append(Measure(label, quantity(value, "px", 2), meaning))
+            rows.append([f"Reprojection, {key}", quantity(value, "px", 2), meaning])
     explained = {key for key, *_ in _KNOWN_MEASURES} | _STATED_ELSEWHERE
     rows += [
-        Measure(key, significant(number(summary.metrics, key)), "")
+        [key, significant(number(summary.metrics, key)), ""]
         for key in summary.metrics
         if key not in explained and number(summary.metrics, key) is not None
     ]
     return rows
 
 
-@dataclass(frozen=True)
-class PersonErrors:
-    """Row of the table of people; shares 0..1, None where unknown."""
+def _by_person(summary: Summary) -> Table:
+    """Make the table of people; without rows if fewer than two were reconstructed."""
+    own, tracking = section(summary.metrics, "by_person"), section(summary.metrics, "tracking")
+    caption, columns = "By person.", [Column("Person", text=True), Column("Seen", "% of the times")]
+    columns += [Column("Measured", "% of joint-frames"), Column("MPJPE", "mm")]
+    if tracking:
+        columns += [Column("Switches"), Column("Misses", "frames"), Column("Phantom", "frames")]
+        counts = [f"{whole(number(tracking, key))} {key}" for key in ("switches", "misses", "phantoms")]
+        caption += f" Against truth, at {fixed(number(tracking, 'within_m'))} m: {', '.join(counts)} in"
+        caption += f" {whole(number(tracking, 'present'))} person-frames"
+        scores = [f"{key.upper()} {fixed(number(tracking, key), 3)}" for key in ("mota", "idf1")]
+        caption += f"; {', '.join(scores)}." if number(tracking, "mota") is not None else "."
+    rows = []
+    for name in own if len(own) > 1 else ():
+        stated = section(own, name)
+        shares = [number(stated, key) for key in ("coverage", "reconstructed_share")]
+        cells = [fixed(None if share is None else 100 * share) for share in shares]
+        cells.append(fixed(number(stated, "mpjpe_mm")))
+        keys = ("switches", "misses", "phantoms") if tracking else ()
+        rows.append([name, *cells, *(whole(number(stated, key)) for key in keys)])
+    return Table("by-person", caption, columns, rows, "measures people")
 
-    name: str
-    coverage: float | None  # share of the times with any measured joint
-    reconstructed: float | None  # share of joint-frames
-    mpjpe_mm: float | None
-    switches: float | None  # in person-frames, as the next two
-    misses: float | None
-    phantoms: float | None
 
-
-def errors_by_person(summary: Summary) -> list[PersonErrors]:
-    """Return the rows of the table of people; none if fewer than two were reconstructed."""
-    own = section(summary.metrics, "by_person")
-    return [
-        PersonErrors(
-            name=name,
-            coverage=number(section(own, name), "coverage"),
-            reconstructed=number(section(own, name), "reconstructed_share"),
-            mpjpe_mm=number(section(own, name), "mpjpe_mm"),
-            switches=number(section(own, name), "switches"),
-            misses=number(section(own, name), "misses"),
-            phantoms=number(section(own, name), "phantoms"),
-        )
-        for name in own
-        if len(own) > 1
+def table_of_joints(summary: Summary) -> Table:
+    """Make the table of all joints, with the number of joint-frames by status."""
+    with_truth = any(row.mpjpe_mm is not None for row in summary.joints)
+    columns = [Column("Joint", text=True), Column("Measured", "share")]
+    columns += [Column("MPJPE", "mm"), Column("Relative", "to hips, mm")] * with_truth
+    columns += [Column("Reprojection", "median, px"), Column("Uncertainty", "median σ, mm")]
+    columns += [Column(STATUS_LABELS[word].capitalize(), key=word) for word in summary.statuses]
+    caption = (
+        "Every joint: how often it was measured, how well, and how many joint-frames ended with which status."
+    )
+    rows = [
+        [
+            joint_label(row.name),
+            percent(row.share),
+            *([fixed(row.mpjpe_mm), fixed(row.root_mpjpe_mm)] if with_truth else []),
+            fixed(row.reprojection_px, 2),
+            fixed(row.sigma_mm),
+            *(whole(row.counts[word]) for word in summary.statuses),
+        ]
+        for row in summary.joints
     ]
+    return Table("joints", caption, columns, rows, "joints")
 
 
-def errors_per_camera(summary: Summary) -> list[CameraErrors]:
-    """Return the rows of the table of reprojection errors; none if the metrics have none per camera."""
-    own = section(summary.metrics, "reprojection_px_per_camera")
-    left_out = section(summary.metrics, "leave_one_camera_out_px")
-    return [
-        CameraErrors(
-            name=name,
-            median_px=number(section(own, name), "median"),
-            mean_px=number(section(own, name), "mean"),
-            left_out_median_px=number(section(left_out, name), "median"),
+def table_of_cameras(content: SessionContent, summary: Summary, started: str) -> Table:
+    """Make the table of what was ingested; `started` is the zero of its times."""
+    columns = (
+        Column("Camera", text=True),
+        Column("Picture", "px"),
+        Column("Frames"),
+        Column("Rate", "Hz"),
+        Column("Span", "s"),
+        Column("Poses"),
+        Column("Gaps", "in poses"),
+        Column("Frames", "without pose"),
+        Column("Frames", "without person"),
+        Column("Keypoints", text=True),
+    )
+    settings = section(content.stages.get("detect", {}), "settings")
+    detector = settings.get("detector") or "a detector"
+    rows = []
+    for camera in summary.cameras:
+        entry, keypoints = camera.entry, camera.entry.keypoints
+        gaps = f"{len(camera.gaps_s)} ({fixed(camera.gap_total_s, 2)} s)" if camera.gaps_s else "none"
+        source = f"{detector}, run here" if camera.name in content.keypoints else "none"
+        if keypoints is not None:
+            source = f"{keypoints.format}, {len(keypoints.joints)} joints"
+        rows.append(
+            [
+                camera.name,
+                f"{entry.intrinsics.width} × {entry.intrinsics.height}",
+                whole(entry.frames.count),
+                fixed(entry.frames.rate_hz, 2),
+                f"{fixed(camera.first_s, 2)} to {fixed(camera.last_s, 2)}",
+                "stands still" if entry.poses.static else whole(entry.poses.count),
+                gaps,
+                whole(entry.poses.frames_without_pose),
+                ABSENT if keypoints is None else whole(keypoints.frames_without_person),
+                source,
+            ]
         )
-        for name in own
-    ]
+    caption = f"Cameras. Times count from the first frame of all, {started}; the clock offsets stated in the"
+    return Table("cameras", f"{caption} flight are applied.", columns, rows)
 
 
-_KNOWN_MEASURES = (
-    ("mpjpe_mm", "MPJPE", "mm", 1, "mean distance of joints from truth, in the world"),
-    ("root_mpjpe_mm", "Root-relative MPJPE", "mm", 1, "the same with the hips laid on each other"),
-    ("pa_mpjpe_mm", "PA-MPJPE", "mm", 1, "after the best shift, turn and scale of each frame"),
-    (
-        "pck150",
-        "PCK at 150 mm",
-        "%",
-        1,
-        "share of joints within 150 mm of truth; missing ones count as wrong",
-    ),
-    ("pck150_auc", "PCK area", "%", 1, "mean of PCK over all thresholds from 0 to 150 mm"),
-    ("acceleration_error_mm_s2", "Acceleration error", "mm/s²", 0, "mean difference of accelerations"),
-    ("jerk_m_s3", "Jerk", "m/s³", 0, "median length of the third derivative of the joints' motion"),
-    ("bone_spread_mm", "Bone length spread", "mm", 1, "median over the bones of each one's spread"),
-    ("e_recon_m2", "E_recon", "m²", 3, "sum of squared distances over all joint-frames with truth"),
-    ("e_recon_terms", "E_recon, terms", "", 0, "joint-frames in that sum"),
-    ("e_recon_per_joint_frame_m2", "E_recon per joint-frame", "m²", 6, "the sum divided by its terms"),
-    ("root_frames_left_out", "Frames without root", "", 0, "left out of the root-relative error"),
-    ("pa_frames_left_out", "Frames not aligned", "", 0, "too few joints in common for PA-MPJPE"),
-)
-_STATED_ELSEWHERE = {"reconstructed_share", "reconstructed_share_of_truth", "joint_frames", "schema"}
+def table_of_quality(content: SessionContent, summary: Summary) -> Table:
+    """Make the table of the quality of every camera's data."""
+    columns = (
+        Column("Camera", text=True),
+        Column("Pose noise", "stated", text=True),
+        Column("Pose noise", "measured"),
+        Column("Clock", "offset"),
+        Column("Clock", "σ"),
+        Column("Person found", "of frames"),
+        Column("Keypoints used", "of those found"),
+        Column("Hidden", "of moments"),
+    )
+    caption = (
+        "How good the data of every camera is. Pose noise is per axis, measured as root mean square of logged"
+        " less true poses; a clock’s offset is as stated, plus what was estimated."
+    )
+    if content.hidden:
+        caption += " Hidden: the share of moments in which the map stands between camera and actor."
+    rows = [_quality(content, summary, camera) for camera in summary.cameras]
+    return Table("quality", caption, columns, rows, "quality")
 
 
-# --- data quality --------------------------------------------------------------------------------------
-
-
-_CONFIDENT = 0.3  # default least confidence of keypoints in reconstruct
-_NOISE_UNITS = {
-    "position_m": ("", "m"),
-    "rotation_deg": ("", "deg"),
-    "position_m_per_sqrt_s": ("", "m/√s"),
-    "rotation_deg_per_sqrt_s": ("", "deg/√s"),
-    "correlation_s": ("over", "s"),
-    "offset_s": ("", "s"),
-}
-
-
-@dataclass(frozen=True)
-class QualityRow:
-    """Quality of one camera, in words and shares; None where nothing is known."""
-
-    name: str
-    stated: str  # of the poses' errors, per axis
-    measured: str  # logged less true poses, root mean square per axis
-    offset: str
-    sigma: str
-    detected: float | None  # share of the frames looked at that show a person
-    confident: float | None  # share of the keypoints of those that are used
-    hidden: float | None  # share of moments in which the map hides the actor
-
-
-def quality(content: SessionContent, summary: Summary) -> tuple[QualityRow, ...]:
-    """Return the rows of the table of data quality."""
-    return tuple(_quality_row(content, summary, camera) for camera in summary.cameras)
-
-
-def _quality_row(content: SessionContent, summary: Summary, camera: CameraRow) -> QualityRow:
+def _quality(content: SessionContent, summary: Summary, camera: CameraRow) -> list[str]:
     clock = camera.entry.clock
     found = number(section(summary.metrics, "clock_offsets_s"), camera.name)
     offset = quantity(clock.offset_s, "s", 3)
     if found is not None:
-        sign = "+" if found >= 0 else ""
-        offset += f" {sign}{quantity(found, 's', 3)}"
-    detected, confident = _detection(content, camera)
+        offset += f" {'+' if found >= 0 else ''}{quantity(found, 's', 3)}"
     poses, truth = content.poses.get(camera.name), content.true_poses.get(camera.name)
-    still = camera.entry.poses.static
-    return QualityRow(
-        name=camera.name,
-        stated=_stated_noise(camera, poses),
-        measured=ABSENT
-        if poses is None or truth is None or still
-        else _measured_noise(poses, truth, summary),
-        offset=offset,
-        sigma=_clock_words(clock, number(section(summary.metrics, "clock_offset_sigmas_s"), camera.name)),
-        detected=detected,
-        confident=confident,
-        hidden=content.hidden.get(camera.name),
-    )
+    unknown = poses is None or truth is None or camera.entry.poses.static
+    return [
+        camera.name,
+        _stated_noise(camera, poses),
+        ABSENT if unknown or poses is None or truth is None else _measured_noise(poses, truth, summary),
+        offset,
+        _clock_words(clock, number(section(summary.metrics, "clock_offset_sigmas_s"), camera.name)),
+        *(percent(share) for share in (*_detection(content, camera), content.hidden.get(camera.name))),
+    ]
 
 
 def _clock_words(clock: ClockEntry, found_s: float | None) -> str:
@@ -394,9 +463,6 @@ def _clock_words(clock: ClockEntry, found_s: float | None) -> str:
     words = f"±{THIN}{quantity(sigma_s, 's', 3)}" if sigma_s else "known"
     words += {"stated": "", "assumed": ", assumed", "none": ", not stated"}[clock.start]
     return f"{words}; estimated to ±{THIN}{quantity(found_s, 's', 3)}" if found_s else words
-
-
-# --- poses ---------------------------------------------------------------------------------------------
 
 
 def _stated_noise(camera: CameraRow, poses: pd.DataFrame | None) -> str:
@@ -447,15 +513,12 @@ def _position_and_rotation(position_m: float, rotation_deg: float) -> str:
     return f"{fixed(position_m, 3)}{THIN}m, {fixed(rotation_deg, 2)}{THIN}deg"
 
 
-# --- detections ----------------------------------------------------------------------------------------
-
-
 def _detection(content: SessionContent, camera: CameraRow) -> tuple[float | None, float | None]:
     table = content.keypoints.get(camera.name)
     if table is None:
         return None, None
     least = number(section(content.stages.get("reconstruct", {}), "settings"), "min_confidence")
-    used = table["confidence"].to_numpy() >= (_CONFIDENT if least is None else least)
+    used = table["confidence"].to_numpy() >= (DEFAULT_MIN_CONFIDENCE if least is None else least)
     confident = float(used.mean()) if len(used) else None
     if camera.entry.keypoints is not None:
         count = camera.entry.frames.count

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.reporting.content import SessionContent, items, number, section, text
-from pipelines.reporting.summary import Summary, errors_per_camera, finite_median
+from pipelines.reporting.summary import Summary, camera_errors, finite_median
 from pipelines.reporting.wording import (
     STATUS_LABELS,
     STATUS_REASONS,
@@ -21,6 +21,19 @@ from pipelines.reporting.wording import (
 )
 from pipelines.session.description import Doubt
 
+# Thigh and shank are these parts of the stature by Drillis and Contini (1966): Winter, Biomechanics and Motor
+# Control of Human Movement, 4th edition, figure 4.1.
+LEG_OF_STATURE = 0.245 + 0.246
+# Few adults are smaller or taller.
+USUAL_STATURE_M = (1.4, 2.05)
+# Walking people keep the trunk more upright than this.
+USUAL_TRUNK_DEG = 30.0
+# The lower foot of walking people rises and falls by less than this.
+USUAL_RISE_OF_FEET_M = 0.2
+# Running people are slower than this.
+USUAL_SPEED_MPS = 8.0
+# Speeds over half a second average out the swing of the hips.
+SPEED_SPAN_NS = 500_000_000
 # Below this share of measured times a joint is named among the doubts.
 DOUBTFUL_COVERAGE = 0.8
 # A status is named among the doubts from this share of joint-frames on.
@@ -55,13 +68,6 @@ class Glance:
     odd: bool  # outside the usual range
 
 
-# Thigh and shank as parts of the stature, by Drillis and Contini (1966): Winter, Biomechanics and Motor
-# Control of Human Movement, 4th edition, figure 4.1.
-_LEG_OF_STATURE = 0.245 + 0.246
-_STATURE_M, _TRUNK_DEG, _FEET_M, _SPEED_MPS = (1.4, 2.05), 30.0, 0.2, 8.0
-_SPAN_NS = 500_000_000
-
-
 def at_a_glance(summary: Summary) -> list[Glance]:
     """Compare the first person with people: stature, trunk, feet and speed; what is not known is left out."""
     if summary.motion is None or not summary.motion.measured.any():
@@ -74,17 +80,17 @@ def at_a_glance(summary: Summary) -> list[Glance]:
         if ("thigh", side) in legs and ("shank", side) in legs
     ]
     if whole_legs:
-        stature = float(np.mean(whole_legs)) / _LEG_OF_STATURE
-        usual = f"roughly, from thigh and shank; adults {_STATURE_M[0]} to {_STATURE_M[1]} m"
-        is_odd = not _STATURE_M[0] <= stature <= _STATURE_M[1]
+        stature = float(np.mean(whole_legs)) / LEG_OF_STATURE
+        usual = f"roughly, from thigh and shank; adults {USUAL_STATURE_M[0]} to {USUAL_STATURE_M[1]} m"
+        is_odd = not USUAL_STATURE_M[0] <= stature <= USUAL_STATURE_M[1]
         glances.append(Glance("Height", quantity(stature, "m", 2), usual, is_odd))
     position, joints = summary.motion.measured_position[:, 0], summary.motion.joints
     hips, shoulders = (_middle(position, joints, kind) for kind in ("hip", "shoulder"))
     trunk = shoulders - hips
     tilt = np.degrees(np.arctan2(np.linalg.norm(trunk[:, :2], axis=1), trunk[:, 2]))
     if (middle := finite_median(tilt)) is not None:
-        usual = f"of the trunk from upright; walking people up to {_TRUNK_DEG:.0f}°"
-        glances.append(Glance("Upright", quantity(middle, "°"), usual, middle > _TRUNK_DEG))
+        usual = f"of the trunk from upright; walking people up to {USUAL_TRUNK_DEG:.0f}°"
+        glances.append(Glance("Upright", quantity(middle, "°"), usual, middle > USUAL_TRUNK_DEG))
     feet = [
         j for j, name in enumerate(joints) if name.endswith(("_ankle", "_heel", "_big_toe", "_foot_index"))
     ]
@@ -92,14 +98,16 @@ def at_a_glance(summary: Summary) -> list[Glance]:
         axis=1, initial=np.inf
     )
     if (spread := _rise_of_feet(summary.motion.t_ns, lowest)) is not None:
-        usual = f"rise and fall of the lower foot; walking people up to {100 * _FEET_M:.0f} cm"
-        glances.append(Glance("Feet on the ground", quantity(100 * spread, "cm"), usual, spread > _FEET_M))
+        usual = f"rise and fall of the lower foot; walking people up to {100 * USUAL_RISE_OF_FEET_M:.0f} cm"
+        glances.append(
+            Glance("Feet on the ground", quantity(100 * spread, "cm"), usual, spread > USUAL_RISE_OF_FEET_M)
+        )
     speed = _speeds(summary.motion.t_ns, hips)
     if len(speed):
         fast = float(np.percentile(speed, 95))
         value = f"{quantity(float(np.median(speed)), 'm/s')}, up to {quantity(fast, 'm/s')}"
-        usual = f"median and 95 % of the time; running people up to {_SPEED_MPS:.0f} m/s"
-        glances.append(Glance("Speed", value, usual, fast > _SPEED_MPS))
+        usual = f"median and 95 % of the time; running people up to {USUAL_SPEED_MPS:.0f} m/s"
+        glances.append(Glance("Speed", value, usual, fast > USUAL_SPEED_MPS))
     return glances
 
 
@@ -124,11 +132,11 @@ def _rise_of_feet(t_ns: Int64, lowest: Float) -> float | None:
 
 def _speeds(t_ns: Int64, hips: Float) -> Float:
     """Compute horizontal speeds of the hips over half a second, m/s, where they are known."""
-    after = np.searchsorted(t_ns, t_ns + _SPAN_NS)
+    after = np.searchsorted(t_ns, t_ns + SPEED_SPAN_NS)
     start = np.flatnonzero(after < len(t_ns))
     span_ns = t_ns[after[start]] - t_ns[start]
     moved = np.linalg.norm((hips[after[start]] - hips[start])[:, :2], axis=1)
-    usable = np.isfinite(moved) & (span_ns < 2 * _SPAN_NS)
+    usable = np.isfinite(moved) & (span_ns < 2 * SPEED_SPAN_NS)
     speeds: Float = moved[usable] / (span_ns[usable] / 1e9)
     return speeds
 
@@ -245,7 +253,7 @@ def _odd_cameras(summary: Summary) -> list[str]:
 
     This needs at least three cameras.
     """
-    medians = {row.name: row.median_px for row in errors_per_camera(summary) if row.median_px is not None}
+    medians = {name: px[0] for name, px in camera_errors(summary).items() if px[0] is not None}
     if len(medians) < 3:
         return []
     usual = float(np.median(list(medians.values())))

@@ -16,11 +16,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.reporting.content import FULL_SCALE, Strip
-from pipelines.reporting.motion import Motion, full_covariance, middles, side_of, standing_heights
-from pipelines.reporting.replanned import Arm, Replan
+from pipelines.reporting.arms import ArmTrack, MapSurface, Replan, surface
+from pipelines.reporting.content import (
+    FULL_SCALE,
+    MeasuredMotion,
+    Strip,
+    full_covariance,
+    middles,
+    side_of,
+    standing_heights,
+)
 from pipelines.reporting.summary import CameraRow, Summary
-from pipelines.reporting.terrain import Surface, surface
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.people import DERIVED, bones_of
@@ -30,21 +36,24 @@ from pipelines.session.tables import trajectory_from
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_BYTES = 6_000_000
-"""Size to which longer flights are thinned out; a third more in the page, where it is base64.
+# Longer flights are thinned out, so that a page with 15 MB of pictures stays below 25 MB in base64.
+MAX_BYTES = 6_000_000
+# Ellipsoids change more slowly than joints, and take at least this share in longer flights.
+SHARE_OF_ELLIPSOIDS = 0.25
+# Cameras alone need no more times to move smoothly.
+MAX_TIMES_WITHOUT_SKELETON = 3000
+# 16 bits of millimetres reach no farther from the middle of the body.
+FARTHEST_JOINT_M = 32.767
+# More square roots at once would take more than 100 MB.
+MATRICES_AT_ONCE = 1 << 15
+# Pictures farther apart are no film any more, and are noted.
+FILM_STEP_S = 0.2
 
-A page with the largest choice of pictures, 15 MB, then stays below 25 MB.
-"""
-_SHARE_OF_ELLIPSOIDS = 0.25  # of MOST_BYTES, at least, in longer flights: they change more slowly than joints
-_MOST_TIMES_WITHOUT_SKELETON = 3000
-_FARTHEST_M = 32.767
-_MATRICES_AT_ONCE = 1 << 15  # whose square roots are computed: others take no memory meanwhile
-_PICTURES_S = 0.2  # apart: more is no film any more, and is noted
 _SIDES = ("", "left", "right")
 
 
 @dataclass(frozen=True)
-class Scene:
+class ViewerScene:
     """Data of the viewer, and what the page says about it."""
 
     data: dict[str, object]  # JSON
@@ -62,7 +71,7 @@ def make_scene(
     poses: Mapping[str, pd.DataFrame],
     replan: Replan | None = None,
     strips: Sequence[Strip] = (),
-) -> Scene | None:
+) -> ViewerScene | None:
     """Pack a session for the viewer; None where there is nothing to be seen.
 
     Every camera's pose (tables.POSES) is interpolated to the times of the skeleton, never across a gap as
@@ -74,7 +83,7 @@ def make_scene(
     if motion is None and not cameras:
         return None
     all_t_ns = motion.t_ns if motion is not None else _times_without_skeleton(summary)
-    body = _Body.of(motion, summary.truth) if motion is not None else None
+    body = _PackedBody.of(motion, summary.truth) if motion is not None else None
     arms = [arm for arm in replan.arms if arm.simulated] if replan is not None else []
     all_cameras = len(cameras) + sum(len(arm.cameras) for arm in arms)
     thinned = _Thinned.of(len(all_t_ns), body, all_cameras)
@@ -96,13 +105,13 @@ def make_scene(
     }
     if body is not None:
         data["body"] = body.packed(thinned, origin) | {"names": list(summary.people)}
-    around = surface(replan.terrain) if replan is not None and replan.terrain is not None else None
+    around = surface(replan.around) if replan is not None and replan.around is not None else None
     if around is not None and around.voxels:
         points = _packed(1000 * (around.points - origin), np.int32)
         data["surface"] = {"cube": around.cube_m, "points": points}
     if body is not None and strips:
         data["film"] = [_packed_strip(strip, summary.origin_ns) for strip in strips]
-    return Scene(
+    return ViewerScene(
         data=data,
         people=summary.people if body is not None else (),
         truth=body is not None and body.truth is not None,
@@ -115,7 +124,11 @@ def make_scene(
 
 
 def _notes(
-    thinned: _Thinned, times: int, body: _Body | None, around: Surface | None, strips: Sequence[Strip]
+    thinned: _Thinned,
+    times: int,
+    body: _PackedBody | None,
+    around: MapSurface | None,
+    strips: Sequence[Strip],
 ) -> list[str]:
     """List differences from the tables, in whole sentences."""
     notes = []
@@ -131,7 +144,7 @@ def _notes(
     if body is not None:
         notes += body.notes()
         steps_s = [float(np.median(np.diff(strip.t_ns))) / 1e9 for strip in strips if len(strip.t_ns) > 1]
-        if steps_s and max(steps_s) > _PICTURES_S:
+        if steps_s and max(steps_s) > FILM_STEP_S:
             notes.append(f"Pictures are {quantity(max(steps_s), 's')} apart.")
     if around is not None and around.voxels:
         notes.append(
@@ -151,11 +164,11 @@ def _packed_strip(strip: Strip, origin_ns: int) -> dict[str, object]:
     }
 
 
-# --- bodies --------------------------------------------------------------------------------------------
+# --- bodies ---
 
 
 @dataclass(frozen=True)
-class _Body:
+class _PackedBody:
     """The measured people, each joint relative to the middle of its body."""
 
     joints: tuple[str, ...]
@@ -166,7 +179,7 @@ class _Body:
     feet_m: Float  # [T, P] height on which each person stands
 
     @classmethod
-    def of(cls, motion: Motion, truth: Float | None) -> _Body:
+    def of(cls, motion: MeasuredMotion, truth: Float | None) -> _PackedBody:
         position = motion.measured_position
         middle = middles(position)
         if truth is not None:
@@ -228,13 +241,13 @@ class _Body:
     def notes(self) -> list[str]:
         """Count the joints that are too far from their body for 16 bits."""
         far = [
-            (int((np.abs(values) > _FARTHEST_M).any(axis=-1).sum()), noun)
+            (int((np.abs(values) > FARTHEST_JOINT_M).any(axis=-1).sum()), noun)
             for values, noun in ((self.joint, "joint-frame"), (self.truth, "true joint-frame"))
             if values is not None
         ]
         return [
-            f"{plural(count, noun).capitalize()} more than {_FARTHEST_M:.0f} m from the middle of the body "
-            f"{'is' if count == 1 else 'are'} not drawn."
+            f"{plural(count, noun).capitalize()} more than {FARTHEST_JOINT_M:.0f} m from the middle of the "
+            f"body {'is' if count == 1 else 'are'} not drawn."
             for count, noun in far
             if count
         ]
@@ -245,8 +258,8 @@ def _square_root(covariance: Float) -> Float | None:
     rows, columns = np.tril_indices(3)
     upper = covariance.reshape(-1, 6)
     root = np.full(upper.shape, np.nan)
-    for first in range(0, len(upper), _MATRICES_AT_ONCE):
-        part = slice(first, first + _MATRICES_AT_ONCE)
+    for first in range(0, len(upper), MATRICES_AT_ONCE):
+        part = slice(first, first + MATRICES_AT_ONCE)
         full = full_covariance(upper[part])
         known = np.isfinite(full).all(axis=(1, 2))
         positive = np.zeros(len(full), dtype=np.bool_)
@@ -255,7 +268,7 @@ def _square_root(covariance: Float) -> Float | None:
     return root.reshape(covariance.shape) if np.isfinite(root).any() else None
 
 
-# --- cameras -------------------------------------------------------------------------------------------
+# --- cameras ---
 
 
 @dataclass(frozen=True)
@@ -285,7 +298,7 @@ def _placed(camera: CameraRow, table: pd.DataFrame, t_ns: Int64, summary: Summar
     return _Placed(camera.name, camera, *poses, {})
 
 
-def _placed_again(arm: Arm, a: int, k: int, t_ns: Int64, summary: Summary) -> _Placed:
+def _placed_again(arm: ArmTrack, a: int, k: int, t_ns: Int64, summary: Summary) -> _Placed:
     """Place camera `k` of arm `a`, with the lenses of the session's cameras, in turn."""
     track = Trajectory(arm.t_ns, arm.position[k], arm.quaternion_xyzw[k])
     poses = poses_at(track, t_ns, summary.description.pose_interpolation)
@@ -305,31 +318,31 @@ def _picture_corners(camera: CameraRow) -> list[float]:
     return _rounded(np.array(edges))
 
 
-# --- packing -------------------------------------------------------------------------------------------
+# --- packing ---
 
 
 @dataclass(frozen=True)
 class _Thinned:
-    """Choice of the times that a page holds, so that they need at most MOST_BYTES."""
+    """Choice of the times that a page holds, so that they need at most MAX_BYTES."""
 
     every: int  # of the skeleton's times
     ellipsoids_every: int = 1  # of the times that the page holds
 
     @classmethod
-    def of(cls, times: int, body: _Body | None, cameras: int) -> _Thinned:
+    def of(cls, times: int, body: _PackedBody | None, cameras: int) -> _Thinned:
         per_time = cameras * (3 * 4 + 4 * 2) + (0 if body is None else body.bytes_per_time)
         ellipsoids = 0 if body is None else body.bytes_of_ellipsoids
-        if times * (per_time + ellipsoids) <= MOST_BYTES:
+        if times * (per_time + ellipsoids) <= MAX_BYTES:
             return cls(1)
-        share = _SHARE_OF_ELLIPSOIDS if ellipsoids else 0.0
-        every = math.ceil(times * per_time / ((1 - share) * MOST_BYTES))
+        share = SHARE_OF_ELLIPSOIDS if ellipsoids else 0.0
+        every = math.ceil(times * per_time / ((1 - share) * MAX_BYTES))
         held = -(-times // every)
-        left = MOST_BYTES - held * per_time
+        left = MAX_BYTES - held * per_time
         return cls(every, math.ceil(held * ellipsoids / left) if ellipsoids else 1)
 
 
 def _times_without_skeleton(summary: Summary) -> Int64:
-    count = min(max(camera.entry.frames.count for camera in summary.cameras), _MOST_TIMES_WITHOUT_SKELETON)
+    count = min(max(camera.entry.frames.count for camera in summary.cameras), MAX_TIMES_WITHOUT_SKELETON)
     steps = np.round(np.linspace(0, 1e9 * summary.duration_s, count)).astype(np.int64)
     return summary.origin_ns + np.unique(steps)
 

@@ -1,9 +1,10 @@
-"""Numbers and words as the pages print them, and the templates that use them."""
+"""Numbers, words and tables as the pages print them, and the templates that use them."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -14,10 +15,11 @@ if TYPE_CHECKING:
 THIN = "\u202f"  # narrow no-break space: between a number and its unit, and between thousands
 ABSENT = "–"
 
-# A stamp after this one counts from the epoch: no log counts 30 years since its own start.
-_EPOCH_SINCE_NS = 946_684_800_000_000_000  # 2000-01-01
+# A stamp after 2000-01-01 counts from the epoch: no log counts 30 years since its own start.
+EPOCH_SINCE_NS = 946_684_800_000_000_000
+# Longer labels would take the room of the curves.
+MAX_LABEL = 24
 
-_LABEL = 24  # most characters of a label
 _FORMULA = re.compile(r"(?:^|(?<=[;\t\r\n]))(?=[-=+@\t\r\n＝＋－＠])")
 
 STATUS_LABELS = {
@@ -45,6 +47,41 @@ STATUS_REMEDIES = {
     "not_detected": "Check that the keypoint files belong to these videos, and their first frame number.",
     "no_pose": "Check that the pose logs cover the time of the videos, and the clock offsets.",
 }
+
+
+@dataclass(frozen=True)
+class Column:
+    """Column of a table: its title, what stands below that, and its alignment."""
+
+    title: str
+    small: str = ""
+    text: bool = False  # else numbers, on the right
+    key: str = ""  # of the status whose colour stands beside the title
+
+
+Cell = str | tuple[str, str]
+"""A text, and below it a smaller one where there is one."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a page: the first column names the rows."""
+
+    key: str
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[object]]  # of `Cell`
+    kind: str = ""  # classes of the style sheet
+
+
+def with_interval(
+    value: float | None, ends: tuple[float, float] | None, digits: int = 1, *, signed: bool = False
+) -> tuple[str, str]:
+    """Format a mean and its interval, `4.2` and `4.0 to 4.4`; a dash and nothing where there is none."""
+    if value is None:
+        return ABSENT, ""
+    plus = "+" if signed and round(value, digits) > 0 else ""
+    return plus + fixed(value, digits), " to ".join(fixed(end, digits) for end in ends or ())
 
 
 def fixed(value: float | None, digits: int = 1) -> str:
@@ -99,8 +136,8 @@ def listing(words: Iterable[str]) -> str:
 def shortened(label: str) -> str:
     """Shorten a name for a figure's label: printable, on one line, cut in the middle if it is long."""
     clean = "".join(c if c.isprintable() else " " for c in label).strip()
-    half = (_LABEL - 1) // 2
-    return clean if len(clean) <= _LABEL else f"{clean[:half]}…{clean[-half:]}"
+    half = (MAX_LABEL - 1) // 2
+    return clean if len(clean) <= MAX_LABEL else f"{clean[:half]}…{clean[-half:]}"
 
 
 def cell_text(value: object) -> object:
@@ -122,7 +159,7 @@ def moment(t_ns: int | None) -> str:
     """Format a stamp as a date in UTC if it counts from the epoch, else as seconds of the log's clock."""
     if t_ns is None:
         return ABSENT
-    if t_ns < _EPOCH_SINCE_NS:
+    if t_ns < EPOCH_SINCE_NS:
         return f"{fixed(t_ns / 1e9, 3)}{THIN}s on the log's own clock"
     seconds, rest = divmod(t_ns, 1_000_000_000)
     stamp = datetime.fromtimestamp(seconds, UTC)

@@ -30,7 +30,7 @@ from pipelines.reconstruct import Settings as ReconstructSettings
 from pipelines.reconstruct import reconstruct
 from pipelines.reconstruction import segments
 from pipelines.report import Reported
-from pipelines.reporting.flights import FlightRow, render_flights
+from pipelines.reporting.page import FlightRow, render_flights
 from pipelines.session.errors import BusyError
 from pipelines.session.parallel import connected
 from pipelines.session.registries import install_command

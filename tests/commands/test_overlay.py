@@ -17,8 +17,8 @@ from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.poses import conjugate, rotate
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct
-from pipelines.reporting.frame_drawing import GREY as BLANK
-from pipelines.reporting.frame_drawing import SIDES
+from pipelines.reporting.pictures import GREY as BLANK
+from pipelines.reporting.pictures import SIDES
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json, write_json
 from tests.commands.runner import as_if_written

@@ -6,15 +6,19 @@ import re
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
-from pipelines.reporting.arm_figures import draw_arms, hidden_spans
-from pipelines.reporting.from_above import KEYFRAMES, draw_from_above
-from pipelines.reporting.plates import Plate
-from pipelines.reporting.replanned import Replan, summarise_replan
+from pipelines.reporting.arms import (
+    KEYFRAMES,
+    Replan,
+    draw_arms,
+    draw_from_above,
+    hidden_spans,
+    summarise_replan,
+)
+from pipelines.reporting.chart import Plate
 
-from .comparisons import make_comparison, make_cost_map
+from .comparisons import make_comparison
 from .conftest import START_NS
 from .reading import numbers
 
@@ -81,14 +85,6 @@ def test_the_line_of_the_yaw_rises_as_commanded(plates: dict[str, Plate]) -> Non
     assert kept[0, 1] == turned[0, 1]
 
 
-def test_the_actor_is_drawn_to_scale(plates: dict[str, Plate]) -> None:
-    svg = plates["arms-top"].svg
-    way, along = _path(svg, "--ink", "1.8"), _ticks(svg, "x")
-    m_per_unit = 5 / (along[5] - along[0])
-    assert np.ptp(way[:, 0]) * m_per_unit == pytest.approx(10, abs=0.01)
-    assert np.ptp(way[:, 1]) == 0
-
-
 def test_hidden_sight_lines_are_told_apart(plates: dict[str, Plate]) -> None:
     svg = plates["arms-top"].svg
     # One sight line, and the key that explains it.
@@ -128,20 +124,6 @@ def test_no_fly_zones_are_hatched_and_named() -> None:
     assert "no-fly" not in bare.svg + bare.caption
 
 
-def test_without_a_cost_map_the_yaw_stands_alone() -> None:
-    plate = draw_arms(summarise_replan(replace(make_comparison(), cost_map=None), START_NS, 2))["arms-yaw"]
-    assert "cost" not in plate.title + plate.caption + plate.svg
-
-
-def test_a_flat_cost_map_is_said_to_be_flat() -> None:
-    flat = make_cost_map().assign(cost=0.0)
-    plate = draw_arms(summarise_replan(replace(make_comparison(), cost_map=flat), START_NS, 2))["arms-yaw"]
-    shaded = draw_arms(summarise_replan(make_comparison(), START_NS, 2))["arms-yaw"]
-    assert "cost" in plate.caption
-    assert plate.caption != shaded.caption
-    assert shaded.svg.count("var(--muted)") > plate.svg.count("var(--muted)")
-
-
 @pytest.mark.parametrize("rows", [2, 40])  # a single moment, and twenty
 def test_short_flights_are_drawn(rows: int) -> None:
     content = make_comparison()
@@ -149,22 +131,6 @@ def test_short_flights_are_drawn(rows: int) -> None:
     plates = draw_arms(summarise_replan(replace(content, arms=short), START_NS, 2))
     assert len(plates) == 3
     assert all(said[-1] == 2 * min(rows // 2, KEYFRAMES) for said in _told(plates["arms-top"]).values())
-
-
-def test_arms_without_rows_are_not_drawn() -> None:
-    content = make_comparison()
-    empty = {name: table[:0] for name, table in content.arms.items()}
-    assert draw_arms(summarise_replan(replace(content, arms=empty), START_NS, 2)) == {}
-
-
-def test_errors_without_bound_do_not_flatten_the_others() -> None:
-    content = make_comparison("adaptive", "fixed")
-    table: pd.DataFrame = content.arms["fixed"].copy()
-    table.loc[table.index[:4], "predicted_error_m"] = 1000.0
-    arms = content.arms | {"fixed": table}
-    plate = draw_arms(summarise_replan(replace(content, arms=arms), START_NS, 2))["arms-time"]
-    # Three times the 90th percentile, 50 cm.
-    assert numbers(plate.caption) == [150]
 
 
 def test_the_same_comparison_gives_the_same_bytes(compared: Replan, plates: dict[str, Plate]) -> None:

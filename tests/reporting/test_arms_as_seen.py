@@ -8,9 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.reporting.arm_figures import draw_arms
-from pipelines.reporting.arms_as_seen import draw_as_seen, moments
-from pipelines.reporting.replanned import Replan, summarise_replan
+from pipelines.reporting.arms import Replan, draw_arms, moments, summarise_replan
 
 from .comparisons import DRONES, HIDDEN_S, make_comparison
 from .conftest import START_NS
@@ -49,20 +47,6 @@ def test_moments_are_those_at_which_the_arms_differ_most(compared: Replan) -> No
     assert moments(looks).tolist() == [2, 3, 8, 10]
 
 
-def test_a_loss_that_all_arms_share_is_no_difference(compared: Replan) -> None:
-    """All arms lose all joints at 7 and 9 s; one of them loses one joint at 6 and at 8 s."""
-    looks = []
-    for k, (arm, seen) in enumerate((arm, arm.seen) for arm in compared.arms):
-        assert seen is not None
-        status = np.full(seen.status.shape, "seen", dtype="<U7")
-        status[:, [7, 9]] = "hidden"
-        if k == 0:
-            status[0, [6, 8], 0] = "hidden"
-        looks.append((arm, replace(seen, status=status)))
-    assert moments(looks).tolist()[2:] == [8, 10]
-    assert moments(looks[:1]).tolist()[2:] == [7, 9]  # a single arm: where it loses most
-
-
 def test_the_figure_says_what_is_lost(compared: Replan) -> None:
     plate = draw_arms(compared)["arms-seen"]
     said = dict(sentence.split(":") for sentence in plate.description.rstrip(".").split(". "))
@@ -80,7 +64,3 @@ def test_the_figure_says_what_is_lost(compared: Replan) -> None:
     assert set(hidden["arm"]) == {"fixed"}
     assert sorted(set(hidden["t_s"])) == [2, 3]
     assert table.loc[table["status"] == "outside", "x_px"].isna().all()
-
-
-def test_without_a_skeleton_there_is_none(compared: Replan) -> None:
-    assert draw_as_seen(summarise_replan(make_comparison(), START_NS, 2)) is None

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.reporting.comparison import camera_positions
 from pipelines.reporting.content import SessionContent, as_reconstructed
 from pipelines.reporting.overlays import collect_moments
+from pipelines.reporting.session_comparison import camera_positions
 from pipelines.reporting.summary import summarise
 
 from .conftest import ASIDE_PX, CAMERAS, START_NS, _camera_at

@@ -15,13 +15,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.reporting.comparison import compare
-from pipelines.reporting.comparison_figures import draw_comparison
+from pipelines.reporting.chart import MARK, Plate, refuse_foreign, write_figures
+from pipelines.reporting.comparison_page import draw_comparison
 from pipelines.reporting.content import SessionContent
-from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
 from pipelines.reporting.figures import draw_all
 from pipelines.reporting.page import draw_session
-from pipelines.reporting.plates import Plate
+from pipelines.reporting.session_comparison import compare
 from pipelines.reporting.summary import summarise
 from pipelines.session.errors import DataError
 
@@ -99,14 +98,6 @@ def test_numbers_are_those_of_the_session(written: Path) -> None:
     np.testing.assert_allclose(radius, 6.0, atol=0.35)
 
 
-def test_labels_are_no_formulas_of_a_spreadsheet(tmp_path: Path, plates: Mapping[str, Plate]) -> None:
-    numbers = pd.DataFrame({"session": ["=1+1", "walk"], "value": [-1.5, 2.0]})
-    write_figures(tmp_path, {"time": replace(plates["time"], numbers={"": numbers})}, {}, "k")
-    read = _read(tmp_path, "time.csv")
-    assert read["session"].tolist() == ["'=1+1", "walk"]
-    assert read["value"].tolist() == [-1.5, 2.0]
-
-
 def test_numbers_of_arms_are_those_of_the_comparison(written: Path) -> None:
     arms = _read(written, "arms-time.csv")
     assert len(arms) == 3 * 2 * TIMES
@@ -177,31 +168,3 @@ def test_nothing_of_others_is_written_over(written: Path, tmp_path: Path) -> Non
     (tmp_path / "session.json").write_text("{}")
     with pytest.raises(DataError, match="is a session"):
         refuse_foreign(tmp_path, overwrite=True)
-
-
-@pytest.mark.parametrize(
-    ("named", "problem"),
-    [
-        (".", "holds a session in deep/a.session"),
-        ("deep/a.session/report", "is a stage of a session"),
-        ("deep/a.session/cameras", "is a part of a session"),
-    ],
-)
-def test_no_session_is_lost_with_what_is_around_it(named: str, problem: str, tmp_path: Path) -> None:
-    session = tmp_path / "deep" / "a.session"
-    (session / "cameras").mkdir(parents=True)
-    (session / "report").mkdir()
-    (session / "session.json").write_text("{}")
-    (session / "report" / "stage.json").write_text("{}")
-    with pytest.raises(DataError, match=problem):
-        refuse_foreign(tmp_path / named, overwrite=True)
-    refuse_foreign(session / "figures", overwrite=True)  # a folder of its own
-
-
-def test_a_file_beside_our_figures_is_not_ours(tmp_path: Path) -> None:
-    (tmp_path / MARK).write_text('{"figures": [{"files": ["top.svg"]}]}')
-    (tmp_path / "top.svg").write_text("<svg/>")
-    refuse_foreign(tmp_path, overwrite=False)
-    (tmp_path / "top-edited.svg").write_text("<svg/>")
-    with pytest.raises(DataError, match=r"\(1, \D*top-edited\.svg\)"):
-        refuse_foreign(tmp_path, overwrite=False)

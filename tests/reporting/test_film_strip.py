@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.reporting.content import SessionContent, as_reconstructed
-from pipelines.reporting.panels import make_strips
+from pipelines.reporting.pictures import make_strips
 from pipelines.reporting.summary import summarise
 from pipelines.reporting.viewer import make_scene
 

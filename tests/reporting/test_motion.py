@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.motion import errors_mm, motion_from_skeleton, share_inside_95, standing_heights
+from pipelines.reporting.content import errors_mm, motion_from_skeleton, share_inside_95, standing_heights
 from pipelines.reporting.summary import truth_at
 
 from .conftest import FRAMES, JOINTS, OFFSET_M, make_skeleton, make_truth, statuses
@@ -22,12 +22,6 @@ def test_rows_in_any_order_give_the_same_arrays() -> None:
     assert np.array_equal(motion.t_ns, shuffled.t_ns)
     np.testing.assert_array_equal(motion.position, shuffled.position[:, :, order])
     np.testing.assert_array_equal(motion.status, shuffled.status[:, :, order])
-
-
-def test_a_cell_without_a_row_has_no_status() -> None:
-    motion = motion_from_skeleton(make_skeleton(10).drop(index=3))
-    assert motion.status[0, 0, motion.joints.index(JOINTS[3])] == -1
-    assert np.count_nonzero(motion.status == -1) == 1
 
 
 def test_error_is_the_offset_wherever_the_joint_was_measured() -> None:
@@ -70,11 +64,6 @@ def test_people_are_compared_with_the_nearest_truth() -> None:
     assert np.nanmax(error) == pytest.approx(1000 * np.linalg.norm(OFFSET_M), abs=1e-6)
 
 
-def test_truth_of_other_joints_compares_with_nothing() -> None:
-    motion = motion_from_skeleton(make_skeleton(5))
-    assert np.isnan(truth_at(make_truth(5).assign(joint="tail"), motion)).all()
-
-
 def test_a_calibrated_covariance_holds_95_percent_of_the_truth() -> None:
     motion = motion_from_skeleton(make_skeleton(400))
     rng = np.random.default_rng(7)
@@ -92,13 +81,6 @@ def test_a_calibrated_covariance_holds_95_percent_of_the_truth() -> None:
     assert share == pytest.approx(0.95, abs=0.011)
 
 
-@pytest.mark.parametrize("value", [np.nan, 0.0])
-def test_no_share_without_a_usable_covariance(value: float) -> None:
-    motion = motion_from_skeleton(make_skeleton(10))
-    motion = replace(motion, covariance=np.full(motion.covariance.shape, value))
-    assert share_inside_95(motion, truth_at(make_truth(10), motion)) is None
-
-
 def test_a_person_stands_where_the_lowest_joint_is_for_two_seconds() -> None:
     motion = motion_from_skeleton(make_skeleton())  # on level ground, without a joint from 9.5 s on
     slope = 0.1 * (motion.t_ns - motion.t_ns[0]) / 1e9  # 10 cm/s: the median of two seconds is the middle
@@ -111,20 +93,3 @@ def test_a_person_stands_where_the_lowest_joint_is_for_two_seconds() -> None:
     # Ankles are 8 cm high at all times. One time of 61 moves the median by a step of 3.3 mm at most.
     assert feet[inner] == pytest.approx(0.08 + OFFSET_M[2] + slope[inner], abs=0.0034)
     assert np.isfinite(feet).all()
-
-
-def test_a_person_who_was_never_measured_stands_where_the_others_do() -> None:
-    motion = motion_from_skeleton(make_skeleton(30))
-    height_m = 100.0  # of the flight above the world's zero
-    both = replace(
-        motion,
-        position=np.concatenate(
-            [motion.position + np.array([0, 0, height_m]), np.full_like(motion.position, np.nan)], axis=1
-        ),
-        status=np.concatenate(
-            [motion.status, np.full_like(motion.status, STATUS.index("few_views"))], axis=1
-        ),
-    )
-    first, second = standing_heights(both).T
-    assert np.median(first) > height_m
-    assert second == pytest.approx(np.median(first))

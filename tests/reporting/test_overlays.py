@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.content import SessionContent
-from pipelines.reporting.motion import motion_from_skeleton
+from pipelines.reporting.content import SessionContent, motion_from_skeleton
 from pipelines.reporting.overlays import (
     MOMENTS,
     View,
@@ -92,35 +91,6 @@ def test_a_joint_that_was_lost_otherwise_is_no_rejected_one(content: SessionCont
         assert not view.rejected[0, JOINTS.index("nose")]
 
 
-def test_keypoints_that_were_not_used_are_left_out(content: SessionContent) -> None:
-    doubted = content.keypoints["mast"].copy()
-    doubted.loc[doubted["joint"] == "nose", "confidence"] = 0.2
-    unsure = replace(
-        content,
-        keypoints={**content.keypoints, "mast": doubted},
-        stages={"reconstruct": {"settings": {"min_confidence": 0.3}}},
-    )
-    nose = JOINTS.index("nose")
-    assert all(np.isnan(view.found[0, nose]).all() for view in _views(unsure, "mast"))
-    assert not any(np.isnan(view.found[0, nose]).any() for view in _views(content, "mast"))
-
-
-def test_camera_that_saw_nobody_still_shows_the_skeleton(content: SessionContent) -> None:
-    empty = content.keypoints["mast"][:0]
-    blind = replace(content, keypoints={**content.keypoints, "mast": empty})
-    views = _views(blind, "mast")
-    assert len(views) == MOMENTS
-    assert all(view.median_px is None and np.isnan(view.found).all() for view in views)
-    assert all(np.isfinite(view.reprojected).any() for view in views)
-
-
-def test_camera_that_had_stopped_is_named(content: SessionContent) -> None:
-    short = content.frames["mast"][: FRAMES // 2]
-    stopped = replace(content, frames={**content.frames, "mast": short})
-    moments = collect_moments(stopped, summarise(stopped), None)
-    assert [moment.without_frame for moment in moments] == [()] * 3 + [("mast",)] * 3
-
-
 def test_pictures_are_asked_for_by_camera_and_frame(content: SessionContent) -> None:
     moments = collect_moments(
         content,
@@ -135,23 +105,12 @@ def test_pictures_are_asked_for_by_camera_and_frame(content: SessionContent) -> 
             assert view.picture[0, 0, 0] == view.frame % 256
 
 
-def test_without_a_skeleton_or_keypoints_there_is_nothing_to_compare(content: SessionContent) -> None:
-    for poorer in (replace(content, skeleton=None, truth=None), replace(content, keypoints={})):
-        assert collect_moments(poorer, summarise(poorer), None) == ()
-
-
 def test_moments_are_spread_and_hold_the_worst() -> None:
     motion = motion_from_skeleton(_with_error(433, list(JOINTS), 80.0))
     chosen, worst = choose_moments(motion)
     assert worst == 433
     assert [row // (FRAMES // MOMENTS) for row in chosen] == list(range(MOMENTS))
     assert 433 in chosen
-
-
-def test_one_joint_gone_astray_makes_no_worst_moment() -> None:
-    # The skeleton's own errors lie between 3 and 5 px.
-    _, worst = choose_moments(motion_from_skeleton(_with_error(433, ["nose"], 5000.0)))
-    assert worst != 433
 
 
 def test_the_worst_moment_is_that_of_the_largest_error_where_truth_is_known() -> None:
@@ -164,21 +123,6 @@ def test_the_worst_moment_is_that_of_the_largest_error_where_truth_is_known() ->
     assert worst == 100
     assert 100 in chosen
     assert choose_moments(motion, np.full_like(error_mm, np.nan))[1] == 433
-
-
-def test_no_moment_is_empty(content: SessionContent) -> None:
-    assert content.skeleton is not None
-    motion = motion_from_skeleton(content.skeleton)
-    chosen, _ = choose_moments(motion)
-    assert (motion.measured[chosen].sum(axis=(1, 2)) >= 15).all()
-
-
-@pytest.mark.parametrize("frames", [1, 2, 5])
-def test_fewer_times_than_moments(frames: int) -> None:
-    table = make_skeleton(frames).assign(status="ok", x=1.0, reprojection_px=1.0)
-    chosen, worst = choose_moments(motion_from_skeleton(table))
-    assert chosen == list(range(frames))
-    assert worst in chosen
 
 
 BODY = np.array([[100.0, 100.0], [140.0, 100.0], [100.0, 300.0], [140.0, 300.0]])

@@ -8,11 +8,10 @@ import pytest
 
 from pipelines.reporting.content import SessionContent, items
 from pipelines.reporting.summary import summarise
-from pipelines.reporting.verdict import Verdict, _rise_of_feet, _speeds, give_verdict
+from pipelines.reporting.verdict import Verdict, give_verdict
 from pipelines.reporting.wording import STATUS_REASONS, STATUS_REMEDIES, joint_label
-from pipelines.session.description import Doubt
 
-from .conftest import STAGES, described, make_session, make_skeleton
+from .conftest import STAGES, make_skeleton
 from .reading import numbers, one
 
 
@@ -63,14 +62,6 @@ def test_verdict_without_truth_says_so_and_uses_the_bones(content: SessionConten
     assert [numbers(said) for said in verdict.certainty] == [[15.0]]  # nothing to check it by
 
 
-def test_optimistic_covariance_is_called_so(content: SessionContent) -> None:
-    assert content.skeleton is not None
-    narrow = content.skeleton.assign(cxx=1e-6, cyy=1e-6, czz=1e-6)
-    _, share = _verdict(replace(content, skeleton=narrow)).certainty
-    assert numbers(share) == [0, 95]
-    assert "small" in share
-
-
 def test_joints_far_from_truth_are_doubtful_however_few(content: SessionContent) -> None:
     assert content.skeleton is not None
     assert not [doubt for doubt in _verdict(content).doubts if "(ok)" in doubt]
@@ -93,19 +84,6 @@ def test_nothing_reconstructed_names_the_gate(content: SessionContent, word: str
     assert all(part in lead for part in (STATUS_REASONS[word], STATUS_REMEDIES[word], f"({word})"))
 
 
-def test_the_most_frequent_gate_is_named(content: SessionContent) -> None:
-    skeleton = _all_lost_to("rejected", make_skeleton(50))
-    skeleton.loc[skeleton.index[:340], "status"] = "no_pose"  # 340 of 850
-    lead = _verdict(replace(content, skeleton=skeleton, metrics={})).lead
-    assert numbers(lead) == [850, 60.0]
-    assert "(rejected)" in lead
-
-
-def test_not_reconstructed_yet(content: SessionContent) -> None:
-    ingested = replace(content, skeleton=None, metrics=None, truth=None)
-    assert "mocap reconstruct" in _verdict(ingested).lead
-
-
 def test_a_camera_that_disagrees_with_the_others_is_doubtful(content: SessionContent) -> None:
     medians = {"drone1": 5.0, "drone2": 6.0, "mast": 20.0}
     metrics = (content.metrics or {}) | {
@@ -116,19 +94,6 @@ def test_a_camera_that_disagrees_with_the_others_is_doubtful(content: SessionCon
     assert numbers(doubt) == [20.0, 6.0]
 
 
-def test_no_warnings_no_doubts(content: SessionContent) -> None:
-    session = make_session() | {"warnings": []}
-    cameras = session["cameras"]
-    assert isinstance(cameras, dict)
-    session["cameras"] = {"drone1": cameras["drone1"]}
-    skeleton = make_skeleton(20)
-    complete = skeleton.assign(status="ok", x=1.0, y=2.0, z=0.5)
-    quiet = replace(content, session=described(session), skeleton=complete, truth=None, stages={})
-    verdict = _verdict(quiet)
-    assert numbers(verdict.lead)[0] == 100
-    assert verdict.doubts == ()
-
-
 def test_a_doubt_comes_before_everything_else(content: SessionContent) -> None:
     doubt = {"code": "mount", "cameras": ["mast"], "what": "W1", "evidence": {}, "remedy": "R1"}
     doubted = replace(content, metrics={**(content.metrics or {}), "doubts": [doubt]})
@@ -136,30 +101,3 @@ def test_a_doubt_comes_before_everything_else(content: SessionContent) -> None:
     assert verdict.lead.index("W1") < verdict.lead.index("81.1")
     assert right.lead.split()[0] not in verdict.lead
     assert "R1" in verdict.doubts[0]
-
-
-def test_a_doubt_comes_first_where_nothing_is_reconstructed(content: SessionContent) -> None:
-    doubt = {"code": "mount", "cameras": ["mast"], "what": "W1", "evidence": {}, "remedy": "R1"}
-    session = content.session.model_copy(update={"doubts": [Doubt(**doubt)]})
-    ingested = replace(content, session=session, skeleton=None, metrics=None, truth=None)
-    assert content.skeleton is not None
-    empty = replace(content, skeleton=content.skeleton.iloc[:0], metrics={"doubts": [doubt]})
-    for lacking in (ingested, empty):
-        right = replace(lacking, session=content.session, metrics=lacking.metrics and {"doubts": []})
-        usual = _verdict(right).lead
-        assert _verdict(lacking).lead.endswith(usual)
-        assert 0 < _verdict(lacking).lead.index("W1") < len(_verdict(lacking).lead) - len(usual)
-
-
-def test_speed_and_feet_of_a_straight_climb() -> None:
-    """Walk east at 1.5 m/s up a slope of 10 %; feet that rise and fall by 4 cm in a second."""
-    t_ns = np.arange(0, 10 * 10**9, 10**9 // 50)
-    t_s = t_ns / 1e9
-    hips = np.stack([1.5 * t_s, 0 * t_s, 1 + 0.15 * t_s], axis=1)
-    np.testing.assert_allclose(_speeds(t_ns, hips), 1.5, rtol=1e-9)
-    # 10th to 90th percentile of a sine: 2 sin(0.4 pi) of its amplitude. A slope shows at both ends alone.
-    for lowest, expected in ((0.02 * np.sin(2 * np.pi * t_s), 0.04 * np.sin(0.4 * np.pi)), (0.15 * t_s, 0.0)):
-        rise = _rise_of_feet(t_ns, lowest)
-        assert rise is not None
-        assert abs(rise - expected) < 0.004
-    assert _rise_of_feet(t_ns, np.full(len(t_ns), np.inf)) is None

@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 from pipelines.reporting import viewer
+from pipelines.reporting.arms import summarise_replan
 from pipelines.reporting.content import SessionContent
-from pipelines.reporting.replanned import summarise_replan
 from pipelines.reporting.summary import summarise
-from pipelines.reporting.viewer import Scene, make_scene
+from pipelines.reporting.viewer import ViewerScene, make_scene
 
 from .comparisons import DRONES, TIMES, make_comparison, positions
 from .conftest import (
@@ -35,7 +35,7 @@ from .reading import numbers
 ROUNDING_M = 0.001001
 
 
-def _scene(content: SessionContent) -> Scene:
+def _scene(content: SessionContent) -> ViewerScene:
     scene = make_scene(summarise(content), content.poses)
     assert scene is not None
     return scene
@@ -50,7 +50,7 @@ def _numbers(text: Any, kind: type[np.int16 | np.int32], columns: int) -> np.nda
     return np.where(missing, np.nan, values)
 
 
-def _joints(scene: Scene, which: str = "joint") -> np.ndarray:
+def _joints(scene: ViewerScene, which: str = "joint") -> np.ndarray:
     """Decode the positions [T, P, J, 3] in the world, without the scene's origin."""
     body: Any = scene.data["body"]
     middle = _numbers(body["middle"], np.int32, 3) / 1000
@@ -59,7 +59,7 @@ def _joints(scene: Scene, which: str = "joint") -> np.ndarray:
     return middle.reshape(-1, people, 1, 3) + offset
 
 
-def _origin(scene: Scene, content: SessionContent) -> np.ndarray:
+def _origin(scene: ViewerScene, content: SessionContent) -> np.ndarray:
     """Compute the scene's origin from the camera that stands still."""
     cameras: Any = scene.data["cameras"]
     mast = _numbers(cameras[CAMERAS.index("mast")]["position"], np.int32, 3) / 1000
@@ -117,17 +117,8 @@ def test_uncertainty_comes_back_as_its_square_root(content: SessionContent) -> N
     assert lower @ lower.T == pytest.approx(covariance, abs=2 * 0.05 * 5e-5 * 3)
 
 
-def test_without_truth_and_covariance_there_is_nothing_to_switch_on(content: SessionContent) -> None:
-    assert content.skeleton is not None
-    unknown = content.skeleton.assign(cxx=np.nan)
-    scene = _scene(replace(content, truth=None, skeleton=unknown))
-    assert not scene.truth
-    assert not scene.ellipsoids
-    assert scene.notes == ()
-
-
 def test_long_flight_is_thinned_and_says_so(content: SessionContent, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer, "MOST_BYTES", 1_500_000)
+    monkeypatch.setattr(viewer, "MAX_BYTES", 1_500_000)
     frames = 6000
     long_flight = replace(
         content,
@@ -149,25 +140,6 @@ def test_long_flight_is_thinned_and_says_so(content: SessionContent, monkeypatch
     expected = true_positions(np.arange(0, frames, every) / 30)[:, JOINTS.index("left_hip")]
     hip = joints[:, 0, JOINTS.index("left_hip")] + _origin(scene, long_flight)
     assert np.nanmax(np.abs(hip - expected - OFFSET_M)) < ROUNDING_M
-
-
-def test_ellipsoids_of_a_long_flight_are_thinned_further(
-    content: SessionContent, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert content.skeleton is not None
-    whole: Any = _scene(content).data["body"]
-    # 600 times of 280 bytes are 168 kB: of what is left, a time in three.
-    monkeypatch.setattr(viewer, "MOST_BYTES", 225_000)
-    scene = _scene(content)
-    body: Any = scene.data["body"]
-    assert body["rootEvery"] == 3
-    assert [numbers(note) for note in scene.notes] == [[3]]
-    joints = len(JOINTS)
-    stored = _numbers(body["root"], np.int16, 6).reshape(-1, joints, 6)
-    assert len(stored) == FRAMES // 3
-    assert np.array_equal(
-        stored, _numbers(whole["root"], np.int16, 6).reshape(-1, joints, 6)[::3], equal_nan=True
-    )
 
 
 def test_a_joint_gone_far_astray_is_left_out_and_counted(content: SessionContent) -> None:
@@ -197,16 +169,6 @@ def test_bones_know_their_side_and_join_what_is_derived(content: SessionContent)
     ]
 
 
-def test_opens_with_a_time_that_shows_a_body(content: SessionContent) -> None:
-    assert content.skeleton is not None
-    late = content.skeleton.copy()
-    empty = late["t_ns"] < START_NS + 2_000_000_000
-    late.loc[empty, ["x", "y", "z"]] = np.nan
-    late.loc[empty, "status"] = "few_views"
-    body: Any = _scene(replace(content, skeleton=late)).data["body"]
-    assert body["start"] == 61  # at frame 60 two joints of 17 are missing
-
-
 def test_two_people_keep_apart(content: SessionContent) -> None:
     first = make_skeleton(40)
     both = pd.concat([first, first.assign(person=1, x=first["x"] + 3)])
@@ -223,10 +185,6 @@ def test_cameras_alone_before_the_reconstruction(content: SessionContent) -> Non
     assert "body" not in scene.data
     t_s = _numbers(scene.data["t"], np.int32, 1)[:, 0] / 1e4
     assert t_s == pytest.approx(np.arange(FRAMES) / 30, abs=1e-4)
-
-
-def test_nothing_to_show(content: SessionContent) -> None:
-    assert make_scene(summarise(replace(content, skeleton=None, truth=None)), {}) is None
 
 
 def test_simulated_arms_bring_their_cameras_and_the_map(content: SessionContent) -> None:

@@ -8,30 +8,13 @@ from pipelines.reporting.wording import (
     THIN,
     cell_text,
     fixed,
-    flattened,
     listing,
     moment,
     percent,
-    plain,
     plural,
     shortened,
     significant,
 )
-
-
-@pytest.mark.parametrize(
-    ("share", "said"),
-    [
-        (0.0, "0"),
-        (1.0, "100"),
-        (0.9999, f">{THIN}99.9"),
-        (0.0001, f"<{THIN}0.1"),
-        (0.8105, "81.0"),
-        (0.5, "50.0"),
-    ],
-)
-def test_percent_says_all_or_nothing_only_of_all_or_nothing(share: float, said: str) -> None:
-    assert percent(share) == f"{said}{THIN}%"
 
 
 @given(st.floats(0, 1))
@@ -72,20 +55,3 @@ def test_numbers() -> None:
 def test_moment_tells_the_epoch_from_a_clock_of_its_own() -> None:
     assert moment(1_700_000_000_123_000_000) == "2023-11-14 22:13:20.123 UTC"
     assert moment(12_500_000_000).startswith(f"12.500{THIN}s ")
-
-
-def test_settings_are_flattened_in_their_order() -> None:
-    settings: dict[str, object] = {
-        "method": "robust",
-        "gates": {"chi2": 9.21, "on": True},
-        "cameras": [],
-        "noise": None,
-    }
-    assert flattened(settings) == [
-        ("method", "robust"),
-        ("gates.chi2", "9.21"),
-        ("gates.on", "yes"),
-        ("cameras", "none"),
-        ("noise", "none"),
-    ]
-    assert plain([{"a": 1}, 2]) == "a: 1, 2"

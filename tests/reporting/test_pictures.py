@@ -4,25 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Picture
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.frame_drawing import (
+from pipelines.reporting.overlays import View
+from pipelines.reporting.pictures import (
     CHI2_95,
     FOUND,
     GREY,
     REJECTED,
     SIDES,
     UNMEASURED,
-    blank_frame,
-    caption_of,
     draw_frame,
+    draw_panel,
+    panel_source,
+    panel_width,
+    window_of,
 )
-from pipelines.reporting.overlays import View
 
 JOINTS = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 BODY = np.array([[[620.0, 300.0], [520.0, 300.0], [615.0, 380.0], [525.0, 380.0]]])
@@ -98,30 +97,12 @@ def test_keypoints_are_rings_and_lost_ones_crosses(view: View) -> None:
         assert (drawn[y, x] == GREY).all() == (colour == FOUND)  # a ring leaves its middle free
 
 
-def test_people_who_are_not_part_of_the_skeleton_are_dots(view: View) -> None:
-    drawn = draw_frame(GROUND, replace(view, reprojected=MISSING, others=BODY + 50), ())
-    assert drawn[350, 670].tolist() == list(UNMEASURED)
-
-
 def test_a_picture_of_another_size_is_the_same_view_at_another_scale(view: View) -> None:
     half = draw_frame(np.ascontiguousarray(GROUND[::2, ::2]), replace(view, reprojected=_only(0)), ())
     rows, columns = np.nonzero(changed(half))
     # Pixel 620 covers 619.5 to 620.5 of 1280, that is 309.75 to 310.25 of 640: (620 + 0.5) / 2 - 0.5.
     assert abs((columns.min() + columns.max()) / 2 - 309.75) <= 0.5
     assert abs((rows.min() + rows.max()) / 2 - 149.75) <= 0.5
-
-
-@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=8, max_size=8))
-def test_points_anywhere_leave_the_given_picture_alone(values: list[float]) -> None:
-    small = np.full((24, 32, 3), GREY, np.uint8)
-    points = np.array(values).reshape(1, 4, 2)
-    nobody = np.zeros((1, 4), dtype=np.bool_)
-    lens = Intrinsics(32, 24, 30.0, 30.0, 15.5, 11.5)
-    anywhere = View(
-        "drone1", lens, JOINTS, 0, 0.0, points, points, nobody, nobody, points, has_pose=True, picture=None
-    )
-    assert draw_frame(small, anywhere, ("words",)).shape == small.shape
-    assert (small == GREY).all()
 
 
 @pytest.mark.parametrize("size", [(1280, 720), (1920, 1080), (480, 800), (320, 96)])
@@ -142,30 +123,6 @@ def test_captions_fit_their_ground(view: View, size: tuple[int, int]) -> None:
     assert (ground > 240).any()
     assert (ground[:, -3:] < 100).all()
     assert (ground[-2:] < 100).all()
-
-
-def test_no_words_where_nobody_could_read_them(view: View) -> None:
-    tiny = np.full((9, 16, 3), GREY, np.uint8)
-    assert not changed(draw_frame(tiny, replace(view, reprojected=MISSING), ("drone1", "robust"))).any()
-    assert not changed(blank_frame(16, 9, "undecoded")).any()
-
-
-def test_a_blank_frame_says_why_in_its_middle() -> None:
-    blank = blank_frame(WIDTH, HEIGHT, "frame 3 cannot be decoded")
-    rows, columns = np.nonzero(changed(blank))
-    assert abs((rows.min() + rows.max()) / 2 - (HEIGHT - 1) / 2) <= 1
-    assert abs((columns.min() + columns.max()) / 2 - (WIDTH - 1) / 2) <= 1
-    assert (blank[rows, columns] > 240).any()
-
-
-def test_what_a_caption_says(view: View) -> None:
-    status = np.full((1, 4), STATUS.index("ok"), np.int8)
-    status[0, 1] = STATUS.index("rejected")
-    assert caption_of(view, status, "robust") == ("drone1   frame 3   0.100 s", "robust: 3 ok, 1 rejected")
-    nothing = np.full((1, 4), -1, np.int8)
-    _, said = caption_of(replace(view, has_pose=False), nothing, "refined")
-    missing = said.removeprefix("refined: ").split(", ")
-    assert [word in part for word, part in zip(("skeleton", "pose"), missing, strict=True)] == [True, True]
 
 
 def test_ellipses_hold_95_percent(view: View) -> None:
@@ -219,3 +176,48 @@ def test_labels_stand_beside_their_joints_and_do_not_cover_each_other(view: View
     assert together.sum() > 1.5 * max(own.sum() for own in apart)  # one below the other, in full
     beyond = replace(view, reprojected=BODY + 2000.0)
     assert not (draw_frame(GROUND, beyond, (), both) != draw_frame(GROUND, beyond, ())).any()
+
+
+# --- panels ---
+
+
+@pytest.mark.parametrize("corner", [(0.0, 0.0), (WIDTH - 101.0, HEIGHT - 81.0), (520.0, 300.0)])
+def test_a_panel_is_a_square_about_the_person_in_the_picture(view: View, corner: tuple[float, float]) -> None:
+    moved = BODY - BODY.min(axis=(0, 1)) + corner
+    astray = moved.copy()
+    astray[0, 0] = [9e5, -9e5]  # points outside the picture do not count
+    window = window_of(replace(view, found=moved, reprojected=astray))
+    assert window.width == np.ceil(1.3 * 100)
+    assert -0.5 <= window.left <= WIDTH - 0.5 - window.width
+    assert -0.5 <= window.top <= HEIGHT - 0.5 - window.width
+    assert window_of(replace(view, reprojected=MISSING)).width == WIDTH  # nobody: the whole picture
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_a_picture_lies_under_its_pixels(view: View, scale: int) -> None:
+    """White from 568 to 572 by 340 to 344 px, in a picture as large as the calibration's or twice."""
+    picture = np.zeros((HEIGHT * scale, WIDTH * scale, 3), dtype=np.uint8)
+    picture[340 * scale : 345 * scale, 568 * scale : 573 * scale] = 255
+    window, px = window_of(view), 520
+    rows, columns = np.nonzero((draw_panel(replace(view, picture=picture), px) > 250).all(axis=-1))
+    inside = (rows > px // 3) & (columns > px // 3)  # not the map in the corner
+    place = np.array([columns[inside].mean(), rows[inside].mean()]) + 0.5
+    found = place / px * window.width + [window.left, window.top]
+    assert found == pytest.approx([570, 342], abs=0.2)
+
+
+def test_a_panel_shows_residuals_and_the_same_bytes_again(view: View) -> None:
+    aside = replace(view, found=BODY + np.array([6.0, 8.0]))
+    between = draw_panel(aside, 650)
+    window = window_of(aside)
+    x, y = ((BODY[0, 1] + [3.0, 4.0] - [window.left, window.top]) / window.width * 650).astype(int)
+    near = between[y - 2 : y + 3, x - 2 : x + 3].astype(int)
+    assert np.abs(near - FOUND).max(axis=-1).min() < 40  # the line is smoothed
+    assert panel_source(aside, 300) == panel_source(aside, 300)
+    assert panel_source(aside, 300).startswith("data:image/webp;base64,")
+
+
+@pytest.mark.parametrize(("panels", "width"), [(1, 640), (12, 640), (48, 353)])
+def test_many_panels_share_the_room(panels: int, width: int) -> None:
+    assert panel_width(panels) == width
+    assert panels * panel_width(panels) ** 2 <= 6_000_000

@@ -18,21 +18,22 @@ import numpy as np
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.bootstrap import Series, interval_of, intervals, resampled
 from pipelines.geometry.metrics import aligned_distances, bone_lengths, root_relative_distances
-from pipelines.reporting.content import SessionContent, text
-from pipelines.reporting.motion import Motion, middles
+from pipelines.reporting.content import MeasuredMotion, SessionContent, middles, text
 from pipelines.reporting.summary import Summary, summarise
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.people import bones_of
 from pipelines.session.tables import trajectory_from
 
-_PCK_M = 0.15
-_LEAST_SHARED = 0.5
-"""Least share of the shorter session's times with a time in the other, for sessions at the same times."""
-_SAME_TRUTH_M = 0.05
-"""Truths closer than this (median) are one motion: at a walk, two stamps half a frame apart are 25 mm."""
-_SAME_PLACE_M = 0.5
-"""Without truth, people measured closer than this to each other (median) are the same one."""
-_FEWEST_TIMES = 10
+# The field counts a joint as right within this distance (PCK at 150 mm).
+PCK_M = 0.15
+# Sessions that share fewer of the shorter one's times were not recorded at the same times.
+MIN_SHARED_TIMES = 0.5
+# Truths closer than this (median) are one motion: at a walk, two stamps half a frame apart are 25 mm.
+SAME_TRUTH_M = 0.05
+# Without truth, people measured closer than this to each other (median) are the same one.
+SAME_PLACE_M = 0.5
+# Fewer common times leave no interval.
+MIN_COMMON_TIMES = 10
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ def compare(contents: Mapping[str, SessionContent]) -> Comparison:
     return Comparison(sessions, tuple(_pair(sessions[0], other) for other in sessions[1:]))
 
 
-# --- one session ---------------------------------------------------------------------------------------
+# --- one session ---
 
 
 def _judged(label: str, content: SessionContent) -> Judged:
@@ -228,7 +229,7 @@ def _estimates(series: Mapping[str, Series], t_ns: Int64) -> dict[str, Estimate]
     }
 
 
-def _values(content: SessionContent, summary: Summary, motion: Motion) -> dict[str, Values]:
+def _values(content: SessionContent, summary: Summary, motion: MeasuredMotion) -> dict[str, Values]:
     """Return every measure that has a value at all."""
     position = motion.measured_position
     listed = motion.status >= 0
@@ -243,7 +244,7 @@ def _values(content: SessionContent, summary: Summary, motion: Motion) -> dict[s
     }
     if summary.truth is not None and summary.errors_mm is not None:
         true = np.isfinite(summary.truth).all(axis=-1)
-        within = np.nan_to_num(summary.errors_mm, nan=np.inf) <= 1e3 * _PCK_M
+        within = np.nan_to_num(summary.errors_mm, nan=np.inf) <= 1e3 * PCK_M
         found |= {
             "mpjpe": summary.errors_mm,
             "root_mpjpe": 1e3 * root_relative_distances(position, summary.truth, motion.joints),
@@ -257,7 +258,7 @@ def _values(content: SessionContent, summary: Summary, motion: Motion) -> dict[s
     return {key: one for key, one in values.items() if np.isfinite(one.values).any()}
 
 
-def _bone_values(motion: Motion) -> Values:
+def _bone_values(motion: MeasuredMotion) -> Values:
     """Compute the deviation of each bone of each person from its own median length, mm."""
     bones = bones_of(motion.joints)
     lengths = 1e3 * bone_lengths(motion.measured_position, motion.joints, bones)
@@ -269,7 +270,7 @@ def _bone_values(motion: Motion) -> Values:
     return Values(names, np.abs(lengths - usual))
 
 
-def _tilt(content: SessionContent, summary: Summary, motion: Motion) -> Values:
+def _tilt(content: SessionContent, summary: Summary, motion: MeasuredMotion) -> Values:
     """Compute the cameras' mean elevation above the first person, deg [T, 1]; NaN where one has no pose."""
     actor = middles(motion.measured_position)[:, 0]
     away = camera_positions(content, summary, motion.t_ns) - actor
@@ -291,7 +292,7 @@ def camera_positions(content: SessionContent, summary: Summary, t_ns: Int64) -> 
     return np.stack(positions) if positions else np.full((1, len(t_ns), 3), np.nan)
 
 
-# --- two sessions --------------------------------------------------------------------------------------
+# --- two sessions ---
 
 
 def _pair(first: Judged, other: Judged) -> Pair:
@@ -316,17 +317,17 @@ def _same_motion(first: Judged, other: Judged) -> tuple[Int64, Int64] | None:
     if a is None or b is None:
         return None
     rows = _same_times(a.t_ns, b.t_ns)
-    if len(rows[0]) < max(_FEWEST_TIMES, _LEAST_SHARED * min(len(a.t_ns), len(b.t_ns))):
+    if len(rows[0]) < max(MIN_COMMON_TIMES, MIN_SHARED_TIMES * min(len(a.t_ns), len(b.t_ns))):
         return None
     ours, theirs = first.summary.truth, other.summary.truth
     if ours is not None and theirs is not None:
         shared = [name for name in a.joints if name in b.joints]
         place = [[motion.joints.index(name) for name in shared] for motion in (a, b)]
         apart = ours[rows[0]][:, 0, place[0]] - theirs[rows[1]][:, 0, place[1]]
-        limit_m = _SAME_TRUTH_M
+        limit_m = SAME_TRUTH_M
     else:
         first_m, other_m = (middles(motion.measured_position)[:, 0] for motion in (a, b))
-        apart, limit_m = first_m[rows[0]] - other_m[rows[1]], _SAME_PLACE_M
+        apart, limit_m = first_m[rows[0]] - other_m[rows[1]], SAME_PLACE_M
     distance = np.linalg.norm(apart, axis=-1)
     known = distance[np.isfinite(distance)]
     return rows if known.size and float(np.median(known)) < limit_m else None

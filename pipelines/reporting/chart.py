@@ -1,4 +1,4 @@
-"""A figure with its words and its numbers, in the page's style, and as inline SVG.
+"""Figures: their marks, words and numbers, in the page's style, as inline SVG and as files for a publication.
 
 The SVG takes its colours and fonts from the page: each colour of the palette is replaced by a CSS variable,
 so that one drawing serves light and dark mode and paper, and text stays text. The same figure gives the same
@@ -14,13 +14,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from xml.sax.saxutils import escape
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float
+from pipelines.reporting.content import SessionContent
 from pipelines.reporting.wording import cell_text, fixed
+from pipelines.session.errors import DataError
+from pipelines.session.storage import read_json, refuse_sessions, write_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,8 +37,8 @@ if TYPE_CHECKING:
 INK, MUTED, GRID, PAPER = "#22262a", "#666d74", "#dddcd6", "#fefdfb"
 SIDES = {"left": "#1f78b5", "right": "#c8561b", "": "#4a4f55"}
 """Colours of the sides of the body, by the words of `motion.side_of`."""
-CAMERAS = ("#00785a", "#7d4fb5", "#8f7a00", "#5d7d1c", "#00808f", "#8c5a3c")
-"""Colours of cameras: none is near the blue and the orange of left and right."""
+CAMERAS = ("#00785a", "#7d4fb5", "#8f7a00", "#9c2f4f", "#00808f", "#8c5a3c")
+"""Colours of cameras, arms and sessions: neighbours differ in hue, none is the blue or orange of a side."""
 PEOPLE = ("#b0267a", "#3f48b8", "#a36f00", "#2a7d33", "#a8322b", "#4f6272")
 """Colours of people, where there are several."""
 LEVELS = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")
@@ -60,8 +64,8 @@ PALETTE = {
     **{colour: f"--status-{word.replace('_', '-')}" for word, colour in STATUS_COLOURS.items()},
 }
 
+# CSS scales a figure as wide as the page to the window; the fonts are chosen for this width.
 WIDTH_IN = 9.0
-"""Width of a figure as wide as the page; CSS scales it to the window."""
 
 _PAGE_STYLE: dict[RcKeyType, Any] = {
     "svg.fonttype": "none",
@@ -199,15 +203,20 @@ def _page_colour(colour: str) -> str:
     return f"var({PALETTE[colour]})" if colour in PALETTE else colour
 
 
-MOST_POINTS, MOST_BINS = 600, 300
+# A path of more points shows no more on a page 9 inches wide.
+MOST_POINTS = 600
+# A time axis shows no more stretches on a page 9 inches wide.
+MOST_BINS = 300
+# Coordinates beyond this are shown relative to a round number near them, or labels would be too long.
+FAR_FROM_ZERO_M = 10_000.0
+# One shade on the other still shows the lines below.
+SHADE_OPACITY = 0.17
+
 LINE_STYLES: tuple[Literal["-"] | tuple[int, tuple[float, ...]], ...] = (
     "-",
     (0, (4.0, 1.5)),
     (0, (1.0, 1.2)),
 )
-_SHADE = 0.17  # opacity of one level on those below
-# World coordinates beyond this are shown relative to a round number near them.
-_FAR_M = 10_000.0
 
 
 @dataclass(frozen=True)
@@ -283,7 +292,7 @@ def bounds(paths: Sequence[Float]) -> tuple[Float, Float]:
 
 def near_zero(low: Float) -> Float:
     """Return the offset to subtract from coordinates whose least is `low`: 0, or a round number if far."""
-    return np.where(np.abs(low) > _FAR_M, np.floor(low / 1000) * 1000, 0.0)
+    return np.where(np.abs(low) > FAR_FROM_ZERO_M, np.floor(low / 1000) * 1000, 0.0)
 
 
 def axis_label(direction: str, origin_m: float) -> str:
@@ -309,7 +318,7 @@ def quiet(axes: Axes, grid: Literal["x", "y", "both"] | None = None) -> None:
 def shade(axes: Axes, x: Float, y: Float, values: Float, levels: Sequence[float]) -> None:
     """Shade where values [X, Y] exceed each level, one shade on the other."""
     for level in levels:
-        axes.contourf(x, y, values.T, levels=[level, np.inf], colors=[MUTED], alpha=_SHADE, zorder=1)
+        axes.contourf(x, y, values.T, levels=[level, np.inf], colors=[MUTED], alpha=SHADE_OPACITY, zorder=1)
 
 
 def shade_keys(labels: Sequence[str]) -> list[Patch]:
@@ -317,7 +326,7 @@ def shade_keys(labels: Sequence[str]) -> list[Patch]:
     from matplotlib.patches import Patch
 
     return [
-        Patch(color=MUTED, alpha=1 - (1 - _SHADE) ** (k + 1), linewidth=0, label=label)
+        Patch(color=MUTED, alpha=1 - (1 - SHADE_OPACITY) ** (k + 1), linewidth=0, label=label)
         for k, label in enumerate(labels)
     ]
 
@@ -349,3 +358,266 @@ def _by_bin(values: Float, seconds: Float, bins: Float) -> list[Float]:
     """Return the finite values [T, ...] of the times in each bin."""
     inside = np.split(values, np.searchsorted(seconds, bins))[1:-1]
     return [part[np.isfinite(part)] for part in inside]
+
+
+# --- figures of lines, bars and points -----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Line:
+    """A series [N] with the band around it, where there is one."""
+
+    x: Float
+    y: Float
+    colour: str
+    name: str = ""  # for the legend; none without one
+    low: Float | None = None
+    high: Float | None = None
+    style: Literal["-"] | tuple[int, tuple[float, ...]] = "-"
+    width: float = 1.1
+    shade: float = 0.16  # opacity of the band
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Horizontal bars [N]: rows from above, where they begin, and how long they are."""
+
+    rows: Sequence[float]
+    start: Sequence[float] | float
+    length: Sequence[float]
+    colour: str
+    name: str = ""
+    thickness: float = 0.72
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points [N] in rows from above, with the interval of each, where there is one; 0 rows are a legend."""
+
+    rows: Sequence[float]
+    x: Sequence[float]
+    ends: Sequence[tuple[float, float] | None]
+    colour: str
+    name: str = ""
+    width: float = 1.4
+    opacity: float = 1.0
+    marked: bool = True  # else the intervals alone
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Shares [K, bins] over time, one on top of the other; each holds for the whole of its bin."""
+
+    edges: Float  # [bins + 1]
+    shares: Mapping[str, Float]  # by name
+    colours: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One drawing of a figure: its marks, labels and spans."""
+
+    marks: Sequence[Line | Bars | Points | Stack]
+    x_label: str = ""
+    y_label: str = ""
+    rows: Mapping[float, str] | None = None  # labels of rows from above, by place
+    row_span: tuple[float, float] | None = None  # else half a row beyond the first and the last
+    x_span: tuple[float | None, float | None] | None = None
+    y_span: tuple[float | None, float | None] | None = None
+    title: str = ""
+    title_inside: bool = False
+    grid: Literal["x", "y", "both"] | None = "y"
+    zero: bool = False  # draw a line at x = 0
+
+
+def chart(
+    panels: Sequence[Sequence[Panel]],
+    height_in: float,
+    *,
+    width_in: float = WIDTH_IN,
+    heights: Sequence[float] | None = None,
+    widths: Sequence[float] | None = None,
+    share_x: bool = True,
+    share_y: bool = False,
+    legend: Literal["above", "inside", ""] = "above",
+    columns: int = 4,
+    label: str = "",
+) -> Figure:
+    """Draw panels, row by row; `label` is that of the vertical axes of all, `columns` are the legend's."""
+    rows, across = len(panels), max(len(row) for row in panels)
+    with page_style():
+        figure = new_figure(height_in, width_in)
+        grid = figure.subplots(
+            rows,
+            across,
+            squeeze=False,
+            sharex=share_x,
+            sharey=share_y,
+            height_ratios=heights,
+            width_ratios=widths,
+        )
+        for own, panel_row in zip(grid, panels, strict=True):
+            for axes, panel in zip(own, panel_row, strict=False):
+                _draw_panel(axes, panel)
+            for axes in own[len(panel_row) :]:
+                axes.set_axis_off()
+        if across == 1:
+            figure.align_ylabels(list(grid[:, 0]))
+        entries: dict[str, Any] = {}
+        for axes in grid.flat:
+            for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
+                entries.setdefault(name, handle)
+        if entries and legend == "above":
+            count = min(len(entries), columns)
+            figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=count)
+        elif entries and legend == "inside":
+            grid[0, 0].legend(loc="upper left", ncols=columns)
+        if label:
+            figure.supylabel(label, fontsize=7.6, color=MUTED)
+    return figure
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    if panel.zero:
+        axes.axvline(0, color=MUTED, linewidth=0.8)
+    for mark in panel.marks:
+        _draw_mark(axes, mark)
+    axes.set_xlabel(panel.x_label)
+    axes.set_ylabel(panel.y_label)
+    if panel.rows is not None:
+        axes.set_yticks(list(panel.rows), list(panel.rows.values()))
+        axes.set_ylim(*(panel.row_span or (max(panel.rows, default=0) + 0.5, -0.5)))
+    if panel.x_span is not None:
+        axes.set_xlim(*panel.x_span)
+    if panel.y_span is not None:
+        axes.set_ylim(*panel.y_span)
+    if panel.title and panel.title_inside:
+        words = axes.text(0.01, 0.97, panel.title, transform=axes.transAxes, va="top", fontsize=7)
+        words.set_in_layout(False)  # a long name takes no room from the curves
+    elif panel.title:
+        axes.set_title(panel.title, fontsize=7.2, color=MUTED, loc="left")
+    quiet(axes, panel.grid)
+
+
+def _draw_mark(axes: Axes, mark: Line | Bars | Points | Stack) -> None:
+    if isinstance(mark, Line):
+        if mark.low is not None and mark.high is not None:
+            axes.fill_between(mark.x, mark.low, mark.high, color=mark.colour, alpha=mark.shade, linewidth=0)
+        style: dict[str, Any] = {"color": mark.colour, "linestyle": mark.style, "linewidth": mark.width}
+        axes.plot(mark.x, mark.y, label=mark.name or None, **style)
+    elif isinstance(mark, Bars):
+        label = mark.name or None
+        axes.barh(mark.rows, mark.length, mark.thickness, mark.start, color=mark.colour, label=label)
+    elif isinstance(mark, Points):
+        for row, x, ends in zip(mark.rows, mark.x, mark.ends, strict=True):
+            if ends is not None:
+                axes.plot(ends, [row, row], color=mark.colour, linewidth=mark.width, alpha=mark.opacity)
+            if mark.marked:
+                axes.plot(x, row, "o", color=mark.colour, markersize=4)
+        if mark.name:
+            axes.plot([], [], "o-", color=mark.colour, markersize=4, label=mark.name)
+    else:
+        corners, base = np.repeat(mark.edges, 2)[1:-1], np.zeros(len(mark.edges) - 1)
+        for name, share in mark.shares.items():
+            low, high = np.repeat(base, 2), np.repeat(base + share, 2)
+            axes.fill_between(corners, low, high, color=mark.colours[name], linewidth=0, label=name)
+            base = base + share
+
+
+# --- files for a publication ---
+
+
+MARK = "figures.json"
+"""Mark of a folder of figures: their flights, titles, captions, and the names of all files."""
+
+# A figure as wide as the page fills the two columns of a journal.
+FILE_WIDTH_MM = 180.0
+# Journals ask for 300 dots per inch.
+FILE_DPI = 300
+# Text stays text, and fonts are embedded as TrueType: journals refuse Type 3.
+_FILE_STYLE: dict[RcKeyType, Any] = {"svg.fonttype": "none", "pdf.fonttype": 42, "savefig.facecolor": "white"}
+# Neither dates nor versions: the same figure gives the same files.
+_FILE_METADATA: dict[str, dict[str, Any]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None, "Creator": None},
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+
+
+def write_figures(
+    folder: Path, plates: Mapping[str, Plate], contents: Mapping[str, SessionContent], key: str
+) -> None:
+    """Write `<figure>.png`, `.svg`, `.pdf` and `.csv` for every figure, and the mark.
+
+    The same plates give the same bytes. Numbers that have a name of their own go to `<figure>-<name>.csv`;
+    empty cells are missing numbers.
+
+    Args:
+        folder: an existing, empty folder.
+        contents: the sessions that they are of, by label; the mark names their flights.
+        key: equal for equal figures; it is stored in the mark.
+    """
+    listed = []
+    for plate in plates.values():
+        names = _write_drawing(folder, plate.key, plate.figure)
+        for what, numbers in plate.csv.items():
+            name = f"{plate.key}-{what}.csv" if what else f"{plate.key}.csv"
+            (folder / name).write_text(numbers, encoding="utf-8", newline="\n")
+            names.append(name)
+        words = {"title": plate.title, "caption": plate.caption, "description": plate.description}
+        listed.append({"figure": plate.key, **words, "files": names})
+    sessions = {
+        label: {"flight": content.session.flight, "simulated": content.session.simulated}
+        for label, content in contents.items()
+    }
+    write_json(folder / MARK, {"schema": 1, "key": key, "sessions": sessions, "figures": listed})
+
+
+def _write_drawing(folder: Path, key: str, figure: Figure) -> list[str]:
+    import matplotlib as mpl
+
+    names = []
+    with page_style():
+        mpl.rcParams.update(_FILE_STYLE)
+        with settled(figure, FILE_WIDTH_MM / 25.4 / WIDTH_IN):
+            for kind, metadata in _FILE_METADATA.items():
+                names.append(f"{key}.{kind}")
+                figure.savefig(folder / names[-1], dpi=FILE_DPI, metadata=metadata)
+    return names
+
+
+def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
+    """Refuse to overwrite files that are not ours.
+
+    Args:
+        folder: the folder for figures; its old contents are removed.
+        overwrite: replace other people's files; sessions and their parts are never replaced.
+
+    Raises:
+        DataError: a session, a part of one, or a folder that contains one; a file, or a folder that contains
+            more than figures that were written before.
+    """
+    refuse_sessions(folder, mark=MARK, option="--figures")
+    if overwrite or not folder.exists():
+        return
+    if not folder.is_dir():
+        raise DataError(
+            folder, "is a file, not a folder", "name another place with --figures", code="not-a-folder"
+        )
+    foreign = sorted({path.name for path in folder.iterdir()} - _ours(folder))
+    if foreign:
+        raise DataError(
+            folder,
+            f"holds other files than figures ({len(foreign)}, the first {foreign[0]})",
+            "name another folder with --figures, or replace it with --overwrite",
+            code="exists",
+        )
+
+
+def _ours(folder: Path) -> set[str]:
+    """Return the names of the files that the mark in a folder lists."""
+    if not (folder / MARK).is_file():
+        return set()
+    stated = read_json(folder / MARK, "remove it, or name another folder with --figures").get("figures")
+    figures = stated if isinstance(stated, list) else []
+    return {MARK, *(name for each in figures if isinstance(each, dict) for name in each.get("files", ()))}
