@@ -44,7 +44,7 @@ if a gimbal turns the camera."""
 BODY_COLUMNS = ("body_qx", "body_qy", "body_qz", "body_qw")
 POSES_WITH_COVARIANCE = pa.schema([*POSES, *[(name, pa.float64()) for name in COVARIANCE_COLUMNS]])
 KEYPOINTS = pa.schema([_FRAME, _T_NS, _PERSON, _JOINT, *_XY, ("confidence", pa.float64())])
-"""cameras/<camera>/keypoints.parquet: imported keypoints, px; detect/<camera>/keypoints.parquet has those of
+"""cameras/<camera>/keypoints.parquet: imported keypoints, px; `detect/<camera>/keypoints.parquet` has those of
 our detector."""
 TRACKS = pa.schema([_FRAME, ("point", pa.int32()), ("x", pa.float32()), ("y", pa.float32())])
 """background/<camera>/tracks.parquet: points of the background in the pictures, px, sorted by frame."""
@@ -54,7 +54,7 @@ ACTOR = pa.schema([_T_NS, _PERSON, *_XYZ])
 TRUTH = pa.schema([_T_NS, _PERSON, _JOINT, *_XYZ])
 """truth.parquet: the true joints."""
 CAMERA_POSES = pa.schema([_T_NS, _CAMERA, *_POSE])
-"""truth_poses.parquet: the true world_from_camera; reconstruct/cameras.parquet has the corrected one."""
+"""truth_poses.parquet: the true world_from_camera; `reconstruct/cameras.parquet` has the corrected one."""
 
 PLAN = pa.schema([_T_NS, _CAMERA, *_XYZ])
 """plan.parquet: the setpoints of the on-board planner for every drone."""
