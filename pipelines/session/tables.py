@@ -44,8 +44,8 @@ if a gimbal turns the camera."""
 BODY_COLUMNS = ("body_qx", "body_qy", "body_qz", "body_qw")
 POSES_WITH_COVARIANCE = pa.schema([*POSES, *[(name, pa.float64()) for name in COVARIANCE_COLUMNS]])
 KEYPOINTS = pa.schema([_FRAME, _T_NS, _PERSON, _JOINT, *_XY, ("confidence", pa.float64())])
-"""cameras/<camera>/keypoints.parquet: imported keypoints, px; `detect/<camera>/keypoints.parquet` has those of
-our detector."""
+"""cameras/<camera>/keypoints.parquet: imported keypoints, px; `detect/<camera>/keypoints.parquet` has
+those of our detector."""
 TRACKS = pa.schema([_FRAME, ("point", pa.int32()), ("x", pa.float32()), ("y", pa.float32())])
 """background/<camera>/tracks.parquet: points of the background in the pictures, px, sorted by frame."""
 
