@@ -14,7 +14,6 @@ That is less than journaling file systems promise, which keep the order of chang
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
@@ -31,7 +30,7 @@ import numpy as np
 
 from pipelines.session.errors import DataError
 from pipelines.session.stages import STAGES, open_session
-from tests.commands.runner import content, mocap, succeeds
+from tests.commands.runner import mocap, succeeds
 from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 from tests.kills.killing import SCENARIO, SMALL_STUDY, kept
 from tests.synthetic.flights import write_flight
@@ -124,12 +123,11 @@ class Recorder:
 
     Args:
         folder: the folder.
-        durable: a folder in it that never loses anything, as an object store.
     """
 
-    def __init__(self, folder: Path, durable: Path | None = None) -> None:
+    def __init__(self, folder: Path) -> None:
         self.trace = Trace()
-        self._folder, self._durable = folder, durable
+        self._folder = folder
         self._nodes: dict[int, int] = {}  # by inode
         self._entries: dict[Key, int] = {}
         self._contents: dict[int, bytes] = {}
@@ -202,19 +200,13 @@ class Recorder:
             node = self._entries[key]
             steps.append(Entry(node, key, None, node not in self._contents))
         contents: dict[int, bytes] = {}
-        lasting: set[int] = set()
-        for (parent, _), inode, path, is_folder in found:
+        for _, inode, path, is_folder in found:
             node = nodes[inode]
             if not is_folder:
                 contents[node] = path.read_bytes()
                 if self._contents.get(node) != contents[node]:
                     steps.append(Content(node, contents[node]))
-            if self._durable is not None and path.is_relative_to(self._durable):
-                lasting |= {ROOT if parent == -1 else nodes[parent], node}
-        steps += [Synced(step.node) for step in steps if step.node in lasting]
         steps += [Entry(node, places.get(node), key, is_folder) for key, node, is_folder in came]
-        parents = {parent for step in steps if isinstance(step, Entry) for parent, _ in step.keys}
-        steps += [Synced(node) for node in sorted(parents & lasting)]
         self.trace.steps += steps
         self._nodes, self._entries, self._contents = nodes, entries, contents
 
@@ -380,7 +372,6 @@ class Case:
     version: Callable[[], Mapping[str, str]]  # what readers find; DataError if that is damaged
     files: Callable[[], Mapping[str, str]]  # the result, which is the same after every run
     before: Callable[[], object] = lambda: None  # makes an earlier version
-    durable: Path | None = None  # a folder that never loses anything
     whole: bool = True  # False if every file, or every stage, is whole for itself
 
 
@@ -422,7 +413,7 @@ def replay(folder: Path, case: Case, *, moments: int, each: int, again: int, see
     choice = np.random.default_rng(seed)
     case.before()
     before = case.version()
-    recorder = Recorder(folder, case.durable)
+    recorder = Recorder(folder)
     with recorder.recording() as trace:
         done = mocap(*case.arguments)
     assert done.returncode == 0, done.stderr
@@ -493,18 +484,6 @@ def _visible(folder: Path) -> dict[str, str]:
 def _made(folder: Path) -> dict[str, str]:
     """List a folder that is made whole; between two renames, that which the same command puts back."""
     return _visible(folder if folder.exists() else folder.parent / f".{folder.name}.making" / "old")
-
-
-def _published(session: Path) -> dict[str, str]:
-    """List the files of the newest version of a session in a store, with their hashes."""
-    pointers = sorted(session.glob("*.json"))
-    if not pointers:
-        return {}
-    newest = json.loads(pointers[-1].read_text(encoding="utf-8"))
-    stated = {name: digest for name, digest in newest["files"].items() if name != "run.json"}
-    if content(session / newest["folder"]) != stated:
-        raise DataError(session, "is damaged")
-    return stated
 
 
 def _of_session(
@@ -594,17 +573,6 @@ def _study(name: str, place: Path) -> Case:
     return Case(name, ["study", *SMALL_STUDY, "-o", target], partial(_made, target), files)
 
 
-def _store(name: str, place: Path) -> Case:
-    """A session in an object store, which loses nothing; its copy on this machine does."""
-    store, flown = place / "store", place / "flown"
-    flown.mkdir()
-    url = f"file://{store}/flown.session"
-    published = partial(_published, store / "flown.session")
-    before = partial(succeeds, "ingest", write_flight(flown, seconds=0.3).manifest, "-o", url)
-    arguments = ["reconstruct", url, "--method", "robust"]
-    return Case(name, arguments, published, published, before, durable=store)
-
-
 _CASES: Mapping[str, Callable[[str, Path], Case]] = {
     "ingest": _ingest,
     "ingest again": _ingest_again,
@@ -615,18 +583,14 @@ _CASES: Mapping[str, Callable[[str, Path], Case]] = {
     "export": _export,
     "simulate": _simulate,
     "study": _study,
-    "store": _store,
 }
 
 
 def print_replays(names: Sequence[str], *, moments: int, seed: int) -> int:
     """Replay losses of power in commands and print each; return 1 if any made trouble."""
     found = []
-    with tempfile.TemporaryDirectory() as place, patch.dict(os.environ):
-        os.environ.pop("XDG_CACHE_HOME", None)
+    with tempfile.TemporaryDirectory() as place:
         for folder, case in cases_on(Path(place), names):
-            if case.durable is not None:
-                os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
             lost = replay(folder, case, moments=moments, each=2, again=moments // 2, seed=seed)
             found.append(lost)
             print(  # noqa: T201
