@@ -245,7 +245,7 @@ def manifest_keys() -> tuple[str, ...]:
     from pydantic import BaseModel
 
     from pipelines.session import manifest, source_options
-    from pipelines.session.yaml_files import Part
+    from pipelines.session.yaml_files import YamlModel
 
     def named(annotation: Any) -> Iterator[type[BaseModel]]:
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -254,14 +254,14 @@ def manifest_keys() -> tuple[str, ...]:
             yield from named(argument)
 
     options = [value for value in vars(source_options).values() if isinstance(value, type)]
-    waiting: list[type[BaseModel]] = [model for model in options if issubclass(model, Part)]
+    waiting: list[type[BaseModel]] = [model for model in options if issubclass(model, YamlModel)]
     waiting.append(manifest.Manifest)
     models: list[type[BaseModel]] = []
     while waiting:
         model = waiting.pop()
         if model not in models:
             models.append(model)
-            waiting += [base for base in model.__bases__ if issubclass(base, Part)]
+            waiting += [base for base in model.__bases__ if issubclass(base, YamlModel)]
             waiting += [inner for field in model.model_fields.values() for inner in named(field.annotation)]
     return tuple(
         f"{model.__name__}.{field.alias or key}"

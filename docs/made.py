@@ -29,7 +29,7 @@ from pydantic import BaseModel
 from pipelines.planning.config import PlannerConfig
 from pipelines.session import registries, tables
 from pipelines.session.description import DOUBT_CODES
-from pipelines.session.manifest import Manifest, Source
+from pipelines.session.manifest import FileSource, Manifest
 from pipelines.session.source_options import option_models
 
 DOCS = Path(__file__).parent
@@ -102,7 +102,7 @@ def _text_of(node: ast.stmt | None) -> str:
 
 def flight() -> str:
     """List the keys of flight.yaml, part by part."""
-    places: dict[type[BaseModel], list[str]] = {Manifest: ["The flight"], Source: ["A source"]}
+    places: dict[type[BaseModel], list[str]] = {Manifest: ["The flight"], FileSource: ["A source"]}
     rows = {}
     for model in iter(lambda: next((each for each in places if each not in rows), None), None):
         (place, *_) = places[model]
@@ -111,7 +111,7 @@ def flight() -> str:
             places.setdefault(part, []).append(inside)
     sections = []
     for model, named in places.items():
-        is_source = issubclass(model, Source) and model is not Source
+        is_source = issubclass(model, FileSource) and model is not FileSource
         said = _first_line(model) + (" It is [a source](#a-source)." if is_source else "")
         keys = [table(_KEYS, rows[model])] if rows[model] else []
         sections.append("\n\n".join([f"### {', '.join(named)}", said, *keys]).rstrip())
@@ -142,7 +142,7 @@ def _rows_of(
     own = meanings(model)
     for name, field in model.model_fields.items():
         key = field.alias or name
-        if key == "assumed" or (model is not Source and name in Source.model_fields):
+        if key == "assumed" or (model is not FileSource and name in FileSource.model_fields):
             continue
         inner, many = _part_of(field.annotation)
         path = f"{place}.{key}" if place else key

@@ -31,11 +31,13 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import StageRecord, WritableSession, locked
 from pipelines.session.tables import Span
 
-_LOOK_S = 8.0
+LOOK_S = 8.0
 """Seconds in the middle of a flight that the detector looks at."""
-_LOOK_EVERY = 3
+LOOK_EVERY = 3
 """It looks at every third picture of them: ten a second of thirty."""
-_CONFIDENT = 0.3  # as `reconstruct` has it unasked
+
+# The confidence below which `reconstruct` leaves keypoints out unless asked otherwise.
+MIN_CONFIDENCE = 0.3
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def _doubts(
         folder,
         description,
         detected,
-        min_confidence=_CONFIDENT,
+        min_confidence=MIN_CONFIDENCE,
         pose_noise=pose_noise,
         span_ns=span_ns,
     )
@@ -171,16 +173,16 @@ def _detected(
     frames = [entry.frames for entry in description.cameras.values()]
     first, last = max(each.first_t_ns for each in frames), min(each.last_t_ns for each in frames)
     middle_s = ((first + last) / 2 - description.start_ns) / 1e9
-    start_s, end_s = max(0.0, middle_s - _LOOK_S / 2), middle_s + _LOOK_S / 2
+    start_s, end_s = max(0.0, middle_s - LOOK_S / 2), middle_s + LOOK_S / 2
     following = None
     moving = cameras_to_follow(description)
     # Of imported keypoints, all pictures would have to be decoded.
     if moving and all(description.cameras[name].keypoints is None for name in moving):
-        following = Following(session, every=_LOOK_EVERY, span_s=(start_s, end_s))
+        following = Following(session, every=LOOK_EVERY, span_s=(start_s, end_s))
     record = detect(
         session,
         detector=detector,
-        every=_LOOK_EVERY,
+        every=LOOK_EVERY,
         start_s=start_s,
         end_s=end_s,
         workers=workers,

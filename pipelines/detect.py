@@ -59,7 +59,7 @@ from pipelines.session.tables import (
     trajectory_from,
     write_table,
 )
-from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_pictures
+from pipelines.sources.pictures import CameraPictures, open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -506,7 +506,7 @@ def _produce(
     write_json(folder / "counts.json", {"joints": list(networks.joints), "counts": counts})
 
 
-def _decoded_ahead(pictures: Pictures, numbers: list[int]) -> Generator[Picture | None]:
+def _decoded_ahead(pictures: CameraPictures, numbers: list[int]) -> Generator[Picture | None]:
     """Yield the pictures of these numbers; the next one is decoded while the networks process this one."""
     with ThreadPoolExecutor(1) as decoder:
         coming = deque(decoder.submit(pictures.read, number) for number in numbers[:1])

@@ -13,20 +13,20 @@ from pipelines.drafting.found import (
     LAST_POSE_TYPE,
     NO_DATE_NS,
     POSE_TYPES,
-    Angles,
-    Candidate,
-    Edge,
-    Film,
-    Flown,
-    Kind,
-    Listed,
-    Recording,
-    Span,
+    FlownPoses,
+    FoundAngles,
+    FoundFilm,
+    FoundFrames,
+    FoundLink,
+    FoundLog,
+    Proposal,
+    SourceKind,
+    TimeSpan,
     VideoStart,
 )
-from pipelines.drafting.labels import NED, OPTICAL, is_called, label_of, label_of_place
+from pipelines.drafting.labels import NED, OPTICAL, NamePlace, is_called, label_of, label_of_place
 from pipelines.drafting.manifest_text import write_manifest
-from pipelines.drafting.matching import Alike, match
+from pipelines.drafting.matching import MotionMatch, match
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
@@ -138,7 +138,7 @@ def draft(
     Raises:
         DataError: nothing was recognised, a path is missing, or the output exists or cannot be written.
     """
-    search = _Search()
+    search = _FileSearch()
     things, home = search.look([_absolute(path) for path in paths])
     target = output or home / "flight.yaml"
     if target.exists() and not overwrite:
@@ -147,14 +147,14 @@ def draft(
         )
     progress = progress or Silent()
     progress.start("Reading", len(things))
-    found: list[Candidate | Recording] = []
+    found: list[Proposal | FoundLog] = []
     for path, formats in things:
         read, problem = _read(path, formats, home)
         found += read
         if problem:
             search.left_out[path] = problem
         progress.advance()
-    kitti = [each.path for each in found if isinstance(each, Candidate) and each.type == "kitti"]
+    kitti = [each.path for each in found if isinstance(each, Proposal) and each.type == "kitti"]
     for path in (_absolute(target), *map(times_of, kitti)):
         search.left_out.pop(path, None)
     if not found:
@@ -163,9 +163,9 @@ def draft(
             [(path, reason)] = search.left_out.items()
         raise DataError(path, reason, "" if "; " in reason else EXPECTED, code="wrong-kind")
 
-    candidates = [each for each in found if isinstance(each, Candidate)]
-    logs = [each for each in found if isinstance(each, Recording)]
-    flight = match(candidates, logs, _Comparison(), _distance_m)
+    candidates = [each for each in found if isinstance(each, Proposal)]
+    logs = [each for each in found if isinstance(each, FoundLog)]
+    flight = match(candidates, logs, _MotionComparison(), _distance_m)
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
     problem = _write(target, manifest.text)
     return Drafted(
@@ -211,7 +211,7 @@ Thing = tuple[Path, list[Format]]
 """A file or folder, and the formats that recognise it."""
 
 
-class _Search:
+class _FileSearch:
     """Search through files and folders; `left_out` has the paths that cannot be used, with the reason."""
 
     def __init__(self) -> None:
@@ -315,14 +315,14 @@ def _why_left_out(path: Path) -> str:
 # --- reading -------------------------------------------------------------------------------------------
 
 
-def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Candidate | Recording], str]:
+def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Proposal | FoundLog], str]:
     """Read a thing as every kind that it can be; of several formats of a kind, the first that works is used.
 
     Return also the reason if it is of no kind, or if one of its kinds cannot be read.
     """
     *folders, name = path.relative_to(home).parts or (path.name,)
     place = (*folders, name if path.is_dir() else Path(name).stem)
-    found: dict[type | None, list[Candidate | Recording]] = {}
+    found: dict[type | None, list[Proposal | FoundLog]] = {}
     problems: list[tuple[Format, DataError]] = []
     for format_ in formats:
         kind = _kind_of_format(format_)
@@ -346,111 +346,85 @@ def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Candi
 
 
 def _described(
-    path: Path, place: tuple[str, ...], format_: Format, ambiguous: bool
-) -> Iterator[Candidate | Recording]:
+    path: Path, place: NamePlace, format_: Format, ambiguous: bool
+) -> Iterator[Proposal | FoundLog]:
     """Describe a thing by the kind of its format.
 
     Raises:
         DataError: it cannot be read.
     """
-    label = label_of_place(place)
-    named: dict[str, object] = {"file": path}
-    head = (path, place, format_.title)
+    file: dict[str, object] = {"file": path}
+    head, labels, title = (path, place), (label_of_place(place),), format_.title
     if isinstance(format_, KeypointFormat):
         listed = format_.read_keypoints(path, skeleton=None, first_frame=0).frames_listed
-        about = f"{format_.title}, {len(listed)} frames"
-        yield Listed(
-            "keypoints",
-            path,
-            place,
-            about,
-            named,
-            (label,),
-            (0, place),
-            frames=len(listed),
-            first_frame=int(listed[0]),
-            last_frame=int(listed[-1]),
-            ambiguous=format_.name if ambiguous else "",
-        )
+        about = f"{title}, {len(listed)} frames"
+        found = FoundFrames("keypoints", *head, about, file, labels, (0, place), frames=len(listed))
+        rival = format_.name if ambiguous else ""
+        yield replace(found, first_frame=int(listed[0]), last_frame=int(listed[-1]), ambiguous=rival)
     elif isinstance(format_, TrajectoryFormat):
         span = _span(format_.read_trajectory(path).t_ns)
-        about = f"{format_.title}, {span}"
-        yield Candidate("pose", path, place, about, named, (label,), (0, 0, place), span, type=format_.name)
+        about, rank = f"{title}, {span}", (0, 0, place)
+        yield Proposal("pose", *head, about, file, labels, rank, span, type=format_.name)
     elif isinstance(format_, CalibrationFormat):
-        cameras = format_.read_calibration(path)
-        if len(cameras) > MAX_CAMERAS_OF_CALIBRATION:
-            return
-        for name, camera in cameras.items():
-            own, alone = label_of(name), len(cameras) == 1
-            both = tuple({word.key: word for word in (*label, *own)}.values())
-            labels = tuple(each for each in ([label, own] if alone else [own, both]) if each) or ((),)
-            settings = named if alone else {**named, "camera": name}
-            kinds: list[tuple[Kind, bool]] = [
-                ("intrinsics", camera.intrinsics is not None),
-                ("still", camera.position is not None),
-            ]
-            for kind, there in kinds:
-                if there:
-                    yield Candidate(kind, *head, settings, labels, (0, place, name))
+        yield from _of_calibration(path, place, format_)
     elif isinstance(format_, JointFormat):
         span = _span(format_.read_joints(path, unit=None, axes=None).t_ns)
-        yield Candidate("joints", *head, named, (label,), (0, place), span, type=format_.name)
+        yield Proposal("joints", *head, title, file, labels, (0, place), span, type=format_.name)
     elif isinstance(format_, LogFormat):
         yield _recording(path, place, format_)
     elif isinstance(format_, VideoFormat):
         index = format_.index(path)
         length_ns = int(index.pts_ns[-1])
-        yield Film(
-            "video",
-            path,
-            place,
-            f"{index.count} frames, {length_ns / 1e9:.6g} s",
-            named,
-            (label,),
-            (0, place),
-            frames=index.count,
-            length_ns=length_ns,
-            made_ns=(index.start_ns or None) if path.is_dir() else created_ns(path),
-            clock={SHARED_SECONDS: "whole seconds", UNTIMED: "none"}.get(index.codec, "own"),
-        )
+        about = f"{index.count} frames, {length_ns / 1e9:.6g} s"
+        film = FoundFilm("video", *head, about, file, labels, (0, place), frames=index.count)
+        made_ns = (index.start_ns or None) if path.is_dir() else created_ns(path)
+        clock = {SHARED_SECONDS: "whole seconds", UNTIMED: "none"}.get(index.codec, "own")
+        yield replace(film, length_ns=length_ns, made_ns=made_ns, clock=clock)
     elif isinstance(format_, MapFormat):
-        fitting_m = None
         try:
             grid = format_.read_map(path)
         except MapSizeError as error:
-            if (fitting_m := error.fitting_m) is None:
+            if error.fitting_m is None:
                 raise
-            grid = format_.read_map(path, resolution_m=fitting_m)
+            grid, file = format_.read_map(path, resolution_m=error.fitting_m), dict(file)
+            file["resolution_m"] = error.fitting_m
         far = float(np.abs(grid.origin[:2]).max()) > MAX_LOCAL_M
-        settings = named if fitting_m is None else {**named, "resolution_m": fitting_m}
-        projected = "projected" if far and grid.crs is None else ""
-        yield Candidate("map", *head, settings, (label,), (0, place), frame=projected)
+        frame = "projected" if far and grid.crs is None else ""
+        yield Proposal("map", *head, title, file, labels, (0, place), frame=frame)
     elif isinstance(format_, TelemetryFormat):
         yield from _drone_logs(path, place, format_)
     elif isinstance(format_, FrameTimesFormat):
         t_ns = read_frame_times(path).t_ns
-        utc = ", local time taken as UTC" if path.suffix.lower() == ".srt" else ""
-        yield Listed(
-            "frame_times",
-            path,
-            place,
-            f"{len(t_ns)} times{utc}",
-            named,
-            (label,),
-            (0, place),
-            _span(t_ns),
-            frames=len(t_ns),
-        )
+        about = f"{len(t_ns)} times" + (", local time taken as UTC" if path.suffix.lower() == ".srt" else "")
+        span = _span(t_ns)
+        yield FoundFrames("frame_times", *head, about, file, labels, (0, place), span, frames=len(t_ns))
 
 
-def _span(t_ns: Int64) -> Span:
-    return Span(int(t_ns[0]), int(t_ns[-1]))
+def _of_calibration(path: Path, place: NamePlace, format_: CalibrationFormat) -> Iterator[Proposal]:
+    """Yield the intrinsics and the pose of every camera."""
+    cameras, label = format_.read_calibration(path), label_of_place(place)
+    if len(cameras) > MAX_CAMERAS_OF_CALIBRATION:
+        return
+    for name, camera in cameras.items():
+        own, alone = label_of(name), len(cameras) == 1
+        both = tuple({word.key: word for word in (*label, *own)}.values())
+        labels = tuple(each for each in ([label, own] if alone else [own, both]) if each) or ((),)
+        settings: dict[str, object] = {"file": path} | ({} if alone else {"camera": name})
+        about = (path, place, format_.title, settings, labels, (0, place, name))
+        if camera.intrinsics is not None:
+            yield Proposal("intrinsics", *about)
+        if camera.position is not None:
+            yield Proposal("still", *about)
+
+
+def _span(t_ns: Int64) -> TimeSpan:
+    return TimeSpan(int(t_ns[0]), int(t_ns[-1]))
 
 
 # --- drones' own logs ------------------------------------------------------------------------------------
 
 
-def _drone_logs(path: Path, place: tuple[str, ...], format_: TelemetryFormat) -> Iterator[Candidate]:
+def _drone_logs(path: Path, place: NamePlace, format_: TelemetryFormat) -> Iterator[Proposal]:
     """Describe the poses in a drone's own log, with or without attitudes; those of each vehicle in it.
 
     Attitudes that come without positions, or without north, are a thing of their own.
@@ -474,19 +448,19 @@ def _drone_logs(path: Path, place: tuple[str, ...], format_: TelemetryFormat) ->
         yield from angles
 
 
-def _angles(path: Path, place: tuple[str, ...], format_: Format) -> Iterator[Angles]:
+def _angles(path: Path, place: NamePlace, format_: Format) -> Iterator[FoundAngles]:
     """Describe the camera's attitudes in a log that can be used for them alone."""
     if isinstance(format_, AttitudeFormat):
         with suppress(DataError):
             found = format_.read_attitudes(path)
             about = f"{len(found.camera.t_ns)} attitudes of the camera in its video"
             label = label_of_place(place)
-            yield Angles(
+            yield FoundAngles(
                 "angles", path, place, about, {"file": path}, (label,), knows_north=found.knows_north
             )
 
 
-def _drone_log(path: Path, place: tuple[str, ...], format_: TelemetryFormat, instance: int | None) -> Flown:
+def _drone_log(path: Path, place: NamePlace, format_: TelemetryFormat, instance: int | None) -> FlownPoses:
     try:
         telemetry = format_.read_telemetry(path, TelemetryChoice(instance=instance))
     except DataError:  # if only heights are missing, reading with a stated height works
@@ -506,7 +480,7 @@ def _drone_log(path: Path, place: tuple[str, ...], format_: TelemetryFormat, ins
     turned, held = telemetry.gimbal is not None, telemetry.body is not None
     span = _span(track.t_ns)
     has = "with gimbal angles" if turned else "no gimbal angles"
-    return Flown(
+    return FlownPoses(
         "pose",
         path,
         place,
@@ -523,17 +497,17 @@ def _drone_log(path: Path, place: tuple[str, ...], format_: TelemetryFormat, ins
         states_altitude="altitude" in getattr(format_, "choices", ()),
         height=track.height,
         video_start=start,
-        films=tuple(Span(*film) for film in films),
+        films=tuple(TimeSpan(*film) for film in films),
     )
 
 
-class _Comparison:
+class _MotionComparison:
     """Comparison of videos with drones' logs by their motion; each video is followed once."""
 
     def __init__(self) -> None:
         self._followed: dict[Path, TrackedPoints] = {}
 
-    def __call__(self, film: Film, log: Flown) -> Alike | None:
+    def __call__(self, film: FoundFilm, log: FlownPoses) -> MotionMatch | None:
         """Return how well the poses in a log explain the motion in a video's pictures; None without poses.
 
         The lens is taken to have an ordinary angle of view. Without a gimbal, the camera is taken to look
@@ -556,14 +530,14 @@ class _Comparison:
         rows = np.isfinite(moved).all(axis=1)
         if film.made_ns is not None and log.span and log.span.first_ns > NO_DATE_NS:
             rows &= np.abs(track.t_ns - film.made_ns) <= 2 * film.length_ns + MADE_WITHIN_NS
-        found: list[Alike] = []
+        found: list[MotionMatch] = []
         for down_deg in (0.0,) if telemetry.gimbal else TRIED_DOWN_DEG:
             turned = multiply(track.quaternion_xyzw[rows], body_from_camera("forward", down_deg))
             explained = explain_motion(
                 track.t_ns[rows], moved[rows], turned, self._followed[film.path], max_gap_ns=MAX_GAP_NS
             )
             if explained is not None:
-                found.append(Alike(*explained))
+                found.append(MotionMatch(*explained))
         return max(found, key=lambda alike: float(np.nansum(alike.gain)), default=None)
 
 
@@ -572,7 +546,7 @@ def _enu(geodetic: Float, place: Place) -> Float:
     return enu_from_geodetic(geodetic[:, 0], geodetic[:, 1], geodetic[:, 2], place)
 
 
-def _distance_m(log: Flown, other: Flown) -> float | None:
+def _distance_m(log: FlownPoses, other: FlownPoses) -> float | None:
     """Return the median distance across of positions on Earth in two logs, at the times of the first."""
     tracks = [each.telemetry.position for each in (log, other) if each.telemetry]
     if len(tracks) < 2 or not all(track.on_earth for track in tracks):
@@ -587,21 +561,21 @@ def _distance_m(log: Flown, other: Flown) -> float | None:
 # --- logs ----------------------------------------------------------------------------------------------
 
 
-def _recording(path: Path, place: tuple[str, ...], format_: LogFormat) -> Recording:
+def _recording(path: Path, place: NamePlace, format_: LogFormat) -> FoundLog:
     """Describe the topics of a log, with the frames of its poses and transforms."""
-    kinds: dict[str, Kind] = {"poses": "pose", "pictures": "video", "angles": "gimbal"}
+    kinds: dict[str, SourceKind] = {"poses": "pose", "pictures": "video", "angles": "gimbal"}
     kinds |= {"intrinsics": "intrinsics", "transforms": "transforms"}
-    topics: dict[str, Candidate] = {}
-    edges: dict[Edge, None] = {}
+    topics: dict[str, Proposal] = {}
+    edges: dict[FoundLink, None] = {}
     with format_.open_log([path]) as log:
         for topic in log.topics:
             kind = kinds.get(kind_of(topic) or "")
             kind = "map" if topic.type in MAP_TYPES else "fixes" if topic.type in FIXES else kind
             if kind is None or topic.name in topics:
                 continue
-            span = Span(topic.first_ns or 0, topic.last_ns or 0) if topic.count else None
+            span = TimeSpan(topic.first_ns or 0, topic.last_ns or 0) if topic.count else None
             short = topic.type.rpartition("/")[2]
-            known = Candidate(
+            known = Proposal(
                 kind,
                 path,
                 place,
@@ -624,13 +598,13 @@ def _recording(path: Path, place: tuple[str, ...], format_: LogFormat) -> Record
                 for sample in _pose_samples(log, topic.name, TRANSFORMS_READ, path):
                     lead_ns = sample.stamp_ns - sample.receive_ns if sample.stamp_ns else None
                     link = (topic.name, sample.target, sample.source, still)
-                    edges.setdefault(Edge(*link, sample.receive_ns, lead_ns))
+                    edges.setdefault(FoundLink(*link, sample.receive_ns, lead_ns))
             topics[topic.name] = known
         topics |= {f"{each.rank}": each for each in _drivers(log, path, place)}
-    return Recording(path, place, format_.title, topics, tuple(edges), (path,))
+    return FoundLog(path, place, format_.title, topics, tuple(edges), (path,))
 
 
-def _pose_topic(log: Log, topic: Candidate, type_: str, count: int) -> Candidate:
+def _pose_topic(log: Log, topic: Proposal, type_: str, count: int) -> Proposal:
     """Add the frames of a topic's first pose, and what its names say of it."""
     first = next(_pose_samples(log, topic.topic, 1, topic.path), None)
     target, source = (first.target, first.source) if first else ("", "")
@@ -645,7 +619,7 @@ def _pose_topic(log: Log, topic: Candidate, type_: str, count: int) -> Candidate
     )
 
 
-def _drivers(log: Log, path: Path, place: tuple[str, ...]) -> Iterator[Candidate]:
+def _drivers(log: Log, path: Path, place: NamePlace) -> Iterator[Proposal]:
     """Yield the drones whose drivers' usual topics are in a log: together they hold more than each alone."""
     topics = {topic.name: topic for topic in log.topics if topic.count}
     every = namespaces(list(topics))
@@ -663,14 +637,14 @@ def _drivers(log: Log, path: Path, place: tuple[str, ...]) -> Iterator[Candidate
         found.append(({"topic": position, "attitude": attitude}, position, [position], True, False, True))
     for settings, named, names, body, gimbal, by_gps in found:
         parts_ = [topics[name] for name in names]
-        span = Span(min(t.first_ns or 0 for t in parts_), max(t.last_ns or 0 for t in parts_))
+        span = TimeSpan(min(t.first_ns or 0 for t in parts_), max(t.last_ns or 0 for t in parts_))
         count = max(topic.count for topic in parts_)
         preset_ = "preset" in settings
         likelihood = -1 if preset_ else LAST_POSE_TYPE
         what = (
             f"usual topics{' with gimbal angles' if gimbal else ''}" if preset_ else "positions and attitudes"
         )
-        yield Candidate(
+        yield Proposal(
             "pose",
             path,
             place,

@@ -31,7 +31,7 @@ from pipelines.session.description import (
     read_description,
 )
 from pipelines.session.errors import DataError, MocapError
-from pipelines.session.manifest import Axes, CameraSources, LogSource, Manifest, Source, read_flight
+from pipelines.session.manifest import Axes, CameraSources, FileSource, LogSource, Manifest, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
@@ -53,10 +53,8 @@ from pipelines.session.tables import (
 )
 from pipelines.session.urls import as_urls, located, media_path, named
 from pipelines.sources.cameras import FlightCameras
-from pipelines.sources.files import FlightFiles
-from pipelines.sources.hashes import fetch_sources, hash_sources, refuse_written, source_stamps
-from pipelines.sources.logs import FlightLogs
-from pipelines.sources.maps import maps_of_log
+from pipelines.sources.files import FlightFiles, fetch_sources, hash_sources, refuse_written, source_stamps
+from pipelines.sources.logs import FlightLogs, maps_of_log
 from pipelines.sources.parts import (
     CameraData,
     camera_entry,
@@ -75,7 +73,8 @@ INGEST = Stage("ingest", revision=9)
 
 T = TypeVar("T")
 
-_AHEAD_ROWS = 200_000  # of cameras that are read during hashing: some 70 MB
+# Cameras that are read during hashing wait in memory: so many rows take 70 MB.
+MAX_ROWS_AHEAD = 200_000
 
 
 @dataclass(frozen=True)
@@ -229,12 +228,12 @@ class _FlightReader:
         self._notes.append(as_urls(line))
 
     def read_ahead(self) -> Iterator[str]:
-        """Read cameras in advance for `store_camera`, one after the other, up to `_AHEAD_ROWS` rows.
+        """Read cameras in advance for `store_camera`, one after the other, up to `MAX_ROWS_AHEAD` rows.
 
         An error ends it. The same error is raised again when that camera is stored.
         """
         for name in self._flight.cameras:
-            if sum(data.rows for data in self._ahead.values()) > _AHEAD_ROWS:
+            if sum(data.rows for data in self._ahead.values()) > MAX_ROWS_AHEAD:
                 return
             try:
                 self._ahead[name] = self._read_camera(name)
@@ -284,7 +283,7 @@ class _FlightReader:
         logged: Axes | None = self._log_of("gimbal", gimbal, lambda log: log.axes)
         return gimbal.axes or logged or self._flight.world.frame
 
-    def _log_of(self, part: str, source: Source, setting: Callable[[LogSource], T | None]) -> T | None:
+    def _log_of(self, part: str, source: FileSource, setting: Callable[[LogSource], T | None]) -> T | None:
         """Return a setting of the log that is a source; None if the source is no log."""
         if not self._files.is_log(part, source):
             return None

@@ -73,7 +73,7 @@ from pipelines.session.tables import (
     read_table,
 )
 from pipelines.session.urls import is_there
-from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_pictures
+from pipelines.sources.pictures import CameraPictures, open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -300,7 +300,7 @@ def _pictures_there(folder: Path, description: Description) -> list[str]:
 
 def _open_pictures(
     folder: Path, description: Description, stack: ExitStack
-) -> tuple[dict[str, Pictures], list[str]]:
+) -> tuple[dict[str, CameraPictures], list[str]]:
     """Open the pictures of every camera that still has them; return a warning for each other camera."""
     opened, warnings = {}, []
     for name, entry in description.cameras.items():
@@ -313,7 +313,7 @@ def _open_pictures(
     return opened, warnings
 
 
-def _read_frame(pictures: dict[str, Pictures], camera: str, frame: int) -> Picture | None:
+def _read_frame(pictures: dict[str, CameraPictures], camera: str, frame: int) -> Picture | None:
     return pictures[camera].read(frame) if camera in pictures else None
 
 

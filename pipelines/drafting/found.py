@@ -13,14 +13,14 @@ from pipelines.drafting.labels import (
     NED,
     OPTICAL,
     Label,
-    Place,
+    NamePlace,
     is_called,
     label_of,
     label_of_place,
 )
 from pipelines.session.records import Height, Telemetry
 
-Kind = Literal[
+SourceKind = Literal[
     "video",
     "keypoints",
     "frame_times",
@@ -46,7 +46,7 @@ MAX_LENGTHS_APART_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)
-class Span:
+class TimeSpan:
     """First and last stamp, ns."""
 
     first_ns: int
@@ -57,13 +57,13 @@ class Span:
         """The time between them."""
         return self.last_ns - self.first_ns
 
-    def overlap_ns(self, other: Span) -> int:
+    def overlap_ns(self, other: TimeSpan) -> int:
         """Compute the length of the overlap with another span; negative is the gap between them."""
         return min(self.last_ns, other.last_ns) - max(self.first_ns, other.first_ns)
 
-    def later(self, by_ns: int) -> Span:
+    def later(self, by_ns: int) -> TimeSpan:
         """Return the span at later times."""
-        return Span(self.first_ns + by_ns, self.last_ns + by_ns)
+        return TimeSpan(self.first_ns + by_ns, self.last_ns + by_ns)
 
     def __str__(self) -> str:
         """Write the length and the start."""
@@ -79,17 +79,17 @@ class VideoStart(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class Proposal:
     """Something that a part of a manifest can name; its settings hold paths as Path objects."""
 
-    kind: Kind
+    kind: SourceKind
     path: Path
-    place: Place
+    place: NamePlace
     about: str  # a few words for the comment
     settings: dict[str, object]
     labels: tuple[Label, ...]
     rank: tuple[object, ...] = (0,)  # the smallest is the likeliest among those with equal names
-    span: Span | None = None
+    span: TimeSpan | None = None
     of_body: bool = False  # poses of the body; else of the camera
     unturned: bool = False  # positions only, without attitudes of drone or gimbal
     by_gps: bool = False  # poses whose position is that of a satellite receiver
@@ -102,7 +102,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Film(Candidate):
+class FoundFilm(Proposal):
     """A video file or a folder of pictures."""
 
     frames: int = 0
@@ -112,7 +112,7 @@ class Film(Candidate):
 
 
 @dataclass(frozen=True, eq=False)
-class Listed(Candidate):
+class FoundFrames(Proposal):
     """2D keypoints of one camera."""
 
     frames: int = 0
@@ -122,7 +122,7 @@ class Listed(Candidate):
 
 
 @dataclass(frozen=True, eq=False)
-class Flown(Candidate):
+class FlownPoses(Proposal):
     """Poses in a drone's own log."""
 
     telemetry: Telemetry | None = None
@@ -130,16 +130,16 @@ class Flown(Candidate):
     states_altitude: bool = False  # a manifest can state which of its heights are taken
     height: Height = "unknown"
     video_start: VideoStart | None = None  # of the video beside it, or of the one that holds it
-    films: tuple[Span, ...] = ()  # when it says that the camera recorded videos
+    films: tuple[TimeSpan, ...] = ()  # when it says that the camera recorded videos
 
-    def film_of(self, film: Film) -> Span | None:
+    def film_of(self, film: FoundFilm) -> TimeSpan | None:
         """Return the only recording of about a video's length; None if there is none, or several."""
         alike = [f for f in self.films if abs(f.length_ns - film.length_ns) < MAX_LENGTHS_APART_NS]
         return alike[0] if len(alike) == 1 else None
 
 
 @dataclass(frozen=True, eq=False)
-class Angles(Candidate):
+class FoundAngles(Proposal):
     """Attitudes of a camera in a log, for the positions of another one."""
 
     knows_north: bool = True
@@ -149,7 +149,7 @@ class Angles(Candidate):
 
 
 @dataclass(frozen=True)
-class Edge:
+class FoundLink:
     """A logged transform: the frame `child` in `parent`."""
 
     topic: str
@@ -161,23 +161,27 @@ class Edge:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class FoundLog:
     """A log; it has several parts if it was split."""
 
     path: Path
-    place: Place
+    place: NamePlace
     title: str
-    topics: dict[str, Candidate]  # by topic, and by preset and namespace
-    edges: tuple[Edge, ...] = ()
+    topics: dict[str, Proposal]  # by topic, and by preset and namespace
+    edges: tuple[FoundLink, ...] = ()
     parts: tuple[Path, ...] = ()
     stamps: Literal["header", "receive"] = "header"
     ahead_ns: int = 0  # of its header stamps, if that is more than the log is long
 
     @property
-    def span(self) -> Span:
+    def span(self) -> TimeSpan:
         """The time from its first message to its last."""
         spans = [topic.span for topic in self.topics.values() if topic.span]
-        return Span(min(s.first_ns for s in spans), max(s.last_ns for s in spans)) if spans else Span(0, 0)
+        return (
+            TimeSpan(min(s.first_ns for s in spans), max(s.last_ns for s in spans))
+            if spans
+            else TimeSpan(0, 0)
+        )
 
     @property
     def label(self) -> Label:
@@ -186,7 +190,7 @@ class Recording:
         match = _PART.fullmatch(name)
         return label_of_place((*folders, match[1] if match and label_of(match[1]) else name))
 
-    def candidates(self) -> Iterator[Candidate]:
+    def candidates(self) -> Iterator[Proposal]:
         """Yield its topics with their labels, and the chains of its transforms."""
         for topic in self.topics.values():
             if topic.span and topic.kind != "transforms":
@@ -194,8 +198,8 @@ class Recording:
         moving = [t.span for t in self.topics.values() if t.kind == "transforms" and t.span]
         for parent, child, first_ns in chains(self.edges):
             of_body = not is_called(child, OPTICAL)
-            span = Span(first_ns, max(s.last_ns for s in moving)) if moving else None
-            yield Candidate(
+            span = TimeSpan(first_ns, max(s.last_ns for s in moving)) if moving else None
+            yield Proposal(
                 "pose",
                 self.path,
                 self.place,
@@ -217,12 +221,12 @@ LAST_POSE_TYPE = len(POSE_TYPES)
 _PART = re.compile(r"(.*)_(\d{1,9})", re.DOTALL)
 
 
-def join_parts(recordings: Sequence[Recording]) -> list[Recording]:
+def join_parts(recordings: Sequence[FoundLog]) -> list[FoundLog]:
     """Join files named NAME_0, NAME_1, ... to one recording, if each begins after the previous one ends.
 
     Two drones that log at the same time stay two recordings.
     """
-    result: list[Recording] = []
+    result: list[FoundLog] = []
     for recording in sorted(recordings, key=lambda each: _part(each.place)):
         before = result[-1] if result else None
         if before and _continues(before, recording):
@@ -232,7 +236,7 @@ def join_parts(recordings: Sequence[Recording]) -> list[Recording]:
                 if known is None or known.span is None or topic.span is None:
                     topics[name] = topic if known is None or known.span is None else known
                 else:
-                    topics[name] = replace(known, span=Span(known.span.first_ns, topic.span.last_ns))
+                    topics[name] = replace(known, span=TimeSpan(known.span.first_ns, topic.span.last_ns))
             edges = tuple(dict.fromkeys((*before.edges, *recording.edges)))
             result[-1] = replace(before, parts=(*before.parts, recording.path), topics=topics, edges=edges)
         else:
@@ -240,13 +244,13 @@ def join_parts(recordings: Sequence[Recording]) -> list[Recording]:
     return sorted(result, key=lambda recording: recording.place)
 
 
-def _part(place: Place) -> tuple[Place, str, int]:
+def _part(place: NamePlace) -> tuple[NamePlace, str, int]:
     match = _PART.fullmatch(place[-1])
     name, number = (match[1], int(match[2])) if match else (place[-1], -1)
     return place[:-1], name, number
 
 
-def _continues(before: Recording, recording: Recording) -> bool:
+def _continues(before: FoundLog, recording: FoundLog) -> bool:
     *name, number = _part(recording.place)
     *first, zero = _part(before.place)
     if name != first or zero != 0 or number != len(before.parts):
@@ -260,7 +264,7 @@ def _continues(before: Recording, recording: Recording) -> bool:
     return bool(spans) and all(one.last_ns <= other.first_ns for one, other in spans)
 
 
-def choose_stamps(recordings: Sequence[Recording]) -> list[Recording]:
+def choose_stamps(recordings: Sequence[FoundLog]) -> list[FoundLog]:
     """Choose one kind of stamps for all logs; with it, the spans are those of these stamps.
 
     Header stamps are taken, unless they differ from those of receipt by more than a log is long (simulation
@@ -298,18 +302,18 @@ def choose_stamps(recordings: Sequence[Recording]) -> list[Recording]:
     return found
 
 
-def chains(edges: Sequence[Edge]) -> list[tuple[str, str, int]]:
+def chains(edges: Sequence[FoundLink]) -> list[tuple[str, str, int]]:
     """List (parent, child) of every moving camera or body frame of a log's transforms; cameras first.
 
     The third is the time (ns) from which all transforms between them are known. The parent is the root of
     the child's tree. Frames that are fixed to the root are left out.
     """
-    above: dict[str, Edge] = {}
+    above: dict[str, FoundLink] = {}
     for edge in edges:
         above.setdefault(edge.child, edge)
     found = []
     for child in sorted(above):
-        way: list[Edge] = []
+        way: list[FoundLink] = []
         frame = child
         while frame in above and len(way) <= len(above):
             way.append(above[frame])

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-Place = tuple[str, ...]
+NamePlace = tuple[str, ...]
 """Names of a thing: folders below the common one, then the file's name without its suffix."""
 
 EQUAL, PART, NUMBER, UNNAMED, OTHER = 4, 3, 2, 1, 0
@@ -36,7 +36,9 @@ _GENERIC_NUMBERED = re.compile(
     r"(?![^\W_])"
 )
 _WORD = re.compile(r"[^\W\d_]+[0-9]*|[0-9]+")
-_MOST_DIGITS = 18  # of a number; only the last ones are compared
+
+# Longer numbers are hashes or times, of which the last digits tell files apart.
+MAX_DIGITS = 18
 
 
 class Word(NamedTuple):
@@ -61,7 +63,7 @@ def words(text: str) -> list[Word]:
     start = end = 0  # of the word found last
     for match in _WORD.finditer(_GENERIC_NUMBERED.sub(lambda generic: " " * len(generic[0]), text)):
         letters = match[0].rstrip("0123456789")
-        number = int(match[0][len(letters) :][-_MOST_DIGITS:] or -1)
+        number = int(match[0][len(letters) :][-MAX_DIGITS:] or -1)
         if not letters and found and found[-1].number is None and match.start() == end + 1:
             found[-1] = Word(text[start : match.end()], found[-1].word, number)
         else:
@@ -77,7 +79,7 @@ def label_of(text: str) -> Label:
     return tuple(kept.values())
 
 
-def label_of_place(place: Place) -> Label:
+def label_of_place(place: NamePlace) -> Label:
     """Return the label of a file: that of its name, with numbered folders above it (drone1/DJI_0001.mp4).
 
     If the name has no label (drone1/video.mp4), it is the label of the nearest folder that has one.

@@ -21,18 +21,19 @@ from ruamel.yaml.representer import RoundTripRepresenter
 
 from pipelines.drafting.found import (
     NO_DATE_NS,
-    Candidate,
-    Film,
-    Flown,
-    Listed,
-    Recording,
-    Span,
+    FlownPoses,
+    FoundFilm,
+    FoundFrames,
+    FoundLog,
+    Proposal,
+    TimeSpan,
     VideoStart,
 )
 from pipelines.drafting.matching import CameraDraft, FlightDraft
 from pipelines.session.manifest import SCHEMA, CameraSources, Manifest
-from pipelines.session.yaml_files import Part
+from pipelines.session.yaml_files import YamlModel
 
+# Most cameras of drones film at 30 pictures a second unless asked otherwise.
 ASSUMED_FPS = 30
 
 # Ingest bridges a gap of half a second between two poses unless asked otherwise.
@@ -86,7 +87,7 @@ def one_line(text: str) -> str:
 
 
 @dataclass
-class Entry:
+class DraftedKey:
     """A key of the manifest: its value, the comment behind it, and lines of comments below it."""
 
     value: object = None  # None: the key is missing, and stands in a comment with an example
@@ -95,7 +96,7 @@ class Entry:
     example: object = None
     blank: bool = False  # an empty line before it
 
-    def lines(self, key: str, model: type[Part] | None) -> list[str]:
+    def lines(self, key: str, model: type[YamlModel] | None) -> list[str]:
         """Write the key as YAML without indentation."""
         comment = one_line("; ".join(self.remarks))
         if self.value is None and self.example is None:
@@ -117,7 +118,7 @@ class ManifestText:
     assumed: list[str]  # the flight can be ingested, but results depend on it
 
 
-class _Writer:
+class _ManifestWriter:
     """Writer of a draft; collects what is missing and what is assumed, with the cameras that it concerns."""
 
     def __init__(self, draft: FlightDraft, relative: Callable[[Path], str]) -> None:
@@ -141,7 +142,7 @@ class _Writer:
         value = self.stated(dict(settings))
         return {**(value if isinstance(value, dict) else {"file": value}), "assumed": True}
 
-    def others(self, key: str, candidates: Sequence[Candidate]) -> list[str]:
+    def others(self, key: str, candidates: Sequence[Proposal]) -> list[str]:
         """List alternatives as comments."""
         lines = [
             f"# or {flow(key)}: {flow(self.stated(_settings(c)))}  # {one_line(c.about)}"
@@ -152,7 +153,7 @@ class _Writer:
 
     # --- a camera --------------------------------------------------------------------------------------
 
-    def camera(self, camera: CameraDraft) -> dict[str, Entry]:
+    def camera(self, camera: CameraDraft) -> dict[str, DraftedKey]:
         """Return the entries of a camera by key."""
         entries = {
             "video": self._video(camera),
@@ -171,12 +172,12 @@ class _Writer:
     def _miss(self, camera: CameraDraft, what: str) -> None:
         self.missing.setdefault(what, []).append(camera.name)
 
-    def _entry(self, key: str, candidates: Sequence[Candidate], remarks: list[str], guess: bool) -> Entry:
+    def _entry(self, key: str, candidates: Sequence[Proposal], remarks: list[str], guess: bool) -> DraftedKey:
         settings = _settings(candidates[0])
         value = self.guessed(settings) if guess else self.stated(settings)
-        return Entry(value, [candidates[0].about, *remarks], self.others(key, candidates[1:]))
+        return DraftedKey(value, [candidates[0].about, *remarks], self.others(key, candidates[1:]))
 
-    def _video(self, camera: CameraDraft) -> Entry:
+    def _video(self, camera: CameraDraft) -> DraftedKey:
         videos = camera.pictures["video"]
         if videos:
             if camera.paired:
@@ -184,24 +185,24 @@ class _Writer:
             remarks = ["assumed: of the same camera as the keypoints"] if camera.paired else []
             return self._entry("video", videos, remarks, camera.paired)
         if camera.pictures["keypoints"]:
-            return Entry()
+            return DraftedKey()
         self._miss(camera, "a video or keypoints")
-        return Entry(
+        return DraftedKey(
             None, ["missing: a video, pictures of a log, or keypoints"], example=f"{camera.name}.mp4"
         )
 
-    def _keypoints(self, camera: CameraDraft) -> Entry:
+    def _keypoints(self, camera: CameraDraft) -> DraftedKey:
         listed = camera.pictures["keypoints"]
         if not listed:
-            return Entry()
+            return DraftedKey()
         first = listed[0]
         remarks: list[str] = []
         settings: dict[str, object] = {}
-        if isinstance(first, Listed) and first.ambiguous:
+        if isinstance(first, FoundFrames) and first.ambiguous:
             settings["format"] = first.ambiguous
             remarks.append("assumed: other formats recognise it too")
             self._assume(camera, "keypoints", f"that they are {first.ambiguous}'s")
-        number = _first_frame(first, camera.film) if isinstance(first, Listed) else 0
+        number = _first_frame(first, camera.film) if isinstance(first, FoundFrames) else 0
         if number:
             settings["first_frame"] = number
             remarks.append(f"assumed: frame {number} of it is the first")
@@ -213,35 +214,37 @@ class _Writer:
 
     # --- time ------------------------------------------------------------------------------------------
 
-    def _frame_times(self, camera: CameraDraft) -> Entry:
+    def _frame_times(self, camera: CameraDraft) -> DraftedKey:
         choice, film = camera.choices.get("frame_times"), camera.film
         if choice:
             return self._entry("frame_times", [choice.taken, *choice.others], [], False)
         if camera.logged_film is not None:
-            return Entry()  # the log's own stamps
+            return DraftedKey()  # the log's own stamps
         if film and film.clock == "none":
             self._miss(camera, "frame_times: when its pictures were taken, for their EXIF does not say it")
             why = "missing: their EXIF has no times that rise; or a file of times"
-            return Entry(None, [why], example={"start": "SECONDS", "fps": ASSUMED_FPS})
+            return DraftedKey(None, [why], example={"start": "SECONDS", "fps": ASSUMED_FPS})
         if (known := _known_start(camera)) is not None:
             settings: dict[str, object] = {"start": (Decimal(known.start_ns) / 10**9).normalize()}
             if not known.sigma_s:
-                return Entry(settings, [known.source])
+                return DraftedKey(settings, [known.source])
             self._assume(camera, "frame_times", f"start {known.source}, to {known.sigma_s:g} s")
-            return Entry(self.guessed(settings), [f"assumed: {known.source}"])
+            return DraftedKey(self.guessed(settings), [f"assumed: {known.source}"])
         if not film and not camera.pictures["keypoints"]:
-            return Entry()
+            return DraftedKey()
         start, reason = self._start(camera)
         if film and start is None:
             why = "when the first frame was taken, if not at 0"
-            return Entry(None, [why], example={"start": "SECONDS"})
+            return DraftedKey(None, [why], example={"start": "SECONDS"})
         settings = {} if start is None else {"start": start}
         assumed = [] if film else [f"fps {ASSUMED_FPS}"]
         if not film:
             settings["fps"] = ASSUMED_FPS
         assumed.append("the first frame at 0 s" if start is None else "start, when the first frame was taken")
         self._assume(camera, "frame_times", ", ".join(assumed))
-        return Entry(self.guessed(settings), [f"assumed: {', '.join(assumed)}{reason and f' ({reason})'}"])
+        return DraftedKey(
+            self.guessed(settings), [f"assumed: {', '.join(assumed)}{reason and f' ({reason})'}"]
+        )
 
     def _start(self, camera: CameraDraft) -> tuple[Decimal | None, str]:
         """Assume the first frame's time in seconds: the start of poses and truth; None for 0."""
@@ -251,31 +254,31 @@ class _Writer:
         spans = {what: span for what, span in (("its poses", poses), ("the truth", truth)) if span}
         if poses and truth and poses.overlap_ns(truth) < 0:
             spans = {"its poses": poses}  # the truth has another zero of time
-        listed = [c.frames for c in camera.pictures["keypoints"] if isinstance(c, Listed)]
+        listed = [c.frames for c in camera.pictures["keypoints"] if isinstance(c, FoundFrames)]
         length_ns = camera.film.length_ns if camera.film else sum(listed[:1]) * 10**9 // ASSUMED_FPS
-        filmed = Span(0, length_ns)
+        filmed = TimeSpan(0, length_ns)
         if all(filmed.overlap_ns(span) >= 0 for span in spans.values()):
             return None, ""
         first_ns = max(span.first_ns for span in spans.values())
         return Decimal(-(-first_ns // 10**6)) / 1000, f"when {' and '.join(spans)} begin"
 
-    def _clock(self, camera: CameraDraft) -> Entry:
+    def _clock(self, camera: CameraDraft) -> DraftedKey:
         if camera.logged_film is not None:
-            return Entry()
+            return DraftedKey()
         known = None if camera.choices.get("frame_times") else _known_start(camera)
         if known is not None and known.sigma_s:
             why = f"the start is known to {known.sigma_s:g} s"
-            return Entry({"offset_s": 0, "sigma_s": known.sigma_s}, [why])
-        return Entry(None, ["if its clock is off, or unsure"], example={"offset_s": 0, "sigma_s": 0.2})
+            return DraftedKey({"offset_s": 0, "sigma_s": known.sigma_s}, [why])
+        return DraftedKey(None, ["if its clock is off, or unsure"], example={"offset_s": 0, "sigma_s": 0.2})
 
     # --- poses -----------------------------------------------------------------------------------------
 
-    def _pose(self, camera: CameraDraft) -> Entry:
+    def _pose(self, camera: CameraDraft) -> DraftedKey:
         choice = camera.choices.get("pose")
         if choice is None:
             self._miss(camera, "pose: nothing of that name has poses")
             remarks = [f"missing: nothing of that name has poses{self._loose(('pose', 'still'))}"]
-            return Entry(None, remarks, example={"file": f"{camera.name}.tum"})
+            return DraftedKey(None, remarks, example={"file": f"{camera.name}.tum"})
         taken, remarks, guess = choice.taken, [], False
 
         def assume(remark: str, what: str) -> None:
@@ -294,7 +297,7 @@ class _Writer:
         if filmed and taken.span and filmed.overlap_ns(taken.span) < 0:
             remarks.append(f"missing: it was filmed at other times, {filmed}")
             self._miss(camera, "pose: there are no poses of the time when it filmed")
-        if isinstance(taken, Flown):
+        if isinstance(taken, FlownPoses):
             if taken.height == "stated":
                 self._miss(camera, "pose: altitude, for its log states no height")
                 remarks.append("missing: altitude: METRES above the take-off")
@@ -313,63 +316,66 @@ class _Writer:
             assume(hint, "axes enu, although a name sounds like ned")
         return self._entry("pose", [taken, *choice.others], remarks, guess)
 
-    def _mount(self, camera: CameraDraft) -> dict[str, Entry]:
+    def _mount(self, camera: CameraDraft) -> dict[str, DraftedKey]:
         """Return the mount or the gimbal of a camera whose poses are not its own."""
         choice, gimbal = camera.choices.get("pose"), camera.choices.get("gimbal")
         if choice is None or choice.taken.kind == "still":
             return {}
         taken = choice.taken
-        lever = Entry(
+        lever = DraftedKey(
             None,
             ["the lever arm to the gimbal, m"],
             example={"looks": "forward", "translation": [0, 0, 0]},
         )
         if not (taken.of_body or taken.unturned):
-            return {"mount": lever} if isinstance(taken, Flown) or "preset" in taken.settings else {}
+            return {"mount": lever} if isinstance(taken, FlownPoses) or "preset" in taken.settings else {}
         if gimbal is not None:
             why = "gimbal: relative_to, what its angles are relative to"
             self._miss(camera, why)
             example = {**dict(gimbal.taken.settings), "relative_to": "world"}
             remarks = [gimbal.taken.about, "missing: relative_to, and order and units if not ypr and deg"]
-            entry = Entry(None, remarks, self.others("gimbal", gimbal.others), self.stated(example))
+            entry = DraftedKey(None, remarks, self.others("gimbal", gimbal.others), self.stated(example))
             return {"gimbal": entry, "mount": lever}
         own = camera.angles
         if own is not None and own.knows_north:
-            return {"gimbal": Entry(self.stated(own.settings), [own.about]), "mount": lever}
+            return {"gimbal": DraftedKey(self.stated(own.settings), [own.about]), "mount": lever}
         if own is not None:
             heading = "yaw_deg is where its first picture looks, from north to east"
             turned = self.stated({**own.settings, "yaw_deg": 90})
             if taken.of_body:
                 remark = f"if it turned in a gimbal: {heading}"
-                return {"mount": self._fixed_mount(camera), "gimbal": Entry(None, [remark], example=turned)}
+                return {
+                    "mount": self._fixed_mount(camera),
+                    "gimbal": DraftedKey(None, [remark], example=turned),
+                }
             why = "gimbal: yaw_deg, the heading of its first picture, which a GoPro does not log"
             self._miss(camera, why)
             remarks = [f"missing: {heading} ({own.about})"]
-            return {"gimbal": Entry(None, remarks, example=turned), "mount": lever}
+            return {"gimbal": DraftedKey(None, remarks, example=turned), "mount": lever}
         if taken.unturned:
             self._miss(camera, "gimbal: how the camera was turned, for its log does not say it")
             remarks = ["missing: constant angles, from north to east and up, or a file and topic of angles"]
-            return {"gimbal": Entry(None, remarks, example={"yaw_deg": 90, "pitch_deg": -30})}
+            return {"gimbal": DraftedKey(None, remarks, example={"yaw_deg": 90, "pitch_deg": -30})}
         return {"mount": self._fixed_mount(camera)}
 
-    def _fixed_mount(self, camera: CameraDraft) -> Entry:
+    def _fixed_mount(self, camera: CameraDraft) -> DraftedKey:
         self._assume(camera, "mount", "the camera looks forward, level, from the body's origin")
         settings = {"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}
         remark = "assumed: along the body's x axis, level, no lever arm (m)"
-        return Entry(self.guessed(settings), [remark])
+        return DraftedKey(self.guessed(settings), [remark])
 
-    def _intrinsics(self, camera: CameraDraft) -> Entry:
+    def _intrinsics(self, camera: CameraDraft) -> DraftedKey:
         choice = camera.choices.get("intrinsics")
         if choice is None:
             self._miss(camera, "intrinsics: nothing of that name has them")
             remarks = [f"missing: nothing of that name has them{self._loose(('intrinsics',))}"]
             numbers = {"width": 1920, "height": 1080, "fx": 1400, "fy": 1400, "cx": 959.5, "cy": 539.5}
-            return Entry(None, remarks, example=numbers)
+            return DraftedKey(None, remarks, example=numbers)
         if not choice.named:
             self._assume(camera, "intrinsics", "that one calibration holds for them")
         remarks = [] if choice.named else ["assumed: it holds for this camera"]
         if choice.taken.settings.get("camera") == camera.name:  # its own name need not be stated
-            taken = Entry(self.stated({"file": choice.taken.path}), [choice.taken.about, *remarks])
+            taken = DraftedKey(self.stated({"file": choice.taken.path}), [choice.taken.about, *remarks])
             taken.below = self.others("intrinsics", choice.others)
             if not choice.named:
                 taken.value = self.guessed({"file": choice.taken.path})
@@ -378,24 +384,24 @@ class _Writer:
 
     def _loose(self, kinds: tuple[str, ...]) -> str:
         """List found things of some kinds that are not used."""
-        unused = [c for c in self.draft.unused if isinstance(c, Recording) or c.kind in kinds]
+        unused = [c for c in self.draft.unused if isinstance(c, FoundLog) or c.kind in kinds]
         paths = [flow(self._relative(each.path)) for each in unused[:MAX_LISTED]]
         return f"; there is {', '.join(paths)}" if paths else ""
 
     # --- the flight ------------------------------------------------------------------------------------
 
-    def world(self) -> Entry:
+    def world(self) -> DraftedKey:
         """Return the axes of the world, which trajectories and logs do not state."""
         taken = [c.choices["pose"].taken for c in self.draft.cameras if "pose" in c.choices]
-        guessed = any(c.kind == "pose" and not isinstance(c, Flown) for c in taken)
+        guessed = any(c.kind == "pose" and not isinstance(c, FlownPoses) for c in taken)
         origin = "#   origin: {latitude_deg: 0, longitude_deg: 0, altitude_m: 0}  # else the first position's"
-        return Entry(
+        return DraftedKey(
             {"frame": "enu"} | ({"assumed": True} if guessed else {}),
             ["assumed: the poses have z up (x east, y north); or ned"] if guessed else [],
             [origin] if any(c.by_gps for c in taken) else [],
         )
 
-    def logs(self) -> dict[str, Entry]:
+    def logs(self) -> dict[str, DraftedKey]:
         """Return the logs that the rest of the manifest names."""
         poses = {c.choices["pose"].taken.path for c in self.draft.cameras if "pose" in c.choices}
         several = len(poses & set(self._log_names)) > 1
@@ -418,25 +424,25 @@ class _Writer:
                     remarks.append(f"{apart}, assumed: {log.stamps}")
             if several or log.ahead_ns or log.stamps == "receive":
                 settings["assumed"] = True
-            entries[name] = Entry(settings, remarks)
+            entries[name] = DraftedKey(settings, remarks)
         if several:
             self.assumed["logs: one clock and one origin for all; else say clock and world_from_source"] = []
         return entries
 
-    def actor(self) -> Entry:
+    def actor(self) -> DraftedKey:
         """Return the source of the person's logged positions."""
         if not self.draft.actors:
-            return Entry()
+            return DraftedKey()
         taken, *others = self.draft.actors
         self.assumed["actor: point hip, which point of the person the log follows"] = []
         value = self.guessed({**taken.settings, "point": "hip"})
         remarks = [taken.about, "assumed: point, one of hip, head, feet, centre"]
-        return Entry(value, remarks, self.others("actor", others), blank=True)
+        return DraftedKey(value, remarks, self.others("actor", others), blank=True)
 
-    def map(self) -> Entry:
+    def map(self) -> DraftedKey:
         """Return the map: the first file, else a topic that lies where the poses do."""
         if not self.draft.maps:
-            return Entry()
+            return DraftedKey()
         taken, *others = self.draft.maps
         remarks = [taken.about]
         if "resolution_m" in taken.settings:
@@ -446,14 +452,14 @@ class _Writer:
             remarks.append("missing: crs: EPSG:32632, that of its coordinates")
             self.missing["map: crs, for its coordinates are those of a map projection"] = []
         if taken.topic and taken.unturned:
-            return Entry(None, [], self.others("map", self.draft.maps), blank=True)
-        return Entry(self.stated(taken.settings), remarks, self.others("map", others), blank=True)
+            return DraftedKey(None, [], self.others("map", self.draft.maps), blank=True)
+        return DraftedKey(self.stated(taken.settings), remarks, self.others("map", others), blank=True)
 
-    def truth(self) -> Entry:
+    def truth(self) -> DraftedKey:
         """Return the truth; joints only if they overlap with poses in time, because ingest refuses others."""
         logged = [c.choices["pose"].taken.span for c in self.draft.cameras if "pose" in c.choices]
         spans = [span for span in logged if span]
-        entry = Entry(blank=True)
+        entry = DraftedKey(blank=True)
         known: dict[str, object] = {}
         for joints in self.draft.joints:
             meets = not spans or any(joints.span and joints.span.overlap_ns(s) >= 0 for s in spans)
@@ -475,7 +481,7 @@ class _Writer:
         """List files that were recognised but are not used."""
         lines = ["", "# Recognised, but not used:"] if self.draft.unused else []
         for found in self.draft.unused:
-            if isinstance(found, Recording):
+            if isinstance(found, FoundLog):
                 about = found.title
                 fixes = [t.topic for t in found.topics.values() if t.kind == "fixes"]
                 held = [
@@ -494,7 +500,7 @@ class _Writer:
         return lines
 
 
-def _settings(candidate: Candidate) -> dict[str, object]:
+def _settings(candidate: Proposal) -> dict[str, object]:
     """Return what a candidate states, with the thing that its logged poses are of."""
     logged = candidate.kind == "pose" and ("topic" in candidate.settings or "parent" in candidate.settings)
     return {**candidate.settings, **({"of": "body" if candidate.of_body else "camera"} if logged else {})}
@@ -513,10 +519,10 @@ def _known_start(camera: CameraDraft) -> VideoStart | None:
     if choice.start_ns is not None:
         return VideoStart(choice.start_ns, "when its pictures move as its poses", sigma_s=0.2)
     for candidate in (taken, *choice.others):  # poses of another log, the clock of its own
-        start = candidate.video_start if isinstance(candidate, Flown) else None
+        start = candidate.video_start if isinstance(candidate, FlownPoses) else None
         if start and candidate.path == film.path and (candidate is taken or start.start_ns > NO_DATE_NS):
             return start
-    if isinstance(taken, Flown):
+    if isinstance(taken, FlownPoses):
         if taken.video_start is not None and taken.path.suffix.lower() == ".srt":
             return taken.video_start
         if (recorded := taken.film_of(film)) is not None:
@@ -527,12 +533,12 @@ def _known_start(camera: CameraDraft) -> VideoStart | None:
     if film.path.is_dir() and taken.path == film.path:
         whole = film.clock == "whole seconds"
         return VideoStart(film.made_ns, "by the EXIF of its pictures", sigma_s=1 if whole else 0)
-    if taken.span.overlap_ns(Span(film.made_ns, film.made_ns + film.length_ns)) < film.length_ns:
+    if taken.span.overlap_ns(TimeSpan(film.made_ns, film.made_ns + film.length_ns)) < film.length_ns:
         return None
     return VideoStart(film.made_ns, "by the time of creation in its metadata", sigma_s=1)
 
 
-def _first_frame(listed: Listed, film: Film | None) -> int:
+def _first_frame(listed: FoundFrames, film: FoundFilm | None) -> int:
     """Return the first frame's number if the numbers cannot count from 0; else 0."""
     if film is None:
         return listed.first_frame if listed.first_frame > listed.frames else 0
@@ -548,8 +554,8 @@ def write_manifest(draft: FlightDraft, name: str, relative: Callable[[Path], str
         name: of the flight.
         relative: converts a path to the form in the manifest.
     """
-    writer = _Writer(draft, relative)
-    lines = [_HEAD, *Entry(SCHEMA).lines("schema", None), *Entry(name).lines("name", None)]
+    writer = _ManifestWriter(draft, relative)
+    lines = [_HEAD, *DraftedKey(SCHEMA).lines("schema", None), *DraftedKey(name).lines("name", None)]
     lines += writer.world().lines("world", None)
     if draft.logs:
         lines += ["", "logs:"]

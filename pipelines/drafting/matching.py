@@ -15,13 +15,13 @@ import numpy as np
 
 from pipelines.drafting.found import (
     NO_DATE_NS,
-    Angles,
-    Candidate,
-    Film,
-    Flown,
-    Listed,
-    Recording,
-    Span,
+    FlownPoses,
+    FoundAngles,
+    FoundFilm,
+    FoundFrames,
+    FoundLog,
+    Proposal,
+    TimeSpan,
     choose_stamps,
     join_parts,
 )
@@ -58,25 +58,25 @@ MAP_TYPES = ("Octomap", "GridMap", "OccupancyGrid")
 
 
 @dataclass(frozen=True)
-class Alike:
+class MotionMatch:
     """Agreement of a video with a drone's log, by their motion."""
 
     gain: Float  # [S] log-likelihood of each stretch of the video, over a camera that stands still
     start_ns: int  # of the video, on the log's clock
 
 
-Compare = Callable[[Film, Flown], Alike | None]
+Compare = Callable[[FoundFilm, FlownPoses], MotionMatch | None]
 """Comparison of a video with a drone's log; None if one of them shows no motion."""
-Distance = Callable[[Flown, Flown], float | None]
+Distance = Callable[[FlownPoses, FlownPoses], float | None]
 """Median distance across (m) of the positions in two drones' logs; None if they share no time or place."""
 
 
 @dataclass(frozen=True)
-class Choice:
+class Chosen:
     """The candidate that was taken, and its alternatives."""
 
-    taken: Candidate
-    others: tuple[Candidate, ...] = ()
+    taken: Proposal
+    others: tuple[Proposal, ...] = ()
     named: bool = True  # False: it is the only one there is, or `why` says how it was found
     why: str = ""
     start_ns: int | None = None  # of the video, if that was found with it
@@ -88,25 +88,25 @@ class CameraDraft:
 
     label: Label
     name: str = ""
-    pictures: dict[str, list[Candidate]] = field(default_factory=lambda: {"video": [], "keypoints": []})
+    pictures: dict[str, list[Proposal]] = field(default_factory=lambda: {"video": [], "keypoints": []})
     paired: bool = False  # video and keypoints are matched only because nothing else is left
-    choices: dict[str, Choice] = field(default_factory=dict)
-    angles: Angles | None = None  # attitudes in its own video
-    true_poses: Choice | None = None
+    choices: dict[str, Chosen] = field(default_factory=dict)
+    angles: FoundAngles | None = None  # attitudes in its own video
+    true_poses: Chosen | None = None
 
     @property
-    def film(self) -> Film | None:
+    def film(self) -> FoundFilm | None:
         """The video file or folder of pictures."""
         first = next(iter(self.pictures["video"]), None)
-        return first if isinstance(first, Film) else None
+        return first if isinstance(first, FoundFilm) else None
 
     @property
-    def logged_film(self) -> Candidate | None:
+    def logged_film(self) -> Proposal | None:
         """The pictures in a log."""
         first = next(iter(self.pictures["video"]), None)
-        return None if isinstance(first, Film) else first
+        return None if isinstance(first, FoundFilm) else first
 
-    def mentioned(self) -> list[Candidate]:
+    def mentioned(self) -> list[Proposal]:
         """List every candidate that the manifest mentions for it, also those in comments."""
         choices = [*self.choices.values(), *([self.true_poses] if self.true_poses else [])]
         listed = [
@@ -121,16 +121,16 @@ class CameraDraft:
 class FlightDraft:
     """A flight as far as it is known from what was found."""
 
-    logs: dict[str, Recording]  # those that are used, by their name in the manifest
+    logs: dict[str, FoundLog]  # those that are used, by their name in the manifest
     cameras: list[CameraDraft]
-    joints: list[Candidate]  # true ones; the first is taken
-    actors: list[Candidate]  # the first is taken
-    maps: list[Candidate]  # the first is taken if it lies where the poses do, or is a file
-    unused: list[Candidate | Recording]
+    joints: list[Proposal]  # true ones; the first is taken
+    actors: list[Proposal]  # the first is taken
+    maps: list[Proposal]  # the first is taken if it lies where the poses do, or is a file
+    unused: list[Proposal | FoundLog]
 
 
 def match(
-    found: Sequence[Candidate], recordings: Sequence[Recording], compare: Compare, distance: Distance
+    found: Sequence[Proposal], recordings: Sequence[FoundLog], compare: Compare, distance: Distance
 ) -> FlightDraft:
     """Find the cameras, and what belongs to each.
 
@@ -142,7 +142,7 @@ def match(
     """
     logs = choose_stamps(join_parts(recordings))
     every = [*found, *(candidate for log in logs for candidate in log.candidates())]
-    of: dict[str, list[Candidate]] = {}
+    of: dict[str, list[Proposal]] = {}
     for candidate in every:
         of.setdefault(candidate.kind, []).append(candidate)
     poses = of.get("pose", [])
@@ -151,7 +151,7 @@ def match(
     moving = [c for c in poses if not _is_true(c) and not (c.topic and is_called(c.topic, ACTOR | COMMANDED))]
     joints = [c for c in of.get("joints", []) if _is_true(c)]
     joints.sort(key=lambda c: (-_shared([c.span], _spans(moving)), c.place))
-    # Angles of other names are magnetic fields, velocities, attitudes.
+    # FoundAngles of other names are magnetic fields, velocities, attitudes.
     gimbals = [c for c in of.get("gimbal", []) if is_called(c.topic, GIMBAL)]
     cameras = _cameras(of, moving)
     anchors = [*moving, *of.get("joints", [])]
@@ -171,7 +171,7 @@ def match(
         }
         camera.choices = {part: choice for part, choice in found_choices.items() if choice is not None}
         film = camera.film
-        own = [c for c in of.get("angles", []) if isinstance(c, Angles) and film and c.path == film.path]
+        own = [c for c in of.get("angles", []) if isinstance(c, FoundAngles) and film and c.path == film.path]
         camera.angles = own[0] if own else None
     _pair_drones(cameras, moving, compare)
     _prefer_attitudes(cameras, moving, distance)
@@ -184,7 +184,7 @@ def match(
     for log in logs:
         label = "_".join(word.text for word in log.label)
         names.append(unique(fitting(label, fitting(log.place[-1], "log")), names))
-    unused: dict[object, Candidate | Recording] = {c.path: c for c in found if c.path not in used}
+    unused: dict[object, Proposal | FoundLog] = {c.path: c for c in found if c.path not in used}
     unused |= {log.path: log for log in logs if log.path not in used}
     return FlightDraft(
         {name: log for name, log in zip(names, logs, strict=True) if log.path in used},
@@ -196,13 +196,13 @@ def match(
     )
 
 
-def _is_true(candidate: Candidate) -> bool:
+def _is_true(candidate: Proposal) -> bool:
     """Test if a thing's name, or that of a folder above it, says that it is the truth."""
     names = (candidate.topic,) if candidate.topic else candidate.place
     return any(is_called(name, TRUTH_WORDS) for name in names)
 
 
-def _own_stamps(camera: CameraDraft, choice: Choice | None, moving: Sequence[Candidate]) -> Choice | None:
+def _own_stamps(camera: CameraDraft, choice: Chosen | None, moving: Sequence[Proposal]) -> Chosen | None:
     """Leave out frame times of a video that are not clearly its own: one without its name, or subtitles.
 
     Subtitles without the video's name have about as many frames as it, and no log in it knows its start.
@@ -216,12 +216,12 @@ def _own_stamps(camera: CameraDraft, choice: Choice | None, moving: Sequence[Can
         or stamps.path.suffix.lower() != ".srt"
     ):
         return choice
-    clocked = any(isinstance(log, Flown) and log.path == film.path for log in moving)
-    missing = abs(stamps.frames - film.frames) if isinstance(stamps, Listed) else 0
+    clocked = any(isinstance(log, FlownPoses) and log.path == film.path for log in moving)
+    missing = abs(stamps.frames - film.frames) if isinstance(stamps, FoundFrames) else 0
     return None if clocked or missing > MAX_MISSING_SUBTITLES * film.frames else choice
 
 
-def _maps(maps: Sequence[Candidate], cameras: Sequence[CameraDraft]) -> list[Candidate]:
+def _maps(maps: Sequence[Proposal], cameras: Sequence[CameraDraft]) -> list[Proposal]:
     """Sort maps: files, then topics in the frame of a camera's poses in the same log, then the others."""
     poses = [choice.taken for c in cameras if (choice := c.choices.get("pose"))]
     frames = {(pose.path, pose.frame) for pose in poses}
@@ -238,7 +238,7 @@ def _maps(maps: Sequence[Candidate], cameras: Sequence[CameraDraft]) -> list[Can
 # --- cameras -------------------------------------------------------------------------------------------
 
 
-def _cameras(of: dict[str, list[Candidate]], moving: Sequence[Candidate]) -> list[CameraDraft]:
+def _cameras(of: dict[str, list[Proposal]], moving: Sequence[Proposal]) -> list[CameraDraft]:
     """Make a camera for everything that has pictures; if nothing has, one for each source of poses."""
     cameras: list[CameraDraft] = []
     videos = of.get("video", [])
@@ -260,19 +260,19 @@ def _cameras(of: dict[str, list[Candidate]], moving: Sequence[Candidate]) -> lis
     return cameras
 
 
-def _by_name(candidate: Candidate) -> tuple[object, ...]:
+def _by_name(candidate: Proposal) -> tuple[object, ...]:
     return bool(candidate.topic), order(candidate.labels[0]), candidate.rank
 
 
-def _same(label: Label, candidate: Candidate) -> bool:
+def _same(label: Label, candidate: Proposal) -> bool:
     return _likeness(candidate, label) == EQUAL or label == candidate.labels[0]
 
 
-def _likeness(candidate: Candidate, label: Label) -> int:
+def _likeness(candidate: Proposal, label: Label) -> int:
     return max(affinity(own, label) for own in candidate.labels)
 
 
-def _home(cameras: list[CameraDraft], candidate: Candidate) -> CameraDraft:
+def _home(cameras: list[CameraDraft], candidate: Proposal) -> CameraDraft:
     """Find or add the camera of some pictures: one of the same name, or a similar one without pictures."""
     label = candidate.labels[0]
     for camera in cameras:
@@ -305,42 +305,40 @@ def _are_two(one: Label, other: Label) -> bool:
 # --- what belongs to a camera ---------------------------------------------------------------------------
 
 
-def _pair_drones(cameras: Sequence[CameraDraft], moving: Sequence[Candidate], compare: Compare) -> None:
+def _pair_drones(cameras: Sequence[CameraDraft], moving: Sequence[Proposal], compare: Compare) -> None:
     """Give videos without poses the drones' logs that no camera has: by time, else by motion."""
     taken = _taken(cameras)
-    free = [c for c in moving if isinstance(c, Flown) and c not in taken]
+    free = [c for c in moving if isinstance(c, FlownPoses) and c not in taken]
     filmed = [(c, film) for c in cameras if "pose" not in c.choices and (film := c.film) is not None]
     possible = {c.name: [log for log in free if _may_be_of(film, log)] for c, film in filmed}
     uses = Counter(id(log) for logs in possible.values() for log in logs)
-    found: dict[str, tuple[Flown, Alike]] = {}
+    found: dict[str, tuple[FlownPoses, MotionMatch]] = {}
     for camera, film in filmed:
         logs = possible[camera.name]
         if len(logs) == 1 and uses[id(logs[0])] == 1:
-            camera.choices["pose"] = Choice(logs[0], named=False, why="by the times of video and log")
+            camera.choices["pose"] = Chosen(logs[0], named=False, why="by the times of video and log")
         elif (own := _own_by_motion(film, logs, compare)) is not None:
             found[camera.name] = own
     for camera, _ in filmed:
         motion = found.get(camera.name)
         if motion is not None and sum(motion[0] is log for log, _ in found.values()) == 1:
             log, alike = motion
-            camera.choices["pose"] = Choice(log, named=False, why="by their motion", start_ns=alike.start_ns)
+            camera.choices["pose"] = Chosen(log, named=False, why="by their motion", start_ns=alike.start_ns)
 
 
-def _taken(cameras: Sequence[CameraDraft]) -> list[Candidate]:
+def _taken(cameras: Sequence[CameraDraft]) -> list[Proposal]:
     chosen = [choice for camera in cameras if (choice := camera.choices.get("pose"))]
     return [c for choice in chosen for c in (choice.taken, *choice.others)]
 
 
-def _prefer_attitudes(
-    cameras: Sequence[CameraDraft], moving: Sequence[Candidate], distance: Distance
-) -> None:
+def _prefer_attitudes(cameras: Sequence[CameraDraft], moving: Sequence[Proposal], distance: Distance) -> None:
     """Give cameras whose poses lack attitudes the log that has them at that time, if just one does.
 
     Subtitles or a GoPro's GPS have the camera's name, but a flight record or an autopilot's log has more. Of
     several, that of the same drone was where its positions are. The others become alternatives.
     """
     taken = _taken(cameras)
-    free: dict[object, Candidate] = {}
+    free: dict[object, Proposal] = {}
     for candidate in moving:
         if not (candidate.unturned or candidate.span is None or candidate in taken):
             key = candidate.path, candidate.settings.get("instance")
@@ -363,15 +361,15 @@ def _prefer_attitudes(
         if not _share_time(logs[0], choice.taken):
             camera.choices.pop("frame_times", None)  # of another clock
         why = "by time and place, for what has its name has no attitudes"
-        camera.choices["pose"] = Choice(logs[0], (choice.taken, *choice.others), named=False, why=why)
+        camera.choices["pose"] = Chosen(logs[0], (choice.taken, *choice.others), named=False, why=why)
 
 
-def _nearest(logs: Sequence[Candidate], own: Candidate, distance: Distance) -> list[Candidate]:
+def _nearest(logs: Sequence[Proposal], own: Proposal, distance: Distance) -> list[Proposal]:
     """Leave out logs that were elsewhere than a camera's own positions; of several, keep a clear nearest."""
-    near: list[tuple[float, Candidate]] = []
-    unknown: list[Candidate] = []
+    near: list[tuple[float, Proposal]] = []
+    unknown: list[Proposal] = []
     for log in logs:
-        apart_m = distance(own, log) if isinstance(own, Flown) and isinstance(log, Flown) else None
+        apart_m = distance(own, log) if isinstance(own, FlownPoses) and isinstance(log, FlownPoses) else None
         if apart_m is None:
             unknown.append(log)
         elif apart_m < SAME_DRONE_M:
@@ -382,22 +380,24 @@ def _nearest(logs: Sequence[Candidate], own: Candidate, distance: Distance) -> l
     return [*(log for _, log in near), *unknown]
 
 
-def _is_of_film(log: Candidate, camera: CameraDraft) -> bool:
+def _is_of_film(log: Proposal, camera: CameraDraft) -> bool:
     """Test if a log shares the time of a camera's poses, or recorded one video of its video's length."""
     pose, film = camera.choices.get("pose"), camera.film
     if pose and _share_time(log, pose.taken):
         return True
-    return film is not None and isinstance(log, Flown) and log.film_of(film) is not None
+    return film is not None and isinstance(log, FlownPoses) and log.film_of(film) is not None
 
 
-def _share_time(log: Candidate, other: Candidate) -> bool:
+def _share_time(log: Proposal, other: Proposal) -> bool:
     """Test if a log has dates and covers half of another one."""
     if log.span is None or other.span is None or min(log.span.first_ns, other.span.first_ns) < NO_DATE_NS:
         return False
     return 2 * log.span.overlap_ns(other.span) >= other.span.length_ns
 
 
-def _own_by_motion(film: Film, logs: Sequence[Flown], compare: Compare) -> tuple[Flown, Alike] | None:
+def _own_by_motion(
+    film: FoundFilm, logs: Sequence[FlownPoses], compare: Compare
+) -> tuple[FlownPoses, MotionMatch] | None:
     """Return the log that explains a video's motion clearly, and clearly better than all others."""
     known = [(log, alike) for log in logs if (alike := compare(film, log)) is not None]
     for log, alike in known:
@@ -407,11 +407,11 @@ def _own_by_motion(film: Film, logs: Sequence[Flown], compare: Compare) -> tuple
     return None
 
 
-def _may_be_of(film: Film, log: Candidate) -> bool:
+def _may_be_of(film: FoundFilm, log: Proposal) -> bool:
     """Test if a log covers half of a video; its metadata have the time when it began, or when it ended."""
     if film.made_ns is None or log.span is None or log.span.first_ns < NO_DATE_NS:
         return True
-    filmed = Span(film.made_ns, film.made_ns + film.length_ns)
+    filmed = TimeSpan(film.made_ns, film.made_ns + film.length_ns)
     overlap_ns = max(log.span.overlap_ns(each) for each in (filmed, filmed.later(-film.length_ns)))
     return 2 * overlap_ns >= film.length_ns
 
@@ -420,13 +420,13 @@ class _Chooser:
     """Chooser of candidates of one kind for one camera; `anchors` define the time of the flight."""
 
     def __init__(
-        self, camera: CameraDraft, cameras: Sequence[CameraDraft], anchors: Sequence[Candidate]
+        self, camera: CameraDraft, cameras: Sequence[CameraDraft], anchors: Sequence[Proposal]
     ) -> None:
         self._camera = camera
         self._lone = len(cameras) == 1
         self._anchors = anchors
 
-    def __call__(self, candidates: Sequence[Candidate], *, shared: bool = False) -> Choice | None:
+    def __call__(self, candidates: Sequence[Proposal], *, shared: bool = False) -> Chosen | None:
         """Choose the best candidate with the camera's name; or the only one, for the only camera.
 
         Args:
@@ -450,16 +450,16 @@ class _Chooser:
         rivals = [c for c in rivals if likeness[id(c)] >= level]
         times = self._times(rivals)
 
-        def key(rival: Candidate) -> tuple[object, ...]:
+        def key(rival: Proposal) -> tuple[object, ...]:
             # A log that began a second earlier is as good as another; one of another flight is not.
             elsewhere = 2 * times[id(rival)] < max(times.values())
             return elsewhere, -likeness[id(rival)], -self._near(rival), rival.rank
 
         taken, *others = sorted(rivals, key=key)
         best = likeness[id(taken)]
-        return Choice(taken, tuple(others), named=best >= NUMBER or (self._lone and best != OTHER))
+        return Chosen(taken, tuple(others), named=best >= NUMBER or (self._lone and best != OTHER))
 
-    def _near(self, candidate: Candidate) -> int:
+    def _near(self, candidate: Proposal) -> int:
         """Count the leading name parts that a camera info shares with the topic of the pictures."""
         logged = self._camera.logged_film
         if candidate.kind != "intrinsics" or not candidate.topic or logged is None:
@@ -473,7 +473,7 @@ class _Chooser:
             shared += 1
         return shared
 
-    def _times(self, rivals: Sequence[Candidate]) -> dict[int, float]:
+    def _times(self, rivals: Sequence[Proposal]) -> dict[int, float]:
         """Compute how long each overlaps in time with the camera's film, or else with the other logs."""
         filmed = self._camera.logged_film
         others = [anchor for anchor in self._anchors if all(anchor is not rival for rival in rivals)]
@@ -481,17 +481,17 @@ class _Chooser:
         return {id(rival): _shared([rival.span], anchors) for rival in rivals}
 
 
-def _shared(spans: Iterable[Span | None], anchors: Iterable[Span]) -> float:
+def _shared(spans: Iterable[TimeSpan | None], anchors: Iterable[TimeSpan]) -> float:
     """Sum the overlaps of spans with other spans, ns."""
     return float(sum(max(span.overlap_ns(anchor), 0) for anchor in anchors for span in spans if span))
 
 
-def _spans(candidates: Iterable[Candidate]) -> list[Span]:
+def _spans(candidates: Iterable[Proposal]) -> list[TimeSpan]:
     return [candidate.span for candidate in candidates if candidate.span]
 
 
-def _beside(first: Choice | None, second: Choice | None) -> Choice | None:
+def _beside(first: Chosen | None, second: Chosen | None) -> Chosen | None:
     """Return the first choice with the candidates of the second as alternatives."""
     if first is None or second is None:
         return first or second
-    return Choice(first.taken, (*first.others, second.taken, *second.others), first.named)
+    return Chosen(first.taken, (*first.others, second.taken, *second.others), first.named)

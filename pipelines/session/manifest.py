@@ -22,13 +22,14 @@ from pipelines.session.old_spellings import old_spellings
 from pipelines.session.source_options import option_names
 from pipelines.session.storage import refuse_camera_names, refuse_names_of_people
 from pipelines.session.yaml_files import (
-    Part,
     SecondsAsNs,
+    YamlModel,
     nanoseconds,
     read_yaml_model,
     unknown_key,
 )
 
+# The first version of flight.yaml is the only one so far.
 SCHEMA = 1
 
 # A year at 30 Hz has fewer frames: a larger number was misread.
@@ -73,14 +74,14 @@ Seconds = Annotated[float, AfterValidator(_seconds)]
 """Seconds that can be added to any time."""
 
 
-class Guess(Part):
+class Guess(YamlModel):
     """A mapping that `mocap init` may have guessed."""
 
     assumed: bool = False
     """True for what `mocap init` guessed and nobody has confirmed yet."""
 
 
-class Source(Guess):
+class FileSource(Guess):
     """A file, or a topic of a log, with the options of its format."""
 
     model_config = ConfigDict(extra="allow")
@@ -96,7 +97,7 @@ class Source(Guess):
     """Name of the file's format, where several recognise its content."""
 
     @model_validator(mode="after")
-    def _options_exist(self) -> Source:
+    def _options_exist(self) -> FileSource:
         known = option_names(self.part)
         for key in self.options:
             if key not in known:
@@ -109,7 +110,14 @@ class Source(Guess):
         return dict(self.model_extra or {})
 
 
-class WorldOrigin(Part):
+class NamedFile(FileSource):
+    """A file, or a topic of a log, that must be named."""
+
+    file: str
+    """As of any source; it must be there."""
+
+
+class WorldOrigin(YamlModel):
     """Place on Earth of the world's origin."""
 
     latitude_deg: float = Field(ge=-90, le=90)
@@ -141,7 +149,7 @@ class WorldAxes(Guess):
         return self
 
 
-class LogClock(Part):
+class LogClock(YamlModel):
     """Relation of a recorder's clock to the world's."""
 
     offset_s: Seconds = 0.0
@@ -150,7 +158,7 @@ class LogClock(Part):
     """Drift of the log's clock since its first message, parts per million."""
 
 
-class Placement(Part):
+class Placement(YamlModel):
     """Pose in the world of the origin of a source."""
 
     translation: Vector = [0.0, 0.0, 0.0]
@@ -187,14 +195,11 @@ class LogSource(Guess):
     """Place in the world of the log's origin."""
 
 
-class VideoSource(Source):
+class VideoSource(NamedFile):
     """A video, a folder of pictures, or pictures in a log."""
 
-    file: str
-    """A video, a folder of pictures, or a log that holds them."""
 
-
-class FrameTimes(Source):
+class FrameTimes(FileSource):
     """Source of the frames' times; by default the container's stamps, counted from `start`."""
 
     start_ns: SecondsAsNs = Field(0, alias="start")
@@ -235,12 +240,10 @@ class CameraClock(Guess):
     """Standard deviation of the offset, s; 0 means that it is known."""
 
 
-class PoseSource(Source):
+class PoseSource(NamedFile):
     """Source of a camera's poses: a trajectory, a log, a drone's own log or a calibration."""
 
     part = "pose"
-    file: str
-    """A trajectory, a log, a drone's own log, or a calibration that holds the pose of a still camera."""
     of: Literal["camera", "body"] | None = None
     """What the poses are of: the camera, or the body that carries it by a mount or gimbal."""
     axes: Axes | None = None
@@ -265,7 +268,7 @@ class Mount(Guess):
     """Place of the camera on the body: forward, left, up, m."""
 
 
-class GimbalSource(Source):
+class GimbalSource(FileSource):
     """Source of the gimbal's angles: a topic, fixed angles, another log, or the log that gives the pose."""
 
     part = "gimbal"
@@ -309,7 +312,7 @@ class GimbalSource(Source):
         return self.file is None and not self.is_fixed
 
 
-class IntrinsicsSource(Source):
+class IntrinsicsSource(FileSource):
     """A calibration file (and which of its cameras), a topic, or the numbers themselves."""
 
     part = "intrinsics"
@@ -342,12 +345,10 @@ class IntrinsicsSource(Source):
         return self
 
 
-class KeypointSource(Source):
+class KeypointSource(NamedFile):
     """2D keypoints of this camera, made by a detector of the user's own."""
 
     part = "keypoints"
-    file: str
-    """Results of a detector: a file, or a folder of one file for each picture."""
     first_frame: int = Field(0, ge=-_MAX_FRAME_NUMBER, le=_MAX_FRAME_NUMBER)
     """Number that the file gives to the first picture of the video."""
     mirrored: bool | Literal["x", "y", "names"] = False
@@ -356,7 +357,7 @@ class KeypointSource(Source):
     """Width and height of the pictures that the detector saw, px."""
 
 
-class CameraSources(Part):
+class CameraSources(YamlModel):
     """One camera in the air, or on the ground."""
 
     video: VideoSource | None = None
@@ -401,23 +402,19 @@ class CameraSources(Part):
         return self.mount is not None or self.gimbal is not None
 
 
-class ActorSource(Source):
+class ActorSource(NamedFile):
     """Source of a person's positions, logged in flight."""
 
-    file: str
-    """A log, or the tracks of a watch."""
     point: Literal["hip", "head", "feet", "centre"] = "hip"
     """Point of the person that the positions follow."""
     weight: float = Field(1.0, ge=0, allow_inf_nan=False)
     """Weight of this person for the planners, among several."""
 
 
-class MapSource(Source):
+class MapSource(NamedFile):
     """Source of the map of the surroundings."""
 
     part = "map"
-    file: str
-    """A map, a cloud of points, or a log that holds them."""
     crs: str | None = None
     """Map projection of its coordinates; without it, the file's own or `world.crs`."""
     unknown: Literal["free", "occupied"] = "free"
@@ -426,7 +423,7 @@ class MapSource(Source):
     """Side of the voxels that a cloud of points is divided into, m."""
 
 
-class TruthSource(Source):
+class TruthSource(FileSource):
     """Sources of ground truth: joints, and camera poses by camera."""
 
     unit: Literal["m", "cm", "mm"] | None = None
@@ -441,14 +438,11 @@ class TruthSource(Source):
     """Files of true poses by camera."""
 
 
-class PlanSource(Source):
+class PlanSource(NamedFile):
     """Setpoints of the on-board planner for one drone."""
 
-    file: str
-    """A log, or a trajectory."""
 
-
-class Manifest(Part):
+class Manifest(YamlModel):
     """One flight, as `flight.yaml` describes it."""
 
     schema_version: Literal[1] = Field(alias="schema")
@@ -512,7 +506,7 @@ class Manifest(Part):
     @property
     def files(self) -> list[str]:
         """Every path and URL that the manifest states, each once, spelled as in it."""
-        sources: list[Source | None] = [
+        sources: list[FileSource | None] = [
             *self.logged_people.values(),
             self.map,
             *self.plan.values(),

@@ -39,7 +39,7 @@ from pipelines.session.records import (
 )
 from pipelines.session.storage import refuse_special, sha256_of
 from pipelines.session.unknown_files import describe_unknown
-from pipelines.session.yaml_files import Part
+from pipelines.session.yaml_files import YamlModel
 
 T = TypeVar("T")
 
@@ -90,7 +90,7 @@ class CalibrationFormat(Format, Protocol):
         """Read every camera; the world's axes are those of the file."""
 
 
-class TelemetryChoice(Part):
+class TelemetryChoice(YamlModel):
     """Options of a drone's own log."""
 
     position: Literal["local", "global", "gps"] | None = None

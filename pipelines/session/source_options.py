@@ -21,12 +21,12 @@ from pipelines.session.registries import (
     TelemetryFormat,
     TrajectoryFormat,
 )
-from pipelines.session.yaml_files import Part, describe_problem
+from pipelines.session.yaml_files import YamlModel, describe_problem
 
-O = TypeVar("O", bound=Part)
+O = TypeVar("O", bound=YamlModel)
 
 
-class FiledPose(Part):
+class FiledPose(YamlModel):
     """Options of poses in a trajectory."""
 
     inverse: bool = False
@@ -71,7 +71,7 @@ class LoggedPose(FiledPose):
         return self.preset is not None or self.attitude is not None
 
 
-class LoggedAngles(Part):
+class LoggedAngles(YamlModel):
     """Options of a gimbal's angles in a log of topics."""
 
     order: Literal["ypr", "rpy", "pry"] = "ypr"
@@ -80,7 +80,7 @@ class LoggedAngles(Part):
     """Unit of the angles in a message of three numbers."""
 
 
-class LoggedMap(Part):
+class LoggedMap(YamlModel):
     """Options of a map in a log of topics."""
 
     parent: str | None = None
@@ -89,25 +89,25 @@ class LoggedMap(Part):
     """Height of what stands on a floor plan, m."""
 
 
-class CameraOfCalibration(Part):
+class CameraOfCalibration(YamlModel):
     """Options of a calibration."""
 
     camera: str | None = None
     """Name of the camera in a calibration of several."""
 
 
-class DetectorOutput(Part):
+class DetectorOutput(YamlModel):
     """Options of keypoints."""
 
     skeleton: str | None = None
     """Skeleton of the keypoints, where the file does not name it."""
 
 
-class NoOptions(Part):
+class NoOptions(YamlModel):
     """Nothing: files of this kind take no options."""
 
 
-_BY_KIND: Mapping[str, tuple[tuple[type, type[Part]], ...]] = {
+_BY_KIND: Mapping[str, tuple[tuple[type, type[YamlModel]], ...]] = {
     "pose": (
         (CalibrationFormat, CameraOfCalibration),
         (TrajectoryFormat, FiledPose),
@@ -122,7 +122,7 @@ _BY_KIND: Mapping[str, tuple[tuple[type, type[Part]], ...]] = {
 """Options by part of the manifest and kind of format."""
 
 
-def option_models(part: str) -> list[type[Part]]:
+def option_models(part: str) -> list[type[YamlModel]]:
     """List the models of all options that a part of the manifest may have."""
     return [model for _, model in _BY_KIND.get(part, ())]
 

@@ -13,15 +13,18 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, mo
 from pipelines.session.errors import DataError
 from pipelines.session.storage import code_of, plain_text, refuse_special
 
-_LARGEST_FILE = 1_000_000  # bytes; a real one has a few thousand
-_LATEST_NS = 2**62  # differences of two such times fit int64
+# A real file has a few thousand bytes, and a parser of YAML needs seconds for a million.
+MAX_FILE_BYTES = 1_000_000
+
+# Differences of two such times still fit into 64 bits.
+LATEST_NS = 2**62
 
 
 def nanoseconds(value: object) -> int:
     """Convert seconds, a number or text, to exact nanoseconds; ValueError for no time before 2116."""
     try:
         exact = Decimal(str(value)) * 1_000_000_000
-        is_near = abs(exact) <= _LATEST_NS  # before it becomes an integer of as many digits
+        is_near = abs(exact) <= LATEST_NS  # before it becomes an integer of as many digits
     except ArithmeticError:
         raise ValueError("is no time in seconds") from None
     if not is_near:
@@ -33,7 +36,7 @@ SecondsAsNs = Annotated[int, BeforeValidator(nanoseconds)]
 """Seconds in the file (number or text), exact nanoseconds in the program."""
 
 
-class Part(BaseModel):
+class YamlModel(BaseModel):
     """A mapping of the manifest: unknown keys are refused, numbers are finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
@@ -49,17 +52,17 @@ class Part(BaseModel):
         return {cls.shorthand: value} if cls.shorthand and isinstance(value, str | list) else value
 
     @model_validator(mode="after")
-    def _exactly_one(self) -> Part:
+    def _exactly_one(self) -> YamlModel:
         stated = [name for name in self.one_of if getattr(self, name) is not None]
         if self.one_of and len(stated) != 1:
             raise ValueError(f"needs exactly one of {', '.join(self.one_of)}" + f" (has {len(stated)})")
         return self
 
 
-M = TypeVar("M", bound=Part)
+M = TypeVar("M", bound=YamlModel)
 
 
-def keys_of(model: type[Part]) -> set[str]:
+def keys_of(model: type[YamlModel]) -> set[str]:
     """Return the keys that a mapping of this kind may have, as users write them."""
     return {field.alias or name for name, field in model.model_fields.items()}
 
@@ -111,9 +114,9 @@ def read_yaml_model(
 def _read_yaml(path: Path, noun: str, how: str) -> object:
     refuse_special(path)
     try:
-        if path.stat().st_size > _LARGEST_FILE:
+        if path.stat().st_size > MAX_FILE_BYTES:
             raise DataError(
-                path, f"is larger than {_LARGEST_FILE} bytes", f"this is no {noun}", code="too-large"
+                path, f"is larger than {MAX_FILE_BYTES} bytes", f"this is no {noun}", code="too-large"
             )
         text = plain_text(path.read_bytes(), errors="strict")
     except OSError as error:
@@ -125,7 +128,9 @@ def _read_yaml(path: Path, noun: str, how: str) -> object:
     return plain_yaml(path, text)
 
 
-def describe_problem(problem: Any, model: type[Part]) -> str:  # ErrorDetails, whose ctx has no fixed shape
+def describe_problem(
+    problem: Any, model: type[YamlModel]
+) -> str:  # ErrorDetails, whose ctx has no fixed shape
     """Describe a problem that pydantic found, with its place."""
     place = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
@@ -148,11 +153,11 @@ def unknown_key(key: str, known: Sequence[str]) -> str:
     return f"unknown key, {hint}"
 
 
-def _keys_at(model: type[Part], place: tuple[str | int, ...]) -> list[str]:
+def _keys_at(model: type[YamlModel], place: tuple[str | int, ...]) -> list[str]:
     """List the keys that the schema allows at a place, by walking the types of the fields."""
     kind: Any = model
     for part in place:
-        if isinstance(kind, type) and issubclass(kind, Part):
+        if isinstance(kind, type) and issubclass(kind, YamlModel):
             fields = {field.alias or name: field for name, field in kind.model_fields.items()}
             kind = _plain(fields[str(part)].annotation)
         else:  # a list or a dict
@@ -169,9 +174,14 @@ def _plain(annotation: Any) -> Any:
     return annotation
 
 
-_MOST_BITS = 1024  # a float holds integers of fewer
-_MOST_MARKS = 30_000  # signs that separate values: the parser reads 10,000 to 20,000 in a second
-_MOST_MERGED = 100_000  # entries that merge keys copy
+# A float holds no integer of more bits.
+MAX_INTEGER_BITS = 1024
+
+# The parser reads 10,000 to 20,000 values in a second.
+MAX_MARKS = 30_000
+
+# Merges of merges copy entries without end; no file of a user has so many.
+MAX_MERGED_ENTRIES = 100_000
 
 
 def plain_yaml(path: Path, text: str) -> object:
@@ -192,15 +202,15 @@ def plain_yaml(path: Path, text: str) -> object:
         def flatten_mapping(self, node: Any) -> Any:
             super().flatten_mapping(node)
             self.merged += len(getattr(node, "merge", None) or ())
-            if self.merged > _MOST_MERGED:
+            if self.merged > MAX_MERGED_ENTRIES:
                 raise ConstructorError(
-                    None, None, f"merges more than {_MOST_MERGED} entries", node.start_mark
+                    None, None, f"merges more than {MAX_MERGED_ENTRIES} entries", node.start_mark
                 )
 
     marks = sum(map(text.count, "\n,:[{-?&*"))
-    if marks > _MOST_MARKS:
+    if marks > MAX_MARKS:
         raise DataError(
-            path, f"holds about {marks} values", f"at most {_MOST_MARKS} are read", code="too-large"
+            path, f"holds about {marks} values", f"at most {MAX_MARKS} are read", code="too-large"
         )
     remedy = "mend it, or copy the file again if it was cut off"
     parser = YAML(typ="safe", pure=True)
@@ -237,7 +247,7 @@ def _refuse_impossible_values(path: Path, value: object) -> None:
             waiting += [(part, (*place, index)) for index, part in enumerate(item)]
         elif isinstance(item, str) and ("\0" in item or not _is_unicode(item)):
             raise _impossible(path, place, f"holds a text with impossible characters ({item[:60]!r})")
-        elif isinstance(item, int) and item.bit_length() >= _MOST_BITS:
+        elif isinstance(item, int) and item.bit_length() >= MAX_INTEGER_BITS:
             digits = item.bit_length() * 3 // 10
             raise _impossible(path, place, f"holds an integer of about {digits} digits")
 

@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from pipelines.geometry.cameras import COEFFICIENT_COUNTS, Intrinsics
-from pipelines.session.yaml_files import Part, SecondsAsNs, read_yaml_model
+from pipelines.session.yaml_files import SecondsAsNs, YamlModel, read_yaml_model
 
 SCHEMA = 2
 _MOST_VOXELS = 20_000_000
@@ -50,7 +50,7 @@ _SHOT = ("exposure_ms", "distortion", "readout_ms", "bitrate_mbps")
 # --- the actor -----------------------------------------------------------------------------------------
 
 
-class Body(Part):
+class Body(YamlModel):
     """Appearance of the actor."""
 
     sex: Literal["female", "male"] = "male"
@@ -59,7 +59,7 @@ class Body(Part):
     outfit: Literal["casual", "sport", "dark", "bright"] = "casual"
 
 
-class Travel(Part):
+class Travel(YamlModel):
     """A way on foot: a straight line, an arc of `turn_deg` (left is positive), or to a place."""
 
     one_of = ("distance_m", "to")
@@ -77,26 +77,26 @@ class Travel(Part):
         return self
 
 
-class Stand(Part):
+class Stand(YamlModel):
     """A stand, breathing and swaying a little."""
 
     seconds: float = Field(ge=0.05, le=3600)
 
 
-class Turn(Part):
+class Turn(YamlModel):
     """A turn on the spot, in small steps; left is positive."""
 
     deg: float = Field(ge=-720, le=720)
 
 
-class Crouch(Part):
+class Crouch(YamlModel):
     """A crouch: down, stay, up again."""
 
     seconds: Seconds = 2.0
     depth: float = Field(0.8, gt=0, le=1)  # 1 is as deep as people sit on their heels
 
 
-class Reach(Part):
+class Reach(YamlModel):
     """A reach up and ahead with a hand, and back."""
 
     side: Literal["left", "right", "both"] = "right"
@@ -104,14 +104,14 @@ class Reach(Part):
     seconds: Seconds = 2.0
 
 
-class Kick(Part):
+class Kick(YamlModel):
     """The seed's soccer: a run-up, the kick, the follow-through, and back to a stand."""
 
     foot: Literal["left", "right"] = "right"
     run_up_m: float = Field(3.0, ge=1.0, le=10)
 
 
-class Step(Part):
+class Step(YamlModel):
     """One action of the actor."""
 
     one_of = ("walk", "jog", "stand", "turn", "crouch", "reach", "kick")
@@ -130,7 +130,7 @@ def _is_path(text: str) -> str:
     return text
 
 
-class Motion(Part):
+class Motion(YamlModel):
     """The actor's actions one after another, or a BVH file. At the end the actor stands, or begins again."""
 
     shorthand = "steps"
@@ -142,7 +142,7 @@ class Motion(Part):
     repeat: bool = False
 
 
-class Actor(Part):
+class Actor(YamlModel):
     """One person: how they look and move, and how well their position was known in flight."""
 
     body: Body = Body()
@@ -169,14 +169,14 @@ ActorName = Annotated[str, AfterValidator(_is_topic)]
 # --- the world -----------------------------------------------------------------------------------------
 
 
-class Ground(Part):
+class Ground(YamlModel):
     """The visible and mapped ground: a square about its centre."""
 
     centre: Place = [0.0, 0.0]
     size_m: float = Field(60.0, gt=1, le=1000)
 
 
-class Mound(Part):
+class Mound(YamlModel):
     """A hill of Gaussian shape: the seed's mound."""
 
     centre: Place
@@ -185,7 +185,7 @@ class Mound(Part):
     yaw_deg: float = 0.0
 
 
-class Tree(Part):
+class Tree(YamlModel):
     """A trunk and a crown."""
 
     position: Place
@@ -193,7 +193,7 @@ class Tree(Part):
     crown_radius_m: float = Field(1.6, gt=0, le=20)
 
 
-class Wood(Part):
+class Wood(YamlModel):
     """Trees strewn at random, none nearer to the actor's way than `clear_m`."""
 
     count: int = Field(ge=1, le=2000)
@@ -203,7 +203,7 @@ class Wood(Part):
     height_m: float = Field(6.0, gt=0.5, le=60)
 
 
-class Wall(Part):
+class Wall(YamlModel):
     """An upright slab along a line on the ground."""
 
     start: Place
@@ -212,14 +212,14 @@ class Wall(Part):
     thickness_m: Metres = 0.3
 
 
-class Mapping(Part):
+class Mapping(YamlModel):
     """The occupancy map of the drones: voxels over the ground, up to a height."""
 
     resolution_m: float = Field(0.25, gt=0.01, le=10)
     height_m: Metres = 12.0
 
 
-class World(Part):
+class World(YamlModel):
     """The surroundings: ground, mounds, trees, walls, the map and the sun."""
 
     ground: Ground = Ground()
@@ -253,7 +253,7 @@ class World(Part):
 # --- the drones ----------------------------------------------------------------------------------------
 
 
-class Formation(Part):
+class Formation(YamlModel):
     """Slots of the drones about the actor, at yaw + i 360/n (90 for two)."""
 
     planner: str = "ring"  # or a planner arm: adaptive, fixed, ...
@@ -264,14 +264,14 @@ class Formation(Part):
     variation: float = Field(0.0, ge=0, le=3)  # deviation of each drone from its slot
 
 
-class Limits(Part):
+class Limits(YamlModel):
     """Limits of a drone's motion."""
 
     speed_mps: float = Field(8.0, gt=0, le=50)
     acceleration_mps2: float = Field(4.0, gt=0, le=50)
 
 
-class Lens(Part):
+class Lens(YamlModel):
     """The camera on every drone."""
 
     width: int = Field(1280, ge=64, le=7680, multiple_of=2)  # as H.264 has it
@@ -329,7 +329,7 @@ class Lens(Part):
         return {name: value for name, value in values.items() if not (name in _SHOT and value is None)}
 
 
-class Drones(Part):
+class Drones(YamlModel):
     """The team."""
 
     count: int = Field(2, ge=1, le=16)
@@ -346,7 +346,7 @@ ModelledDetector = Literal["blazepose", "blazepose-heavy"]
 """A detector whose errors were measured (`detector_errors`)."""
 
 
-class DetectorErrors(Part):
+class DetectorErrors(YamlModel):
     """Errors of `--no-video` on true keypoints; more come with tilt and behind obstacles."""
 
     detector: ModelledDetector = "blazepose"  # whose measured errors
@@ -357,7 +357,7 @@ class DetectorErrors(Part):
     swap_share: float = Field(0.005, ge=0, lt=1)  # of frames, left for right in one limb pair
 
 
-class Scenario(Part):
+class Scenario(YamlModel):
     """A flight to be simulated."""
 
     one_of = ("actor", "actors")

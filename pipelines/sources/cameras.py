@@ -24,17 +24,22 @@ from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs, Frames
 from pipelines.sources.parts import CameraFrames
 
-_MOST_FRAMES = 2_000_000  # 18 hours at 30 Hz; a larger number was misread from a date
-_WATCHED_NS = 120 * 10**9  # of a video, to estimate when it began
+# So many frames last 18 hours at 30 Hz: a larger number was misread from a date.
+MAX_FRAMES = 2_000_000
+
+# Two minutes of a video determine when it began.
+WATCHED_NS = 120 * 10**9
 
 # Of half the picture's size: cameras' principal points lie nearer to the middle (a few per cent), while
 # pictures of another usual size (3/4, 2/3, 1/2 of it) have their middle further off.
-_FARTHEST_CENTRE = 0.2
+MAX_CENTRE_OFFSET = 0.2
 
 # Shares of keypoints. Detectors extrapolate people whom the border cuts, to all sides alike. But if the
 # pictures have another size, keypoints lie beyond the right and the lower border only: all begin at 0.
-_LARGEST_SHARE_BEYOND = 0.2
-_LARGEST_SHARE_OUTSIDE = 0.5
+MAX_SHARE_BEYOND = 0.2
+
+# A person whom the border cuts has half of the joints outside at most.
+MAX_SHARE_OUTSIDE = 0.5
 
 
 class PosesOfCameras(Protocol):
@@ -169,7 +174,7 @@ class FlightCameras:
                 code="no-pictures",
             )
         count = int(detections.frames_listed[-1]) + 1
-        if count > _MOST_FRAMES:
+        if count > MAX_FRAMES:
             raise DataError(
                 self._files.path(camera.keypoints.file),
                 f"numbers its frames up to {count - 1}",
@@ -240,7 +245,7 @@ class FlightCameras:
                 place, "start_from: motion needs a video and poses that move", remedy, code="no-pictures"
             )
         poses = self._poses.trajectory(name, camera, None)
-        some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + _WATCHED_NS))
+        some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + WATCHED_NS))
         try:
             fit = fit_start(
                 poses.t_ns,
@@ -391,7 +396,7 @@ def _with_size(intrinsics: Intrinsics, size: tuple[int, int] | None, source: Pat
             code="wrong-size",
         )
     offset = np.abs(np.divide((2 * intrinsics.cx + 1, 2 * intrinsics.cy + 1), size) - 1)
-    if offset.max() > _FARTHEST_CENTRE:
+    if offset.max() > MAX_CENTRE_OFFSET:
         raise DataError(
             source,
             f"has its principal point at {intrinsics.cx:.0f}, {intrinsics.cy:.0f} px, which is not the middle"
@@ -433,7 +438,7 @@ def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: De
     beyond = (xy > [intrinsics.width - 0.5, intrinsics.height - 0.5]).any(axis=-1)
     outside = beyond | (xy < -0.5).any(axis=-1)
     share_beyond, share_outside = (float(np.average(which, weights=weight)) for which in (beyond, outside))
-    if share_beyond > _LARGEST_SHARE_BEYOND or share_outside > _LARGEST_SHARE_OUTSIDE:
+    if share_beyond > MAX_SHARE_BEYOND or share_outside > MAX_SHARE_OUTSIDE:
         (left, top), (right, bottom) = np.percentile(xy[outside], [1, 99], axis=0)
         raise DataError(
             place,

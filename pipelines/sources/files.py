@@ -1,15 +1,21 @@
 """Files that a manifest names for one flight: their formats, and readers in the files' axes and times."""
 
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM, CheckedHash, stated_checksum
+from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.formats.skeletons.joint_files import joint_names
 from pipelines.formats.videos.frame_times import FrameTimesFormat
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import CameraSources, KeypointSource, Manifest, Source, TruthSource
+from pipelines.session.manifest import CameraSources, FileSource, KeypointSource, Manifest, TruthSource
+from pipelines.session.progress import Progress
 from pipelines.session.records import CalibratedCamera, Detections, JointMotion, VideoIndex
 from pipelines.session.registries import (
     AttitudeFormat,
@@ -27,12 +33,16 @@ from pipelines.session.registries import (
     recognise_any,
 )
 from pipelines.session.source_options import CameraOfCalibration, DetectorOutput, options_of
-from pipelines.session.urls import located
-from pipelines.session.yaml_files import Part
+from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
+from pipelines.session.urls import fetched, located, named, source_url
+from pipelines.session.yaml_files import YamlModel
 from pipelines.sources.world import losses
 
-_FARTHEST_M = 10_000  # in any flight a person's joints are closer to their median than this
-_LARGEST_M = 1e8  # metric grids have coordinates up to 1e7
+# In any flight a person's joints are closer to their median than this.
+MAX_JOINT_DISTANCE_M = 10_000
+
+# Metric grids on Earth have coordinates up to 1e7 m.
+MAX_COORDINATE_M = 1e8
 
 
 _KINDS: dict[str, tuple[str, tuple[type, ...]]] = {
@@ -48,7 +58,7 @@ _KINDS: dict[str, tuple[str, tuple[type, ...]]] = {
 }
 """Name and kinds of formats of the file in each part of a manifest."""
 
-O = TypeVar("O", bound=Part)
+O = TypeVar("O", bound=YamlModel)
 
 
 class FlightFiles:
@@ -65,7 +75,7 @@ class FlightFiles:
         """Return the path of a `file:`, the first one of a split log."""
         return located(self._base, self._flight.paths_of(file)[0])
 
-    def format_of(self, part: str, source: Source) -> Format:
+    def format_of(self, part: str, source: FileSource) -> Format:
         """Recognise the file of a part of the manifest; errors as in `recognise`."""
         key = (part, source.file or "", source.format)
         if key not in self._formats:
@@ -73,11 +83,11 @@ class FlightFiles:
             self._formats[key] = recognise_any(self.path(key[1]), kinds, noun, name=source.format)
         return self._formats[key]
 
-    def is_log(self, part: str, source: Source) -> bool:
+    def is_log(self, part: str, source: FileSource) -> bool:
         """Return True if a source is a log of topics."""
         return source.file is not None and isinstance(self.format_of(part, source), LogFormat)
 
-    def options(self, part: str, source: Source, wanted: type[O], place: str = "") -> O:
+    def options(self, part: str, source: FileSource, wanted: type[O], place: str = "") -> O:
         """Validate the options beside the file of a part of the manifest, and return them."""
         where = f"{self._manifest}: {place or part}"
         return options_of(where, part, self.format_of(part, source), source.options, wanted)
@@ -89,7 +99,7 @@ class FlightFiles:
             DataError: a file does not exist, is of no kind that belongs where it stands, or has options or
                 a topic that such a file does not take.
         """
-        parts: list[tuple[str, str, Source | None]] = []
+        parts: list[tuple[str, str, FileSource | None]] = []
         for name, camera in self._flight.cameras.items():
             named = ("video", "frame_times", "pose", "gimbal", "intrinsics", "keypoints")
             parts += [(f"cameras.{name}.{part}", part, getattr(camera, part)) for part in named]
@@ -98,7 +108,7 @@ class FlightFiles:
         for place, part, source in parts:
             if source is None or source.file is None:
                 continue
-            self.options(part, source, Part, place)
+            self.options(part, source, YamlModel, place)
             if source.topic is not None and not self.is_log(part, source):
                 raise DataError(
                     f"{self._manifest}: {place}",
@@ -138,7 +148,7 @@ class FlightFiles:
         path = self.video_file(camera)
         return None if path is None else recognise(path, VideoFormat, "video").index(path)
 
-    def camera(self, name: str, part: str, source: Source) -> CalibratedCamera:
+    def camera(self, name: str, part: str, source: FileSource) -> CalibratedCamera:
         """Return the camera that is asked for, or the one of this name, or the only one of the file."""
         path, camera = source.file or "", self.options(part, source, CameraOfCalibration).camera
         if path not in self._calibrations:
@@ -224,13 +234,112 @@ def _without_far_joints(motion: JointMotion) -> JointMotion:
     if not len(known):
         return replace(motion, position=position)
     with np.errstate(over="ignore", invalid="ignore"):  # 1e308 is infinitely far from its negative
-        far = (np.abs(position - np.median(known, axis=0)) > _FARTHEST_M).any(axis=-1)
-        far |= (np.abs(position) > _LARGEST_M).any(axis=-1)
+        far = (np.abs(position - np.median(known, axis=0)) > MAX_JOINT_DISTANCE_M).any(axis=-1)
+        far |= (np.abs(position) > MAX_COORDINATE_M).any(axis=-1)
     if not far.any():
         return replace(motion, position=position)
-    cause = f"position more than {_FARTHEST_M // 1000} km from the others"
+    cause = f"position more than {MAX_JOINT_DISTANCE_M // 1000} km from the others"
     return replace(
         motion,
         position=np.where(far[..., None], np.nan, position),
         dropped=motion.dropped | {cause: int(far.sum())},
     )
+
+
+# More threads than four read no faster from one disk.
+HASHING_THREADS = 4
+
+
+def hash_sources(
+    flight: Manifest, base: Path, progress: Progress, meanwhile: Iterator[object]
+) -> tuple[dict[str, str], dict[str, dict[str, int]]]:
+    """Compute the sha256 of every file that is read, and the damage, both by the manifest's path.
+
+    Steps of `meanwhile` run until all is hashed.
+    """
+    unique = flight.files
+    for path in unique:  # before anything waits for one of them
+        refuse_special(located(base, path))
+    progress.start("Hashing sources", len(unique))
+    hashes, damage = {}, {}
+    with ThreadPoolExecutor(
+        HASHING_THREADS
+    ) as pool:  # hashing releases the GIL, so long logs run in parallel
+        hashing = {path: pool.submit(_hash_of, located(base, path)) for path in unique}
+        try:
+            while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
+                pass
+            for path, digest in hashing.items():
+                hashes[path], differing = digest.result()
+                if differing:
+                    damage[path] = {OTHER_CHECKSUM: differing}
+                progress.advance()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return hashes, damage
+
+
+def fetch_sources(flight: Manifest, base: Path, progress: Progress) -> None:
+    """Fetch the files that a manifest states by URL, where the copies in the cache are not as in the store.
+
+    Raises:
+        DataError: a store cannot be read, or holds no such file.
+    """
+    urls = [url for path in flight.files if (url := source_url(base, path))]
+    if urls:
+        progress.start("Fetching sources", len(urls))
+    for url in urls:
+        fetched(url, fresh=True)
+        progress.advance()
+
+
+def source_stamps(flight: Manifest, base: Path) -> dict[str, str]:
+    """Return the stamp of every file that is read, by the manifest's path.
+
+    Raises:
+        DataError: one of them is missing or cannot be read.
+    """
+    stamps = {
+        path: [file_stamp(file) for file in _source_files(located(base, path))] for path in flight.files
+    }
+    return {path: own[0] if len(own) == 1 else hash_of(own) for path, own in stamps.items()}
+
+
+def refuse_written(flight: Manifest, base: Path, stamps: Mapping[str, str]) -> None:
+    """Refuse sources that changed since they had these stamps, so that the hash fits what was read.
+
+    Raises:
+        DataError: a source changed, or is missing.
+    """
+    for path, stamp in source_stamps(flight, base).items():
+        if stamp != stamps[path]:
+            raise DataError(
+                named(base, path),
+                "was written to while it was being read",
+                "run `mocap ingest` again when it is complete",
+                code="changed",
+            )
+
+
+def _hash_of(path: Path) -> tuple[str, int]:
+    """Compute the sha256 of a source, and count its files that differ from their own checksum.
+
+    A floor plan's YAML is hashed together with the picture that it names.
+    """
+    hashes: list[CheckedHash] = []
+
+    def hash_for(file: Path) -> CheckedHash:
+        hashes.append(CheckedHash(stated_checksum(file)))
+        return hashes[-1]
+
+    digests = [sha256_of(file, hash_for) for file in _source_files(path)]
+    digest = digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
+    return digest, sum(each.differs for each in hashes)
+
+
+def _source_files(path: Path) -> list[Path]:
+    """Return a source and the files that it refers to: a floor plan is a YAML and a picture."""
+    if path.suffix.lower() in {".yaml", ".yml"} and ROS_MAP.recognises(path):
+        return [path, *ROS_MAP.pictures(path)]
+    return [path]

@@ -11,6 +11,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, Self
 
+from pipelines.formats.logs.maps import (
+    MAP_TYPES,
+    OCCUPANCY_GRID,
+    LoggedMaps,
+    Losses,
+    MapTopic,
+    frame_of,
+    read_maps,
+)
 from pipelines.formats.logs.messages import Kind, all_samples, kind_of
 from pipelines.formats.logs.pictures import (
     TRIGGER_TYPES,
@@ -27,20 +36,26 @@ from pipelines.formats.logs.trajectories import (
     StampCheck,
     attitudes_of,
     chained,
+    frames_of_poses,
+    place_of_frame,
     poses_of,
     read_commands,
     transforms_in,
 )
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import LogSource, Manifest
-from pipelines.session.records import IntrinsicsSample, PictureSample, Trajectory
+from pipelines.session.manifest import LogSource, Manifest, MapSource
+from pipelines.session.records import IntrinsicsSample, Message, Occupancy, PictureSample, Trajectory
 from pipelines.session.registries import Log, LogFormat, recognise
+from pipelines.session.source_options import LoggedMap
 from pipelines.session.urls import located
-from pipelines.sources.world import world_times
+from pipelines.sources.world import in_enu, in_world, world_times
 
-_KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 MB
-_KEPT_FILES = 64
+# The tables of so many messages, of all logs that stay open, take 160 MB.
+MAX_KEPT_MESSAGES = 4_000_000
+
+# A process may hold some hundred files open, and a split log has many.
+MAX_KEPT_FILES = 64
 
 _NOUNS: dict[Kind, str] = {
     "poses": "poses",
@@ -188,8 +203,8 @@ class FlightLogs:
             return
         self._kept[paths] = recording
         while len(self._kept) > 1 and (
-            sum(topic.count for log in self._kept.values() for topic in log.topics) > _KEPT_MESSAGES
-            or sum(len(log.parts) for log in self._kept.values()) > _KEPT_FILES
+            sum(topic.count for log in self._kept.values() for topic in log.topics) > MAX_KEPT_MESSAGES
+            or sum(len(log.parts) for log in self._kept.values()) > MAX_KEPT_FILES
         ):
             self._close(next(iter(self._kept)))
         recording.forget()  # losses counted while another topic was read
@@ -340,3 +355,91 @@ def doubts_of_stamps(check: StampCheck, stamps: str) -> list[str]:
         for jump in check.jumps[:5]
     ]
     return doubts
+
+
+DEFAULT_HEIGHT_M = 2.5
+"""Height of the cells of a floor plan: an ordinary storey."""
+
+
+def maps_of_log(
+    flight: Manifest,
+    stated: MapSource,
+    logs: FlightLogs,
+    *,
+    max_gap_ns: int,
+    note: Callable[[str], None],
+) -> LoggedMaps:
+    """Read the maps of a topic, in ENU axes at world times.
+
+    Raises:
+        DataError: no such topic, several candidates, no readable map, or a map in a frame that the
+            log does not connect with its world.
+    """
+    log, options = stated.file, LoggedMap.model_validate(stated.options)
+    with logs.open(log) as opened:
+        recording, source, settings = opened.recording, opened.source, opened.settings
+        there = [known.name for known in recording.topics if known.type in MAP_TYPES]
+        topic = opened.choose_among(there, "maps", stated.topic)
+        type_ = opened.type_of(topic) or ""
+        place = f"{source} {topic}"
+        first = next(recording.messages([topic]), None)
+        if first is None:
+            raise Losses(place, recording.dropped).nothing_usable()
+        if options.height_m is not None and type_ != OCCUPANCY_GRID:
+            problem = f"{topic} holds {type_}, which has heights of its own"
+            raise DataError(source, problem, "leave `height_m` out", code="wrong-option")
+        frame = frame_of(first, place)
+        log_from_frame = place_of_frame(
+            recording,
+            source,
+            place,
+            frame,
+            parent=options.parent,
+            poses_in=frames_of_poses(recording, source, _poses_taken(flight, logs, log)),
+            stamps=settings.stamps,
+            max_gap_ns=max_gap_ns,
+            note=note,
+        )
+        started_ns = opened.started_ns
+    lost: dict[str, int] = {}
+
+    def read() -> Iterator[Message]:
+        with logs.open(log) as opened:
+            yield from opened.recording.messages([topic])
+            lost.update(opened.recording.dropped)
+
+    about = MapTopic(
+        source=place,
+        frame=frame,
+        stamps=settings.stamps,
+        world_from_frame=in_world(
+            in_enu(log_from_frame, settings.axes or flight.world.frame), settings.world_from_source
+        ),
+        max_gap_ns=max_gap_ns,
+        resolution_m=stated.resolution_m,
+        height_m=DEFAULT_HEIGHT_M if options.height_m is None else options.height_m,
+    )
+    found = read_maps(read, type_, about)
+    for line in found.notes:
+        note(line)
+    from_ns = world_times(settings.clock, found.from_ns, started_ns)
+    return replace(
+        found,
+        maps=_at_times(found.maps, from_ns),
+        from_ns=from_ns,
+        dropped=dict(Counter(found.dropped) + Counter(lost)),
+    )
+
+
+def _poses_taken(flight: Manifest, logs: FlightLogs, log: str) -> list[tuple[str | None, str | None]]:
+    """Return topic and parent of all poses that the flight takes from a log."""
+    poses = [camera.pose for camera in flight.cameras.values()]
+    taken = [(pose.file, pose.topic, pose.options.get("parent")) for pose in poses]
+    taken += [(actor.file, actor.topic, None) for actor in flight.logged_people.values()]
+    paths = logs.paths(log)
+    return [(topic, parent) for name, topic, parent in taken if logs.paths(name) == paths]
+
+
+def _at_times(maps: Iterator[Occupancy], from_ns: Int64) -> Iterator[Occupancy]:
+    for occupancy, since_ns in zip(maps, from_ns.tolist(), strict=True):
+        yield replace(occupancy, from_ns=since_ns)

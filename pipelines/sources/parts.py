@@ -41,11 +41,15 @@ from pipelines.session.tables import (
 from pipelines.session.urls import named
 from pipelines.sources.world import doubts_of_speed, doubts_of_stillness, losses, mounted
 
-_MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log gets a note
-_SHORTER_S = 1.0
+# A video that covers less of its pose log may have lost its end.
+MIN_COVERED_SHARE = 0.9
+
+# Logs run on for about a second after the video of a short flight.
+MIN_UNCOVERED_S = 1.0
+
 # Share of a picture's sides. Detectors search the box of a person; most of them pad it to 1.25 of its size.
 # If the box is as large as the picture, it then reaches an eighth beyond it: no detector looked further.
-_EXTRAPOLATED = 1 / 8
+MAX_EXTRAPOLATION = 1 / 8
 
 
 @dataclass(frozen=True)
@@ -180,7 +184,7 @@ def _poses_entry(
         for doubt in (*doubts_of_speed(trajectory), *doubts_of_stillness(trajectory)):
             note(f"{name}: {doubt}")
         span, covered = int(np.ptp(trajectory.t_ns)) / 1e9, int(np.ptp(frames_t_ns)) / 1e9
-        if covered < _MUCH_SHORTER * span and span - covered > _SHORTER_S:
+        if covered < MIN_COVERED_SHARE * span and span - covered > MIN_UNCOVERED_S:
             note(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses")
     return PosesEntry(
         source=pose.file,
@@ -267,7 +271,7 @@ def _other_side(name: str, joints: tuple[str, ...]) -> str:
 def near_picture(detections: Detections, intrinsics: Intrinsics) -> Detections:
     """Drop and count keypoints further outside the picture than a detector may extrapolate."""
     size = np.array([intrinsics.width, intrinsics.height])
-    margin = _EXTRAPOLATED * size
+    margin = MAX_EXTRAPOLATION * size
     with np.errstate(invalid="ignore"):
         beyond = (detections.xy < -0.5 - margin) | (detections.xy > size - 0.5 + margin)
     far = np.asarray(beyond.any(axis=-1))

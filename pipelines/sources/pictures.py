@@ -20,7 +20,7 @@ from pipelines.session.storage import file_stamp, sha256_of
 from pipelines.session.urls import located
 
 
-class Pictures(Protocol):
+class CameraPictures(Protocol):
     """Reader of pictures; a context manager."""
 
     def read(self, number: int) -> Picture | None:
@@ -34,7 +34,7 @@ class Pictures(Protocol):
 
 
 @contextmanager
-def open_pictures(session: Path, description: Description, camera: str) -> Iterator[Pictures]:
+def open_pictures(session: Path, description: Description, camera: str) -> Iterator[CameraPictures]:
     """Open the pictures that a session was made from; check before and after that they did not change.
 
     Raises:
@@ -43,7 +43,7 @@ def open_pictures(session: Path, description: Description, camera: str) -> Itera
     media = _media(description, camera)
     refuse_changed_pictures(session, description, [camera])
     paths = [located(session, path) for path in media.paths]
-    opened: Pictures = (
+    opened: CameraPictures = (
         _filed(paths[0]) if media.topic is None else LoggedPictures(paths, media.topic, media.stamps)
     )
     with opened as pictures:

@@ -65,13 +65,14 @@ from pipelines.session.urls import located
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.parts import CameraFrames
-from pipelines.sources.projections import Projection, is_usable
 from pipelines.sources.world import (
     METRES,
+    Projection,
     as_stated,
     body_in_enu,
     in_enu,
     in_world,
+    is_usable,
     losses,
     mounted,
     refuse_projected,
@@ -82,7 +83,10 @@ from pipelines.sources.world import (
 )
 
 _FIXED = "fixed angles"
-_SAME_PLACE_M = 1.0  # datums of one continent differ by less, as ETRS89 and WGS84
+
+# Datums of one continent, as ETRS89 and WGS84, differ by less.
+SAME_PLACE_M = 1.0
+
 _ABOVE_TAKE_OFF = ("take-off", "stated")
 _ADD_ANGLES = (
     "add gimbal: {file, topic, relative_to: world} with the angles of another log, or"
@@ -516,7 +520,7 @@ class FlightPoses:
             apart_m = float(np.linalg.norm(places[0] - places[1]))
         except DataError:  # outside one of them
             apart_m = np.inf
-        if apart_m > _SAME_PLACE_M:
+        if apart_m > SAME_PLACE_M:
             self.map_doubts.append(
                 Doubt(
                     code="origin",

@@ -1,12 +1,16 @@
 """Conversion of logged poses to the world: to its clock, its axes (east-north-up) and its origin; doubts."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from pipelines.formats.maps.voxel_grids import placed
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.geodesy import Place
+from pipelines.geometry.geodesy import Place, enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera, flu_body_from_frd
 from pipelines.geometry.poses import (
     carried_covariance,
@@ -20,13 +24,22 @@ from pipelines.geometry.poses import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, LogClock, Mount, Placement, PoseSource, Up, WorldAxes
-from pipelines.session.records import Trajectory
+from pipelines.session.records import Occupancy, Trajectory
+from pipelines.session.registries import need
 from pipelines.session.source_options import FiledPose
 
-_FASTEST_MPS = 100.0  # no camera that films a person flies faster
-_FROZEN_S, _FROZEN_POSES = 1.0, 10  # a frozen pose stays the same for longer, and for as many messages
+# No camera that films a person flies faster.
+MAX_SPEED_MPS = 100.0
+
+# A hovering drone may log the same pose for a moment: frozen is what stays so longer.
+FROZEN_S = 1.0
+
+# A slow log repeats a pose a few times: frozen are at least so many messages.
+FROZEN_POSES = 10
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
-_FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and UTM eastings begin at 166 km
+
+# No drone flies so far from the origin, and eastings of UTM begin at 166 km.
+MAX_DISTANCE_M = 100_000.0
 
 
 UP_ROWS: dict[Up, tuple[tuple[int, int, int], ...]] = {
@@ -155,7 +168,7 @@ def refuse_projected(source: Path | str, position: Float, origin: Place, crs: st
         return
     x_m, y_m = np.median(across, axis=0).tolist()
     away_m = float(np.hypot(x_m, y_m))
-    if away_m > _FARTHEST_M:
+    if away_m > MAX_DISTANCE_M:
         place = f"latitude {origin.latitude_deg:.6f}, longitude {origin.longitude_deg:.6f}"
         away = f"{away_m / 1000:.0f} km from the world's origin ({place})"
         if crs:
@@ -178,7 +191,7 @@ def doubts_of_speed(trajectory: Trajectory) -> list[str]:
     """Report poses that jump further than anything flies, in one line or none."""
     step_s = np.diff(trajectory.t_ns) / 1e9
     speed = np.linalg.norm(np.diff(trajectory.position, axis=0), axis=1) / step_s
-    too_fast = speed > _FASTEST_MPS
+    too_fast = speed > MAX_SPEED_MPS
     if not too_fast.any():
         return []
     first_s = int(trajectory.t_ns[np.argmax(too_fast)] - trajectory.t_ns[0]) / 1e9
@@ -199,7 +212,7 @@ def doubts_of_stillness(trajectory: Trajectory) -> list[str]:
     first, last = np.append(0, changes + 1), np.append(changes, len(pose) - 1)
     lasts_s = (trajectory.t_ns[last] - trajectory.t_ns[first]) / 1e9
     count = last - first + 1
-    frozen = (lasts_s > _FROZEN_S) & (count >= _FROZEN_POSES)
+    frozen = (lasts_s > FROZEN_S) & (count >= FROZEN_POSES)
     if not frozen.any() or len(first) == 1:
         return []
     after_s = int(trajectory.t_ns[first[np.argmax(frozen)]] - trajectory.t_ns[0]) / 1e9
@@ -221,3 +234,127 @@ def mounted(mount: Mount | None) -> tuple[Float, Float]:
     if mount.rotation_xyzw is not None:
         return np.array(mount.translation), np.array(mount.rotation_xyzw)
     return np.array(mount.translation), body_from_camera(mount.looks or "forward", mount.down_deg)
+
+
+# No flight is nearer to the zero of a grid that lies outside of its own area.
+MIN_GRID_COORDINATE_M = 10_000.0
+
+_NO_PLACE = "check the CRS: world.crs and map.crs are those of the numbers in the files"
+
+
+def is_usable(name: str) -> bool:
+    """Return True for a projected or geographic CRS that pyproj knows."""
+    return _crs(name) is not None
+
+
+def _crs(name: str) -> Any | None:
+    pyproj: Any = need("pyproj", "places")
+    try:
+        crs = pyproj.CRS.from_user_input(name).to_2d()
+    except pyproj.exceptions.CRSError:
+        return None
+    return crs if crs.is_projected or crs.is_geographic else None
+
+
+class Projection:
+    """One CRS, of positions x east (or longitude), y north (or latitude) and height.
+
+    Raises:
+        DataError: pyproj is missing, or the CRS is unknown or no projected or geographic one.
+    """
+
+    def __init__(self, name: str, place: str) -> None:
+        pyproj: Any = need("pyproj", "places")
+        crs = _crs(name)
+        if crs is None:
+            raise DataError(
+                place,
+                f"{name!r} is no projected or geographic CRS",
+                "write one like EPSG:32632 (UTM 32 north)",
+                code="place-unknown",
+            )
+        authority = crs.to_authority(min_confidence=100)
+        self.name = ":".join(authority) if authority else crs.name
+        self._step = 1.0 if crs.is_projected else 1e-5  # a unit north by which grid north is found
+        self._to_earth = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+        # No flight is near the zero of a grid whose zero lies outside of the area that it is for, as in UTM.
+        # Japan, Portugal and Norway have it in the middle of their grids.
+        is_far = crs.is_projected and crs.area_of_use is not None and not self._has_zero_in(crs.area_of_use)
+        self._nearest_m = MIN_GRID_COORDINATE_M if is_far else 0.0
+
+    def _has_zero_in(self, area: Any) -> bool:
+        """Test if x 0, y 0 lies in pyproj's area of use."""
+        longitude, latitude = self._to_earth.transform(0.0, 0.0)
+        in_longitude = area.west <= longitude <= area.east or area.west > area.east
+        return bool(in_longitude and area.south <= latitude <= area.north)
+
+    def first_place(self, source: Path | str, position: Float) -> Place:
+        """Return the place on Earth of the first position [N, 3].
+
+        Raises:
+            DataError: it lies outside the CRS.
+        """
+        latitude, longitude, height = self._geodetic(source, position[:1])[0].tolist()
+        return Place(latitude, longitude, height)
+
+    def points(self, source: Path | str, position: Float, origin: Place) -> Float:
+        """Convert positions [..., 3] to metres east, north and up of the origin; NaN stays NaN.
+
+        Raises:
+            DataError: none of them lies inside the CRS.
+        """
+        flat = position.reshape(-1, 3)
+        latitude, longitude, height = self._geodetic(source, flat).T
+        return enu_from_geodetic(latitude, longitude, height, origin).reshape(position.shape)
+
+    def trajectory(self, source: Path | str, poses: Trajectory, origin: Place) -> Trajectory:
+        """Convert poses in the grid's axes to the world; covariances of positions turn with them."""
+        position = self.points(source, poses.position, origin)
+        turn = self._turn(source, poses.position, origin)
+        covariance = poses.covariance
+        if covariance is not None:
+            rotated = np.tile(np.eye(6), (len(turn), 1, 1))
+            rotated[:, :3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
+            covariance = carried_covariance(rotated, covariance)
+        quaternion = multiply(turn, poses.quaternion_xyzw)
+        return replace(poses, position=position, quaternion_xyzw=quaternion, covariance=covariance)
+
+    def map(self, source: Path | str, grid: Occupancy, origin: Place) -> tuple[Occupancy, float]:
+        """Convert a map to the world about its own centre; return also the largest error (m) of that.
+
+        The grid's scale, which differs from 1 by up to 0.04 % in UTM, is not applied to voxels.
+        """
+        half = np.array(grid.probability.shape) * grid.resolution_m / 2
+        centre = grid.origin + half
+        turn = self._turn(source, centre[None], origin)[0]
+        middle = self.points(source, centre[None], origin)[0]
+        found = placed(str(source), replace(grid, origin=-half), (middle, turn))
+        corners = centre + half * [[-1, -1, 0], [1, 1, 0], [-1, 1, 0], [1, -1, 0]]
+        exact = self.points(source, corners, origin)[:, :2]
+        kept = (corners - centre) @ matrix_from_quaternion(turn).T + middle
+        return found, float(np.linalg.norm(exact - kept[:, :2], axis=1).max())
+
+    def _geodetic(self, source: Path | str, position: Float) -> Float:
+        """Return latitude, longitude (deg) and height (m) of positions [N, 3]."""
+        known = position[np.isfinite(position[:, :2]).all(axis=1), :2]
+        if len(known) and np.abs(known).max() < self._nearest_m:
+            x, y = known[0].tolist()
+            problem = f"its x {x:.0f}, y {y:.0f} are metres of a local frame, not coordinates in {self.name}"
+            raise DataError(source, problem, _NO_PLACE, code="place-unknown")
+        longitude, latitude = self._to_earth.transform(position[:, 0], position[:, 1])
+        found = np.stack([latitude, longitude, position[:, 2]], axis=1)
+        found[~np.isfinite(found).all(axis=1)] = np.nan  # pyproj says inf outside the CRS
+        if len(found) and np.isnan(found[:, 0]).all():
+            x, y = position[0, :2].tolist()
+            raise DataError(
+                source, f"its x {x:.0f}, y {y:.0f} lies outside {self.name}", _NO_PLACE, code="place-unknown"
+            )
+        return found
+
+    def _turn(self, source: Path | str, position: Float, origin: Place) -> Float:
+        """Return the rotations [N, 4] from the grid's axes to the world's, about the vertical."""
+        north = self.points(source, position + np.array([0, self._step, 0]), origin)
+        north -= self.points(source, position, origin)
+        yaw = np.arctan2(-north[:, 0], north[:, 1])
+        still = np.zeros_like(yaw)
+        return quaternion_from_rotation_vector(np.stack([still, still, yaw], axis=1))

@@ -17,7 +17,7 @@ from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector
 from pipelines.ingest import ingest
 from pipelines.session.maps import read_grid, write_grid
 from pipelines.session.records import Occupancy, Trajectory
-from pipelines.sources.projections import Projection
+from pipelines.sources.world import Projection
 from tests.commands.runner import refused
 from tests.commands.test_drone_flights import errors, session_of
 from tests.formats.maps.test_las import write as write_las

@@ -180,8 +180,8 @@ def test_pictures_tell_where_logs_have_their_own_origins(
 
 def test_a_log_that_two_cameras_have_is_exchanged_by_its_name(flight: Described, tmp_path: Path) -> None:
     manifest = mistaken(flight, same_topic)
-    assert doubts_of(manifest)[0]["remedy"] == "cameras.drone1.pose.tum: drone1.tum"
-    assert with_remedy(manifest, "cameras.drone1.pose.tum: drone1.tum")
+    assert doubts_of(manifest)[0]["remedy"] == "cameras.drone1.pose.file: drone1.tum"
+    assert with_remedy(manifest, "cameras.drone1.pose.file: drone1.tum")
     succeeds("ingest", manifest, "-o", tmp_path / "mended.session")
     described = json.loads((tmp_path / "mended.session" / "session.json").read_text())
     assert described["doubts"] == []

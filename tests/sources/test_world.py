@@ -16,7 +16,8 @@ from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps, write_grid
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import CalibrationFormat, recognise
-from tests.synthetic.flights import START_NS, SyntheticFlight, pose2sim_table, write_flight, write_tum
+from pipelines.simulation.flight_files import write_tum
+from tests.synthetic.flights import START_NS, SyntheticFlight, pose2sim_table, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log
 

@@ -24,8 +24,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import LogSource, Manifest, MapSource, Placement
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import MapFormat
-from pipelines.sources.logs import FlightLogs
-from pipelines.sources.maps import maps_of_log
+from pipelines.sources.logs import FlightLogs, maps_of_log
 from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
 from tests.synthetic.map_logs import (
     Pose,

@@ -1,4 +1,4 @@
-"""Pictures of logs in every layout that ROS names: decoded colours equal the encoded ones."""
+"""CameraPictures of logs in every layout that ROS names: decoded colours equal the encoded ones."""
 
 from __future__ import annotations
 
