@@ -98,6 +98,14 @@ _COCO17 = ("nose", *_both("eye", "ear", "shoulder", "elbow", "wrist", "hip", "kn
 _JOINTS: dict[str, tuple[str, ...]] = {
     "coco17": _COCO17,
     "halpe26": (*_COCO17, "head", "neck", "hip", *_both("big_toe", "small_toe", "heel")),
+    "coco18": (
+        *("nose", "neck"),
+        *_one_side("right", "shoulder", "elbow", "wrist"),
+        *_one_side("left", "shoulder", "elbow", "wrist"),
+        *_one_side("right", "hip", "knee", "ankle"),
+        *_one_side("left", "hip", "knee", "ankle"),
+        *("right_eye", "left_eye", "right_ear", "left_ear"),
+    ),
     "body25": (
         *("nose", "neck"),
         *_one_side("right", "shoulder", "elbow", "wrist"),

@@ -24,7 +24,15 @@ NAMES = st.sampled_from(sorted(SKELETONS))
 
 @pytest.mark.parametrize(
     ("name", "count"),
-    [("coco17", 17), ("halpe26", 26), ("body25", 25), ("body25b", 25), ("blazepose33", 33), ("coco23", 23)],
+    [
+        ("coco17", 17),
+        ("halpe26", 26),
+        ("body25", 25),
+        ("body25b", 25),
+        ("blazepose33", 33),
+        ("coco23", 23),
+        ("coco18", 18),
+    ],
 )
 def test_every_skeleton_has_its_detectors_number_of_distinct_joints(name: str, count: int) -> None:
     joints = get_skeleton(name).joints
@@ -34,6 +42,7 @@ def test_every_skeleton_has_its_detectors_number_of_distinct_joints(name: str, c
 # Joints by number as the detectors' own documentation gives them, a few of each group.
 NUMBERED = {
     "coco23": "16 right_ankle 17 left_big_toe 18 left_small_toe 19 left_heel 20 right_big_toe 22 right_heel",
+    "coco18": "1 neck 2 right_shoulder 5 left_shoulder 8 right_hip 13 left_ankle 14 right_eye 17 left_ear",
     "coco17": "0 nose 1 left_eye 4 right_ear 5 left_shoulder 10 right_wrist 16 right_ankle",
     "halpe26": "16 right_ankle 17 head 18 neck 19 hip 20 left_big_toe 21 right_big_toe 22 left_small_toe "
     "24 left_heel 25 right_heel",
@@ -55,15 +64,15 @@ def test_joints_have_the_detectors_numbers(name: str) -> None:
 
 def test_an_unknown_skeleton_is_refused_with_those_there_are() -> None:
     with pytest.raises(DataError) as caught:
-        get_skeleton("coco18")
-    assert caught.value.source == "coco18"
+        get_skeleton("coco19")
+    assert caught.value.source == "coco19"
     assert caught.value.remedy.endswith(", ".join(SKELETONS))
 
 
 def test_skeletons_by_count() -> None:
     assert [s.name for s in skeleton_with(25)] == ["body25", "body25b"]
     assert [s.name for s in skeleton_with(33)] == ["blazepose33"]
-    assert skeleton_with(18) == ()
+    assert skeleton_with(19) == ()
 
 
 @pytest.mark.parametrize("name", sorted(SKELETONS))

@@ -407,7 +407,13 @@ def _rows(subtitles: Subtitles) -> DjiRows:
 def _columns(texts: Sequence[str]) -> dict[str, Float]:
     """Return all columns of `_COLUMNS`, [B] each, NaN if a subtitle does not hold the value."""
     rows = [_fields(text) for text in texts]
-    return {name: np.array([row.get(name, np.nan) for row in rows]) for name in _COLUMNS}
+    columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in _COLUMNS}
+    latitude, longitude = columns["latitude"], columns["longitude"]
+    beyond = np.count_nonzero(np.abs(latitude) > 90)
+    if 2 * beyond > np.count_nonzero(np.isfinite(latitude)) and not (np.abs(longitude) > 90).any():
+        # GPS(latitude, longitude, n): no latitude is beyond 90 degrees.
+        columns |= {"latitude": longitude, "longitude": latitude}
+    return columns
 
 
 def _fields(text: str) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -21,6 +21,7 @@ _SAMPLED_FILES = 8
 _FRAME_LIMIT = 2**62  # keeps frame numbers and their differences inside int64
 # ".jpg" and ".jp2" are suffixes, the ".0004" of "cam01.0004" is a frame number.
 _SUFFIX = re.compile(r"\.[A-Za-z]\w*$")
+_CAMERA = re.compile(r"(?:cam|camera|view|drone)[_-]?[0-9]+", re.IGNORECASE)
 _FARTHEST_PX = 1_000_000  # far larger than any picture: beyond it the file is faulty
 
 # Whole-body skeletons by their number of keypoints: those of this body come first, then face and hands.
@@ -132,12 +133,33 @@ def whole_number(value: object) -> int | None:
     return int(value) if abs(value) < _FRAME_LIMIT and value == int(value) else None
 
 
-def frame_number(name: object) -> int | None:
-    """Return the frame of an image id or a name: the number itself, or the last digits before the suffix."""
+def frame_number(name: object, group: int = -1) -> int | None:
+    """Return the frame of an image id or a name: the number itself, or a group of its digits (the last)."""
     if not isinstance(name, str):
         return whole_number(name)
-    digits = re.findall(r"[0-9]+", _SUFFIX.sub("", name))
-    return whole_number(int(digits[-1])) if digits and len(digits[-1]) < 20 else None
+    digits = _digits(name)
+    if not digits or len(digits) < -group:
+        return None
+    return whole_number(int(digits[group])) if len(digits[group]) < 20 else None
+
+
+def changing_digits(names: Collection[str]) -> int:
+    """Return the group of digits that numbers pictures: the last that is another in each name; -1 if none is.
+
+    The 2 in 000012_cam2 numbers a camera, the 192 in 000012_rtmpose-m_256x192 nothing.
+    """
+    groups = [_digits(name) for name in names]
+    if len({len(each) for each in groups}) != 1:
+        return -1
+    columns = list(zip(*groups, strict=True))
+    changing = [k for k, column in enumerate(columns) if len(set(column)) == len(groups) > 1]
+    of_cameras = _CAMERA.search(_SUFFIX.sub("", min(names)))
+    number = len(_digits(min(names)[: of_cameras.end()])) - 1 if of_cameras else -1
+    return next((k - len(columns) for k in reversed(changing) if k != number), -1)
+
+
+def _digits(name: str) -> list[str]:
+    return re.findall(r"[0-9]+", _SUFFIX.sub("", name))
 
 
 class KeypointFile:
@@ -169,6 +191,7 @@ class Gathering:
         self.joint_names: tuple[str, ...] | None = None
         self.image_size: tuple[int, int] | None = None
         self.dropped: Counter[str] = Counter()
+        self.digits = -1  # the group in the names of pictures that numbers them
         self._listed: dict[int, str] = {}
         self._people: Counter[int] = Counter()
         self._frame: list[int] = []
@@ -206,7 +229,7 @@ class Gathering:
         `where` names the entry for messages. `file` is stated if each of several files counts frames by
         itself.
         """
-        frame = frame_number(name)
+        frame = frame_number(name, self.digits)
         if frame is None:
             raise DataError(
                 where, f"picture {name!r} has no frame number", "name pictures with the number at the end"
@@ -292,13 +315,11 @@ class Gathering:
             problem = f"holds no keypoints from frame {first_frame} on (its last frame is {last}{causes})"
             raise DataError(self.path, problem, "check first_frame, and that the detector saw the person")
         rows = np.flatnonzero(somebody)
+        shared = self._told_apart(frame, person, rows)
         rows = rows[np.lexsort((person[rows], frame[rows]))]
-        again = (np.diff(frame[rows], prepend=-1) == 0) & (np.diff(person[rows], prepend=-1) == 0)
-        rows = rows[~again]
-
         dropped["frame before first_frame"] = int((listed < 0).sum())
         dropped["person without a joint"] = int((~somebody).sum())
-        dropped["same person twice in a frame"] = int(again.sum())
+        adjusted["person under another's id, numbered anew"] = shared
         return Detections(
             joints=skeleton.joints,
             frame=frame[rows],
@@ -324,6 +345,19 @@ class Gathering:
                 repeats[row] = detection in seen
                 seen.add(detection)
         return repeats
+
+    @staticmethod
+    def _told_apart(frame: Int64, person: Int64, rows: Int64) -> int:
+        """Give new numbers to all but the first of people with one number in a frame; return how many."""
+        seen: Counter[tuple[int, int]] = Counter()
+        unused, shared = int(person.max(initial=0)) + 1, 0
+        for row in rows.tolist():
+            key = int(frame[row]), int(person[row])
+            if seen[key]:
+                person[row] = unused + seen[key] - 1
+                shared += 1
+            seen[key] += 1
+        return shared
 
     def _person_numbers(self, kept: Bool) -> Int64:
         """Number the kept people by the detector's own ids, or by their positions within the frame."""

@@ -9,9 +9,11 @@ import numpy as np
 from pipelines.formats.keypoint_files.keypoint_people import (
     Gathering,
     KeypointFile,
+    changing_digits,
     first_entry,
     frame_number,
     is_alphapose_entry,
+    json_files,
     load_json,
     numbers,
     objects,
@@ -36,6 +38,8 @@ class OpenPose(KeypointFile):
 
     def gather(self, people: Gathering) -> None:
         """Add every person, file by file; skip and count files that are no frames."""
+        if people.path.is_dir():
+            people.digits = changing_digits([_stem(file) for file in json_files(people.path)])
         for file, content in people.contents():
             _read_frame(file, content, people)
         if people.count() == len(SKELETONS["body25"].joints):
@@ -48,8 +52,8 @@ def _is_frame(content: object) -> bool:
 
 def _read_frame(file: Path, content: object, people: Gathering) -> None:
     """Add the people of one file; count the file instead if it is no frame."""
-    name = file.stem.removesuffix("_keypoints")
-    if frame_number(name) is None:
+    name = _stem(file)
+    if frame_number(name, people.digits) is None:
         people.dropped["file without a frame number"] += 1
         return
     if not isinstance(content, dict) or not _is_frame(content):
@@ -57,9 +61,13 @@ def _read_frame(file: Path, content: object, people: Gathering) -> None:
         return
     frame = people.frame_of(name, str(file))
     for rank, (where, person) in enumerate(objects(content["people"], file, "people")):
-        if person.get("pose_keypoints_2d"):
-            rows = triples(person["pose_keypoints_2d"], where)
+        if stated := person.get("pose_keypoints_2d") or person.get("pose_keypoints"):  # the latter until 2018
+            rows = triples(stated, where)
             people.add(frame, rows, where, rank=rank, own_id=_openpose_track(person.get("person_id")))
+
+
+def _stem(file: Path) -> str:
+    return file.stem.removesuffix("_keypoints")
 
 
 def _openpose_track(person_id: object) -> int | None:
@@ -85,24 +93,50 @@ OPENPOSE = OpenPose()
 
 
 class AlphaPose(KeypointFile):
-    """Reader of AlphaPose's `alphapose-results.json`, old and new."""
+    """Reader of AlphaPose's `alphapose-results.json`, old and new, also in its formats `cmu` and `open`."""
 
     name = "alphapose"
     title = "AlphaPose keypoints"
 
     def recognises(self, path: Path) -> bool:
         """Return True for a list of results that name pictures, or have AlphaPose's `box` or `idx`."""
-        return path.is_file() and any(is_alphapose_entry(first_entry(s)) for s in samples(path))
+        return path.is_file() and any(
+            is_alphapose_entry(first_entry(s)) or _is_by_picture(s) for s in samples(path)
+        )
 
     def gather(self, people: Gathering) -> None:
         """Add every person, with the tracker's id."""
-        for where, entry in objects(load_json(people.path), people.path, "results"):
+        content = load_json(people.path)
+        if isinstance(content, dict) and _is_by_picture(content):
+            people.digits = changing_digits(content)
+            for picture, shown in content.items():
+                frame = people.frame_of(picture, str(people.path))
+                key = next(key for key in _BY_PICTURE if key in shown)
+                for where, person in objects(shown[key], f"{people.path}, {picture}", key):
+                    people.add(frame, triples(person.get(_BY_PICTURE[key]), where), where)
+            return
+        if isinstance(content, list):
+            named = {entry.get("image_id") for entry in content if isinstance(entry, dict)}
+            people.digits = changing_digits([name for name in named if isinstance(name, str)])
+        for where, entry in objects(content, people.path, "results"):
             frame = people.frame_of(entry.get("image_id"), where)
             if "keypoints" not in entry:
                 raise DataError(where, "has no keypoints", "check the file's format")
             people.add(
                 frame, triples(entry["keypoints"], where), where, own_id=_alphapose_track(entry.get("idx"))
             )
+
+
+# The list of people of a picture and the keypoints of each, in AlphaPose's formats `open` and `cmu`.
+_BY_PICTURE = {"people": "pose_keypoints_2d", "bodies": "joints"}
+
+
+def _is_by_picture(content: object) -> bool:
+    return (
+        isinstance(content, dict)
+        and bool(content)
+        and all(isinstance(shown, dict) and _BY_PICTURE.keys() & shown.keys() for shown in content.values())
+    )
 
 
 def _alphapose_track(idx: object) -> int | None:

@@ -11,6 +11,7 @@ number.
 """
 
 import math
+import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -112,6 +113,9 @@ def _check_layout(path: Path) -> None:
     # DEC stores the half with the sign first.
     is_float = head[13] & 0x80 if processor == _DEC else scale < 0
     frames = max(last - first + 1, 0)
+    if stated := re.search(rb"[\x06\xfa].FRAMES..\x02(?:\x00|\x01\x01)(..)", section, re.DOTALL):
+        # Optotrak's headers count wrong; readers go by POINT:FRAMES.
+        frames = min(frames, struct.unpack(f"{order}H", stated[1])[0])
     needed = (start - 1) * _BLOCK + frames * (4 * points + analogs) * (4 if is_float else 2)
     if size < needed:
         raise DataError(
@@ -185,7 +189,8 @@ def _words(contents: Any, name: str) -> int | None:
     values = _values(contents, "TRIAL", name)
     if len(values) == 0:
         return None
-    low, high = (int(v) & 0xFFFF for v in [*values, 0][:2])
+    # Theia3D writes them as a table of 2 x 1.
+    low, high = (int(v) & 0xFFFF for v in [*np.ravel(values).tolist(), 0][:2])
     return low | high << 16
 
 

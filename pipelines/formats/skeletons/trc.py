@@ -83,7 +83,7 @@ class TrcFormat:
 def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
     """Return the header, the lines below it, and the line number of the first of those in the file."""
     lines = text.split("\n")
-    if len(lines) < 5 or not lines[0].startswith("PathFileType") or not lines[3].startswith("Frame#"):
+    if len(lines) < 5 or not lines[0].startswith("PathFileType") or not re.match(r"Frame\s*#", lines[3]):
         raise DataError(
             path,
             "has no TRC header (five lines from PathFileType to X1 Y1 Z1)",
@@ -109,10 +109,14 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
     """Read times as text, and coordinates [T, M, 3]."""
     times: list[str] = []
     values: list[list[float]] = []
+    decimal_commas = not any("." in line for line in lines[:10])
     for number, line in enumerate(lines, start=first_line):
         if not line.strip():
             continue
-        cells = line.split("\t")
+        cells = (line.replace(",", ".") if decimal_commas else line).split("\t")
+        last = number == first_line + len(lines) - 1  # without its end of line: perhaps broken off
+        if 2 < len(cells) < 3 * markers + 2 and len(cells) % 3 == 2 and not last:
+            cells += [""] * (3 * markers + 2 - len(cells))  # some programs cut blanks at the end of a line
         if len(cells) == 3 * markers + 3 and not cells[-1].strip():
             cells.pop()  # many writers end their lines with a tab
         if len(cells) != 3 * markers + 2:

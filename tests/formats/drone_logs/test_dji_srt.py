@@ -253,3 +253,13 @@ def test_angles_that_are_repeated_become_lines_and_their_holds_stay(rows: int) -
     held = number < 31 * rows - (rows + 1)
     np.testing.assert_array_equal(found[held, 1], 0)
     np.testing.assert_allclose(found[31 * rows :, 1], true[31 * rows :, 1], atol=1e-9)
+
+
+def test_places_whose_order_shows_in_their_numbers(tmp_path: Path) -> None:
+    """116 E is no latitude: GPS(latitude, longitude, satellites)."""
+    path = subtitles(tmp_path / "a.SRT", *(f"GPS(39.9042,116.407{k},16) BAROMETER:20.1" for k in range(3)))
+    track = read(path).position
+    assert track.values[0, :2].tolist() == [39.9042, 116.407]
+    assert (
+        read(subtitles(tmp_path / "a.SRT", "GPS(8.25,47.5,16) BAROMETER:20.1")).position.values[0, 0] == 47.5
+    )

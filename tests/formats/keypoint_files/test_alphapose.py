@@ -77,7 +77,7 @@ def test_joints_far_beyond_any_picture_are_left_out_and_counted(
     "content",
     [
         [],
-        [entry("1.jpg", count=18)],
+        [entry("1.jpg", count=19)],
         [entry("a/1.jpg"), entry("b/1.jpg")],
         [{"image_id": "1.jpg", "keypoints": ["x", {}, []]}],
         [{"image_id": "1.jpg", "keypoints": [0.0] * 51}],
@@ -105,3 +105,29 @@ def test_damaged_files_are_one_clear_line_and_belong_to_no_format(tmp_path: Path
         assert not reader.recognises(path)
         with pytest.raises(DataError):
             reader.read_keypoints(path, skeleton=None, first_frame=0)
+
+
+@pytest.mark.parametrize(("people", "keypoints"), [("bodies", "joints"), ("people", "pose_keypoints_2d")])
+def test_the_formats_cmu_and_open(tmp_path: Path, people: str, keypoints: str) -> None:
+    content = {
+        f"{k}.jpg": {
+            "version": "AlphaPose v0.3",
+            people: [{keypoints: entry("", x=x, count=18)["keypoints"]}],
+        }
+        for k, x in ((7, 1.0), (9, 2.0))
+    }
+    path = written(tmp_path, content)
+    assert [f.name for f in FORMATS.all() if f.recognises(path)] == ["alphapose"]
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert (found.frame.tolist(), found.xy[:, 0, 0].tolist()) == ([7, 9], [1.0, 2.0])
+    assert found.joints[1] == "neck"
+
+
+def test_two_people_under_one_id_are_two_people(tmp_path: Path) -> None:
+    path = written(
+        tmp_path, [entry("1.jpg", 4), entry("1.jpg", 4, x=500.0), entry("2.jpg", 4), entry("2.jpg", 5)]
+    )
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert found.frame.tolist() == [1, 1, 2, 2]
+    assert found.person.tolist() == [4, 6, 4, 5]
+    assert (found.dropped, list(found.adjusted.values())) == ({}, [1])

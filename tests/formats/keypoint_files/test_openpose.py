@@ -147,3 +147,21 @@ def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, seen:
     assert list(zip(found.frame.tolist(), found.person.tolist(), strict=True)) == expected
     assert found.xy[:, 0, 0].tolist() == [100.0 * frame + place for frame, place in expected]
     assert found.frames_listed.tolist() == list(range(len(seen)))
+
+
+@pytest.mark.parametrize("name", ["{:06d}_cam2", "{:06d}_rtmpose-m_256x192", "cam2_{:012d}_keypoints"])
+def test_pictures_are_numbered_by_the_digits_that_change(tmp_path: Path, name: str) -> None:
+    for k in range(3, 15):
+        frame_file(tmp_path / "a", f"{name.format(k)}.json", person(x=k))
+    found = FORMAT.read_keypoints(tmp_path / "a", skeleton=None, first_frame=0)
+    assert found.frame.tolist() == list(range(3, 15))
+    assert found.xy[:, 0, 0].tolist() == list(range(3, 15))
+
+
+def test_the_coco_model_and_the_key_of_its_time(tmp_path: Path) -> None:
+    old = person(count=18)
+    old["pose_keypoints"] = old.pop("pose_keypoints_2d")
+    frame_file(tmp_path / "a", "a_0.json", old)
+    found = FORMAT.read_keypoints(tmp_path / "a", skeleton=None, first_frame=0)
+    assert (found.joints[1], found.joints[2], found.joints[-1]) == ("neck", "right_shoulder", "left_ear")
+    assert found.xy[0, 17].tolist() == [27.0, 20.0]

@@ -153,3 +153,22 @@ def test_pauses_are_frames_without_points_and_counted(tmp_path: Path) -> None:
     assert len(back.t_ns) == 60
     assert np.isnan(back.position[20:40]).all()
     assert any("20" in note for note in listener.notes)
+
+
+def test_a_header_that_counts_too_many_frames_is_outvoted_by_point_frames(tmp_path: Path) -> None:
+    """Optotrak writes such files; ezc3d reads them."""
+    path = write(tmp_path / "a.c3d", walking(40))
+    content = bytearray(path.read_bytes())
+    content[8:10] = (400).to_bytes(2, "little")  # the last frame
+    path.write_bytes(content)
+    assert len(read(path).t_ns) == 40
+    path.write_bytes(content[: len(content) // 2])
+    with refuses(path):
+        read(path)
+
+
+def test_counts_of_a_trial_may_be_a_table() -> None:
+    """Theia3D writes TRIAL:ACTUAL_END_FIELD as 2 x 1; ezc3d cannot."""
+    for stated in ([70_000 & 0xFFFF, 1], [[70_000 & 0xFFFF], [1]]):
+        contents = {"parameters": {"TRIAL": {"ACTUAL_END_FIELD": {"value": np.array(stated)}}}}
+        assert c3d._words(contents, "ACTUAL_END_FIELD") == 70_000

@@ -89,7 +89,7 @@ def test_the_header_of_a_real_file_may_count_wrong() -> None:
     "text",
     [
         "",
-        HEADER + "1\t0\t1\t2\t3\n",
+        HEADER + "1\t0\t1\t2\n",
         HEADER + "1\t0\t1\t2\t3\t4\tx\t6\n",
         HEADER + "1\tnan\t1\t2\t3\t4\t5\t6\n",
         HEADER.replace("mm", "furlong") + "1\t0\t1\t2\t3\t4\t5\t6\n",
@@ -238,3 +238,11 @@ def test_another_reader_finds_the_same(tmp_path: Path) -> None:
     names, table = as_pose2sim_reads(real_data("motion/pose2sim_markers.trc"))
     assert names[0] == "RHip"
     assert table.iloc[0, 2:5].tolist() == pytest.approx([-0.065, 0.90151, -1.40057], abs=1e-5)
+
+
+def test_spellings_of_other_programs(tmp_path: Path) -> None:
+    rows = "1\t0.0\t1.5\t2\t3\t4\t5\t6\n2\t0.1\t1.5\t2\t3\t\t\t\n"
+    expected = read(write(tmp_path, HEADER + rows)).position
+    commas = HEADER.replace("Frame#", "Frame #") + rows.replace(".", ",").replace("\t\t\t\n", "\n")
+    np.testing.assert_array_equal(read(write(tmp_path, commas)).position, expected)
+    assert np.isnan(expected[1, 0, 1]).all()
