@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.follow import BLOCK, FollowedPart, Following
-from pipelines.follow import Block as FollowedBlock
+from pipelines.follow import BLOCK, FollowedBlock, FollowedPart, Following
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.keypoints.hints import Hint, actor_hints
 from pipelines.keypoints.tracking import PeopleTracker
@@ -388,7 +387,7 @@ def _span_words(start_s: float | None, end_s: float | None) -> str:
 
 
 @dataclass(frozen=True)
-class _Order:
+class _DetectionOrder:
     """A block for a worker."""
 
     session: SharedSession
@@ -400,7 +399,7 @@ class _Order:
     followed: FollowedBlock | None
 
 
-def detect_block(order: _Order) -> tuple[dict[str, bytes], dict[str, bytes] | None]:
+def detect_block(order: _DetectionOrder) -> tuple[dict[str, bytes], dict[str, bytes] | None]:
     """Detect on a worker; return the files of the block, and those of its background.
 
     Raises:
@@ -443,7 +442,7 @@ def _detected(
     session, models = SharedSession.at(work.folder), hashes_of_models(detector)
     missing = [block for block in blocks if not run.has_chunk(block.name)]
     orders = [
-        _Order(session, detector, models, only_one, work.every, block, _followed(following, block))
+        _DetectionOrder(session, detector, models, only_one, work.every, block, _followed(following, block))
         for block in missing
     ]
     progress.advance(sum(work.pictures(block) for block in blocks if block not in missing))

@@ -112,7 +112,7 @@ def export(
             for format_ in exports:
                 own = work / format_.name
                 own.mkdir()
-                notes = _Notes(progress)
+                notes = _KeptNotes(progress)
                 unit_, axes_ = shapes[format_.name] or (None, None)
                 zero = zeros[format_.name]
                 zero_ns = recording.zero_ns if zero == "zero" else 0
@@ -134,7 +134,7 @@ def export(
 
 
 @dataclass(frozen=True)
-class _Notes:
+class _KeptNotes:
     """Progress that passes everything on and keeps the notes for export.json."""
 
     whom: Progress

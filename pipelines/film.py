@@ -42,8 +42,8 @@ from pipelines.simulation.flight import Set, build_set
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.sightings import (
-    Formation,
-    Sightings,
+    CameraFormation,
+    SimulatedKeypoints,
     Walk,
     errors_in_common,
     measure_arm,
@@ -225,7 +225,7 @@ class _Arm:
     names: tuple[str, ...]
     people: list[Walk]
     tilt_rad: Float | None  # [N, T] above whom each camera films; None for one person
-    seen_by: Formation
+    seen_by: CameraFormation
     logged: list[Float]  # positions [T, 3] m of each logged person
     noise: tuple[NoiseModel, ...]
 
@@ -301,7 +301,7 @@ def _arm(
         motion, person = performer.moving((moments - plan.start_ns) / 1e9), performer.person
         joints = person.keypoints(motion)
         people.append(Walk(moments, person, performer.look.body.height_m, motion, joints, motion.root))
-    seen_by = Formation(
+    seen_by = CameraFormation(
         position.take(rows, axis=1), quaternion.take(rows, axis=1), flight.cameras[0].intrinsics
     )
     tilt = table["tilt_rad"].to_numpy(np.float64).reshape(-1, len(cameras)).T
@@ -390,7 +390,7 @@ def _whose(
     return found, sure
 
 
-def _read_sightings(parts: Sequence[Path]) -> list[Sightings]:
+def _read_sightings(parts: Sequence[Path]) -> list[SimulatedKeypoints]:
     """Read what all cameras found of each person."""
     xy, confidence = [], []
     for part in parts:
@@ -398,14 +398,14 @@ def _read_sightings(parts: Sequence[Path]) -> list[Sightings]:
             xy.append(stored["xy"])
             confidence.append(stored["confidence"])
     found, sure = np.stack(xy), np.stack(confidence)
-    return [Sightings(found[:, :, p], sure[:, :, p]) for p in range(found.shape[2])]
+    return [SimulatedKeypoints(found[:, :, p], sure[:, :, p]) for p in range(found.shape[2])]
 
 
 # --- measuring -----------------------------------------------------------------------------------------
 
 
 def _measured(
-    arm: _Arm, of: Walk, sightings: Sightings, *, seed: int, desired_tilt_deg: float
+    arm: _Arm, of: Walk, sightings: SimulatedKeypoints, *, seed: int, desired_tilt_deg: float
 ) -> tuple[Float, dict[str, Any]]:
     """Reconstruct a person [T, J, 3] and measure the arm by them."""
     views = views_of(of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
@@ -449,7 +449,7 @@ def _means(each: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _write_arm(
-    folder: Path, arm: _Arm, sightings: Sequence[Sightings], points: Float, parts: Sequence[Path]
+    folder: Path, arm: _Arm, sightings: Sequence[SimulatedKeypoints], points: Float, parts: Sequence[Path]
 ) -> None:
     """Write the skeletons [T, P, J, 3] of an arm, and each camera's pictures with them drawn over them."""
     folder.mkdir()
@@ -460,7 +460,12 @@ def _write_arm(
 
 
 def _draw(
-    arm: _Arm, camera: int, sightings: Sequence[Sightings], points: Float, pictures: Path, folder: Path
+    arm: _Arm,
+    camera: int,
+    sightings: Sequence[SimulatedKeypoints],
+    points: Float,
+    pictures: Path,
+    folder: Path,
 ) -> None:
     """Write <camera>.mp4: the skeletons over the pictures, the person in the middle enlarged in a corner."""
     lens, name = arm.seen_by.lens, arm.names[camera]

@@ -55,7 +55,7 @@ def cameras_to_follow(description: Description) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Block:
+class FollowedBlock:
     """Pictures of a camera that are followed together, by their numbers."""
 
     camera: str
@@ -77,7 +77,7 @@ class FollowedPart:
         block: the pictures; others that are shown are left out.
     """
 
-    def __init__(self, block: Block) -> None:
+    def __init__(self, block: FollowedBlock) -> None:
         self.block = block
         self._numbers = frozenset(
             [*block.numbers.tolist(), *([] if block.before is None else [block.before])]
@@ -116,7 +116,7 @@ class FollowedPart:
         write_json(folder / "counts.json", counts | {"points": points, "stills": len(self._stills)})
 
 
-def follow_block(order: tuple[SharedSession, Block]) -> dict[str, bytes]:
+def follow_block(order: tuple[SharedSession, FollowedBlock]) -> dict[str, bytes]:
     """Follow through the pictures of a block on a worker; return its files.
 
     Raises:
@@ -176,11 +176,11 @@ class Following:
         self._kept: set[str] = set()
         self._run = session.begin(BACKGROUND, settings={"cameras": names}, inputs=inputs, force=force)
 
-    def block(self, camera: str, first: int) -> Block | None:
+    def block(self, camera: str, first: int) -> FollowedBlock | None:
         """Return the block of a camera that begins with row `first`; None if it is not followed any more."""
         return None if self._run.finished else self._at.get((camera, first))
 
-    def keep(self, block: Block, write: Callable[[Path], None]) -> None:
+    def keep(self, block: FollowedBlock, write: Callable[[Path], None]) -> None:
         """Store a block whose pictures were all seen; `write` puts its files into a folder."""
         self._run.chunk(block.name, write)
         self._kept.add(block.name)
@@ -220,7 +220,9 @@ class Following:
         }
         return self._run.publish(counts={"cameras": counts})
 
-    def _looked_at(self, camera: str, every: int, span_s: tuple[float | None, float | None]) -> list[Block]:
+    def _looked_at(
+        self, camera: str, every: int, span_s: tuple[float | None, float | None]
+    ) -> list[FollowedBlock]:
         """List the blocks of a camera's pictures that are followed."""
         frames = read_table(self._folder / "cameras" / camera / "frames.parquet", FRAMES)
         numbers, t_ns = (frames[name].to_numpy(np.int64) for name in ("frame", "t_ns"))
@@ -240,7 +242,9 @@ class Following:
             begin, end = np.searchsorted(rows, (first, min(first + BLOCK, span.stop))).tolist()
             own = rows[begin:end]
             before = int(numbers[rows[begin - 1]]) if begin and len(own) else None
-            blocks.append(Block(camera, first, before, numbers[own], numbers[np.intersect1d(own, stills)]))
+            blocks.append(
+                FollowedBlock(camera, first, before, numbers[own], numbers[np.intersect1d(own, stills)])
+            )
         return blocks
 
     def _assemble(self, camera: str, parts: Iterable[Path]) -> dict[str, int]:

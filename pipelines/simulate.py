@@ -43,7 +43,7 @@ from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_sce
 from pipelines.simulation.flight_files import logged_messages, manifest_text, write_keypoints, write_truth
 from pipelines.simulation.flying import Known, Planner
 from pipelines.simulation.rendering.camera import exposed_moments
-from pipelines.simulation.rendering.renderer import Moment, Renderer
+from pipelines.simulation.rendering.renderer import ExposedMoment, Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.world.scene import World
 
@@ -294,7 +294,7 @@ def _film_block(
             halt.check()
             of_frame = range(number * len(offsets_s), (number + 1) * len(offsets_s))
             moments = [
-                Moment(
+                ExposedMoment(
                     camera.camera_position[k],
                     camera.camera_quaternion_xyzw[k],
                     [

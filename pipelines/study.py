@@ -62,11 +62,11 @@ from pipelines.simulate import recorded_motions
 from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import build_set
 from pipelines.simulation.rendering.renderer import Renderer
-from pipelines.simulation.scenario import World, read_scenario
+from pipelines.simulation.scenario import WorldSettings, read_scenario
 from pipelines.simulation.sightings import (
     IMITATED,
-    Formation,
-    Sightings,
+    CameraFormation,
+    SimulatedKeypoints,
     Walk,
     exact_keypoints,
     formation,
@@ -264,11 +264,11 @@ def _study_walk(
             for noise in settings.noise
             for each in product(settings.tilts_deg, settings.robots, [noise])
         ]
-        seen: dict[tuple[float, int], Sightings] = {}
+        seen: dict[tuple[float, int], SimulatedKeypoints] = {}
         if detector is not None:
-            sun = np.array((World() if scenario is None else scenario.world).sun)
+            sun = np.array((WorldSettings() if scenario is None else scenario.world).sun)
             if scenario is None:
-                world = build_world(World(), settings.seed, keep_clear=filmed.motion.root[:, :2])
+                world = build_world(WorldSettings(), settings.seed, keep_clear=filmed.motion.root[:, :2])
             else:
                 world = scenery.world
             renderer = Renderer(world.surfaces(), filmed.lens, sun=sun, seed=settings.seed)
@@ -314,7 +314,7 @@ def _measure_condition(
     settings: WalkStudy,
     filmed: Walk,
     condition: _Condition,
-    seen: Mapping[tuple[float, int], Sightings],
+    seen: Mapping[tuple[float, int], SimulatedKeypoints],
     halt: Halt,
     progress: Progress,
     folder: Path,
@@ -401,7 +401,7 @@ def _detect_all(
     workers: int,
     making: Making,
     progress: Progress,
-) -> dict[tuple[float, int], Sightings]:
+) -> dict[tuple[float, int], SimulatedKeypoints]:
     """Film the walk from every formation and detect keypoints in the pictures."""
     geometries = sorted({condition.filmed for condition in conditions})
     cameras = [(tilt, robots, k) for tilt, robots in geometries for k in range(robots)]
@@ -418,14 +418,14 @@ def _detect_all(
         with np.load(made / "keypoints.npz") as stored:
             found.setdefault((tilt, robots), []).append((stored["xy"], stored["confidence"]))
     return {
-        geometry: Sightings(*(np.stack(each) for each in zip(*own, strict=True)))
+        geometry: SimulatedKeypoints(*(np.stack(each) for each in zip(*own, strict=True)))
         for geometry, own in found.items()
     }
 
 
 def _film(
     filmed: Walk,
-    seen_by: Formation,
+    seen_by: CameraFormation,
     camera: int,
     renderer: Renderer,
     detector: Detector,

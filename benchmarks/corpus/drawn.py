@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.corpus.stored import RECORDED, Flight, read_backgrounds, read_keypoints
 from pipelines.detect import Block as DetectorBlock
-from pipelines.follow import Block
+from pipelines.follow import FollowedBlock
 from pipelines.formats.calibrations.camera_matrices import write_camera_info
 from pipelines.formats.maps.octomap import write_octomap
 from pipelines.formats.scenes.mcap_writing import Ros2Recording
@@ -43,7 +43,7 @@ from pipelines.session.tables import KEYPOINTS, TRACKS, write_table
 from pipelines.simulate import _planner
 from pipelines.simulation.flight import SimulatedFlight, fly_scenario
 from pipelines.simulation.flight_files import (
-    Sighting,
+    TrackedKeypoints,
     logged_messages,
     manifest_text,
     write_alphapose,
@@ -213,7 +213,7 @@ class DrawnFlight:
                 where = rows["frame"].to_numpy(), [joints.index(name) for name in rows["joint"]]
                 xy[where], confidence[where] = rows[["x", "y"]], rows["confidence"]
                 xy[np.isnan(xy).all(axis=-1).any(axis=-1)] = np.nan
-                people.append(Sighting(track, xy, confidence))
+                people.append(TrackedKeypoints(track, xy, confidence))
             write_alphapose(place / f"{drone.name}_keypoints.json", people)
 
 
@@ -234,7 +234,7 @@ def kept_in_place_of_pictures(flight: Flight, detector: str) -> Iterator[None]:
         counts = kept.counts[block.camera] if not block.first else dict.fromkeys(kept.counts[block.camera], 0)
         write_json(folder / "counts.json", {"joints": list(kept.joints), "counts": counts})
 
-    def follow(self: Any, block: Block, halt: Any, progress: Any, folder: Path) -> None:
+    def follow(self: Any, block: FollowedBlock, halt: Any, progress: Any, folder: Path) -> None:
         del self, halt, progress
         background = backgrounds[block.camera]
         table = background.tracks[background.tracks["frame"].isin(block.numbers)]

@@ -41,7 +41,7 @@ from pipelines.simulation.body_outfits import (
 )
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, BodyMotion, Rig
 from pipelines.simulation.scenario import Body
-from pipelines.simulation.surfaces import Surface
+from pipelines.simulation.surfaces import TriangleSurface
 
 _ASSET = Path(__file__).parent / "data" / "body.npz"
 _FRAMES_AT_ONCE = 1024  # bounds the memory of long motions: 5 MB of transforms
@@ -53,7 +53,7 @@ _CLOTHES, _SLICE, _SOLE_STRIP = 0.008, 0.017, 0.017  # fractions of the height
 
 
 @dataclass(frozen=True)
-class Person:
+class PosablePerson:
     """A person who can be posed.
 
     `rig` is measured from this very mesh. Arms hang straight, leaning outward just enough to clear the
@@ -69,14 +69,16 @@ class Person:
     keypoint_mass: Float  # [17, M] of the moving bones, rows sum to 1
     keypoint_moment: Float  # [17, M, 3] m, at rest
 
-    def surface(self, root: Float, rotation: Float) -> Surface:
+    def surface(self, root: Float, rotation: Float) -> TriangleSurface:
         """Return the person's surface in one pose.
 
         Args:
             root: [3] m, the pelvis's joint in the world.
             rotation: [22, 4] as in `BodyMotion`.
         """
-        return Surface(self.skin.moved(*self.skinning.transforms(root, rotation)), self.faces, self.colour)
+        return TriangleSurface(
+            self.skin.moved(*self.skinning.transforms(root, rotation)), self.faces, self.colour
+        )
 
     def keypoints(self, motion: BodyMotion) -> Float:
         """Compute the keypoints [T, 17, 3] m, world, in the order of `joints`.
@@ -92,7 +94,7 @@ class Person:
         return found
 
 
-def make_body(look: Body) -> Person:
+def make_body(look: Body) -> PosablePerson:
     """Make the person of a scenario: `look.height_m` from bare soles to the crown in the neutral pose.
 
     Shoes and hair come on top: 1 % and 1 % of the height. The ground, z = 0 of the neutral pose, is
@@ -104,7 +106,7 @@ def make_body(look: Body) -> Person:
     skinning = _cleared(body)
     rig = _measured(skinning, skin, dressed, _SOLE_STRIP * look.height_m)
     mass, moment = _keypoint_parts(body)
-    return Person(
+    return PosablePerson(
         rig, get_skeleton("coco17").joints, dressed.faces, dressed.colour, skin, skinning, mass, moment
     )
 
@@ -132,10 +134,7 @@ def _undressed(look: Body) -> Undressed:
 
 
 def _height_standing(vertices: Float, joint: Float) -> float:
-    """Return the bare body's height with straight legs, m.
-
-    At rest the legs are spread. This lowers the body by some millimetres.
-    """
+    """Return the bare body's height with straight legs, m."""
     thigh, shank, foot = (joint[BONE[f"left_{name}"]] for name in ("thigh", "shank", "foot"))
     leg = np.linalg.norm(shank - thigh) + np.linalg.norm(foot - shank)
     return float(vertices[:, 2].max() - thigh[2] + leg + foot[2])
@@ -177,10 +176,7 @@ def _standing(skinning: Skinning, skin: Skin) -> Float:
 
 
 def _measured(skinning: Skinning, skin: Skin, dressed: Dressed, strip_m: float) -> Rig:
-    """Measure the rig of a mesh.
-
-    The pelvis's offset starts at the ground, at the point between the ankles below the neutral pelvis.
-    """
+    """Measure the rig of a mesh."""
     points = _standing(skinning, skin)
     offset = skinning.offset.copy()
     ankle = sum(offset[BONE[f"left_{name}"]] for name in ("thigh", "shank", "foot"))
@@ -205,10 +201,7 @@ def _sole_at(under: Float, x: float, strip_m: float) -> Float:
 
 
 def _keypoint_parts(body: Undressed) -> tuple[Float, Float]:
-    """Compute the part of each moving bone in each keypoint: mass [17, M] and moment [17, M, 3].
-
-    The mass is the bone's share of the keypoint; rows sum to 1. The moment is the share times the place.
-    """
+    """Compute the part of each moving bone in each keypoint: mass [17, M] and moment [17, M, 3]."""
     asset = _asset()
     vertex, row = asset["keypoint_vertex"].astype(np.intp), asset["keypoint"].astype(np.intp)
     by_bone = moving_weights(body.weights[vertex]) * asset["keypoint_weight"].astype(np.float64)[:, None]

@@ -74,10 +74,7 @@ def neutral_offsets(rest_joint: Float, turns: Float) -> Float:
 
 
 def _turn(source: tuple[Float, Float], target: tuple[Float, Float]) -> Float:
-    """Return the rotation that takes the first source direction to the first target direction.
-
-    It takes the plane of both source directions to the plane of both target directions.
-    """
+    """Return the rotation that takes the first source direction to the first target direction."""
     turn: Float = np.einsum("ik,jk->ij", _frame(*target), _frame(*source))
     return turn
 
@@ -359,12 +356,7 @@ def _share(points: Float, start: Float, end: Float) -> Float:
 
 
 def _on_scalp(ahead: Float, above: Float) -> Float:
-    """Compute the distance [V] of places inside the hairline, m; negative outside of it.
-
-    Places are relative to the middle of the eyes.
-
-    The line goes over the forehead, down before the ears, round behind them and along the nape.
-    """
+    """Compute the distance [V] of places inside the hairline, m; negative outside of it."""
     crown = above - 0.06 + 0.25 * np.maximum(-ahead - 0.02, 0.0)
     sides = np.minimum(-ahead - 0.045, above - 0.012)
     back = np.minimum(-ahead - 0.112, above + 0.06)

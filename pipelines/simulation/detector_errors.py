@@ -251,11 +251,7 @@ def _correlated(shape: tuple[int, ...], rng: np.random.Generator) -> Float:
 
 
 def _swapped(frames: int, joints: tuple[str, ...], share: float, rng: np.random.Generator) -> Bool:
-    """Draw which joints [T, J] have their mirror's place: one limb of a pair at a time, for a few frames.
-
-    Runs of mean length L begin with the probability p per frame outside of them; the mean gap is then
-    (1 - p) / p, and the share of swapped frames s = L / (L + (1 - p) / p).
-    """
+    """Draw which joints [T, J] have their mirror's place: one limb of a pair at a time, for a few frames."""
     limbs = [_limb(joints, parts) for parts in _LIMBS]
     shortest, longest = SWAP_FRAMES
     length = (shortest + longest) / 2

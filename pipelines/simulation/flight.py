@@ -11,7 +11,7 @@ from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.poses import invert, transform
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
-from pipelines.simulation.body import Person, make_body
+from pipelines.simulation.body import PosablePerson, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
 from pipelines.simulation.flying import DronePaths, Planner, fly, fly_with, moments, ring_slots
 from pipelines.simulation.motion.retarget import retarget
@@ -27,7 +27,7 @@ from pipelines.simulation.recording import (
 )
 from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Actor, Scenario
-from pipelines.simulation.surfaces import Surface, hidden_by
+from pipelines.simulation.surfaces import TriangleSurface, hidden_by
 from pipelines.simulation.world.scene import World, build_world
 from pipelines.simulation.world.solids import raise_mounds
 
@@ -64,7 +64,7 @@ class SimulatedPerson:
 
     name: str
     look: Actor
-    person: Person
+    person: PosablePerson
     moving: Moving  # at any seconds since the flight's start
     motion: BodyMotion  # at the moments T
     joints: Float  # [T, J, 3] m, of `person.joints`
@@ -72,7 +72,7 @@ class SimulatedPerson:
     estimate_ns: Int64  # [A] since the flight's start
     estimate: Float  # [A, 3] m, where the hip was thought to be
 
-    def surface(self, row: int) -> Surface:
+    def surface(self, row: int) -> TriangleSurface:
         """Return the person's surface at one of the moments T."""
         return self.person.surface(self.motion.root[row], self.motion.rotation[row])
 
@@ -99,7 +99,7 @@ class Performer:
 
     name: str
     look: Actor
-    person: Person
+    person: PosablePerson
     moving: Moving  # the person's motion at seconds since the flight's start
 
 
@@ -201,14 +201,7 @@ def visible_joints(
 def _at_their_rows(
     flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson
 ) -> tuple[Int64, Float, Float, Float]:
-    """Find the time at which each joint's row is read, and what is where then.
-
-    The row depends on the time and the time on the row: a step of the fixed point iteration leaves of an
-    error the share that an image moves up or down during the readout, some percent of the picture.
-
-    Returns:
-        [F, J] ns since the flight's start; joints [F, J, 3] m; the camera's poses, [F, J, 3] and [F, J, 4].
-    """
+    """Find the time at which each joint's row is read, and what is where then."""
     lens, stamps = drone.intrinsics, drone.at_frames.t_ns
     nodes_s = _nodes_s(lens)
     near = _during_readouts(flight, drone, person)
@@ -281,11 +274,7 @@ def keypoints_of(
 
 
 def _usable(lens: Intrinsics) -> Intrinsics:
-    """Return the same camera, if its distortion reaches the whole picture.
-
-    Raises:
-        DataError: no ray reaches a corner.
-    """
+    """Return the same camera, if its distortion reaches the whole picture."""
     right, bottom = lens.width - 0.5, lens.height - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
     if np.isnan(undistort(corners, lens)).any():
@@ -342,15 +331,7 @@ def _person(
 
 
 def _hidden_by_person(other: SimulatedPerson, around: Float, t_ns: Int64, eye: Float, joints: Float) -> Bool:
-    """Find the joints [F, J] of somebody that a person's body hides.
-
-    Args:
-        other: who may stand in the way.
-        around: [F, J, 3, N] m, their own joints during the readout of each picture.
-        t_ns: [F, 1] or [F, J], when the joints were taken, since the flight's start.
-        eye: [F, 1, 3] or [F, J, 3] m, of the camera at those times.
-        joints: [F, J, 3] m.
-    """
+    """Find the joints [F, J] of somebody that a person's body hides."""
     low, high = around.min(axis=(1, 3)) - _REACH_M, around.max(axis=(1, 3)) + _REACH_M
     near = _meets_box(eye, joints, low[:, None], high[:, None])
     # A global shutter takes all joints of a picture at once, a rolling one each of them at a time of its own.
@@ -378,7 +359,7 @@ def _meets_box(start: Float, end: Float, low: Float, high: Float) -> Bool:
 
 
 def _moving(
-    actor: Actor, person: Person, scenario: Scenario, bvh: SkeletalMotion | None, seed: int
+    actor: Actor, person: PosablePerson, scenario: Scenario, bvh: SkeletalMotion | None, seed: int
 ) -> Moving:
     """The actor's motion as a function of time since the flight's start."""
     terrain = raise_mounds(scenario.world.mounds)

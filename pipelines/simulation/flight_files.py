@@ -28,7 +28,7 @@ from pipelines.simulation.flying import LEVER_ARM
 _BOX_MARGIN = 0.15  # of the keypoints' extent, as a person detector's box is larger than the joints
 
 
-class Sighting(NamedTuple):
+class TrackedKeypoints(NamedTuple):
     """One person over all frames of one camera."""
 
     track: int  # the tracker's id of the person
@@ -66,7 +66,7 @@ def write_people(path: Path, t_ns: Int64, names: tuple[str, ...], people: Sequen
     write_lines(path, lines)
 
 
-def write_alphapose(path: Path, people: Iterable[Sighting]) -> None:
+def write_alphapose(path: Path, people: Iterable[TrackedKeypoints]) -> None:
     """Write keypoints as AlphaPose does with its tracker: a list of people, picture by picture.
 
     Frame k is picture `00000k.jpg`. Joints that were missed are 0, 0, 0; frames in which all of a person's
@@ -79,12 +79,12 @@ def write_alphapose(path: Path, people: Iterable[Sighting]) -> None:
     write_lines(path, ["[", ",\n".join(json.dumps(e, separators=(",", ":")) for _, e in entries), "]"])
 
 
-def _frames_with(person: Sighting) -> list[int]:
+def _frames_with(person: TrackedKeypoints) -> list[int]:
     frames: list[int] = np.flatnonzero(np.isfinite(person.xy).all(axis=-1).any(axis=-1)).tolist()
     return frames
 
 
-def _alphapose_entry(frame: int, person: Sighting) -> dict[str, object]:
+def _alphapose_entry(frame: int, person: TrackedKeypoints) -> dict[str, object]:
     xy, confidence = person.xy[frame], person.confidence[frame]
     keypoints = np.nan_to_num(np.concatenate([xy, confidence[:, None]], axis=1), nan=0.0)
     low, high = np.nanmin(xy, axis=0), np.nanmax(xy, axis=0)
@@ -142,7 +142,10 @@ def _visible_lines(flight: SimulatedFlight, drone: SimulatedDrone) -> list[str]:
 
 def write_keypoints(folder: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
     """Write what a detector would have found, as AlphaPose does, and the times of the pictures."""
-    people = [Sighting(1 + k, *keypoints_of(flight, drone, person)) for k, person in enumerate(flight.people)]
+    people = [
+        TrackedKeypoints(1 + k, *keypoints_of(flight, drone, person))
+        for k, person in enumerate(flight.people)
+    ]
     write_alphapose(folder / f"{drone.name}_keypoints.json", people)
     stamps = picture_stamps(flight, drone)
     lines = ["frame,t_ns", *(f"{frame},{stamp}" for frame, stamp in enumerate(stamps.tolist()))]

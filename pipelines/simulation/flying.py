@@ -23,7 +23,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
 from pipelines.geometry.mounting import attitude_from_angles, body_from_camera
 from pipelines.geometry.poses import look_at, multiply, quaternion_from_matrix, rotate
-from pipelines.simulation.scenario import Formation, Limits
+from pipelines.simulation.scenario import FormationSettings, Limits
 
 # How far a camera strays from its slot at `variation` 1. METHODS of the noise studies use the same
 # amounts: they make a constant error of each drone's poses observable.
@@ -134,7 +134,7 @@ def moments(first_s: float, last_s: float) -> Float:
     return first_s + np.arange(math.ceil((last_s - first_s) * 100 - 1e-6) + 1) / 100
 
 
-def ring_slots(formation: Formation, count: int, actor: Float, t_s: Float) -> Float:
+def ring_slots(formation: FormationSettings, count: int, actor: Float, t_s: Float) -> Float:
     """Compute slots [N, T, 3] m on a ring about the actor; obstacles are ignored.
 
     Args:
@@ -285,11 +285,7 @@ def _check(t_s: Float, *places: Float) -> None:
 
 
 def _leaning(acceleration: Float, velocity: Float, heading: Float) -> Float:
-    """Compute world_from_body [..., 4] of multirotors: up along the thrust, the nose above the heading.
-
-    Mellinger & Kumar 2011, "Minimum snap trajectory generation and control for quadrotors", Sec. III,
-    with drag against the velocity.
-    """
+    """Compute world_from_body [..., 4] of multirotors: up along the thrust, the nose above the heading."""
     thrust = acceleration + _DRAG_PER_S * velocity
     lift = np.maximum(thrust[..., 2] + _GRAVITY_MPS2, _LEAST_LIFT * _GRAVITY_MPS2)
     up = _unit(np.concatenate([thrust[..., :2], lift[..., None]], axis=-1))
@@ -330,10 +326,7 @@ def _shorten(vector: Float, longest: float) -> None:
 
 @helper
 def _approach(distance_m: float, braking_mps2: float) -> float:
-    """Compute the speed towards a slot: in proportion while near, such that it can stop while far.
-
-    The "square root controller" of ArduPilot: both parts and their slopes agree where they meet.
-    """
+    """Compute the speed towards a slot: in proportion while near, such that it can stop while far."""
     near = braking_mps2 / POSITION_GAIN_PER_S**2
     if distance_m <= near:
         return POSITION_GAIN_PER_S * distance_m
@@ -351,12 +344,7 @@ def _track(
     speed_limit: float,
     acceleration_limit: float,
 ) -> None:
-    """Fly from the first row of the last three arrays [N, T, 3], and write their other rows.
-
-    The acceleration is a mean of accelerations within the limit, so it keeps to the limit. A velocity
-    that would leave the ball of allowed ones is put back on it; as a ball is convex, that never lengthens
-    the step from a velocity inside, so the drone's true acceleration keeps to the limit as well.
-    """
+    """Fly from the first row of the last three arrays [N, T, 3], and write their other rows."""
     kept = _BRAKING_SHARE * acceleration_limit
     for n in range(position.shape[0]):
         at, moving, pushed = position[n, 0].copy(), velocity[n, 0].copy(), acceleration[n, 0].copy()

@@ -130,7 +130,7 @@ def _is_path(text: str) -> str:
     return text
 
 
-class Motion(YamlModel):
+class ActorMotion(YamlModel):
     """The actor's actions one after another, or a BVH file. At the end the actor stands, or begins again."""
 
     shorthand = "steps"
@@ -148,7 +148,7 @@ class Actor(YamlModel):
     body: Body = Body()
     start: Place = [0.0, 0.0]
     heading_deg: float = 0.0  # counterclockwise from east
-    motion: Motion
+    motion: ActorMotion
     estimate_sigma_m: float = Field(0.2, ge=0, le=10)  # of the actor's logged position, per axis
     estimate_rate_hz: float = Field(10.0, gt=0, le=100)
 
@@ -169,7 +169,7 @@ ActorName = Annotated[str, AfterValidator(_is_topic)]
 # --- the world -----------------------------------------------------------------------------------------
 
 
-class Ground(YamlModel):
+class GroundSquare(YamlModel):
     """The visible and mapped ground: a square about its centre."""
 
     centre: Place = [0.0, 0.0]
@@ -219,10 +219,10 @@ class Mapping(YamlModel):
     height_m: Metres = 12.0
 
 
-class World(YamlModel):
+class WorldSettings(YamlModel):
     """The surroundings: ground, mounds, trees, walls, the map and the sun."""
 
-    ground: Ground = Ground()
+    ground: GroundSquare = GroundSquare()
     mounds: Annotated[list[Mound], Field(max_length=100)] = []
     trees: Annotated[list[Tree], Field(max_length=2000)] = []
     wood: Wood | None = None
@@ -231,7 +231,7 @@ class World(YamlModel):
     sun: Annotated[list[float], Field(min_length=3, max_length=3)] = [0.45, -0.35, 0.82]  # towards it
 
     @model_validator(mode="after")
-    def _map_fits(self) -> World:
+    def _map_fits(self) -> WorldSettings:
         side = self.ground.size_m / self.map.resolution_m
         voxels = side * side * self.map.height_m / self.map.resolution_m
         if voxels > _MOST_VOXELS:
@@ -253,7 +253,7 @@ class World(YamlModel):
 # --- the drones ----------------------------------------------------------------------------------------
 
 
-class Formation(YamlModel):
+class FormationSettings(YamlModel):
     """Slots of the drones about the actor, at yaw + i 360/n (90 for two)."""
 
     planner: str = "ring"  # or a planner arm: adaptive, fixed, ...
@@ -333,7 +333,7 @@ class Drones(YamlModel):
     """The team."""
 
     count: int = Field(2, ge=1, le=16)
-    formation: Formation = Formation()
+    formation: FormationSettings = FormationSettings()
     limits: Limits = Limits()
     camera: Lens = Lens()
     odometry_hz: float = Field(50.0, ge=1, le=1000)
@@ -368,7 +368,7 @@ class Scenario(YamlModel):
     start_ns: SecondsAsNs = Field(1_700_000_000_000_000_000, alias="start")
     actor: Actor | None = None
     actors: dict[ActorName, Actor] | None = Field(None, min_length=1, max_length=_MOST_ACTORS)
-    world: World = World()
+    world: WorldSettings = WorldSettings()
     drones: Drones = Drones()
     keypoints: DetectorErrors = DetectorErrors()
 
@@ -411,7 +411,7 @@ class Scenario(YamlModel):
             return {"actor": self.actor}
         return dict(self.actors or {})
 
-    def motion_files(self, folder: Path) -> dict[str, tuple[Path, Motion]]:
+    def motion_files(self, folder: Path) -> dict[str, tuple[Path, ActorMotion]]:
         """Return the BVH files that are named, by actor; relative ones lie in a folder."""
         motions = {name: actor.motion for name, actor in self.people.items()}
         return {

@@ -19,7 +19,7 @@ from pipelines.geometry.metrics import common, measure
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import matrix_from_quaternion, rates
 from pipelines.geometry.triangulation import Views, estimate_noise, reprojection_px, triangulate_pictures
-from pipelines.simulation.body import Person, make_body
+from pipelines.simulation.body import PosablePerson, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
 from pipelines.simulation.flight import Performer
 from pipelines.simulation.flying import orbit
@@ -54,7 +54,7 @@ class Walk:
     """A person under way at the moments T of the pictures."""
 
     t_ns: Int64  # [T]
-    person: Person
+    person: PosablePerson
     height_m: float
     motion: BodyMotion  # at those moments
     joints: Float  # [T, J, 3] m, world, of `person.joints`
@@ -64,7 +64,7 @@ class Walk:
 
 
 @dataclass(frozen=True)
-class Formation:
+class CameraFormation:
     """Cameras N in their slots at the moments T."""
 
     position: Float  # [N, T, 3] m, world
@@ -73,7 +73,7 @@ class Formation:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class SimulatedKeypoints:
     """Keypoints of the person in every camera."""
 
     xy: Float  # [N, T, J, 2] px, NaN for joints that were not found
@@ -136,7 +136,7 @@ def _smoothed(at: Callable[[Float], BodyMotion], t_s: Float) -> Float:
     return np.stack([np.interp(t_s, middle_s, mean[:, k]) for k in range(3)], axis=-1)
 
 
-def formation(of: Walk, *, cameras: int, tilt_deg: float) -> Formation:
+def formation(of: Walk, *, cameras: int, tilt_deg: float) -> CameraFormation:
     """Place cameras in their slots: 360/n degrees apart, 90 for two, `RANGE_M` from the person."""
     position, quaternion = orbit(
         of.t_ns / 1e9,
@@ -146,10 +146,10 @@ def formation(of: Walk, *, cameras: int, tilt_deg: float) -> Formation:
         tilt_deg=tilt_deg,
         yaw_rate_deg_per_s=0.0,
     )
-    return Formation(position, quaternion, of.lens)
+    return CameraFormation(position, quaternion, of.lens)
 
 
-def exact_keypoints(of: Walk, seen_by: Formation) -> Sightings:
+def exact_keypoints(of: Walk, seen_by: CameraFormation) -> SimulatedKeypoints:
     """Compute the true keypoints in every picture."""
     xy = np.stack(
         [
@@ -157,10 +157,12 @@ def exact_keypoints(of: Walk, seen_by: Formation) -> Sightings:
             for pose in zip(seen_by.position, seen_by.quaternion_xyzw, strict=True)
         ]
     )
-    return Sightings(xy, np.isfinite(xy[..., 0]).astype(np.float64))
+    return SimulatedKeypoints(xy, np.isfinite(xy[..., 0]).astype(np.float64))
 
 
-def model_keypoints(of: Walk, seen_by: Formation, exact: Sightings, *, seed: int, trial: int) -> Sightings:
+def model_keypoints(
+    of: Walk, seen_by: CameraFormation, exact: SimulatedKeypoints, *, seed: int, trial: int
+) -> SimulatedKeypoints:
     """Simulate the keypoints of a detector with measured errors (`detector_errors`).
 
     The errors grow with tilt. They include joints that the body itself hides; there are no obstacles.
@@ -182,13 +184,13 @@ def model_keypoints(of: Walk, seen_by: Formation, exact: Sightings, *, seed: int
             )
         )
     xy, confidence = (np.stack(part) for part in zip(*found, strict=True))
-    return Sightings(xy, confidence)
+    return SimulatedKeypoints(xy, confidence)
 
 
 def views_of(
     of: Walk,
-    seen_by: Formation,
-    sightings: Sightings,
+    seen_by: CameraFormation,
+    sightings: SimulatedKeypoints,
     noise: Sequence[NoiseModel],
     *,
     seed: int,
@@ -238,8 +240,8 @@ def triangulate_robustly(views: Views) -> tuple[Views, Float]:
 
 def measure_arm(
     of: Walk,
-    seen_by: Formation,
-    sightings: Sightings,
+    seen_by: CameraFormation,
+    sightings: SimulatedKeypoints,
     views: Views,
     points: Float,
     *,

@@ -10,7 +10,7 @@ from pipelines.geometry.compilation import cached
 
 
 @dataclass(frozen=True)
-class Surface:
+class TriangleSurface:
     """Triangles with a colour at each corner, seen from both sides.
 
     `smooth` surfaces are shaded with normals averaged at their corners, others face by face. Where
@@ -24,7 +24,7 @@ class Surface:
     ground: bool = False
 
 
-def joined(*surfaces: Surface) -> Surface:
+def joined(*surfaces: TriangleSurface) -> TriangleSurface:
     """Join several surfaces of one kind to one.
 
     Raises:
@@ -33,7 +33,7 @@ def joined(*surfaces: Surface) -> Surface:
     if len({(s.smooth, s.ground) for s in surfaces}) != 1:
         raise ValueError("only surfaces of one kind can be joined")
     first = np.cumsum([0, *(len(s.vertices) for s in surfaces[:-1])])
-    return Surface(
+    return TriangleSurface(
         np.concatenate([s.vertices for s in surfaces]),
         np.concatenate([s.faces + k for s, k in zip(surfaces, first, strict=True)]).astype(np.int32),
         np.concatenate([s.colour for s in surfaces]),
@@ -42,7 +42,7 @@ def joined(*surfaces: Surface) -> Surface:
     )
 
 
-def hidden_by(surface: Surface, eye: Float, targets: Float) -> Bool:
+def hidden_by(surface: TriangleSurface, eye: Float, targets: Float) -> Bool:
     """Test if a surface, whose both sides hide, stands between an eye [3] and targets [N, 3] m, world.
 
     Exact up to rounding, which counts where a line runs through the edge of a triangle. False for a target

@@ -21,7 +21,7 @@ from pipelines.session.storage import read_json
 from pipelines.session.tables import TRUTH, read_motion
 from pipelines.simulation.detector_errors import see
 from pipelines.simulation.rendering.renderer import Renderer
-from pipelines.simulation.surfaces import Surface
+from pipelines.simulation.surfaces import TriangleSurface
 from tests.commands.test_replan import compare, refused, session_of
 from tests.keypoints.spotted_flights import spot_detector
 from tests.synthetic.flights import write_flight
@@ -135,7 +135,9 @@ def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: 
     lens = read_description(session).cameras["drone1"].intrinsics.intrinsics()
     rendered, shown = [], []
 
-    def picture(_: Renderer, position: Float, quaternion: Float, people: list[Surface], frame: int) -> object:
+    def picture(
+        _: Renderer, position: Float, quaternion: Float, people: list[TriangleSurface], frame: int
+    ) -> object:
         rendered.append([person.vertices.mean(axis=0) for person in people])
         shown.append([see(person, position, quaternion, lens) for person in joints[frame]])
         return np.zeros((360, 640, 3), np.uint8)

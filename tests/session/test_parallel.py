@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.detect import Block, _Order, detect_block
+from pipelines.detect import Block, _DetectionOrder, detect_block
 from pipelines.session.errors import DataError
 from pipelines.session.parallel import SharedSession, each_part
 from pipelines.session.registries import find_detector, hashes_of_models
@@ -52,7 +52,9 @@ def test_a_worker_refuses_another_session_another_program_and_other_models(tmp_p
     with refused("wrong-worker", "--scheduler"):
         replace(shared, code="0.0.0").opened()
     detector = find_detector(spot_detector(tmp_path))
-    order = _Order(shared, detector, hashes_of_models(detector), True, 1, Block("drone1", 0, 1), None)
+    order = _DetectionOrder(
+        shared, detector, hashes_of_models(detector), True, 1, Block("drone1", 0, 1), None
+    )
     (tmp_path / "pose.onnx").write_bytes(b"another model")
     with refused("wrong-worker", detector.name):
         detect_block(order)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector, rotate
-from pipelines.simulation.body import Person, make_body, moving_weights
+from pipelines.simulation.body import PosablePerson, make_body, moving_weights
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, BodyMotion, joint_centres
 from pipelines.simulation.scenario import Body
 
@@ -17,23 +17,23 @@ STILL = np.tile([0.0, 0.0, 0.0, 1.0], (len(BONES), 1))
 
 
 @pytest.fixture(scope="module", params=[("female", "heavy"), ("male", "slim")], ids="-".join)
-def person(request: pytest.FixtureRequest) -> Person:
+def person(request: pytest.FixtureRequest) -> PosablePerson:
     sex, build = request.param
     return make_body(Body.model_validate({"sex": sex, "build": build}))
 
 
-def random_motion(person: Person, frames: int = 5, seed: int = 0) -> BodyMotion:
+def random_motion(person: PosablePerson, frames: int = 5, seed: int = 0) -> BodyMotion:
     """Turn every bone by up to about a right angle from the neutral pose."""
     draw = np.random.default_rng(seed)
     rotation = quaternion_from_rotation_vector(draw.normal(0.0, 0.5, (frames, len(BONES), 3)))
     return BodyMotion(np.arange(frames) / 30, draw.normal(0.0, 5.0, (frames, 3)), rotation)
 
 
-def neutral(person: Person) -> BodyMotion:
+def neutral(person: PosablePerson) -> BodyMotion:
     return BodyMotion(np.zeros(1), person.rig.offset[:1], STILL[None])
 
 
-def test_it_stands_on_the_ground_as_tall_as_stated(person: Person) -> None:
+def test_it_stands_on_the_ground_as_tall_as_stated(person: PosablePerson) -> None:
     vertices = person.surface(person.rig.offset[0], STILL).vertices
     assert vertices[:, 2].min() == pytest.approx(0.0, abs=1e-12)
     # The crown is level, so soles (16 mm) and hair (16 mm or 10 mm) add to the height as they are.
@@ -42,7 +42,7 @@ def test_it_stands_on_the_ground_as_tall_as_stated(person: Person) -> None:
     assert above < 0.02 * 1.75
 
 
-def test_the_rig_is_neutral_and_the_same_on_both_sides(person: Person) -> None:
+def test_the_rig_is_neutral_and_the_same_on_both_sides(person: PosablePerson) -> None:
     offset = person.rig.offset
     for bone, name in enumerate(BONES):
         if name.startswith("left_"):
@@ -61,7 +61,7 @@ def test_the_rig_is_neutral_and_the_same_on_both_sides(person: Person) -> None:
         assert offset[BONE[f"{side}_toes"], 1] == 0
 
 
-def test_transforms_agree_with_the_rig(person: Person) -> None:
+def test_transforms_agree_with_the_rig(person: PosablePerson) -> None:
     """Both bones of a joint put it at the same place, that of `joint_centres`."""
     motion = random_motion(person)
     matrix, translation = person.skinning.transforms(motion.root, motion.rotation)
@@ -96,7 +96,7 @@ def test_a_bent_knee_keeps_its_girth(share: float) -> None:
         assert girth == pytest.approx(1.0, abs=1e-12)
 
 
-def test_all_follows_a_rigid_motion(person: Person) -> None:
+def test_all_follows_a_rigid_motion(person: PosablePerson) -> None:
     motion = random_motion(person)
     turn = quaternion_from_rotation_vector(np.array([0.4, -1.1, 2.0]))
     shift = np.array([120.0, -70.0, 12.0])
@@ -110,7 +110,7 @@ def test_all_follows_a_rigid_motion(person: Person) -> None:
     np.testing.assert_allclose(after, rotate(turn, before) + shift, atol=1e-11)
 
 
-def test_keypoints_lie_at_the_joints_and_the_same_on_both_sides(person: Person) -> None:
+def test_keypoints_lie_at_the_joints_and_the_same_on_both_sides(person: PosablePerson) -> None:
     places = dict(zip(person.joints, person.keypoints(neutral(person))[0], strict=True))
     centres = joint_centres(person.rig, neutral(person))[0]
     bones = {"knee": "shank", "ankle": "foot", "elbow": "forearm", "wrist": "hand"}

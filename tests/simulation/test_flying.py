@@ -23,11 +23,11 @@ from pipelines.simulation.flying import (
     moments,
     ring_slots,
 )
-from pipelines.simulation.scenario import Formation, Limits
+from pipelines.simulation.scenario import FormationSettings, Limits
 
 T_S = moments(0.0, 20.0)
 MIDDLE = np.tile([0.0, 0.0, 1.0], (len(T_S), 1))
-RING = Formation(radius_m=10.0, tilt_deg=15.0, yaw_rate_deg_per_s=20.0)
+RING = FormationSettings(radius_m=10.0, tilt_deg=15.0, yaw_rate_deg_per_s=20.0)
 TURN_RADPS, RADIUS_M = math.radians(20.0), 10.0 * math.cos(math.radians(15.0))
 SETTLED = T_S > 10.0  # the slowest mode of the loops decays within a second
 

@@ -19,14 +19,14 @@ from pipelines.simulation.recording import (
     poses_at,
     sample_log,
 )
-from pipelines.simulation.scenario import Formation, Lens, Limits
+from pipelines.simulation.scenario import FormationSettings, Lens, Limits
 
 
 def flight(rate_hz: int = 100) -> DronePaths:
     """Fly two drones that circle a walking actor for ten seconds."""
     t_s = moments(-1.0, 10.0)[:: 100 // rate_hz]
     actor = np.stack([1.2 * t_s, 0 * t_s, 1.0 + 0 * t_s], axis=1)
-    formation = Formation(yaw_rate_deg_per_s=15.0, variation=1.0)
+    formation = FormationSettings(yaw_rate_deg_per_s=15.0, variation=1.0)
     return fly(ring_slots(formation, 2, actor, t_s), actor, t_s, Limits())
 
 

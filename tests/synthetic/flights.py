@@ -18,7 +18,7 @@ from pipelines.geometry.noise import disturb
 from pipelines.geometry.poses import invert, look_at, rotation_vector_from_quaternion
 from pipelines.session.registries import noise_models
 from pipelines.simulation.detector_errors import see
-from pipelines.simulation.flight_files import Sighting, write_alphapose, write_joints, write_tum
+from pipelines.simulation.flight_files import TrackedKeypoints, write_alphapose, write_joints, write_tum
 from pipelines.simulation.flying import orbit
 from tests.synthetic.keypoints import KeypointNoise, detect
 from tests.synthetic.walk import COCO17, route, walk
@@ -124,10 +124,10 @@ def write_flight(
         write_tum(folder / f"{name}_true.tum", log_ns, true_position[k], true_quaternion[k])
 
         pixels.append(see(joints, position[k], quaternion[k], LENS))
-        people = [Sighting(1, *detect(pixels[-1], detector, rng))]
+        people = [TrackedKeypoints(1, *detect(pixels[-1], detector, rng))]
         if bystander:
             passing = see(_bystander(_seconds(t_ns)), position[k], quaternion[k], LENS)
-            people.insert(0, Sighting(2, *detect(passing, detector, rng)))
+            people.insert(0, TrackedKeypoints(2, *detect(passing, detector, rng)))
         keypoints = name if keypoint_format == "openpose" else f"{name}.json"
         KEYPOINT_WRITERS[keypoint_format](folder / keypoints, people)
         sources[name] = {
@@ -164,7 +164,7 @@ def film_at(flight: SyntheticFlight, name: str, t_ns: Int64) -> None:
     position, quaternion = _camera_poses(_seconds(t_ns), len(flight.cameras), static=False)
     pixels = see(_actor(_seconds(t_ns)), position[k], quaternion[k], LENS)
     folder = flight.manifest.parent
-    write_alphapose(folder / f"{name}.json", [Sighting(1, pixels, np.ones(pixels.shape[:2]))])
+    write_alphapose(folder / f"{name}.json", [TrackedKeypoints(1, pixels, np.ones(pixels.shape[:2]))])
     rows = [f"{frame},{stamp_ns}" for frame, stamp_ns in enumerate(t_ns.tolist())]
     (folder / f"{name}_times.csv").write_text("\n".join(["frame,t_ns", *rows]) + "\n", encoding="utf-8")
     flight.settings["cameras"][name]["frame_times"] = {"file": f"{name}_times.csv"}
@@ -231,12 +231,12 @@ def _write_pose_csv(path: Path, t_ns: Int64, position: Float, quaternion: Float)
     path.write_text("\n".join(["t_ns,x,y,z,qx,qy,qz,qw", *lines, ""]), encoding="utf-8")
 
 
-def _triples(person: Sighting, frame: int) -> list[float]:
+def _triples(person: TrackedKeypoints, frame: int) -> list[float]:
     rows = np.concatenate([person.xy[frame], person.confidence[frame, :, None]], axis=1)
     return [round(value, 4) for value in np.nan_to_num(rows).ravel().tolist()]
 
 
-def _write_coco(path: Path, people: list[Sighting]) -> None:
+def _write_coco(path: Path, people: list[TrackedKeypoints]) -> None:
     results = [
         {"image_id": frame, "category_id": 1, "keypoints": _triples(person, frame), "score": 1.0}
         for frame in range(len(people[0].xy))
@@ -246,7 +246,7 @@ def _write_coco(path: Path, people: list[Sighting]) -> None:
     path.write_text(json.dumps(results), encoding="utf-8")
 
 
-def _write_openpose(folder: Path, people: list[Sighting]) -> None:
+def _write_openpose(folder: Path, people: list[TrackedKeypoints]) -> None:
     folder.mkdir(exist_ok=True)
     for frame in range(len(people[0].xy)):
         content = {
@@ -260,7 +260,7 @@ def _write_openpose(folder: Path, people: list[Sighting]) -> None:
         (folder / f"picture_{frame:012d}_keypoints.json").write_text(json.dumps(content), encoding="utf-8")
 
 
-KEYPOINT_WRITERS: dict[str, Callable[[Path, list[Sighting]], None]] = {
+KEYPOINT_WRITERS: dict[str, Callable[[Path, list[TrackedKeypoints]], None]] = {
     "alphapose": write_alphapose,
     "coco": _write_coco,
     "openpose": _write_openpose,

@@ -127,10 +127,7 @@ def _idle(style: Style, t_s: Float, rate_hz: float, which: int) -> Float:
 
 
 def _wanted_height(rig: Rig, plan: Plan, speed: Float, run: Float, stride: Float) -> Float:
-    """Compute the wanted height of the pelvis above the ground.
-
-    For walkers it is slightly out of reach of the legs. For runners it bounces.
-    """
+    """Compute the wanted height of the pelvis above the ground."""
     moving = np.tanh(speed / 0.5)
     headroom = _STANDING_HEADROOM_M + moving * (_WALKING_HEADROOM_M - _STANDING_HEADROOM_M)
     upright = rig.height_of_pelvis + headroom

@@ -185,11 +185,7 @@ def _turned(point: Float, pitch: Float) -> Float:
 
 
 def _rolled(joint: Float, heel: Float, tip: Float, pitch: Float, bend: Float, softness_m: Float) -> Float:
-    """Compute the ankle's shift from its place with a flat sole, [T, 2] m, if one point stays put.
-
-    The point is the lower one of heel and tip; where both are as low, the change from one to the other is
-    spread over `softness_m` of the difference of their heights.
-    """
+    """Compute the ankle's shift from its place with a flat sole, [T, 2] m, if one point stays put."""
     heel_now = _turned(heel, pitch)
     tip_now = _turned(joint, pitch) + _turned(tip - joint, pitch + bend)
     lower = np.clip((tip_now[:, 1] - heel_now[:, 1]) / softness_m, -500.0, 500.0)
@@ -254,10 +250,7 @@ def two_bones(upper: Float, lower: Float, towards: Float, hinge: Float) -> tuple
 
 
 def _from_neutral(bone: Float) -> Float:
-    """Return the rotation [1, 4] of a bone's neutral direction straight down.
-
-    The axis of the rotation is square to the bone and to y.
-    """
+    """Return the rotation [1, 4] of a bone's neutral direction straight down."""
     down = bone / np.sqrt(np.sum(bone**2))
     left = np.array([0.0, 1.0, 0.0]) - down[1] * down
     left /= np.sqrt(np.sum(left**2))

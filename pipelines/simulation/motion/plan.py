@@ -15,7 +15,7 @@ _ROUNDED_M = 0.4  # a corner is cut over this far on either side
 
 
 @dataclass(frozen=True)
-class Part:
+class WayPart:
     """A straight line or an arc."""
 
     length_m: float
@@ -55,7 +55,7 @@ class Way:
     stay straight, an arc of radius r shrinks by 1 cm^2 / r, corners are cut, and both ends are kept.
     """
 
-    def __init__(self, start: Float, parts: Sequence[Part]) -> None:
+    def __init__(self, start: Float, parts: Sequence[WayPart]) -> None:
         from scipy.interpolate import CubicSpline
 
         self.length_m = sum(part.length_m for part in parts)
@@ -97,7 +97,7 @@ class Pace:
     knots: tuple[tuple[float, float, float], ...]
 
 
-def pace(parts: Sequence[Part]) -> Pace:
+def pace(parts: Sequence[WayPart]) -> Pace:
     """Compute speeds over time from a stand to a stand.
 
     Each part has its own speed where it is long enough for that.
@@ -309,13 +309,13 @@ class Plan:
             stretch, [(0.0, 0.0, 0.0)], first=LEFT if angle > 0 else RIGHT, least=_TURN_CADENCE
         )
 
-    def travel(self, parts: Sequence[Part]) -> None:
+    def travel(self, parts: Sequence[WayPart]) -> None:
         """Travel from a stand to a stand."""
         knots = pace(parts).knots
         stretch = self._along(parts, Pace(knots))
         self._step_through(stretch, knots, first=RIGHT)
 
-    def run_up(self, parts: Sequence[Part], speeds: Pace, plant_s: float, foot: int) -> None:
+    def run_up(self, parts: Sequence[WayPart], speeds: Pace, plant_s: float, foot: int) -> None:
         """Run so that `foot` strikes `plant_s` after the start, and take no step after that one.
 
         The caller plans the rest of the steps and sets the time.
@@ -332,7 +332,7 @@ class Plan:
 
     # --- steps of a stretch ----------------------------------------------------------------------------
 
-    def _along(self, parts: Sequence[Part], speeds: Pace) -> Stretch:
+    def _along(self, parts: Sequence[WayPart], speeds: Pace) -> Stretch:
         from scipy.interpolate import CubicHermiteSpline
 
         times, values, run = np.array(speeds.knots).T
@@ -401,10 +401,7 @@ class Plan:
     def _rhythm(
         self, stretch: Stretch, knots: Sequence[tuple[float, float, float]], count: int | None, least: float
     ) -> _Rhythm:
-        """Compute the cadence from the speed; steps are shorter where it is steep.
-
-        With `count`, so many steps are taken up to the last knot.
-        """
+        """Compute the cadence from the speed; steps are shorter where it is steep."""
         phase = self._phase(knots, least)
         duration_s = stretch.end_s - stretch.start_s
         since_s = np.linspace(-3.0, duration_s + 5.0, int((duration_s + 8.0) / 0.005))

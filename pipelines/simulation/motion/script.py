@@ -7,7 +7,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.simulation.motion import gait
 from pipelines.simulation.motion.body import Style, bodies
-from pipelines.simulation.motion.plan import LEFT, RIGHT, Pace, Part, Plan
+from pipelines.simulation.motion.plan import LEFT, RIGHT, Pace, Plan, WayPart
 from pipelines.simulation.rig import BONE, BodyMotion, Rig
 from pipelines.simulation.scenario import Step, Travel
 
@@ -120,7 +120,7 @@ def kick(plan: Plan, side: str, run_up_m: float) -> None:
     slow_s, stop_s = (plant_s + after for after in _AFTER_PLANT_S)
     knots = ((0.0, 0.0), (plant_s, speed), (slow_s, _SLOWED_TO * speed), (stop_s, 0.0))
     beyond_m = speed * ((1 + _SLOWED_TO) * (slow_s - plant_s) + _SLOWED_TO * (stop_s - slow_s)) / 2
-    way = Part(run_up_m + beyond_m, plan.heading, 0.0, speed, 1.0)
+    way = WayPart(run_up_m + beyond_m, plan.heading, 0.0, speed, 1.0)
     plant = plan.t_s + plant_s
     plan.run_up([way], Pace(tuple((t, v, 1.0) for t, v in knots)), plant_s, support)
     end = (plan.place, plan.heading)
@@ -215,17 +215,17 @@ def _once(steps: Sequence[Step], rig: Rig, plan: Plan, end_s: float) -> None:
             reach(plan, step.reach.side, step.reach.height_m, step.reach.seconds, shoulder_m, arm_m)
 
 
-def _ways_on(waiting: list[Step], plan: Plan) -> list[Part]:
+def _ways_on(waiting: list[Step], plan: Plan) -> list[WayPart]:
     """Take the ways off the script that lead on without a stop."""
     place, heading = plan.place, plan.heading
-    parts: list[Part] = []
+    parts: list[WayPart] = []
     while waiting and (travel := waiting[0].walk or waiting[0].jog):
         part = _part(travel, place, heading, jogs=waiting[0].jog is not None)
         if part.length_m > 0.05:
             if parts and abs(_nearest(part.heading - heading)) > _STOPS_AT_CORNER:
                 break
             # As an angle that goes on from the last one, so that the heading does not jump by a turn.
-            part = Part(
+            part = WayPart(
                 part.length_m, heading + _nearest(part.heading - heading), part.turn, part.speed_mps, part.run
             )
             parts.append(part)
@@ -234,13 +234,15 @@ def _ways_on(waiting: list[Step], plan: Plan) -> list[Part]:
     return parts
 
 
-def _part(travel: Travel, place: Float, heading: float, *, jogs: bool) -> Part:
+def _part(travel: Travel, place: Float, heading: float, *, jogs: bool) -> WayPart:
     speed = travel.speed_mps or (gait.JOG_SPEED_MPS if jogs else gait.WALK_SPEED_MPS)
     run = 1.0 if jogs or speed > gait.FASTEST_WALK_MPS else 0.0
     if travel.to is None:
-        return Part(float(travel.distance_m or 0.0), heading, float(np.radians(travel.turn_deg)), speed, run)
+        return WayPart(
+            float(travel.distance_m or 0.0), heading, float(np.radians(travel.turn_deg)), speed, run
+        )
     way = np.asarray(travel.to) - place
-    return Part(float(np.hypot(*way)), float(np.arctan2(way[1], way[0])), 0.0, speed, run)
+    return WayPart(float(np.hypot(*way)), float(np.arctan2(way[1], way[0])), 0.0, speed, run)
 
 
 def _nearest(angle: float) -> float:

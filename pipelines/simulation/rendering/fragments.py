@@ -9,7 +9,7 @@ from pipelines.geometry.compilation import cached
 from pipelines.simulation.rendering.raster import GROUND, NOTHING, SHIFTS_PX, SMOOTH, SUBROWS, Band, Mesh
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """The camera, and the land that goes on level where the ground's mesh ends."""
 
     position: Float  # [3] m
@@ -40,7 +40,9 @@ def room_for(count: int) -> Fragments:
 
 
 @cached
-def gather(band: Band, first_row: int, view: View, mesh: Mesh, fragments: Fragments, sky: Float32) -> int:
+def gather(
+    band: Band, first_row: int, view: CameraView, mesh: Mesh, fragments: Fragments, sky: Float32
+) -> int:
     """Find the fragments of a band's pixels, and their number.
 
     Samples of one face in one pixel become one fragment at their common centre, which lies on the face and

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float, Float32, Int32
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.compilation import cached
-from pipelines.simulation.surfaces import Surface
+from pipelines.simulation.surfaces import TriangleSurface
 
 SMOOTH, GROUND = 1, 2
 
@@ -30,7 +30,7 @@ class Mesh(NamedTuple):
     kind: NDArray[np.uint8]  # [F] SMOOTH and GROUND, or-ed
 
 
-def mesh_of(surfaces: Sequence[Surface]) -> Mesh:
+def mesh_of(surfaces: Sequence[TriangleSurface]) -> Mesh:
     """Join the surfaces, one after another; an empty mesh for none."""
     parts = [_single(surface) for surface in surfaces]
     return stacked(parts) if parts else _single(_EMPTY)
@@ -48,7 +48,7 @@ def stacked(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _single(surface: Surface) -> Mesh:
+def _single(surface: TriangleSurface) -> Mesh:
     vertices = np.ascontiguousarray(surface.vertices, np.float64)
     faces = np.ascontiguousarray(surface.faces, np.int32)
     kind = (SMOOTH if surface.smooth else 0) | (GROUND if surface.ground else 0)
@@ -81,7 +81,7 @@ def _corner_normals(vertices: Float, faces: Int32) -> Float32:
     return normals
 
 
-_EMPTY = Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+_EMPTY = TriangleSurface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
 
 SUBROWS = 4

@@ -9,7 +9,7 @@ from pipelines.geometry.arrays import Bool, Bytes, Float, Float32
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.simulation.rendering.camera import DistortingLens, developed
-from pipelines.simulation.rendering.fragments import View, gather, room_for
+from pipelines.simulation.rendering.fragments import CameraView, gather, room_for
 from pipelines.simulation.rendering.raster import (
     CENTRES_PX,
     GROUND,
@@ -27,7 +27,7 @@ from pipelines.simulation.rendering.raster import (
 )
 from pipelines.simulation.rendering.shading import ground_texture, paint, shade
 from pipelines.simulation.rendering.shadows import ShadowMap, shadow_map, sun_axes, sunlight
-from pipelines.simulation.surfaces import Surface
+from pipelines.simulation.surfaces import TriangleSurface
 
 _BAND_ROWS = 16  # pixel rows whose samples fit a processor's cache
 _STATIC_TEXEL_M, _STATIC_TEXELS = 0.02, 2048
@@ -35,12 +35,12 @@ _PERSON_TEXEL_M, _PERSON_TEXELS = 0.008, 1024
 _LEVEL_M = 0.05  # ground this close to its median height casts no shadow worth a map
 
 
-class Moment(NamedTuple):
+class ExposedMoment(NamedTuple):
     """The camera's pose and the people before it at one moment."""
 
     position: Float  # [3] m, of the camera in the world
     quaternion_xyzw: Float  # [4] world_from_camera
-    people: Sequence[Surface]  # whoever moves
+    people: Sequence[TriangleSurface]  # whoever moves
 
 
 class Renderer:
@@ -60,7 +60,9 @@ class Renderer:
             horizon.
     """
 
-    def __init__(self, static: Sequence[Surface], intrinsics: Intrinsics, *, sun: Float, seed: int) -> None:
+    def __init__(
+        self, static: Sequence[TriangleSurface], intrinsics: Intrinsics, *, sun: Float, seed: int
+    ) -> None:
         direction = np.asarray(sun, np.float64)
         if direction.shape != (3,) or not np.isfinite(direction).all() or direction[2] <= 0:
             raise ValueError(f"the sun must stand above the horizon, not at {direction.tolist()}")
@@ -75,7 +77,7 @@ class Renderer:
         self._static_shadows = _static_maps(self._static, self._axes)
 
     def picture(
-        self, position: Float, quaternion_xyzw: Float, people: Sequence[Surface], frame: int
+        self, position: Float, quaternion_xyzw: Float, people: Sequence[TriangleSurface], frame: int
     ) -> Bytes:
         """Render the camera's picture.
 
@@ -88,9 +90,11 @@ class Renderer:
         Returns:
             [H, W, 3] BGR; equal arguments give equal bytes.
         """
-        return self.exposed([Moment(position, quaternion_xyzw, people)], np.ones((1, self._size[0])), frame)
+        return self.exposed(
+            [ExposedMoment(position, quaternion_xyzw, people)], np.ones((1, self._size[0])), frame
+        )
 
-    def exposed(self, moments: Sequence[Moment], weights: Float, frame: int) -> Bytes:
+    def exposed(self, moments: Sequence[ExposedMoment], weights: Float, frame: int) -> Bytes:
         """Render what the camera sees while its rows are exposed.
 
         Args:
@@ -110,14 +114,14 @@ class Renderer:
         middle = np.asarray(moments[len(moments) // 2].position, np.float64)
         return developed(light, _noise_key(self._seed, frame, middle))
 
-    def _light(self, moment: Moment, part: slice) -> Float32:
+    def _light(self, moment: ExposedMoment, part: slice) -> Float32:
         """Render the light [R, W, 3] of some rows of the picture at one moment."""
         if self._lens is None:
             return self._pinhole_light(moment, part)
         needed = self._lens.rows(part)
         return self._lens.bent(self._pinhole_light(moment, needed), needed.start, part)
 
-    def _pinhole_light(self, moment: Moment, part: slice) -> Float32:
+    def _pinhole_light(self, moment: ExposedMoment, part: slice) -> Float32:
         """Render the same before the lens distorts it; rows count from `part.start` on."""
         width = self._intrinsics.width
         position = np.asarray(moment.position, np.float64)
@@ -128,7 +132,7 @@ class Renderer:
         pinhole = np.array(
             [self._intrinsics.fx, self._intrinsics.fy, self._intrinsics.cx, self._intrinsics.cy]
         )
-        view = View(position, rotation, pinhole, self._land)
+        view = CameraView(position, rotation, pinhole, self._land)
 
         triangles = projected(mesh.vertices, mesh.faces, position, rotation, self._intrinsics)
         first_band, last_band = part.start // _BAND_ROWS, -(-part.stop // _BAND_ROWS)
@@ -149,7 +153,11 @@ class Renderer:
         return light[part.start - top : part.stop - top]
 
     def silhouette(
-        self, position: Float, quaternion_xyzw: Float, person: Surface, others: Sequence[Surface] = ()
+        self,
+        position: Float,
+        quaternion_xyzw: Float,
+        person: TriangleSurface,
+        others: Sequence[TriangleSurface] = (),
     ) -> Bool:
         """Return the pixels [H, W] at whose centres the camera sees the person, without distortion.
 
@@ -161,7 +169,9 @@ class Renderer:
         mine: Bool = (seen != NOTHING) & (seen < len(person.faces))
         return mine
 
-    def depth(self, position: Float, quaternion_xyzw: Float, people: Sequence[Surface] = ()) -> Float32:
+    def depth(
+        self, position: Float, quaternion_xyzw: Float, people: Sequence[TriangleSurface] = ()
+    ) -> Float32:
         """Return the depth [H, W] m at pixels' centres, along the optical axis, without distortion.
 
         It is infinite where no surface is seen; poses are those of `picture`.
@@ -205,9 +215,6 @@ def _person_map(person: Mesh, axes: Float) -> ShadowMap:
 
 
 def _noise_key(seed: int, frame: int, position: Float) -> int:
-    """Compute the key of a picture's noise.
-
-    The position distinguishes the pictures that several cameras take of one frame.
-    """
+    """Compute the key of a picture's noise."""
     where = np.ascontiguousarray(position).view(np.uint32).tolist()
     return int(np.random.SeedSequence([seed, frame, *where]).generate_state(1, np.uint64)[0])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bytes, Float, Float32, Int32
 from pipelines.geometry.compilation import cached, helper
-from pipelines.simulation.rendering.fragments import Fragments, View
+from pipelines.simulation.rendering.fragments import CameraView, Fragments
 
 SUN_RGB = np.array([0.86, 0.79, 0.67])
 SKY_RGB = np.array([0.21, 0.25, 0.31])  # from above, on a level surface
@@ -24,7 +24,13 @@ HAZE_M = 700.0  # distance at which haze has half its effect
 
 
 def shade(
-    fragments: Fragments, count: int, sun: Float32, sky: Float32, first_row: int, view: View, light: Float32
+    fragments: Fragments,
+    count: int,
+    sun: Float32,
+    sky: Float32,
+    first_row: int,
+    view: CameraView,
+    light: Float32,
 ) -> None:
     """Write the light [R, W, 3] of the pixels of a band: the mean of the light at their samples.
 
@@ -121,7 +127,7 @@ def ground_texture(seed: int) -> GroundTexture:
     )
 
 
-def paint(texture: GroundTexture, fragments: Fragments, count: int, view: View) -> None:
+def paint(texture: GroundTexture, fragments: Fragments, count: int, view: CameraView) -> None:
     """Multiply the colours of ground fragments by the texture, averaged over each fragment's footprint.
 
     A pixel's footprint on the ground is longer than it is wide. Mip maps (Williams, "Pyramidal

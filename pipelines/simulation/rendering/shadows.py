@@ -82,10 +82,7 @@ def _cast(
     normal: Float32,
     sun: Float32,
 ) -> None:
-    """Remove the light that one map shades: bilinear comparisons over 3 x 3 texels.
-
-    After Reeves, Salesin & Cook, "Rendering antialiased shadows with depth maps" (1987).
-    """
+    """Remove the light that one map shades: bilinear comparisons over 3 x 3 texels."""
     rows, width = height.shape
     (ux, uy, uz), (vx, vy, vz), (wx, wy, wz) = axes
     per_m, u0, v0 = 1.0 / texel_m, corner[0] / texel_m + 0.5, corner[1] / texel_m + 0.5

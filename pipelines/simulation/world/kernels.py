@@ -136,11 +136,7 @@ def _meets_ground(
     start: tuple[float, float, float],
     way: tuple[float, float, float],
 ) -> bool:
-    """March along the line in steps that the slope bounds, but no shorter than the curvature allows.
-
-    The clearance c(t) = z - height falls by at most `slope * length - rise` per unit of t, so there is
-    no crossing before c / fall. A step of s metres over the ground leaves out dips of curvature * s^2 / 8.
-    """
+    """March along the line in steps that the slope bounds, but no shorter than the curvature allows."""
     length = math.hypot(way[0], way[1])
     fall = slope * length - way[2]
     least = math.sqrt(8 * GRAZE_M / curvature) / length  # inf over flat ground and for upright lines

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.records import Occupancy
 from pipelines.simulation import scenario
-from pipelines.simulation.surfaces import Surface
+from pipelines.simulation.surfaces import TriangleSurface
 from pipelines.simulation.world import kernels
 from pipelines.simulation.world.solids import (
+    MoundedGround,
     Obstacles,
-    Terrain,
     erect,
     ground_surface,
     plant,
@@ -27,8 +27,8 @@ from pipelines.simulation.world.solids import (
 class World:
     """The surroundings: ground with mounds, trees, walls. The ground goes on beyond its square."""
 
-    ground: scenario.Ground
-    terrain: Terrain
+    ground: scenario.GroundSquare
+    terrain: MoundedGround
     obstacles: Obstacles
     seed: int
 
@@ -40,7 +40,7 @@ class World:
         """Compute unit normals [..., 3] of the ground, pointing up, at points [..., 2]."""
         return self.terrain.normal(xy)
 
-    def surfaces(self) -> list[Surface]:
+    def surfaces(self) -> list[TriangleSurface]:
         """Return the visible surfaces: the ground out to the horizon, then trunks, crowns and walls if any.
 
         The ground is within 2 cm of `height`, trunks within 4 % of their radius, walls exact. Crowns are
@@ -94,7 +94,7 @@ class World:
         )
 
 
-def build_world(spec: scenario.World, seed: int, *, keep_clear: Float) -> World:
+def build_world(spec: scenario.WorldSettings, seed: int, *, keep_clear: Float) -> World:
     """Raise the mounds, plant the wood, stand trees and walls on the ground.
 
     `keep_clear` [K, 2] m are points of the actor's way, which the wood keeps clear of. Trees with a place
@@ -120,8 +120,8 @@ _MOST_SAMPLES = 16  # along a voxel
 
 
 def map_world(
-    ground: scenario.Ground,
-    terrain: Terrain,
+    ground: scenario.GroundSquare,
+    terrain: MoundedGround,
     obstacles: Obstacles,
     *,
     resolution_m: float,
@@ -150,7 +150,7 @@ def map_world(
 
 
 def _filled_ground(
-    terrain: Terrain, low: NDArray[np.int64], shape: tuple[int, int, int], side_m: float
+    terrain: MoundedGround, low: NDArray[np.int64], shape: tuple[int, int, int], side_m: float
 ) -> Bool:
     # Between the corners of a square of side s a surface rises above them by at most curvature s^2 / 4:
     # linear interpolation errs by curvature r^2 / 2 within the circle of radius r = s / sqrt(2) around it.

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float, Int32, Int64
 from pipelines.session.errors import DataError
 from pipelines.simulation import scenario
-from pipelines.simulation.surfaces import Surface, joined
+from pipelines.simulation.surfaces import TriangleSurface, joined
 from pipelines.simulation.world import kernels
 
 
 @dataclass(frozen=True)
-class Terrain:
+class MoundedGround:
     """Mounds over z = 0: height = sum of h exp(-(a^2 + b^2) / 2).
 
     a and b are the distances from a mound's centre along its yawed axes, in its sigmas.
@@ -63,7 +63,7 @@ class Terrain:
         return total
 
 
-def raise_mounds(mounds: Sequence[scenario.Mound]) -> Terrain:
+def raise_mounds(mounds: Sequence[scenario.Mound]) -> MoundedGround:
     """Return the ground that a scenario describes."""
     rows = [
         (
@@ -75,7 +75,7 @@ def raise_mounds(mounds: Sequence[scenario.Mound]) -> Terrain:
         )
         for m in mounds
     ]
-    return Terrain(np.array(rows, dtype=np.float64).reshape(-1, 7))
+    return MoundedGround(np.array(rows, dtype=np.float64).reshape(-1, 7))
 
 
 def _rows(points: Float, columns: int) -> Float:
@@ -91,7 +91,7 @@ _FINEST = 17  # halvings of the whole: cells of 3 to 6 cm, however steep a mound
 _GRASS = (0.115, 0.15, 0.055)  # mean reflectance of a meadow; the texture of the ground varies it
 
 
-def ground_surface(ground: scenario.Ground, terrain: Terrain) -> Surface:
+def ground_surface(ground: scenario.GroundSquare, terrain: MoundedGround) -> TriangleSurface:
     """Triangulate the corners of a quadtree, whose cells are halved until the ground in them is flat.
 
     A linear triangle within a circle of radius r errs by at most curvature r^2 / 2 (r = side / sqrt 2).
@@ -109,10 +109,10 @@ def ground_surface(ground: scenario.Ground, terrain: Terrain) -> Surface:
     faces[turn < 0] = faces[turn < 0][:, ::-1]
     vertices = np.concatenate([xy, terrain.height(xy)[:, None]], axis=1)
     colour = np.tile(np.array(_GRASS, np.float32), (len(vertices), 1))
-    return Surface(vertices, faces, colour, smooth=True, ground=True)
+    return TriangleSurface(vertices, faces, colour, smooth=True, ground=True)
 
 
-def _corners(ground: scenario.Ground, terrain: Terrain, whole_m: float) -> tuple[Int64, float]:
+def _corners(ground: scenario.GroundSquare, terrain: MoundedGround, whole_m: float) -> tuple[Int64, float]:
     """Return the cells' corners [V, 2], in units of the finest cell's side, and that side in metres."""
     finest_m = whole_m / 2**_FINEST
     cells, side = np.zeros((1, 2), dtype=np.int64), 2**_FINEST
@@ -127,7 +127,9 @@ def _corners(ground: scenario.Ground, terrain: Terrain, whole_m: float) -> tuple
     return np.unique(np.concatenate(found), axis=0), finest_m
 
 
-def _too_wide(centre: Float, side_m: float, ground: scenario.Ground, terrain: Terrain) -> NDArray[np.bool_]:
+def _too_wide(
+    centre: Float, side_m: float, ground: scenario.GroundSquare, terrain: MoundedGround
+) -> NDArray[np.bool_]:
     """Find the cells [N] to be halved; centres [N, 2] are relative to the ground's middle."""
     outside = np.abs(centre).max(axis=1) - side_m / 2 - ground.size_m / 2
     allowed = np.maximum(1.001 * ground.size_m / _CELLS, _GROWTH * outside)
@@ -234,7 +236,9 @@ class Obstacles:
     slabs: Float  # [W, 8]
 
 
-def erect(terrain: Terrain, trees: Sequence[scenario.Tree], walls: Sequence[scenario.Wall]) -> Obstacles:
+def erect(
+    terrain: MoundedGround, trees: Sequence[scenario.Tree], walls: Sequence[scenario.Wall]
+) -> Obstacles:
     """Stand trees and walls on the ground.
 
     A tree's crown is the upper 62 % of its height; its trunk, 3 % of the height in radius, ends in the
@@ -251,23 +255,23 @@ def erect(terrain: Terrain, trees: Sequence[scenario.Tree], walls: Sequence[scen
     )
 
 
-def _foot(terrain: Terrain, tree: scenario.Tree) -> float:
+def _foot(terrain: MoundedGround, tree: scenario.Tree) -> float:
     return float(terrain.height(np.array(tree.position)))
 
 
-def _trunk(terrain: Terrain, tree: scenario.Tree) -> tuple[float, ...]:
+def _trunk(terrain: MoundedGround, tree: scenario.Tree) -> tuple[float, ...]:
     foot, radius = _foot(terrain, tree), min(_TRUNK_SHARE * tree.height_m, tree.crown_radius_m)
     buried = min(0.1 + radius * terrain.slope, _MOST_BURIED_M)
     return (*tree.position, foot - buried, foot + (1 - _CROWN_SHARE / 2) * tree.height_m, radius)
 
 
-def _crown(terrain: Terrain, tree: scenario.Tree) -> tuple[float, ...]:
+def _crown(terrain: MoundedGround, tree: scenario.Tree) -> tuple[float, ...]:
     upright = _CROWN_SHARE / 2 * tree.height_m
     centre = _foot(terrain, tree) + tree.height_m - upright
     return (*tree.position, centre, tree.crown_radius_m, upright)
 
 
-def _slab(terrain: Terrain, k: int, wall: scenario.Wall) -> tuple[float, ...]:
+def _slab(terrain: MoundedGround, k: int, wall: scenario.Wall) -> tuple[float, ...]:
     start, end = np.array(wall.start), np.array(wall.end)
     length = math.hypot(*(end - start))
     if length == 0:
@@ -298,7 +302,7 @@ _BLOCK_M = (0.6, 0.3)  # length and height of a wall's stones
 _MOST_BLOCKS = (120, 20)  # along and up a wall; longer walls have larger stones
 
 
-def tree_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
+def tree_surfaces(obstacles: Obstacles, seed: int) -> list[TriangleSurface]:
     """Draw all trunks as one surface and all crowns as another; nothing without trees."""
     if not len(obstacles.trunks):
         return []
@@ -311,7 +315,7 @@ def tree_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
     return [joined(*trunks), joined(*crowns)]
 
 
-def wall_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
+def wall_surfaces(obstacles: Obstacles, seed: int) -> list[TriangleSurface]:
     """Draw all walls as one surface, stone by stone; nothing without walls."""
     if not len(obstacles.slabs):
         return []
@@ -322,7 +326,7 @@ def wall_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
     return [joined(*walls)]
 
 
-def _drawn_trunk(trunk: Float, rng: np.random.Generator) -> Surface:
+def _drawn_trunk(trunk: Float, rng: np.random.Generator) -> TriangleSurface:
     """Draw a prism of the trunk's cross-section, its bark mottled."""
     x, y, low, high, radius = trunk
     bearing = np.arange(_SIDES) * (2 * np.pi / _SIDES)
@@ -340,15 +344,11 @@ def _drawn_trunk(trunk: Float, rng: np.random.Generator) -> Surface:
         ]
     )
     tone = rng.uniform(0.7, 1.3, len(vertices))
-    return Surface(vertices, _split(quads), _colours(np.array(_BARK), tone), smooth=True)
+    return TriangleSurface(vertices, _split(quads), _colours(np.array(_BARK), tone), smooth=True)
 
 
-def _drawn_crown(crown: Float, sphere: tuple[Float, Int32], rng: np.random.Generator) -> Surface:
-    """Draw clusters of leaves around the middle: the outermost of some balls in every direction.
-
-    An outline shows the outermost leaves. A high mean of the radius over all directions is therefore scaled
-    to 1, so that outlines are as large as the ellipsoid's.
-    """
+def _drawn_crown(crown: Float, sphere: tuple[Float, Int32], rng: np.random.Generator) -> TriangleSurface:
+    """Draw clusters of leaves around the middle: the outermost of some balls in every direction."""
     direction, faces = sphere
     middle = _spread(_CLUSTERS, rng) * rng.uniform(0.58, 0.66, _CLUSTERS)[:, None]
     size = rng.uniform(0.38, 0.46, _CLUSTERS)
@@ -364,10 +364,10 @@ def _drawn_crown(crown: Float, sphere: tuple[Float, Int32], rng: np.random.Gener
     tone = rng.uniform(0.75, 1.25, _CLUSTERS)[nearest] * (0.5 + 0.5 * depth)  # dark between the clusters
     tone *= rng.uniform(0.75, 1.25, len(radius))
     vertices = crown[:3] + direction * radius[:, None] * crown[[3, 3, 4]]
-    return Surface(vertices, faces, _colours(green, tone), smooth=False)
+    return TriangleSurface(vertices, faces, _colours(green, tone), smooth=False)
 
 
-def _drawn_wall(slab: Float, rng: np.random.Generator) -> Surface:
+def _drawn_wall(slab: Float, rng: np.random.Generator) -> TriangleSurface:
     """Draw four sides and the top, of stones that differ in tone."""
     x, y, cos, sin, length, thickness, low, high = slab
     along, across = np.array([cos, sin, 0.0]), np.array([-sin, cos, 0.0])
@@ -385,7 +385,7 @@ def _drawn_wall(slab: Float, rng: np.random.Generator) -> Surface:
     return joined(*(_stones(*side, rng) for side in sides))
 
 
-def _stones(corner: Float, along: Float, up: Float, rng: np.random.Generator) -> Surface:
+def _stones(corner: Float, along: Float, up: Float, rng: np.random.Generator) -> TriangleSurface:
     """Draw a rectangle of stones, each with four corners of its own; seen from `along` x `up`."""
     columns, rows = (
         min(max(1, round(float(np.sqrt((edge**2).sum())) / size)), most)
@@ -397,7 +397,7 @@ def _stones(corner: Float, along: Float, up: Float, rng: np.random.Generator) ->
     vertices = (corner + s[..., None] * along + t[..., None] * up).reshape(-1, 3)
     tone = np.repeat(rng.uniform(0.75, 1.2, len(u)), 4) * rng.uniform(0.92, 1.08, 4 * len(u))
     quads = np.arange(4 * len(u)).reshape(-1, 4)
-    return Surface(vertices, _split(quads), _colours(np.array(_STONE), tone), smooth=False)
+    return TriangleSurface(vertices, _split(quads), _colours(np.array(_STONE), tone), smooth=False)
 
 
 def _split(quads: NDArray[np.int64]) -> Int32:
@@ -410,10 +410,7 @@ def _colours(colour: Float, tone: Float) -> NDArray[np.float32]:
 
 
 def _spread(count: int, rng: np.random.Generator) -> Float:
-    """Draw unit vectors [count, 3], evenly about the sphere (a Fibonacci spiral).
-
-    They are turned and shaken at random.
-    """
+    """Draw unit vectors [count, 3], evenly about the sphere (a Fibonacci spiral)."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     bearing = k * (np.pi * (1 + math.sqrt(5))) + rng.uniform(0, 2 * np.pi)
@@ -425,10 +422,7 @@ def _spread(count: int, rng: np.random.Generator) -> Float:
 
 
 def _sphere(halvings: int) -> tuple[Float, Int32]:
-    """Return directions and triangles of an icosahedron whose edges were halved some times.
-
-    There are 20 * 4^halvings triangles.
-    """
+    """Return directions and triangles of an icosahedron whose edges were halved some times."""
     g = (1 + math.sqrt(5)) / 2
     # Three golden rectangles; every triangle joins three corners that are mutually 2 apart.
     corners = np.array([np.roll((0.0, a, b * g), k) for k in range(3) for a in (-1, 1) for b in (-1, 1)])

@@ -22,10 +22,10 @@ from pipelines.geometry.poses import (
 )
 from pipelines.simulation.body import make_body
 from pipelines.simulation.rendering.camera import EXPOSURE, STEP_S, exposed_moments
-from pipelines.simulation.rendering.renderer import Moment, Renderer
+from pipelines.simulation.rendering.renderer import ExposedMoment, Renderer
 from pipelines.simulation.rig import BONES
 from pipelines.simulation.scenario import Body
-from pipelines.simulation.surfaces import Surface, hidden_by
+from pipelines.simulation.surfaces import TriangleSurface, hidden_by
 
 Pose = tuple[Float, Float]
 
@@ -52,11 +52,13 @@ def rays(pose: Pose, intrinsics: Intrinsics = CAMERA) -> Float:
     return rotate(pose[1], np.concatenate([normalised, np.ones((*x.shape, 1))], axis=-1))
 
 
-def surface(vertices: Float, faces: NDArray[np.int32], grey: float = 0.5, *, smooth: bool = False) -> Surface:
-    return Surface(vertices, faces, np.full((len(vertices), 3), grey, np.float32), smooth)
+def surface(
+    vertices: Float, faces: NDArray[np.int32], grey: float = 0.5, *, smooth: bool = False
+) -> TriangleSurface:
+    return TriangleSurface(vertices, faces, np.full((len(vertices), 3), grey, np.float32), smooth)
 
 
-def rectangle(centre: Float, along: Float, across: Float, grey: float = 0.5) -> Surface:
+def rectangle(centre: Float, along: Float, across: Float, grey: float = 0.5) -> TriangleSurface:
     """Make a rectangle of two triangles; `along` and `across` are half its sides."""
     corners = np.stack(
         [centre - along - across, centre + along - across, centre + along + across, centre - along + across]
@@ -64,13 +66,13 @@ def rectangle(centre: Float, along: Float, across: Float, grey: float = 0.5) -> 
     return surface(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), grey)
 
 
-def level(half_m: float, height_m: float = 0.0, grey: float = 0.5) -> Surface:
+def level(half_m: float, height_m: float = 0.0, grey: float = 0.5) -> TriangleSurface:
     return rectangle(
         np.array([0.0, 0.0, height_m]), np.array([half_m, 0.0, 0.0]), np.array([0.0, half_m, 0.0]), grey
     )
 
 
-def box(low: Float, high: Float) -> Surface:
+def box(low: Float, high: Float) -> TriangleSurface:
     """Make a box of twelve triangles."""
     corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -78,7 +80,7 @@ def box(low: Float, high: Float) -> Surface:
     return surface(np.where(corner == 1, high, low), np.array(faces, np.int32))
 
 
-def sphere(centre: Float, radius: float, sectors: int = 48, rings: int = 24) -> Surface:
+def sphere(centre: Float, radius: float, sectors: int = 48, rings: int = 24) -> TriangleSurface:
     """Make a sphere with corners on its surface, each counted once."""
     polar = np.linspace(0, np.pi, rings + 1)[1:-1, None]
     turn = np.arange(sectors) * 2 * np.pi / sectors
@@ -96,7 +98,7 @@ def sphere(centre: Float, radius: float, sectors: int = 48, rings: int = 24) -> 
     return surface(centre + radius * vertices, np.array(faces, np.int32), smooth=True)
 
 
-def renderer(*static: Surface, intrinsics: Intrinsics = CAMERA) -> Renderer:
+def renderer(*static: TriangleSurface, intrinsics: Intrinsics = CAMERA) -> Renderer:
     return Renderer(static, intrinsics, sun=SUN, seed=SEED)
 
 
@@ -152,8 +154,8 @@ def test_the_nearer_one_hides_the_farther() -> None:
     person = sphere(np.array([0.0, 0.0, 1.0]), 0.8)
     alone = renderer().silhouette(*pose, person)
     wall = rectangle(np.array([0.0, -2.0, 1.0]), np.array([3.0, 0.0, 0.0]), np.array([0.0, 0.0, 3.0]))
-    beyond = Surface(wall.vertices + np.array([0.0, 4.0, 0.0]), wall.faces, wall.colour)
-    half = Surface(wall.vertices + np.array([3.0, 0.0, 0.0]), wall.faces, wall.colour)
+    beyond = TriangleSurface(wall.vertices + np.array([0.0, 4.0, 0.0]), wall.faces, wall.colour)
+    half = TriangleSurface(wall.vertices + np.array([3.0, 0.0, 0.0]), wall.faces, wall.colour)
     assert alone.any()
     assert not renderer(wall).silhouette(*pose, person).any()
     assert np.array_equal(renderer(beyond).silhouette(*pose, person), alone)
@@ -280,9 +282,11 @@ def test_markers_lie_where_they_are_projected(exposure_s: float, readout_s: floa
         turned = multiply(pose[1], quaternion_from_rotation_vector(t_s * TURN_RADPS))
         return (pose[0] + t_s * np.array([1.0, 0.5, 0.0]), turned), places + t_s * FALL_MPS
 
-    def moment(t_s: float, seen: bool) -> Moment:
+    def moment(t_s: float, seen: bool) -> ExposedMoment:
         camera, centres = at(t_s)
-        return Moment(*camera, [surface_of_all([sphere(c, 0.12, 24, 12) for c in centres])] if seen else [])
+        return ExposedMoment(
+            *camera, [surface_of_all([sphere(c, 0.12, 24, 12) for c in centres])] if seen else []
+        )
 
     moments, weights = exposed_moments(lens.height, exposure_s=exposure_s, readout_s=readout_s)
     one = renderer(intrinsics=lens)
@@ -308,7 +312,7 @@ def test_markers_lie_where_they_are_projected(exposure_s: float, readout_s: floa
     assert (moved > 2.0) == (readout_s > 0)
 
 
-def surface_of_all(parts: list[Surface]) -> Surface:
+def surface_of_all(parts: list[TriangleSurface]) -> TriangleSurface:
     """Black, as one surface."""
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     return surface(

@@ -26,7 +26,7 @@ WALLS = [
 
 def site(**parts: object) -> World:
     """Build a world of the named parts, on a ground of 20 m."""
-    spec = scenario.World.model_validate({"ground": {"size_m": 20.0}, **parts})
+    spec = scenario.WorldSettings.model_validate({"ground": {"size_m": 20.0}, **parts})
     return build_world(spec, 3, keep_clear=NOBODY)
 
 

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float
-from pipelines.simulation.surfaces import Surface
+from pipelines.simulation.surfaces import TriangleSurface
 from tests.simulation.world.sites import everything, site
 
 
-def within_faces(surface: Surface, per_face: int) -> Float:
+def within_faces(surface: TriangleSurface, per_face: int) -> Float:
     """Draw random points of every triangle [F, K, 3]."""
     shares = np.random.default_rng(4).dirichlet([1, 1, 1], (len(surface.faces), per_face))
     points: Float = np.einsum("fkc,fcd->fkd", shares, surface.vertices[surface.faces])
     return points
 
 
-def face_normals(surface: Surface) -> Float:
+def face_normals(surface: TriangleSurface) -> Float:
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
     normals: Float = np.cross(b - a, c - a)
     return normals

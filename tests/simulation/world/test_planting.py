@@ -13,8 +13,8 @@ from tests.simulation.world.sites import NOBODY
 WAY = np.stack([np.linspace(-20, 20, 400), np.zeros(400)], axis=1)
 
 
-def spec(**wood: float) -> scenario.World:
-    return scenario.World.model_validate(
+def spec(**wood: float) -> scenario.WorldSettings:
+    return scenario.WorldSettings.model_validate(
         {
             "wood": wood,
             "walls": [{"start": [5.0, 5.0], "end": [5.0, 15.0]}],
@@ -49,4 +49,4 @@ def test_a_wood_that_does_not_fit_is_one_clear_line() -> None:
 def test_a_wall_needs_a_length() -> None:
     walls = [{"start": [0.0, 1.0], "end": [3.0, 1.0]}, {"start": [2.0, 2.0], "end": [2.0, 2.0]}]
     with pytest.raises(DataError, match=r"^world\.walls\[1\]: .*\[2\.0, 2\.0\]"):
-        build_world(scenario.World.model_validate({"walls": walls}), 1, keep_clear=NOBODY)
+        build_world(scenario.WorldSettings.model_validate({"walls": walls}), 1, keep_clear=NOBODY)

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.simulation import scenario
-from pipelines.simulation.world.solids import Terrain
+from pipelines.simulation.world.solids import MoundedGround
 from tests.simulation.world.sites import MOUNDS, everything, site
 
 
@@ -36,7 +36,7 @@ def test_heights_are_those_of_the_formula() -> None:
     assert np.array_equal(site().height(xy), np.zeros((20, 20)))
 
 
-def second_derivatives(terrain: Terrain, xy: Float) -> Float:
+def second_derivatives(terrain: MoundedGround, xy: Float) -> Float:
     """Compute the largest second derivative in any direction, [N].
 
     It is the spectral norm of the Hessian, by differences of slopes.
