@@ -25,6 +25,8 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
+from pipelines.reporting.studies import tables
+
 ROOT = Path(__file__).parents[1]
 PAGE, STORE = ROOT / "docs" / "results.md", ROOT / "docs" / "results.json"
 PLACE = ROOT / "build" / "results"
@@ -233,9 +235,10 @@ FILMED = {
         for name, scenario, start in (("jogging", "real_e3_jog", 4), ("soccer", "real_e3_soccer", 5))
     },
 }
+_WALK = "noise=none,low,medium,high method=robust seconds=20 trials=5"
 STUDIES = {
-    "study-tilt": "mocap study tilt=0,15,30,45,60 noise=none,low,medium,high",
-    "study-drones": "mocap study drones=2,3,4,5 noise=none,low,medium,high",
+    "study-tilt": f"mocap study tilt_deg=0:60:15 {_WALK} -o FOLDER",
+    "study-drones": f"mocap study robots=2,3,4,5 {_WALK} -o FOLDER",
 }
 
 
@@ -331,9 +334,14 @@ def measure_filmed() -> None:
 def measure_studies() -> None:
     """Study the error against tilt and against the number of drones."""
     for key, command in STUDIES.items():
-        _run(f"{command} --trials 5 -o {PLACE / key}")
-        lines = (PLACE / key / "summary.md").read_text(encoding="utf-8").splitlines()
-        keep(key, lines, command)
+        _run(command.replace("FOLDER", str(PLACE / key)))
+        lines: list[str] = []
+        for table in tables(_metrics(PLACE / key / "metrics.json")):
+            if table.title.startswith(("MPJPE, ", "Root-relative MPJPE")):
+                rows = [[row[0], *(cell.partition(" [")[0] for cell in row[2:])] for row in table.rows]
+                header = [f"noise; {table.title}", *table.header[2:]]
+                lines += [*markdown_table(header, rows), ""]
+        keep(key, lines[:-1], command)
 
 
 MEASURES: dict[str, Callable[[], None]] = {
@@ -355,8 +363,9 @@ def main() -> None:
     if options.check:
         sys.exit(0 if PAGE.read_text(encoding="utf-8") == page_of(read_store()) else f"{PAGE}: is old")
     if not options.page:
-        shutil.rmtree(PLACE, ignore_errors=True)
-        PLACE.mkdir(parents=True)
+        if not options.only:
+            shutil.rmtree(PLACE, ignore_errors=True)
+        PLACE.mkdir(parents=True, exist_ok=True)
         for name, measure in MEASURES.items():
             if options.only in (None, name):
                 measure()
