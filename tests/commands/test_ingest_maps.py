@@ -20,7 +20,7 @@ from tests.real_data import real_data
 from tests.synthetic.flights import SyntheticFlight
 from tests.synthetic.flights import write_flight as write_synthetic_flight
 from tests.synthetic.logs import Container, write_log
-from tests.synthetic.map_logs import as_bt, grid_entry, octomap_entry
+from tests.synthetic.map_logs import as_bt, octomap_entry
 
 SECOND = 10**9
 
@@ -123,44 +123,6 @@ def test_place_clock_and_axes_of_the_log_are_applied(tmp_path: Path) -> None:
     high = maps[-1].origin + (occupied.max(axis=0) + 1) * 0.5
     assert low == pytest.approx([105, -7, 1], abs=1e-9)
     assert high == pytest.approx([108, -6.5, 5], abs=1e-9)
-
-
-def test_maps_change_during_the_replay(tmp_path: Path) -> None:
-    """Check that the replay has no map before the first one, and reports this."""
-    flight = flight_with_maps(tmp_path, seconds=2.0)
-    flight.settings["logs"] = {"ground": {"file": flight.settings["map"]["file"], "clock": {"offset_s": 0.5}}}
-    flight.settings["map"] = {"file": "ground"}
-    flight.save()
-    succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust")
-    done = mocap("replan-compare", tmp_path / "flight.session", "--arms", "adaptive,fixed")
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"\bmap\b.* 0\.5 s ", done.stderr)
-
-
-def test_height_belongs_to_plans_of_logs(tmp_path: Path) -> None:
-    flight = flight_with_maps(tmp_path)
-    cells = np.zeros((8, 8), np.int8)
-    cells[2, 3] = 100
-    log = write_log(tmp_path / "logs", "plan", "ros2-mcap", [grid_entry(cells, int(flight.t_ns[0]))])
-    flight.settings["map"] = {"file": str(log.relative_to(tmp_path)), "height_m": 4}
-    flight.save()
-    succeeds("ingest", flight.manifest)
-    assert json.loads((tmp_path / "flight.session/session.json").read_text())["map"]["shape"] == [8, 8, 8]
-    flight.settings["map"] = {"file": "site/map.bt", "height_m": 4}
-    flight.save()
-    assert "height_m: " in refused("ingest", flight.manifest)
-
-
-def test_maps_of_another_day_are_refused(tmp_path: Path) -> None:
-    flight = flight_with_maps(tmp_path)
-    flight.settings["logs"] = {
-        "ground": {"file": flight.settings["map"]["file"], "clock": {"offset_s": 86400}}
-    }
-    flight.settings["map"]["file"] = "ground"
-    flight.save()
-    line = refused("ingest", flight.manifest)
-    assert re.search(r"flight\.yaml: map\.file .*: .*\bmap\b.*\bpictures\b.*`stamps: receive`", line)
 
 
 def test_truncated_maps_are_counted_or_refused(tmp_path: Path) -> None:

@@ -105,23 +105,6 @@ def test_one_kind_of_stamps_is_chosen_for_all(tmp_path: Path, others: list[Any],
     assert frames_with_poses(result.path) == FRAMES
 
 
-def test_logs_with_equal_clocks_keep_header_stamps_without_a_guess(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "drone1.mcap", poses("/drone1/pose", -40_000_000))
-    write_pictures(tmp_path, "drone1")
-    assert drafted(tmp_path)[1]["logs"]["drone1"] == {"file": "drone1.mcap", "stamps": "header"}
-
-
-def test_poses_without_a_header_have_the_time_of_receipt(tmp_path: Path) -> None:
-    entries = poses("/vrpn/pose", None, bare=True)
-    write_log(tmp_path, "drone1", "ros1", entries)
-    write_pictures(tmp_path, "drone1")
-    result, stated = drafted(tmp_path)
-    assert stated["cameras"]["drone1"]["pose"]["topic"] == "/vrpn/pose"
-    assert frames_with_poses(result.path) == FRAMES
-    table = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "drone1" / "poses.parquet")
-    assert table["t_ns"].tolist() == [entry.stamp_ns for entry in entries]
-
-
 def test_px4_messages_and_fixes_with_attitudes_are_drafted(tmp_path: Path) -> None:
     flight = write_flight(tmp_path / "x", cameras=1, seconds=1.0, clean=True)
     write_mcap(tmp_path / "drone1.mcap", px4_entries(drone_of(flight, 0), "/px4_1"))
@@ -295,24 +278,6 @@ def test_a_watch_beside_a_drone_on_earth_is_the_actor(tmp_path: Path) -> None:
     assert (tmp_path / "flight.session" / "actor.parquet").exists()
 
 
-def test_positions_alone_are_refused_with_the_attitudes_beside_them(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=1, seconds=0.2, clean=True)
-    place = {"header": header(START_NS, "gps"), "latitude": 47.5, "longitude": 8.5, "altitude": 400.0}
-    turned = {"header": header(START_NS, "base_link"), "orientation": {"w": 1.0}}
-    entries = [
-        Entry("/gps", "sensor_msgs/msg/NavSatFix", START_NS, place),
-        Entry("/imu/data", "sensor_msgs/msg/Imu", START_NS, turned),
-    ]
-    write_log(tmp_path, "flight", "ros1", entries)
-    for pose, wanted in (
-        ({"file": "flight.bag", "topic": "/gps", "of": "camera"}, "attitude: /imu/data"),
-        ({"file": "flight.bag", "preset": "mavros"}, "there is /gps, /imu/data"),
-    ):
-        flight.settings["cameras"]["drone1"]["pose"] = pose
-        flight.save()
-        assert wanted in refused("ingest", flight.manifest)
-
-
 def test_a_map_is_drafted_as_it_fits_and_its_crs_is_missing_beside_gps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -332,14 +297,6 @@ def test_a_map_is_drafted_as_it_fits_and_its_crs_is_missing_beside_gps(
     text = result.path.read_text(encoding="utf-8")
     result.path.write_text(text.replace("resolution_m: 0.4", "resolution_m: 0.4, crs: EPSG:32617"))
     assert "by its CRS, EPSG:32617" in refused("ingest", result.path)  # another place in that zone
-
-
-def test_a_map_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
-    (tmp_path / "site.pcd").write_text("VERSION .7\nFIELDS x y z\nSIZE 4 4 4\n")
-    write_pictures(tmp_path, "drone1")
-    result, stated = drafted(tmp_path)
-    assert "map" not in stated
-    assert tmp_path / "site.pcd" in result.left_out
 
 
 def test_each_vehicle_of_a_ground_station_s_log_goes_to_the_camera_of_its_number(tmp_path: Path) -> None:

@@ -68,17 +68,6 @@ def test_poses_of_the_body_become_those_of_the_camera(tmp_path: Path, container:
     assert result["mpjpe_mm"] < 0.5
 
 
-def test_a_topic_that_is_left_out_is_chosen_and_said(tmp_path: Path) -> None:
-    flight = write_logged_flight(tmp_path, "ros2-sqlite3")
-    for name in flight.cameras:
-        del flight.settings["cameras"][name]["pose"]["topic"]
-    flight.save()
-    done = mocap("ingest", flight.manifest)
-    assert done.returncode == 0
-    assert " /drone1/odometry, " in done.stderr
-    assert re.search(r"\bheader\b.*: drone1, drone2\b", done.stdout)
-
-
 def test_strict_refuses_what_is_salvaged_otherwise(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path, "ros1")
     succeeds("ingest", flight.manifest, "--strict")
@@ -113,18 +102,6 @@ def test_a_log_that_differs_from_its_own_checksum_is_said_and_refused_by_strict(
     assert f"{stated}: 1 {OTHER_CHECKSUM}" in refused("ingest", flight.manifest, "--strict")
 
 
-def test_missing_topic_lists_the_candidates(tmp_path: Path) -> None:
-    flight = write_logged_flight(tmp_path, "ros2-mcap")
-    flight.settings["cameras"]["drone1"]["pose"]["topic"] = "/drone1/odom"
-    flight.save()
-    line = refused("ingest", flight.manifest)
-    assert "/drone1/odom;" in line
-    assert "/drone1/odometry" in line
-    flight.settings["cameras"]["drone1"]["pose"]["topic"] = "/drone1/camera_info"
-    flight.save()
-    assert "CameraInfo" in refused("ingest", flight.manifest)
-
-
 @pytest.mark.parametrize("container", ["ros1", "mcap-cdr"])
 def test_truncated_log_is_salvaged_and_the_loss_is_said(tmp_path: Path, container: Container) -> None:
     flight = write_logged_flight(tmp_path, container, seconds=3.0)
@@ -141,23 +118,6 @@ def test_truncated_log_is_salvaged_and_the_loss_is_said(tmp_path: Path, containe
     assert stored["cameras"]["drone1"]["poses"]["dropped"] == {}
 
 
-def test_log_of_nothing_but_its_head_is_refused(tmp_path: Path) -> None:
-    flight = write_logged_flight(tmp_path, "mcap-cdr")
-    (log,) = [path for path in (tmp_path / "logs").iterdir() if path.name.startswith("drone2")]
-    log.write_bytes(log.read_bytes()[:40])
-    assert "drone2" in refused("ingest", flight.manifest)
-
-
-def test_bag_folder_without_metadata(tmp_path: Path) -> None:
-    flight = write_logged_flight(tmp_path, "ros2-sqlite3")
-    with_metadata, _ = ingested(tmp_path)
-    before = tables(with_metadata)
-    for metadata in (tmp_path / "logs").rglob("metadata.yaml"):
-        metadata.unlink()
-    succeeds("ingest", flight.manifest)
-    assert tables(with_metadata) == before
-
-
 def test_clock_that_jumps_in_flight_is_said_and_the_rest_is_used(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path, "mcap-cdr", seconds=2.0, jump_s=-30.0)
     done = mocap("ingest", flight.manifest)
@@ -168,33 +128,6 @@ def test_clock_that_jumps_in_flight_is_said_and_the_rest_is_used(tmp_path: Path)
     lost = stored["cameras"]["drone1"]["poses"]["dropped"]
     assert sum(lost.values()) + stored["cameras"]["drone1"]["poses"]["count"] == len(flight.t_ns)
     assert lost
-
-
-def test_clock_of_another_day_is_refused(tmp_path: Path) -> None:
-    flight = write_logged_flight(tmp_path, "mcap-cdr")
-    settings = flight.settings["cameras"]["drone1"]["pose"]
-    flight.settings["logs"] = {
-        "d1": {"file": settings["file"], "clock": {"offset_s": 3600}},
-    }
-    settings["file"] = "d1"
-    flight.save()
-    line = refused("ingest", flight.manifest)
-    assert "drone1" in line
-    assert "--max-pose-gap" in line
-
-
-def test_video_shorter_than_its_log_is_said(tmp_path: Path) -> None:
-    flight = write_logged_flight(tmp_path, "mcap-cdr", seconds=4.0)
-    camera = flight.settings["cameras"]["drone1"]
-    keypoints = tmp_path / camera["keypoints"]["file"]
-    people = json.loads(keypoints.read_text(encoding="utf-8"))
-    keypoints.write_text(json.dumps(people[:30]), encoding="utf-8")
-    del camera["video"]
-    camera["frame_times"] = {"start": int(flight.t_ns[0]) // 10**9, "fps": 30}
-    flight.save()
-    done = mocap("ingest", flight.manifest)
-    assert done.returncode == 0
-    assert re.search(r"drone1: .* 1\.0 s of 4\.0 s ", done.stderr)
 
 
 def test_keypoints_beyond_the_pictures_are_counted(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -157,13 +156,6 @@ def test_a_crs_that_is_none_is_refused(tmp_path: Path, crs: str) -> None:
     assert "EPSG:32632" in said
 
 
-def test_local_metres_are_no_coordinates_of_a_registered_grid(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=1, seconds=0.2, clean=True)
-    flight.settings["world"]["crs"] = ZONE
-    flight.save()
-    assert ZONE in refused("ingest", flight.manifest)
-
-
 @pytest.mark.parametrize(
     ("crs", "latitude_deg", "longitude_deg"), [("EPSG:6677", 36.0, 139 + 5 / 6), ("EPSG:27391", 58.0, 6.052)]
 )
@@ -172,19 +164,6 @@ def test_a_grid_whose_zero_is_in_its_country_is_flown_there(
 ) -> None:
     place = Projection(crs, "world.crs").first_place("poses", np.array([[0.0, 0.0, 30.0]]))
     assert (place.latitude_deg, place.longitude_deg) == pytest.approx((latitude_deg, longitude_deg), abs=2e-3)
-
-
-def test_another_zone_is_refused_by_the_distance(tmp_path: Path) -> None:
-    flight = flown_in_utm(tmp_path)
-    flight.settings["world"]["crs"] = "EPSG:32632"
-    flight.save()
-    assert "drone1.tum" in refused("ingest", flight.manifest)
-
-
-def test_without_pyproj_the_refusal_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flight = flown_in_utm(tmp_path)
-    monkeypatch.setitem(sys.modules, "pyproj", None)
-    assert 'pip install "pyproj' in refused("ingest", flight.manifest)
 
 
 @pytest.mark.parametrize(
@@ -241,16 +220,3 @@ def test_the_crs_in_a_cloud_places_it_unless_another_is_stated(
     else:
         assert [doubt.code for doubt in doubts] == ["origin"]
         assert doubts[0].evidence["apart_m"] == pytest.approx(apart_m, rel=0.5)
-
-
-def test_a_cloud_of_another_place_is_refused_by_its_own_crs(tmp_path: Path) -> None:
-    pyproj = pytest.importorskip("pyproj")
-    flight = flown_in_utm(tmp_path)
-    write_las(
-        tmp_path / "site.laz", np.array([[500000.0, 5300000.0, 400.0]]), crs=pyproj.CRS.from_epsg(25832)
-    )
-    flight.settings["map"] = "site.laz"
-    flight.save()
-    line = refused("ingest", flight.manifest)
-    assert "EPSG:25832" in line
-    assert "site.laz" in line

@@ -17,7 +17,7 @@ import pytest
 
 from pipelines.geometry.cameras import project
 from pipelines.session.description import read_description
-from pipelines.session.registries import EXPORTS, FORMATS, NOISE_MODELS
+from pipelines.session.registries import FORMATS
 from pipelines.session.stages import COMMANDS
 from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
@@ -135,14 +135,6 @@ def test_absurd_truth_is_counted_and_measures_nothing(
         succeeds("ingest", flight.manifest, "--strict")
 
 
-def test_truth_of_nothing_but_absurd_positions_is_refused(flight: SyntheticFlight, tmp_path: Path) -> None:
-    path = tmp_path / "truth.csv"
-    header, *rows = path.read_text(encoding="utf-8").splitlines()
-    rows = [",".join([*row.split(",")[:-3], "1e9", "1e9", "1e9"]) for row in rows]
-    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
-    assert re.search(rf"truth\.csv: .*\({len(rows)} ", refused("ingest", flight.manifest))
-
-
 def test_true_poses_that_are_left_out_are_counted(flight: SyntheticFlight, tmp_path: Path) -> None:
     path = tmp_path / "drone1_true.tum"
     rows = path.read_text(encoding="utf-8").splitlines()
@@ -152,18 +144,6 @@ def test_true_poses_that_are_left_out_are_counted(flight: SyntheticFlight, tmp_p
     assert re.search("^warning: drone1: true .*: 1 ", done.stderr, re.MULTILINE)
     dropped = session_json(tmp_path)["truth"]["poses_dropped"]
     assert {name: list(counts.values()) for name, counts in dropped.items()} == {"drone1": [1]}
-
-
-def test_log_of_nothing_but_nan(flight: SyntheticFlight, tmp_path: Path) -> None:
-    (tmp_path / "drone1.tum").write_text("1700000000.0 nan nan nan 0 0 0 1\n", encoding="utf-8")
-    assert refused("ingest", flight.manifest).startswith(f"mocap: {tmp_path}/drone1.tum: ")
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{}", "no JSON"])
-def test_empty_keypoint_file(flight: SyntheticFlight, tmp_path: Path, text: str) -> None:
-    (tmp_path / "drone2.json").write_text(text, encoding="utf-8")
-    assert "drone2.json: " in refused("ingest", flight.manifest)
-    assert not (tmp_path / "flight.session").exists()
 
 
 @pytest.mark.parametrize(
@@ -190,34 +170,12 @@ def test_camera_without_overlap_in_time(flight: SyntheticFlight) -> None:
     assert "frame_times.start" in line or "clocks" in line
 
 
-def test_static_camera_without_overlap_in_time(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=3, static=True, seconds=0.5)
-    flight.settings["cameras"]["drone3"]["frame_times"]["start"] = 1_700_000_600
-    flight.save()
-    line = refused("ingest", flight.manifest)
-    assert line.startswith(f"mocap: {flight.manifest}: cameras.drone3: frames ")
-    assert "overlap" in line
-
-
 def test_picture_size_that_disagrees_with_the_calibration(flight: SyntheticFlight) -> None:
     flight.settings["cameras"]["drone1"]["keypoints"]["image_size"] = [1920, 1200]
     flight.save()
     line = refused("ingest", flight.manifest)
     assert "cameras.drone1.intrinsics" in line
     assert "1920" in line
-
-
-def test_same_shape_at_another_size_is_rescaled_with_a_warning(flight: SyntheticFlight) -> None:
-    inline = flight.settings["cameras"]["drone1"]["intrinsics"]
-    for key in ("width", "height"):
-        inline[key] = inline[key] // 2
-    for key in ("fx", "fy", "cx", "cy"):
-        inline[key] = inline[key] / 2
-    flight.settings["cameras"]["drone1"]["keypoints"]["image_size"] = [1280, 720]
-    flight.save()
-    done = mocap("ingest", flight.manifest)
-    assert done.returncode == 0
-    assert "warning: drone1: " in done.stderr
 
 
 def test_an_inline_fisheye_without_distortion_is_equidistant(flight: SyntheticFlight, tmp_path: Path) -> None:
@@ -240,20 +198,6 @@ def test_keypoints_outside_the_calibrated_picture(flight: SyntheticFlight) -> No
     line = refused("ingest", flight.manifest)
     assert line.startswith(f"mocap: {flight.manifest}: cameras.drone1.intrinsics: ")
     assert "image_size: [W, H]" in line
-
-
-def test_joints_that_nobody_sees_have_a_status(flight: SyntheticFlight, tmp_path: Path) -> None:
-    nose = 0
-    for name in flight.cameras:
-        path = tmp_path / f"{name}.json"
-        people = json.loads(path.read_text(encoding="utf-8"))
-        for person in people:
-            person["keypoints"][3 * nose : 3 * nose + 3] = [0, 0, 0]
-        path.write_text(json.dumps(people), encoding="utf-8")
-    succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust")
-    skeleton = pd.read_parquet(tmp_path / "flight.session" / "reconstruct" / "skeleton.parquet")
-    assert set(skeleton.loc[skeleton["joint"] == "nose", "status"]) == {"not_detected"}
 
 
 def test_when_nothing_is_reconstructed_the_gate_is_named(tmp_path: Path) -> None:
@@ -319,16 +263,10 @@ HUGE = "0x" + "f" * 5000  # Python refuses to print it
     ("old", "new", "place"),
     [
         ("fps: 30", 'fps: "1e99999999"', "frame_times.fps"),
-        ("fps: 30", 'fps: "1e-99999999"', "frame_times.fps"),
         ("start: 1700000000.0", 'start: "1e999980"', "frame_times.start"),
-        ("start: 1700000000.0", "start: .nan", "frame_times.start"),
         ("schema: 1", f"schema: {HUGE}", "schema"),
-        ("fps: 30", f"fps: {HUGE}", "frame_times.fps"),
         ("schema: 1", f"schema: 1\n? [{HUGE}]\n: 1", "an integer of about 6000 digits"),
-        ("schema: 1", f"schema: 1\nname: {HUGE}", "name"),
-        ("schema: 1", f"schema: 1\n? {HUGE}\n: 1", "an integer of about 6000 digits"),
         ("file: k.json", f"file: k.json, first_frame: {10**30}", "keypoints.first_frame"),
-        ("file: k.json", f"file: k.json, image_size: [{10**30}, 480]", "keypoints.image_size"),
     ],
 )
 def test_numbers_beyond_all_bounds(tmp_path: Path, old: str, new: str, place: str) -> None:
@@ -378,17 +316,3 @@ def test_no_format_opens_a_pipe(tmp_path: Path) -> None:
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
-
-
-def test_unknown_export_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:
-    succeeds("ingest", flight.manifest)
-    assert ", ".join(EXPORTS.names()) in refused("export", tmp_path / "flight.session", "--to", "fbx")
-    assert "reconstruct" in refused("export", tmp_path / "flight.session", "--to", "trc")
-
-
-def test_unknown_noise_model_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:
-    succeeds("ingest", flight.manifest)
-    line = refused(
-        "reconstruct", tmp_path / "flight.session", "--method", "robust", "--pose-noise", "pink:position_m=1"
-    )
-    assert ", ".join(NOISE_MODELS.names()) in line

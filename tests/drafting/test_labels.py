@@ -14,11 +14,8 @@ from pipelines.drafting.labels import (
     UNNAMED,
     affinity,
     camera_names,
-    fitting,
     label_of,
     label_of_place,
-    unique,
-    words,
 )
 
 
@@ -38,11 +35,6 @@ from pipelines.drafting.labels import (
 )
 def test_names_of_the_same_drone_bear_one_label(name: str) -> None:
     assert affinity(label_of(name), label_of("drone1")) == EQUAL
-
-
-@pytest.mark.parametrize("name", ["odometry", "/camera/image_raw", "video", "poses_gt", "calibration", ""])
-def test_names_that_say_what_a_thing_is_say_not_whose(name: str) -> None:
-    assert label_of(name) == ()
 
 
 @pytest.mark.parametrize(
@@ -65,21 +57,10 @@ def test_affinity(one: str, other: str, expected: int) -> None:
     assert affinity(label_of(other), label_of(one)) == expected
 
 
-def test_place_without_a_name_is_called_after_its_folder() -> None:
-    assert label_of_place(("day1", "drone1", "video")) == label_of("drone1")
-    assert label_of_place(("left", "poses")) == label_of("left")
-
-
 def test_numbered_folders_tell_files_of_one_name_apart() -> None:
     one, other = label_of_place(("drone1", "DJI_0001")), label_of_place(("drone2", "DJI_0001"))
     assert affinity(one, other) == OTHER
     assert affinity(one, label_of("drone1")) == PART
-
-
-def test_a_number_of_its_own_belongs_to_the_word_before() -> None:
-    assert [word.key for word in words("DJI_0123")] == [("dji", 123)]
-    assert [word.key for word in words("drone1_0123")] == [("drone", 1), ("", 123)]
-    assert [word.text for word in words("a-07 b")] == ["a-07", "b"]
 
 
 @pytest.mark.parametrize(
@@ -105,9 +86,3 @@ def test_camera_names_are_always_fit_to_name_folders(texts: list[str]) -> None:
     assert len(names) == len(texts)
     assert all(re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name) for name in names)
     assert len({name.lower() for name in names}) == len(names)
-
-
-def test_names_that_are_taken_get_a_number() -> None:
-    assert unique("Log", ["log", "log_2"]) == "Log_3"
-    assert len(unique("x" * 64, ["x" * 64])) <= 64
-    assert fitting("a: b/../c", "camera") == "a_b_c"

@@ -107,7 +107,7 @@ def moved(flight: SyntheticFlight, x_by_frame: dict[int, list[float]]) -> None:
     path.write_text(json.dumps(people), encoding="utf-8")
 
 
-@pytest.mark.parametrize("slightly", [-49.0, -LENS.width / 8, LENS.width + 49.0, LENS.width * 9 / 8 - 1])
+@pytest.mark.parametrize("slightly", [-LENS.width / 8, LENS.width * 9 / 8 - 1])
 def test_keypoints_slightly_outside_are_kept_and_far_ones_left_out(tmp_path: Path, slightly: float) -> None:
     flight = write_flight(tmp_path, cameras=2, seconds=0.5, clean=True)
     succeeds("ingest", flight.manifest)
