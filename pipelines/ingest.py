@@ -54,22 +54,28 @@ from pipelines.session.tables import (
 from pipelines.session.urls import as_urls, located, media_path, named
 from pipelines.sources.cameras import FlightCameras
 from pipelines.sources.files import FlightFiles, fetch_sources, hash_sources, refuse_written, source_stamps
+from pipelines.sources.keypoints import (
+    doubt_numbers,
+    in_pixels,
+    near_picture,
+    unmirrored,
+    within,
+    without_repeats,
+    without_zeros,
+)
 from pipelines.sources.logs import FlightLogs, maps_of_log
 from pipelines.sources.parts import (
     CameraData,
     camera_entry,
-    near_picture,
     refuse_no_overlap,
     span_of_pictures,
     span_words,
     store_camera,
-    unmirrored,
-    within,
 )
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=9)
+INGEST = Stage("ingest", revision=10)
 
 T = TypeVar("T")
 
@@ -299,6 +305,8 @@ class _FlightReader:
         intrinsics = self._cameras.intrinsics(name, camera, video, detections)
         if detections is not None:
             if camera.keypoints:
+                detections = without_zeros(detections)
+                detections = in_pixels(detections, intrinsics, camera.keypoints.file)
                 detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics)
             detections = near_picture(detections, intrinsics)
         frames = self._cameras.frames(name, camera, video, detections, intrinsics)
@@ -306,6 +314,9 @@ class _FlightReader:
         if camera.pose_noise:
             noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", camera.pose_noise)
         if detections is not None:
+            numbers = doubt_numbers(detections, frames, from_video=video is not None)
+            if camera.keypoints and "first_frame" not in camera.keypoints.model_fields_set and numbers:
+                self._take_note(f"{name}: {numbers}")
             detections = within(detections, frames)
             if not len(detections.frame):
                 raise DataError(
@@ -314,6 +325,9 @@ class _FlightReader:
                     "check first_frame and frame_times",
                     code="no-overlap",
                 )
+            detections, repeats = without_repeats(detections, frames)
+            for repeat in repeats:
+                self._take_note(f"{name} {repeat}: they are left out")
         return CameraData(
             detections,
             detector_format,

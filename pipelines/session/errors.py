@@ -19,6 +19,7 @@ CODES = {
     "doubted": "the flight.yaml cannot be right, and --strict was given",
     "empty": "a file holds nothing",
     "exists": "something would be overwritten",
+    "keypoints-normalised": "The keypoints are shares of the picture, and not pixels.",
     "losses": "data were lost, and --strict was given",
     "missing-column": "a table lacks a column or a header",
     "missing-library": "a library that is not installed is needed",

@@ -1,8 +1,7 @@
 """Parts of a flight as they were read, and as a session stores them: tables, entries, doubts."""
 
-from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -46,10 +45,6 @@ MIN_COVERED_SHARE = 0.9
 
 # Logs run on for about a second after the video of a short flight.
 MIN_UNCOVERED_S = 1.0
-
-# Share of a picture's sides. Detectors search the box of a person; most of them pad it to 1.25 of its size.
-# If the box is as large as the picture, it then reaches an eighth beyond it: no detector looked further.
-MAX_EXTRAPOLATION = 1 / 8
 
 
 @dataclass(frozen=True)
@@ -233,79 +228,6 @@ def _keypoints_entry(camera: CameraSources, data: CameraData) -> KeypointsEntry 
         dropped=detections.dropped,
         adjusted=detections.adjusted,
         mirrored=camera.keypoints.mirrored,
-    )
-
-
-def unmirrored(detections: Detections, mirrored: bool | str, intrinsics: Intrinsics) -> Detections:
-    """Undo that keypoints were found in mirrored pictures.
-
-    Args:
-        detections: as the file has them.
-        mirrored: True, or of what: "x" alone counts from the right, "y" from below, or "names" alone have
-            left for right.
-        intrinsics: of the pictures.
-    """
-    if mirrored in (True, "x"):
-        xy = detections.xy.copy()
-        xy[..., 0] = intrinsics.width - 1 - xy[..., 0]
-        detections = replace(detections, xy=xy)
-    if mirrored == "y":
-        xy = detections.xy.copy()
-        xy[..., 1] = intrinsics.height - 1 - xy[..., 1]
-        detections = replace(detections, xy=xy)
-    if mirrored in (True, "names"):
-        order = [detections.joints.index(_other_side(name, detections.joints)) for name in detections.joints]
-        detections = replace(
-            detections, xy=detections.xy[:, order], confidence=detections.confidence[:, order]
-        )
-    return detections
-
-
-def _other_side(name: str, joints: tuple[str, ...]) -> str:
-    """Return the name of the same joint on the other side; its own if there is none."""
-    other = {"left": "right", "right": "left"}.get(name.partition("_")[0])
-    opposite = f"{other}_{name.partition('_')[2]}" if other else name
-    return opposite if opposite in joints else name
-
-
-def near_picture(detections: Detections, intrinsics: Intrinsics) -> Detections:
-    """Drop and count keypoints further outside the picture than a detector may extrapolate."""
-    size = np.array([intrinsics.width, intrinsics.height])
-    margin = MAX_EXTRAPOLATION * size
-    with np.errstate(invalid="ignore"):
-        beyond = (detections.xy < -0.5 - margin) | (detections.xy > size - 0.5 + margin)
-    far = np.asarray(beyond.any(axis=-1))
-    if not far.any():
-        return detections
-    lost = {"keypoints far outside the picture": int(far.sum())}
-    xy = np.where(far[..., None], np.nan, detections.xy)
-    confidence = np.where(far, 0.0, detections.confidence)
-    seen = np.isfinite(xy).any(axis=(1, 2))
-    if not seen.all():
-        lost["people far outside the picture"] = int((~seen).sum())
-    return replace(
-        detections,
-        frame=detections.frame[seen],
-        person=detections.person[seen],
-        xy=xy[seen],
-        confidence=confidence[seen],
-        dropped=dict(Counter(detections.dropped) + Counter(lost)),
-    )
-
-
-def within(detections: Detections, frames: CameraFrames) -> Detections:
-    """Keep the detections in frames that have a time; count the others."""
-    known = np.isin(detections.frame, frames.frame)
-    if known.all():
-        return detections
-    lost = {"detections in frames without a time": int((~known).sum())}
-    return replace(
-        detections,
-        frame=detections.frame[known],
-        person=detections.person[known],
-        xy=detections.xy[known],
-        confidence=detections.confidence[known],
-        dropped=detections.dropped | lost,
     )
 
 

@@ -1,0 +1,173 @@
+"""Checks of keypoints that came with the flight: what cannot be pixels of this picture, or of its time."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.arrays import Bool
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.session.errors import DataError
+from pipelines.session.records import Detections
+from pipelines.sources.parts import CameraFrames
+
+# --- tuning ---
+
+# A share of a picture's sides. Detectors search the box of a person; most of them pad it to 1.25 of its size.
+# If the box is as large as the picture, it then reaches an eighth beyond it: no detector looked further.
+_MAX_EXTRAPOLATION = 1 / 8
+# Coordinates in shares of the picture stay below this; a person in pixels is larger in every picture.
+_MAX_SHARE = 2.0
+# Beyond a few extrapolated joints, negative shares mean that 0 is the middle of the picture.
+_MAX_NEGATIVE_SHARE = 0.05
+# People do not stand still to the last digit of 3 joints for this long, so the detector repeats itself.
+_MAX_REPEAT_S = 0.3
+# Where most detections repeat, nothing in the file moves: they may be right, and are kept.
+_MAX_REPEATED_SHARE = 0.5
+
+
+def without_zeros(detections: Detections) -> Detections:
+    """Take joints at exactly (0, 0) as missing, as many programs write them; count them."""
+    zero: Bool = np.asarray((detections.xy == 0.0).all(axis=-1))
+    if not zero.any():
+        return detections
+    return _without(zero, detections, {"joints at exactly 0, 0, taken as missing": int(zero.sum())})
+
+
+def in_pixels(detections: Detections, intrinsics: Intrinsics, source: str) -> Detections:
+    """Turn coordinates that are shares of the picture (0 to 1) into pixels; count them as adjusted.
+
+    Raises:
+        DataError: the coordinates count from the middle of the picture.
+    """
+    known = detections.xy[np.isfinite(detections.xy)]
+    if not len(known) or np.abs(known).max() > _MAX_SHARE:
+        return detections
+    if (known < 0).mean() > _MAX_NEGATIVE_SHARE:
+        raise DataError(
+            source,
+            f"has keypoints from {known.min():.3g} to {known.max():.3g}, which are no pixels: they seem to"
+            " count from the middle of the picture, in halves of its sides or of its width",
+            "write them in pixels from the top left",
+            code="keypoints-normalised",
+        )
+    xy = detections.xy * [intrinsics.width, intrinsics.height] - 0.5
+    number = int(np.isfinite(xy[..., 0]).sum())
+    adjusted = {"keypoints from shares of the picture (0 to 1) to pixels": number}
+    return replace(detections, xy=xy, adjusted=detections.adjusted | adjusted)
+
+
+def without_repeats(detections: Detections, frames: CameraFrames) -> tuple[Detections, list[str]]:
+    """Drop detections that a tracker holds while its person moves on; return also a note on each stretch.
+
+    A detection repeats if three or more joints, all it has, are where they were for the same person in
+    the picture before. Stretches of repeats up to 0.3 s stay.
+    """
+    order = np.lexsort((detections.frame, detections.person))
+    xy, person = detections.xy[order], detections.person[order]
+    t_ns = frames.t_ns[np.searchsorted(frames.frame, detections.frame[order])]
+    same = ((xy[1:] == xy[:-1]) | np.isnan(xy[1:]) & np.isnan(xy[:-1])).all(axis=(1, 2))
+    same &= (person[1:] == person[:-1]) & (np.isfinite(xy[1:]).all(axis=-1).sum(axis=-1) >= 3)
+    edges = np.flatnonzero(np.diff(same, prepend=False, append=False))
+    held = np.zeros(len(order), np.bool_)
+    stretches = []
+    for first, end in edges.reshape(-1, 2):  # rows first + 1 to end repeat row first
+        if t_ns[end] - t_ns[first] > _MAX_REPEAT_S * 1e9:
+            held[first + 1 : end + 1] = True
+            stretches.append((int(detections.frame[order[first]]), int(detections.frame[order[end]])))
+    if not held.any() or held.mean() > _MAX_REPEATED_SHARE:
+        return detections, []
+    notes = [f"repeats its keypoints in pictures {first} to {last}" for first, last in sorted(stretches)]
+    rows = np.sort(order[~held])
+    lost = {"repeated detections": int(held.sum())}
+    return _chosen(rows, detections, lost), notes
+
+
+def doubt_numbers(detections: Detections, frames: CameraFrames, *, from_video: bool) -> str | None:
+    """Return a doubt if keypoints seem to be numbered from 1; None without one."""
+    first, last = int(detections.frame[0]), int(detections.frame[-1])
+    if from_video and first >= 1 and last == int(frames.frame[-1]) + 1:
+        return (
+            f"its keypoints are numbered up to {last}, its pictures up to {frames.frame[-1]}: the"
+            " keypoints count from 1, so write `first_frame: 1` in `keypoints`"
+        )
+    if not from_video and int(detections.frames_listed[0]) == 1:
+        return (
+            "its keypoints begin with 1: if this is the first picture, write `first_frame: 1` in `keypoints`"
+        )
+    return None
+
+
+def unmirrored(detections: Detections, mirrored: bool | str, intrinsics: Intrinsics) -> Detections:
+    """Undo that keypoints were found in mirrored pictures.
+
+    Args:
+        detections: as the file has them.
+        mirrored: True, or of what: "x" alone counts from the right, "y" from below, or "names" alone have
+            left for right.
+        intrinsics: of the pictures.
+    """
+    if mirrored in (True, "x"):
+        xy = detections.xy.copy()
+        xy[..., 0] = intrinsics.width - 1 - xy[..., 0]
+        detections = replace(detections, xy=xy)
+    if mirrored == "y":
+        xy = detections.xy.copy()
+        xy[..., 1] = intrinsics.height - 1 - xy[..., 1]
+        detections = replace(detections, xy=xy)
+    if mirrored in (True, "names"):
+        order = [detections.joints.index(_other_side(name, detections.joints)) for name in detections.joints]
+        detections = replace(
+            detections, xy=detections.xy[:, order], confidence=detections.confidence[:, order]
+        )
+    return detections
+
+
+def _other_side(name: str, joints: tuple[str, ...]) -> str:
+    """Return the name of the same joint on the other side; its own if there is none."""
+    other = {"left": "right", "right": "left"}.get(name.partition("_")[0])
+    opposite = f"{other}_{name.partition('_')[2]}" if other else name
+    return opposite if opposite in joints else name
+
+
+def near_picture(detections: Detections, intrinsics: Intrinsics) -> Detections:
+    """Drop and count keypoints further outside the picture than a detector may extrapolate."""
+    size = np.array([intrinsics.width, intrinsics.height])
+    margin = _MAX_EXTRAPOLATION * size
+    with np.errstate(invalid="ignore"):
+        beyond = (detections.xy < -0.5 - margin) | (detections.xy > size - 0.5 + margin)
+    far: Bool = np.asarray(beyond.any(axis=-1))
+    if not far.any():
+        return detections
+    return _without(far, detections, {"keypoints far outside the picture": int(far.sum())})
+
+
+def within(detections: Detections, frames: CameraFrames) -> Detections:
+    """Keep the detections in frames that have a time; count the others."""
+    known = np.isin(detections.frame, frames.frame)
+    if known.all():
+        return detections
+    lost = {"detections in frames without a time": int((~known).sum())}
+    return _chosen(np.flatnonzero(known), detections, lost)
+
+
+def _without(joints: Bool, detections: Detections, lost: dict[str, int]) -> Detections:
+    """Take joints [M, J] as not found, and drop people of whom nothing is left."""
+    xy = np.where(joints[..., None], np.nan, detections.xy)
+    confidence = np.where(joints, 0.0, detections.confidence)
+    seen = np.isfinite(xy).any(axis=(1, 2))
+    if not seen.all():
+        lost = lost | {"people without a joint that is left": int((~seen).sum())}
+    return _chosen(np.flatnonzero(seen), replace(detections, xy=xy, confidence=confidence), lost)
+
+
+def _chosen(rows: NDArray[np.intp], detections: Detections, lost: dict[str, int]) -> Detections:
+    return replace(
+        detections,
+        frame=detections.frame[rows],
+        person=detections.person[rows],
+        xy=detections.xy[rows],
+        confidence=detections.confidence[rows],
+        dropped=dict(Counter(detections.dropped) + Counter(lost)),
+    )
