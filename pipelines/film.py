@@ -26,7 +26,7 @@ from pipelines.planning.arm_flights import poses_from
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.loading import LoggedFlight, load_flight
 from pipelines.reconstruction.refining import refined_points
-from pipelines.reporting.overlays import View
+from pipelines.reporting.overlays import OverlayView
 from pipelines.reporting.pictures import draw_frame, with_inlet
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
@@ -487,7 +487,7 @@ def _draw(
                     raise ValueError(f"{pictures}: picture {k} cannot be decoded")
                 found = np.stack([own.xy[camera, k] for own in sightings])
                 known, seen = np.isfinite(points[k, ..., 0]), np.isfinite(found[..., 0])
-                view = View(
+                view = OverlayView(
                     camera=name,
                     intrinsics=lens,
                     joints=nearest.person.joints,

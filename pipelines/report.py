@@ -327,13 +327,12 @@ def content_of(folder: Path) -> SessionContent:
     return _load(folder, read_description(folder), records)
 
 
-_MOST_TIMES = 18_000
-"""The most times of the skeleton that a page is drawn from: ten minutes at 30 Hz."""
-
-_MOST_ROWS = 400_000
-"""The most rows of its table: twelve thousand times of one person with 33 joints."""
-
-_STRETCH_NS = 180_000_000_000  # of a flight whose lines of sight are looked at together
+# A page is drawn from ten minutes at 30 Hz at most: more times change no figure.
+MAX_TIMES = 18_000
+# The table of a page holds twelve thousand times of one person with 33 joints at most, to save memory.
+MAX_ROWS = 400_000
+# Lines of sight are looked at in stretches of three minutes, so that long flights take no more memory.
+STRETCH_NS = 180_000_000_000
 
 
 class _Shown:
@@ -347,7 +346,7 @@ class _Shown:
     """
 
     def __init__(self, folder: Path, t_ns: Int64, rows: int, metrics: Mapping[str, object] | None) -> None:
-        self.every = max(-(-len(t_ns) // _MOST_TIMES), -(-rows // _MOST_ROWS), 1)
+        self.every = max(-(-len(t_ns) // MAX_TIMES), -(-rows // MAX_ROWS), 1)
         self._folder = folder
         self._t_ns = t_ns[:: self.every]
         self._offset_ns = estimated_clocks(metrics or {})
@@ -456,7 +455,7 @@ def _load_hidden(
     found: list[tuple[float, dict[str, float]]] = []
     frames = [entry.frames for entry in description.cameras.values()]
     first_ns, last_ns = min(of.first_t_ns for of in frames), max(of.last_t_ns for of in frames)
-    count = max(-(-(last_ns - first_ns) // _STRETCH_NS), 1)
+    count = max(-(-(last_ns - first_ns) // STRETCH_NS), 1)
     edges = np.linspace(first_ns, last_ns, count + 1).round().astype(np.int64).tolist()
     for span_ns in pairwise(edges) if count > 1 else [None]:
         try:

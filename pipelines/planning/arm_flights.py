@@ -36,7 +36,13 @@ PLANNED = "planned"
 """Name of the other arm that is no planner: the commands of the planner on board, as logged."""
 LOGGED = (FLOWN, PLANNED)
 
-_LOOK_EVERY_S = 1.0
+# Pictures of a person who walks differ from second to second.
+LOOK_PERIOD_S = 1.0
+# `mocap reconstruct` first takes this standard deviation of a good keypoint, too.
+PIXEL_SIGMA_PX = 3.0
+# `mocap reconstruct` leaves out keypoints below this confidence, too.
+MIN_CONFIDENCE = 0.3
+
 _POSITION = ["x", "y", "z"]
 _QUATERNION = ["qx", "qy", "qz", "qw"]
 _SLOT = ["slot_yaw_rad", "slot_tilt_rad", "slot_range_m"]
@@ -53,7 +59,7 @@ class ArmFlight:
     aim: Float  # [N, T, P] shares of people in the place that each camera films
     known: Bool  # [N, T] False where a log has a gap and the position goes straight on
     separation: dict[str, int]  # local plans by `Separation`; empty for logged arms
-    safety: dict[str, int]  # local plannings by `guard.Flown`; likewise
+    safety: dict[str, int]  # local plannings by `guard.FlownMotion`; likewise
     central_s: Sequence[float] = ()  # measured planning times, different from run to run
     local_s: Sequence[float] = ()
 
@@ -146,7 +152,7 @@ def fly_arm(scene: ReplayScene, arm: Arm, *, foresight: bool = False) -> ArmFlig
     )
 
 
-def measure_arm(scene: ReplayScene, flown: ArmFlight, detect: Detect) -> Measured | None:
+def measure_arm(scene: ReplayScene, flown: ArmFlight, detect: Detect) -> MeasuredJoints | None:
     """Simulate what an arm's cameras measure of everybody's skeleton; None without a skeleton.
 
     It is known which keypoints belong to whom.
@@ -206,14 +212,14 @@ def trajectories(scene: ReplayScene, flown: ArmFlight) -> pd.DataFrame:
     return table
 
 
-def seen_joints(scene: ReplayScene, flown: ArmFlight, measured: Measured) -> pd.DataFrame:
+def seen_joints(scene: ReplayScene, flown: ArmFlight, measured: MeasuredJoints) -> pd.DataFrame:
     """Return the rows of `tables.SEEN`: the first person's joints once a second, as seen by each camera."""
     import pandas as pd
 
     if scene.joints is None or scene.flight.skeleton is None:
         raise ValueError("the scene has no skeleton")
     t_s, t_ns = scene.t_s[scene.pictures], scene.t_ns[scene.pictures]
-    looks = np.unique(np.searchsorted(t_s, np.arange(0.0, t_s[-1] + 1e-9, _LOOK_EVERY_S) - 1e-9))
+    looks = np.unique(np.searchsorted(t_s, np.arange(0.0, t_s[-1] + 1e-9, LOOK_PERIOD_S) - 1e-9))
     first = slice(len(scene.flight.skeleton.joints))
     pixels, free = (values[:, looks, first].swapaxes(0, 1) for values in (measured.pixels, measured.free))
     status = np.where(np.isnan(pixels[..., 0]), "outside", np.where(free, "seen", "hidden"))  # [K, N, J]
@@ -257,12 +263,6 @@ def _rows(values: Float) -> Float:
     return values.swapaxes(0, 1).reshape(-1, values.shape[2])
 
 
-PIXEL_SIGMA = 3.0
-"""Standard deviation of a good keypoint for triangulation, px: the first value in `mocap reconstruct`."""
-MIN_CONFIDENCE = 0.3
-"""Least confidence of keypoints that are used, as in `mocap reconstruct`."""
-
-
 class Detect(Protocol):
     """Function that simulates a keypoint detector on one camera's pictures."""
 
@@ -303,7 +303,7 @@ class CameraPaths:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredJoints:
     """Result of the simulated measurements."""
 
     error_m: Float32  # [trials, T, J]; NaN where the joint was not measured or the truth is unknown
@@ -322,7 +322,7 @@ def measure(
     start_m: float,
     trials: int,
     seed: int,
-) -> Measured:
+) -> MeasuredJoints:
     """Measure a skeleton in several trials; sight is tested in the map of each moment.
 
     The last `start_m` of a sight line, next to the joint, is left out: maps contain the person. Trial k of
@@ -367,7 +367,7 @@ def measure(
             position=logged_position,
             rotation=logged_rotation,
             focal=np.array([_focal(lens) for lens in paths.intrinsics]),
-            pixel_sigma=np.full(cameras, PIXEL_SIGMA),
+            pixel_sigma=np.full(cameras, PIXEL_SIGMA_PX),
             pose_sigma=sigma,
         )
         points = locate(views, method="robust").points.reshape(joints.shape)
@@ -378,14 +378,14 @@ def measure(
     seen = np.isfinite(pixels[..., 0]) & free
     total = cameras * int(known.sum())
     seen_share = float((seen & known).sum() / total) if total else 0.0
-    return Measured(error, first, seen_share, int(known.sum()), pixels, free)
+    return MeasuredJoints(error, first, seen_share, int(known.sum()), pixels, free)
 
 
-def joined(people: Sequence[Measured]) -> Measured:
+def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:
     """Join what was measured of several people: their joints in a row."""
     frames = [person.joint_frames for person in people]
     seen = sum(person.seen_share * count for person, count in zip(people, frames, strict=True))
-    return Measured(
+    return MeasuredJoints(
         error_m=np.concatenate([person.error_m for person in people], axis=2),
         first=np.concatenate([person.first for person in people], axis=1),
         seen_share=seen / sum(frames) if sum(frames) else 0.0,

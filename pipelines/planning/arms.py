@@ -180,12 +180,7 @@ class _TeamPlanner:
 
 
 class _JointPlanner(_TeamPlanner):
-    """Planner of yaw, tilt and range of every drone for the least error of all views together.
-
-    Spacing is free, so that nobody has to stay behind an obstacle. All drones choose from the same slots, so
-    that one look at these serves the whole team. Of the teams found and the plan of `adaptive`, the one whose
-    views are best as the local planner would fly it is flown.
-    """
+    """Planner of yaw, tilt and range of every drone for the least error of all views together."""
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
         _, tilt_step, range_step = np.array(config.slot_rates) * config.tuning.knot_s
@@ -250,10 +245,7 @@ class _JointPlanner(_TeamPlanner):
         return paths[best]
 
     def _flown(self, places: Float, actor: Float, field: DistanceField) -> float:
-        """Compute the mean cost of the next seconds for drones at [n, N, 3] and the actor at [N, 3] m.
-
-        Slots alone do not show it: drones follow late, give way to obstacles and take short cuts.
-        """
+        """Compute the mean cost of the next seconds for drones at [n, N, 3] and the actor at [N, 3] m."""
         config = self._config
         soon = max(round(config.tuning.rolled_out_s / config.tuning.waypoint_s), 1)
         places, actor = places[:, :soon], actor[:soon]
@@ -415,13 +407,7 @@ def _best_path(
 
 
 class _GroupPlanner(_TeamPlanner):
-    """Planner for several people: for each drone its yaw, and whom it films.
-
-    A drone films one person or the weighted middle of all, from the tilt and range of the settings. All
-    drones maximise the worth of their views together (`Worth`): for each person, by weight, the
-    information on a joint, and the view quality, in units of a face seen straight from that
-    range.
-    """
+    """Planner for several people: for each drone its yaw, and whom it films."""
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
         neighbour = _in_a_turn(drones)
@@ -500,10 +486,7 @@ class _GroupPlanner(_TeamPlanner):
         )
 
     def _from_elsewhere(self, view: SlotChoice, place: Float, about: Float, actor: Forecast) -> SlotChoice:
-        """Return the views of a drone that begins to film somebody else: none before it can have arrived.
-
-        It flies there from `place` [3] at its limits of acceleration and speed, from rest to rest.
-        """
+        """Return the views of a drone that begins to film somebody else: none before it can have arrived."""
         config = self._config
         way = np.linalg.norm(view.position - place, axis=-1)
         most_m = config.speed_mps**2 / config.acceleration_mps2

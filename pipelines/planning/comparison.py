@@ -21,15 +21,18 @@ from pipelines.planning.scores import coverage as viewed
 
 REFERENCE = "fixed"
 """Arm that the others are compared with; the first arm where it is missing."""
-_ALIKE_DEG = 2.0  # smaller differences of tilt are not reported
-_ALIKE_PERCENT = 1.0  # of the joints, likewise
-_ALIKE_RANGE_M = 0.3  # arms whose mean ranges differ by more are not compared at equal range
+# Smaller differences of the largest tilt are not worth a sentence.
+SAME_TILT_DEG = 2.0
+# Smaller differences of the measured share are not worth a sentence.
+SAME_COVERAGE_PERCENT = 1.0
+# Errors of arms whose mean ranges differ by more are not compared at equal range.
+SAME_RANGE_M = 0.3
+# The field counts a joint as right within this distance (PCK at 150 mm).
 PCK_M = 0.15
-"""Largest error of a right joint in `pck150`."""
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MeanWithInterval:
     """A mean and the interval that holds it with `LEVEL` probability; None where it cannot be computed."""
 
     mean: float
@@ -40,12 +43,12 @@ class Estimate:
         return {"mean": self.mean, "interval": None if self.interval is None else list(self.interval)}
 
 
-def mean_of_trials(values: Float, seed: int) -> Estimate | None:
+def mean_of_trials(values: Float, seed: int) -> MeanWithInterval | None:
     """Compute the mean of a figure over trials [K]; None without any, no interval for a single one."""
     return _mean(values, None, seed)
 
 
-def mean_over_time(values: Float, counted: Bool, t_ns: Int64, seed: int) -> Estimate | None:
+def mean_over_time(values: Float, counted: Bool, t_ns: Int64, seed: int) -> MeanWithInterval | None:
     """Compute the mean over the moments that count, which are joined and resampled in stretches.
 
     Args:
@@ -105,12 +108,12 @@ def coverage(error_m: Float32, joint_frames: int) -> Float:
     return share
 
 
-def _mean(values: Float, t_ns: Int64 | None, seed: int) -> Estimate | None:
+def _mean(values: Float, t_ns: Int64 | None, seed: int) -> MeanWithInterval | None:
     """Compute the mean of values over trials or times, and its interval."""
     if not len(values):
         return None
     interval = intervals({"mean": (values, np.ones(len(values)))}, t_ns, seed=seed)["mean"]
-    return Estimate(float(values.mean()), interval)
+    return MeanWithInterval(float(values.mean()), interval)
 
 
 @dataclass(frozen=True)
@@ -217,10 +220,7 @@ def _scores(scene: ReplayScene, name: str, result: ArmResult, shared: Bool | Non
 
 
 def _by_person(scene: ReplayScene, result: ArmResult, seen: Bool, shared: Bool | None) -> dict[str, Any]:
-    """Compute the view quality over all people, and of several people the figures of each.
-
-    View quality is a mean over time; that over all people is the sum by weight.
-    """
+    """Compute the view quality over all people, and of several people the figures of each."""
     flown, people = result.flight, scene.people
     covered = viewed(
         flown.position,
@@ -258,7 +258,7 @@ def _by_person(scene: ReplayScene, result: ArmResult, seen: Bool, shared: Bool |
 
 def _errors(
     scene: ReplayScene, result: ArmResult, shared: Bool | None
-) -> tuple[Estimate | None, Estimate | None, Estimate | None]:
+) -> tuple[MeanWithInterval | None, MeanWithInterval | None, MeanWithInterval | None]:
     """Return the mean error of all measured joint-frames and of the common ones, and the coverage."""
     error, seed = result.error_m, scene.settings.seed
     if error is None or shared is None:
@@ -268,17 +268,14 @@ def _errors(
     return own, common, mean_of_trials(coverage(error, result.joint_frames), seed)
 
 
-def _pck(scene: ReplayScene, result: ArmResult) -> Estimate | None:
+def _pck(scene: ReplayScene, result: ArmResult) -> MeanWithInterval | None:
     if result.error_m is None:
         return None
     return mean_of_trials(pck(result.error_m, result.joint_frames), scene.settings.seed)
 
 
 def _difference(scene: ReplayScene, one: ArmResult, other: ArmResult, shared: Bool | None) -> dict[str, Any]:
-    """Compute one minus the other, with intervals.
-
-    Both have the same seeds, moments and joint-frames as in the table.
-    """
+    """Compute one minus the other, with intervals."""
     tilt_deg, hidden = (
         of(scene, one.flight).mean(axis=0) - of(scene, other.flight).mean(axis=0)
         for of in (_tilt_deg, _hidden)
@@ -310,10 +307,7 @@ def _difference(scene: ReplayScene, one: ArmResult, other: ArmResult, shared: Bo
 
 
 def _over_flights(scene: ReplayScene, one: Float32, other: Float32, both: Bool) -> dict[str, object]:
-    """Compute the intervals of the differences over stretches of the flight, noise averaged over trials.
-
-    They answer another question than those over trials: what another flight of this kind could show.
-    """
+    """Compute the intervals of the differences over stretches of the flight, noise averaged over trials."""
     t_ns = scene.t_ns[scene.pictures]
     known = np.zeros(one.shape[1]) if scene.joints is None else np.isfinite(scene.joints[..., 0]).sum(axis=1)
     right = ((one <= PCK_M).sum(axis=2, dtype=np.float64) - (other <= PCK_M).sum(axis=2)).mean(axis=0)
@@ -342,13 +336,7 @@ def _best(
     arms: Mapping[str, Mapping[str, Any]],
     shared: Bool | None,
 ) -> dict[str, Any] | None:
-    """Name the best arm, the runner-up, and their difference; None if fewer than two measured anything.
-
-    Arms that violate a limit are left out, unless all do. The largest `pck150` over all joint-frames wins,
-    since missing joints cannot flatter it. Arms that the noise does not tell apart from the winner by it
-    are ranked by `mpjpe_mm` on common joint-frames. `alike` are those that neither figure tells apart from
-    the best; the runner-up is the best of the others, or of these if there are no others.
-    """
+    """Name the best arm, the runner-up, and their difference; None if fewer than two measured anything."""
     measured = [
         name
         for name, arm in arms.items()
@@ -432,7 +420,7 @@ def equal_ranges(range_m: Mapping[str, float]) -> list[list[str]]:
     """
     groups: list[list[str]] = []
     for name in sorted(range_m, key=lambda name: range_m[name]):
-        if groups and range_m[name] - range_m[groups[-1][0]] <= _ALIKE_RANGE_M:
+        if groups and range_m[name] - range_m[groups[-1][0]] <= SAME_RANGE_M:
             groups[-1].append(name)
         else:
             groups.append([name])
@@ -447,7 +435,7 @@ def _unequal(arms: Mapping[str, Mapping[str, Any]]) -> list[str]:
         said = ", ".join(f"{name} {count}" for name, count in counts.items())
         found.append(f"the arms have different numbers of drones ({said}): more views measure better")
     ranges = {name: arm["range_m"]["mean"] for name, arm in arms.items()}
-    if max(ranges.values()) - min(ranges.values()) > _ALIKE_RANGE_M:
+    if max(ranges.values()) - min(ranges.values()) > SAME_RANGE_M:
         said = ", ".join(f"{name} {mean:.1f} m" for name, mean in ranges.items())
         found.append(f"the arms film from different mean ranges ({said}): part of a difference may be that")
     return found
@@ -484,7 +472,7 @@ def _warnings(results: Mapping[str, ArmResult]) -> list[str]:
     return warnings
 
 
-def _json(estimate: Estimate | None) -> dict[str, object] | None:
+def _json(estimate: MeanWithInterval | None) -> dict[str, object] | None:
     return None if estimate is None else estimate.as_json()
 
 
@@ -523,7 +511,7 @@ def _times(count: int) -> str:
 
 def _about_tilt(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
     own, other = (arms[name]["tilt_deg"]["max"] for name in (arm, against))
-    if abs(own - other) < _ALIKE_DEG:
+    if abs(own - other) < SAME_TILT_DEG:
         return f"{arm} and {against} tilt alike, up to {own:.0f} and {other:.0f} deg"
     if own < other:
         return f"{arm} keeps the tilt at {own:.0f} deg where {against} climbs to {other:.0f}"
@@ -531,15 +519,12 @@ def _about_tilt(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -
 
 
 def _about_coverage(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
-    """Say which arm measured more joints; empty if they are alike.
-
-    Errors are compared on joints that both measured, so the coverage must be reported as well.
-    """
+    """Say which arm measured more joints; empty if they are alike."""
     found = [arms[name]["reconstruction_error"]["coverage"] for name in (arm, against)]
     if None in found:
         return ""
     own, other = (100 * each["mean"] for each in found)
-    if abs(own - other) < _ALIKE_PERCENT:
+    if abs(own - other) < SAME_COVERAGE_PERCENT:
         return ""
     return f", and it measures {own:.0f} % of the joints where {against} measures {other:.0f} %"
 

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, Validation
 
 from pipelines.session.errors import DataError
 
-# Times of drones that plan one after the other were measured up to this number.
+# Drones plan one after the other, so that more would not keep the rates.
 MOST_DRONES = 16
 # A smaller polygon is a line or a point after rounding, and bars nothing.
 MIN_ZONE_AREA_M2 = 1e-6
@@ -94,7 +94,7 @@ class PlannerTuning:
     # Plans reach 10 s ahead, as far as the formation search does by default.
     waypoints: int = 20
     waypoint_s: float = 0.5
-    # More steps change the cost by less than the tolerance.
+    # The descent ends after so many evaluations, to keep the rate of the local planner.
     iterations: int = 40
     tolerance: float = 1e-3
     # Longer steps jump over thin obstacles.

@@ -17,13 +17,21 @@ from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import Zone
 from pipelines.session.records import Occupancy
 
-# A point is at most half a diagonal from its voxel's centre. It is at most a whole one from the corners
-# of the cell in which it is interpolated, and so are the corners from each other. In voxels:
+# A point is at most half a diagonal (in voxels) from its voxel's centre. It is at most a whole one from the
+# corners of the cell in which it is interpolated, and so are the corners from each other.
 DIAGONAL = math.sqrt(3.0)
-ROUNDING = 1e-4  # margin of such bounds for single precision
-BRICK = 4  # voxels along the side of one of `Sight.bricks`
-_LONGEST_LEAP = 127  # seven bits
-_SLAB_VOXELS = 1_000_000  # whose distances are computed at once
+# Single precision of the distances needs this margin of such bounds, in voxels.
+ROUNDING = 1e-4
+# Bricks of 4 x 4 x 4 bytes fill a cache line.
+BRICK = 4
+# The leap is stored in seven bits of a byte.
+MAX_LEAP = 127
+# Distances are computed so many voxels at a time, because scipy holds four numbers for each of them.
+SLAB_VOXELS = 1_000_000
+# OctoMap takes a voxel for an obstacle from this probability on.
+OCCUPIED = 0.5
+# No drone flies so far: everything in a map without obstacles has this distance.
+NOWHERE_M = 1e3
 
 
 NO_ZONES: Float = np.zeros((0, 7))
@@ -166,10 +174,7 @@ def sampling(x: float, y: float, z: float, start_m: float, side_m: float, rule: 
 
 @helper
 def _samples_inside(first: float, per: float, size: int, low: float, high: float) -> tuple[float, float]:
-    """Return the range of the samples `low` to `high` inside the grid along an axis.
-
-    `per` is one over the step.
-    """
+    """Return the range of the samples `low` to `high` inside the grid along an axis."""
     if math.isinf(per):
         return (low, high) if 0.0 <= first < size else (high, high)
     one, other = -first * per, (size - first) * per
@@ -261,7 +266,7 @@ def fill_bricks(grid: Grid, bricks: NDArray[np.uint8]) -> None:
         for j in range(deep):
             for k in range(high):
                 free_voxels = abs(d[i, j, k]) / grid.resolution_m - (DIAGONAL - 0.5)
-                leap = min(max(int(2.0 * free_voxels - ROUNDING), 0), _LONGEST_LEAP)
+                leap = min(max(int(2.0 * free_voxels - ROUNDING), 0), MAX_LEAP)
                 within = (i % BRICK * BRICK + j % BRICK) * BRICK + k % BRICK
                 bricks[i // BRICK, j // BRICK, k // BRICK, within] = 2 * leap + (d[i, j, k] < 0.0)
 
@@ -280,9 +285,6 @@ def line_shares(grid: Grid, sight: Sight, actor: Float, camera: Float, start_m: 
 
 
 Unknown = Literal["free", "occupied"]
-
-OCCUPIED = 0.5  # probability from which a voxel is an obstacle
-_NOWHERE_M = 1e3  # distance everywhere in a map without obstacles
 
 
 @dataclass(frozen=True)
@@ -356,9 +358,9 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
         occupied |= np.isnan(occupancy.probability)
     half = occupancy.resolution_m / 2
     if not occupied.any():
-        distance = np.full(occupied.shape, _NOWHERE_M, dtype=np.float32)
+        distance = np.full(occupied.shape, NOWHERE_M, dtype=np.float32)
     elif occupied.all():
-        distance = np.full(occupied.shape, -_NOWHERE_M, dtype=np.float32)
+        distance = np.full(occupied.shape, -NOWHERE_M, dtype=np.float32)
     else:
         distance = np.empty(occupied.shape, dtype=np.float32)
         box = _box_around(occupied)
@@ -387,16 +389,13 @@ def _box_around(occupied: NDArray[np.bool_]) -> tuple[slice, ...]:
 
 
 def _distances(inside: NDArray[np.bool_], resolution_m: float) -> Iterator[tuple[slice, Float]]:
-    """Yield the exact distances (m) [., Y, Z] to the nearest voxel outside, a slab [X, Y, Z] at a time.
-
-    `scipy.ndimage.distance_transform_edt` holds four arrays of 64-bit numbers for every voxel at once.
-    """
+    """Yield the exact distances (m) [., Y, Z] to the nearest voxel outside, a slab [X, Y, Z] at a time."""
     from scipy.ndimage import distance_transform_edt
 
     nearest_voxel = distance_transform_edt(
         inside, sampling=resolution_m, return_distances=False, return_indices=True
     )
-    thick = max(1, _SLAB_VOXELS // max(1, inside[0].size))
+    thick = max(1, SLAB_VOXELS // max(1, inside[0].size))
     for first in range(0, len(inside), thick):
         part = slice(first, first + thick)
         squared = np.zeros(nearest_voxel[0, part].shape)
@@ -408,7 +407,7 @@ def _distances(inside: NDArray[np.bool_], resolution_m: float) -> Iterator[tuple
 
 def open_space() -> DistanceField:
     """Return the field of a world without known obstacles."""
-    return DistanceField(Grid(np.full((2, 2, 2), _NOWHERE_M, dtype=np.float32), np.zeros(3), 1.0))
+    return DistanceField(Grid(np.full((2, 2, 2), NOWHERE_M, dtype=np.float32), np.zeros(3), 1.0))
 
 
 def zone_edges(zones: Sequence[Zone]) -> Float:

@@ -11,7 +11,12 @@ import numpy as np
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.planning.config import PlannerConfig
 
-_FIRST_SPEED_MPS = 3.0  # standard deviation per axis before a second measurement: people run
+# People run: the standard deviation per axis of the speed before a second measurement.
+FIRST_SPEED_SIGMA_MPS = 3.0
+# A direction is used only where the speed is beyond this many of its standard deviations.
+MIN_SPEED_SIGMAS = 3.0
+# Hips sway by less than a metre, so that a way of a metre has a direction.
+MIN_FIRST_WAY_M = 1.0
 
 
 class Forecast(NamedTuple):
@@ -43,7 +48,7 @@ class ActorFilter:
         self._variance = sigma_m**2
         self._t_s: float | None = None
         self._state = np.zeros((2, 3))
-        self._covariance = np.diag([self._variance, _FIRST_SPEED_MPS**2])
+        self._covariance = np.diag([self._variance, FIRST_SPEED_SIGMA_MPS**2])
 
     def measure(self, t_s: float, position: Float) -> None:
         """Update with one measured position [3], metres, world, not earlier than the last one.
@@ -168,10 +173,6 @@ def positions_at(t_ns: Int64, people: Float, at_ns: Int64) -> Float:
     return found
 
 
-_SURE = 3.0  # standard deviations of the speed; its direction is used only above
-_FIRST_WAY_M = 1.0
-
-
 class YawZero:
     """The direction that yaws count from, over time: east, or with `yaw_frame` `heading` the actor's.
 
@@ -200,7 +201,7 @@ class YawZero:
         """
         self._from, self._from_s = float(self.at(np.array([t_s]))[0]), t_s
         speed_mps = math.hypot(velocity[0], velocity[1])
-        if speed_mps >= max(self._least_mps, _SURE * math.sqrt(covariance[1, 1])):
+        if speed_mps >= max(self._least_mps, MIN_SPEED_SIGMAS * math.sqrt(covariance[1, 1])):
             way = math.atan2(velocity[1], velocity[0]) - self._from
             self._goal = self._from + math.remainder(way, 2 * math.pi)
 
@@ -218,7 +219,7 @@ def first_heading(actor: Float) -> float:
     """
     level = actor[np.isfinite(actor).all(axis=1), :2]
     away = level - level[:1]
-    far = np.hypot(away[:, 0], away[:, 1]) >= _FIRST_WAY_M
+    far = np.hypot(away[:, 0], away[:, 1]) >= MIN_FIRST_WAY_M
     if not far.any():
         return 0.0
     east_m, north_m = away[far.argmax()]

@@ -195,11 +195,7 @@ def _look_at_slots(
     obstacle: Float,
     share: Float,
 ) -> None:
-    """Compute the results of `_slot_costs`, into arrays of zeros, for the states that are reached [T, S].
-
-    The distances at the two ends show that most sight lines are free. One look at the actor serves all lines,
-    and the obstacle cost needs the camera's distance anyway.
-    """
+    """Compute the results of `_slot_costs`, into arrays of zeros, for the states that are reached [T, S]."""
     times, (states, cameras, _) = actor.shape[0], offsets.shape
     side_m = grid.resolution_m
     rules, counts = np.zeros((states, cameras, 11)), np.zeros((states, cameras), np.int64)
@@ -252,10 +248,7 @@ def _slot_costs(
 
 @helper
 def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
-    """Compute the cost map [T, S] from the results of `_slot_costs`.
-
-    Costs are summed over the drones, the first one first.
-    """
+    """Compute the cost map [T, S] from the results of `_slot_costs`."""
     times, states, cameras = obstacle.shape
     cost = np.zeros((times, states))
     for t in range(times):
@@ -267,10 +260,7 @@ def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
 
 @helper
 def _first_step(lattice: Lattice, start: Float) -> tuple[Bool, Float]:
-    """Test which states [S] can follow slots anywhere between the states; return the time to each, too.
-
-    The time [S] s is the sum over the coordinates.
-    """
+    """Test which states [S] can follow slots anywhere between the states; return the time to each, too."""
     states = lattice.states.shape[0]
     reach_s, way_s = np.zeros(states), np.zeros(states)
     for s in range(states):
@@ -392,10 +382,7 @@ def _team_cost(
 def _improve_team(
     price: Float, free: Float, views: TeamViews, w: TeamWeights, commanded: Float, order: Int64, team: Int64
 ) -> None:
-    """Replace each drone's states by the cheapest ones, given the others', until nobody finds better ones.
-
-    Drones take turns in this `order` [n]. States of -1 are not there yet, and do not count for the others.
-    """
+    """Replace each drone's states by the cheapest ones, given the others', until nobody finds better ones."""
     drones, times = team.shape
     cost = np.empty(price.shape)
     others, known = np.zeros(6), np.zeros(6)

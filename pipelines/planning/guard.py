@@ -31,19 +31,28 @@ from pipelines.planning.tracking import (
     stopping_ticks,
 )
 
-_CHECK_S = 0.05  # motions are checked as often, and every half voxel
-_ROUNDING_M = 1e-6
-_INSIDE_M = 1e-3  # a drone that is nearer to an obstacle by more than this leaves first
-_DEEPER_M = 0.1  # ways out end this much beyond the radius
-_CLIMB_MPS = 2.0
-_ASIDE_MPS = 1.5
-_CHANGE_SHARE = 0.75  # of the largest acceleration, with which a drone takes up another velocity
-_ACTOR_AHEAD_S = 2.0  # plans keep away from the actor's forecast so far ahead
-_WINDOW_M = 4.0  # first window in which a way out is searched
-_ZONES_IN_A_ROW = 8
+# At 8 m/s a drone flies 0.4 m between two checks; every half voxel is checked as well.
+CHECK_PERIOD_S = 0.05
+# Distances are sums of a few roundings.
+ROUNDING_M = 1e-6
+# A drone that is nearer to an obstacle by more than this leaves first.
+INSIDE_M = 1e-3
+# Ways out end this much beyond the radius, or tracking errors would lead back inside.
+WAY_OUT_MARGIN_M = 0.1
+# A drone stops from 2 m/s within its radius of half a metre.
+CLIMB_MPS = 2.0
+ASIDE_MPS = 1.5
+# A drone takes up another velocity with this share of its acceleration; tracking needs the rest.
+ACCELERATION_SHARE = 0.75
+# Forecasts of a person who may turn are not trusted beyond two seconds.
+ACTOR_AHEAD_S = 2.0
+# A way out is nearly always within this window, and larger ones cost the cube of their size.
+FIRST_WINDOW_M = 4.0
+# A drone that leaves a zone and meets the next one so many times stands between zones without a gap.
+MAX_ZONES_IN_A_ROW = 8
 
 
-class Flown(StrEnum):
+class FlownMotion(StrEnum):
     """Motion of a drone after a local planning."""
 
     PLANNED = "planned"
@@ -67,7 +76,7 @@ class _Around(NamedTuple):
 class _Motion:
     """A motion that ends at rest, and its least distances."""
 
-    kind: Flown
+    kind: FlownMotion
     plan: DronePlan
     states: Float  # [K + 1, 4, 3], see `tracking`
     clearance_m: float
@@ -88,12 +97,12 @@ class Guard:
         self._config, self._flying, self._exactly = config, flying_of(config), exactly
         self._ticks = math.ceil(config.tuning.tracking_hz / config.tuning.local_hz - 1e-9)
         rows = self._ticks + stopping_ticks(self._flying) + 1
-        self._ticks_ahead = min(round(_ACTOR_AHEAD_S * config.tuning.tracking_hz), rows - 1)
+        self._ticks_ahead = min(round(ACTOR_AHEAD_S * config.tuning.tracking_hz), rows - 1)
         self._states = np.zeros((len(position), rows, 4, 3))
         self._states[:, :, POSITION] = position[:, None]
         self._age = np.zeros(len(position), dtype=np.int64)  # periods since a drone's motion was committed
         self._last: list[DronePlan | None] = [None] * len(position)
-        self.counts: Counter[Flown] = Counter()
+        self.counts: Counter[FlownMotion] = Counter()
 
     @property
     def position(self) -> Float:
@@ -134,8 +143,10 @@ class Guard:
             if _shortfall(motion, least) == _NONE:
                 break
         chosen = min(tried, key=lambda motion: _shortfall(motion, least))
-        self.counts[chosen.kind if _shortfall(chosen, least) == _NONE else Flown.UNSAFE] += 1
-        self._last[drone] = chosen.plan if chosen.kind in (Flown.PLANNED, Flown.PREVIOUS) else None
+        self.counts[chosen.kind if _shortfall(chosen, least) == _NONE else FlownMotion.UNSAFE] += 1
+        self._last[drone] = (
+            chosen.plan if chosen.kind in (FlownMotion.PLANNED, FlownMotion.PREVIOUS) else None
+        )
         self._states[drone], self._age[drone] = chosen.states, 0
         return chosen.plan
 
@@ -150,10 +161,7 @@ class Guard:
         return np.asarray(self._states[others.nonzero()[0][:, None], ahead, POSITION])
 
     def _least(self, now: tuple[float, float, float], around: _Around) -> tuple[float, float, float]:
-        """Return the distances to map, drones and actor that must be kept.
-
-        They are the configured ones, or the present ones if these are smaller.
-        """
+        """Return the distances to map, drones and actor that must be kept."""
         config = self._config
         # The actor's estimate errs by about the log's noise.
         stated = (
@@ -162,7 +170,7 @@ class Guard:
             config.actor_distance_m + config.tuning.actor_sigma_m if config.actor_distance_m else 0.0,
         )
         map_m, drones_m, actor_m = (
-            min(one, other) - _ROUNDING_M for one, other in zip(stated, now, strict=True)
+            min(one, other) - ROUNDING_M for one, other in zip(stated, now, strict=True)
         )
         return map_m, drones_m, actor_m
 
@@ -172,38 +180,35 @@ class Guard:
         """Yield motions from the best to the last resort, from a place of this clearance."""
         here, field = self._states[drone, self._age[drone]], around.field
 
-        def follow(kind: Flown, followed: DronePlan) -> _Motion:
+        def follow(kind: FlownMotion, followed: DronePlan) -> _Motion:
             exactly = self._exactly and followed is plan
             states, stopped = self._rolled_out(t_s, here, followed, self._ticks, exactly)
             ahead, _ = self._rolled_out(t_s, here, followed, self._ticks_ahead, exactly, stops=False)
             return self._measured(kind, followed, states, stopped, ahead, around)
 
         place, wanted_m = here[POSITION], wanted_clearance_m(self._config, field.grid)
-        if clearance_m < wanted_m - _INSIDE_M:
-            goal = nearest_free(field, place, wanted_m + _DEEPER_M)
+        if clearance_m < wanted_m - INSIDE_M:
+            goal = nearest_free(field, place, wanted_m + WAY_OUT_MARGIN_M)
             if goal is not None:
                 way = goal - place
                 length = float(np.linalg.norm(way))
-                speed = min(_ASIDE_MPS, 2.0 * length)  # no farther than the goal within a second
-                yield follow(Flown.LEFT, self._steered(t_s, here, way * (speed / max(length, 1e-9))))
-        yield follow(Flown.PLANNED, plan)
+                speed = min(ASIDE_MPS, 2.0 * length)  # no farther than the goal within a second
+                yield follow(FlownMotion.LEFT, self._steered(t_s, here, way * (speed / max(length, 1e-9))))
+        yield follow(FlownMotion.PLANNED, plan)
         previous = self._last[drone]
         if previous is not None:
-            yield follow(Flown.PREVIOUS, previous)
+            yield follow(FlownMotion.PREVIOUS, previous)
         for kind, velocity in self._ways_out(here, around):
             yield follow(kind, self._steered(t_s, here, velocity))
         rows = np.minimum(self._age[drone] + np.arange(self._states.shape[1]), self._states.shape[1] - 1)
         committed = self._states[drone, rows]
         braked = self._plan_of(t_s, committed)
-        yield self._measured(Flown.BRAKED, braked, committed, len(committed) - 1, committed, around)
+        yield self._measured(FlownMotion.BRAKED, braked, committed, len(committed) - 1, committed, around)
 
     def _rolled_out(
         self, t_s: float, here: Float, plan: DronePlan, ticks: int, exactly: bool, *, stops: bool = True
     ) -> tuple[Float, int]:
-        """Return states [K + 1, 4, 3] of a drone that follows a plan and then stops, and the row of the stop.
-
-        Without `stops` they end where the drone leaves the plan.
-        """
+        """Return states [K + 1, 4, 3] of a drone that follows a plan and stops, and the row of the stop."""
         stopping = self._states.shape[1] - self._ticks if stops else 1
         states = np.empty((ticks + stopping, 4, 3))
         states[0] = here
@@ -213,35 +218,27 @@ class Guard:
         )
         return states, stopped
 
-    def _ways_out(self, here: Float, around: _Around) -> list[tuple[Flown, Float]]:
-        """Return velocities for ways out.
-
-        They go up, up and off the nearest obstacle, or away from the actor, faster than the actor. Of several
-        people the nearest one counts.
-        """
+    def _ways_out(self, here: Float, around: _Around) -> list[tuple[FlownMotion, Float]]:
+        """Return velocities for ways out."""
         place = here[POSITION]
         actor = around.people[np.linalg.norm(around.people[:, 0] - place, axis=-1).argmin()]
-        up = np.array([0.0, 0.0, _CLIMB_MPS])
+        up = np.array([0.0, 0.0, CLIMB_MPS])
         level = around.field.sample(place)[1] * [1.0, 1.0, 0.0]
-        off = level / max(float(np.linalg.norm(level)), 1e-9) * _ASIDE_MPS
+        off = level / max(float(np.linalg.norm(level)), 1e-9) * ASIDE_MPS
         pace_mps = float(np.linalg.norm(actor[1] - actor[0])) / self._flying.period_s
         away = (place - actor[0]) * [1.0, 1.0, 0.0]
-        away *= (pace_mps + _CLIMB_MPS) / max(float(np.linalg.norm(away)), 1e-9)
+        away *= (pace_mps + CLIMB_MPS) / max(float(np.linalg.norm(away)), 1e-9)
         return [
-            (Flown.CLIMBED, up),
-            (Flown.CLIMBED, up + off),
-            (Flown.GAVE_WAY, away + up / 2.0),
-            (Flown.GAVE_WAY, away),
+            (FlownMotion.CLIMBED, up),
+            (FlownMotion.CLIMBED, up + off),
+            (FlownMotion.GAVE_WAY, away + up / 2.0),
+            (FlownMotion.GAVE_WAY, away),
         ]
 
     def _measured(
-        self, kind: Flown, plan: DronePlan, states: Float, stopped: int, ahead: Float, around: _Around
+        self, kind: FlownMotion, plan: DronePlan, states: Float, stopped: int, ahead: Float, around: _Around
     ) -> _Motion:
-        """Measure the least distances of a motion to the map and to drones, and of its plan to the actor.
-
-        A drone at rest cannot keep away from an actor who walks: for the actor the plan counts, not the stop.
-        The actor may walk on as forecast, or stop where they are.
-        """
+        """Measure the least distances of a motion to the map and to drones, and of its plan to the actor."""
         distances = least_distances(
             around.field.grid,
             states,
@@ -257,7 +254,7 @@ class Guard:
         """Return a plan that takes up a velocity [3] m/s with a constant acceleration."""
         after = self._waypoint_times()
         change = velocity - here[VELOCITY]
-        until = float(np.linalg.norm(change)) / (_CHANGE_SHARE * self._config.acceleration_mps2)
+        until = float(np.linalg.norm(change)) / (ACCELERATION_SHARE * self._config.acceleration_mps2)
         share = np.minimum(after, until)
         gained = change * (share**2 / (2.0 * max(until, 1e-9)) + after - share)
         path = here[POSITION] + here[VELOCITY] * after + gained
@@ -298,7 +295,7 @@ def nearest_free(field: DistanceField, point: Float, wanted_m: float) -> Float |
             return out
     size = np.array(grid.distance_m.shape)
     middle = np.floor((point - grid.origin) / grid.resolution_m).astype(np.int64)
-    reach = math.ceil(_WINDOW_M / grid.resolution_m)
+    reach = math.ceil(FIRST_WINDOW_M / grid.resolution_m)
     while True:
         low, high = np.clip(middle - reach, 0, size - 1), np.clip(middle + reach + 1, 1, size)
         part = grid.distance_m[tuple(slice(*ends) for ends in zip(low, high, strict=True))]
@@ -320,20 +317,17 @@ def nearest_free(field: DistanceField, point: Float, wanted_m: float) -> Float |
 def _out_of_zones(field: DistanceField, point: Float, wanted_m: float) -> Float | None:
     """Go straight away from the nearest barrier, and from those it leads to; None if that is in vain."""
     place = point.copy()
-    for _ in range(_ZONES_IN_A_ROW):
+    for _ in range(MAX_ZONES_IN_A_ROW):
         distance, gradient = field.sample(place)
         if distance >= wanted_m:
             return place
-        place = place + (wanted_m - distance + _INSIDE_M) * gradient
+        place = place + (wanted_m - distance + INSIDE_M) * gradient
     return place if field.sample(place)[0] >= wanted_m else None
 
 
 @helper
 def _least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> float:
-    """Compute the least distance to obstacles along a motion [K + 1, 4, 3] up to a row.
-
-    It is sampled every 0.05 s or every half voxel, whichever is finer, on straight lines between two rows.
-    """
+    """Compute the least distance to obstacles along a motion [K + 1, 4, 3] up to a row."""
     least = math.inf
     for k in range(last + 1):
         x, y, z = states[k, 0, 0], states[k, 0, 1], states[k, 0, 2]
@@ -341,7 +335,7 @@ def _least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> f
             return float(min(least, barred(grid, x, y, z)[0]))
         dx, dy, dz = states[k + 1, 0, 0] - x, states[k + 1, 0, 1] - y, states[k + 1, 0, 2] - z
         moved = math.sqrt(dx * dx + dy * dy + dz * dz)
-        pieces = max(math.ceil(period_s / _CHECK_S), math.ceil(2.0 * moved / grid.resolution_m), 1)
+        pieces = max(math.ceil(period_s / CHECK_PERIOD_S), math.ceil(2.0 * moved / grid.resolution_m), 1)
         for piece in range(pieces):
             u = piece / pieces
             least = min(least, barred(grid, x + u * dx, y + u * dy, z + u * dz)[0])

@@ -32,14 +32,22 @@ from pipelines.session.tables import (
 
 Source = Literal["log", "reconstruction", "truth"]
 
-_LONGEST_STEP_NS = 200_000_000  # joints are interpolated across this much at least: 10 Hz and a missed frame
-_STEPS = 1.5  # or this many median steps
-_GAP_NS = 1_000_000_000  # longer gaps of the actor's measurements give a warning
-_COMMAND_HOLDS_NS = 2_000_000_000  # longest time for which a command holds; planners send several a second
-_SHORTEST_S = 1.0
+# Joints are interpolated across a missed frame at 10 Hz.
+MIN_INTERPOLATED_NS = 200_000_000
+# Joints are not interpolated across more than this many median steps.
+MAX_STEPS_INTERPOLATED = 1.5
+# A person can turn round within a second, so that longer gaps of the actor's measurements give a warning.
+LONG_GAP_NS = 1_000_000_000
+# Planners send several commands a second, so that a command that is older does not hold.
+COMMAND_HOLDS_NS = 2_000_000_000
+# A shorter flight has too few plans to compare.
+MIN_FLIGHT_S = 1.0
+# People without a common time are matched last: no distance is as large.
+NEVER_TOGETHER_M = 1e6
+# Others who are reconstructed at less than half of the first person's times are not filmed again.
+MIN_SHARE_OF_TIMES = 0.5
+
 _HIPS = ("left_hip", "right_hip")
-_FAR_M = 1e6
-_LEAST_SHARE = 0.5  # of the first person's times: others who are reconstructed less are not filmed again
 
 
 @dataclass(frozen=True)
@@ -126,11 +134,11 @@ def load_flight(
         known = np.isfinite(hips.position[..., 0, 0]).all(axis=1)
         spans["the truth"] = hips.t_ns[np.flatnonzero(known)[[0, -1]]]
     t_ns, actor = _cut(folder, t_ns, actor, spans)
-    missing = [gap for own in np.isfinite(actor[..., 0]).T for gap in gaps(t_ns[own], _GAP_NS)]
+    missing = [gap for own in np.isfinite(actor[..., 0]).T for gap in gaps(t_ns[own], LONG_GAP_NS)]
     if missing:
         longest_s = max(last - first for first, last in missing) / 1e9
         warnings.append(
-            f"the actor was not measured {len(missing)} times for more than {_GAP_NS / 1e9:g} s, at most"
+            f"the actor was not measured {len(missing)} times for more than {LONG_GAP_NS / 1e9:g} s, at most"
             f" {longest_s:.1f} s: planners take a straight way meanwhile"
         )
     return LoggedFlight(
@@ -153,7 +161,7 @@ def load_flight(
 def points_at(motion: JointMotion, t_ns: Int64) -> Float:
     """Interpolate the joints [T, P, J, 3] at given times; NaN where not known nearby."""
     step_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
-    longest_ns = max(_LONGEST_STEP_NS, round(_STEPS * step_ns))
+    longest_ns = max(MIN_INTERPOLATED_NS, round(MAX_STEPS_INTERPOLATED * step_ns))
     return interpolate_points(motion.t_ns, motion.position, t_ns, max_gap_ns=longest_ns)
 
 
@@ -187,7 +195,7 @@ def planned_positions(flight: LoggedFlight, t_ns: Int64) -> tuple[Float, Bool]:
     for i, (stamps, sent) in enumerate(flight.planned.values()):
         after = np.searchsorted(stamps, t_ns, side="left").clip(1, max(len(stamps) - 1, 1))
         apart = np.diff(stamps, append=stamps[-1])[after - 1]
-        known.append((t_ns >= stamps[0]) & (t_ns <= stamps[-1]) & (apart <= _COMMAND_HOLDS_NS))
+        known.append((t_ns >= stamps[0]) & (t_ns <= stamps[-1]) & (apart <= COMMAND_HOLDS_NS))
         for axis in range(3):
             position[i, :, axis] = np.interp(t_ns - stamps[0], stamps - stamps[0], sent[:, axis])
     return position, np.array(known, dtype=np.bool_).reshape(position.shape[:2])
@@ -215,10 +223,7 @@ def _reconstruction(folder: Path, span_ns: Span | None) -> JointMotion:
 
 
 def _of_people(skeleton: JointMotion, t_ns: Int64, actor: Float, *, logged: bool) -> JointMotion:
-    """Return the skeletons of the P people whose hips [A, P, 3] were measured; NaN for those without one.
-
-    Logged people have the numbers of the skeletons. Others are the skeletons nearest to them, in the mean.
-    """
+    """Return the skeletons of the P people whose hips [A, P, 3] were measured; NaN for those without one."""
     from scipy.optimize import linear_sum_assignment
 
     people = actor.shape[1]
@@ -231,7 +236,7 @@ def _of_people(skeleton: JointMotion, t_ns: Int64, actor: Float, *, logged: bool
         apart = np.linalg.norm(hips[:, None] - there[:, :, None], axis=-1)  # [T, P, Q]
         known = np.isfinite(apart)
         mean = np.where(known, apart, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-        person, whose = linear_sum_assignment(np.where(known.any(axis=0), mean, _FAR_M))
+        person, whose = linear_sum_assignment(np.where(known.any(axis=0), mean, NEVER_TOGETHER_M))
     position[:, person] = skeleton.position[:, whose]
     return JointMotion(skeleton.t_ns, skeleton.joints, position)
 
@@ -291,7 +296,7 @@ def _actor(
             code="no-actor",
         )
     known = np.isfinite(middle[..., 0])
-    filmed = known[known[:, 0]].mean(axis=0) >= _LEAST_SHARE
+    filmed = known[known[:, 0]].mean(axis=0) >= MIN_SHARE_OF_TIMES
     return *_measured(folder, found.t_ns, middle[:, filmed], "the reconstruction's hips"), "reconstruction"
 
 
@@ -311,11 +316,11 @@ def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.in
     last_ns = min(int(span[1]) for span in [*own, *spans.values()])
     kept = (t_ns >= first_ns) & (t_ns <= last_ns)
     shared_s = float(np.ptp(t_ns[kept]) / 1e9) if kept.any() else 0.0
-    if shared_s < _SHORTEST_S:
+    if shared_s < MIN_FLIGHT_S:
         raise DataError(
             folder,
             f"{', '.join(['the actor', *spans])} are known together for {shared_s:.2f} s, less than"
-            f" {_SHORTEST_S:g} s",
+            f" {MIN_FLIGHT_S:g} s",
             "check the clocks of the logs",
             code="no-overlap",
         )
@@ -389,10 +394,7 @@ def _said_by(stating: set[str]) -> str:
 
 
 def _logged_sigma(trajectory: Trajectory) -> tuple[float, float] | None:
-    """Compute the median standard deviation per axis (m, rad) of the logged covariances.
-
-    None if they contain no information.
-    """
+    """Compute the median standard deviation per axis (m, rad) of the logged covariances."""
     if trajectory.covariance is None:
         return None
     variances, known_axes = known_variances(trajectory.covariance)

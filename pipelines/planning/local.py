@@ -37,11 +37,16 @@ from pipelines.planning.distance_field import (
 from pipelines.planning.tracking import DronePlan
 
 TERMS = ("smooth", "form", "obs", "occ", "sep")
-_SLOWEST_STEP = 1e4  # of eta: beyond it nothing moves
-_FASTEST_STEP = 0.2  # likewise: five Newton steps
-_ASTRAY_M = 3.0  # a plan that ends farther off the slot may be in a local minimum
-_ROUNDS = 10  # of projection, each a little farther than the one before
-_MARGIN_M = 0.1  # projected waypoints keep this much more than the least distance
+# Beyond this divisor of a Newton step nothing moves.
+MAX_ETA = 1e4
+# Steps of more than five Newton steps are not tried.
+MIN_ETA = 0.2
+# A plan that ends farther off the slot may be in a local minimum.
+ASTRAY_M = 3.0
+# Each round of projection goes 5 % farther; after ten there is no room.
+MAX_PROJECTION_ROUNDS = 10
+# The ways between projected waypoints need this much more than the least distance.
+PROJECTION_MARGIN_M = 0.1
 
 
 class Weights(NamedTuple):
@@ -96,10 +101,7 @@ def _hinge(distance: float, eps: float) -> tuple[float, float]:
 
 @helper
 def _add_smoothness(path: Float, w: Weights, gradient: Float) -> float:
-    """Compute the squared velocity, acceleration and jerk, and add to the gradient.
-
-    `path` [N + 3, 3] begins with three fixed points.
-    """
+    """Compute the squared velocity, acceleration and jerk, and add to the gradient."""
     n = gradient.shape[0]
     h1 = 1.0 / w.step_s
     h2, h3 = h1 * h1, h1 * h1 * h1
@@ -123,11 +125,7 @@ def _add_smoothness(path: Float, w: Weights, gradient: Float) -> float:
 
 @helper
 def _sight_cost(grid: Grid, q: Float, actor: Float, w: Weights) -> tuple[float, float, float, float]:
-    """Compute the hinge cost along the sight line, times its length, and its gradient by the position q.
-
-    Points p = q + sigma (L - r L/|L|), L = actor - q, sigma in 0..1: the line ends r off the actor, and
-    moves with q by (1 - sigma) I + sigma r/|L| (I - LL'/|L|^2), so that the cost has no steps.
-    """
+    """Compute the hinge cost along the sight line, times its length, and its gradient by the position q."""
     lx, ly, lz = actor[0] - q[0], actor[1] - q[1], actor[2] - q[2]
     length = math.sqrt(lx * lx + ly * ly + lz * lz)
     reach = length - w.sight_start_m
@@ -243,10 +241,7 @@ def _evaluate(
 
 @cached
 def _factorise(n: int, w: Weights) -> Float:
-    """Compute the Cholesky factor of (A_smooth + l_form I)/N, banded: [N, 4].
-
-    Column b holds L[i, i - b].
-    """
+    """Compute the Cholesky factor of (A_smooth + l_form I)/N, banded: [N, 4]."""
     h = 1.0 / w.step_s
     stencil = np.array([[1.0, -1.0, 0.0, 0.0], [1.0, -2.0, 1.0, 0.0], [1.0, -3.0, 3.0, -1.0]])
     weight = np.array([w.a_velocity * h**2, w.a_acceleration * h**4, w.a_jerk * h**6])
@@ -325,10 +320,10 @@ def _descend(
             path, tried = tried, path
             gradient, tried_gradient = tried_gradient, gradient
             cost = tried_cost
-            eta = max(eta / 1.5, _FASTEST_STEP)
+            eta = max(eta / 1.5, MIN_ETA)
         else:
             eta *= 3.0
-            if eta > _SLOWEST_STEP:
+            if eta > MAX_ETA:
                 return path, cost, used + 1
     return path, cost, iterations
 
@@ -387,7 +382,7 @@ class LocalPlanner:
         waypoints = np.stack([p.at(np.append(t_s, times))[0] for p in others]) if others else _nobody(times)
         guess = slots if previous is None else previous.at(times)[0]
         path, cost, evaluations = self._descended(position, velocity, guess, slots, actor, waypoints, field)
-        if previous is not None and np.linalg.norm(path[-1] - slots[-1]) > _ASTRAY_M:
+        if previous is not None and np.linalg.norm(path[-1] - slots[-1]) > ASTRAY_M:
             # Caught behind something: descend once more from the slots, and take the better result.
             other = self._descended(position, velocity, slots, slots, actor, waypoints, field)
             evaluations += other[2]
@@ -494,7 +489,7 @@ def _keep_apart(
     """Return the path [N + 1, 3], pushed away from the others' [M, N + 1, 3] if need be, or the old one."""
     if closest_approach(path, others) >= least_m:
         return path, Separation.KEPT
-    pushed = _pushed_apart(path, others, least_m + _MARGIN_M)
+    pushed = _pushed_apart(path, others, least_m + PROJECTION_MARGIN_M)
     free = field.sample(pushed[1:])[0].min() > min(0.0, field.sample(path[1:])[0].min())
     if free and closest_approach(pushed, others) >= least_m:
         return pushed, Separation.PROJECTED
@@ -505,14 +500,9 @@ def _keep_apart(
 
 
 def _pushed_apart(path: Float, others: Float, least_m: float) -> Float:
-    """Move waypoints aside until no way between them comes nearer to the others. The start stays.
-
-    All waypoints near another drone move in the same direction, along the line that joins the two drones at
-    their nearest. If each moved straight away from the other drone, those before and behind a crossing would
-    move to opposite sides, and the drone would fly through the middle.
-    """
+    """Move waypoints aside until no way between them comes nearer to the others. The start stays."""
     pushed = path.copy()
-    for round_ in range(_ROUNDS):
+    for round_ in range(MAX_PROJECTION_ROUNDS):
         if closest_approach(pushed, others) >= least_m:
             break
         wanted_m = least_m * (1.0 + 0.05 * round_)

@@ -28,11 +28,12 @@ from pipelines.planning.formation import (
     slot_offsets,
     turned,
 )
-from pipelines.planning.guard import Flown, Guard
+from pipelines.planning.guard import FlownMotion, Guard
 from pipelines.planning.local import LocalPlanner, Separation
 from pipelines.planning.tracking import DronePlan, tracking_times
 
-_NOW_S = 1e-6  # times are sums of periods: due this much early is due
+# Times are sums of periods: what is due this much early is due.
+DUE_ROUNDING_S = 1e-6
 
 
 class Start(NamedTuple):
@@ -64,7 +65,7 @@ class Replay:
     estimate: Float  # [N, T, 3] the planner's estimate of whom each camera films
     aim: Float  # [N, T, P] shares of people in the place that each camera films
     separation: dict[str, int]  # local plans by `Separation`
-    safety: dict[str, int]  # local plannings by `guard.Flown`
+    safety: dict[str, int]  # local plannings by `guard.FlownMotion`
     times: PlanningTimes
 
     @property
@@ -145,10 +146,10 @@ class Pilot:
             field: the distance field of the obstacles that are known now.
         """
         config = self._config
-        if t_s >= self._next_central_s - _NOW_S:
+        if t_s >= self._next_central_s - DUE_ROUNDING_S:
             self._next_central_s = max(self._next_central_s, t_s) + 1.0 / config.tuning.central_hz
             self._plan_formation(t_s, position, velocity, field)
-        if t_s >= self._next_local_s - _NOW_S:
+        if t_s >= self._next_local_s - DUE_ROUNDING_S:
             self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.tuning.local_hz
             self._plan_locally(t_s, position, velocity, field)
 
@@ -160,7 +161,7 @@ class Pilot:
     @property
     def due_s(self) -> float:
         """Time from which `replan` makes the next plan."""
-        return min(self._next_central_s, self._next_local_s) - _NOW_S
+        return min(self._next_central_s, self._next_local_s) - DUE_ROUNDING_S
 
     def wanted(self, t_s: Float) -> tuple[Float, Float]:
         """Return commanded slots [T, N, 3], yaw from east, and the places [N, T, 3] that cameras aim at."""
@@ -341,6 +342,6 @@ def replay(
         estimate=estimate,
         aim=aim,
         separation={kind.value: pilot.separation[kind] for kind in Separation},
-        safety={kind.value: guard.counts[kind] for kind in Flown},
+        safety={kind.value: guard.counts[kind] for kind in FlownMotion},
         times=pilot.times,
     )

@@ -42,12 +42,17 @@ from pipelines.session.description import Description
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 
+# More drones are refused, because no comparison of more was ever checked.
 MOST_DRONES = 8
+# The detector's errors are modelled for 30 Hz, and 25 divide the 50 of the tracking.
 PICTURES_HZ = 25.0
-"""Rate of the pictures: near enough to the 30 Hz for which the detector's errors are modelled."""
-_COST_MAP_HZ, _COST_MAP_YAWS = 2.0, 72
-_NOISE_LOOKS = 200  # moments from which the noise of a flight's poses is averaged
-_HIDDEN_HZ = 10.0  # rate of the moments of `hidden_shares`
+# The report's cost map has a column every half second and a row every 5 deg.
+COST_MAP_HZ = 2.0
+COST_MAP_YAWS = 72
+# Errors of poses change slowly along a flight, so that the mean over 200 moments is that of all.
+NOISE_LOOKS = 200
+# A share of moments is exact to a second in a hundred at this rate.
+HIDDEN_LOOKS_HZ = 10.0
 
 
 @dataclass(frozen=True)
@@ -180,8 +185,8 @@ class ReplayScene:
 
     def cost_map(self) -> tuple[Int64, Float, Float]:
         """Compute times [M], yaws [D] of the first camera, and the formation's cost [M, D] there."""
-        rows = slice(None, None, max(round(self.config.tuning.tracking_hz / _COST_MAP_HZ), 1))
-        yaws = yaw_set(_COST_MAP_YAWS, self.yaw_rad)
+        rows = slice(None, None, max(round(self.config.tuning.tracking_hz / COST_MAP_HZ), 1))
+        yaws = yaw_set(COST_MAP_YAWS, self.yaw_rad)
         slots = formation_slots(
             yaws, self.drones, tilt_rad=self.config.tilt_rad, range_m=self.config.radius_m
         )
@@ -269,7 +274,7 @@ def with_pose_errors(
         position: [C, T, 3] m, of the cameras as flown.
         quaternion_xyzw: [C, T, 4], the same.
     """
-    rows = slice(None, None, max(len(t_ns) // _NOISE_LOOKS, 1))
+    rows = slice(None, None, max(len(t_ns) // NOISE_LOOKS, 1))
     elapsed_s = (t_ns[rows] - t_ns[0]) / 1e9
     sigma = [
         sum_sigma(camera.noise, elapsed_s, *rates(t_ns[rows], position[c, rows], quaternion_xyzw[c, rows]))
@@ -328,7 +333,7 @@ def hidden_shares(
     """
     start_m = PlannerTuning().sight_start_m
     first_ns, last_ns = int(flight.actor_t_ns[0]), int(flight.actor_t_ns[-1])
-    count = max(2, round((last_ns - first_ns) / 1e9 * _HIDDEN_HZ) + 1)
+    count = max(2, round((last_ns - first_ns) / 1e9 * HIDDEN_LOOKS_HZ) + 1)
     t_ns = np.linspace(first_ns, last_ns, count).round().astype(np.int64)
     people, _ = flight.scored_actor(t_ns)
     position, _, known = flown_poses(flight, description, t_ns)

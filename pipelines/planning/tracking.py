@@ -22,10 +22,14 @@ from pipelines.planning.config import PlannerConfig
 POSITION, VELOCITY, ACCELERATION, INTEGRAL = range(4)
 """Rows of a drone's state [4, 3]: m, m/s, m/s^2, and the integral of the position error in m s."""
 
-_LOOKAHEAD_S = 0.25  # longer than the change of acceleration from limit to limit takes (0.16 s by default)
-_BRAKING_PER_S = 3.0  # deceleration over speed in the end of a stop
-_STOPPED_MPS = 1e-3
-_LONGEST_MARGIN_S = 3.5  # of a stop: the exponential end from 1.3 m/s to 1 mm/s takes 2.4 s
+# Acceleration changes from limit to limit in 0.16 s by default, which has to end before the speed's limit.
+LOOKAHEAD_S = 0.25
+# The deceleration falls with the speed in the end of a stop, which so ends without a jerk.
+BRAKING_PER_S = 3.0
+# A drone that moves by less than a millimetre a second stands.
+STOPPED_MPS = 1e-3
+# The exponential end of a stop from 1.3 m/s to 1 mm/s takes 2.4 s.
+STOP_MARGIN_S = 3.5
 
 
 @dataclass(frozen=True)
@@ -122,18 +126,14 @@ def _shorten(vector: Float, longest: float) -> bool:
 
 @helper
 def _fly(wanted: Float, flying: Flying, state: Float, following: Float, scratch: Float) -> bool:
-    """Fly one period at `wanted` [3], shortened to the limits.
-
-    The drone accelerates by `wanted` or as near to it as the limits allow. `scratch` [3] is overwritten.
-    Return True if `wanted` was shortened.
-    """
+    """Fly one period at `wanted` [3], shortened to the limits."""
     shortened = _shorten(wanted, flying.acceleration_mps2)
     for axis in range(3):
-        scratch[axis] = state[VELOCITY, axis] + wanted[axis] * _LOOKAHEAD_S
+        scratch[axis] = state[VELOCITY, axis] + wanted[axis] * LOOKAHEAD_S
     if _shorten(scratch, flying.speed_mps):
         shortened = True
         for axis in range(3):
-            wanted[axis] = (scratch[axis] - state[VELOCITY, axis]) / _LOOKAHEAD_S
+            wanted[axis] = (scratch[axis] - state[VELOCITY, axis]) / LOOKAHEAD_S
         _shorten(wanted, flying.acceleration_mps2)
     for axis in range(3):
         scratch[axis] = wanted[axis] - state[ACCELERATION, axis]
@@ -173,7 +173,7 @@ def roll_out(
         The row at which the drone stands still; all that follow are like it.
     """
     x, v, a, wanted, scratch = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    braking = min(_BRAKING_PER_S, 0.5 * flying.jerk_mps3 / flying.acceleration_mps2)
+    braking = min(BRAKING_PER_S, 0.5 * flying.jerk_mps3 / flying.acceleration_mps2)
     last = states.shape[0] - 1
     for k in range(last):
         state, following = states[k], states[k + 1]
@@ -205,7 +205,7 @@ def roll_out(
         for axis in range(3):
             following[INTEGRAL, axis] = 0.0
             square += following[VELOCITY, axis] ** 2
-        if square < _STOPPED_MPS**2:
+        if square < STOPPED_MPS**2:
             following[VELOCITY] = 0.0
             following[ACCELERATION] = 0.0
             for rest in range(k + 2, last + 1):
@@ -217,4 +217,4 @@ def roll_out(
 def stopping_ticks(flying: Flying) -> int:
     """Return the largest number of periods that any stop takes."""
     slow_s = flying.speed_mps / flying.acceleration_mps2 + flying.acceleration_mps2 / flying.jerk_mps3
-    return math.ceil((slow_s + _LONGEST_MARGIN_S) / flying.period_s)
+    return math.ceil((slow_s + STOP_MARGIN_S) / flying.period_s)

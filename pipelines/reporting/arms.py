@@ -68,7 +68,7 @@ if TYPE_CHECKING:
 MAP_MARGIN_M = 12.0
 # Everything lower than this above the ground is ground.
 LOWEST_OBSTACLE_M = 0.5
-# More cubes make the page larger by more than a tenth.
+# More cubes cannot be told apart in the 3D view.
 MAX_SURFACE_POINTS = 3000
 # Finer cells of the top view cannot be told apart in a panel.
 MAX_TOP_CELLS = 120
@@ -119,7 +119,7 @@ class Heights:
 
 
 @dataclass(frozen=True)
-class MapSurface:
+class RaisedSurface:
     """The surface of everything that rises above the ground, thinned out."""
 
     points: Float  # [N, 3] m, world: middles of cubes
@@ -170,7 +170,7 @@ def heights(around: MapAround) -> Heights:
     )
 
 
-def surface(around: MapAround, most: int = MAX_SURFACE_POINTS) -> MapSurface:
+def surface(around: MapAround, most: int = MAX_SURFACE_POINTS) -> RaisedSurface:
     """Return the occupied voxels with a free neighbour that rise above the ground.
 
     They are grouped in cubes of whole voxels, the smallest with which at most `most` cubes are occupied.
@@ -189,7 +189,7 @@ def surface(around: MapAround, most: int = MAX_SURFACE_POINTS) -> MapSurface:
         gathered += 1
         cubes = np.unique(voxels // gathered, axis=0)
     cube_m = around.resolution_m * gathered
-    return MapSurface(around.corner + cube_m * (cubes + 0.5), cube_m, len(voxels))
+    return RaisedSurface(around.corner + cube_m * (cubes + 0.5), cube_m, len(voxels))
 
 
 # --- flights ---

@@ -391,7 +391,7 @@ class Bars:
 
 
 @dataclass(frozen=True)
-class Points:
+class RowPoints:
     """Points [N] in rows from above, with the interval of each, where there is one; 0 rows are a legend."""
 
     rows: Sequence[float]
@@ -417,7 +417,7 @@ class Stack:
 class Panel:
     """One drawing of a figure: its marks, labels and spans."""
 
-    marks: Sequence[Line | Bars | Points | Stack]
+    marks: Sequence[Line | Bars | RowPoints | Stack]
     x_label: str = ""
     y_label: str = ""
     rows: Mapping[float, str] | None = None  # labels of rows from above, by place
@@ -499,7 +499,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     quiet(axes, panel.grid)
 
 
-def _draw_mark(axes: Axes, mark: Line | Bars | Points | Stack) -> None:
+def _draw_mark(axes: Axes, mark: Line | Bars | RowPoints | Stack) -> None:
     if isinstance(mark, Line):
         if mark.low is not None and mark.high is not None:
             axes.fill_between(mark.x, mark.low, mark.high, color=mark.colour, alpha=mark.shade, linewidth=0)
@@ -508,7 +508,7 @@ def _draw_mark(axes: Axes, mark: Line | Bars | Points | Stack) -> None:
     elif isinstance(mark, Bars):
         label = mark.name or None
         axes.barh(mark.rows, mark.length, mark.thickness, mark.start, color=mark.colour, label=label)
-    elif isinstance(mark, Points):
+    elif isinstance(mark, RowPoints):
         for row, x, ends in zip(mark.rows, mark.x, mark.ends, strict=True):
             if ends is not None:
                 axes.plot(ends, [row, row], color=mark.colour, linewidth=mark.width, alpha=mark.opacity)

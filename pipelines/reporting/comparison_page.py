@@ -20,7 +20,7 @@ from pipelines.reporting.chart import (
     Line,
     Panel,
     Plate,
-    Points,
+    RowPoints,
     as_csv,
     chart,
     means,
@@ -605,7 +605,7 @@ def _joint_bars(comparison: Comparison, measure: Measure) -> Plate:
     thick = 0.8 / len(there)
     panels = []
     for of in (measure, MEASURE_OF["share"]):
-        marks: list[Bars | Points] = []
+        marks: list[Bars | RowPoints] = []
         for k, one in enumerate(there):
             found = one.per_joint.get(of.key, {})
             known = [(j, found[name]) for j, name in enumerate(joints) if name in found]
@@ -613,7 +613,7 @@ def _joint_bars(comparison: Comparison, measure: Measure) -> Plate:
             values, ends = [each.value for _, each in known], [each.interval for _, each in known]
             name = shortened(one.label) if of is measure else ""
             bars = Bars(rows, 0.0, values, colour_of(comparison, one), name, 0.92 * thick)
-            marks += [bars, Points(rows, values, ends, MUTED, width=0.8, marked=False)]
+            marks += [bars, RowPoints(rows, values, ends, MUTED, width=0.8, marked=False)]
         labels = {float(j): shortened(joint_label(name)) for j, name in enumerate(joints)}
         span = (0, None) if of is measure else (0, 100)
         panels.append(Panel(marks, f"{of.name} ({of.unit})", rows=labels, x_span=span, grid="x"))
@@ -661,7 +661,7 @@ def _differences(comparison: Comparison) -> Plate:
             ends.append(None if interval is None else (scale * interval[0], scale * interval[1]))
             drawn.append((pair.other.label, measure.label, values[-1], *(ends[-1] or (np.nan, np.nan))))
         name = shortened(pair.other.label) if len(pairs) > 1 else ""
-        marks.append(Points(rows, values, ends, colour_of(comparison, pair.other), name))
+        marks.append(RowPoints(rows, values, ends, colour_of(comparison, pair.other), name))
     panel = Panel(
         marks,
         f"difference from {shortened(comparison.sessions[0].label)} (% of its value)",

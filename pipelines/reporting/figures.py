@@ -32,7 +32,7 @@ from pipelines.reporting.chart import (
     Line,
     Panel,
     Plate,
-    Points,
+    RowPoints,
     Stack,
     axis_label,
     bounds,
@@ -226,10 +226,7 @@ def _draw_camera(
     style: tuple[str, Any],
     extent_m: float,
 ) -> tuple[Float, int]:
-    """Draw a path with strokes in the direction of view; a camera that stands still is a square.
-
-    Returns the path as drawn, from the origin, and the stride of the drawn poses.
-    """
+    """Draw a path with strokes in the direction of view; a camera that stands still is a square."""
     ground = track.position[:, :2] - origin
     look = rotate(track.quaternion_xyzw, np.array([0.0, 0.0, 1.0]))[:, :2]
     path, stride = _drawn_path(track.t_ns, ground, [start for start, _ in camera.entry.poses.gaps_ns])
@@ -298,7 +295,7 @@ def _bone_lengths(summary: Summary) -> Plate:
     bones = summary.bones
     names = list(dict.fromkeys(bone.name for bone in bones))
     marks = [
-        Points(
+        RowPoints(
             [names.index(bone.name) + {"left": -0.17, "right": 0.17, "": 0.0}[bone.side]],
             [100 * bone.median_m],
             [(100 * bone.low_m, 100 * bone.high_m)],
@@ -559,10 +556,7 @@ def _fullest_times(motion: MeasuredMotion) -> list[int]:
 
 
 def _three_quarter_view(body: Float, joints: tuple[str, ...]) -> tuple[Float, Float]:
-    """Compute horizontal and vertical picture coordinates in metres of one body [J, 3].
-
-    The picture's right is where the body faces, turned 35 degrees towards its left, so that both sides show.
-    """
+    """Compute horizontal and vertical picture coordinates in metres of one body [J, 3]."""
     facing = np.array([1.0, 0.0])
     for left, right in (("left_hip", "right_hip"), ("left_shoulder", "right_shoulder")):
         if left in joints and right in joints:

@@ -64,7 +64,7 @@ SAME_PERSON_SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class View:
+class OverlayView:
     """The sight of one camera at a moment: P people of the skeleton with its J joints."""
 
     camera: str
@@ -95,19 +95,19 @@ class View:
 
 
 @dataclass(frozen=True)
-class Moment:
+class OverlayMoment:
     """All cameras at one time; cameras without a frame near it only by name."""
 
     t_s: float
     worst: bool
     error_mm: float | None  # the largest of a measured joint, where truth is known
-    views: tuple[View, ...]
+    views: tuple[OverlayView, ...]
     without_frame: tuple[str, ...]
 
 
 def collect_moments(
     content: SessionContent, summary: Summary, read_frame: ReadFrame | None
-) -> tuple[Moment, ...]:
+) -> tuple[OverlayMoment, ...]:
     """Collect the cameras' views at a few moments; nothing without a skeleton or without keypoints.
 
     Args:
@@ -126,7 +126,7 @@ def collect_moments(
         t_ns = int(motion.t_ns[row])
         frames = [(camera, camera.nearest_frame(t_ns)) for camera in cameras]
         moments.append(
-            Moment(
+            OverlayMoment(
                 t_s=(t_ns - summary.origin_ns) / 1e9,
                 worst=row == worst,
                 error_mm=_largest_mm(summary.errors_mm, row),
@@ -340,7 +340,7 @@ def _nearest_row(motion: MeasuredMotion, t_ns: Int64) -> Int64:
 
 def views_of(
     camera: FilmedCamera, at: Int64, motion: MeasuredMotion, status: NDArray[np.int8], origin_ns: int
-) -> list[View]:
+) -> list[OverlayView]:
     """Reproject the skeleton into frames of a camera, beside the detections there; no pictures.
 
     Args:
@@ -369,7 +369,7 @@ def views_of(
         lost = np.isfinite(found[..., 0]) & np.isnan(skeleton[n, ..., 0])
         rejected = lost & (status[n] == STATUS.index("rejected"))
         views.append(
-            View(
+            OverlayView(
                 camera=camera.name,
                 intrinsics=camera.intrinsics,
                 joints=joints,
@@ -419,7 +419,7 @@ def _view(
     row: int,
     origin_ns: int,
     read_frame: ReadFrame | None,
-) -> View:
+) -> OverlayView:
     (view,) = views_of(camera, np.array([at]), motion, motion.status[[row]], origin_ns)
     return view if read_frame is None else replace(view, picture=read_frame(view.camera, view.frame))
 

@@ -31,9 +31,9 @@ from pipelines.reporting.chart import (
 from pipelines.reporting.content import MeasuredMotion, SessionContent, Strip, side_of
 from pipelines.reporting.overlays import (
     FilmedCamera,
-    Moment,
+    OverlayMoment,
+    OverlayView,
     ReadFrame,
-    View,
     filmed_cameras,
     status_at,
     views_of,
@@ -92,7 +92,9 @@ TRIED_PICTURES = 3
 # More panels in a row are too small to see.
 MAX_PANELS_IN_ROW = 4
 
-_SHIFT = 4  # OpenCV takes coordinates in sixteenths of a pixel
+# OpenCV takes coordinates in sixteenths of a pixel.
+COORDINATE_BITS = 4
+
 _WITH_ELLIPSE = {"nose", "head", "shoulder", "elbow", "wrist", "hip", "knee", "ankle"}  # others lie too close
 
 Label = tuple[int, str, str]
@@ -114,7 +116,7 @@ class Window(NamedTuple):
 
 def draw_frame(
     picture: Picture,
-    view: View,
+    view: OverlayView,
     caption: Sequence[str],
     labels: Sequence[Label] = (),
     *,
@@ -170,7 +172,7 @@ def blank_frame(width: int, height: int, words: str) -> Picture:
     return blank
 
 
-def caption_of(view: View, status: NDArray[np.int8], method: str) -> tuple[str, str]:
+def caption_of(view: OverlayView, status: NDArray[np.int8], method: str) -> tuple[str, str]:
     """Write the caption of a frame: camera, frame, time, and the number of joints by status.
 
     Args:
@@ -204,14 +206,22 @@ def _line(picture: Picture, start: Float, end: Float, thickness: int, colour: Co
     import cv2
 
     if _drawable(np.stack([start, end])).all():
-        cv2.line(picture, _fixed(start), _fixed(end), colour, thickness, cv2.LINE_AA, _SHIFT)
+        cv2.line(picture, _fixed(start), _fixed(end), colour, thickness, cv2.LINE_AA, COORDINATE_BITS)
 
 
 def _dots(picture: Picture, points: Float, radius: float, colour: Colour) -> None:
     import cv2
 
     for point in points[_drawable(points)]:
-        cv2.circle(picture, _fixed(point), round(radius * 2**_SHIFT), colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+        cv2.circle(
+            picture,
+            _fixed(point),
+            round(radius * 2**COORDINATE_BITS),
+            colour,
+            cv2.FILLED,
+            cv2.LINE_AA,
+            COORDINATE_BITS,
+        )
 
 
 def _ellipses(
@@ -232,7 +242,9 @@ def _ellipses(
                 size = _fixed(half[::-1])
                 colour = SIDES[side_of(joints[k])]
                 centre = _fixed(body[k])
-                cv2.ellipse(picture, centre, size, angle, 0, 360, colour, thickness, cv2.LINE_AA, _SHIFT)
+                cv2.ellipse(
+                    picture, centre, size, angle, 0, 360, colour, thickness, cv2.LINE_AA, COORDINATE_BITS
+                )
 
 
 def _corners(picture: Picture, found: Float, thickness: int) -> None:
@@ -255,7 +267,15 @@ def _rings(picture: Picture, points: Float, radius: float, thickness: int, colou
     import cv2
 
     for point in points[_drawable(points)]:
-        cv2.circle(picture, _fixed(point), round(radius * 2**_SHIFT), colour, thickness, cv2.LINE_AA, _SHIFT)
+        cv2.circle(
+            picture,
+            _fixed(point),
+            round(radius * 2**COORDINATE_BITS),
+            colour,
+            thickness,
+            cv2.LINE_AA,
+            COORDINATE_BITS,
+        )
 
 
 def _crosses(picture: Picture, points: Float, arm: float, thickness: int, colour: Colour) -> None:
@@ -270,7 +290,7 @@ def _drawable(points: Float) -> NDArray[np.bool_]:
 
 
 def _fixed(point: Float) -> tuple[int, int]:
-    x, y = np.round(point * 2**_SHIFT).astype(int).tolist()
+    x, y = np.round(point * 2**COORDINATE_BITS).astype(int).tolist()
     return x, y
 
 
@@ -370,7 +390,7 @@ def _square_about(middle: Float, width: float, size: tuple[int, int]) -> Window:
     return Window(float(corner[0]) - 0.5, float(corner[1]) - 0.5, float(extent[0]))
 
 
-def window_of(view: View) -> Window:
+def window_of(view: OverlayView) -> Window:
     """Return the part that a panel shows: the people with a margin; without any, the whole picture."""
     size = (view.intrinsics.width, view.intrinsics.height)
     inside = _within(np.concatenate([view.found.reshape(-1, 2), view.reprojected.reshape(-1, 2)]), size)
@@ -423,7 +443,7 @@ def panel_width(panels: int) -> int:
     return min(MAX_PANEL_PX, int(np.sqrt(MAX_PIXELS_OF_PAGE / max(panels, 1))))
 
 
-def draw_panel(view: View, px: int) -> Picture:
+def draw_panel(view: OverlayView, px: int) -> Picture:
     """Draw the people of a view in a square of `px` pixels, on plain ground where there is no picture."""
     import cv2
 
@@ -447,26 +467,26 @@ def draw_panel(view: View, px: int) -> Picture:
         scale = wide / lens.width
         _dots(small, scale * np.nanmedian(view.others, axis=1), 2, UNMEASURED)
         start, end = (_fixed(scale * (corner + far)) for far in (0, window.width))
-        cv2.rectangle(small, start, end, _PAPER, 1, cv2.LINE_AA, _SHIFT)
+        cv2.rectangle(small, start, end, _PAPER, 1, cv2.LINE_AA, COORDINATE_BITS)
         gap = max(round(0.02 * px), 1)
         part = cv2.copyMakeBorder(small, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=_PAPER)
         drawn[gap : gap + part.shape[0], gap : gap + part.shape[1]] = part
     return drawn
 
 
-def panel_source(view: View, px: int) -> str:
+def panel_source(view: OverlayView, px: int) -> str:
     """Return a panel as the source of an `<img>`; the same view gives the same bytes with the same OpenCV."""
     data = base64.b64encode(_as_webp(draw_panel(view, px), PANEL_QUALITY)).decode("ascii")
     return f"data:image/webp;base64,{data}"
 
 
-def draw_overlays(moments: Sequence[Moment]) -> dict[str, Plate]:
+def draw_overlays(moments: Sequence[OverlayMoment]) -> dict[str, Plate]:
     """Draw a figure for every moment at which any camera has a frame, by its key."""
     plates = [_moment(k, moment) for k, moment in enumerate(moments, start=1) if moment.views]
     return {plate.key: plate for plate in plates}
 
 
-def _moment(k: int, moment: Moment) -> Plate:
+def _moment(k: int, moment: OverlayMoment) -> Plate:
     columns = min(len(moment.views), MAX_PANELS_IN_ROW)
     rows = -(-len(moment.views) // columns)
     with page_style():
@@ -498,7 +518,7 @@ def _moment(k: int, moment: Moment) -> Plate:
     return Plate(f"overlay-{k}", title, caption, f"Median reprojection error: {errors}.", figure, numbers)
 
 
-def _numbers_of_view(view: View) -> pd.DataFrame:
+def _numbers_of_view(view: OverlayView) -> pd.DataFrame:
     """Tabulate every joint in the picture; empty where it was not found or not reconstructed."""
     people, joints = view.found.shape[:2]
     reprojected = view.reprojected[:, :joints].reshape(-1, 2)

@@ -349,10 +349,7 @@ def _draw_walk(metrics: Mapping[str, Any], width_in: float, title: str = "") -> 
 
 
 def _draw_session(metrics: Mapping[str, Any]) -> Figure:
-    """Draw error against way for each combination.
-
-    Colours show the range, markers the number of drones, and texts everything else that varies.
-    """
+    """Draw error against way for each combination."""
     rows = metrics["cells"]
     ranges, counts = (sorted({row[name] for row in rows}) for name in ("range_m", "robots"))
     others = [name for name in metrics["varied"] if name not in ("range_m", "robots")]

@@ -249,10 +249,7 @@ def _certainty(summary: Summary) -> list[str]:
 
 
 def _odd_cameras(summary: Summary) -> list[str]:
-    """List cameras that agree far worse with the skeleton than the others.
-
-    This needs at least three cameras.
-    """
+    """List cameras that agree far worse with the skeleton than the others."""
     medians = {name: px[0] for name, px in camera_errors(summary).items() if px[0] is not None}
     if len(medians) < 3:
         return []

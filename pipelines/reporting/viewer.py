@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.reporting.arms import ArmTrack, MapSurface, Replan, surface
+from pipelines.reporting.arms import ArmTrack, RaisedSurface, Replan, surface
 from pipelines.reporting.content import (
     FULL_SCALE,
     MeasuredMotion,
@@ -44,7 +44,7 @@ SHARE_OF_ELLIPSOIDS = 0.25
 MAX_TIMES_WITHOUT_SKELETON = 3000
 # 16 bits of millimetres reach no farther from the middle of the body.
 FARTHEST_JOINT_M = 32.767
-# More square roots at once would take more than 100 MB.
+# Square roots are computed a part at a time, so that the others take no memory meanwhile.
 MATRICES_AT_ONCE = 1 << 15
 # Pictures farther apart are no film any more, and are noted.
 FILM_STEP_S = 0.2
@@ -127,7 +127,7 @@ def _notes(
     thinned: _Thinned,
     times: int,
     body: _PackedBody | None,
-    around: MapSurface | None,
+    around: RaisedSurface | None,
     strips: Sequence[Strip],
 ) -> list[str]:
     """List differences from the tables, in whole sentences."""
@@ -357,10 +357,7 @@ def _bounds(points: Float) -> tuple[Float, Float]:
 
 
 def _packed(values: Float, kind: type[np.int16 | np.int32]) -> str:
-    """Encode rounded values in base64.
-
-    Values that are NaN or do not fit are missing, in all their coordinates.
-    """
+    """Encode rounded values in base64."""
     limits = np.iinfo(kind)
     fits = np.abs(values) <= limits.max
     if values.ndim > 1:

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 
-THIN = "\u202f"  # narrow no-break space: between a number and its unit, and between thousands
+# A narrow no-break space stands between a number and its unit, and between thousands (ISO 80000-1).
+THIN = "\u202f"
 ABSENT = "–"
 
 # A stamp after 2000-01-01 counts from the epoch: no log counts 30 years since its own start.

@@ -21,7 +21,7 @@ from pipelines.planning.distance_field import (
     zone_edges,
 )
 from pipelines.planning.forecast import ActorFilter
-from pipelines.planning.guard import Flown, Guard, least_distances, nearest_free, wanted_clearance_m
+from pipelines.planning.guard import FlownMotion, Guard, least_distances, nearest_free, wanted_clearance_m
 from pipelines.planning.replay import Start, replay
 from pipelines.planning.scores import score
 from pipelines.planning.tracking import DronePlan
@@ -108,7 +108,7 @@ def test_drones_can_always_stop_in_free_space_whatever_plans_ask_for(
         [path[:, :-1] + u * np.diff(path, axis=1) for u in (0.0, 0.25, 0.5, 0.75)], axis=1
     )
     assert field.sample(finely)[0].min() >= wanted_m
-    assert guard.counts[Flown.UNSAFE] == 0
+    assert guard.counts[FlownMotion.UNSAFE] == 0
     assert guard.counts.total() == 25 * drones
 
 
@@ -145,7 +145,7 @@ def test_a_slot_behind_a_wall_is_reached_over_it(thick_m: float, side_m: float) 
             path.append(guard.position[0])
             guard.fly(1)
     assert field.sample(np.array(path))[0].min() >= CONFIG.drone_radius_m
-    assert guard.counts[Flown.CLIMBED] > 0
+    assert guard.counts[FlownMotion.CLIMBED] > 0
     assert np.array(path)[:, 2].max() > 8.0 + CONFIG.drone_radius_m
     assert np.array(path)[-1, 1] > thick_m
 
@@ -178,7 +178,7 @@ def test_who_starts_too_near_leaves_by_the_shortest_way(depth_m: float) -> None:
             guard.fly(1)
             path.append(guard.position[0])
     flown = np.array(path)
-    assert guard.counts[Flown.LEFT] > 0
+    assert guard.counts[FlownMotion.LEFT] > 0
     clearance = field.sample(flown)[0]
     out = int(np.flatnonzero(clearance >= wanted_m)[0])
     assert (np.diff(clearance[: out + 1]) > -1e-3).all()
@@ -217,7 +217,7 @@ def test_a_drone_in_the_way_of_somebody_who_walks_gives_way() -> None:
             nearest = min(nearest, float(np.linalg.norm(away)))
             guard.fly(1)
     assert nearest >= CONFIG.actor_distance_m
-    assert guard.counts[Flown.GAVE_WAY] + guard.counts[Flown.CLIMBED] > 0
+    assert guard.counts[FlownMotion.GAVE_WAY] + guard.counts[FlownMotion.CLIMBED] > 0
 
 
 def test_a_map_that_comes_late_is_left_and_reported() -> None:
@@ -231,7 +231,7 @@ def test_a_map_that_comes_late_is_left_and_reported() -> None:
     occupied[tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))] = 1
     late = distance_field(Occupancy(occupied, origin, side_m, from_ns=4_000_000_000))
     result = replay(FIXED, stamps, hips, [late], Start(1), config=CONFIG)
-    assert result.safety[Flown.LEFT] > 0
+    assert result.safety[FlownMotion.LEFT] > 0
     for maps in (late, in_turn([late], result.t_ns)):
         figures = score(result.t_s, result.position, result.actor, maps, CONFIG)
         violations = figures["limit_violations"]
@@ -274,7 +274,7 @@ def test_a_drone_that_starts_in_a_zone_leaves_it() -> None:
     result = replay(FIXED, stamps, hips, [], Start(1), config=replace(CONFIG, zones=(around,)))
     distance = zone_distances(zone_edges([around]), result.position[0])
     assert distance[0] == pytest.approx(-2.0)
-    assert result.safety[Flown.LEFT] > 0
+    assert result.safety[FlownMotion.LEFT] > 0
     assert distance[-1] >= CONFIG.drone_radius_m
     assert (np.diff(np.nonzero(distance >= 0.0)[0]) == 1).all()  # once out it stays out
 

@@ -14,7 +14,7 @@ from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import SessionContent, motion_from_skeleton
 from pipelines.reporting.overlays import (
     MOMENTS,
-    View,
+    OverlayView,
     angles_at,
     choose_moments,
     collect_moments,
@@ -27,7 +27,7 @@ from pipelines.reporting.summary import summarise
 from .conftest import ASIDE_PX, CAMERAS, FRAMES, JOINTS, START_NS, make_skeleton, true_pixels
 
 
-def _views(content: SessionContent, camera: str) -> list[View]:
+def _views(content: SessionContent, camera: str) -> list[OverlayView]:
     moments = collect_moments(content, summarise(content), None)
     return [view for moment in moments for view in moment.views if view.camera == camera]
 

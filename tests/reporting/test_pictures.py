@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Picture
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.reporting.overlays import View
+from pipelines.reporting.overlays import OverlayView
 from pipelines.reporting.pictures import (
     CHI2_95,
     FOUND,
@@ -31,9 +31,9 @@ GROUND = np.full((HEIGHT, WIDTH, 3), GREY, np.uint8)
 
 
 @pytest.fixture
-def view() -> View:
+def view() -> OverlayView:
     nobody = np.zeros((1, 4), dtype=np.bool_)
-    return View(
+    return OverlayView(
         camera="drone1",
         intrinsics=Intrinsics(WIDTH, HEIGHT, 900.0, 900.0, 639.5, 359.5),
         joints=JOINTS,
@@ -53,7 +53,7 @@ def changed(picture: Picture) -> NDArray[np.bool_]:
     return np.asarray((picture != GREY).any(axis=-1), np.bool_)
 
 
-def test_bones_have_the_colour_of_their_side_and_lie_on_pixel_centres(view: View) -> None:
+def test_bones_have_the_colour_of_their_side_and_lie_on_pixel_centres(view: OverlayView) -> None:
     drawn = draw_frame(GROUND, view, ())
     for point, side in zip(BODY[0].astype(int), ("left", "right", "left", "right"), strict=True):
         assert drawn[point[1], point[0]].tolist() == list(SIDES[side])
@@ -72,7 +72,7 @@ def _only(joint: int) -> NDArray[np.float64]:
     return alone
 
 
-def test_a_missing_joint_takes_its_bones_along(view: View) -> None:
+def test_a_missing_joint_takes_its_bones_along(view: OverlayView) -> None:
     lost = BODY.copy()
     lost[0, 2] = np.nan
     drawn = changed(draw_frame(GROUND, replace(view, reprojected=lost), ()))
@@ -82,7 +82,7 @@ def test_a_missing_joint_takes_its_bones_along(view: View) -> None:
     assert not changed(draw_frame(GROUND, replace(view, reprojected=MISSING), ())).any()
 
 
-def test_keypoints_are_rings_and_lost_ones_crosses(view: View) -> None:
+def test_keypoints_are_rings_and_lost_ones_crosses(view: OverlayView) -> None:
     flags = np.eye(4, dtype=np.bool_)
     drawn = draw_frame(
         GROUND,
@@ -97,7 +97,7 @@ def test_keypoints_are_rings_and_lost_ones_crosses(view: View) -> None:
         assert (drawn[y, x] == GREY).all() == (colour == FOUND)  # a ring leaves its middle free
 
 
-def test_a_picture_of_another_size_is_the_same_view_at_another_scale(view: View) -> None:
+def test_a_picture_of_another_size_is_the_same_view_at_another_scale(view: OverlayView) -> None:
     half = draw_frame(np.ascontiguousarray(GROUND[::2, ::2]), replace(view, reprojected=_only(0)), ())
     rows, columns = np.nonzero(changed(half))
     # Pixel 620 covers 619.5 to 620.5 of 1280, that is 309.75 to 310.25 of 640: (620 + 0.5) / 2 - 0.5.
@@ -106,7 +106,7 @@ def test_a_picture_of_another_size_is_the_same_view_at_another_scale(view: View)
 
 
 @pytest.mark.parametrize("size", [(1280, 720), (1920, 1080), (480, 800), (320, 96)])
-def test_captions_fit_their_ground(view: View, size: tuple[int, int]) -> None:
+def test_captions_fit_their_ground(view: OverlayView, size: tuple[int, int]) -> None:
     width, height = size
     lines = (
         "drone1   frame 123456   1234.567 s",
@@ -125,7 +125,7 @@ def test_captions_fit_their_ground(view: View, size: tuple[int, int]) -> None:
     assert (ground[-2:] < 100).all()
 
 
-def test_ellipses_hold_95_percent(view: View) -> None:
+def test_ellipses_hold_95_percent(view: OverlayView) -> None:
     covariance = np.array([[400.0, 150.0], [150.0, 100.0]])
     spread = np.full((1, 4, 2, 2), np.nan)
     spread[0, 0] = covariance  # of the left shoulder
@@ -143,7 +143,7 @@ def test_ellipses_hold_95_percent(view: View) -> None:
     assert not changed(draw_frame(GROUND, replace(alone, spread=1e8 * spread), ()))[~drawn].any()
 
 
-def test_corners_hold_the_person_that_was_found(view: View) -> None:
+def test_corners_hold_the_person_that_was_found(view: OverlayView) -> None:
     found = BODY.copy()
     found[0, 1] = np.nan
     lost = np.ones((1, 4), np.bool_)
@@ -159,7 +159,7 @@ def test_corners_hold_the_person_that_was_found(view: View) -> None:
     assert not changed(draw_frame(GROUND, nobody, ())).any()
 
 
-def test_labels_stand_beside_their_joints_and_do_not_cover_each_other(view: View) -> None:
+def test_labels_stand_beside_their_joints_and_do_not_cover_each_other(view: OverlayView) -> None:
     both = [(0, "left_hip", "left hip flexion 12 deg"), (0, "left_shoulder", "left shoulder 30 deg")]
     bare = draw_frame(GROUND, view, ())
     marked = [
@@ -182,7 +182,9 @@ def test_labels_stand_beside_their_joints_and_do_not_cover_each_other(view: View
 
 
 @pytest.mark.parametrize("corner", [(0.0, 0.0), (WIDTH - 101.0, HEIGHT - 81.0), (520.0, 300.0)])
-def test_a_panel_is_a_square_about_the_person_in_the_picture(view: View, corner: tuple[float, float]) -> None:
+def test_a_panel_is_a_square_about_the_person_in_the_picture(
+    view: OverlayView, corner: tuple[float, float]
+) -> None:
     moved = BODY - BODY.min(axis=(0, 1)) + corner
     astray = moved.copy()
     astray[0, 0] = [9e5, -9e5]  # points outside the picture do not count
@@ -194,7 +196,7 @@ def test_a_panel_is_a_square_about_the_person_in_the_picture(view: View, corner:
 
 
 @pytest.mark.parametrize("scale", [1, 2])
-def test_a_picture_lies_under_its_pixels(view: View, scale: int) -> None:
+def test_a_picture_lies_under_its_pixels(view: OverlayView, scale: int) -> None:
     """White from 568 to 572 by 340 to 344 px, in a picture as large as the calibration's or twice."""
     picture = np.zeros((HEIGHT * scale, WIDTH * scale, 3), dtype=np.uint8)
     picture[340 * scale : 345 * scale, 568 * scale : 573 * scale] = 255
@@ -206,7 +208,7 @@ def test_a_picture_lies_under_its_pixels(view: View, scale: int) -> None:
     assert found == pytest.approx([570, 342], abs=0.2)
 
 
-def test_a_panel_shows_residuals_and_the_same_bytes_again(view: View) -> None:
+def test_a_panel_shows_residuals_and_the_same_bytes_again(view: OverlayView) -> None:
     aside = replace(view, found=BODY + np.array([6.0, 8.0]))
     between = draw_panel(aside, 650)
     window = window_of(aside)
