@@ -26,6 +26,7 @@ from ruamel.yaml import YAML
 from mocap_cli.main import mocap
 from pipelines.geometry.triangulation import STATUS
 from pipelines.session.manifest import Manifest
+from pipelines.session.people import SKELETONS
 from pipelines.simulation.scenario import Scenario
 from tests.synthetic.flights import write_flight
 
@@ -223,6 +224,10 @@ def test_every_key_column_and_code_has_a_meaning(name: str) -> None:
 def test_every_status_is_explained() -> None:
     section = _text("session.md").partition("| status | means |")[2].partition("\n\n")[0]
     assert re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE) == list(STATUS)
+
+
+def test_every_skeleton_is_named() -> None:
+    assert set(SKELETONS) <= set(_spans(_text("formats.md")))
 
 
 def test_every_example_of_a_manifest_or_scenario_is_valid() -> None:
