@@ -71,6 +71,10 @@ _UNREAD = (
      "save a sequence of pictures as JPEG or PNG, a height model as points (LAS, PLY)"),
     (re.compile(rb"(?:\s*(?:#|mtllib|o |g )[^\n]*\n)*\s*v\s+-?[\d.]+\s|solid [^\n]*\n\s*facet"),
      "a mesh (OBJ or STL)", "sample points of it, and save them as PLY (CloudCompare does)"),
+    (re.compile(rb"\0\0\0?\x01[\x06\x09\x27\x47\x67]"), "raw H.264 without times",
+     "give it a container and its rate: ffmpeg -r 30 -i FILE -c copy FILE.mp4"),
+    (re.compile(rb"\0\0\0?\x01[\x40\x46\x4e]\x01"), "raw H.265 without times",
+     "give it a container and its rate: ffmpeg -r 30 -i FILE -c copy FILE.mp4"),
     (re.compile(rb"glTF"), "a glTF scene", "sample points of a map, and save them as PLY"),
     (re.compile(rb"RRF\d"), "a recording of Rerun", "name the log or the session that it was made of"),
     (re.compile(rb"\x80[\x02-\x05].*\.$", re.DOTALL), "a pickle of Python", "save its arrays as CSV"),
@@ -99,6 +103,17 @@ _UNREAD = (
 )  # fmt: skip
 
 
+_LFS_POINTER = re.compile(rb"version https://git-lfs\.github\.com/spec/v\d+\n[^\0]{0,400}?size (\d{1,18})")
+
+
+def describe_lfs_pointer(head: bytes) -> Likeness | None:
+    """Describe a pointer of Git LFS, which stands for a file that was not fetched; None for other files."""
+    match = _LFS_POINTER.match(head)
+    if match is None:
+        return None
+    return Likeness(f"is a pointer of Git LFS ({int(match[1])} bytes are elsewhere)", "run `git lfs pull`")
+
+
 def describe_unknown(path: Path) -> Likeness:
     """Describe an existing file or folder that is not recognised. Never raise."""
     if path.is_dir():
@@ -115,7 +130,7 @@ def describe_unknown(path: Path) -> Likeness:
         return Likeness(f"cannot be read ({reason})", "check its permissions")
     if not size:
         return Likeness("is empty", "copy it again")
-    return _of_bytes(path, head) or _of_text(path, head, size)
+    return describe_lfs_pointer(head) or _of_bytes(path, head) or _of_text(path, head, size)
 
 
 def _of_folder(path: Path) -> Likeness:

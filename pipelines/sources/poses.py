@@ -234,6 +234,8 @@ class FlightPoses:
     def _unfit_pose(self, camera: CameraSources) -> Iterator[tuple[str, str]]:
         pose, is_log = camera.pose, self._is_log(camera.pose)
         title = self._files.format_of("pose", pose).title
+        if self._files.format_of("pose", pose).name == "airsim" and pose.axes:
+            yield f"pose: axes: a file of this kind ({title}) states its own", "leave them out"
         if self.is_still(camera):
             if pose.of == "body" or camera.is_carried:
                 yield "pose: a still camera's pose is its own", "leave `of: body` and the mount out"

@@ -71,8 +71,58 @@ class OpencvStorage:
         return {name: _with_pose(path, name, storage, CalibratedCamera(lens, size_stated=stated))}
 
 
-def _with_pose(path: Path, name: str, storage: Storage, camera: CalibratedCamera) -> CalibratedCamera:
-    rotation, translation = storage.matrix("R", "rvec"), storage.matrix("T", "tvec")
+class EasyMocap:
+    """Reader of EasyMocap's intri.yml with the extri.yml beside it: K_, dist_, Rot_ or R_, T_ by camera."""
+
+    name = "easymocap"
+    title = "EasyMocap calibration"
+    suffixes: tuple[str, ...] = (".yml", ".yaml")
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if FileStorage wrote names of cameras and a matrix for each."""
+        head = read_head(path, self.suffixes)
+        return "!!opencv-matrix" in head and bool(re.search(r"(?m)^names:(?s:.*)^(?:K|R|Rot)_\w+:", head))
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe every camera."""
+        return describe_cameras(self.read_calibration(path))
+
+    def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
+        """Read every camera; poses are camera_from_world, in metres."""
+        ways = [path.with_name(path.name.replace(*pair)) for pair in (("extri", "intri"), ("intri", "extri"))]
+        if not ways[0].is_file():
+            raise DataError(ways[0], "is not there", "put it beside extri.yml", code="no-such-file")
+        lenses = Storage(ways[0])
+        places = Storage(ways[1]) if ways[1].is_file() and ways[1] != ways[0] else None
+        found = {}
+        for name in lenses.texts("names"):
+            matrix, distortion = lenses.matrix(f"K_{name}"), lenses.matrix(f"dist_{name}")
+            if matrix is None or distortion is None:
+                raise DataError(ways[0], f"has no K_{name} or no dist_{name}", "calibrate again")
+            size = [lenses.number((f"{side}_{name}",)) for side in "WH"]
+            lens = intrinsics(
+                ways[0], name, size=size if any(size) else [*unstated_size(matrix)], matrix=matrix,
+                distortion=distortion.ravel().tolist(), fisheye=False,
+            )  # fmt: skip
+            camera = CalibratedCamera(lens, size_stated=any(size))
+            keys = (f"Rot_{name}", f"R_{name}"), (f"T_{name}",)
+            found[name] = _with_pose(ways[1], name, places, camera, keys) if places else camera
+        if not found:
+            raise DataError(path, "names no camera", "calibrate again", code="empty")
+        return found
+
+
+EASYMOCAP = EasyMocap()
+
+
+def _with_pose(
+    path: Path,
+    name: str,
+    storage: Storage,
+    camera: CalibratedCamera,
+    keys: tuple[tuple[str, ...], tuple[str, ...]] = (("R", "rvec"), ("T", "tvec")),
+) -> CalibratedCamera:
+    rotation, translation = (storage.matrix(*each) for each in keys)
     if rotation is None and translation is None:
         return camera
     if rotation is None or translation is None:
@@ -124,6 +174,11 @@ class Storage:
         """Return a string; empty if there is none."""
         node = self._root.getNode(key)
         return str(node.string()) if node.isString() else ""
+
+    def texts(self, key: str) -> list[str]:
+        """Return a list of strings; empty if there is none."""
+        node = self._root.getNode(key)
+        return [str(node.at(k).string()) for k in range(node.size())] if node.isSeq() else []
 
     def number(self, keys: tuple[str, ...]) -> float:
         """Return the number of the first key that has one; 0 if none does."""

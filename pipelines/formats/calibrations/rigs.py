@@ -151,8 +151,12 @@ class KalibrFormat:
         return bool(re.search(r"(?m)^cam\d+\s*:", head) and re.search(r"(?m)^\s+camera_model\s*:", head))
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Describe the cameras."""
-        return describe_cameras(self.read_calibration(path))
+        """Describe the cameras, and the offsets of their clocks, which belong into flight.yaml."""
+        summary = describe_cameras(self.read_calibration(path))
+        for name, block in read_yaml(path).items():
+            if isinstance(block, dict) and "timeshift_cam_imu" in block:
+                summary[f"{name}: timeshift_cam_imu (not applied)"] = block["timeshift_cam_imu"]
+        return summary
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
         """Read every camera of the chain."""

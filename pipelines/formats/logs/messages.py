@@ -38,6 +38,8 @@ LATEST_NS = 2**62
 _FISHEYE_MODELS = {"equidistant", "fisheye", "kannala_brandt"}
 _RADTAN_MODELS = {"plumb_bob", "rational_polynomial", "radtan"}
 
+# Principal points of whole pictures lie nearer to their middle, as for calibrations without a size.
+_FAR_OFF_CENTRE = 0.2
 _SIGNATURES = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png"}
 
 
@@ -239,7 +241,23 @@ def _lens(message: Message, source: Source) -> Intrinsics:
         distortion=distortion,
         fisheye=model in _FISHEYE_MODELS,
     )
-    return _of_the_picture(full, value)
+    binned = _of_the_picture(full, value)
+    undivided = replace(full, width=binned.width, height=binned.height)
+    if _off_centre(binned) > _FAR_OFF_CENTRE >= _off_centre(undivided):
+        raise DataError(
+            source,
+            f"topic {topic}: its K has its middle in that of the binned {binned.width} x {binned.height} px"
+            " already, so that its binning would divide it once more",
+            "give a calibration file under `intrinsics`",
+            code="bad-value",
+        )
+    return binned
+
+
+def _off_centre(lens: Intrinsics) -> float:
+    """Return how far the principal point is from the middle, as a share of the picture's sides."""
+    x, y = (lens.cx + 0.5) / lens.width, (lens.cy + 0.5) / lens.height
+    return max(abs(x - 0.5), abs(y - 0.5))
 
 
 def _of_the_picture(full: Intrinsics, value: Any) -> Intrinsics:

@@ -24,6 +24,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Message, Topic
 from pipelines.session.registries import Log
 from pipelines.session.storage import code_of
+from pipelines.session.unknown_files import describe_lfs_pointer
 
 # Causes of losses, as sessions and `mocap info` state them.
 UNDEFINED = "messages without a usable definition"
@@ -266,7 +267,12 @@ def open_file(path: Path) -> tuple[IO[bytes], int]:
         size = path.stat().st_size
         if not size:
             raise DataError(path, "is empty (0 bytes)", "copy it again from the drone")
-        return path.open("rb"), size
+        file = path.open("rb")
+        if pointer := describe_lfs_pointer(file.read(1024)):
+            file.close()
+            raise DataError(path, *pointer, code="wrong-kind")
+        file.seek(0)
+        return file, size
     except OSError as error:
         raise DataError(
             path, f"cannot be opened ({error.strerror})", "check the path", code=code_of(error)

@@ -9,9 +9,11 @@ without keeping the pages in memory.
 from __future__ import annotations
 
 import re
+import shutil
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path, PurePath
@@ -38,7 +40,7 @@ from pipelines.formats.logs.recordings import (
 )
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.storage import is_special
+from pipelines.session.storage import as_data_error, is_special
 from pipelines.session.yaml_files import plain_yaml
 
 # Causes of losses.
@@ -46,7 +48,6 @@ NOT_IN_FILES = "messages that metadata.yaml counts and the files lack"
 BAD_METADATA = "metadata.yaml cannot be read"
 MISSING_FILES = "files of the bag that are missing"
 GAPS = "gaps in the table of messages"
-UNMERGED = "bytes of its write-ahead log, not merged"
 
 _MAGIC = b"SQLite format 3\0"
 
@@ -130,7 +131,37 @@ def _open_part(path: Path) -> LogPart:
     file, size = open_file(path)
     with file:
         head = file.read(len(_MAGIC))
-    return Sqlite3Part(path, path, size) if head == _MAGIC else open_mcap(path)
+    if head != _MAGIC:
+        return open_mcap(path)
+    if not _write_ahead_log(path):
+        return Sqlite3Part(path, path, size)
+    with TemporaryDirectory() as folder:
+        # The folder is deleted while the part is open, which keeps its file by the handle.
+        merged = _merged(path, Path(folder))
+        return Sqlite3Part(path, merged, merged.stat().st_size)
+
+
+def _write_ahead_log(path: Path) -> Path | None:
+    """Return the log with the last messages of a recorder that lost its power; None without any."""
+    log = path.with_name(path.name + "-wal")
+    return log if log.is_file() and log.stat().st_size else None
+
+
+def _merged(path: Path, folder: Path) -> Path:
+    """Merge a database with its write-ahead log into a copy in another folder."""
+    copy = folder / path.name
+    log = _write_ahead_log(path)
+    try:
+        shutil.copyfile(path, copy)
+        if log is not None:
+            shutil.copyfile(log, copy.with_name(log.name))
+    except OSError as error:
+        raise as_data_error(error, path) from error
+    with suppress(*_UNREADABLE):  # of a damaged log; what the database holds is read
+        database = apsw.Connection(str(copy))
+        database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+        database.close()
+    return copy
 
 
 def _open_compressed(path: Path) -> LogPart:
@@ -247,7 +278,6 @@ class Sqlite3Part(LogPart):
             self._read_topics()
             self.take(self._list_messages())
             self._check_length(database)
-            self._count_unmerged()
             require_content(self)
         except _UNREADABLE as error:
             self.close()
@@ -366,11 +396,6 @@ class Sqlite3Part(LogPart):
         if pages * (65536 if page_size == 1 else page_size) > self.file_size:
             self.lost[TRUNCATED] = 1
 
-    def _count_unmerged(self) -> None:
-        log = self.path.with_name(self.path.name + "-wal")
-        if log.is_file() and (size := log.stat().st_size):
-            self.lost[UNMERGED] += size
-
 
 def _connect(path: Path) -> apsw.Connection:
     # Immutable: sqlite neither locks the user's file nor writes beside it.
@@ -383,6 +408,8 @@ def _connect(path: Path) -> apsw.Connection:
 
 def _has_bag_tables(path: Path) -> bool:
     """Return True if a sqlite3 file has the tables of a bag; if it is unreadable, judge by its suffix."""
+    if _write_ahead_log(path):
+        return path.suffix.lower() == ".db3"
     query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
     database = _connect(path)
     try:

@@ -44,6 +44,7 @@ Edge = tuple[str, str]
 _LONGEST_POSE = 1024
 _MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
 _MAY_JUMP_S = 1.0  # from one message to the next, in addition to the time that passed
+_SAME_VALUE = 1e-6  # m, and parts of a quaternion: rounding
 _FIXED_FRAMES = ("world", "map", "odom", "earth")  # names of fixed frames in REP 105
 
 _THE_WORLD = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]))
@@ -352,6 +353,8 @@ def chained(
         poses = rows.trajectory(f"{source}: {_named(edge)}", stamps)
         is_static = edge not in transforms.moving or len(rows.header_ns) == 1
         links[edge] = Link(poses.t_ns, poses.position, poses.quaternion_xyzw, is_static)
+        if is_static and (others := _other_values(edge, transforms, poses)):
+            dropped[f"other values of a static transform ({_named(edge)})"] = others
         if not is_static:
             checks.append(rows.check())
             dropped |= {f"{cause} ({_named(edge)})": count for cause, count in poses.dropped.items()}
@@ -369,6 +372,16 @@ def chained(
         found.t_ns[known], found.position[known], found.quaternion_xyzw[known], dropped=dropped
     )
     return Gathered(trajectory, _together(checks), (parent, child))
+
+
+def _other_values(edge: Edge, transforms: TransformLog, used: Trajectory) -> int:
+    """Count the logged values of a static transform that differ from the one that is used, the latest."""
+    values = [log[edge].values for log in (transforms.static, transforms.moving) if edge in log]
+    expected = np.concatenate([used.position[-1], used.quaternion_xyzw[-1]])
+    turned = expected * np.array([1, 1, 1, -1, -1, -1, -1])  # the same rotation
+    every = np.concatenate(values)
+    same = [np.abs(every - each).max(axis=1) < _SAME_VALUE for each in (expected, turned)]
+    return int(np.count_nonzero(~(same[0] | same[1])))
 
 
 def frames_of_poses(recording: Log, source: str, taken: Iterable[tuple[str | None, str | None]]) -> list[str]:

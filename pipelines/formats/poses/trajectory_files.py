@@ -12,7 +12,9 @@ the data set has them: `sequences/NAME/times.txt` for `poses/NAME.txt`.
 
 from __future__ import annotations
 
+import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ import numpy as np
 from pipelines.formats.common.exporting import file_names_of_people, safe_file_name, tracks_of
 from pipelines.formats.common.files import read_head, read_text
 from pipelines.formats.common.rows import (
+    NANOSECONDS,
     NORM_TOLERANCE,
     SECONDS,
     Heading,
@@ -36,6 +39,7 @@ from pipelines.formats.common.rows import (
     stamp_column,
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.records import Recording, Trajectory
@@ -156,6 +160,8 @@ def describe_trajectory(trajectory: Trajectory) -> dict[str, object]:
     }
 
 
+# VINS-Mono and vio_loop.csv of VINS-Fusion have w first; vio.csv is TUM.
+_VINS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 _COLUMNS: tuple[str, ...] = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _POSES_AT_ONCE = 10_000  # of a file that is written
 _HEADING = re.compile(r"[^\s,;\[(]+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?")  # a name, perhaps with its unit
@@ -175,7 +181,8 @@ class TumFormat:
         """Return True if the first line of numbers has eight, without a CSV header above."""
         head, _, _ = _take_header(_spaced(read_head(path, self.suffixes)))
         first = next((line for line in head.split("\n") if line and not line.startswith("#")), "")
-        return find_poses(read_head(path, self.suffixes)) is None and _is_eight_numbers(first)
+        is_known = _is_eight_numbers(first) or _is_vins_mono(first)
+        return find_poses(read_head(path, self.suffixes)) is None and is_known
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, times, gaps, bounding box and losses."""
@@ -187,11 +194,16 @@ class TumFormat:
         `clean_poses` documents which rows are dropped.
         """
         body, columns, unit = _take_header(_spaced(read_text(path)))
+        width = len(_COLUMNS)
+        if _is_vins_mono(body.partition("\n")[0]):
+            columns, unit, width = _VINS, NANOSECONDS, 11
+        elif path.name == "vio_loop.csv" and columns == _COLUMNS:
+            columns = _VINS
         table = parse_table(
             path,
             body,
             delimiter=" ",
-            columns=len(_COLUMNS),
+            columns=width,
             text={"t": 0},
             numbers={name: index for index, name in enumerate(columns) if index},
             first_line=1,
@@ -313,6 +325,15 @@ def _find_quaternion(headings: list[str]) -> tuple[str, ...] | None:
     return None
 
 
+def _is_vins_mono(line: str) -> bool:
+    """Test for eleven numbers of VINS-Mono: nanoseconds, position, quaternion with w first, velocity."""
+    try:
+        numbers = [float(cell) for cell in line.split(" ")]
+    except ValueError:
+        return False
+    return len(numbers) == 11 and numbers[0] > 1e17 and abs(math.hypot(*numbers[4:8]) - 1) < 1e-2
+
+
 def _is_eight_numbers(line: str) -> bool:
     cells = line.split(" ")
     try:
@@ -416,6 +437,32 @@ def times_of(path: Path) -> Path:
 KITTI = KittiFormat()
 
 
+class AirSimFormat:
+    """Reader of AirSim's own recording (airsim_rec.txt): world NED, body forward, right, down."""
+
+    name = "airsim"
+    title = "AirSim recording"
+    suffixes: tuple[str, ...] = (".txt",)
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if the heading has the names of AirSim's columns."""
+        head = read_head(path, self.suffixes).partition("\n")[0].split()
+        return {"TimeStamp", "POS_X", "Q_W", "ImageFile"} <= set(head)
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe rows, times, gaps, bounding box and losses."""
+        return describe_trajectory(self.read_trajectory(path))
+
+    def read_trajectory(self, path: Path) -> Trajectory:
+        """Read every pose, turned to east, north, up and a body's forward, left, up."""
+        found = POSE_CSV.read_trajectory(path)
+        turned = attitude_in_enu(found.quaternion_xyzw, relative_to="world", axes="ned")
+        return replace(found, position=found.position[:, [1, 0, 2]] * [1, 1, -1], quaternion_xyzw=turned)
+
+
+AIRSIM = AirSimFormat()
+
+
 class PoseCsvFormat:
     """Reader of CSV with a header, separated by commas, semicolons or tabs; the order of columns is free.
 
@@ -432,7 +479,7 @@ class PoseCsvFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the header names a time, a position and a quaternion."""
-        return find_poses(read_head(path, self.suffixes)) is not None
+        return find_poses(read_head(path, self.suffixes)) is not None and not AIRSIM.recognises(path)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, times, gaps, bounding box and losses."""

@@ -14,7 +14,7 @@ from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -43,14 +43,43 @@ _BLACK = 16  # brightness, of 255
 _EYE_BGR = (0.114, 0.587, 0.299)  # weights of the channels in brightness (ITU-R BT.601)
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 _PACKET_TS, _PACKET_M2TS = 188, 192
+# The first bytes of containers, and FFmpeg's names of them.
+_MAGIC = {
+    b"\x1a\x45\xdf\xa3": "matroska",
+    b"FLV\x01": "flv",
+    b"OggS": "ogg",
+    b"DKIF": "ivf",
+    b"\0\0\x01\xba": "mpeg",
+    b"0&\xb2u\x8ef\xcf\x11": "asf",
+    b"nut/multimedia container\0": "nut",
+    b"YUV4MPEG2 ": "yuv4mpegpipe",
+    bytes.fromhex("060e2b34020501010d010201"): "mxf",
+}
 
 
 class VideoContainer:
-    """Reader of MP4, MOV, MKV, WebM, AVI and MPEG transport streams, with any codec that FFmpeg decodes."""
+    """Reader of the containers of video that FFmpeg reads, with any codec that it decodes."""
 
     name = "video"
     title = "video"
-    suffixes: tuple[str, ...] = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts")
+    suffixes: tuple[str, ...] = (
+        *(
+            ".mp4",
+            ".mov",
+            ".m4v",
+            ".mkv",
+            ".webm",
+            ".avi",
+            ".ts",
+            ".mts",
+            ".m2ts",
+            ".flv",
+            ".ogv",
+            ".ogg",
+            ".ivf",
+        ),
+        *(".mpg", ".mpeg", ".vob", ".wmv", ".asf", ".nut", ".y4m", ".mxf"),
+    )
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins like one of these containers, or is empty with such a suffix."""
@@ -194,6 +223,14 @@ class VideoReader:
             self.close()
             count = len(self._scan.ticks)
             raise DataError(path, f"none of its {count} frames can be decoded", "export it again, as MP4")
+        if _is_mirrored(self._next[1]):
+            self.close()
+            raise DataError(
+                path,
+                "shows its pictures mirrored (by its display matrix)",
+                "export it again, so that its pictures are as the lens saw them",
+                code="unsupported",
+            )
         self.index = _index(self._scan, self._stream, self._next[1])
 
     def __enter__(self) -> Self:
@@ -353,6 +390,16 @@ def _scan(path: Path) -> _Scan:
     )
 
 
+def _is_mirrored(frame: VideoFrame) -> bool:
+    """Test if a frame's display matrix (3 x 3, fixed point) swaps left and right."""
+    sides: Any = frame.side_data  # whose annotations take its keys for its values
+    for data in sides:
+        if data.type.name == "DISPLAYMATRIX":
+            a, b, _, c, d = np.frombuffer(bytes(data), "<i4").astype(float)[:5]
+            return bool(a * d - b * c < 0)
+    return False
+
+
 def _index(scan: _Scan, stream: VideoStream, first: VideoFrame) -> VideoIndex:
     turned = round(first.rotation / 90) % 4 * 90
     width, height = (first.width, first.height) if turned % 180 == 0 else (first.height, first.width)
@@ -480,7 +527,7 @@ def _kind(path: Path) -> str:
         raise DataError(
             path,
             "is no video container that is known here",
-            "known are MP4, MOV, MKV, WebM, AVI, MPEG-TS",
+            "export it as MP4",
             code="wrong-kind",
         )
     return kind
@@ -492,10 +539,11 @@ def container_format(path: Path) -> str | None:
         head = file.read(2 * _PACKET_M2TS)
     if head[4:8] in _MP4_BOXES:
         return "mov"
-    if head.startswith(b"\x1a\x45\xdf\xa3"):
-        return "matroska"
     if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
         return "avi"
+    for magic, kind in _MAGIC.items():
+        if head.startswith(magic):
+            return kind
     for first, step in ((0, _PACKET_TS), (4, _PACKET_M2TS)):
         if head[first : first + 1] == b"G" == head[first + step : first + step + 1]:
             return "mpegts"

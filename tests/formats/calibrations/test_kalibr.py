@@ -87,3 +87,8 @@ def test_faulty_content_is_refused(tmp_path: Path, keys: dict[str, str | None]) 
         READER.read_calibration(chain(tmp_path / "c.yaml", **keys))
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500
+
+
+def test_the_offset_of_its_clock_is_named(tmp_path: Path) -> None:
+    facts = READER.describe(chain(tmp_path / "chain.yaml", timeshift_cam_imu="0.0123"))
+    assert [value for key, value in facts.items() if "timeshift_cam_imu" in key] == [0.0123]

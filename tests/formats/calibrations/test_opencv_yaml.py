@@ -12,7 +12,7 @@ from pipelines.formats.calibrations import opencv_yaml
 from pipelines.geometry.cameras import project
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
-from pipelines.session.registries import CalibrationFormat
+from pipelines.session.registries import CalibrationFormat, recognise
 
 READER: CalibrationFormat = opencv_yaml.OPENCV
 K = np.array([[800.0, 0, 330.5], [0, 790.0, 241.25], [0, 0, 1]])
@@ -102,3 +102,33 @@ def test_without_a_size_the_pictures_decide(tmp_path: Path) -> None:
 def test_faulty_content_is_refused(tmp_path: Path, values: dict[str, object]) -> None:
     with pytest.raises(DataError):
         READER.read_calibration(store(tmp_path / "c.yml", **values))
+
+
+def test_easymocap_has_its_poses_in_a_file_beside(tmp_path: Path) -> None:
+    matrix, place = np.array([[900.0, 0, 640], [0, 901, 360], [0, 0, 1]]), np.array([[0.1], [0.2], [3.0]])
+    turns = {f"0{k}": np.array([[0.1 * k], [-0.2], [0.3]]) for k in (1, 2)}
+    for name in ("intri", "extri"):
+        storage = cv2.FileStorage(str(tmp_path / f"{name}.yml"), cv2.FILE_STORAGE_WRITE)
+        storage.startWriteStruct("names", cv2.FileNode_SEQ)
+        for camera in turns:
+            storage.write("", camera)
+        storage.endWriteStruct()
+        for camera, turn in turns.items():
+            if name == "intri":
+                storage.write(f"K_{camera}", matrix)
+                storage.write(f"dist_{camera}", np.zeros((5, 1)))
+            else:
+                storage.write(f"R_{camera}", turn)
+                storage.write(f"Rot_{camera}", cv2.Rodrigues(turn)[0])
+                storage.write(f"T_{camera}", place)
+        storage.release()
+    for name in ("intri", "extri"):
+        path = tmp_path / f"{name}.yml"
+        assert recognise(path, CalibrationFormat, "calibration").name == "easymocap"
+        cameras = recognise(path, CalibrationFormat, "calibration").read_calibration(path)
+        assert list(cameras) == ["01", "02"]
+        expected = -cv2.Rodrigues(turns["02"])[0].T @ place
+        np.testing.assert_allclose(cameras["02"].position, expected[:, 0], atol=1e-12)
+        lens = cameras["02"].intrinsics
+        assert lens is not None
+        assert (lens.fx, lens.cy, cameras["02"].size_stated) == (900.0, 360.0, False)

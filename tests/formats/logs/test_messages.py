@@ -218,6 +218,16 @@ def test_camera_info(version: str, stated: Any, model: str, distortion: tuple[fl
     )
 
 
+def test_binning_of_a_calibration_that_is_binned_already_is_refused() -> None:
+    """The message of astuff/avt_vimba_camera#82: 2064 x 1544 px, binned by 4, K of the 516 x 386 px."""
+    stated = {"width": 2064, "height": 1544, "binning_x": 4, "binning_y": 4}
+    with pytest.raises(DataError) as caught:
+        lens(camera_info("ros2", **stated, k=[299.5, 0, 254.1, 0, 300.1, 183.9, 0, 0, 1]))
+    assert caught.value.code == "bad-value"
+    full = lens(camera_info("ros2", **stated, k=[1198.0, 0, 1016.4, 0, 1200.4, 735.6, 0, 0, 1]))
+    assert (full.width, full.fx, full.cx) == (516, 299.5, 254.1)
+
+
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
 def test_foxglove_calibration(encoding: str) -> None:
     fields = {

@@ -19,7 +19,7 @@ from pipelines.formats.logs.recordings import (
     UNCLOSED,
     UNDEFINED,
 )
-from pipelines.formats.logs.ros2_bag import BAD_METADATA, MISSING_FILES, NOT_IN_FILES, UNMERGED
+from pipelines.formats.logs.ros2_bag import BAD_METADATA, MISSING_FILES, NOT_IN_FILES
 from tests.formats.log_entries import (
     OTHER,
     PICTURE,
@@ -32,6 +32,7 @@ from tests.formats.log_entries import (
     positions,
     recognised_by,
 )
+from tests.formats.refusals import refuses
 from tests.synthetic.logs import (
     CONTAINERS,
     ROS2,
@@ -236,10 +237,39 @@ def test_a_length_of_gigabytes_is_damage(tmp_path: Path) -> None:
     assert len(found) + lost == len(ALL)
 
 
-def test_messages_only_in_the_write_ahead_log_are_counted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unmerged", [True, False])
+def test_messages_in_the_write_ahead_log_are_read(tmp_path: Path, unmerged: bool) -> None:
+    """A recorder that lost its power leaves its last messages there, and on the first run all of them."""
+    whole = write_ros2(tmp_path / "bag", FLIGHT) / "bag.db3"
+    source = sqlite3.connect(whole)
+    target = sqlite3.connect(tmp_path / "a_0.db3", isolation_level=None)
+    target.execute("PRAGMA journal_mode = WAL")
+    target.execute("PRAGMA wal_autocheckpoint = 0")
+    for k, statement in enumerate(source.iterdump()):
+        if statement not in {"BEGIN TRANSACTION;", "COMMIT;"}:
+            target.execute(statement)
+        if k == 60 and not unmerged:
+            target.execute("PRAGMA wal_checkpoint(PASSIVE)")
+    lost = tmp_path / "lost"
+    lost.mkdir()
+    for name in ("a_0.db3", "a_0.db3-wal"):
+        shutil.copyfile(tmp_path / name, lost / name)
+    before = (lost / "a_0.db3").read_bytes()
+    for path in (lost / "a_0.db3", lost):
+        assert recognised_by(path) == ["ros2"]
+        assert everything(path)[0] == everything(whole)[0]
+        assert everything(path)[1] == {}
+    assert (lost / "a_0.db3").read_bytes() == before
+    assert sorted(each.name for each in lost.iterdir()) == ["a_0.db3", "a_0.db3-wal"]
+    target.close()
+
+
+def test_a_pointer_of_git_lfs_is_named(tmp_path: Path) -> None:
     path = write_ros2(tmp_path / "bag", FLIGHT)
-    (path / "bag.db3-wal").write_bytes(bytes(4152))
-    assert positions(path)[1] == {UNMERGED: 4152}
+    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 16384\n"
+    (path / "bag.db3").write_bytes(pointer)
+    with refuses(path / "bag.db3", "LFS", 16384):
+        positions(path)
 
 
 def test_type_names_cannot_carry_code(tmp_path: Path) -> None:

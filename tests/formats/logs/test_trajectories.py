@@ -146,6 +146,22 @@ def test_chains_of_moving_and_static_transforms() -> None:
     assert found.stamps.count == 55  # static ones have no time to compare
 
 
+@pytest.mark.parametrize("beside_moving", [False, True])
+def test_other_values_of_a_static_transform_are_counted(beside_moving: bool) -> None:
+    arm = static(("base", "camera"), (0.5, 0.0, 0.0))
+    moved = replace(static(("base", "camera"), (0.5, 0.0, 1.0)), stamp_ns=arm.stamp_ns + 1)
+    turned_alike = replace(moved, quaternion_xyzw=tuple(-part for part in moved.quaternion_xyzw))
+    odometry = flown(10, rate_hz=50, frames=("map", "base"))
+    transforms = transforms_of(
+        [*odometry, *([moved] if beside_moving else [])],
+        "d1",
+        static=[arm] if beside_moving else [arm, moved, turned_alike],
+    )
+    found = chained(transforms, "d1", parent="map", child="camera", stamps="header", max_gap_ns=S)
+    assert list(found.trajectory.dropped.values()) == [1]
+    np.testing.assert_allclose(found.trajectory.position[:, 2], 1.0)
+
+
 def test_frames_that_cannot_be_chained_are_refused() -> None:
     late = [replace(s, stamp_ns=s.stamp_ns + 1000 * S) for s in flown(frames=("base", "camera"))]
     transforms = transforms_of([*flown(), *late], "d1.mcap")

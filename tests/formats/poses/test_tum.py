@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 
 from pipelines.formats.poses import trajectory_files
+from pipelines.geometry.poses import rotate
 from pipelines.session.records import JointMotion, Recording, Trajectory
-from pipelines.session.registries import Export, TrajectoryFormat
+from pipelines.session.registries import Export, TrajectoryFormat, recognise
 from tests.formats.exported import flown, recording
 from tests.formats.trajectories import trajectories
 from tests.real_data import real_data
@@ -172,3 +173,36 @@ def test_each_person_gets_tracks_of_its_own(tmp_path: Path) -> None:
     motion = JointMotion(np.array([0]), ("nose",), np.ones((1, 2, 1, 3)))
     paths = WRITER.write(Recording("x", motion, {}), tmp_path)
     assert [path.name for path in paths] == ["x_person0_nose.tum", "x_person1_nose.tum"]
+
+
+def test_vins_writes_w_first(tmp_path: Path) -> None:
+    """VINS-Fusion's vio_loop.csv by its name, VINS-Mono's rows by their eleven numbers in nanoseconds."""
+    turned = [0.5, 0.1, 0.7, 0.5]  # w x y z
+    numbers = " ".join(map(str, [1.5, -2.0, 3.0, *turned]))
+    (tmp_path / "vio_loop.csv").write_text(f"1700000000.25 {numbers}\n1700000001.25 {numbers}\n")
+    mono = f"1700000000250000000,{numbers.replace(' ', ',')},0.1,0.2,0.3,\n"
+    (tmp_path / "vins.csv").write_text(mono + mono.replace("000250", "001250"))
+    for name in ("vio_loop.csv", "vins.csv"):
+        assert READER.recognises(tmp_path / name)
+        found = READER.read_trajectory(tmp_path / name)
+        assert found.t_ns.tolist() == [1_700_000_000_250_000_000, 1_700_000_001_250_000_000]
+        np.testing.assert_allclose(found.position[0], [1.5, -2.0, 3.0])
+        np.testing.assert_allclose(found.quaternion_xyzw[0], np.array([0.1, 0.7, 0.5, 0.5]))
+    (tmp_path / "vio.csv").write_text(f"1700000000.25 {numbers}\n")
+    np.testing.assert_allclose(READER.read_trajectory(tmp_path / "vio.csv").quaternion_xyzw[0], turned)
+
+
+def test_airsims_recording_is_turned_to_east_north_up(tmp_path: Path) -> None:
+    """A drone 34 m above the ground that heads 90 deg, to the east, and looks level."""
+    heading = "VehicleName TimeStamp POS_X POS_Y POS_Z Q_W Q_X Q_Y Q_Z ImageFile"
+    half = 0.5**0.5
+    rows = [["Drone1", 1_700_000_000_000 + 40 * k, 1 + k, 2, -34, half, 0, 0, half, "a.png"] for k in (0, 1)]
+    path = tmp_path / "airsim_rec.txt"
+    path.write_text("\n".join("\t".join(map(str, row)) for row in (heading.split(), *rows)) + "\n")
+    reader = recognise(path, TrajectoryFormat, "trajectory")
+    assert reader.name == "airsim"
+    found = reader.read_trajectory(path)
+    assert np.diff(found.t_ns).tolist() == [40_000_000]
+    np.testing.assert_allclose(found.position, [[2, 1, 34], [2, 2, 34]])
+    np.testing.assert_allclose(rotate(found.quaternion_xyzw[0], np.array([1.0, 0, 0])), [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(rotate(found.quaternion_xyzw[0], np.array([0, 0, 1.0])), [0, 0, 1], atol=1e-9)

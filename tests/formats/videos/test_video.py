@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import av
 import cv2
@@ -17,12 +17,13 @@ from pipelines.formats.videos import video
 from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames, index_video, is_shown
 from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
-from pipelines.session.registries import VideoFormat
+from pipelines.session.registries import VideoFormat, recognise
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.videos import (
     SIZE,
     TICK_S,
+    bar_code,
     even_ticks,
     read_bar_code,
     uneven_ticks,
@@ -261,6 +262,52 @@ def test_other_containers_are_read_as_far_as_they_go(tmp_path: Path, suffix: str
     numbers = [(number, read_bar_code(picture)) for number, picture in frames(path)]
     assert 20 < len(numbers) < 50
     assert numbers == [(k, k) for k in range(len(numbers))]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec"),
+    [
+        (".flv", "libx264"),
+        (".nut", "libx264"),
+        (".mpg", "mpeg2video"),
+        (".wmv", "wmv2"),
+        (".ivf", "libvpx"),
+        (".ogv", "libvpx"),
+        (".mxf", "mpeg2video"),
+        (".y4m", "wrapped_avframe"),
+    ],
+)
+def test_more_containers_that_ffmpeg_reads(tmp_path: Path, suffix: str, codec: str) -> None:
+    path = tmp_path / f"v{suffix}"
+    try:
+        with av.open(str(path), "w") as container:
+            stream: Any = container.add_stream(codec, rate=30)
+            stream.width, stream.height, stream.pix_fmt = (
+                bar_code(0).shape[1],
+                bar_code(0).shape[0],
+                "yuv420p",
+            )
+            for k in range(12):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(bar_code(k), format="rgb24")))
+            container.mux(stream.encode(None))
+    except (av.error.FFmpegError, ValueError) as error:
+        pytest.skip(f"this FFmpeg does not write {suffix} ({error})")
+    assert recognise(path, VideoFormat, "video").name == "video"
+    index = index_video(path)
+    np.testing.assert_allclose(np.diff(index.pts_ns), 1e9 / 30, atol=1e6)
+    assert [read_bar_code(picture) for _, picture in frames(path)] == list(range(index.count))
+    assert index.count in {11, 12}  # a container may lose the length of its last picture
+
+
+def test_a_display_matrix_that_mirrors_is_refused(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", even_ticks(5))
+    content = path.read_bytes()
+    one = (1 << 16).to_bytes(4)
+    unit = one + bytes(12) + one + bytes(12)  # of the track, after that of the movie
+    at = content.index(unit, content.index(unit) + 1)
+    path.write_bytes(content[:at] + (-(1 << 16)).to_bytes(4, signed=True) + content[at + 4 :])
+    with refuses(path):
+        index_video(path)
 
 
 def test_a_stated_size_beyond_reason_is_refused(tmp_path: Path) -> None:
