@@ -24,7 +24,14 @@ from pipelines.keypoints.no_people import Ground, Surroundings, level_of
 from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
 from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
-from pipelines.reconstruction.doubts.diagnosis import doubts_of
+from pipelines.reconstruction.clocks import (
+    MIN_SIGMAS_TO_MOVE,
+    OFFSET_TO_FIND_S,
+    QUESTIONED_SIGMA_S,
+    FoundClocks,
+    is_wrong,
+)
+from pipelines.reconstruction.doubts.diagnosis import doubts_of, doubts_of_clocks
 from pipelines.reconstruction.doubts.scene import Ground as GroundOfMap
 from pipelines.reconstruction.doubts.turning import common_offset
 from pipelines.reconstruction.finishing import finish
@@ -49,11 +56,11 @@ from pipelines.reconstruction.observations import (
     time_base,
 )
 from pipelines.reconstruction.refining import (
-    FoundClocks,
     RefinedFlight,
     RobustFlight,
     doubted_people,
     find_clocks,
+    find_wrong_clocks,
     refine_flight,
     shifted,
 )
@@ -162,8 +169,8 @@ class Source:
         Raises:
             DataError: a table or map of the session is damaged.
         """
-        timed = shifted(loaded.cameras, attempt.offset_s)
-        return doubts_of(
+        timed = attempt.timed(loaded.cameras)
+        doubts = doubts_of(
             self.folder,
             self.description,
             timed,
@@ -171,6 +178,7 @@ class Source:
             followed=loaded.flight.followed,
             pose_noise=self.settings.pose_noise,
         )
+        return [*doubts_of_clocks(self.description, attempt.metrics.get("clocks_moved", {})), *doubts]
 
 
 @dataclass(frozen=True)
@@ -248,7 +256,7 @@ class Flight:
 class Attempt:
     """Result of one reconstruction of the flight (one trial)."""
 
-    offset_s: Float  # [C] of the clocks that were found, added to the pictures' times
+    clocks: FoundClocks | None  # those that were found, of all cameras; None where all are held
     observations: Observations
     views: Views
     result: Triangulation
@@ -258,6 +266,10 @@ class Attempt:
     metrics: dict[str, Any]
     poses: pd.DataFrame | None  # of every picture, if they are not those of the log
     warnings: list[str]
+
+    def timed(self, cameras: Sequence[Camera]) -> list[Camera]:
+        """Return the cameras with the clocks that were found."""
+        return list(cameras) if self.clocks is None else shifted(cameras, self.clocks.offset_s)
 
 
 def reconstruct_once(
@@ -269,10 +281,11 @@ def reconstruct_once(
         NoViewsError: no two cameras see anything at the same times.
     """
     description, refines = flight.description, settings.method in ("refined", "auto")
+    made = None
     if flight.clocks is None:
-        clocks, clock_sigma_s = clocks_of(flight, cameras, settings, workers)
+        clocks, clock_sigma_s, made = clocks_of(flight, cameras, settings, workers)
     else:
-        clocks, clock_sigma_s = flight.clocks, np.zeros(len(cameras))
+        clocks, clock_sigma_s = flight.clocks if flight.clocks.moves else None, np.zeros(len(cameras))
     if clocks is not None:
         cameras = shifted(cameras, clocks.offset_s)
     logged = cameras
@@ -289,7 +302,9 @@ def reconstruct_once(
             cameras, flight.followed, flight.stills, between=description.pose_interpolation
         )
         cameras, background["ground"] = binding.cameras, binding.entry
-    seen, views, result, solve = _triangulated(flight, cameras, settings, workers)
+    if made is None or cameras is not logged:
+        made = _triangulated(flight, cameras, settings, workers)
+    seen, views, result, solve = made.seen, made.views, made.result, made.solve
     observations = seen.observations
     if settings.method == "auto" and are_calibrated(cameras, observations):
         refines = False
@@ -300,7 +315,7 @@ def reconstruct_once(
     refined, solves = None, settings.method
     if refines:
         refined = refine_flight(
-            _robust_flight(flight, cameras, seen, views, result, clock_sigma_s, settings, workers)
+            _robust_flight(flight, cameras, replace(made, result=result), clock_sigma_s, settings, workers)
         )
         observations, views = refined.observations, refined.views
         result = refused_people(refined.result, observations, seen.anybody)
@@ -335,7 +350,7 @@ def reconstruct_once(
     known = source_of_pose_noise(description, logged, settings.pose_noise)
     progress.advance()
     return Attempt(
-        np.zeros(len(cameras)) if clocks is None else clocks.offset_s,
+        clocks,
         observations,
         views,
         result,
@@ -362,8 +377,12 @@ def reconstruct_once(
 
 def clocks_of(
     flight: Flight, cameras: list[Camera], settings: Settings, workers: int
-) -> tuple[FoundClocks | None, Float]:
-    """Estimate unknown clock offsets; return also their prior standard deviations [C], s, for later steps.
+) -> tuple[FoundClocks | None, Float, _Triangulated | None]:
+    """Estimate unknown clock offsets, and question stated ones.
+
+    Returns:
+        The clocks, None where all are held; their prior standard deviations [C], s, for later steps; and what
+        was triangulated with clocks that all were held.
 
     A camera that turns has its clock from its background. The others are compared with these by the rays of
     people, or with each other. An offset that all cameras share hardly changes these rays: if no camera's
@@ -372,68 +391,94 @@ def clocks_of(
     description = flight.description
     prior_s, stated = load_clock_sigma(description, cameras)
     if settings.method == "refined":  # it finds the clocks of which the manifest says that they are off
-        return None, np.where(stated, with_reference(description, cameras, prior_s), 0.0)
+        return None, np.where(stated, with_reference(description, cameras, prior_s), 0.0), None
     none, clocks, known = np.zeros(len(cameras)), None, np.zeros(len(cameras), dtype=np.bool_)
-    if flight.followed and prior_s.any():
+    exact = (prior_s == 0) & (settings.method == "auto")
+    questioned_s = np.where(exact, QUESTIONED_SIGMA_S, prior_s)
+    if flight.followed and questioned_s.any():
         offset_s, sigma_s = clocks_of_backgrounds(
             cameras,
             flight.followed,
             _stated_errors(cameras, description, settings),
-            prior_s,
+            questioned_s,
+            exact,
             between=description.pose_interpolation,
         )
-        known = np.isfinite(offset_s)
-        if known.any():
-            clocks = FoundClocks(np.nan_to_num(offset_s), np.nan_to_num(sigma_s), none)
+        wrong = exact & is_wrong(np.nan_to_num(offset_s), np.nan_to_num(sigma_s))
+        held = exact & ~wrong
+        known = np.isfinite(offset_s) & ~(held & (MIN_SIGMAS_TO_MOVE * sigma_s > OFFSET_TO_FIND_S))
+        moved = known & ~held
+        if moved.any():
+            by = {cameras[c].name: "background" for c in np.flatnonzero(wrong)}
+            offset_s, sigma_s = np.where(moved, [offset_s, sigma_s], 0.0)
+            clocks = FoundClocks(offset_s, sigma_s, none, wrong=by)
             cameras, prior_s = shifted(cameras, clocks.offset_s), np.where(known, 0.0, prior_s)
     prior_s = with_reference(description, cameras, prior_s)
+    made = None
+    if (exact & ~known).any():
+        made = _triangulated(flight, cameras, settings, workers)
+        robust = _robust_flight(flight, cameras, made, prior_s, settings, workers)
+        late = find_wrong_clocks(robust, exact & ~known, prior_s == 0, description.clock_reference)
+        if late.wrong:
+            cameras, made = shifted(cameras, late.offset_s), None
+            clocks = late if clocks is None else clocks.with_others(late)
     if prior_s.any():
-        seen, views, result, _ = _triangulated(flight, cameras, settings, workers)
-        robust = _robust_flight(flight, cameras, seen, views, result, prior_s, settings, workers)
-        found = find_clocks(robust, stated)
+        made = made or _triangulated(flight, cameras, settings, workers)
+        found = find_clocks(_robust_flight(flight, cameras, made, prior_s, settings, workers), stated)
         cameras, prior_s = shifted(cameras, found.offset_s), found.prior_s
         clocks = found if clocks is None else clocks.with_others(found)
-    if settings.method == "auto" and not known.any() and is_time_unknown(description, cameras):
-        late = common_offset(cameras, flight.followed, description.pose_interpolation)
-        if late is not None:
+    unknown = not known.any() and is_time_unknown(description, cameras)
+    if settings.method == "auto" and unknown:
+        late_of_all = common_offset(cameras, flight.followed, description.pose_interpolation)
+        if late_of_all is not None:
             clocks = clocks or FoundClocks(none, none, none)
-            clocks = replace(clocks, offset_s=clocks.offset_s + late.late_s, common_sigma_s=late.sigma_s)
-    return clocks, prior_s
+            offset_s = clocks.offset_s + late_of_all.late_s
+            clocks = replace(clocks, offset_s=offset_s, common_sigma_s=late_of_all.sigma_s)
+    return clocks, prior_s, None if clocks is not None else made
 
 
-def _triangulated(
-    flight: Flight, cameras: list[Camera], settings: Settings, workers: int
-) -> tuple[_Seen, Views, Triangulation, Callable[[Views], Triangulation]]:
-    """Observe and triangulate by the method, or by what it starts from; the last result is its solver."""
+@dataclass(frozen=True)
+class _Triangulated:
+    """Observations, and what the method, or what it starts from, makes of them."""
+
+    seen: _Seen
+    views: Views
+    result: Triangulation
+    solve: Callable[[Views], Triangulation]
+
+
+def _triangulated(flight: Flight, cameras: list[Camera], settings: Settings, workers: int) -> _Triangulated:
+    """Observe and triangulate by the method, or by what it starts from."""
     seen = flight.waiting.put(_observe(flight, cameras, settings))
     flight.waiting.release()
     views = views_with_noise(cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers)
     solve = solver_for(
         settings.method, cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers
     )
-    return seen, views, flight.waiting.put(solve(views)), solve
+    return _Triangulated(seen, views, flight.waiting.put(solve(views)), solve)
 
 
 def _robust_flight(
     flight: Flight,
     cameras: list[Camera],
-    seen: _Seen,
-    views: Views,
-    result: Triangulation,
+    made: _Triangulated,
     clock_sigma_s: Float,
     settings: Settings,
     workers: int,
 ) -> RobustFlight:
     """Collect what the refinement starts from."""
-    doubts = doubted_people(seen.observations, views, result, seen.association.doubts, settings.pixel_sigma)
+    seen = made.seen
+    doubts = doubted_people(
+        seen.observations, made.views, made.result, seen.association.doubts, settings.pixel_sigma
+    )
     return RobustFlight(
         cameras,
         seen.found,
         seen.association.choice,
         seen.observations,
         seen.sides,
-        views,
-        result,
+        made.views,
+        made.result,
         prior=load_pose_errors(flight.description, cameras, settings.pose_noise),
         measured=any(camera.errors is not None for camera in cameras),
         clock_sigma_s=clock_sigma_s,
@@ -447,20 +492,20 @@ def _robust_flight(
 
 def _clock_metrics(
     cameras: Sequence[Camera], clocks: FoundClocks | None, refined: RefinedFlight | None
-) -> dict[str, dict[str, float]]:
+) -> dict[str, Any]:
     """Collect the clock offsets of all steps and their standard deviations; empty without unknown clocks."""
     if clocks is None:
         return {}
+    offset_s, sigma_s = clocks.offset_s, clocks.sigma_s
     names = [camera.name for camera in cameras]
-    offset_s = dict(zip(names, clocks.offset_s.tolist(), strict=True))
-    sigma_s = dict(zip(names, clocks.sigma_s.tolist(), strict=True))
     if refined is not None and refined.cameras is not None:
-        later = refined.metrics["clock_offsets_s"]
-        offset_s = {name: offset + later[name] for name, offset in offset_s.items()}
-        if any(refined.metrics["clock_offset_sigmas_s"].values()):  # else they were held
-            sigma_s = refined.metrics["clock_offset_sigmas_s"]
-    sigma_s = {name: float(np.hypot(sigma, clocks.common_sigma_s)) for name, sigma in sigma_s.items()}
-    return {"clock_offsets_s": offset_s, "clock_offset_sigmas_s": sigma_s}
+        later, sigmas = (
+            np.array([refined.metrics[part][name] for name in names])
+            for part in ("clock_offsets_s", "clock_offset_sigmas_s")
+        )
+        offset_s = offset_s + later
+        sigma_s = sigmas if sigmas.any() else sigma_s  # else they were held
+    return replace(clocks, offset_s=offset_s, sigma_s=sigma_s).as_metrics(names)
 
 
 @dataclass(frozen=True)

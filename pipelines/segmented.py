@@ -28,8 +28,8 @@ from pipelines.attempt import (
 )
 from pipelines.detect import cameras_to_detect
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.reconstruction.clocks import FoundClocks, agreed_clocks
 from pipelines.reconstruction.loading import common_joints
-from pipelines.reconstruction.refining import FoundClocks, agreed_clocks, shifted
 from pipelines.reconstruction.results import camera_poses_table, gait_of, write_figures
 from pipelines.reconstruction.segments import (
     APART_M,
@@ -90,8 +90,7 @@ class _Order:
     left_out: str | None
     segment: Segment
     threads: int
-    clocks: Mapping[str, tuple[float, float]] | None = None  # offset and standard deviation (s) by camera
-    common_sigma_s: float = 0.0  # of these clocks
+    clocks: FoundClocks | None = None  # of all cameras of the flight
     person: LoggedActor | None = None  # place of the person at the end of the segment before
 
     def load(self, waiting: Waiting) -> tuple[Source, Loaded]:
@@ -105,13 +104,13 @@ class _Order:
         if self.person is not None and not flight.actors:
             flight = replace(flight, actors=[self.person])
         if self.clocks is not None:
-            known = np.array([self.clocks[camera.name] for camera in loaded.cameras])
-            none = np.zeros(len(known))
-            flight = replace(flight, clocks=FoundClocks(known[:, 0], known[:, 1], none, self.common_sigma_s))
+            names = list(description.cameras)
+            here = [names.index(camera.name) for camera in loaded.cameras]
+            flight = replace(flight, clocks=self.clocks.of(names, here))
         return source, replace(loaded, flight=flight)
 
 
-def clocks_of_segment(order: _Order) -> dict[str, dict[str, float]]:
+def clocks_of_segment(order: _Order) -> dict[str, dict[str, Any]]:
     """Find the clocks of a segment on a worker; see `agreed_clocks`."""
     return_freed_arrays()
     settings = (
@@ -119,19 +118,22 @@ def clocks_of_segment(order: _Order) -> dict[str, dict[str, float]]:
     )
     with TemporaryDirectory() as place:
         try:
-            _, loaded = order.load(Waiting(Path(place)))
-            clocks, prior_s = clocks_of(loaded.flight, loaded.cameras, settings, order.threads)
+            source, loaded = order.load(Waiting(Path(place)))
+            clocks, prior_s, _ = clocks_of(loaded.flight, loaded.cameras, settings, order.threads)
         except NoViewsError:
             return {"": {"common_sigma_s": 0.0}}
     if clocks is None:
         clocks = FoundClocks(np.zeros(len(prior_s)), np.zeros(len(prior_s)), prior_s)
-    found = {
-        camera.name: {"offset_s": float(offset), "sigma_s": float(sigma), "prior_s": float(prior)}
-        for camera, offset, sigma, prior in zip(
-            loaded.cameras, clocks.offset_s, clocks.sigma_s, prior_s, strict=True
-        )
-    }
-    return found | {"": {"common_sigma_s": clocks.common_sigma_s}}
+    found: dict[str, dict[str, Any]] = {"": {"common_sigma_s": clocks.common_sigma_s}}
+    for c, camera in enumerate(loaded.cameras):
+        found[camera.name] = {
+            "offset_s": float(clocks.offset_s[c]),
+            "sigma_s": float(clocks.sigma_s[c]),
+            "prior_s": float(prior_s[c]),
+        }
+        if source.description.cameras[camera.name].clock.prior_sigma_s == 0:
+            found[camera.name]["wrong"] = clocks.wrong.get(camera.name, "")
+    return found
 
 
 def reconstruct_segment(order: _Order) -> dict[str, bytes]:
@@ -160,7 +162,7 @@ def _made_of_segment(place: Path, order: _Order, source: Source, loaded: Loaded)
     doubts = source.doubts(loaded, attempt)
     gait, walks = gait_of(attempt.observations, attempt.result)
     corrected = [] if attempt.poses is None else attempt.poses["camera"].unique().tolist()
-    timed = shifted(loaded.cameras, attempt.offset_s)
+    timed = attempt.timed(loaded.cameras)
     logged = [camera for camera in timed if camera.name not in corrected]
     poses = [attempt.poses] if attempt.poses is not None else []
     if logged:
@@ -241,11 +243,9 @@ def by_segments(
 
     clocks = _clocks_of_flight(run, source, [order_of(part) for part in sampled(segments, _CLOCKED)], each)
     if clocks is not None and source.settings.rate_hz is None:
-        late_ns = round(1e9 * clocks[0][base][0])
+        late_ns = round(1e9 * clocks.offset_s[list(source.description.cameras).index(base)])
         segments = [segment.later(late_ns) for segment in segments]
-    orders = [order_of(segment) for segment in segments]
-    if clocks is not None:
-        orders = [replace(order, clocks=clocks[0], common_sigma_s=clocks[1]) for order in orders]
+    orders = [replace(order_of(segment), clocks=clocks) for segment in segments]
     missing = [order for order in orders if not run.has_chunk(order.segment.name)]
     progress.advance(len(orders) - len(missing))
     with closing(each(reconstruct_segment, missing)) as found:
@@ -256,11 +256,8 @@ def by_segments(
     doubts = flight.doubts
     _refuse_nothing_of_segments(folder, flight, doubts)
     metrics = flight.metrics | {"doubts": [doubt.as_json() for doubt in doubts]}
-    if clocks is not None:
-        metrics["clock_offsets_s"] = {name: offset for name, (offset, _) in clocks[0].items()}
-        metrics["clock_offset_sigmas_s"] = {
-            name: float(np.hypot(sigma, clocks[1])) for name, (_, sigma) in clocks[0].items()
-        }
+    if clocks is not None and (clocks.moves or _has_unknown_clocks(source.description)):
+        metrics |= clocks.as_metrics(list(source.description.cameras))
     refuse_doubted(folder, metrics["doubts"], strict=strict)
     flight.write(run.folder)
     metrics = write_figures(run.folder, jsonable(metrics))
@@ -270,25 +267,24 @@ def by_segments(
 Each = Callable[[Callable[[_Order], Any], Sequence[_Order]], Generator[tuple[int, Any]]]
 
 
-def _clocks_of_flight(
-    run: Run, source: Source, orders: Sequence[_Order], each: Each
-) -> tuple[dict[str, tuple[float, float]], float] | None:
-    """Find offset and standard deviation (s) of every clock, and that of a common offset; None if known."""
+def _clocks_of_flight(run: Run, source: Source, orders: Sequence[_Order], each: Each) -> FoundClocks | None:
+    """Find the clocks of all cameras; None if all are held without a look."""
     cameras = source.description.cameras
-    names = list(cameras)
-    if not any(entry.clock.prior_sigma_s > 0 for entry in cameras.values()):
+    if source.settings.method != "auto" and not _has_unknown_clocks(source.description):
         return None
 
     def find(place: Path) -> None:
-        found: list[dict[str, dict[str, float]]] = [{}] * len(orders)
+        found: list[dict[str, dict[str, Any]]] = [{}] * len(orders)
         with closing(each(clocks_of_segment, orders)) as parts:
             for number, clocks in parts:
                 found[number] = clocks
         write_json(place / "clocks.json", {"segments": found})
 
-    agreed = agreed_clocks(names, read_json(run.chunk("clocks", find) / "clocks.json")["segments"])
-    by_camera = zip(names, agreed.offset_s.tolist(), agreed.sigma_s.tolist(), strict=True)
-    return {name: (offset, sigma) for name, offset, sigma in by_camera}, agreed.common_sigma_s
+    return agreed_clocks(list(cameras), read_json(run.chunk("clocks", find) / "clocks.json")["segments"])
+
+
+def _has_unknown_clocks(description: Description) -> bool:
+    return any(camera.clock.prior_sigma_s > 0 for camera in description.cameras.values())
 
 
 @dataclass(frozen=True)

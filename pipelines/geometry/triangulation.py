@@ -109,6 +109,19 @@ class Views:
         if n and (self.pose_index.min() < 0 or self.pose_index.max() >= instants):
             raise ValueError(f"pose_index leaves 0..{instants - 1}")
 
+    def of(self, cameras: Bool) -> Views:
+        """Take the views of some of the cameras [C]."""
+        return replace(
+            self,
+            rays=self.rays[:, cameras],
+            weight=self.weight[:, cameras],
+            position=self.position[:, cameras],
+            rotation=self.rotation[:, cameras],
+            focal=self.focal[cameras],
+            pixel_sigma=self.pixel_sigma[cameras],
+            pose_sigma=self.pose_sigma[:, cameras],
+        )
+
 
 @dataclass(frozen=True)
 class Points:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.noise import EXACT, ROTATION, PoseErrors, Process
 from pipelines.geometry.poses import quaternion_from_matrix, velocities
@@ -31,6 +31,11 @@ from pipelines.reconstruction.doubts.turning import common_offset
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Trajectory
+
+# --- tuning ---
+
+# Few pictures show a clock roughly. A stated one within so many standard deviations needs no closer look.
+SIGMAS_TO_LOOK_CLOSER = 3.0
 
 
 def refine_cameras(
@@ -81,6 +86,7 @@ def clocks_of_backgrounds(
     followed: Mapping[str, Followed | str],
     errors: Sequence[PoseErrors | None],
     clock_sigma_s: Float,
+    stated: Bool | None = None,
     *,
     between: Interpolation,
 ) -> tuple[Float, Float]:
@@ -93,6 +99,7 @@ def clocks_of_backgrounds(
         followed: background of each camera by its name, or the reason why none was followed.
         errors: as for `refine_cameras`.
         clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
+        stated: [C] True for clocks of which a quick look decides if they are estimated; by default none.
         between: rules for interpolating between logged poses.
 
     Returns:
@@ -100,14 +107,21 @@ def clocks_of_backgrounds(
         known or the background does not determine it.
     """
     found = np.full((len(cameras), 2), np.nan)
-    for c, (camera, stated) in enumerate(zip(cameras, errors, strict=True)):
+    for c, (camera, stated_errors) in enumerate(zip(cameras, errors, strict=True)):
         seen = followed[camera.name]
         if clock_sigma_s[c] == 0 or isinstance(seen, str):
             continue
+        background, prior = background_of(camera, seen), PosePrior.of(stated_errors)
+        if stated is not None and stated[c]:
+            poses_at = partial(_poses_late, camera, camera.frame_t_ns[seen.rows], 0.0, between)
+            look = clock_offset(background, poses_at, prior, quick=True)
+            if look is None or abs(look[0]) <= SIGMAS_TO_LOOK_CLOSER * look[1]:
+                found[c] = (np.nan, np.nan) if look is None else (0.0, look[1])
+                continue
         rough = common_offset([camera], {camera.name: seen}, between)
         about_s = 0.0 if rough is None else rough.late_s
         poses_at = partial(_poses_late, camera, camera.frame_t_ns[seen.rows], about_s, between)
-        clock = clock_offset(background_of(camera, seen), poses_at, PosePrior.of(stated))
+        clock = clock_offset(background, poses_at, prior)
         if clock is not None:
             share = clock_sigma_s[c] ** 2 / (clock_sigma_s[c] ** 2 + clock[1] ** 2)
             found[c] = share * (about_s + clock[0]), np.sqrt(share) * clock[1]
@@ -135,7 +149,8 @@ def background_of(camera: Camera, followed: Followed) -> Background:
             np.concatenate([part.rays for part in parts]),
         )
 
-    return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9)
+    loosened = None if camera.loosened is None else camera.loosened_at(t_ns)
+    return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9, loosened)
 
 
 def _rays(tracks: Tracks, camera: Camera, t_ns: Int64) -> Float:
@@ -172,7 +187,16 @@ def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:
         sigma=np.sqrt(variances.mean(axis=2)),
         covariance=covariance,
         errors=found.left,
+        loosened=_loosened_still(camera.loosened_at(t_ns[posed]), variances.mean(axis=2)),
     )
+
+
+def _loosened_still(loosened: Float, variance: Float) -> Float | None:
+    """Compute what is left of loosened poses [T, 2], from the variances [T, 2] that all poses have now."""
+    if not loosened.any():
+        return None
+    more = np.sqrt(np.maximum(variance - np.median(variance, axis=0), 0.0))
+    return np.where((loosened > 0).any(axis=1, keepdims=True), more, 0.0)
 
 
 def _entry(found: Adjusted) -> dict[str, Any]:

@@ -97,6 +97,8 @@ _STANDS_PX = 0.3  # largest median residual of a camera that only turns: twice w
 _STANDS = 0.03  # px^2 of misfit that a free path may save: noise, not parallax
 _SLOW_LAG_S = 1.0  # over which slow errors of a camera that stands are read off its log
 _CLOCK_PICTURES = 600  # in which the clock is looked for
+# Some seconds show an offset of 50 ms by ten standard deviations where a camera turns.
+_QUICK_CLOCK_PICTURES = 150
 _CLOCK_ROUNDS = 8  # of which each moves the stamps
 _SETTLED = 0.5  # the last offset is at most this share of its standard deviation
 _ANY_CLOCK_S = 0.5  # standard deviation of what is left in each round
@@ -206,6 +208,7 @@ class Background:
     between: Callable[[int, int], SeenPoints]  # in pictures from the first number to before the second
     focal_px: float
     t_s: Float  # [T]
+    loosened: Float | None = None  # [T, 2] m, rad: what logged poses in bad stretches err by besides
 
 
 def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
@@ -270,8 +273,7 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
     pixels = float(np.median(np.concatenate([found.missed for found in results])))
     if pixels > _WORST_PX:
         return refused(f"the background moves by {pixels:.1f} px against itself", pixels)
-    level = np.repeat(prior.level, 3)
-    surprise = max(float((np.sqrt(np.mean(found.errors**2, axis=0)) / level).max()) for found in results)
+    surprise = max(found.surprise(prior.level) for found in results)
     if surprise > _SIGMAS:
         return refused(f"its poses would be {surprise:.0f} standard deviations from the log", pixels)
     priors = [found.prior for found in results]
@@ -299,7 +301,11 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
 
 
 def clock_offset(
-    seen: Background, poses_at: Callable[[float], tuple[Float, Float]], prior: PosePrior
+    seen: Background,
+    poses_at: Callable[[float], tuple[Float, Float]],
+    prior: PosePrior,
+    *,
+    quick: bool = False,
 ) -> tuple[float, float] | None:
     """Find by how much pictures were taken later than their stamps: the log turns as the background then.
 
@@ -307,6 +313,7 @@ def clock_offset(
         seen: the background.
         poses_at: function that returns the logged poses, as for `adjust`, this many seconds after the stamps.
         prior: standard deviations of the log's errors.
+        quick: look at few pictures once; larger offsets are not exact then.
 
     Returns:
         Offset and its standard deviation, s, by the background alone. None if the camera turns too little in
@@ -317,12 +324,13 @@ def clock_offset(
     for again in range(_CLOCK_ROUNDS):
         position, rotation = poses_at(offset_s)
         posed = np.flatnonzero(np.isfinite(position[:, 0]))
-        skipped = max(len(posed) - _CLOCK_PICTURES, 0) // 2
-        rows = posed[skipped : skipped + _CLOCK_PICTURES]
+        pictures = _QUICK_CLOCK_PICTURES if quick else _CLOCK_PICTURES
+        skipped = max(len(posed) - pictures, 0) // 2
+        rows = posed[skipped : skipped + pictures]
         if len(rows) < 2:
             return None
         stretch = _Stretch.of(seen, rows, position, rotation)
-        solved = stretch._solved(levels, level_rounds=1 if again else _LEVEL_ROUNDS)
+        solved = stretch._solved(levels, level_rounds=1 if again or quick else _LEVEL_ROUNDS)
         if solved is None or solved.clock is None:
             return None
         levels = solved.prior
@@ -331,6 +339,8 @@ def clock_offset(
         if np.sqrt(np.var(away, axis=0).sum()) < _LEAST_TURNING:
             return None
         late_s, sigma_s = solved.clock
+        if quick:
+            return late_s, sigma_s
         offset_s += late_s if late_s * before_s >= 0 else late_s / 2  # steps that swing to and fro
         before_s = late_s
         if abs(late_s) <= _SETTLED * sigma_s:
@@ -435,7 +445,13 @@ class _Solved:
     missed: Float  # [K] residuals, px
     prior: PosePrior
     clock: tuple[float, float] | None  # its offset and standard deviation (s), if it was unknown
+    loosened: Float  # [T, 2] m, rad
     stands: bool = False
+
+    def surprise(self, level: Float) -> float:
+        """Compute the largest rms error of the axes, in standard deviations of the log's [2]."""
+        sigma = np.repeat(np.hypot(level, self.loosened), 3, axis=1)
+        return float(np.sqrt(np.mean((self.errors / sigma) ** 2, axis=0)).max())
 
 
 @dataclass(frozen=True)
@@ -470,6 +486,7 @@ class _Stretch:
     knot_t_s: Float  # [N]
     knot: Int64  # [T] the knot before each picture
     share: Float  # [T] of the knot after it
+    loosened: Float  # [T, 2] m, rad
     focal_px: float
     unbound: int  # pictures that share too few points with the one before
 
@@ -505,6 +522,7 @@ class _Stretch:
             knot_t_s,
             knot,
             share,
+            np.zeros((len(rows), 2)) if whole.loosened is None else whole.loosened[rows],
             whole.focal_px,
             int((_shared(first, picture, len(rows)) < _FEWEST_SHARED).sum()),
         )
@@ -552,7 +570,7 @@ class _Stretch:
         rng = np.random.default_rng(0)
         draws[..., :3] += np.sqrt(variance) * rng.standard_normal((len(draws), 1, 3))
         levels = _with_position_levels(found.prior, prior.white[0], prior.slow[0])
-        return _Solved(errors, covariance, draws, found.missed, levels, found.clock, stands=True)
+        return replace(found, errors=errors, covariance=covariance, draws=draws, prior=levels, stands=True)
 
     def _times_s(self) -> Float:
         """Return the times of the pictures [T], from the knots about them."""
@@ -586,7 +604,9 @@ class _Stretch:
         errors = self._draws(factored, _DRAWS)[0]
         late = float(state.constant[-1]), float(np.sqrt(factored.corner[-1, -1]))
         clock = late if prior.clock_s > 0 else None
-        return _Solved(state.errors, self._covariance(factored), errors, _PIXEL_SIGMA * missed, prior, clock)
+        missed *= _PIXEL_SIGMA
+        covariance = self._covariance(factored)
+        return _Solved(state.errors, covariance, errors, missed, prior, clock, self.loosened)
 
     def _solve(
         self, state: _State, prior: PosePrior, rounds: int, loss: float = _LOSS
@@ -655,7 +675,7 @@ class _Stretch:
         variance = np.square(prior.white)
         if not prior.estimated:  # an estimated level already holds what slow errors do between knots
             variance += [process.stray(float(steps.max(initial=0.0))) for process in prior.slow]
-        white = 1 / np.repeat(np.maximum(variance, EXACT**2), 3)
+        white = 1 / np.repeat(np.maximum(variance + self.loosened**2, EXACT**2), 3, axis=1)
         left, added = np.empty((len(steps), 6)), np.empty((len(steps), 6))
         for k, step in enumerate(steps):
             both = [process.step(float(step)) for process in prior.slow]
@@ -700,8 +720,9 @@ class _Stretch:
     def _estimated(self, state: _State, draws: tuple[Float, Float, Float], prior: PosePrior) -> PosePrior:
         """Estimate the levels of white and slow errors again by MacKay's rule."""
         design = self._design(_without(state.errors, self.position, self.rotation)[1], prior)
-        fresh = self._fresh(state, design)
-        spread = np.stack([self._fresh(_State(*draw), design) for draw in zip(*draws, strict=True)])
+        usual = ~(self.loosened > 0).any(axis=1)
+        fresh = self._fresh(state, design)[usual]
+        spread = np.stack([self._fresh(_State(*draw), design)[usual] for draw in zip(*draws, strict=True)])
         white = [
             _level(fresh[:, of], spread[..., of], sigma, least)
             for of, sigma, least in zip(_KINDS, prior.white, _LEAST_WHITE, strict=True)

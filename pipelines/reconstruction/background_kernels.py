@@ -43,7 +43,7 @@ class Ties(NamedTuple):
     knot_place: Int64  # [N]
     knot: Int64  # [T] the knot before each picture
     share: Float  # [T] of the knot after it
-    white: Float  # [6] precisions of white errors
+    white: Float  # [T, 6] precisions of white errors
     start: Float  # [6] precisions of the first knot
     left: Float  # [N - 1, 6] share of a knot's error that is left at the next one
     added: Float  # [N - 1, 6] precisions of what is added to it
@@ -367,7 +367,7 @@ def add_ties(
             for k in range(count):
                 left -= row[k] * constant[k]
             own, old, new = ties.place[t] + a, ties.knot_place[before] + a, ties.knot_place[after] + a
-            w = ties.white[a]
+            w = ties.white[t, a]
             band[own, 0] += w
             band[old, 0] += (1 - share) ** 2 * w
             band[new, 0] += share**2 * w

@@ -19,6 +19,7 @@ from pipelines.geometry.noise import (
     pose_errors,
 )
 from pipelines.reconstruction.background_tracks import rows_to_follow
+from pipelines.reconstruction.log_stretches import Mended, mend, said_stretches
 from pipelines.reconstruction.observations import Camera, regular_times
 from pipelines.session.camera_poses import stated_models, stated_noise
 from pipelines.session.description import CameraEntry, Description, Interpolation
@@ -211,6 +212,8 @@ def _load_camera(
     trajectory = _logged(
         folder / "cameras" / name / "poses.parquet", entry, description.pose_interpolation, span_ns
     )
+    mended = Mended(trajectory, None, 0, 0, 0, 0.0) if entry.poses.static else mend(trajectory)
+    warnings += said_stretches(name, mended)
     if span_ns is not None:
         span_ns = int(frames["t_ns"].iloc[0]), int(frames["t_ns"].iloc[-1])
     keypoints = read_table(source.table, KEYPOINTS, span_ns)
@@ -233,9 +236,10 @@ def _load_camera(
         frame_number=frame,
         frame_t_ns=frames["t_ns"].to_numpy(np.int64),
         follows=np.diff(frame, prepend=frame[0] - every) == every,
-        trajectory=trajectory,
+        trajectory=mended.trajectory,
         static=entry.poses.static,
         sigma=None,
+        loosened=mended.loosened,
         # From here on frames count the rows of the table: pictures without a time are not in it.
         detections=replace(detections, frame=np.searchsorted(frame, detections.frame)),
     )

@@ -49,6 +49,7 @@ class Camera:
     detections: Detections
     covariance: Float | None = None  # [N, 6, 6]
     errors: PoseErrors | None = None  # remaining errors of its poses, if they were refined beforehand
+    loosened: Float | None = None  # [N, 2] m, rad: what poses in bad stretches of the log err by besides
 
     @cached_property
     def focal_px(self) -> float:
@@ -117,11 +118,27 @@ class Camera:
 
     def sigma_at(self, t_ns: Int64) -> Float | None:
         """Return the pose noise [T, 2] at given times, that of the logged pose before each."""
-        return None if self.sigma is None else self.sigma[self._pose_before(t_ns)]
+        if self.sigma is None:
+            return None
+        sigma = self.sigma[self._pose_before(t_ns)]
+        return sigma if self.loosened is None else np.hypot(sigma, self.loosened_at(t_ns))
 
     def covariance_at(self, t_ns: Int64) -> Float | None:
         """Return the logged pose covariance [T, 6, 6] at given times, that of the logged pose before each."""
-        return None if self.covariance is None else self.covariance[self._pose_before(t_ns)]
+        if self.covariance is None:
+            return None
+        covariance = self.covariance[self._pose_before(t_ns)]
+        if self.loosened is None:
+            return covariance
+        return covariance + np.repeat(self.loosened_at(t_ns) ** 2, 3, axis=1)[..., None] * np.eye(6)
+
+    def loosened_at(self, t_ns: Int64) -> Float:
+        """Return what poses [T, 2] err by besides in bad stretches, by the logged ones before and after."""
+        if self.loosened is None:
+            return np.zeros((len(t_ns), 2))
+        before = self._pose_before(t_ns)
+        after = np.minimum(before + 1, len(self.loosened) - 1)
+        return np.maximum(self.loosened[before], self.loosened[after])
 
     def _pose_before(self, t_ns: Int64) -> NDArray[np.intp]:
         before = np.searchsorted(self.trajectory.t_ns, t_ns, side="right") - 1

@@ -6,7 +6,7 @@ are inliers and which joints are reconstructed. Positions and covariances are th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +19,19 @@ from pipelines.geometry.triangulation import (
     Triangulation,
     Views,
     estimate_noise,
-    locate,
     reprojection_px,
     triangulate,
     triangulate_pictures,
+)
+from pipelines.reconstruction.clocks import (
+    FINE_STEP_S,
+    MIN_OFFSET_BY_PEOPLE_S,
+    MIN_SIGMAS_BY_PEOPLE,
+    QUESTIONED_SIGMA_S,
+    SEARCH_STEP_S,
+    FoundClocks,
+    initial_offsets_s,
+    wrong_clocks,
 )
 from pipelines.reconstruction.observations import (
     Camera,
@@ -169,58 +178,6 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
 # --- clocks --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FoundClocks:
-    """Clock offsets that the backgrounds or the keypoints determine."""
-
-    offset_s: Float  # [C] to add to the pictures' times
-    sigma_s: Float  # [C] posterior standard deviation; the prior's where only the search found it, 0 if held
-    prior_s: Float  # [C] prior standard deviation for later estimates; 0 for clocks that are held
-    common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
-
-    def with_others(self, found: FoundClocks) -> FoundClocks:
-        """Add the offsets that keypoints show for cameras that are already shifted by these.
-
-        The standard deviations of these stay.
-        """
-        sigma_s = np.where(self.sigma_s > 0, self.sigma_s, found.sigma_s)
-        return replace(found, offset_s=self.offset_s + found.offset_s, sigma_s=sigma_s)
-
-
-def agreed_clocks(names: Sequence[str], found: Sequence[Mapping[str, Mapping[str, float]]]) -> FoundClocks:
-    """Agree on the clocks that some segments found.
-
-    Where the backgrounds of some segments determine clocks, the other segments do not count: they compare
-    clocks with a reference that may be late itself. For clocks that no background determines, most segments
-    decide whether a clock is held. Of the offsets that were found, the median is taken, with the median of
-    their standard deviations: an offset that the whole flight shares is hardly surer than that.
-
-    Args:
-        names: of all C cameras.
-        found: of each segment `offset_s`, `sigma_s` and `prior_s` by camera, and `common_sigma_s` of "".
-    """
-    offset_s, sigma_s, prior_s = np.zeros((3, len(names)))
-    found = [each for each in found if any(map(_is_by_background, each.values()))] or found
-    for c, name in enumerate(names):
-        own = [each[name] for each in found if name in each]
-        moved = [each for each in own if each["prior_s"] > 0]
-        by_background = list(filter(_is_by_background, own))
-        if by_background:
-            own = by_background
-        elif 2 * len(moved) > len(own):
-            prior_s[c] = max(each["prior_s"] for each in moved)
-            own = moved
-        if own:
-            offset_s[c] = np.median([each["offset_s"] for each in own])
-            sigma_s[c] = np.median([each["sigma_s"] for each in own])
-    common_s = float(np.median([each[""]["common_sigma_s"] for each in found])) if found else 0.0
-    return FoundClocks(offset_s, sigma_s, prior_s, common_s)
-
-
-def _is_by_background(clock: Mapping[str, float]) -> bool:
-    return clock.get("prior_s") == 0 and clock["sigma_s"] > 0
-
-
 def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
     """Find the clock offsets of a flight: by the refinement, or by its search alone where that is refused.
 
@@ -242,18 +199,60 @@ def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
     return FoundClocks(offset_s, refined.clock_sigma_s, prior_s)
 
 
+def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, reference: str) -> FoundClocks:
+    """Find which stated clocks the rays of people contradict.
+
+    Args:
+        flight: the flight.
+        questioned: [C] True for clocks that may be wrong.
+        held: [C] True for clocks that are stated or found, with those that are questioned.
+        reference: name of the camera whose clock is right where two explain the same.
+    """
+    none = np.zeros(len(held))
+    offset_s, names = none.copy(), [camera.name for camera in flight.cameras]
+    if held.sum() > 1:
+        views_at, every = _views_at(flight, np.ones_like(held))
+        beside = [name for name, kept in zip(names, held, strict=True) if kept]
+        offset_s[held] = wrong_clocks(
+            lambda shift_s: views_at(shift_s).of(held),
+            flight.t_s[::every],
+            questioned[held],
+            flight.pixel_sigma,
+            beside.index(reference) if reference in beside else 0,
+        )
+    suspect = offset_s != 0
+    if not suspect.any():
+        return FoundClocks(none, none, none)
+    limbs = replace(flight, clock_sigma_s=QUESTIONED_SIGMA_S * suspect, only_limbs=True)
+    refined, settled_s = _settle_clocks(limbs, offset_s)
+    settled = suspect & (refined.fallback is None) & (np.abs(settled_s - offset_s) < SEARCH_STEP_S)
+    offset_s = np.where(settled, settled_s, offset_s)
+    sigma_s = np.where(settled, refined.clock_sigma_s, FINE_STEP_S)
+    least_s = np.maximum(MIN_OFFSET_BY_PEOPLE_S, np.where(settled, MIN_SIGMAS_BY_PEOPLE * sigma_s, 0.0))
+    wrong = suspect & (np.abs(offset_s) >= least_s)
+    offset_s, sigma_s = np.where(wrong, [offset_s, sigma_s], 0.0)
+    return FoundClocks(
+        offset_s, sigma_s, none, wrong=dict.fromkeys(np.array(names)[wrong].tolist(), "keypoints")
+    )
+
+
 def _initial_clock_offsets_s(flight: RobustFlight) -> Float:
     """Find the initial offset [C] s of every clock from some times of the flight, see `initial_offsets_s`."""
+    views_at, every = _views_at(flight, flight.clock_sigma_s > 0)
+    return initial_offsets_s(views_at, len(flight.t_s[::every]), flight.clock_sigma_s)
+
+
+def _views_at(flight: RobustFlight, moved: Bool) -> tuple[Callable[[float], Views], int]:
+    """Return a function from a shift (s) of some clocks [C] to views at every k-th time, and k."""
     times = len(flight.observations.t_ns)
     every = -(-times // _SEARCHED)
 
     def views_at(shift_s: float) -> Views:
-        offset_s = np.where(flight.clock_sigma_s > 0, shift_s, 0.0)
-        observed, views = _observe_with_offsets(flight, offset_s, every)
+        observed, views = _observe_with_offsets(flight, np.where(moved, shift_s, 0.0), every)
         weight = np.where(flight.trusted[:, None, None], observed.confidence, 0.0)
         return replace(views, weight=weight.reshape(views.weight.shape))
 
-    return initial_offsets_s(views_at, len(range(0, times, every)), flight.clock_sigma_s)
+    return views_at, every
 
 
 def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Float]:
@@ -415,12 +414,15 @@ def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
         focal_px=camera.focal_px,
         pixel_sigma=flight.pixel_sigma,
         pose_covariance=None if flight.prior is None else white_covariance(camera, flight.prior[c]),
+        loosened=None if camera.loosened is None else camera.loosened_at(frame_t_ns),
     )
 
 
 def white_covariance(camera: Camera, prior: PoseErrors) -> Float | None:
     """Return covariances [F, 6, 6] of the white error of each picture's pose; None if not in the log."""
-    logged = camera.covariance_at(camera.frame_t_ns) if prior.logged else None
+    if not prior.logged:
+        return None
+    logged = replace(camera, loosened=None).covariance_at(camera.frame_t_ns)
     return None if logged is None else WHITE_SHARE * logged
 
 
@@ -485,75 +487,6 @@ def _camera_table(flight: RobustFlight, refined: Refined, offset_s: Float) -> pd
         logged = camera.poses_at(camera.frame_t_ns, flight.between)
         poses.append(corrected(*logged, _numbers_at(refined.corrections[c], t_s)))
     return poses_table(cameras, poses)
-
-
-# --- initial clock offsets -----------------------------------------------------------------------------
-
-_STEP_S = 1 / 15  # limbs swing for longer than that
-_REACH = 2.0  # standard deviations of the stated clock offset
-_CLEARER = 0.8  # share of the disagreement without a shift that the best shift must go below
-_LIMBS = 75.0  # percentile: half of the joints swing too little, and some views are wrong
-
-
-def initial_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sigma_s: Float) -> Float:
-    """Find an initial offset [C] s of every clock, to about two pictures; 0 for known clocks.
-
-    Views agree at the right offset. Pose errors move all joints of a view together and must not count: the
-    disagreement is measured after subtracting the median of each view.
-
-    Args:
-        views_at: function that returns the views with all unknown clocks moved forward by a number of
-            seconds; joint-frames are grouped by time, the same number at each time.
-        instants: number of these times.
-        clock_sigma_s: [C] prior standard deviation of each offset, 0 for a known clock. Without a known
-            clock all offsets are 0.
-    """
-    initial_s = np.zeros(len(clock_sigma_s))
-    unknown = np.flatnonzero(clock_sigma_s > 0)
-    if not len(unknown) or len(unknown) == len(initial_s):
-        return initial_s
-    steps = int(_REACH * clock_sigma_s.max() / _STEP_S)
-    shifts_s = _STEP_S * np.arange(-steps, steps + 1)
-    disagreement = np.full((len(shifts_s), len(initial_s)), np.inf)
-    for row, shift_s in enumerate(shifts_s):
-        views = views_at(float(shift_s))
-        for camera in unknown[np.abs(shift_s) <= _REACH * clock_sigma_s[unknown]]:
-            disagreement[row, camera] = _disagreement(views, instants, clock_sigma_s == 0, camera)
-    for camera in unknown:
-        best = int(np.argmin(disagreement[:, camera]))
-        if disagreement[best, camera] < _CLEARER * disagreement[steps, camera]:
-            initial_s[camera] = shifts_s[best]
-    return initial_s
-
-
-def _disagreement(views: Views, instants: int, known: Bool, camera: int) -> float:
-    """Compute the disagreement of a camera with those of known clocks, beside the median of each view."""
-    chosen = np.append(np.flatnonzero(known), camera)
-    views = replace(
-        views,
-        rays=views.rays[:, chosen],
-        weight=views.weight[:, chosen],
-        position=views.position[:, chosen],
-        rotation=views.rotation[:, chosen],
-        focal=views.focal[chosen],
-        pixel_sigma=views.pixel_sigma[chosen],
-        pose_sigma=views.pose_sigma[:, chosen],
-    )
-    points = locate(views, method="midpoint").points
-    away = points[:, None] - views.position[views.pose_index]
-    seen = np.einsum("ncij,nci->ncj", views.rotation[views.pose_index], away)
-    depth = np.where(seen[..., 2] > 0, seen[..., 2], np.nan)
-    missed = seen[..., :2] / depth[..., None] - views.rays
-    missed[views.weight == 0] = np.nan
-    missed = missed.reshape(instants, -1, len(chosen), 2)
-    there = np.isfinite(missed[..., -1, 0])
-    if not there.any():
-        return np.inf
-    missed = missed[there.any(axis=1)]
-    unseen = np.isnan(missed).all(axis=1, keepdims=True)  # by one of the others
-    of_view = np.nanmedian(np.where(unseen, 0.0, missed), axis=1, keepdims=True)
-    own = np.linalg.norm(missed - of_view, axis=-1)
-    return float(np.nanpercentile(own, _LIMBS))
 
 
 # --- cameras that share their times --------------------------------------------------------------------

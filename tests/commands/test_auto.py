@@ -80,6 +80,36 @@ def test_every_method_is_served_by_the_clocks_that_were_found(tmp_path: Path, me
     assert metrics["mpjpe_mm"] < 0.3 * 240
 
 
+@pytest.mark.parametrize(
+    ("cameras", "late_s", "within_s"),
+    [(3, {"drone1": 0.12}, 0.005), (3, {"drone2": -0.05}, 0.005), (2, {"drone2": 0.2}, 0.02), (3, {}, 0.0)],
+)
+def test_a_stated_clock_that_is_wrong_is_moved_and_doubted(
+    tmp_path: Path, cameras: int, late_s: dict[str, float], within_s: float
+) -> None:
+    """Question clocks that are stated as exact: wrong ones are found, right ones are not moved at all."""
+    flight = write_flight(tmp_path, cameras=cameras, seconds=4.0, pose_noise={})
+    for name, seconds in late_s.items():
+        flight.settings["cameras"][name]["clock"]["offset_s"] = -seconds
+    flight.save()
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest, "-o", session)
+    metrics, _ = reconstructed(session)
+    moved = metrics.get("clocks_moved", {})
+    assert moved.keys() == late_s.keys()
+    assert [doubt["code"] for doubt in metrics["doubts"]] == ["clock"] * len(late_s)
+    for name, seconds in late_s.items():
+        assert moved[name]["by"] == "keypoints"
+        assert abs(moved[name]["offset_s"] - seconds) < within_s
+        (doubt,) = metrics["doubts"]
+        assert doubt["remedy"].startswith(f"cameras.{name}.clock.offset_s: ")
+        assert abs(float(doubt["remedy"].split()[-1])) < within_s
+    assert all(
+        metrics.get("clock_offsets_s", {}).get(name, 0.0) == 0.0 for name in {*flight.cameras} - {*late_s}
+    )
+    assert metrics["mpjpe_mm"] < 15
+
+
 def test_calibrated_still_cameras_are_left_to_robust(tmp_path: Path) -> None:
     """Check the choice that the real recording supports (docs/estimate.md)."""
     flight = write_flight(tmp_path, seconds=1.5, static=True, pose_noise={})

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import Bias, NoiseModel, White
 from pipelines.geometry.triangulation import Views
-from pipelines.reconstruction.refining import initial_offsets_s
+from pipelines.reconstruction.clocks import initial_offsets_s
 from tests.reconstruction.formations import FOCAL_PX, Formation, formation
 
 TIMES, LATE_S, SIGMA_S = 150, 0.45, 0.5

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.reconstruction import segments
-from pipelines.reconstruction.refining import agreed_clocks
+from pipelines.reconstruction.clocks import agreed_clocks
 from pipelines.reconstruction.segments import (
     Segment,
     divided,

@@ -152,6 +152,25 @@ def doubts_of(
     return diagnose(_less_odd(known(chosen=chosen), known()), late).doubts
 
 
+def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, float | str]]) -> list[Doubt]:
+    """State which clocks were moved against what is stated of them, and by what evidence."""
+    said = {"background": "the turning of their background shows", "keypoints": "the people in them show"}
+    doubts = []
+    for name, found in moved.items():
+        late_s, sigma_s = float(found["offset_s"]), float(found["sigma_s"])
+        doubts.append(
+            Doubt(
+                code="clock",
+                cameras=[name],
+                what=f"the pictures of {name} were taken {remedies.earlier_or_later(late_s)}, as"
+                f" {said[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that",
+                evidence={"clock_s": _rounded(late_s), "clock_sigma_s": _rounded(sigma_s)},
+                remedy=f"cameras.{name}.{remedies.offset_of(description.cameras[name], late_s)}",
+            )
+        )
+    return doubts
+
+
 def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | None:
     """Return the flight with the less odd person; the first if they are alike."""
     if chosen is None or prominent is None:

@@ -12,6 +12,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.mounting import Looks, body_from_camera
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.doubts.scene import Filmed
+from pipelines.session.description import CameraEntry
 
 _SAME = 1e-3  # of rotation matrices
 
@@ -22,9 +23,12 @@ def _lines(cameras: Sequence[Filmed], group: Sequence[int], said: Callable[[Film
 
 def clock(cameras: Sequence[Filmed], group: Sequence[int], seconds: float) -> str:
     """Move the clocks of cameras' pictures."""
-    return _lines(
-        cameras, group, lambda camera: f"clock.offset_s: {camera.entry.clock.offset_s + seconds:.3f}"
-    )
+    return _lines(cameras, group, lambda camera: offset_of(camera.entry, seconds))
+
+
+def offset_of(entry: CameraEntry, seconds: float) -> str:
+    """State a clock's offset that is larger by some seconds."""
+    return f"clock.offset_s: {entry.clock.offset_s + seconds:.3f}"
 
 
 def frame_rate(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:

@@ -35,6 +35,7 @@ class Pictures:
     rotation: Float  # [G, 3, 3] world_from_camera
     speed: Float  # [G, 3] m/s, world
     turn: Float  # [G, 3] rad/s, camera
+    loosened: Float  # [G, 2] m, rad: what poses in bad stretches of a log err by besides; 0 elsewhere
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,7 @@ class Sighting:
     focal_px: float
     pixel_sigma: float  # px per axis of a view of confidence 1
     pose_covariance: Float | None = None  # [F, 6, 6] of white pose errors, see `Problem`
+    loosened: Float | None = None  # [F, 2], see `Pictures`
 
     @property
     def range_of(self) -> Bool:
@@ -224,6 +226,7 @@ def _empty_pictures(count: int, joints: int) -> Pictures:
         rotation=np.empty((count, 3, 3)),
         speed=np.empty((count, 3)),
         turn=np.empty((count, 3)),
+        loosened=np.zeros((count, 2)),
     )
 
 
@@ -240,6 +243,8 @@ def _fill(pictures: Pictures, place: Int64, sighting: Sighting, kept: Int64, log
     pictures.position[place] = sighting.position[kept]
     pictures.rotation[place] = sighting.rotation[kept]
     pictures.speed[place], pictures.turn[place] = speed[kept], turn[kept]
+    if sighting.loosened is not None:
+        pictures.loosened[place] = sighting.loosened[kept]
 
 
 def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:

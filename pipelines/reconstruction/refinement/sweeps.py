@@ -448,8 +448,10 @@ def visit(
                 for g in range(starts[time], starts[time + 1]):
                     posterior_of_picture(g, equations, whole, picture, posterior)
                     noise_of(picture, posterior, sums.image)
-                    precision = equations.white_precision[equations.pictures.white_row[g]]
-                    white_of(white[g], precision, posterior.of_white, sums.white)
+                    row = equations.pictures.white_row[g]
+                    if row == equations.pictures.camera[g]:  # others have their own precision, not the level
+                        precision = equations.white_precision[row]
+                        white_of(white[g], precision, posterior.of_white, sums.white)
             if time == 0 and len(starting):
                 for i in range(c):
                     starting[i, 0] = knots[0, i] ** 2 + whole[3 * n + i, 3 * n + i]

@@ -47,7 +47,7 @@ class System:
         """Derive the values that every linearisation needs."""
         problem, known, seen = self.problem, self.knowledge, self.problem.pictures
         of_time, fraction = problem.intervals()
-        white_row, white_precision = _white_errors(problem, known.poses)
+        white_row, white_precision = _loosened(problem, *_white_errors(problem, known.poses))
         kept, variance = _ties(self.layout)
         derived = {
             "pictures": PictureArrays(
@@ -106,6 +106,22 @@ def _white_errors(problem: Problem, poses: Sequence[PoseErrors]) -> tuple[Int64,
     added = np.maximum(stray2, EXACT**2)[of_camera]
     precision = np.linalg.inv(logged + added[:, :, None] * np.eye(6))
     return np.where(own, len(poses) + pictures.logged, pictures.camera), np.concatenate([usual, precision])
+
+
+def _loosened(problem: Problem, row: Int64, precision: Float) -> tuple[Int64, Float]:
+    """Add inverse covariances of the pictures in bad stretches of their logs."""
+    (loose,) = np.nonzero((problem.pictures.loosened > 0).any(axis=1))
+    if not len(loose):
+        return row, precision
+    known = precision[row[loose]]
+    exact = ~np.isfinite(known[:, 0, 0])
+    covariance = np.zeros(known.shape)
+    covariance[~exact] = np.linalg.inv(known[~exact])
+    added = np.maximum(problem.pictures.loosened[loose], EXACT) ** 2
+    covariance += np.repeat(added, 3, axis=1)[..., None] * np.eye(6)
+    row = row.copy()
+    row[loose] = len(precision) + np.arange(len(loose))
+    return row, np.concatenate([precision, np.linalg.inv(covariance)])
 
 
 def _ties(layout: Layout) -> tuple[Float, Float]:

@@ -1,0 +1,324 @@
+"""Clock offsets that the rays of people show: limbs that move meet at the right times only.
+
+Pose errors move all joints of a view together and must not count. So the disagreement of views is measured
+beside the median residual of each view.
+
+A clock that the manifest states is no exception. It is held, and questioned: `wrong_clocks` finds the cameras
+whose views agree clearly better with the others at another time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.triangulation import Views, locate
+
+# --- tuning ---
+
+# Limbs swing for longer than this: a step of the search cannot jump over the right offset.
+SEARCH_STEP_S = 1 / 15
+
+# An offset is searched to two standard deviations of what is stated of it.
+SEARCH_REACH_SIGMAS = 2.0
+
+# Chance lowers the disagreement of views with unknown clocks by up to a tenth.
+MAX_DISAGREEMENT_RATIO = 0.8
+
+# Half of the joints swing too little to show a clock, and some views are wrong.
+DISAGREEMENT_PERCENTILE = 75.0
+
+# A stated clock is questioned with this prior (s): mistaken starts are off by up to a second.
+QUESTIONED_SIGMA_S = 0.5
+
+# A stated clock is moved only beyond both limits: smaller offsets of right clocks occur by chance.
+MIN_SIGMAS_TO_MOVE = 5.0
+MIN_OFFSET_TO_MOVE_S = 0.010
+
+# Where a background would miss an offset of this size (s), the rays of people are asked, too.
+OFFSET_TO_FIND_S = 0.05
+
+# Keypoint errors pull right clocks by up to 18 ms. Rays of people therefore show offsets from here on only.
+MIN_OFFSET_BY_PEOPLE_S = 0.030
+
+# The search is the evidence against a clock. It is moved only where the new offset is surer than the old one.
+MIN_SIGMAS_BY_PEOPLE = 2.0
+
+# Correlations of residuals below this are chance.
+LEAST_CORRELATION = 0.05
+
+# Joints of a limb, a hand or a face err alike: a person has so many independent ones at most.
+INDEPENDENT_JOINTS = 8
+
+# A larger offset must explain more: a gait repeats, and people are mixed up. By this factor for each second.
+RATIO_PER_S = 0.1
+
+# Views that still disagree by so many standard deviations of a keypoint have another cause than a clock.
+MAX_LEFT_SIGMAS = 2.0
+
+# The mean residual of a joint over this time (s) is a lasting error of the detector.
+LASTING_S = 2.0
+
+# The largest tenth of residuals are outliers, and count as much as the next.
+USUAL_SHARE = 0.9
+
+# Residuals of fewer times say nothing, nor do those of less than this share of the times that are stated.
+FEWEST_TIMES = 20
+LEAST_SHARE_OF_TIMES = 0.5
+
+# The search looks at steps of this size (s) around zero and around the best offset.
+FINE_STEP_S = 1 / 60
+FINE_STEPS = 3
+
+# Of two cameras, a shift of either explains the same. Within this factor, the reference's clock is right.
+ALIKE_RATIO = 1.05
+
+
+@dataclass(frozen=True)
+class FoundClocks:
+    """Clock offsets that the backgrounds or the keypoints determine."""
+
+    offset_s: Float  # [C] to add to the pictures' times
+    sigma_s: Float  # [C] posterior standard deviation; the prior's where only the search found it, 0 if held
+    prior_s: Float  # [C] prior standard deviation for later estimates; 0 for clocks that are held
+    common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
+    wrong: Mapping[str, str] = field(default_factory=dict)  # evidence against each stated clock that is moved
+
+    @property
+    def moves(self) -> bool:
+        """True if the estimate moves a clock, or could."""
+        return bool(self.offset_s.any() or self.sigma_s.any())
+
+    def with_others(self, found: FoundClocks) -> FoundClocks:
+        """Add the offsets that keypoints show for cameras that are already shifted by these.
+
+        The standard deviations of these stay.
+        """
+        sigma_s = np.where(self.sigma_s > 0, self.sigma_s, found.sigma_s)
+        wrong = {**found.wrong, **self.wrong}
+        return replace(found, offset_s=self.offset_s + found.offset_s, sigma_s=sigma_s, wrong=wrong)
+
+    def of(self, names: Sequence[str], chosen: Sequence[int]) -> FoundClocks:
+        """Take the clocks of some of the cameras, by their numbers."""
+        kept = {names[number] for number in chosen}
+        wrong = {name: by for name, by in self.wrong.items() if name in kept}
+        rows = np.array(chosen, dtype=np.int64)
+        return FoundClocks(
+            self.offset_s[rows], self.sigma_s[rows], self.prior_s[rows], self.common_sigma_s, wrong
+        )
+
+    def as_metrics(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """Return what metrics.json says of the clocks of all cameras."""
+        offset_s = dict(zip(names, self.offset_s.tolist(), strict=True))
+        sigmas = np.hypot(self.sigma_s, self.common_sigma_s).tolist()
+        found: dict[str, dict[str, Any]] = {
+            "clock_offsets_s": offset_s,
+            "clock_offset_sigmas_s": dict(zip(names, sigmas, strict=True)),
+        }
+        if self.wrong:
+            found["clocks_moved"] = {
+                name: {
+                    "offset_s": offset_s[name],
+                    "sigma_s": found["clock_offset_sigmas_s"][name],
+                    "by": by,
+                }
+                for name, by in self.wrong.items()
+            }
+        return found
+
+
+def is_wrong(offset_s: Float, sigma_s: Float) -> Bool:
+    """Test if the evidence against stated clocks is strong, and their offsets are large enough to matter."""
+    least_s = np.maximum(MIN_SIGMAS_TO_MOVE * sigma_s, MIN_OFFSET_TO_MOVE_S)
+    return np.asarray(np.abs(offset_s) > least_s)
+
+
+def agreed_clocks(names: Sequence[str], found: Sequence[Mapping[str, Mapping[str, Any]]]) -> FoundClocks:
+    """Agree on the clocks that some segments found.
+
+    Where the backgrounds of some segments determine clocks, the other segments do not count: they compare
+    clocks with a reference that may be late itself. For clocks that no background determines, and for stated
+    ones, most segments decide whether a clock is held. Of the offsets that were found, the median is taken,
+    with the median of their standard deviations: an offset that the whole flight shares is hardly surer.
+
+    Args:
+        names: of all C cameras.
+        found: of each segment `offset_s`, `sigma_s`, `prior_s`, and `wrong` for a stated clock by camera, and
+            `common_sigma_s` of "".
+    """
+    offset_s, sigma_s, prior_s = np.zeros((3, len(names)))
+    wrong: dict[str, str] = {}
+    found = [each for each in found if any(map(_is_by_background, each.values()))] or found
+    for c, name in enumerate(names):
+        own = [each[name] for each in found if name in each]
+        moved = [each for each in own if each["prior_s"] > 0]
+        by_background = list(filter(_is_by_background, own))
+        against = [each for each in own if each.get("wrong")]
+        if against or all("wrong" in each for each in own):
+            own = against if 2 * len(against) > len(own) else []
+            if own:
+                wrong[name] = str(own[0]["wrong"])
+        elif by_background:
+            own = by_background
+        elif 2 * len(moved) > len(own):
+            prior_s[c] = max(each["prior_s"] for each in moved)
+            own = moved
+        if own:
+            offset_s[c] = np.median([each["offset_s"] for each in own])
+            sigma_s[c] = np.median([each["sigma_s"] for each in own])
+    common_s = float(np.median([each[""]["common_sigma_s"] for each in found])) if found else 0.0
+    return FoundClocks(offset_s, sigma_s, prior_s, common_s, wrong)
+
+
+def _is_by_background(clock: Mapping[str, Any]) -> bool:
+    return bool(clock.get("prior_s") == 0 and clock["sigma_s"] > 0 and "wrong" not in clock)
+
+
+def initial_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sigma_s: Float) -> Float:
+    """Find an initial offset [C] s of every clock, to about two pictures; 0 for known clocks.
+
+    Args:
+        views_at: function that returns the views with all unknown clocks moved forward by a number of
+            seconds; joint-frames are grouped by time, the same number at each time.
+        instants: number of these times.
+        clock_sigma_s: [C] prior standard deviation of each offset, 0 for a known clock. Without a known
+            clock all offsets are 0.
+    """
+    initial_s = np.zeros(len(clock_sigma_s))
+    unknown = np.flatnonzero(clock_sigma_s > 0)
+    if not len(unknown) or len(unknown) == len(initial_s):
+        return initial_s
+    steps = int(SEARCH_REACH_SIGMAS * clock_sigma_s.max() / SEARCH_STEP_S)
+    shifts_s = SEARCH_STEP_S * np.arange(-steps, steps + 1)
+    disagreement = np.full((len(shifts_s), len(initial_s)), np.inf)
+    for row, shift_s in enumerate(shifts_s):
+        views = views_at(float(shift_s))
+        for camera in unknown[np.abs(shift_s) <= SEARCH_REACH_SIGMAS * clock_sigma_s[unknown]]:
+            beside = views.of((clock_sigma_s == 0) | (np.arange(len(initial_s)) == camera))
+            own = int((clock_sigma_s[:camera] == 0).sum())
+            disagreement[row, camera] = _disagreement_px(beside, instants, own)
+    for camera in unknown:
+        best = int(np.argmin(disagreement[:, camera]))
+        if disagreement[best, camera] < MAX_DISAGREEMENT_RATIO * disagreement[steps, camera]:
+            initial_s[camera] = shifts_s[best]
+    return initial_s
+
+
+def wrong_clocks(
+    views_at: Callable[[float], Views], t_s: Float, questioned: Bool, pixel_sigma: float, reference: int
+) -> Float:
+    """Find clocks [C] s at whose stated times views disagree clearly more than at other times; 0 for others.
+
+    One clock after the other is moved: that which lowers the disagreement most. So most clocks must be right,
+    or be questioned by their backgrounds before.
+
+    Args:
+        views_at: function that returns the views with all clocks moved forward by a number of seconds;
+            joint-frames are grouped by time, the same number at each time.
+        t_s: [T] these times.
+        questioned: [C] True for clocks that may be wrong.
+        pixel_sigma: standard deviation of a good keypoint (px).
+        reference: the camera whose clock is the right one where two explain the same.
+    """
+    steps = int(SEARCH_REACH_SIGMAS * QUESTIONED_SIGMA_S / SEARCH_STEP_S)
+    shifts_s = SEARCH_STEP_S * np.arange(-steps, steps + 1)
+    shifts_s = np.union1d(shifts_s, [-2 * FINE_STEP_S, 2 * FINE_STEP_S])
+    at = {shift_s: views_at(shift_s) for shift_s in shifts_s.tolist()}
+    offset_s, current, open_ = np.zeros(len(questioned)), at[0.0], np.flatnonzero(questioned).tolist()
+    window = LASTING_S / max(float(np.median(np.diff(t_s))), 1e-3) if len(t_s) > 1 else 1.0
+
+    def missed_px(camera: int, shift_s: float) -> Float:
+        if shift_s not in at:
+            at[shift_s] = views_at(shift_s)
+        return _missed_px(_with_camera(current, at[shift_s], camera), len(t_s), camera)
+
+    def ratio(camera: int, shift_s: float) -> float:
+        missed = missed_px(camera, shift_s)
+        if len(missed) < LEAST_SHARE_OF_TIMES * times[camera]:
+            return np.inf
+        after = _changing_px(missed, window)
+        price = 1 + RATIO_PER_S * abs(shift_s)
+        return price * after / before[camera] if after <= MAX_LEFT_SIGMAS * pixel_sigma else np.inf
+
+    while open_ and np.count_nonzero(offset_s) < len(offset_s) - 1:  # one clock gives the time
+        stated = {camera: _missed_px(current, len(t_s), camera) for camera in open_}
+        open_ = [camera for camera in open_ if len(stated[camera]) >= FEWEST_TIMES]
+        before = {camera: _changing_px(stated[camera], window) for camera in open_}
+        times = {camera: len(stated[camera]) for camera in open_}
+        best = {camera: min((ratio(camera, each), each) for each in shifts_s.tolist()) for camera in open_}
+        least = min((value for value, _ in best.values()), default=np.inf)
+        if not least < 1:
+            break
+        alike = [camera for camera in open_ if best[camera][0] <= ALIKE_RATIO * least]
+        chosen = min(alike, key=lambda camera: (camera == reference, best[camera]))
+        around_s = best[chosen][1] + FINE_STEP_S * np.arange(-FINE_STEPS, FINE_STEPS + 1)
+        value, found_s = min((ratio(chosen, each), each) for each in around_s.tolist())
+        gain = -2 * _independent(missed_px(chosen, found_s)) * np.log(value)
+        if not gain >= MIN_SIGMAS_TO_MOVE**2:
+            break
+        open_.remove(chosen)
+        if abs(found_s) >= MIN_OFFSET_BY_PEOPLE_S:
+            offset_s[chosen], current = found_s, _with_camera(current, at[found_s], chosen)
+    return offset_s
+
+
+def _independent(missed: Float) -> float:
+    """Estimate how many independent residuals there are [T, J, C, 2]: neighbours in time are alike."""
+    missed = missed - _mean(missed)
+    variance, alike = float(np.nanmean(missed**2)), 1.0
+    for lag in range(1, len(missed) // 4):
+        correlation = float(np.nanmean(missed[lag:] * missed[:-lag])) / variance
+        if correlation < LEAST_CORRELATION:
+            break
+        alike += 2 * correlation
+    joints = int(np.isfinite(missed[..., 0]).any(axis=(0, 2)).sum())
+    return float(len(missed) / alike * max(2 * missed.shape[2] - 3, 1) * min(joints, INDEPENDENT_JOINTS))
+
+
+def _with_camera(views: Views, other: Views, camera: int) -> Views:
+    """Take one camera's rays and poses from other views."""
+    rays, weight = views.rays.copy(), views.weight.copy()
+    position, rotation = views.position.copy(), views.rotation.copy()
+    rays[:, camera], weight[:, camera] = other.rays[:, camera], other.weight[:, camera]
+    position[:, camera], rotation[:, camera] = other.position[:, camera], other.rotation[:, camera]
+    return replace(views, rays=rays, weight=weight, position=position, rotation=rotation)
+
+
+def _disagreement_px(views: Views, instants: int, camera: int) -> float:
+    """Compute the disagreement of views (px), beside each view's median, where one camera sees something."""
+    own = np.linalg.norm(_missed_px(views, instants, camera), axis=-1)
+    return float(np.nanpercentile(own, DISAGREEMENT_PERCENTILE)) if np.isfinite(own).any() else np.inf
+
+
+def _changing_px(missed: Float, window: float) -> float:
+    """Compute the rms of residuals [T, J, C, 2] px without each joint's mean in a camera over some times."""
+    parts = np.array_split(missed, max(round(len(missed) / window), 1))
+    apart = np.concatenate([np.linalg.norm(part - _mean(part), axis=-1).ravel() for part in parts])
+    apart = apart[np.isfinite(apart)]
+    return float(np.sqrt(np.mean(np.minimum(apart, np.quantile(apart, USUAL_SHARE)) ** 2)))
+
+
+def _mean(values: Float) -> Float:
+    """Compute the mean over the first axis without NaN; 0 where all are NaN."""
+    count = np.isfinite(values).sum(axis=0)
+    mean: Float = np.nansum(values, axis=0) / np.maximum(count, 1)
+    return mean
+
+
+def _missed_px(views: Views, instants: int, camera: int) -> Float:
+    """Compute residuals [T', J, C, 2] px, beside the median of each view, at times when the camera sees."""
+    points = locate(views, method="midpoint").points
+    away = points[:, None] - views.position[views.pose_index]
+    seen = np.einsum("ncij,nci->ncj", views.rotation[views.pose_index], away)
+    depth = np.where(seen[..., 2] > 0, seen[..., 2], np.nan)
+    missed = (seen[..., :2] / depth[..., None] - views.rays) * views.focal[:, None]
+    missed[views.weight == 0] = np.nan
+    missed = missed.reshape(instants, -1, missed.shape[1], 2)
+    missed = missed[np.isfinite(missed[..., camera, 0]).any(axis=1)]
+    unseen = np.isnan(missed).all(axis=1, keepdims=True)  # by one of the others
+    of_view = np.nanmedian(np.where(unseen, 0.0, missed), axis=1, keepdims=True)
+    return np.asarray(missed - of_view)

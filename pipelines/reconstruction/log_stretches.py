@@ -1,0 +1,146 @@
+"""Stretches of a log that lose their weight: it stood still and then jumped, or it jumped away and back.
+
+An estimator that hangs repeats its last pose, and a log that is stepped repeats each pose until the next. The
+poses that are repeated are wrong as soon as the camera moves on. They are bridged: interpolated between the
+last pose before and the first one after, and loosened by how far a drone may leave that line meanwhile.
+Positions and rotations are judged apart, as they come from different sensors.
+
+A camera that stands, or hovers, repeats no pose before a jump, and is left as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.poses import interpolate_poses, multiply, rotation_vector_from_quaternion
+from pipelines.session.records import Trajectory
+
+# --- tuning ---
+
+# Poses at 5 Hz that are repeated in between are near enough to the truth. Frozen ones are equal for longer.
+LEAST_FROZEN_S = 0.3
+
+# The least step (m, rad) after equal poses, and of a jump: noise of logs that are rounded is smaller.
+LEAST_STEP = (0.05, float(np.radians(0.5)))
+LEAST_JUMP = (0.5, float(np.radians(5.0)))
+
+# A jump is so many times larger than nine of ten steps of the log.
+STEPS_OF_JUMP = 8.0
+
+# A log that comes back from a jump later than this (s) has another origin since, rather than a fault.
+LONGEST_JUMP_S = 5.0
+
+# A drone leaves a straight line by this in a second (m, rad), and by the square of the time in longer ones.
+LEFT_IN_A_SECOND = (0.25, 0.025)
+
+# With these standard deviations (m, rad) a log has no weight: more are not needed.
+MOST_SIGMA = (1.0, 0.1)
+
+
+@dataclass(frozen=True)
+class Mended:
+    """Log without its wrong stretches."""
+
+    trajectory: Trajectory
+    loosened: Float | None  # [N, 2] added standard deviations (m, rad) of its poses; None without a stretch
+    frozen: int  # stretches of equal poses before a step
+    jumps: int  # stretches that begin and end with a jump
+    poses: int  # that are bridged
+    longest_s: float
+
+
+def mend(log: Trajectory) -> Mended:
+    """Bridge the wrong stretches of a log of N poses."""
+    loosened = np.zeros((len(log.t_ns), 2))
+    counts, longest_s = np.zeros(2, dtype=np.int64), 0.0
+    bridged = log
+    for kind, steps in enumerate((np.diff(log.position, axis=0), _turns(log.quaternion_xyzw))):
+        stretches = _frozen(log.t_ns, steps, LEAST_STEP[kind])
+        away = _jumps(log.t_ns, steps, LEAST_JUMP[kind])
+        counts += [len(stretches), len(away)]
+        for before, after in [*stretches, *away]:
+            inside = slice(before + 1, after)
+            span_s = float(log.t_ns[after] - log.t_ns[before]) / 1e9
+            longest_s = max(longest_s, span_s)
+            bridged = _bridged(bridged, before, after, kind)
+            sigma = min(LEFT_IN_A_SECOND[kind] * span_s**2, MOST_SIGMA[kind])
+            loosened[inside, kind] = np.maximum(loosened[inside, kind], sigma)
+    poses = int((loosened > 0).any(axis=1).sum())
+    if not poses:
+        return Mended(log, None, 0, 0, 0, 0.0)
+    return Mended(bridged, loosened, int(counts[0]), int(counts[1]), poses, longest_s)
+
+
+def _turns(quaternion: Float) -> Float:
+    """Compute the rotation vectors [N - 1, 3] from each pose to the next, exactly 0 between equal ones."""
+    turns = rotation_vector_from_quaternion(multiply(quaternion[:-1] * [-1, -1, -1, 1], quaternion[1:]))
+    turns[(quaternion[1:] == quaternion[:-1]).all(axis=1)] = 0.0
+    return np.asarray(turns)
+
+
+def _frozen(t_ns: Int64, steps: Float, least: float) -> list[tuple[int, int]]:
+    """Find the pose that is repeated and the first one after it, of every stretch of equal poses."""
+    size = np.linalg.norm(steps, axis=1)
+    edges = np.flatnonzero(np.diff(size == 0.0, prepend=False, append=False)).reshape(-1, 2)
+    return [
+        (int(first), int(last) + 1)
+        for first, last in edges
+        if last < len(size) and t_ns[last] - t_ns[first] > 1e9 * LEAST_FROZEN_S and size[last] >= least
+    ]
+
+
+def _jumps(t_ns: Int64, steps: Float, least: float) -> list[tuple[int, int]]:
+    """Find the last pose before a jump and the first after the way back."""
+    size = np.linalg.norm(steps, axis=1)
+    usual = float(np.quantile(size, 0.9)) if len(size) else 0.0
+    far = np.flatnonzero(size > max(least, STEPS_OF_JUMP * usual)).tolist()
+    found: list[tuple[int, int]] = []
+    for out, back in pairwise(far):
+        if found and found[-1][1] > out:
+            continue
+        returns = np.linalg.norm(steps[out] + steps[back]) < 0.5 * size[out]
+        if returns and t_ns[back] - t_ns[out] < 1e9 * LONGEST_JUMP_S:
+            found.append((out, back + 1))
+    return found
+
+
+def _bridged(log: Trajectory, before: int, after: int, kind: int) -> Trajectory:
+    """Interpolate positions (kind 0) or rotations (1) between two poses."""
+    ends, inside = [before, after], slice(before + 1, after)
+    position, quaternion = interpolate_poses(
+        log.t_ns[ends],
+        log.position[ends],
+        log.quaternion_xyzw[ends],
+        log.t_ns[inside],
+        max_gap_ns=int(log.t_ns[after] - log.t_ns[before]),
+        max_extrapolation_ns=0,
+    )
+    if kind == 0:
+        own = log.position.copy()
+        own[inside] = position
+        return replace(log, position=own)
+    own = log.quaternion_xyzw.copy()
+    own[inside] = quaternion
+    return replace(log, quaternion_xyzw=own)
+
+
+def said_stretches(name: str, mended: Mended) -> list[str]:
+    """State which poses of a camera's log lost their weight."""
+    if not mended.poses:
+        return []
+    what = [
+        f"{count} {word}"
+        for count, word in (
+            (mended.frozen, "stretches of equal poses before a step"),
+            (mended.jumps, "jumps and back"),
+        )
+        if count
+    ]
+    return [
+        f"{name}: its log has {' and '.join(what)}, for up to {mended.longest_s:.2f} s:"
+        f" {mended.poses} poses are interpolated over them and hardly count"
+    ]
