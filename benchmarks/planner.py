@@ -52,7 +52,7 @@ from pipelines.planning.scores import coverage, predicted_errors, score, view_qu
 from pipelines.replan import detect_by_model, error_model, replan
 from pipelines.simulate import simulate
 from pipelines.simulation.scenario import DetectorErrors, Lens
-from pipelines.simulation.sightings import walk
+from pipelines.simulation.walks import walk
 from tests.synthetic.worlds import ARMS, flown, world_of
 
 _CONFIG = PlannerConfig()

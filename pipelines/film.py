@@ -39,9 +39,9 @@ from pipelines.session.storage import SIMULATION_MARK, hash_of, jsonable, read_j
 from pipelines.session.tables import REPLAN, TRUTH, motion_table, read_table, write_table
 from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight import Set, build_set
-from pipelines.simulation.rendering.renderer import Renderer
+from pipelines.simulation.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
-from pipelines.simulation.sightings import (
+from pipelines.simulation.walks import (
     CameraFormation,
     SimulatedKeypoints,
     Walk,

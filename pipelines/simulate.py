@@ -42,10 +42,9 @@ from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario
 from pipelines.simulation.flight_files import logged_messages, manifest_text, write_keypoints, write_truth
 from pipelines.simulation.flying import Known, Planner
-from pipelines.simulation.rendering.camera import exposed_moments
-from pipelines.simulation.rendering.renderer import ExposedMoment, Renderer
+from pipelines.simulation.renderer import ExposedMoment, Renderer, exposed_moments
 from pipelines.simulation.scenario import Scenario, read_scenario
-from pipelines.simulation.world.scene import World
+from pipelines.simulation.world import World
 
 _REVISION = 5
 _OWN = ("drone*", "flight.yaml", "true_poses.yaml", "scenario.yaml", "site.*", "truth", SIMULATION_MARK)

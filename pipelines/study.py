@@ -61,23 +61,27 @@ from pipelines.session.yaml_files import plain_yaml
 from pipelines.simulate import recorded_motions
 from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import build_set
-from pipelines.simulation.rendering.renderer import Renderer
+from pipelines.simulation.renderer import Renderer
 from pipelines.simulation.scenario import WorldSettings, read_scenario
-from pipelines.simulation.sightings import (
+from pipelines.simulation.walks import (
     IMITATED,
     CameraFormation,
     SimulatedKeypoints,
+    StudiedNoise,
+    StudyMethod,
     Walk,
+    WalkStudy,
     exact_keypoints,
     formation,
     model_keypoints,
+    numbers,
     triangulate_robustly,
     views_of,
     walk,
     walk_of,
+    walk_study,
 )
-from pipelines.simulation.studies import StudiedNoise, StudyMethod, WalkStudy, numbers, walk_study
-from pipelines.simulation.world.scene import build_world
+from pipelines.simulation.world import build_world
 
 _REVISION = 6
 _PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")

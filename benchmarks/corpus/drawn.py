@@ -51,7 +51,7 @@ from pipelines.simulation.flight_files import (
     write_truth,
     write_tum,
 )
-from pipelines.simulation.recording import ACTOR_CORRELATION_S, DronePoses, estimate
+from pipelines.simulation.flying import ACTOR_CORRELATION_S, DronePoses, estimate
 
 Poses = Literal["logged", "true", "shared"]
 Given = Literal["model", "nothing"]

@@ -13,23 +13,27 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
 from pipelines.simulation.body import PosablePerson, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
-from pipelines.simulation.flying import DronePaths, Planner, fly, fly_with, moments, ring_slots
-from pipelines.simulation.motion.retarget import retarget
-from pipelines.simulation.motion.script import perform
-from pipelines.simulation.recording import (
+from pipelines.simulation.flying import (
+    DronePaths,
     DronePoses,
+    Planner,
     PoseLog,
     estimate,
     estimate_actor,
+    fly,
+    fly_with,
     frame_times,
+    moments,
     poses_at,
+    ring_slots,
     sample_log,
 )
+from pipelines.simulation.motion_script import perform
+from pipelines.simulation.retarget import retarget
 from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Actor, Scenario
 from pipelines.simulation.surfaces import TriangleSurface, hidden_by
-from pipelines.simulation.world.scene import World, build_world
-from pipelines.simulation.world.solids import raise_mounds
+from pipelines.simulation.world import World, build_world, raise_mounds
 
 Moving = Callable[[Float], BodyMotion]
 

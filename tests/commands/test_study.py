@@ -20,8 +20,8 @@ from pipelines.replan import fly_and_measure
 from pipelines.session.errors import DataError
 from pipelines.session.people import get_skeleton
 from pipelines.session.registries import Person, Region
-from pipelines.simulation import studies
-from pipelines.simulation.sightings import RANGE_M, exact_keypoints, formation, views_of, walk
+from pipelines.simulation import walks as studies
+from pipelines.simulation.walks import RANGE_M, exact_keypoints, formation, views_of, walk
 from pipelines.study import Studied, study, values_of
 from tests.commands.runner import content
 from tests.commands.test_replan import CALM, session_of

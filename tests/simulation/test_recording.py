@@ -10,13 +10,17 @@ import pytest
 from pipelines.geometry.mounting import body_from_camera, compose_gimbal
 from pipelines.geometry.noise import NoiseModel, White
 from pipelines.geometry.poses import conjugate, mounted_covariance, multiply, rotation_vector_from_quaternion
-from pipelines.simulation.flying import LEVER_ARM, DronePaths, fly, moments, ring_slots
-from pipelines.simulation.recording import (
+from pipelines.simulation.flying import (
+    LEVER_ARM,
+    DronePaths,
     DronePoses,
     estimate,
+    fly,
     frame_times,
     log_times,
+    moments,
     poses_at,
+    ring_slots,
     sample_log,
 )
 from pipelines.simulation.scenario import FormationSettings, Lens, Limits

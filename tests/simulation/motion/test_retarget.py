@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.session.records import SkeletalMotion
-from pipelines.simulation.motion.retarget import retarget
+from pipelines.simulation.retarget import retarget
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, joint_centres
 from tests.simulation.motion.performing import RIG, clearance_m, flat, mound, performed
 

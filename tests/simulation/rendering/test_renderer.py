@@ -21,8 +21,7 @@ from pipelines.geometry.poses import (
     transform,
 )
 from pipelines.simulation.body import make_body
-from pipelines.simulation.rendering.camera import EXPOSURE, STEP_S, exposed_moments
-from pipelines.simulation.rendering.renderer import ExposedMoment, Renderer
+from pipelines.simulation.renderer import EXPOSURE, STEP_S, ExposedMoment, Renderer, exposed_moments
 from pipelines.simulation.rig import BONES
 from pipelines.simulation.scenario import Body
 from pipelines.simulation.surfaces import TriangleSurface, hidden_by

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.simulation import scenario
-from pipelines.simulation.world.scene import World, build_world
+from pipelines.simulation.world import World, build_world
 
 NOBODY: Float = np.zeros((0, 2))
 

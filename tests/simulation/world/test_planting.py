@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.session.errors import DataError
 from pipelines.simulation import scenario
-from pipelines.simulation.world.scene import build_world
+from pipelines.simulation.world import build_world
 from tests.simulation.world.sites import NOBODY
 
 WAY = np.stack([np.linspace(-20, 20, 400), np.zeros(400)], axis=1)

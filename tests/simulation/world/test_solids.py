@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.simulation.world.kernels import GRAZE_M
+from pipelines.simulation.world_kernels import GRAZE_M
 from tests.simulation.world.sites import everything, site
 
 # Height 10: the crown is 6.2 high about z = 6.9, the trunk 0.3 in radius and ends there.

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.simulation import scenario
-from pipelines.simulation.world.solids import MoundedGround
+from pipelines.simulation.world import MoundedGround
 from tests.simulation.world.sites import MOUNDS, everything, site
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bytes, Float, Float32, Int32
 from pipelines.geometry.compilation import cached, helper
-from pipelines.simulation.rendering.fragments import CameraView, Fragments
+from pipelines.simulation.raster import CameraView, Fragments
 
 SUN_RGB = np.array([0.86, 0.79, 0.67])
 SKY_RGB = np.array([0.21, 0.25, 0.31])  # from above, on a level surface

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.simulation.motion import gait
+from pipelines.simulation import gait
 
 _SPACING_M = 0.02
 _WALK_MPS2, _RUN_MPS2 = 0.9, 1.9  # mean accelerations

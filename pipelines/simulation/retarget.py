@@ -11,7 +11,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
-from pipelines.simulation.motion.legs import two_bones
+from pipelines.simulation.motion_body import two_bones
 from pipelines.simulation.rig import (
     BONE,
     BONES,

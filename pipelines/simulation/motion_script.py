@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.simulation.motion import gait
-from pipelines.simulation.motion.body import Style, bodies
-from pipelines.simulation.motion.plan import LEFT, RIGHT, Pace, Plan, WayPart
+from pipelines.simulation import gait
+from pipelines.simulation.motion_body import Style, bodies
+from pipelines.simulation.motion_plan import LEFT, RIGHT, Pace, Plan, WayPart
 from pipelines.simulation.rig import BONE, BodyMotion, Rig
 from pipelines.simulation.scenario import Step, Travel
 

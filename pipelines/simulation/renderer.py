@@ -1,33 +1,214 @@
-"""Pictures of people in a world, as a camera in daylight takes them."""
+"""Pictures of people in a world, as a camera in daylight takes them: lens, exposure, light and sensor."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Bytes, Float, Float32
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.compilation import cached
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.simulation.rendering.camera import DistortingLens, developed
-from pipelines.simulation.rendering.fragments import CameraView, gather, room_for
-from pipelines.simulation.rendering.raster import (
+from pipelines.simulation.raster import (
     CENTRES_PX,
     GROUND,
     NOTHING,
     SHIFTS_PX,
     SUBROWS,
     Band,
+    CameraView,
     Mesh,
+    ShadowMap,
     bands,
     draw,
     empty_band,
+    gather,
     mesh_of,
     projected,
+    room_for,
+    shadow_map,
     stacked,
+    sun_axes,
+    sunlight,
 )
-from pipelines.simulation.rendering.shading import ground_texture, paint, shade
-from pipelines.simulation.rendering.shadows import ShadowMap, shadow_map, sun_axes, sunlight
+from pipelines.simulation.shading import ground_texture, paint, shade
 from pipelines.simulation.surfaces import TriangleSurface
+
+_KNOT_PX = 8  # between rays that are solved for; a cubic spline lies between, right to 1e-5 px
+_MARGIN_PX = 3  # around what the lens sees: cubic interpolation takes two pixels on each side
+
+
+class DistortingLens:
+    """A lens that bends the light of a pinhole with the same focal length.
+
+    Light is interpolated by cubics before it is developed, so that the sensor's softness and noise are those
+    of a picture without distortion.
+
+    Raises:
+        ValueError: the distortion's model does not reach the whole picture.
+    """
+
+    pinhole: Intrinsics
+    """The camera whose picture holds all that the lens sees."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        rays = _rays(intrinsics)
+        low, high = rays.min(axis=(0, 1)), rays.max(axis=(0, 1))
+        focal = np.array([intrinsics.fx, intrinsics.fy])
+        centre = _MARGIN_PX - low * focal
+        width, height = (int(n) for n in np.ceil((high - low) * focal) + 2 * _MARGIN_PX + 1)
+        self.pinhole = Intrinsics(width, height, *focal.tolist(), *centre.tolist())
+        self._map = (rays * focal + centre).astype(np.float32)
+
+    def rows(self, part: slice) -> slice:
+        """Return the rows of the pinhole's picture that some rows of the lens's picture need."""
+        of = self._map[part, :, 1]
+        return slice(int(of.min()) - _MARGIN_PX + 1, int(of.max()) + _MARGIN_PX)
+
+    def bent(self, light: Float32, first_row: int, part: slice) -> Float32:
+        """Bend the light [R, W, 3] of some rows of the picture.
+
+        Args:
+            light: [S, V, 3] of the pinhole's rows from `first_row` on.
+            first_row: see `rows`.
+            part: the rows of the lens's picture.
+        """
+        import cv2
+
+        to: NDArray[Any] = self._map[part] - np.array([0, first_row], np.float32)
+        bent = cv2.remap(light, to, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        # Cubics overshoot beside edges; there is no light below none.
+        return np.maximum(np.asarray(bent, np.float32), np.float32(0))
+
+
+def _rays(intrinsics: Intrinsics) -> Float:
+    """Compute the undistorted normalised coordinates [H, W, 2] of every pixel's centre."""
+    from scipy.interpolate import RectBivariateSpline
+
+    rows, columns = np.arange(intrinsics.height), np.arange(intrinsics.width)
+    down, right = (np.linspace(0, len(axis) - 1, max(4, len(axis) // _KNOT_PX)) for axis in (rows, columns))
+    y, x = np.meshgrid(down, right, indexing="ij")
+    solved = undistort(np.stack([x, y], axis=-1), intrinsics)
+    if np.isnan(solved).any():
+        raise ValueError(f"no ray reaches some pixels with the distortion {list(intrinsics.distortion)}")
+    rays: Float = np.stack(
+        [RectBivariateSpline(down, right, solved[..., axis])(rows, columns) for axis in range(2)], axis=-1
+    )
+    return rays
+
+
+EXPOSURE = 1.6
+NOISE = 1.8  # standard deviation, in steps of 8 bits
+_SOFTNESS = 0.11  # share of the light that goes to either neighbour, per axis: a blur of 0.47 px
+_CURVE_STEPS = 1024
+_BRIGHTEST = 4.0  # of the exposed light; the curve is constant above
+
+
+def developed(light: Float32, key: int) -> Bytes:
+    """Convert a field of linear RGB light [H, W, 3] to the BGR bytes of a picture.
+
+    The same key (64 bits) gives the same noise.
+    """
+    return _developed(light, np.uint64(key), _CURVE)
+
+
+def _curve() -> Float32:
+    """Return 8-bit values by the square root of the exposed light: sRGB, with a soft shoulder above 0.8."""
+    root = np.linspace(0.0, np.sqrt(_BRIGHTEST), _CURVE_STEPS)
+    linear = root**2
+    knee = 0.8
+    rolled = np.where(linear < knee, linear, 1 - (1 - knee) * np.exp(-(linear - knee) / (1 - knee)))
+    srgb = np.where(rolled <= 0.0031308, 12.92 * rolled, 1.055 * rolled ** (1 / 2.4) - 0.055)
+    return (255 * srgb).astype(np.float32)
+
+
+_CURVE = _curve()
+
+
+@cached
+def _developed(light: Float32, key: np.uint64, curve: Float32) -> Bytes:
+    height, width, _ = light.shape
+    picture = np.empty((height, width, 3), np.uint8)
+    side, middle = np.float32(_SOFTNESS), np.float32(1 - 2 * _SOFTNESS)
+    # Four fields of five bits add up to a deviation of sqrt(4 (32^2 - 1) / 12) about 62.
+    gain = np.float32(NOISE / 18.466185)
+    finest = np.float32((_CURVE_STEPS - 1) / np.sqrt(_BRIGHTEST))
+    exposure = np.float32(EXPOSURE)
+    column = np.empty((width + 2, 3), np.float32)
+    for y in range(height):
+        above, here, below = light[max(y - 1, 0)], light[y], light[min(y + 1, height - 1)]
+        for x in range(width):
+            for c in range(3):
+                column[x + 1, c] = exposure * (side * (above[x, c] + below[x, c]) + middle * here[x, c])
+        column[0], column[width + 1] = column[1], column[width]
+        for x in range(width):
+            # splitmix64 (Steele, Lea & Flood 2014) of the pixel's number
+            bits = key + np.uint64(y * width + x) * np.uint64(0x9E3779B97F4A7C15)
+            bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            bits ^= bits >> np.uint64(31)
+            for c in range(3):
+                soft = side * (column[x, c] + column[x + 2, c]) + middle * column[x + 1, c]
+                at = min(int(np.sqrt(soft) * finest + np.float32(0.5)), _CURVE_STEPS - 1)
+                noise = np.int64(0)
+                for _ in range(4):
+                    noise += np.int64(bits & np.uint64(31))
+                    bits >>= np.uint64(5)
+                value = curve[at] + gain * np.float32(noise - 62) + np.float32(0.5)
+                picture[y, x, 2 - c] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
+    return picture
+
+
+STEP_S = 1e-3
+"""Longest time between moments: 1 px of an image that moves by 1,000 px/s.
+
+A camera that yaws by 60 degrees a second then films within 0.25 of 255 (rms) of moments 0.25 ms apart, a
+seventh of the sensor's noise."""
+
+
+def exposed_moments(rows: int, *, exposure_s: float, readout_s: float) -> tuple[Float, Float]:
+    """Choose moments whose weighted means are the rows of a picture, read from the first to the last.
+
+    A row's light is the mean over its exposure of light that changes linearly between the moments. The
+    middle of the middle row's exposure is the picture's time. `readout_s` is from the first row to the
+    last.
+
+    Returns:
+        [K] s against the picture's time, ascending, and [K, rows] weights whose columns add up to 1.
+    """
+    # An even number of steps: the picture's own time is one of the moments.
+    steps = 2 * int(np.ceil((exposure_s + readout_s) / (2 * STEP_S) - 1e-9))
+    if not steps:
+        return np.zeros(1), np.ones((1, rows))
+    moments = (np.arange(steps + 1) / steps - 0.5) * (exposure_s + readout_s)
+    middle = (np.arange(rows) / max(rows - 1, 1) - 0.5) * readout_s
+    if not exposure_s:
+        return moments, _between(moments, middle)
+    whole = _integral(moments, middle + exposure_s / 2) - _integral(moments, middle - exposure_s / 2)
+    return moments, whole / exposure_s
+
+
+def _between(moments: Float, at: Float) -> Float:
+    """Compute weights [K, N] of linear interpolation between moments [K] at times [N] within them."""
+    return np.stack([np.interp(at, moments, one) for one in np.eye(len(moments))])
+
+
+def _integral(moments: Float, until: Float) -> Float:
+    """Compute weights [K, N] of the integral of what is linear between moments, from the first one on."""
+    step_s = moments[1] - moments[0]
+    cell = np.clip(((until - moments[0]) / step_s).astype(np.int64), 0, len(moments) - 2)
+    share = (until - moments[cell]) / step_s
+    number = np.arange(len(moments))[:, None]
+    # A step that was passed gives half of it to both of its ends.
+    passed = np.where(number < cell, 0.5, 0.0) + np.where((number > 0) & (number <= cell), 0.5, 0.0)
+    passed += np.where(number == cell, share - share**2 / 2, 0.0)
+    passed += np.where(number == cell + 1, share**2 / 2, 0.0)
+    weights: Float = step_s * passed
+    return weights
+
+
+# --- pictures ------------------------------------------------------------------------------------------
 
 _BAND_ROWS = 16  # pixel rows whose samples fit a processor's cache
 _STATIC_TEXEL_M, _STATIC_TEXELS = 0.02, 2048

@@ -1,1 +1,0 @@
-"""Motion of the simulated actor: scripted actions, or recorded motion put on the actor's bones."""

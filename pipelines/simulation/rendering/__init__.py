@@ -1,1 +1,0 @@
-"""Pictures of a simulated flight, rendered on the processor: no graphics card, no system libraries."""

@@ -1,1 +1,0 @@
-"""The simulated world: obstacles around the actor, which are rendered, hide the actor and are mapped."""
