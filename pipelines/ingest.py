@@ -400,6 +400,10 @@ class _FlightReader:
             self._notes.append(f"truth: positions dropped: {losses(motion.dropped)}")
         if missing > sum(motion.dropped.values()):
             self._notes.append(f"truth: {missing} of {is_missing.size} positions of joints are missing")
+        if not {"hip"} & set(motion.joints) and not {"left_hip", "right_hip"} <= set(motion.joints):
+            self._notes.append(
+                "truth: has no hip, nor left_hip and right_hip: errors relative to the root are not measured"
+            )
         return missing, motion.dropped
 
     def store_actors(self, folder: Path, entries: Mapping[str, CameraEntry]) -> list[ActorEntry]:

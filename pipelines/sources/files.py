@@ -191,7 +191,9 @@ class FlightFiles:
         is_ned = source.axes == "ned"
         axes = "z-up" if is_ned or self.has_world_axes(source) else source.axes
         motion = reader.read_joints(path, unit=source.unit, axes=axes)
-        motion = _of_subject(path, motion, source.subject)
+        motion = _without_zeros(_of_subject(path, motion, source.subject))
+        if source.unit is None:
+            self._refuse_wrong_unit(path, motion, reader, source, axes)
         if is_ned:
             motion = replace(motion, position=motion.position[..., [1, 0, 2]] * [1, 1, -1])
         motion = _without_far_joints(motion)
@@ -201,6 +203,30 @@ class FlightFiles:
                 path, f"holds no position of a joint{lost}", "check what wrote it", code="no-positions"
             )
         return replace(motion, t_ns=motion.t_ns + round(source.offset_s * 1e9))
+
+    @staticmethod
+    def _refuse_wrong_unit(
+        path: Path, motion: JointMotion, reader: JointFormat, source: TruthSource, axes: str | None
+    ) -> None:
+        """Refuse true joints that are no person's in the unit of their file, but are in another one.
+
+        Raises:
+            DataError: the joints have the size of a person in another unit alone.
+        """
+        low_m, high_m = BODY_SIZE_M
+        size_m = _body_size_m(motion)
+        if np.isnan(size_m) or low_m <= size_m <= high_m:
+            return
+        for unit in ("m", "cm", "mm"):
+            other = _of_subject(path, reader.read_joints(path, unit=unit, axes=axes), source.subject)
+            other_m = _body_size_m(_without_zeros(other))
+            if low_m <= other_m <= high_m:
+                raise DataError(
+                    path,
+                    f"holds people of {size_m:.1f} m by its unit, and of {other_m:.2g} m if it is {unit}",
+                    f"say truth: {{unit: {unit}}}",
+                    code="unit-unknown",
+                )
 
 
 def _of_subject(path: Path, motion: JointMotion, subject: str | None) -> JointMotion:
@@ -227,6 +253,25 @@ def _of_subject(path: Path, motion: JointMotion, subject: str | None) -> JointMo
     )
 
 
+def _without_zeros(motion: JointMotion) -> JointMotion:
+    """Take joints at exactly (0, 0, 0) as missing, as many programs write them; count them."""
+    zero = (motion.position == 0.0).all(axis=-1)
+    if not zero.any():
+        return motion
+    lost = {"position at exactly 0, 0, 0, taken as missing": int(zero.sum())}
+    position = np.where(zero[..., None], np.nan, motion.position)
+    return replace(motion, position=position, dropped=motion.dropped | lost)
+
+
+def _body_size_m(motion: JointMotion) -> float:
+    """Measure the median diagonal of the box around a person's joints; NaN of too few joints."""
+    known = np.isfinite(motion.position).all(axis=-1).sum(axis=-1) >= MIN_JOINTS_OF_A_BODY
+    people = motion.position[known]
+    if not len(people):
+        return np.nan
+    return float(np.median(np.linalg.norm(np.nanmax(people, axis=1) - np.nanmin(people, axis=1), axis=-1)))
+
+
 def _without_far_joints(motion: JointMotion) -> JointMotion:
     """Set positions to NaN that are incomplete, or too far from the median of all to be true."""
     position = np.where(np.isfinite(motion.position).all(axis=-1, keepdims=True), motion.position, np.nan)
@@ -245,6 +290,11 @@ def _without_far_joints(motion: JointMotion) -> JointMotion:
         dropped=motion.dropped | {cause: int(far.sum())},
     )
 
+
+# A body that few joints stand for may be of any size.
+MIN_JOINTS_OF_A_BODY = 8
+# The diagonal of the box around a person's joints: curled up, and tall with raised arms.
+BODY_SIZE_M = (0.4, 3.0)
 
 # More threads than four read no faster from one disk.
 HASHING_THREADS = 4

@@ -17,6 +17,7 @@ from pipelines.session.maps import load_maps, write_grid
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import CalibrationFormat, recognise
 from pipelines.simulation.flight_files import write_tum
+from tests.raising import refused
 from tests.synthetic.flights import START_NS, SyntheticFlight, pose2sim_table, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log
@@ -200,3 +201,31 @@ def test_a_subject_that_is_not_clear_is_refused(tmp_path: Path, stated: dict[str
         ingest(flight.manifest)
     assert caught.value.code == code
     assert "P1, P2" in caught.value.problem
+
+
+@pytest.mark.parametrize("unit", ["cm", "mm"])
+def test_truth_in_another_unit_than_its_file_says_is_refused_with_the_unit(tmp_path: Path, unit: str) -> None:
+    flight = write_flight(tmp_path, cameras=2, seconds=0.2, clean=True)
+    right = tables(flight)["truth.parquet"]
+    joints = pd.read_csv(tmp_path / "truth.csv")
+    joints[["x", "y", "z"]] *= {"cm": 100, "mm": 1000}[unit]
+    joints.to_csv(tmp_path / "truth.csv", index=False)
+
+    with refused("unit-unknown", tmp_path / "truth.csv", f"unit: {unit}"):
+        ingest(flight.manifest)
+    flight.settings["truth"] |= {"unit": unit}
+    flight.save()
+    pd.testing.assert_frame_equal(tables(flight)["truth.parquet"], right)
+
+
+def test_truth_of_zeros_is_missing_and_counted(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, seconds=0.2, clean=True)
+    joints = pd.read_csv(tmp_path / "truth.csv")
+    joints.loc[::7, ["x", "y", "z"]] = 0.0
+    joints.to_csv(tmp_path / "truth.csv", index=False)
+
+    ingested = ingest(flight.manifest)
+
+    truth = ingested.description.truth
+    assert truth is not None
+    assert truth.missing == sum(truth.dropped.values()) == len(joints.loc[::7])
