@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 from unittest.mock import patch
 
@@ -37,6 +38,7 @@ from pipelines.geometry.poses import (
 )
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import still_name
+from pipelines.session.parallel import contents_of
 from pipelines.session.registries import noise_models
 from pipelines.session.storage import write_json
 from pipelines.session.tables import KEYPOINTS, TRACKS, write_table
@@ -234,20 +236,22 @@ def kept_in_place_of_pictures(flight: Flight, detector: str) -> Iterator[None]:
         counts = kept.counts[block.camera] if not block.first else dict.fromkeys(kept.counts[block.camera], 0)
         write_json(folder / "counts.json", {"joints": list(kept.joints), "counts": counts})
 
-    def follow(self: Any, block: FollowedBlock, halt: Any, progress: Any, folder: Path) -> None:
-        del self, halt, progress
+    def follow(order: tuple[Any, FollowedBlock]) -> dict[str, bytes]:
+        _, block = order
         background = backgrounds[block.camera]
         table = background.tracks[background.tracks["frame"].isin(block.numbers)]
-        write_table(folder / "tracks.parquet", table, TRACKS)
-        stills = [number for number in background.stills if number in block.numbers]
-        for number in stills:
-            (folder / still_name(number)).write_bytes(background.stills[number])
-        counts = {"pictures": len(block.numbers), "undecoded": 0, "stills": len(stills)}
-        write_json(folder / "counts.json", counts | {"points": 0})  # their numbers are the flight's already
+        numbers = [number for number in background.stills if number in block.numbers]
+        # The numbers of points are the flight's already, so a block adds none to those of the next.
+        counts = {"pictures": len(block.numbers), "undecoded": 0, "stills": len(numbers), "points": 0}
+        with TemporaryDirectory() as place:
+            write_table(Path(place) / "tracks.parquet", table, TRACKS)
+            write_json(Path(place) / "counts.json", counts)
+            stills = {still_name(number): background.stills[number] for number in numbers}
+            return contents_of(Path(place)) | stills
 
     with (
         patch("pipelines.detect._produce", detect),
         patch("pipelines.detect.hashes_of_models", lambda _: {}),
-        patch("pipelines.follow.Following._produce", follow),
+        patch("pipelines.follow.follow_block", follow),
     ):
         yield
