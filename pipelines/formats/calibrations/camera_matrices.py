@@ -20,9 +20,10 @@ from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 
-# k1 k2 p1 p2 k3 k4 k5 k6; the further ones of OpenCV (prism, tilt) are rare and mostly zero.
+# OpenCV's further coefficients (thin prism, tilt) are rare and mostly zero.
 _MOST_COEFFICIENTS = 8
-_LARGEST = 1e12  # beyond any length or angle; larger numbers overflow in later steps
+# No length or angle is larger, and larger numbers overflow in later steps.
+_LARGEST = 1e12
 
 
 def intrinsics(

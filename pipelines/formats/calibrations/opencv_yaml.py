@@ -26,9 +26,12 @@ _MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
 _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
 _WIDTH = ("image_width", "image_Width", "width")
 _HEIGHT = ("image_height", "image_Height", "height")
-_LARGEST = 1 << 20  # characters
+# A calibration has far fewer characters, and OpenCV's parser is slow.
+_LARGEST = 1 << 20
+# OpenCV's parser calls itself for each level, until the process ends.
 _DEEPEST = 200
-_MOST_CELLS = 64  # of a calibration's matrices; a larger size is a mistake and is never allocated
+# A larger matrix is a mistake of its size and must never be allocated.
+_MOST_CELLS = 64
 
 
 class OpencvStorage:

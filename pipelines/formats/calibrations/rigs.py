@@ -27,7 +27,8 @@ from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 
-_MOST_DOTS = 100  # of a key; files have two
+# The parser needs the square of a key's parts; keys of calibrations have two.
+_MOST_DOTS = 100
 
 
 class AniposeToml:

@@ -15,8 +15,10 @@ from pipelines.session.records import JointMotion, Occupancy, Recording, Traject
 CHI2_95 = 7.815
 """95 % of a Gaussian in three dimensions lie within {x : x' S^-1 x = 7.815} (chi-square)."""
 
+# Viewers stay fluent up to this number of cubes.
 MOST_CUBES = 1_000_000
-_SLAB = 16  # layers that are searched together
+# So many layers of a map are searched at once, which bounds the memory.
+_SLAB = 16
 
 
 def safe_file_name(name: str) -> str:

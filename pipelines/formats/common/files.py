@@ -14,7 +14,8 @@ from pipelines.session.yaml_files import plain_yaml
 HEAD_BYTES = 64 * 1024
 """Bytes that `recognises` reads: enough for any header, few enough to be instant."""
 
-_LARGEST_YAML = 1 << 20  # characters; the parser is slow, and calibrations are far smaller
+# Calibrations have far fewer characters, and the parser is slow.
+_LARGEST_YAML = 1 << 20
 
 
 def read_bytes(path: Path) -> bytes:

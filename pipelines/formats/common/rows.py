@@ -26,8 +26,10 @@ SECONDS, MILLISECONDS, MICROSECONDS, NANOSECONDS = 9, 6, 3, 0
 _UNITS = {"s": SECONDS, "sec": SECONDS, "ms": MILLISECONDS, "us": MICROSECONDS, "ns": NANOSECONDS}
 _STAMP_NAMES = {"t", "time", "timestamp", "stamp"}
 _SPLIT_STAMP = re.compile(r"(?:(?:header_)?(?:t|time|timestamp|stamp)_)?(secs?|nsecs?|nanosecs?)")
+# Stamps are int64, and this is its largest number.
 _LARGEST = 2**63 - 1
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?")
+# Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 NORM_TOLERANCE = 0.1

@@ -41,11 +41,15 @@ from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice, need
 
 _START = b"\xa3\x95\x80"  # a FMT message: the first of every log
-_MOST_DEFINITIONS = 10_000  # a log has one for each of up to 256 types, and chance makes one in 16 MB
+# A log defines up to 256 types, and chance makes one definition in 16 MB.
+_MOST_DEFINITIONS = 10_000
 _OLD_LOCAL = ("EKF1",)  # until 2015, when the estimator was logged without being flown by: only if asked for
-_HEAD = 3  # bytes before each message's fields
+# DataFlash puts two marks and the type before the fields of a message.
+_HEAD = 3
 _3D_FIX = 3
-_GPS_EPOCH_NS = 315_964_800_000_000_000  # 1980-01-06, UTC
+# GPS time counts from 1980-01-06, UTC.
+_GPS_EPOCH_NS = 315_964_800_000_000_000
+# GPS time counts whole weeks of this length.
 _WEEK_NS = 7 * 24 * 3600 * 1_000_000_000
 _LEAP_SECONDS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16))
 """UTC second from which GPS time is ahead by so many seconds (IERS announcements up to 2026)."""
@@ -77,7 +81,7 @@ _LETTERS: dict[str, tuple[str, float]] = {
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _MessageRows:
     """Messages of one name, in the order of the log."""
 
     name: str
@@ -116,7 +120,7 @@ class _Rows:
         field, unit_ns = self.clock or ("", 0)
         return self.integers(field) * unit_ns if field else np.zeros(len(self), np.int64)
 
-    def of(self, instance: int, *columns: str) -> _Rows:
+    def of(self, instance: int, *columns: str) -> _MessageRows:
         """Keep the rows of one instance, by the first of `columns` that exists; all rows if none does."""
         for column in columns:
             if column in self:
@@ -139,7 +143,7 @@ class ArduPilotFormat:
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe messages by name, times, GPS, and lost messages."""
-        log = _Log(path)
+        log = _DataFlash(path)
         timed = [rows for name in log.counts if (rows := log.rows(name)) is not None and rows.clock]
         every = np.concatenate([np.zeros(0, np.int64), *(rows.t_ns() for rows in timed)])
         facts: dict[str, object] = {"messages": sum(log.counts.values())}
@@ -160,7 +164,7 @@ class ArduPilotFormat:
         The position is POS (`global`), else that of the estimator XKF1 or NKF1 (`local`, metres from ORGN),
         else GPS.
         """
-        log = _Log(path)
+        log = _DataFlash(path)
         dropped: dict[str, int] = {}
         notes: list[str] = []
         fit = on_gps_time(path, _gps_time(log), choice.time, notes)
@@ -171,7 +175,7 @@ class ArduPilotFormat:
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
         """Read the times of pictures: CAM (by the camera's feedback if it has one), else TRIG."""
-        log = _Log(path)
+        log = _DataFlash(path)
         for name in ("CAM", "TRIG"):
             rows = log.first([name], choice.instance or 0, "I")
             if rows is None and (timed := log.rows(name)) is not None and "GPSTime" in timed and len(timed):
@@ -189,7 +193,7 @@ class ArduPilotFormat:
 
 
 def _position(
-    log: _Log, choice: TelemetryChoice, dropped: MutableMapping[str, int], notes: list[str]
+    log: _DataFlash, choice: TelemetryChoice, dropped: MutableMapping[str, int], notes: list[str]
 ) -> PositionTrack:
     instance = choice.instance or 0
     there = {
@@ -238,13 +242,13 @@ def _position(
     return replace(track, accuracy_m=(across / float(np.sqrt(2)), up))
 
 
-def _estimators_origin(log: _Log) -> Place | None:
+def _estimators_origin(log: _DataFlash) -> Place | None:
     """Return the origin of the estimator's metres (ORGN of type 0); None without one."""
     rows = log.first(["ORGN"], 0, "Type")
     return None if rows is None else Place(*rows.numbers("Lat", "Lng", "Alt")[0].tolist())
 
 
-def _body(log: _Log, dropped: MutableMapping[str, int]) -> AttitudeTrack | None:
+def _body(log: _DataFlash, dropped: MutableMapping[str, int]) -> AttitudeTrack | None:
     for name in ("ATT", "AHR2"):
         rows = log.first([name])
         if rows is not None:
@@ -254,7 +258,7 @@ def _body(log: _Log, dropped: MutableMapping[str, int]) -> AttitudeTrack | None:
 
 
 def _mount(
-    log: _Log, body: AttitudeTrack | None, dropped: MutableMapping[str, int], notes: list[str]
+    log: _DataFlash, body: AttitudeTrack | None, dropped: MutableMapping[str, int], notes: list[str]
 ) -> AttitudeTrack | None:
     """Read MNT: roll and pitch against the horizon, yaw from north if it is logged, else from the nose."""
     every = log.rows("MNT")
@@ -281,7 +285,7 @@ def _mount(
     return attitude_track(rows.name, rows.t_ns(), turned, dropped, stated=stated)
 
 
-def _gps_time(log: _Log) -> ClockFit | None:
+def _gps_time(log: _DataFlash) -> ClockFit | None:
     """Fit UTC to the time since boot, by the first receiver; None if it gives no time."""
     rows = log.first(["GPS"], 0, "I")
     names = (("GWk", "GMS"), ("Week", "TimeMS"))  # today's, and those until 2014
@@ -305,7 +309,7 @@ def _leap_ns(gps_ns: Int64) -> Int64:
 # --- reading -------------------------------------------------------------------------------------------
 
 
-class _Log:
+class _DataFlash:
     """Messages of a log, found once, read by name."""
 
     def __init__(self, path: Path) -> None:
@@ -320,7 +324,7 @@ class _Log:
         }
         self.counts = {name: len(places) for name, places in self._places.items() if len(places)}
 
-    def first(self, names: Sequence[str], instance: int = 0, *columns: str) -> _Rows | None:
+    def first(self, names: Sequence[str], instance: int = 0, *columns: str) -> _MessageRows | None:
         """Return the messages of the first of `names` that has any of the instance; None without any."""
         for name in names:
             rows = self.rows(name)
@@ -328,7 +332,7 @@ class _Log:
                 return found
         return None
 
-    def rows(self, name: str) -> _Rows | None:
+    def rows(self, name: str) -> _MessageRows | None:
         """Return the messages of a name; None without any, or if their definition is not consistent."""
         places = self._places.get(name)
         if places is None or not len(places):
@@ -348,7 +352,7 @@ class _Log:
             else np.zeros(0, layout)
         )
         scales = {column: _LETTERS[c][1] for column, c in zip(columns, letters, strict=True)}
-        return _Rows(name, raw, scales, int(np.count_nonzero(~whole)))
+        return _MessageRows(name, raw, scales, int(np.count_nonzero(~whole)))
 
 
 def _index(path: Path) -> Any:

@@ -43,7 +43,8 @@ from pipelines.session.registries import TelemetryChoice
 from pipelines.session.storage import as_data_error, refuse_special, text_encoding
 
 _FIRST_YEAR, _LAST_YEAR = 1970, 2200  # of dates; others are damage
-_LONGEST_S = 1e6  # of a record, from its start: more is damage
+# No flight lasts twelve days, so a larger time is damage.
+_LONGEST_S = 1e6
 _METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "metres": 1.0, "ft": 0.3048, "feet": 0.3048}
 _SECONDS = {"millisecond": 1e-3, "ms": 1e-3, "seconds": 1.0, "s": 1.0}
 _IN_SECONDS = ("osd.flytime", "clock:offsettime", "offsettime")  # without a unit
@@ -84,10 +85,12 @@ _CLOCK = re.compile(
 _DAY_OF_NAME = re.compile(r"(\d{4})[-_](\d{2})[-_](\d{2})")
 _MARK = re.compile(r"[.,](?=\d)")
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?")
+# Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _PREFIX = struct.Struct("<QHB")  # of a binary record: where its details lie, their length, and the version
 _BINARY_NAME = re.compile(r"DJIFlightRecord_|FLY\d{3}\.dat$", re.IGNORECASE)
-_NEWEST_BINARY = 30  # 14 in 2025
+# DJI was at version 14 in 2025, and a larger number means another kind of file.
+_NEWEST_BINARY = 30
 
 
 class DjiRecordFormat:
@@ -190,7 +193,7 @@ def _binary(path: Path) -> DataError:
 
 
 @dataclass(frozen=True)
-class _Heading:
+class _RecordHeading:
     """The line that names the columns."""
 
     line: int
@@ -285,7 +288,7 @@ def recordings_of(path: Path) -> list[tuple[int, int]]:
     return [(int(t_ns[a]), int(t_ns[b])) for a, b in record.films if timed[a] and timed[b]]
 
 
-def _find_heading(text: str) -> _Heading | None:
+def _find_heading(text: str) -> _RecordHeading | None:
     """Parse the heading, also below a line `sep=,`; None if it is no flight record's."""
     lines = text.split("\n", 2)
     line = 1 if lines[0].strip().strip('"').lower().startswith("sep=") else 0
@@ -311,7 +314,7 @@ def _find_heading(text: str) -> _Heading | None:
     told = numbers.keys() & {"relative", "absolute", "drone_pitch", "gb_pitch"}
     if not numbers.keys() >= {"latitude", "longitude"} or not told or not ("elapsed" in numbers or clock):
         return None
-    return _Heading(line, delimiter, len(cells), numbers, clock, zone == "utc", _column(names, _FILMS))
+    return _RecordHeading(line, delimiter, len(cells), numbers, clock, zone == "utc", _column(names, _FILMS))
 
 
 def _column(names: Sequence[tuple[str, str]], known: Sequence[str]) -> int | None:
@@ -395,7 +398,7 @@ def _read(path: Path) -> _Record:
     return _Record(path, columns, clock_ns, fine, heading.utc, np.array(filming), notes, dropped)
 
 
-def _rows(path: Path, heading: _Heading) -> Iterator[list[str]]:
+def _rows(path: Path, heading: _RecordHeading) -> Iterator[list[str]]:
     """Yield the rows below the heading that are not blank; one that is no CSV comes as an empty row."""
     with path.open("rb") as file:
         encoding = text_encoding(file.read(2))

@@ -40,7 +40,8 @@ from pipelines.session.records import Attitudes, AttitudeTrack, Height, Telemetr
 from pipelines.session.registries import TelemetryChoice
 from pipelines.session.storage import code_of, plain_text
 
-_HIGHEST_M = 500  # above the take-off: the largest height that DJI's drones reach
+# DJI's drones fly no higher than this above their take-off.
+_HIGHEST_M = 500
 
 
 @dataclass(frozen=True)
@@ -205,9 +206,12 @@ _CLOCK = re.compile(
 )
 # Some Mavic 2 write no display times: a number, then the clock time on a line of its own.
 _UNTIMED = re.compile(r"(?m)^\d+[ \t]*\n(?=\d{4}[-./]\d{1,2}[-./]\d{1,2} +\d)")
+# Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_LARGEST_NS = 2**63  # in the year 2262
-_SLOW_NS = 500_000_000  # subtitles further apart than this come once a second, with whole seconds
+# Stamps are int64, which ends in the year 2262.
+_LARGEST_NS = 2**63
+# Subtitles further apart than this come once a second and show whole seconds.
+_SLOW_NS = 500_000_000
 
 
 @dataclass(frozen=True)

@@ -58,10 +58,14 @@ _KINDS = {
     "f": "f4",
     "d": "f8",
 }
+# GPMF marks a fix with height by this number.
 _FIX_3D = 3
-_PACKET_S = 0.2  # standard deviation of when rows were measured: a packet of a second has but its own time
-_BRIDGED_NS = 1_000_000_000  # between two rows of gravity or of the stabilisation
-_LARGEST_TILT_DEG = 20.0  # of gravity against the attitudes; accelerations turn it by some degrees
+# A packet of a second has one time only, so its rows are known to about this.
+_PACKET_S = 0.2
+# Rows of gravity and of the stabilisation further apart than this are a gap.
+_BRIDGED_NS = 1_000_000_000
+# Accelerations turn the measured gravity by some degrees, a wrong axis by more.
+_LARGEST_TILT_DEG = 20.0
 _DAYS_TO_2000 = (datetime(2000, 1, 1, tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)).days
 _KNOWN = ("GPS5", "GPS9", "GLPI", "ATTD", "SYST", "ACCL", "GYRO", "CORI", "IORI", "GRAV")
 

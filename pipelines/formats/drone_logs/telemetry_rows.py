@@ -23,9 +23,12 @@ from pipelines.session.records import AttitudeTrack, Height, PositionTrack, Tele
 from pipelines.session.registries import TelemetryChoice
 from pipelines.session.storage import code_of
 
-_UNEVEN_S = 0.5  # scatter of GPS times beyond what late messages explain
-_HELD_NS = 1_000_000_000  # receivers on drones report at least once a second
-_LEAST_REFRESHES = 4  # intervals between changes that are needed to judge their regularity
+# Late messages scatter GPS times by less.
+_UNEVEN_S = 0.5
+# Receivers on drones report at least once a second.
+_HELD_NS = 1_000_000_000
+# Fewer intervals between changes do not show if they are regular.
+_LEAST_REFRESHES = 4
 
 
 def position_track(
@@ -243,8 +246,10 @@ def refuse_marks(path: Path, *marks: bytes, most: int | None = None) -> None:
         raise DataError(path, f"has {found} beginnings of messages in {size} bytes", "copy it again")
 
 
+# A parser tries so many marks in a second.
 _FEW_MARKS = 100_000
-_SMALLEST_MESSAGE = 8  # bytes
+# No message of an autopilot takes fewer bytes.
+_SMALLEST_MESSAGE = 8
 
 
 def damaged(path: Path, error: Exception) -> DataError:

@@ -29,27 +29,32 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     pictures_on_gps_time,
     refuse_marks,
 )
-from pipelines.formats.drone_logs.ulog import Columns, Topic, telemetry_of
+from pipelines.formats.drone_logs.ulog import Columns, UlogTopic, telemetry_of
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.session.errors import DataError
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice, need
 
-_STAMP = 8  # bytes of the station's clock before each packet
+# The station's clock takes this many bytes before each packet.
+_STAMP = 8
 _MARKS = re.compile(rb"[\xfd\xfe]")
+# Chance makes so many marks without a packet in 25 MB; a log full of damage has more.
 _MOST_WRONG = (
     200_000  # marks without a packet, and ten for each packet: 25 MB of chance in a log full of damage
 )
 _SIGNED, _SIGNATURE = 1, 13  # flag in a packet of MAVLink 2, and the bytes of its signature
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
+# Larger stamps do not fit int64 in nanoseconds.
 _LARGEST_US = 2**62
 _LIKE_PACKETS = re.compile(
     rb"\0[\0-\x0f].{6}[\xfd\xfe]", re.DOTALL
 )  # a clock until 2100, and a packet's first byte
-_SEARCHED = 64 * 1024  # bytes of a file of that name
+# Packets must begin within so many bytes of a file with the name of a log.
+_SEARCHED = 64 * 1024
 _FIRST_US, _LAST_US = 946_684_800_000_000, 4_102_444_800_000_000  # the years 2000 and 2100
-_UNIX_US = 10**15  # stamps in microseconds above it count from 1970, others from boot
+# Stamps in microseconds above this count from 1970, others from boot.
+_UNIX_US = 10**15
 _YAW_IN_VEHICLE, _YAW_IN_EARTH = 32, 64  # GIMBAL_DEVICE_FLAGS
 
 _SYSTEM_TIME, _GPS_RAW_INT, _ATTITUDE, _ATTITUDE_QUATERNION = 2, 24, 30, 31
@@ -183,13 +188,13 @@ def _vehicle(path: Path, log: _Packets, stated: int | None, messages: frozenset[
 # --- content of a log ----------------------------------------------------------------------------------
 
 
-def _topics(log: _Packets, system: int) -> list[tuple[Topic, str]]:
+def _topics(log: _Packets, system: int) -> list[tuple[UlogTopic, str]]:
     """Make PX4's topics of the messages of one vehicle; each with the name of its message."""
-    topics: list[tuple[Topic, str]] = []
+    topics: list[tuple[UlogTopic, str]] = []
 
     def add(name: str, message: int, columns: Columns) -> None:
         if len(columns["timestamp"]):
-            topics.append((Topic(name, 0, columns), log.dialect.mavlink_map[message].msgname))
+            topics.append((UlogTopic(name, 0, columns), log.dialect.mavlink_map[message].msgname))
 
     place = log.columns(system, _GLOBAL_POSITION)
     scaled = {"lat": place["lat"] * 1e-7, "lon": place["lon"] * 1e-7, "alt": place["alt"] * 1e-3}
@@ -261,7 +266,7 @@ def _quaternion(wxyz: Float) -> dict[str, Float]:
 # --- reading -------------------------------------------------------------------------------------------
 
 
-class _Packet(NamedTuple):
+class _MavlinkPacket(NamedTuple):
     stamp_us: int
     system: int
     component: int
@@ -358,7 +363,7 @@ def _read(path: Path) -> _Packets:
 
 def _packets(
     content: mmap.mmap, definitions: Mapping[int, Any], dropped: MutableMapping[str, int]
-) -> Iterator[_Packet]:
+) -> Iterator[_MavlinkPacket]:
     """Yield the packets whose checksum is right; stretches without any are counted."""
     place, in_order, right, wrong = 0, True, 0, 0
     while place + _STAMP < len(content):
@@ -384,7 +389,7 @@ def _packets(
         dropped["cut off"] = dropped.get("cut off", 0) + 1
 
 
-def _packet(content: mmap.mmap, place: int, definitions: Mapping[int, Any]) -> _Packet | None:
+def _packet(content: mmap.mmap, place: int, definitions: Mapping[int, Any]) -> _MavlinkPacket | None:
     """Read the packet behind a stamp; None if there is no whole one, or its checksum is wrong."""
     start = place + _STAMP
     size = _packet_size(content, start)
@@ -403,7 +408,7 @@ def _packet(content: mmap.mmap, place: int, definitions: Mapping[int, Any]) -> _
     elif start + size + _STAMP < len(content) and content[start + size + _STAMP] not in {0xFD, 0xFE}:
         return None  # of an unknown message only its length can be tested
     stamp_us = int.from_bytes(content[place:start], "big")
-    return _Packet(stamp_us, system, component, sequence, message, packet[head:end])
+    return _MavlinkPacket(stamp_us, system, component, sequence, message, packet[head:end])
 
 
 def _are_packets(head: bytes, place: int) -> bool:

@@ -40,7 +40,8 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice, need
 
-_FAR_OFF_NS = 5_000_000_000  # a stamp this far from most others is wrong
+# A stamp so far from nearly all others is wrong.
+_FAR_OFF_NS = 5_000_000_000
 _3D_FIX = 3
 _GPS = ("vehicle_gps_position", "sensor_gps")
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64  # GIMBAL_DEVICE_FLAGS of MAVLink
@@ -61,7 +62,8 @@ _POSITIONS = {
     "gps": _GPS,
 }
 MAGIC = b"ULog\x01\x12\x35"
-_MOST_FIELDS = 20_000  # of one message with its nested types; PX4's largest has some hundreds
+# PX4's largest message has some hundreds of fields, with its nested types.
+_MOST_FIELDS = 20_000
 Columns = Mapping[str, Any]  # by field name, arrays [N] in the log's own number types
 
 
@@ -137,7 +139,11 @@ class UlogFormat:
 
 
 def telemetry_of(
-    path: Path | str, topics: Sequence[Topic], choice: TelemetryChoice, fit: ClockFit | None, notes: list[str]
+    path: Path | str,
+    topics: Sequence[UlogTopic],
+    choice: TelemetryChoice,
+    fit: ClockFit | None,
+    notes: list[str],
 ) -> Telemetry:
     """Make the telemetry of PX4's topics, of a .ulg or of px4_msgs; stamps are converted by `fit`."""
     dropped: dict[str, int] = {}
@@ -149,7 +155,7 @@ def telemetry_of(
 
 def _position(
     path: Path | str,
-    topics: Sequence[Topic],
+    topics: Sequence[UlogTopic],
     choice: TelemetryChoice,
     dropped: MutableMapping[str, int],
     notes: list[str],
@@ -193,7 +199,7 @@ def _position(
     return replace(track, accuracy_m=_accuracy(topic, usable))
 
 
-def _likeliest(found: Mapping[str, Topic]) -> str:
+def _likeliest(found: Mapping[str, UlogTopic]) -> str:
     """Choose the estimator's local position if it is ever valid, else a position on Earth."""
     if "local" in found and _local_is_valid(found["local"]).any():
         return "local"
@@ -205,7 +211,7 @@ def _likeliest(found: Mapping[str, Topic]) -> str:
 
 
 def _local(
-    path: Path | str, topic: Topic, dropped: MutableMapping[str, int], notes: list[str]
+    path: Path | str, topic: UlogTopic, dropped: MutableMapping[str, int], notes: list[str]
 ) -> PositionTrack:
     """Read the estimator's metres and their origin on Earth, which the estimator may move in flight."""
     enu = topic.numbers("y", "x", "z") * [1, 1, -1]
@@ -239,18 +245,18 @@ def _local(
     return replace(track, accuracy_m=_accuracy(topic, valid))
 
 
-def _local_is_valid(topic: Topic) -> Bool:
+def _local_is_valid(topic: UlogTopic) -> Bool:
     return topic.flags("xy_valid") & topic.flags("z_valid")
 
 
-def _resets(topic: Topic, valid: Bool) -> int:
+def _resets(topic: UlogTopic, valid: Bool) -> int:
     if "xy_reset_counter" not in topic:
         return 0
     counter = topic.numbers("xy_reset_counter")[valid]
     return int(np.count_nonzero(np.diff(counter)))
 
 
-def _fixes(topic: Topic) -> tuple[Float, Bool]:
+def _fixes(topic: UlogTopic) -> tuple[Float, Bool]:
     """Return latitude, longitude and height [N, 3], and True where there was a 3D fix [N]."""
     if "latitude_deg" in topic:
         values = topic.numbers("latitude_deg", "longitude_deg", "altitude_msl_m")
@@ -259,7 +265,7 @@ def _fixes(topic: Topic) -> tuple[Float, Bool]:
     return values, np.asarray(topic.numbers("fix_type") >= _3D_FIX)
 
 
-def _accuracy(topic: Topic, usable: Bool) -> tuple[float, float] | None:
+def _accuracy(topic: UlogTopic, usable: Bool) -> tuple[float, float] | None:
     stated = topic.numbers("eph", "epv")[usable]
     stated = stated[np.isfinite(stated).all(axis=1) & (stated > 0).all(axis=1)]
     if not len(stated):
@@ -269,7 +275,7 @@ def _accuracy(topic: Topic, usable: Bool) -> tuple[float, float] | None:
 
 
 def _body(
-    topics: Sequence[Topic], instance: int | None, dropped: MutableMapping[str, int], notes: list[str]
+    topics: Sequence[UlogTopic], instance: int | None, dropped: MutableMapping[str, int], notes: list[str]
 ) -> AttitudeTrack | None:
     found = [topic for topic in topics if topic.name == "vehicle_attitude"]
     estimated = [topic for topic in topics if topic.name == "estimator_attitude" and len(topic)]
@@ -288,7 +294,7 @@ def _body(
 
 
 def _gimbal(
-    topics: Sequence[Topic],
+    topics: Sequence[UlogTopic],
     body: AttitudeTrack | None,
     dropped: MutableMapping[str, int],
     notes: list[str],
@@ -317,7 +323,7 @@ def _gimbal(
 
 
 def _gimbal_device(
-    topic: Topic, body: AttitudeTrack | None, dropped: MutableMapping[str, int]
+    topic: UlogTopic, body: AttitudeTrack | None, dropped: MutableMapping[str, int]
 ) -> AttitudeTrack | None:
     """Read GIMBAL_DEVICE_ATTITUDE_STATUS: pitch and roll against the horizon, yaw by its flags (MAVLink)."""
     stated = topic.numbers("q[1]", "q[2]", "q[3]", "q[0]")
@@ -333,7 +339,7 @@ def _gimbal_device(
     return attitude_track(topic.name, topic.t_ns(), turned, dropped, stated=whatever_from(stated))
 
 
-def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:
+def _gps_time(topics: Sequence[UlogTopic]) -> ClockFit | None:
     """Fit UTC to the time since boot, by the receiver's time; None if it gives no time."""
     for topic in sorted(topics, key=lambda topic: (topic.name not in _GPS[:1], topic.instance)):
         if topic.name in _GPS and "time_utc_usec" in topic:
@@ -345,8 +351,13 @@ def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:
 
 
 def _instance(
-    path: Path | str, topics: Sequence[Topic], names: Sequence[str], choice: TelemetryChoice, *, wanted: bool
-) -> Topic | None:
+    path: Path | str,
+    topics: Sequence[UlogTopic],
+    names: Sequence[str],
+    choice: TelemetryChoice,
+    *,
+    wanted: bool,
+) -> UlogTopic | None:
     """Return the topic of the chosen instance, the first by default; None if there is none."""
     of_kind = _there(topics, names)
     if not of_kind or choice.instance is None:
@@ -357,12 +368,12 @@ def _instance(
     return found[-1] if found else None
 
 
-def _there(topics: Sequence[Topic], names: Sequence[str]) -> list[Topic]:
+def _there(topics: Sequence[UlogTopic], names: Sequence[str]) -> list[UlogTopic]:
     """Return the topics with these names that hold messages."""
     return [topic for name in names for topic in topics if topic.name == name and len(topic)]
 
 
-def _no_instance(path: Path | str, instance: int, what: str, there: Sequence[Topic]) -> DataError:
+def _no_instance(path: Path | str, instance: int, what: str, there: Sequence[UlogTopic]) -> DataError:
     listed = ", ".join(f"{topic.name} {topic.instance}" for topic in there)
     return DataError(
         path, f"has no instance {instance} of {what}", f"there are {listed}", code="no-such-name"
@@ -378,7 +389,7 @@ def _far_off(t_ns: Int64, among: Bool) -> Bool:
 
 
 @dataclass(frozen=True)
-class Topic:
+class UlogTopic:
     """One instance of a topic."""
 
     name: str
@@ -422,9 +433,9 @@ def open_ulog(path: Path, wanted: Collection[str] | None) -> Any:
         raise damaged(path, error) from error
 
 
-def topics_of(log: Any) -> list[Topic]:
+def topics_of(log: Any) -> list[UlogTopic]:
     """Return the topics with a stamp, sorted by name and instance."""
-    found = [Topic(str(d.name), int(d.multi_id), d.data) for d in log.data_list if "timestamp" in d.data]
+    found = [UlogTopic(str(d.name), int(d.multi_id), d.data) for d in log.data_list if "timestamp" in d.data]
     return sorted(found, key=lambda topic: (topic.name, topic.instance))
 
 

@@ -17,16 +17,20 @@ from pipelines.session.people import SKELETONS, Skeleton, get_skeleton, skeleton
 from pipelines.session.records import Detections
 from pipelines.session.storage import code_of
 
+# So many files show the format of a folder, and reading them takes no time.
 _SAMPLED_FILES = 8
-_FRAME_LIMIT = 2**62  # keeps frame numbers and their differences inside int64
+# Frame numbers below it, and their differences, fit int64.
+_FRAME_LIMIT = 2**62
 # ".jpg" and ".jp2" are suffixes, the ".0004" of "cam01.0004" is a frame number.
 _SUFFIX = re.compile(r"\.[A-Za-z]\w*$")
 _CAMERA = re.compile(r"(?:cam|camera|view|drone)[_-]?[0-9]+", re.IGNORECASE)
-_FARTHEST_PX = 1_000_000  # far larger than any picture: beyond it the file is faulty
+# No picture is so large, so a joint beyond it is damage.
+_FARTHEST_PX = 1_000_000
 
 # Whole-body skeletons by their number of keypoints: those of this body come first, then face and hands.
 _BODIES = {136: "halpe26", 133: "coco23"}  # Halpe-136, COCO-WholeBody
-_LEAST_SHARE = 0.25  # of a folder's files that are JSON; one JSON among logs is no folder of keypoints
+# One JSON among logs makes no folder of keypoints.
+_LEAST_SHARE = 0.25
 
 
 def load_json(path: Path) -> object:

@@ -32,9 +32,12 @@ from pipelines.formats.logs.recordings import (
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 
-CHUNK_LIMIT = 1 << 28  # bytes of a chunk, compressed or not: a larger one is taken for damage
-_CACHE = 64 << 20  # bytes of chunks kept in memory, for files whose chunks overlap in time
-_CACHED = 1000  # chunks, as empty ones have no bytes
+# No recorder writes larger chunks, so a larger size in a header is damage.
+CHUNK_LIMIT = 1 << 28
+# Chunks that overlap in time are kept up to this many bytes.
+_CACHE = 64 << 20
+# Empty chunks have no bytes, so their number is bounded, too.
+_CACHED = 1000
 # A small file may inflate to anything. Logs compress to a tenth, black pictures to a hundredth. The stamps of
 # messages differ, so that a message takes a byte at the least.
 _INFLATED = 1 << 30  # bytes of all chunks in any file
@@ -48,7 +51,8 @@ _BARE_SIZE = 4096
 _EMPTY_INDICES = 10_000  # in any file; one more for each 256 bytes
 _EMPTY_SIZE = 256
 
-_KEPT = 16 << 20  # bytes that freed chunks may hold
+# Chunks are smaller, so their memory is used again and not returned to the system.
+_KEPT = 16 << 20
 RECORD_AGAIN = "no recorder writes this; copy it again from the drone"
 
 

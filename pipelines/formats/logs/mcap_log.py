@@ -37,9 +37,13 @@ _MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # then channel, sequence, log time, pu
 _CHUNK_HEAD = struct.Struct("<QQQII")  # first and last stamp, size, checksum, length of what follows
 _INDEX_ROW = np.dtype([("stamp", "<u8"), ("place", "<u8")])
 _NO_SCHEMA = records.Schema(id=0, data=b"", encoding="", name="")
-_RUN = 1 << 20  # bytes of messages outside chunks that are read at once
-_STAMP_LIMIT = 1 << 63  # our stamps are int64
-_BLOCK = 1 << 20  # bytes of a file that are read at once for its checksum
+# Messages outside chunks are read in blocks of this many bytes.
+_RUN = 1 << 20
+# Stamps are int64, and MCAP's are unsigned.
+_STAMP_LIMIT = 1 << 63
+# A checksum is computed over blocks of this many bytes.
+_BLOCK = 1 << 20
+# MCAP marks the end of its data with this kind of record.
 _DATA_END = 15
 _FOOTER_RECORD = struct.Struct("<BQQQI8s")  # kind, length, start of summary, of its offsets, checksum, magic
 _DATA_END_RECORD = struct.Struct("<BQI")  # kind, length; checksum

@@ -28,9 +28,12 @@ if TYPE_CHECKING:
 
 Decoder = Callable[[memoryview | bytes], Any]
 
-MESSAGE_LIMIT = 1 << 28  # bytes of a message that is compressed by itself
-_DEFINITION_LIMIT = 1 << 18  # bytes; the largest of ROS have some 10,000, and the parser is slow
-ARRAY_LIMIT = 1 << 20  # entries of a fixed array; rosbags unrolls arrays of messages into code
+# No message is larger, so a compressed one that inflates to more is damage.
+MESSAGE_LIMIT = 1 << 28
+# The largest definitions of ROS have some 10,000 bytes, and the parser is slow.
+_DEFINITION_LIMIT = 1 << 18
+# rosbags unrolls fixed arrays of messages into code, which must stay small.
+ARRAY_LIMIT = 1 << 20
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)+", re.ASCII)
 OCTOMAP = "octomap_msgs/msg/Octomap"
 # rosbags does not know these types, and logs of ROS 2 up to Humble carry no definitions.
@@ -299,7 +302,7 @@ class _Field:
 
 
 @dataclass(frozen=True)
-class Layout:
+class MessageLayout:
     """Positions of the fields in every message of a topic, found in one of them.
 
     Bytes between fields, which align them, have any value.
@@ -344,7 +347,7 @@ class Layout:
         return stamps
 
 
-def find_layout(schema: Schema, first: bytes) -> Layout | None:
+def find_layout(schema: Schema, first: bytes) -> MessageLayout | None:
     """Find the positions of the fields in one message, or in its first bytes; None if they are not fixed.
 
     CDR (OMG DDSI-RTPS 2.5, section 10) aligns each number to its size, counted from the end of its four bytes
@@ -359,7 +362,7 @@ def find_layout(schema: Schema, first: bytes) -> Layout | None:
         return None
 
 
-def _placed(fields: list[_Field], first: bytes, is_cdr: bool) -> Layout:
+def _placed(fields: list[_Field], first: bytes, is_cdr: bool) -> MessageLayout:
     numbers: dict[str, tuple[slice, np.dtype[Any]]] = {}
     texts: dict[str, str] = {}
     fixed = [slice(0, 4)] if is_cdr else []
@@ -383,7 +386,9 @@ def _placed(fields: list[_Field], first: bytes, is_cdr: bool) -> Layout:
             tail = True
         else:
             numbers[field.path] = slice(begin, at), dtype
-    return Layout(numbers, texts, at, tail, tuple((p, np.frombuffer(first[p], np.uint8)) for p in fixed))
+    return MessageLayout(
+        numbers, texts, at, tail, tuple((p, np.frombuffer(first[p], np.uint8)) for p in fixed)
+    )
 
 
 def _fields(store: Typestore, type_: str, before: str = "") -> Iterator[_Field]:

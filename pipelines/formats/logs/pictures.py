@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from pipelines.formats.logs.message_decoders import Layout, find_layout
+from pipelines.formats.logs.message_decoders import MessageLayout, find_layout
 from pipelines.formats.logs.messages import FAULTS, LATEST_NS, all_samples, nanoseconds, unreadable
 from pipelines.formats.logs.recordings import messages_alike
 from pipelines.geometry.arrays import Int64, Picture
@@ -24,7 +24,8 @@ _LAID_OUT = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 HEAD_LENGTH = 256
 """Bytes at the start of a picture message that hold all fields before the picture, unless names are long."""
 
-_MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less time
+# Transport and decoding delay a picture by less.
+_MAY_LEAP_NS = 1_000_000_000
 
 TRIGGER_TYPES = (
     "std_msgs/msg/Header",
@@ -102,7 +103,7 @@ def stamps_at_once(recording: Log, topic: str) -> tuple[Int64, Int64] | None:
         return None
     header_ns: list[Int64] = [np.zeros(0, np.int64)]
     receive_ns: list[Int64] = [np.zeros(0, np.int64)]
-    layout: Layout | None = None
+    layout: MessageLayout | None = None
     for received, sizes, heads in alike.log.heads(alike.topic, HEAD_LENGTH):
         layout = layout or find_layout(alike.schema, heads[0].tobytes())
         if layout is None or not layout.fits(heads, sizes) or np.abs(received).max() >= LATEST_NS:

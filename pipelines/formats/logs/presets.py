@@ -55,8 +55,10 @@ FIXES = (
 )
 """Types of positions on Earth."""
 
-_MOST_NAMED = 8  # topics in a message
-_NO_FIX = -1  # status.status of NavSatFix and GPSFix
+# A message that names more topics is not read.
+_MOST_NAMED = 8
+# NavSatFix and GPSFix say by this status that there is no fix.
+_NO_FIX = -1
 _TURNED = ("sensor_msgs/msg/Imu", "geometry_msgs/msg/QuaternionStamped")
 _VERSION = re.compile(r"_v\d+")  # PX4 appends it to the names of topics whose messages changed
 _TIME_REFERENCE = "sensor_msgs/msg/TimeReference"
@@ -116,7 +118,7 @@ DRIVERS: dict[Preset, _Driver] = {
 
 
 @dataclass
-class _Rows:
+class _TopicRows:
     """Numbers of one topic, with both of their stamps."""
 
     header_ns: array[int] = field(default_factory=lambda: array("q"))
@@ -417,9 +419,9 @@ def _type_of(recording: Log, topic: str) -> str:
     return next(known.type for known in recording.topics if known.name == topic)
 
 
-def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequence[float]]) -> _Rows:
+def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequence[float]]) -> _TopicRows:
     """Read the numbers of every message of a topic."""
-    rows = _Rows()
+    rows = _TopicRows()
     for message in recording.messages([topic]):
         value = message.value
         try:

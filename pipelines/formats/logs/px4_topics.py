@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.drone_logs.ulog import Topic, telemetry_of
+from pipelines.formats.drone_logs.ulog import UlogTopic, telemetry_of
 from pipelines.formats.logs.messages import FAULTS, Stamps, unreadable
 from pipelines.geometry.arrays import Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
@@ -38,7 +38,8 @@ _FIELDS: dict[str, tuple[str, ...]] = {
 _FIELDS["sensor_gps"] = _FIELDS["vehicle_gps_position"]
 """Fields of each message that are read; versions of px4_msgs differ, so each may be absent."""
 
-_SAME_CLOCK_NS = 60_000_000_000  # apart, beyond the log's own length: then the stamps count from boot
+# Stamps further from receipt than this, beyond the log's length, count from boot.
+_SAME_CLOCK_NS = 60_000_000_000
 
 
 def read_px4(
@@ -56,7 +57,7 @@ def read_px4(
         choice: what the user asks for.
         stamps: which stamps are the times.
     """
-    topics: list[Topic] = []
+    topics: list[UlogTopic] = []
     sent: list[Int64] = []
     received: list[Int64] = []
     for name, topic in sorted(names.items()):
@@ -68,7 +69,7 @@ def read_px4(
             columns["timestamp"] = receive_ns // 1000
         sent.append(np.asarray(columns["timestamp"], np.int64) * 1000)
         received.append(receive_ns)
-        topics.append(Topic(name, 0, columns))
+        topics.append(UlogTopic(name, 0, columns))
     if not topics:
         raise DataError(
             source,
@@ -122,7 +123,7 @@ def _fit(sent_ns: Int64, received_ns: Int64, notes: list[str]) -> ClockFit | Non
     return fit
 
 
-def _with_odometry(topics: Sequence[Topic], notes: list[str]) -> list[Topic]:
+def _with_odometry(topics: Sequence[UlogTopic], notes: list[str]) -> list[UlogTopic]:
     """Use the odometry's position and attitude where there is no message with that alone."""
     found = {topic.name: topic for topic in topics}
     odometry = found.pop("vehicle_odometry", None)
@@ -132,11 +133,11 @@ def _with_odometry(topics: Sequence[Topic], notes: list[str]) -> list[Topic]:
     stamped = {name: columns[name] for name in _STAMPS if name in columns}
     if "vehicle_local_position" not in found:
         place = {axis: columns.get(f"position[{k}]", columns.get(axis)) for k, axis in enumerate("xyz")}
-        found["vehicle_local_position"] = Topic("vehicle_local_position", 0, stamped | place)
+        found["vehicle_local_position"] = UlogTopic("vehicle_local_position", 0, stamped | place)
         notes.append("took the local position from vehicle_odometry")
     if "vehicle_attitude" not in found:
         turned = {f"q[{k}]": columns[f"q[{k}]"] for k in range(4) if f"q[{k}]" in columns}
-        found["vehicle_attitude"] = Topic("vehicle_attitude", 0, stamped | turned)
+        found["vehicle_attitude"] = UlogTopic("vehicle_attitude", 0, stamped | turned)
         notes.append("took the attitude from vehicle_odometry")
     # pose_frame: 1 is NED, 2 FRD of any heading; the older local_frame has these as 0 and 1.
     frame, is_ned = columns.get("pose_frame"), 1

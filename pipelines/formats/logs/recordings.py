@@ -39,9 +39,12 @@ UNREADABLE_FILES = "files that cannot be read"
 UNINDEXED = "damaged blocks without an index"
 NOT_FOUND = "messages stated but not found"
 
-_BATCH = 1 << 16  # messages whose places are Python integers at a time: 10 MB
-_MOST_TYPES = 2000  # each takes a millisecond to understand; PX4 has 250
-_HEADS = 4096  # messages whose heads are read at a time
+# The places of so many messages are Python integers at a time, which takes 10 MB.
+_BATCH = 1 << 16
+# A type takes a millisecond to understand, and PX4 has 250.
+_MOST_TYPES = 2000
+# The heads of so many messages are read at a time.
+_HEADS = 4096
 
 
 @dataclass(frozen=True)

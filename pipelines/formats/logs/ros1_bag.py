@@ -20,7 +20,8 @@ from pipelines.session.storage import is_special
 
 _MAGIC = re.compile(rb"#ROSBAG V(\d+)\.(\d+)\n")
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
-_HEADER_LIMIT = 1 << 20  # bytes of a record's header; usual ones have some hundred
+# The header of a record has some hundred bytes, so more is damage.
+_HEADER_LIMIT = 1 << 20
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
 _STAMP = struct.Struct("<II")

@@ -51,18 +51,24 @@ GAPS = "gaps in the table of messages"
 
 _MAGIC = b"SQLite format 3\0"
 
+# No recording has so many rows, so the search behind damage ends here.
 _LARGEST_ROWID = 1 << 48
-_BATCH = 4096  # rows at a time
-_SMALLEST_ROW = 6  # smallest size of a row in a file, in bytes: length, number, a header of four
-_MOST_ATTEMPTS = 10_000  # attempts to continue after damage
+# So many rows are listed at a time.
+_BATCH = 4096
+# A row takes at least its length, its number and a header of four bytes.
+_SMALLEST_ROW = 6
+# A damaged file must not keep the reader busy for ever.
+_MOST_ATTEMPTS = 10_000
 _UNREADABLE = (apsw.Error, UnicodeDecodeError)  # text in a damaged file may be invalid UTF-8
 
 _INFORMATION = "rosbag2_bagfile_information"
-_METADATA_LIMIT = 2 << 20  # bytes of a metadata.yaml; the parser is slow
+# The parser of YAML is slow, and metadata of real bags is far smaller.
+_METADATA_LIMIT = 2 << 20
 _VIEWS = (
     "SELECT count(*) FROM sqlite_master WHERE name IN ('messages', 'topics') AND sql NOT LIKE 'CREATE TABLE%'"
 )
-_COPIED = 1 << 20  # bytes of a compressed file at a time
+# A compressed file is copied in pieces of this many bytes.
+_COPIED = 1 << 20
 _SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 
@@ -119,7 +125,7 @@ class _Metadata:
 
 
 @dataclass(frozen=True)
-class _Contents:
+class _BagFiles:
     files: list[Path]
     lost: Counter[str]
     stated: _Metadata | None = None
@@ -194,10 +200,10 @@ def _open_compressed(path: Path) -> LogPart:
     return part
 
 
-def _contents(path: Path) -> _Contents:
+def _contents(path: Path) -> _BagFiles:
     """Return the files of a bag's folder, in order, with its metadata.yaml; a file stands for itself."""
     if not path.is_dir():
-        return _Contents([path], Counter())
+        return _BagFiles([path], Counter())
     lost: Counter[str] = Counter()
     stated = None
     if (path / "metadata.yaml").exists():
@@ -211,7 +217,7 @@ def _contents(path: Path) -> _Contents:
     files = [file for file in files if file.is_file()] or _storage_files(path)
     if not files:
         raise DataError(path, "is a bag without its .db3 or .mcap files", "copy the whole folder again")
-    return _Contents(files, lost, stated)
+    return _BagFiles(files, lost, stated)
 
 
 def _read_metadata(path: Path) -> _Metadata:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.formats.logs.message_decoders import Layout, find_layout
+from pipelines.formats.logs.message_decoders import MessageLayout, find_layout
 from pipelines.formats.logs.messages import (
     FAULTS,
     LATEST_NS,
@@ -231,7 +231,7 @@ def poses_at_once(recording: Log, topic: str) -> LoggedRows | None:
     paths = _LAID_OUT[alike.schema.type]
     # These grow in place: joining parts would need the memory of a long log twice.
     header, received, numbers = array("q"), array("q"), array("d")
-    layout: Layout | None = None
+    layout: MessageLayout | None = None
     try:
         for receive_ns, sizes, raw in alike.log.heads(alike.topic, _LONGEST_POSE):
             layout = layout or find_layout(alike.schema, raw[0].tobytes())
@@ -502,7 +502,7 @@ _LOCAL_FRAME, _NO_POSITION = 1, 0b111  # PositionTarget: coordinate_frame, and t
 _Point = tuple[int, float, float, float]
 
 
-class _Way:
+class _CommandedWay:
     """Points in the order of time; a later plan replaces all points from its beginning on."""
 
     def __init__(self) -> None:
@@ -533,7 +533,7 @@ def read_commands(recording: Log, source: str, topic: str, stamps: Stamps) -> Tr
     Setpoints without a position or relative to the body are dropped and counted, and so are empty
     plans. The rotation is the identity and has no meaning.
     """
-    way, dropped = _Way(), Counter[str]()
+    way, dropped = _CommandedWay(), Counter[str]()
     for message in recording.messages([topic]):
         try:
             points = list(_POINTS[message.topic.type](message, dropped))

@@ -28,10 +28,13 @@ from pipelines.session.maps import check_resolution, check_size
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import install_command, need
 
-_CHUNK = 1_000_000  # points
+# So many points are read at a time, which takes some 100 MB.
+_CHUNK = 1_000_000
 _NOISE = (7, 18)  # low and high noise of ASPRS
 _GEO_KEYS = (3072, 2048)  # GeoTIFF: the projected, or else the geographic system's EPSG number
-_RECORD = 54  # bytes of the shortest variable length record
+# A variable length record of LAS has at least this many bytes.
+_RECORD = 54
+# GeoTIFF means by this number that the system has no number.
 _USER_DEFINED = 32767
 _COPY = "copy it again, or export it again"
 

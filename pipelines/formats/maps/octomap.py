@@ -25,7 +25,9 @@ from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size, describe_grid
 from pipelines.session.records import Occupancy
 
+# OctoMap's trees always have this many levels.
 DEPTH = 16
+# The world's origin lies in the middle of the tree.
 _CENTRE = 1 << (DEPTH - 1)
 
 # A .bt has no probabilities. Its leaves get the limits to which OctoMap clamps by default
@@ -35,6 +37,7 @@ FREE_PROBABILITY, OCCUPIED_PROBABILITY = 0.1192, 0.971
 _BINARY = b"# Octomap OcTree binary file"
 _FULL = b"# Octomap OcTree file"
 _LEGACY = struct.Struct("<idI")
+# The oldest .bt files begin with this number.
 _LEGACY_TYPE = 3
 _RECORD_BYTES = {"OcTree": 5, "ColorOcTree": 8}  # of a node in a .ot
 _COPY_AGAIN = "copy or export it again"
@@ -71,7 +74,7 @@ class Leaves:
 
 
 @dataclass(frozen=True)
-class _Header:
+class _OctomapHeader:
     kind: str  # bt, ot, legacy bt
     id: str
     resolution_m: float
@@ -200,7 +203,7 @@ def full_leaves(source: Path | str, payload: Bytes, record_bytes: int) -> Leaves
     return Leaves(key, depth, log_odds, nodes=used)
 
 
-def _read(path: Path) -> tuple[_Header, Leaves]:
+def _read(path: Path) -> tuple[_OctomapHeader, Leaves]:
     content = read_bytes(path)
     header, payload = _split(path, content)
     check_resolution(path, header.resolution_m)
@@ -212,10 +215,10 @@ def _read(path: Path) -> tuple[_Header, Leaves]:
     return header, leaves
 
 
-def _split(path: Path, content: bytes) -> tuple[_Header, Bytes]:
+def _split(path: Path, content: bytes) -> tuple[_OctomapHeader, Bytes]:
     if _is_legacy(content):
         _, resolution_m, nodes = _LEGACY.unpack_from(content)
-        return _Header("legacy bt", "OcTree", resolution_m, nodes), np.frombuffer(content, np.uint8)[
+        return _OctomapHeader("legacy bt", "OcTree", resolution_m, nodes), np.frombuffer(content, np.uint8)[
             _LEGACY.size :
         ]
     if not content.startswith((_BINARY, _FULL)):
@@ -234,7 +237,7 @@ def _split(path: Path, content: bytes) -> tuple[_Header, Bytes]:
             path, f"its header cannot be read ({str(error)[:100]})", _COPY_AGAIN, code="damaged"
         ) from error
     kind = "bt" if content.startswith(_BINARY) else "ot"
-    return _Header(kind, values.get("id", "OcTree"), resolution_m, nodes), payload
+    return _OctomapHeader(kind, values.get("id", "OcTree"), resolution_m, nodes), payload
 
 
 def _is_legacy(content: bytes) -> bool:
@@ -287,7 +290,8 @@ def _box(name: str, leaves: Leaves, chosen: Bool, resolution_m: float) -> dict[s
 
 # --- writing -------------------------------------------------------------------------------------------
 
-_OFF_GRID = 1e-4  # of a voxel; origins are sums and products of rounded decimal numbers
+# Origins are sums and products of rounded decimal numbers, which are off by less.
+_OFF_GRID = 1e-4
 
 _HEADER = """# Octomap OcTree binary file
 # (feel free to add / change comments, but leave the first line as it is!)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Bytes, Float32, Int32, Int64
 from pipelines.geometry.compilation import cached
 
+# OctoMap's trees always have this many levels.
 DEPTH = 16
 UNKNOWN, FREE, OCCUPIED, INNER = 0, 1, 2, 3  # values of the two bits that a .bt has for every child
 BREAKS_OFF, TOO_DEEP = -1, -2

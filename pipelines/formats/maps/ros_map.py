@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 HEIGHT_M = 2.5
 """Height of the walls: an ordinary storey. Drones above it are above the map."""
 
+# A larger plan would exhaust the memory once it is raised to voxels.
 _MOST_PIXELS = 100_000_000
 _MODES = ("trinary", "scale", "raw")
 _SUFFIXES = (".pgm", ".png")
@@ -44,7 +45,7 @@ _MEND = "correct the YAML file"
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _FloorPlan:
     image: Path
     stated_image: str
     mode: str
@@ -110,7 +111,7 @@ class RosMap:
         return _grid(path, plan, _probabilities(path, plan), side)
 
 
-def _grid(path: Path, plan: _Plan, pixels: Float32, side_m: float) -> Occupancy:
+def _grid(path: Path, plan: _FloorPlan, pixels: Float32, side_m: float) -> Occupancy:
     position = np.array([*plan.origin, 0.0])
     turned = np.array([0.0, 0.0, math.sin(plan.yaw / 2), math.cos(plan.yaw / 2)])
     return extruded(
@@ -118,7 +119,7 @@ def _grid(path: Path, plan: _Plan, pixels: Float32, side_m: float) -> Occupancy:
     )
 
 
-def _read_plan(path: Path) -> _Plan:
+def _read_plan(path: Path) -> _FloorPlan:
     values = read_yaml(path)
     missing = [
         key
@@ -151,7 +152,7 @@ def _read_plan(path: Path) -> _Plan:
         raise DataError(path, f"negate is {str(values['negate'])[:40]!r}", "it must be 0 or 1")
     if not isinstance(image, str):
         raise DataError(path, f"image is {str(image)[:40]!r}", "it must name a PGM or PNG file")
-    return _Plan(
+    return _FloorPlan(
         image=_find_image(path, image),
         stated_image=image,
         mode=str(mode),
@@ -179,7 +180,7 @@ def _find_image(path: Path, image: str) -> Path:
         ) from None
 
 
-def _probabilities(path: Path, plan: _Plan) -> Float32:
+def _probabilities(path: Path, plan: _FloorPlan) -> Float32:
     """Read probabilities [W, H] from the lower left corner; NaN is unknown."""
     shade, opaque = _picture(plan.image)
     if plan.mode == "raw":

@@ -25,14 +25,18 @@ from pipelines.session.maps import (
 )
 from pipelines.session.records import Occupancy
 
+# Drones keep a greater distance, and a site of 200 m fits the memory.
 DEFAULT_RESOLUTION_M = 0.2
 
-_BITS = 20  # of a voxel's index along each axis, so that three fit an int64
-_REACH = 1 << (_BITS - 1)  # voxels from the world's origin
+# Three indices of so many bits fit an int64.
+_BITS = 20
+# A voxel's index fits its bits up to this many voxels from the world's origin.
+_REACH = 1 << (_BITS - 1)
 Pose = tuple[Float, Float]
 """Position [3] and quaternion [4] of one frame in another."""
 _UPSIDE_DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # its own inverse; NED to ENU and back
-_SLAB_VALUES = 1 << 22  # values of a turned grid that are sampled at a time
+# So many values of a turned grid are sampled at a time, which bounds the memory.
+_SLAB_VALUES = 1 << 22
 
 
 def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) -> Occupancy:

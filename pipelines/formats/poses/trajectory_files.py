@@ -163,7 +163,8 @@ def describe_trajectory(trajectory: Trajectory) -> dict[str, object]:
 # VINS-Mono and vio_loop.csv of VINS-Fusion have w first; vio.csv is TUM.
 _VINS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 _COLUMNS: tuple[str, ...] = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
-_POSES_AT_ONCE = 10_000  # of a file that is written
+# So many poses are text at a time, which bounds the memory.
+_POSES_AT_ONCE = 10_000
 _HEADING = re.compile(r"[^\s,;\[(]+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?")  # a name, perhaps with its unit
 
 
@@ -348,7 +349,8 @@ TUM_EXPORT = TumExport()
 
 _LAST_ROW = (0.0, 0.0, 0.0, 1.0)  # of a 4 x 4 matrix
 _WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # from x right, y down, z forward
-_ORTHOGONAL = 1e-2  # largest deviation of R R' from the identity that rounding of the numbers explains
+# Rounding of a matrix' numbers explains R R' up to this far from the identity.
+_ORTHOGONAL = 1e-2
 
 
 class KittiFormat:

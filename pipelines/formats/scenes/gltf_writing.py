@@ -26,6 +26,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.people import bones_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
 
+# Viewers interpolate between key frames of this rate without a visible difference.
 _HZ = 30.0
 _JOINT_M, _BONE_M = 0.022, 0.014  # radius of the spheres, half the width of the bars
 _FROM_WORLD = np.array([-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # about x by -90 degrees: z up becomes y up
@@ -33,7 +34,8 @@ _AHEAD = np.array([1.0, 0.0, 0.0, 0.0])  # about x by 180 degrees: z forward and
 _FLOAT, _UINT16 = 5126, 5123
 _ARRAY_BUFFER, _INDEX_BUFFER = 34962, 34963
 _MATERIALS = {"": (0.30, 0.33, 0.36), "left": (0.01, 0.19, 0.46), "right": (0.58, 0.09, 0.01)}  # linear RGB
-_LARGEST = (1 << 32) - (1 << 16)  # bytes: a GLB counts them in 32 bits
+# A GLB counts its bytes in 32 bits.
+_LARGEST = (1 << 32) - (1 << 16)
 
 
 class GlbExport:

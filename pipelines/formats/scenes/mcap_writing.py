@@ -51,6 +51,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.people import bones_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
 
+# Foxglove loads chunks of this size quickly.
 _CHUNK_BYTES = 1 << 20
 _STAMPS = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
 _COMPRESSED_VIDEO = """\
@@ -149,12 +150,16 @@ def _value(store: Typestore, kind: Any, given: Any) -> Any:
 
 
 _TF_HZ, _ELLIPSOIDS_HZ, _PATH_HZ, _STANDING_HZ = 50.0, 10.0, 10.0, 1.0
+# A frustum of this length shows where a camera looks and hides nobody.
 _FRUSTUM_M = 1.0
-_LATEST_NS = (1 << 31) * 10**9  # stamps of ROS count seconds in 31 bits
+# Stamps of ROS count seconds in 31 bits.
+_LATEST_NS = (1 << 31) * 10**9
 _LINE_LIST, _SPHERE, _SPHERE_LIST = 5, 2, 7
 _DELETE_ALL = {"header": {"frame_id": "world"}, "action": 3}
 _COLOURS = {"left": (0.35, 0.72, 0.96), "right": (1.0, 0.62, 0.36), "": (0.87, 0.89, 0.90)}
+# PointField means float32 by this number.
 _FLOAT32 = 7
+# rcl_interfaces/Log means a warning by this number.
 _WARNING = 30
 
 Entry = tuple[int, str, str, Mapping[str, Any]]  # time, topic, type, fields

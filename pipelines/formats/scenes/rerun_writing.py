@@ -38,11 +38,13 @@ from pipelines.session.people import bones_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import need
 
+# A path of this rate looks smooth.
 _PATH_HZ = 10.0
 _JOINT_M, _PICTURE_PLANE_M = 0.025, 1.0
 _COLOURS = {"left": (89, 183, 245), "right": (255, 157, 92), "": (223, 226, 229)}
 _STONE = (150, 146, 140)
-_LAST_WITHOUT_DATE_NS = 10**9 * 10**8  # 1973: smaller stamps count from the start of a log
+# Stamps before 1973 count from the start of a log and not from the epoch.
+_LAST_WITHOUT_DATE_NS = 10**9 * 10**8
 
 
 class RerunExport:

@@ -31,9 +31,12 @@ _CMU_M = 0.0254 / 0.45
 _TALLEST_M, _SMALLEST_M = 2.3, 1.2  # rest poses of adults, from the toes to the top of the head
 AXES = ("y-up", "z-up")
 
+# No body has so many bones, so more is damage.
 _MOST_BONES = 5000
-_LARGEST = 1e9  # of an angle or a place, in the file's unit: more is damage
-_LONGEST_S = 3600  # of a frame
+# No angle or place in a file's unit is larger, so more is damage.
+_LARGEST = 1e9
+# A motion has several frames a minute, so a longer step is damage.
+_LONGEST_S = 3600
 _MOST_STRETCH_M = 0.05
 """Largest movement of a bone against its parent, either way, for which its mean position is used."""
 
@@ -42,7 +45,7 @@ _IN_WORLD = {"y-up": [2, 0, 1], "z-up": [0, 1, 2]}  # indices of the file's axes
 
 
 @dataclass
-class _Bone:
+class _FileBone:
     name: str
     parent: int
     offset: Float  # [3], the file's unit and axes
@@ -52,8 +55,8 @@ class _Bone:
 
 
 @dataclass(frozen=True)
-class _Contents:
-    bones: list[_Bone]
+class _BvhFile:
+    bones: list[_FileBone]
     frame_time_s: float
     values: Float  # [T, C]
 
@@ -114,7 +117,7 @@ class BvhFormat:
         return JointMotion(t_ns, bone_joints(tuple(bone.name for bone in contents.bones)), position[:, None])
 
 
-def _likely_unit(path: Path, bones: list[_Bone], axes: str) -> float:
+def _likely_unit(path: Path, bones: list[_FileBone], axes: str) -> float:
     """Return the length in m of the unit in which the rest pose is as tall as an adult."""
     up = _IN_WORLD[axes][2]
     places = _rest_places(bones)
@@ -183,7 +186,7 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
 # --- from channels to motion ---------------------------------------------------------------------------
 
 
-def _bone_places(bone: _Bone, values: Float) -> tuple[Float, bool]:
+def _bone_places(bone: _FileBone, values: Float) -> tuple[Float, bool]:
     """Return a bone's joint in its parent's frame [T, 3] in the file's unit, and True if it moves there."""
     place = np.tile(bone.offset, (len(values), 1))
     columns = {
@@ -198,7 +201,7 @@ def _bone_places(bone: _Bone, values: Float) -> tuple[Float, bool]:
     return place, bool(np.ptp(place, axis=0).any())
 
 
-def _rotation(bone: _Bone, values: Float) -> Float:
+def _rotation(bone: _FileBone, values: Float) -> Float:
     """Compute parent_from_bone [T, 4] in the file's axes: the product of the channels' turns."""
     total = np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
     for k, channel in enumerate(bone.channels):
@@ -211,7 +214,7 @@ def _rotation(bone: _Bone, values: Float) -> Float:
     return total
 
 
-def _carriers(bones: list[_Bone], moves: list[bool]) -> int:
+def _carriers(bones: list[_FileBone], moves: list[bool]) -> int:
     """Count the bones above the body that only carry it: each has one child, which moves against it."""
     count = 0
     while sum(bone.parent == count for bone in bones) == 1 and bones[count].end is None and moves[count + 1]:
@@ -219,7 +222,7 @@ def _carriers(bones: list[_Bone], moves: list[bool]) -> int:
     return count
 
 
-def _fixed_place(path: Path, bone: _Bone, place: Float) -> Float:
+def _fixed_place(path: Path, bone: _FileBone, place: Float) -> Float:
     middle: Float = place.mean(axis=0)
     stretch_m = float(np.abs(place - middle).max())
     if stretch_m > _MOST_STRETCH_M:
@@ -231,7 +234,7 @@ def _fixed_place(path: Path, bone: _Bone, place: Float) -> Float:
     return place[0] if stretch_m == 0 else middle
 
 
-def _rest_places(bones: list[_Bone]) -> Float:
+def _rest_places(bones: list[_FileBone]) -> Float:
     """Return joints and end sites of the rest pose [N, 3]."""
     places: list[Float] = []
     ends = []
@@ -245,7 +248,7 @@ def _rest_places(bones: list[_Bone]) -> Float:
 # --- from text to channels -----------------------------------------------------------------------------
 
 
-def _read(path: Path) -> _Contents:
+def _read(path: Path) -> _BvhFile:
     text = read_text(path)
     head, marker, tail = text.partition("\nMOTION")
     if not head.lstrip().startswith("HIERARCHY"):
@@ -261,12 +264,12 @@ def _read(path: Path) -> _Contents:
     if not 0 < frame_time_s <= _LONGEST_S:
         raise DataError(path, f"line {first_line + 2}: a frame time of {frame_time_s:g} s", "correct it")
     values = _numbers(path, lines[3], channels, frames, first_line + 3)
-    return _Contents(bones, frame_time_s, values)
+    return _BvhFile(bones, frame_time_s, values)
 
 
-def _bones(path: Path, lines: list[str]) -> list[_Bone]:
+def _bones(path: Path, lines: list[str]) -> list[_FileBone]:
     """Parse the hierarchy, parents first, in the order of the file."""
-    bones: list[_Bone] = []
+    bones: list[_FileBone] = []
     names: set[str] = set()
     open_blocks: list[int | None] = []  # bones, and None for an end site
     coming: int | None = None
@@ -291,7 +294,7 @@ def _bones(path: Path, lines: list[str]) -> list[_Bone]:
                         path, f"has more than {_MOST_BONES} bones", _EXPORT_AGAIN, code="too-large"
                     )
                 names.add(name)
-                bones.append(_Bone(name, -1 if above is None else above, np.zeros(3), [], channels))
+                bones.append(_FileBone(name, -1 if above is None else above, np.zeros(3), [], channels))
                 coming = len(bones) - 1
             elif word == "END" and rest and rest[0].upper() == "SITE":
                 coming, words = None, rest[1:]

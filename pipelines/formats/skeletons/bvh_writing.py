@@ -43,8 +43,10 @@ from pipelines.session.people import take_joints, with_derived
 from pipelines.session.records import JointMotion, Recording, SkeletalMotion
 
 _IN_FILE = {"y-up": [1, 2, 0], "z-up": [0, 1, 2]}  # indices of the world's axes that are the file's x, y, z
-_DECIMALS = 6  # of a degree and of the unit
-_LOCKED = 1e-7  # gimbal lock: cosine of the middle angle below which the outer two share one axis
+# Four decimals of a degree and of a centimetre are below any measurement error.
+_DECIMALS = 6
+# Below this cosine of the middle angle the outer two turn about one axis (gimbal lock).
+_LOCKED = 1e-7
 _AHEAD_UP = (0.5, 0.0, np.sqrt(0.75))
 _AHEAD_DOWN = (np.sqrt(0.75), 0.0, -0.5)
 _LEFT, _RIGHT, _DOWN, _UP, _HERE = (0, 1, 0), (0, -1, 0), (0, 0, -1), (0, 0, 1), (0, 0, 0)
@@ -161,7 +163,7 @@ def _numbers(values: Float) -> str:
 
 
 @dataclass(frozen=True)
-class _Bone:
+class _RigBone:
     """Bone as files name it, with its first joint, and that joint's direction at rest from its parent's."""
 
     name: str
@@ -170,32 +172,32 @@ class _Bone:
     rest: tuple[float, float, float]
 
 
-def _arm(side: str, out: tuple[float, float, float]) -> tuple[_Bone, ...]:
+def _arm(side: str, out: tuple[float, float, float]) -> tuple[_RigBone, ...]:
     word = side.capitalize()
     return (
-        _Bone(f"{word}Shoulder", "Spine", "neck", _UP),
-        _Bone(f"{word}Arm", f"{word}Shoulder", f"{side}_shoulder", out),
-        _Bone(f"{word}ForeArm", f"{word}Arm", f"{side}_elbow", out),
-        _Bone(f"{word}Hand", f"{word}ForeArm", f"{side}_wrist", out),
+        _RigBone(f"{word}Shoulder", "Spine", "neck", _UP),
+        _RigBone(f"{word}Arm", f"{word}Shoulder", f"{side}_shoulder", out),
+        _RigBone(f"{word}ForeArm", f"{word}Arm", f"{side}_elbow", out),
+        _RigBone(f"{word}Hand", f"{word}ForeArm", f"{side}_wrist", out),
     )
 
 
-def _leg(side: str, out: tuple[float, float, float]) -> tuple[_Bone, ...]:
+def _leg(side: str, out: tuple[float, float, float]) -> tuple[_RigBone, ...]:
     word = side.capitalize()
     return (
-        _Bone(f"{word}UpLeg", "Hips", f"{side}_hip", out),
-        _Bone(f"{word}Leg", f"{word}UpLeg", f"{side}_knee", _DOWN),
-        _Bone(f"{word}Foot", f"{word}Leg", f"{side}_ankle", _DOWN),
-        _Bone(f"{word}ToeBase", f"{word}Foot", f"{side}_big_toe", _AHEAD_DOWN),
+        _RigBone(f"{word}UpLeg", "Hips", f"{side}_hip", out),
+        _RigBone(f"{word}Leg", f"{word}UpLeg", f"{side}_knee", _DOWN),
+        _RigBone(f"{word}Foot", f"{word}Leg", f"{side}_ankle", _DOWN),
+        _RigBone(f"{word}ToeBase", f"{word}Foot", f"{side}_big_toe", _AHEAD_DOWN),
     )
 
 
 _TRUNK = (
-    _Bone("Hips", None, "hip", _HERE),
-    _Bone("Spine", "Hips", "hip", _HERE),
-    _Bone("Neck", "Spine", "neck", _UP),
+    _RigBone("Hips", None, "hip", _HERE),
+    _RigBone("Spine", "Hips", "hip", _HERE),
+    _RigBone("Neck", "Spine", "neck", _UP),
 )
-_HEADS = (_Bone("Head", "Neck", "head", _UP), _Bone("Head", "Neck", "nose", _AHEAD_UP))
+_HEADS = (_RigBone("Head", "Neck", "head", _UP), _RigBone("Head", "Neck", "nose", _AHEAD_UP))
 _LIMBS = (*_arm("left", _LEFT), *_arm("right", _RIGHT), *_leg("left", _LEFT), *_leg("right", _RIGHT))
 
 
@@ -242,11 +244,11 @@ def fit_rig(source: str, motion: JointMotion, person: int) -> Rigged:
     return Rigged(skeletal, tuple(bone.joint for bone in bones), int(seen[0]), int(without_hips.sum()), *held)
 
 
-def _bones(place: dict[str, Float]) -> tuple[list[_Bone], list[float]]:
+def _bones(place: dict[str, Float]) -> tuple[list[_RigBone], list[float]]:
     """Choose the bones with known joints, parents first; return median distances from the parents' joints."""
     head = next((bone for bone in _HEADS if bone.joint in place), None)
     candidates = [*_TRUNK, *([head] if head else []), *_LIMBS]  # in the order in which files have them
-    kept: dict[str, _Bone] = {}
+    kept: dict[str, _RigBone] = {}
     lengths = []
     for bone in candidates:
         parent = kept.get(bone.parent or "")
@@ -263,7 +265,7 @@ def _bones(place: dict[str, Float]) -> tuple[list[_Bone], list[float]]:
 
 
 def _turns(
-    bones: list[_Bone], parent: tuple[int, ...], place: dict[str, Float]
+    bones: list[_RigBone], parent: tuple[int, ...], place: dict[str, Float]
 ) -> tuple[Float, tuple[int, int]]:
     """Compute parent_from_bone [T, B, 4]; also count the rotations that are held, and all rotations."""
     frames = len(place["hip"])

@@ -38,12 +38,18 @@ from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import need
 from pipelines.session.storage import as_data_error
 
+# A C3D is divided into blocks of this many bytes.
 _BLOCK = 512
-_MAGIC = 0x50  # the second byte of every C3D
+# This is the second byte of every C3D.
+_MAGIC = 0x50
 _DEC, _MIPS = 85, 86  # processor types, which determine the storage of numbers
-_LONGEST_LABEL = 30  # characters that laboratory programs show
-_LONGEST_TEXT = 255  # bytes
+# Laboratory programs show so many characters.
+_LONGEST_LABEL = 30
+# A text's length takes one byte in a C3D.
+_LONGEST_TEXT = 255
+# Residuals are stored in one byte of the scale.
 _MOST_RESIDUAL = 255
+# A larger number of the first frame is damage of the header.
 _MOST_FIRST_FRAME = 1_000_000_000
 _SCREEN_UP = {"+Z": "z-up", "+Y": "y-up"}
 _EXPORT_AGAIN = "export it again"

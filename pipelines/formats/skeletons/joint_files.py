@@ -36,10 +36,14 @@ if TYPE_CHECKING:
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 AXES = ("z-up", "y-up")
-_KEPT_NS = 500_000  # a sample this near to its frame keeps its position: 1 mm of a hand at 2 m/s
-_LONGEST_STEP = 1.5  # in frame steps: nothing is interpolated between times further apart
+# A hand at 2 m/s moves by 1 mm in this time, so a sample so near keeps its position.
+_KEPT_NS = 500_000
+# Between times further apart than this, in frame steps, nothing is interpolated.
+_LONGEST_STEP = 1.5
+# More frames would exhaust the memory.
 _MOST_FRAMES = 10_000_000
-_MOST_EMPTY = 100  # frames per sample
+# More frames for a sample mean stamps that keep no rate.
+_MOST_EMPTY = 100
 _UNITS = {
     "m": "m",
     "meters": "m",
@@ -262,8 +266,10 @@ def bone_joints(bones: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(named.get(bone, bone) for bone in bones)
 
 
-_TIMES_AT_ONCE = 1000  # of a table that is written
-_MOST_CELLS_PER_ROW = 100  # dense cells per row above which a file is refused as scattered
+# So many times of a table are text at once, which bounds the memory.
+_TIMES_AT_ONCE = 1000
+# More dense cells for a row mean scattered times or names and exhaust the memory.
+_MOST_CELLS_PER_ROW = 100
 
 
 class JointsCsvFormat:

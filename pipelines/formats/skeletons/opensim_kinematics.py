@@ -72,17 +72,23 @@ MODELS = PackagedModels(
     ),
 )
 
-_LEAST_MARKERS = 8  # of a frame: fewer leave limbs of the model where they were
+# Fewer markers in a frame leave limbs of the model where they were.
+_LEAST_MARKERS = 8
 _WEIGHTS = (
     0.01,
     100.0,
 )  # of a marker by its covariance, against the median marker: no marker is all or nothing
-_ACCURACY = 1e-5  # of the solver, Pose2Sim's
+# Pose2Sim solves to this accuracy, too.
+_ACCURACY = 1e-5
 _ARMS = tuple(f"{name}_{side}" for side in "rl" for name in ("arm_flex", "arm_add", "arm_rot", "elbow_flex"))
-_FIRST_BEND = 0.6  # rad, of the elbows, where the solver begins
-_STRAIGHT = np.radians(1.0)  # from the end of an elbow's range
-_CLEARLY_LESS = 0.9  # of the squared errors of markers: equal fits differ by less
-_BENT_ENOUGH = 1.0  # rad: more of one elbow makes up for nothing of the other
+# Elbows begin bent by this angle (rad), because a straight one cannot choose its side.
+_FIRST_BEND = 0.6
+# An elbow nearer to the end of its range counts as straight.
+_STRAIGHT = np.radians(1.0)
+# Squared errors of equal fits differ by less.
+_CLEARLY_LESS = 0.9
+# More bend (rad) of one elbow must not make up for a straight other one.
+_BENT_ENOUGH = 1.0
 
 
 @dataclass(frozen=True)
@@ -384,7 +390,8 @@ def _written(model: Path, found: Kinematics, zero_ns: int) -> list[Path]:
 EXPORT = OpenSimExport()
 
 
-_DECIMALS = 6  # of a degree or a metre
+# Six decimals of a degree and of a metre are below any measurement error.
+_DECIMALS = 6
 
 
 class AnglesExport:

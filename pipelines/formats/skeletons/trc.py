@@ -30,12 +30,14 @@ from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
 
-_DECIMALS = 7  # of a metre: far below any measurement error, and rows stay readable
-_FRAMES_AT_ONCE = 1000  # of a file that is written
+# Seven decimals of a metre are below any measurement error, and rows stay readable.
+_DECIMALS = 7
+# So many frames are text at a time, which bounds the memory.
+_FRAMES_AT_ONCE = 1000
 
 
 @dataclass(frozen=True)
-class _Header:
+class _TrcHeader:
     keys: dict[str, str]
     markers: tuple[str, ...]
 
@@ -80,7 +82,7 @@ class TrcFormat:
         return JointMotion(t_ns=t_ns, joints=joint_names(header.markers), position=position[:, None])
 
 
-def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
+def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
     """Return the header, the lines below it, and the line number of the first of those in the file."""
     lines = text.split("\n")
     if len(lines) < 5 or not lines[0].startswith("PathFileType") or not re.match(r"Frame\s*#", lines[3]):
@@ -102,7 +104,7 @@ def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
             path, f"names the marker {twice[0]} more than once", "rename one", code="stated-twice"
         )
     keys = zip(lines[1].split("\t"), lines[2].split("\t"), strict=False)
-    return _Header({key.strip(): value.strip() for key, value in keys}, markers), lines[5:], 6
+    return _TrcHeader({key.strip(): value.strip() for key, value in keys}, markers), lines[5:], 6
 
 
 def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tuple[list[str], Float]:

@@ -21,8 +21,11 @@ from pipelines.session.records import Telemetry, VideoIndex
 from pipelines.session.registries import TelemetryChoice
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
-_HEAD = 512 * 1024  # bytes in which cameras write XMP
+# Cameras write XMP into the first part of a file of this size.
+_HEAD = 512 * 1024
+# EXIF counts whole seconds.
 _SECOND_NS = 1_000_000_000
+# Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _TAG = re.compile(rb"(?<![\w/-])drone(?:-(?:dji|parrot|skydio))?:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
 _SKYDIO = re.compile(
@@ -164,7 +167,8 @@ def _from_gps(gps: Mapping[int, Any]) -> dict[str, float]:
     return values
 
 
-_MOST_PIXELS = 1 << 27  # as of videos
+# A larger size in a header is damage and would exhaust the memory, as in videos.
+_MOST_PIXELS = 1 << 27
 UNTIMED = "pictures without times"
 """Codec of an index whose stamps only count the pictures, because EXIF has no times or they do not rise."""
 SHARED_SECONDS = "pictures of whole seconds"
@@ -286,6 +290,7 @@ def _silence() -> Iterator[None]:
 PICTURES = PictureFolder()
 
 
+# DJI marks a position by RTK with a fix by this number.
 _RTK_FIXED = 50
 SHARED = "several of its pictures share a second: they are spread evenly over it: let clock.sigma_s be 1"
 

@@ -32,14 +32,20 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.stream import VideoStream
 
-_SHORTEST_S = 1e-5  # of a frame: the fastest cameras take 100,000 in a second
-_LATEST_S = 4 * 10**9  # the year 2096, counted from the epoch; int64 ns hold 292 years
+# The fastest cameras take 100,000 frames in a second.
+_SHORTEST_S = 1e-5
+# Frames after the year 2096 are damage, and int64 ns hold 292 years.
+_LATEST_S = 4 * 10**9
+# Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 # MP4 counts from 1904 and a clock that was never set from 1970: such dates are none.
 _NO_DATE_BEFORE = timedelta(days=365)
-_MOST_KEY_FRAMES = 3  # seeks that are tried before a frame counts as undecodable
-_MOST_PIXELS = 1 << 27  # 16384 x 8192; a larger size in a header is damage and would exhaust the memory
-_BLACK = 16  # brightness, of 255
+# A frame that no seek to one of so many key frames gives counts as undecodable.
+_MOST_KEY_FRAMES = 3
+# A larger size in a header is damage and would exhaust the memory.
+_MOST_PIXELS = 1 << 27
+# A codec's noise stays below this brightness (of 255) in black bars.
+_BLACK = 16
 _EYE_BGR = (0.114, 0.587, 0.299)  # weights of the channels in brightness (ITU-R BT.601)
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 _PACKET_TS, _PACKET_M2TS = 188, 192
@@ -336,7 +342,7 @@ class _Scan:
     dropped: dict[str, int]
 
 
-class _Packet(NamedTuple):
+class _CodedFrame(NamedTuple):
     """Coded frame as it is stored."""
 
     position: int | None  # in the file
@@ -350,7 +356,7 @@ def _scan(path: Path) -> _Scan:
     with container:
         size = path.stat().st_size
         stored = [
-            _Packet(packet.pos, packet.pts, packet.is_keyframe)
+            _CodedFrame(packet.pos, packet.pts, packet.is_keyframe)
             for packet in packets(container, stream)
             if not packet.is_discard and is_shown(packet, stream.codec_context.codec.canonical_name)
         ]
@@ -619,9 +625,13 @@ def _is_shown_vp9(first: int) -> bool:
 FORMAT = VideoContainer()
 
 
-_WIDTH_PX = 320  # width to which pictures are reduced: motion is still visible
+# Motion is still visible in pictures reduced to this width.
+_WIDTH_PX = 320
+# Corners are lost and found again after a fifth of a second.
 _STRETCH_NS = 200_000_000
+# So many corners measure a turn well, and more cost time.
 _CORNERS = 100
+# Fewer corners may all lie on one thing that moves.
 _LEAST_CORNERS = 12
 _CORNER_QUALITY, _CORNERS_APART_PX = 0.01, 8
 
