@@ -1,14 +1,32 @@
 """The `mocap` command: its group, and the only place that turns errors into a line and an exit status."""
 
+import errno
 import os
+import signal
 import sys
-from importlib import import_module
 from typing import Any
 
-import click
+_INTERRUPTED = 130  # the exit status that shells expect after Ctrl-C
+_CONTINUES = "mocap: interrupted; nothing is lost, the same command continues"
 
-from mocap_cli.terminal import one_line, say
-from pipelines.session.errors import MocapError
+
+def _leave_at_once(*_: object) -> None:
+    """Leave with one line. Many imports turn a KeyboardInterrupt into an error of their own."""
+    if sys.stderr is not None:
+        os.write(2, f"{_CONTINUES}\n".encode())
+    os._exit(_INTERRUPTED)
+
+
+_is_script = os.path.basename(sys.argv[0]) == "mocap"  # noqa: PTH119  # pathlib takes a while to import
+if _is_script and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, _leave_at_once)  # until the command is loaded
+
+from importlib import import_module  # noqa: E402
+
+import click  # noqa: E402
+
+from mocap_cli.terminal import one_line, say  # noqa: E402
+from pipelines.session.errors import DataError, MocapError  # noqa: E402
 
 COMMANDS = (
     *("init", "ingest", "check", "reconstruct", "replan-compare", "report"),
@@ -21,7 +39,6 @@ _GONE = {
     "ablate": "`mocap study tilt_deg=0:60:15`, robots=... or noise=...",
     "replan-sweep": "`mocap study range_m=8,10 SESSION`",
 }
-_INTERRUPTED = 130  # the exit status that shells expect after Ctrl-C
 
 
 class Mocap(click.Group):
@@ -40,8 +57,34 @@ class Mocap(click.Group):
             # Patterns of the shell expand to file names, which may hold any character.
             raise click.UsageError(one_line(error.format_message()), error.ctx) from None
         except KeyboardInterrupt:
-            say("mocap: interrupted; nothing is lost, the same command continues", err=True)
+            say(_CONTINUES, err=True)
             ctx.exit(_INTERRUPTED)
+        except (MemoryError, ImportError, RuntimeError, SystemError, OSError) as error:
+            if not _is_short_of_memory(error):
+                raise
+            print_error(OUT_OF_MEMORY)
+            ctx.exit(1)
+
+
+OUT_OF_MEMORY = DataError(
+    "this machine",
+    "has too little memory left for the command",
+    "end other programs, raise the limit (`ulimit -v`), or state fewer --workers",
+    code="out-of-memory",
+)
+
+# Libraries report memory that they do not get in these words, as errors of several kinds.
+_SHORT_OF_MEMORY = (
+    *("annot allocate memory", "failed to map segment", "start new thread", "std::bad_alloc"),
+    *("load shared object file", "error return without exception set"),
+)
+
+
+def _is_short_of_memory(error: BaseException) -> bool:
+    """Return True if an error says that there is no memory left."""
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+        return True
+    return any(words in str(error) for words in _SHORT_OF_MEMORY)
 
 
 def print_error(error: MocapError) -> None:
@@ -63,6 +106,8 @@ class _Lazy(Mocap):
         for name in (cmd_name,) if cmd_name in COMMANDS else COMMANDS:
             module = name.replace("-", "_")
             self.add_command(getattr(import_module(f"mocap_cli.{module}"), f"{module}_command"))
+        if signal.getsignal(signal.SIGINT) is _leave_at_once:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         return super().get_command(ctx, cmd_name)
 
 
@@ -79,6 +124,7 @@ def mocap() -> None:
 
 def run() -> None:
     """Run the `mocap` script (its entry point)."""
+    _open_closed_streams()
     try:
         mocap()
     except BrokenPipeError:
@@ -87,6 +133,19 @@ def run() -> None:
     except OSError as error:
         say(f"mocap: cannot write its output ({error.strerror}); nothing else is lost", err=True)
         _leave_stdout()
+
+
+def _open_closed_streams() -> None:
+    """Open what the shell has closed (`2>&-`), or the next file that is opened would get what is printed."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123
 
 
 def _leave_stdout() -> None:

@@ -15,6 +15,7 @@ from mocap_cli.options import (
     FiniteRange,
     RenamedOptions,
     Shown,
+    any_path,
     force_option,
     grouped,
     output_options,
@@ -140,7 +141,14 @@ _settings_options = grouped(
 @click.command(
     "reconstruct", cls=RenamedOptions, gone=GONE, short_help="Detect, triangulate, measure the errors."
 )
-@each("session", "SESSION")
+@each("session", "SESSION", ".session")
+@click.option(
+    "-o",
+    "--output",
+    type=any_path,
+    metavar="FOLDER",
+    help="Work on a copy of the session there [default: in the session]; videos stay where they are.",
+)
 @_settings_options
 @click.option(
     "--workers",
@@ -155,6 +163,7 @@ _settings_options = grouped(
 @output_options
 def reconstruct_command(
     session: Path,
+    output: Path | None,
     settings: Settings,
     strict: bool,
     workers: int,
@@ -166,9 +175,12 @@ def reconstruct_command(
     from pipelines.precompile import precompile_for
     from pipelines.reconstruct import reconstruct
     from pipelines.session.parallel import connected
-    from pipelines.session.stages import open_session
+    from pipelines.session.stages import copy_session, refuse_no_session
 
-    open_session(session)  # a wrong session is refused before anything is compiled
+    refuse_no_session(session)  # a wrong session is refused before anything is compiled
+    if output is not None:
+        copy_session(session, output)
+        session = output
     with watching(shown.level) as progress, ExitStack() as stack:
         client = stack.enter_context(connected(scheduler, progress)) if scheduler else None
         precompile_for("reconstruct", progress)

@@ -110,10 +110,10 @@ def replan_compare_command(
     """
     from pipelines.precompile import precompile_for
     from pipelines.replan import refuse_name, replan
-    from pipelines.session.stages import open_session
+    from pipelines.session.stages import refuse_no_session
 
     refuse_name(name)
-    open_session(session)  # a wrong session is refused before anything is compiled
+    refuse_no_session(session)  # a wrong session is refused before anything is compiled
     with watching(shown.level) as progress:
         precompile_for("replan", progress)
         result = replan(session, settings, name=name, force=force, progress=progress)

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     "-o",
     "--output",
     type=any_path,
-    help="Page that compares the sessions [default: comparison/index.html beside the first].",
+    help="Page that compares the sessions [default: comparison/index.html beside the first]; of one session,"
+    " its page, and the session is only read.",
 )
 @click.option(
     "--study",
@@ -76,8 +77,6 @@ def report_command(
     from pipelines.session.urls import session_here
 
     ones = expanded(sessions)
-    if output is not None and len(ones) < 2:
-        raise click.UsageError("--output is the page that compares sessions: state two or more.")
     compared = drawn = None
     results = []
     failed: dict[str, str] = {}
@@ -87,7 +86,10 @@ def report_command(
         progress.start("Writing pages", len(ones) + (len(ones) > 1) + (figures is not None))
         for session in ones:
             try:
-                results.append(report(session, studies=studies, video=video, force=force))
+                own = output if len(ones) == 1 else None
+                results.append(
+                    report(session, own, studies=studies, video=video, force=force, overwrite=overwrite)
+                )
             except MocapError as error:
                 if len(ones) == 1:
                     raise

@@ -63,7 +63,9 @@ def _here(stack: ExitStack, argument: str, suffix: str, options: dict[str, Any])
             )
         if argument == "session" or (argument == "path" and holds_session(url)):
             own[argument] = stack.enter_context(session_here(place))
-            if suffix and output is None:  # beside the session is nowhere: into the working directory
+            if (
+                suffix == ".export" and output is None
+            ):  # beside the session is nowhere: into the working directory
                 own["output"] = Path(place.name).with_suffix(suffix)
         else:
             own[argument] = fetched(url, fresh=True)

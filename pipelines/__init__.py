@@ -11,7 +11,7 @@ stores what comes back. Everything here can be called from a notebook; nothing h
 import os as _os
 import zlib as _zlib  # noqa: F401
 
-# Sums over several threads depend on the number of threads, and small matrices are faster on one. Callers
-# distribute the work themselves. Values that the user has set are kept.
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    _os.environ.setdefault(_name, "1")
+# Sums over several threads differ in their last bits with the number of threads, and the same settings must
+# give the same bytes. So linear algebra has one thread, whatever the user has set. Callers share out work.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
+    _os.environ[_name] = "1"

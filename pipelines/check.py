@@ -7,7 +7,6 @@ A long flight is checked in the segments in which it would be reconstructed: a d
 of them have it, and a warning otherwise.
 """
 
-import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,11 +23,11 @@ from pipelines.reconstruction.loading import common_joints, load_cameras, load_t
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.segments import divided, doubts_of_flight
 from pipelines.session.description import Description, Doubt, read_description
-from pipelines.session.errors import DataError, NoViewsError
+from pipelines.session.errors import NoViewsError
 from pipelines.session.memory import return_freed_arrays, return_unused
 from pipelines.session.people import logged_people
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.stages import StageRecord, WritableSession, locked
+from pipelines.session.stages import Session, StageRecord, WritableSession, copy_session, locked, open_session
 from pipelines.session.tables import Span
 
 LOOK_S = 8.0
@@ -67,65 +66,53 @@ def check(
 
     Raises:
         DataError: the flight cannot be read, or nobody is seen.
-        BusyError: another process writes the session.
     """
     progress = progress or Silent()
     return_freed_arrays()
-    if path.is_dir():
-        if _has_keypoints(path):
-            return _checked(path, pose_noise, detector, workers, progress)
-        # Beside the session, so that its relative paths to videos lead there from the copy, too.
-        with tempfile.TemporaryDirectory(prefix=".mocap-check-", dir=path.resolve().parent) as folder:
-            shutil.copytree(path, folder, dirs_exist_ok=True)
-            return _checked(Path(folder), pose_noise, detector, workers, progress)
     with tempfile.TemporaryDirectory(prefix="mocap-check-") as folder:
-        session = Path(folder) / "check.session"
-        ingest(path, session, progress=progress)
-        return _checked(session, pose_noise, detector, workers, progress)
-
-
-def _has_keypoints(folder: Path) -> bool:
-    """Return True if nothing has to be detected."""
-    with locked(folder) as session:
-        return (
-            session.intact_record("ingest") is None
-            or not cameras_to_detect(read_description(folder))
-            or session.intact_record(DETECT.name) is not None
-        )
+        copy = Path(folder) / "check.session"
+        if path.is_dir():
+            session = open_session(path)
+            session.ingested()
+            looked_at = session.intact_record(DETECT.name) is not None
+            if looked_at or not cameras_to_detect(read_description(path)):
+                return _checked(session, pose_noise, detector, workers, progress)
+            copy_session(path, copy)
+        else:
+            ingest(path, copy, progress=progress)
+        with locked(copy) as writable:
+            return _checked(writable, pose_noise, detector, workers, progress)
 
 
 def _checked(
-    folder: Path, pose_noise: str | None, detector: str, workers: int, progress: Progress
+    session: Session, pose_noise: str | None, detector: str, workers: int, progress: Progress
 ) -> Checked:
-    with locked(folder) as session:
-        if session.intact_record("ingest") is None:
-            raise DataError(
-                folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
-            )
-        description = read_description(folder)
-        detected, pictures = _detected(session, description, detector, workers, progress)
-        _, t_ns = load_time_base(folder, description, detected, None)
-        keypoints = len(description.cameras) * len(common_joints(folder, description, detected))
-        segments = divided(t_ns, keypoints)
-        looked_at = partial(_doubts, session, description, detected, pose_noise)
-        if len(segments) < 2:
-            return Checked(looked_at(None), list(description.warnings), pictures)
-        found = []
-        for segment in segments:
-            try:
-                found.append(looked_at(segment.span_ns))
-            except NoViewsError as error:  # too few cameras have pictures there
-                nothing = error
-            return_unused()
-        if not found:
-            raise nothing
-        often, seldom = doubts_of_flight([[doubt.as_json() for doubt in doubts] for doubts in found])
-        warnings = [f"{count} of {len(found)} segments: {doubt.as_warning()}" for doubt, count, _ in seldom]
+    session.ingested()
+    folder = session.folder
+    description = read_description(folder)
+    detected, pictures = _detected(session, description, detector, workers, progress)
+    _, t_ns = load_time_base(folder, description, detected, None)
+    keypoints = len(description.cameras) * len(common_joints(folder, description, detected))
+    segments = divided(t_ns, keypoints)
+    looked_at = partial(_doubts, session, description, detected, pose_noise)
+    if len(segments) < 2:
+        return Checked(looked_at(None), list(description.warnings), pictures)
+    found = []
+    for segment in segments:
+        try:
+            found.append(looked_at(segment.span_ns))
+        except NoViewsError as error:  # too few cameras have pictures there
+            nothing = error
+        return_unused()
+    if not found:
+        raise nothing
+    often, seldom = doubts_of_flight([[doubt.as_json() for doubt in doubts] for doubts in found])
+    warnings = [f"{count} of {len(found)} segments: {doubt.as_warning()}" for doubt, count, _ in seldom]
     return Checked(often, [*description.warnings, *warnings], pictures)
 
 
 def _doubts(
-    session: WritableSession,
+    session: Session,
     description: Description,
     detected: StageRecord | None,
     pose_noise: str | None,
@@ -153,7 +140,7 @@ def _doubts(
     )
 
 
-def _followed(session: WritableSession, cameras: Sequence[Camera]) -> dict[str, Followed]:
+def _followed(session: Session, cameras: Sequence[Camera]) -> dict[str, Followed]:
     """Load the backgrounds that the session has."""
     if session.intact_record(BACKGROUND.name) is None:
         return {}
@@ -162,7 +149,7 @@ def _followed(session: WritableSession, cameras: Sequence[Camera]) -> dict[str, 
 
 
 def _detected(
-    session: WritableSession, description: Description, detector: str, workers: int, progress: Progress
+    session: Session, description: Description, detector: str, workers: int, progress: Progress
 ) -> tuple[StageRecord | None, str]:
     """Return the detection that the session has, else one of a few seconds; and its pictures in words."""
     if not cameras_to_detect(description):
@@ -170,6 +157,8 @@ def _detected(
     known = session.intact_record(DETECT.name)
     if known is not None:
         return known, ""
+    if not isinstance(session, WritableSession):
+        raise TypeError("pictures are looked at in a copy of the session")
     frames = [entry.frames for entry in description.cameras.values()]
     first, last = max(each.first_t_ns for each in frames), min(each.last_t_ns for each in frames)
     middle_s = ((first + last) / 2 - description.start_ns) / 1e9

@@ -144,11 +144,7 @@ def detect(
         "start_s": start_s,
         "end_s": end_s,
     }
-    ingested = session.intact_record("ingest")
-    if ingested is None:
-        raise DataError(
-            session.folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
-        )
+    ingested = session.ingested()
     work = _Work(session.folder, description, every, (start_s, end_s))
     looked_at = _looked_at(work, chosen, media)
     kept = None if force else _kept(session, settings, looked_at)

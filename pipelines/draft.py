@@ -64,7 +64,7 @@ from pipelines.session.registries import (
     TrajectoryFormat,
     VideoFormat,
 )
-from pipelines.session.storage import as_data_error
+from pipelines.session.storage import as_data_error, drop_link
 from pipelines.session.unknown_files import EXPECTED, describe_unknown
 
 # Coordinates beyond it are those of a map projection, m.
@@ -192,6 +192,7 @@ def _stated(path: Path, folder: Path) -> str:
 def _write(target: Path, text: str) -> str:
     """Write the manifest completely or not at all; return the problem if it is not valid, else ''."""
     temporary = target.with_name(f"{target.name}.new")
+    drop_link(temporary)
     problem = ""
     try:
         temporary.write_text(text, encoding="utf-8", newline="\n")

@@ -212,8 +212,8 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
     """
     session = open_session(folder)
     description = read_description(folder)
-    for stage in ("ingest", "detect"):
-        session.intact_record(stage)
+    session.ingested()
+    session.intact_record("detect")
     record = session.intact_record("reconstruct")
     table = folder / "reconstruct" / "skeleton.parquet"
     motion = None if record is None else read_motion(table, SKELETON)

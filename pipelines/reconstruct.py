@@ -93,11 +93,7 @@ def reconstruct(
     _check_fill(settings.fill_s)
     return_freed_arrays()
     with locked(folder) as session:
-        ingested = session.intact_record("ingest")
-        if ingested is None:
-            raise DataError(
-                folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
-            )
+        ingested = session.ingested()
         description = read_description(folder)
         settings = replace(settings, people=settings.people or ("auto" if description.actors else 1))
         following, left_out = _following(session, description, settings, force)

@@ -245,11 +245,7 @@ def inputs_of(session: WritableSession) -> tuple[Description, StageRecord | None
 
     If the errors of the session's own detector were measured, the arms are scored with those.
     """
-    ingested = session.intact_record("ingest")
-    if ingested is None:
-        raise DataError(
-            session.folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
-        )
+    ingested = session.ingested()
     description = read_description(session.folder)
     inputs = dict(ingested.outputs)
     needs_it = description.actor is None or not description.has_true_joints

@@ -17,7 +17,7 @@ from pipelines.geometry.arrays import Int64, Picture
 from pipelines.planning.loading import load_flight
 from pipelines.planning.scene import hidden_shares
 from pipelines.reporting.chart import MARK, refuse_foreign, write_figures
-from pipelines.reporting.comparison_page import GENERATOR, draw_comparison, render_comparison
+from pipelines.reporting.comparison_page import draw_comparison, render_comparison
 from pipelines.reporting.content import (
     ReplanContent,
     SessionContent,
@@ -43,6 +43,7 @@ from pipelines.session.stages import (
     outdated,
     session_name,
     versions_of,
+    was_interrupted,
 )
 from pipelines.session.storage import (
     STUDY_MARK,
@@ -50,6 +51,7 @@ from pipelines.session.storage import (
     hash_of,
     is_made,
     read_json,
+    refuse_special,
     sha256_of,
     whole_folder,
     write_whole,
@@ -79,7 +81,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-REPORT = Stage("report", revision=14)
+REPORT = Stage("report", revision=15)
 _FIGURES_REVISION = 7
 
 
@@ -93,45 +95,78 @@ class Reported:
 
 
 def report(
-    folder: Path, *, studies: Sequence[Path] = (), video: Video = "small", force: bool = False
+    folder: Path,
+    output: Path | None = None,
+    *,
+    studies: Sequence[Path] = (),
+    video: Video = "small",
+    force: bool = False,
+    overwrite: bool = False,
 ) -> Reported:
-    """Write report/index.html of a session.
+    """Write report/index.html of a session, or its page elsewhere. Nothing is written where nothing changed.
 
     Args:
+        output: a file instead; the session is only read.
         studies: folders of `mocap study` that the page shows as well.
         video: the pictures beside the 3D view.
+        force: write it again even if nothing changed.
+        overwrite: replace a file that lies at `output` and is no page of mocap.
 
     Raises:
         DataError: not a session, or damaged; a table of it, or pictures, were changed; a folder that holds no
-            study.
+            study; the page cannot be written.
         BusyError: another process writes the session.
     """
     studied = [read_study(study) for study in studies]
     return_freed_arrays()
+    if output is not None:
+        page = _Page(open_session(folder), studied, video)
+        _refuse_foreign(output, overwrite)
+        html, warnings = page.render()
+        return Reported(output, skipped=not _write_if_changed(output, html), warnings=warnings)
+    place = folder / "report" / "index.html"
+    if not force and not was_interrupted(folder):
+        page = _Page(open_session(folder), studied, video)
+        if (done := page.session.finished(REPORT, page.settings, page.inputs)) is not None:
+            return Reported(place, skipped=True, warnings=done.warnings)
     with locked(folder) as session:
-        records = _finished_stages(session)
-        inputs = {name: digest for record in records.values() for name, digest in record.outputs.items()}
+        page = _Page(session, studied, video)
+        run = session.begin(REPORT, settings=page.settings, inputs=page.inputs, force=force)
+        if run.finished:
+            return Reported(place, skipped=True, warnings=run.record.warnings)
+        html, warnings = page.render()
+        (run.folder / "index.html").write_text(html, encoding="utf-8")
+        record = run.publish(counts={}, warnings=warnings)
+    return Reported(place, skipped=False, warnings=record.warnings)
+
+
+class _Page:
+    """The page of a session, and what it depends on."""
+
+    def __init__(self, session: Session, studied: Sequence[StudyContent], video: Video) -> None:
+        self.session, self._studied, self._video = session, tuple(studied), video
+        folder = session.folder
+        self._records = _finished_stages(session)
+        self.inputs = {name: it for record in self._records.values() for name, it in record.outputs.items()}
         # The settings of the stages are shown: their keys cover them.
-        inputs |= {f"key of {name}": record.key for name, record in records.items()}
-        description = read_description(folder)
-        _refuse_changed_pictures(folder, description)
-        settings = {
+        self.inputs |= {f"key of {name}": record.key for name, record in self._records.items()}
+        self._description = read_description(folder)
+        _refuse_changed_pictures(folder, self._description)
+        self.settings: dict[str, object] = {
             "name": session_name(folder),
-            "pictures": _pictures_there(folder, description),
+            "pictures": _pictures_there(folder, self._description),
             "studies": _named(studied),
             "video": video,
         }
-        run = session.begin(REPORT, settings=settings, inputs=inputs, force=force)
-        page = folder / "report" / "index.html"
-        if run.finished:
-            return Reported(page, skipped=True, warnings=run.record.warnings)
+
+    def render(self) -> tuple[str, list[str]]:
+        """Return the page and warnings."""
+        folder = self.session.folder
         with ExitStack() as stack:
-            pictures, warnings = _open_pictures(folder, description, stack)
-            content = replace(_load(folder, description, records), studies=tuple(studied))
-            html = render_page(content, read_frame=partial(_read_frame, pictures), video=video)
-        (run.folder / "index.html").write_text(html, encoding="utf-8")
-        record = run.publish(counts={}, warnings=warnings)
-    return Reported(page, skipped=False, warnings=record.warnings)
+            pictures, warnings = _open_pictures(folder, self._description, stack)
+            content = replace(_load(folder, self._description, self._records), studies=self._studied)
+            html = render_page(content, read_frame=partial(_read_frame, pictures), video=self._video)
+        return html, warnings
 
 
 def compare_sessions(
@@ -156,16 +191,20 @@ def compare_sessions(
     contents = {label: content_of(folder) for label, folder in zip(_labels(resolved), folders, strict=True)}
     page = output or resolved[0].parent / "comparison" / "index.html"
     html, _ = render_comparison(contents)
+    _refuse_foreign(page, overwrite)
+    return Reported(page, skipped=not _write_if_changed(page, html))
+
+
+def _write_if_changed(page: Path, html: str) -> bool:
+    """Write a page; return False if it is there already."""
     try:
-        if not overwrite:
-            _refuse_foreign(page)
         if page.is_file() and page.read_bytes() == html.encode():
-            return Reported(page, skipped=True)
+            return False
         page.parent.mkdir(parents=True, exist_ok=True)
         write_whole(page, html.encode())
     except OSError as error:
         raise as_data_error(error, page) from error
-    return Reported(page, skipped=False)
+    return True
 
 
 def write_figures_of(
@@ -261,30 +300,27 @@ def _labels(resolved: Sequence[Path]) -> list[str]:
     return labels_of([(*place.parts[1:-1], session_name(place)) for place in resolved])
 
 
-def _refuse_foreign(page: Path) -> None:
-    """Refuse to replace a file that is no comparison; such pages name their generator near the beginning."""
+def _refuse_foreign(page: Path, overwrite: bool) -> None:
+    """Refuse to replace a file that is no page of mocap; those name their generator near the beginning."""
     if page.is_dir():
         raise DataError(page, "is a folder", "name a file with --output", code="not-a-folder")
-    if not page.exists():
+    if overwrite or not page.exists():
         return
-    with page.open("rb") as file:
-        if GENERATOR.encode() not in file.read(2048):
-            raise DataError(
-                page,
-                "is there and is no earlier comparison",
-                "choose another place with --output, or write over it with --overwrite",
-                code="exists",
-            )
+    refuse_special(page)
+    try:
+        with page.open("rb") as file:
+            is_ours = b'<meta name="generator" content="mocap' in file.read(2048)
+    except OSError as error:
+        raise as_data_error(error, page) from error
+    if not is_ours:
+        remedy = "choose another place with --output, or write over it with --overwrite"
+        raise DataError(page, "is there and is no page of mocap", remedy, code="exists")
 
 
 def _finished_stages(session: Session) -> dict[str, StageRecord]:
-    names = ("ingest", "detect", "reconstruct", "replan")
-    records = {name: session.intact_record(name) for name in names}
-    if records["ingest"] is None:
-        raise DataError(
-            session.folder, "was never ingested completely", "run `mocap ingest` again", code="not-a-session"
-        )
-    return {name: record for name, record in records.items() if record is not None}
+    records = {"ingest": session.ingested()}
+    others = {name: session.intact_record(name) for name in ("detect", "reconstruct", "replan")}
+    return records | {name: record for name, record in others.items() if record is not None}
 
 
 def _refuse_changed_pictures(folder: Path, description: Description) -> None:

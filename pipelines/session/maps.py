@@ -30,7 +30,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.session.description import HeldMap
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
-from pipelines.session.storage import as_data_error, jsonable, read_json, write_json
+from pipelines.session.storage import as_data_error, jsonable, read_json, refuse_special, write_json
 
 MOST_VOXELS = 200_000_000
 """The most voxels of a grid (0.8 GB as float32); a larger one is refused."""
@@ -267,6 +267,7 @@ class _StoredGrid:
         self._path = path
 
     def __enter__(self) -> _StoredGrid:
+        refuse_special(self._path)
         try:
             self._archive = zipfile.ZipFile(self._path)
         except OSError as error:

@@ -17,6 +17,8 @@ holds run times, the versions of libraries, and the stamps of sources.
 from __future__ import annotations
 
 import platform
+import shutil
+import stat
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -24,18 +26,20 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pipelines.session.errors import DataError, MocapError
 from pipelines.session.storage import (
     as_data_error,
+    drop_link,
     finished_part,
     hash_of,
     held,
     jsonable,
     make_folder,
     read_json,
+    refuse_special,
     remove_if_unused,
     remove_tree,
     sha256_of,
@@ -148,8 +152,10 @@ def read_record(path: Path) -> StageRecord:
         "warnings": list,
     }
     wrong = [name for name, kind in kinds.items() if not isinstance(document.get(name), kind)]
+    if not wrong and any(PurePosixPath(name).is_absolute() or ".." in name for name in document["outputs"]):
+        wrong = ["outputs"]
     if wrong:
-        raise DataError(path, f"has no usable {', '.join(wrong)}", remedy)
+        raise DataError(path, f"has no usable {', '.join(wrong)}", remedy, code="damaged")
     return StageRecord(**{name: document[name] for name in kinds})
 
 
@@ -319,6 +325,34 @@ class Session:
                 )
         return record
 
+    def ingested(self) -> StageRecord:
+        """Return the record of the ingest after checking its files, as `intact_record` does.
+
+        Raises:
+            DataError: as of `intact_record`, or the folder is a copy of a part of a session.
+        """
+        record = self.intact_record("ingest")
+        if record is None:
+            problem, remedy = "was never ingested completely", "run `mocap ingest` again, or copy all of it"
+            raise DataError(self.folder, problem, remedy, code="not-a-session")
+        return record
+
+    def finished(
+        self, stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, str]
+    ) -> StageRecord | None:
+        """Return the record of a stage that these settings and inputs made, if its files are undamaged.
+
+        Raises:
+            DataError: the stage was written by a later version.
+        """
+        record = usable_record(self.folder / stage.name / "stage.json")
+        key = key_of(stage, settings, inputs)
+        return record if record is not None and record.key == key and self._intact(record) else None
+
+    def _intact(self, record: StageRecord) -> bool:
+        files = {self.folder / name: expected for name, expected in record.outputs.items()}
+        return all(path.is_file() and sha256_of(path) == expected for path, expected in files.items())
+
 
 class WritableSession(Session):
     """A session that no other process writes; `locked` makes it."""
@@ -346,7 +380,7 @@ class WritableSession(Session):
         before = usable_record(self.folder / stage.name / "stage.json")
         if force:
             _remove_partials(self.folder, stage.name)
-        elif before is not None and before.key == key and self._intact(before):
+        elif self.finished(stage, settings, inputs) is not None:
             _remove_partials(self.folder, stage.name)  # of a --force that was interrupted
             return Run(self.folder, stage, key, settings, inputs, before=before, finished=True)
         new = _new_folder(self.folder, stage.name)
@@ -366,10 +400,6 @@ class WritableSession(Session):
         if before is None or before.revision != stage.revision or not self._intact(before):
             return None
         return before
-
-    def _intact(self, record: StageRecord) -> bool:
-        files = {self.folder / name: expected for name, expected in record.outputs.items()}
-        return all(path.is_file() and sha256_of(path) == expected for path, expected in files.items())
 
 
 class Run:
@@ -502,20 +532,32 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 
 
 def open_session(folder: Path) -> Session:
-    """Open a session for reading; an interrupted publication is completed first.
+    """Open a session for reading; nothing is written into it.
 
     Raises:
-        DataError: not a session, damaged, of a later version, or unreadable.
-        BusyError: it is being published right now.
+        DataError: not a session, damaged, of a later version, unreadable, or a stage was interrupted between
+            the renames that publish it.
     """
     try:
-        if not _is_interrupted(folder):
-            _check_session(folder)
-            return Session(folder)
+        for stage in STAGES:
+            new, old = _new_folder(folder, stage), _old(folder, stage)
+            if (new / "stage.json").exists() and old.exists() and not (new.is_symlink() or old.is_symlink()):
+                raise DataError(
+                    folder,
+                    f"was interrupted while `{COMMANDS[stage]}` published its result",
+                    f"run `{COMMANDS[stage]}` again, which completes it",
+                    code="not-a-session",
+                )
+        _check_session(folder)
     except OSError as error:
         raise as_data_error(error, folder) from error
-    with locked(folder):
-        return Session(folder)
+    return Session(folder)
+
+
+def refuse_no_session(folder: Path) -> None:
+    """Refuse a folder that is no session, before work that takes long; an interrupted one passes."""
+    if not was_interrupted(folder):
+        open_session(folder)
 
 
 @contextmanager
@@ -539,10 +581,11 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
         if create:
             _check_target(folder, overwrite=overwrite)
             make_folder(folder)
-        elif not _is_interrupted(folder):
+        elif not was_interrupted(folder):
             _check_session(folder)
         with held(folder / _LOCK, folder):
             try:
+                _drop_links(folder)
                 _repair(folder)
                 if not create:
                     _check_session(folder)
@@ -589,7 +632,7 @@ def _check_target(folder: Path, *, overwrite: bool) -> None:
             folder,
             f"is not a session and not empty ({len(foreign)} entries, the first {foreign[0]})",
             "choose another place with --output, or write into it with --overwrite",
-            code="not-a-session",
+            code="exists",
         )
 
 
@@ -612,12 +655,22 @@ def _old(folder: Path, stage: str) -> Path:
     return folder / f".{stage}.old"
 
 
-def _is_interrupted(folder: Path) -> bool:
-    """Return True if the publication of a stage was interrupted."""
-    return any(
-        (_new_folder(folder, stage) / "stage.json").exists() or _old(folder, stage).exists()
-        for stage in STAGES
+def was_interrupted(folder: Path) -> bool:
+    """Return True if the publication of a stage was interrupted; links of somebody else are none of ours."""
+    news = (_new_folder(folder, stage) for stage in STAGES)
+    olds = (_old(folder, stage) for stage in STAGES)
+    return any((new / "stage.json").exists() and not new.is_symlink() for new in news) or any(
+        old.exists() and not old.is_symlink() for old in olds
     )
+
+
+def _drop_links(folder: Path) -> None:
+    """Remove symbolic links in the places of hidden and unfinished folders; see `drop_link`."""
+    partial = folder / ".partial"
+    drop_link(partial)
+    of_stages = [place(folder, stage) for stage in STAGES for place in (_new_folder, _old)]
+    for path in [*partial.glob("*"), *of_stages, *folder.glob("*.json.new")]:
+        drop_link(path)
 
 
 def _repair(folder: Path) -> None:
@@ -676,3 +729,52 @@ def _remove_partials(folder: Path, stage: str) -> None:
         remove_tree(chunks)
     if partial.is_dir() and not any(partial.iterdir()):
         partial.rmdir()
+
+
+# --- copies of sessions --------------------------------------------------------------------------------
+
+_ORIGIN = "copied_from.json"
+
+
+def copy_session(folder: Path, target: Path) -> None:
+    """Copy a session, so that stages can run on the copy; its videos stay where they are.
+
+    A target that is a copy of this session stays as it is, with what was made in it.
+
+    Raises:
+        DataError: not a session, or the target is something else.
+    """
+    record = open_session(folder).ingested()
+    try:
+        if (target / _ORIGIN).is_file():
+            stated = read_json(target / _ORIGIN, "choose another --output")
+            if stated == {"session": str(origin_of(folder).resolve()), "ingest": record.key}:
+                return
+        if target.exists():
+            raise DataError(
+                target, "exists, and is no copy of this session", "choose another --output", code="exists"
+            )
+        make_folder(target.absolute().parent)
+        new = target.with_name(f".{target.name}.copying")
+        remove_tree(new)
+        hidden = shutil.ignore_patterns(".*", "*.new")
+        shutil.copytree(folder, new, ignore=hidden, symlinks=True, copy_function=_copy_file)
+        for path in [new, *new.rglob("*")]:
+            if not path.is_symlink():
+                path.chmod(path.stat().st_mode | stat.S_IWUSR)
+        write_json(new / _ORIGIN, {"session": str(origin_of(folder).resolve()), "ingest": record.key})
+        new.rename(target)
+    except OSError as error:
+        raise as_data_error(error, target) from error
+
+
+def _copy_file(source: str, target: str) -> None:
+    """Copy a file; another kind of file is refused, because reading it may never end."""
+    refuse_special(Path(source))
+    shutil.copy2(source, target)
+
+
+def origin_of(folder: Path) -> Path:
+    """Return the folder to which the paths in a session are relative: of a copy, that of the original."""
+    note = folder / _ORIGIN
+    return Path(str(read_json(note).get("session", folder))) if note.is_file() else folder

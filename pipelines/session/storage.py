@@ -53,6 +53,7 @@ _CODES = {
     errno.EACCES: "no-permission",
     errno.EPERM: "no-permission",
     errno.EROFS: "no-permission",
+    errno.ENOMEM: "out-of-memory",
 }
 
 
@@ -96,13 +97,21 @@ def refuse_names_of_people(names: Collection[str]) -> None:
         raise ValueError("two people differ in case only: their files would be one on some systems")
 
 
+# The largest JSON that mocap writes is the metrics of an eight-hour flight, of some megabytes.
+MAX_JSON_BYTES = 1 << 26
+
+# Files of the kernel look like files of a size that they do not have, and reading some never ends.
+_OF_THE_KERNEL = ("/proc/", "/sys/")
+
+
 def is_special(path: Path) -> bool:
-    """Return True for a pipe, a socket or a device, of which reading may never end. Never raise."""
+    """Return True for a pipe, a socket, a device or a file of the kernel, of which reading may never end."""
     try:
         mode = path.stat().st_mode
+        of_kernel = os.path.realpath(path).startswith(_OF_THE_KERNEL)
     except (OSError, ValueError):  # missing, or an impossible name: the function that opens it reports this
         return False
-    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+    return of_kernel or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
 def refuse_special(path: Path) -> None:
@@ -245,7 +254,7 @@ def write_whole(path: Path, content: bytes) -> None:
     """Write a file; a kill leaves the old file or the new one, complete."""
     temporary = path.with_name(f"{path.name}.new")
     try:
-        temporary.write_bytes(content)
+        _write_anew(temporary, content)
         sync(temporary)
         temporary.replace(path)
     finally:
@@ -253,13 +262,32 @@ def write_whole(path: Path, content: bytes) -> None:
     sync(path.parent)
 
 
+def _write_anew(path: Path, content: bytes) -> None:
+    """Write a file that does not exist yet; what is in its place is removed, and no link is followed."""
+    path.unlink(missing_ok=True)
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666), "wb") as file:  # noqa: PTH123
+        file.write(content)
+
+
+def drop_link(path: Path) -> None:
+    """Remove a symbolic link in the place of a file or folder of mocap's own; what it leads to stays.
+
+    A session of somebody else may hold one that leads to files of the user, which would be replaced.
+    """
+    if path.is_symlink():
+        path.unlink()
+
+
 def read_json(path: Path, remedy: str = "run the stage that wrote it again with --force") -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
-        DataError: missing, unreadable, not JSON, not an object, or it holds NaN.
+        DataError: missing, unreadable, not a file, too large, not JSON, not an object, or it holds NaN.
     """
+    refuse_special(path)
     try:
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise DataError(path, f"has more than {MAX_JSON_BYTES >> 20} MB", remedy, code="too-large")
         document = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
     except OSError as error:
         raise as_data_error(error, path) from error
@@ -329,13 +357,14 @@ def held(lock: Path, target: Path | str) -> Iterator[None]:
         BusyError: another process holds it.
     """
     holder = lock.with_name(f"{lock.name}.pid")
+    drop_link(lock)
     try:
         acquired = FileLock(lock).acquire(timeout=_RELEASED_S)
     except Timeout:
         raise BusyError(f"{target} is being written by {_process(holder)}; wait for it to finish") from None
     with acquired:
         try:
-            holder.write_text(f"{os.getpid()}\n")
+            _write_anew(holder, f"{os.getpid()}\n".encode())
             yield
         finally:
             holder.unlink(missing_ok=True)
@@ -351,7 +380,7 @@ def _process(holder: Path) -> str:
 def remove_if_unused(folder: Path, lock: str) -> None:
     """Remove a folder if only its lock is left in it."""
     with suppress(OSError):
-        if {path.name for path in folder.iterdir()} <= {lock, f"{lock}.pid"}:
+        if not folder.is_symlink() and {path.name for path in folder.iterdir()} <= {lock, f"{lock}.pid"}:
             for left in (lock, f"{lock}.pid"):
                 (folder / left).unlink(missing_ok=True)
             folder.rmdir()
@@ -364,9 +393,12 @@ def working_folder(work: Path, target: Path) -> Iterator[Path]:
     Raises:
         BusyError: another process uses it.
     """
+    drop_link(work)
     try:
         make_folder(work)
         with held(work / _LOCK, target):
+            for path in work.iterdir():
+                drop_link(path)
             yield work
     finally:
         remove_if_unused(work, _LOCK)
@@ -374,6 +406,7 @@ def working_folder(work: Path, target: Path) -> Iterator[Path]:
 
 def finished_part(finished: Path, produce: Callable[[Path], None]) -> Path:
     """Return the folder of a finished part; call `produce` with an empty folder if it does not exist yet."""
+    drop_link(finished)
     if not finished.is_dir():
         temporary = finished.with_name(f"{finished.name}.new")
         remove_tree(temporary)
@@ -490,7 +523,7 @@ def is_made(target: Path, key: str, *, mark: str) -> bool:
     except DataError:
         return False
     work = _work_of(target.absolute())
-    if made and work.is_dir():
+    if made and work.is_dir() and not work.is_symlink():
         with suppress(OSError, BusyError), working_folder(work, target):
             for left in [path for path in work.iterdir() if path.is_dir()]:
                 remove_tree(left)

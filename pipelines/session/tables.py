@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,9 +22,11 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Detections, JointMotion, Trajectory
+from pipelines.session.storage import as_data_error, refuse_special
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow.parquet as pq
 
 Span = tuple[int, int]
 """First and last time, ns."""
@@ -136,27 +139,44 @@ def join_tables(path: Path, parts: Iterable[pd.DataFrame], schema: pa.Schema) ->
             writer.write_table(pa.Table.from_arrays(columns, schema=schema))
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[pq.ParquetFile]:
+    """Open a Parquet file.
+
+    Raises:
+        DataError: it is missing, is no Parquet file, is cut off, or is a small file of many equal rows, which
+            no stage writes.
+    """
+    import pyarrow.parquet as pq
+
+    refuse_special(path)
+    try:
+        with path.open("rb") as file:
+            opened = pq.ParquetFile(file)
+            _refuse_bomb(path, opened.metadata)
+            yield opened
+    except (FileNotFoundError, PermissionError) as error:
+        raise as_data_error(error, path) from error
+    except MemoryError:  # one of Arrow's own is also an ArrowException
+        raise
+    except (OSError, pa.ArrowException, IndexError) as error:
+        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
+
+
 def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], pd.DataFrame]]]:
     """List the parts of a table of `join_tables`: the least value of the first column, and a reader of each.
 
     Raises:
-        DataError: not a Parquet file, truncated, or columns are missing.
+        DataError: see `read_table`.
     """
-    import pyarrow.parquet as pq
-
-    def group(number: int | None) -> Any:
-        try:
-            with path.open("rb") as opened:
-                file = pq.ParquetFile(opened)
-                return file.metadata if number is None else file.read_row_group(number, columns=schema.names)
-        except (OSError, pa.ArrowException) as error:
-            raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
 
     def read(number: int) -> pd.DataFrame:
-        frame: pd.DataFrame = group(number).to_pandas()
+        with _opened(path) as opened:
+            frame: pd.DataFrame = opened.read_row_group(number, columns=schema.names).to_pandas()
         return frame
 
-    metadata = group(None)
+    with _opened(path) as opened:
+        metadata = opened.metadata
     filled = [k for k in range(metadata.num_row_groups) if metadata.row_group(k).num_rows]
     return [(metadata.row_group(k).column(0).statistics.min, partial(read, k)) for k in filled]
 
@@ -170,22 +190,11 @@ def read_table(path: Path, schema: pa.Schema, span_ns: Span | None = None) -> pd
         span_ns: only rows with times from the first to the second, both included; others take no memory.
 
     Raises:
-        DataError: not a Parquet file, truncated, or columns are missing; or a small file of many equal rows,
-            which no stage writes.
+        DataError: missing, not a Parquet file, truncated, columns are missing, or it holds absurd numbers.
     """
-    import pyarrow.parquet as pq
-
-    try:
-        with path.open("rb") as file:
-            opened = pq.ParquetFile(file)
-            _refuse_bomb(path, opened.metadata)
-            table = (
-                pq.read_table(file)
-                if span_ns is None
-                else pa.Table.from_batches(_batches_within(opened, span_ns), opened.schema_arrow)
-            )
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
+    with _opened(path) as opened:
+        batches = _batches_within(opened, span_ns)
+        table = opened.read() if span_ns is None else pa.Table.from_batches(batches, opened.schema_arrow)
     return _frame_of(path, table, schema)
 
 
@@ -199,22 +208,11 @@ def figures_by_joint(table: pd.DataFrame) -> dict[str, dict[str, float | None]]:
 
 
 def read_first(path: Path, schema: pa.Schema) -> pd.DataFrame:
-    """Read the first row of a table, and no row of an empty one.
-
-    Raises:
-        DataError: not a Parquet file, truncated, or columns are missing.
-    """
-    import pyarrow.parquet as pq
-
-    try:
-        with path.open("rb") as file:
-            batches = pq.ParquetFile(file).iter_batches(1, columns=schema.names)
-            first = next(iter(batches), None)
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
-    frame: pd.DataFrame = (
-        schema.empty_table() if first is None else pa.Table.from_batches([first])
-    ).to_pandas()
+    """Read the first row of a table, and no row of an empty one; DataError as of `read_table`."""
+    with _opened(path) as opened:
+        first = next(opened.iter_batches(1, columns=schema.names), None)
+    table = schema.empty_table() if first is None else pa.Table.from_batches([first])
+    frame: pd.DataFrame = table.to_pandas()
     return frame
 
 
@@ -224,27 +222,16 @@ def distinct(path: Path, name: str) -> Int64:
     Raises:
         DataError: not a Parquet file, truncated, or without this column.
     """
-    import pyarrow.parquet as pq
-
-    try:
-        with path.open("rb") as file:
-            opened = pq.ParquetFile(file)
-            _refuse_bomb(path, opened.metadata)
-            batches = _batches(opened, [name])
-            parts = [np.unique(batch.column(0).to_numpy(zero_copy_only=False)) for batch in batches]
-    except (OSError, pa.ArrowException, IndexError) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
+    with _opened(path) as opened:
+        batches = _batches(opened, [name])
+        parts = [np.unique(batch.column(0).to_numpy(zero_copy_only=False)) for batch in batches]
     return np.unique(np.concatenate(parts)) if parts else np.empty(0, np.int64)
 
 
 def count_rows(path: Path) -> int:
     """Return the number of rows of a table; DataError if it cannot be read."""
-    import pyarrow.parquet as pq
-
-    try:
-        return int(pq.read_metadata(path).num_rows)
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
+    with _opened(path) as opened:
+        return int(opened.metadata.num_rows)
 
 
 def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.DataFrame:
@@ -259,20 +246,13 @@ def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.Dat
     Raises:
         DataError: see `read_table`.
     """
-    import pyarrow.parquet as pq
-
     kept = []
-    try:
-        with path.open("rb") as file:
-            opened = pq.ParquetFile(file)
-            _refuse_bomb(path, opened.metadata)
-            for batch in _batches(opened):
-                values = batch.column(batch.schema.get_field_index(name)).to_numpy(zero_copy_only=False)
-                place = np.searchsorted(chosen, values).clip(0, max(len(chosen) - 1, 0))
-                kept.append(batch.filter(pa.array(chosen[place] == values)) if len(chosen) else batch[:0])
-            table = pa.Table.from_batches(kept, opened.schema_arrow)
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
+    with _opened(path) as opened:
+        for batch in _batches(opened):
+            values = batch.column(batch.schema.get_field_index(name)).to_numpy(zero_copy_only=False)
+            place = np.searchsorted(chosen, values).clip(0, max(len(chosen) - 1, 0))
+            kept.append(batch.filter(pa.array(chosen[place] == values)) if len(chosen) else batch[:0])
+        table = pa.Table.from_batches(kept, opened.schema_arrow)
     return _frame_of(path, table, schema)
 
 
@@ -304,17 +284,10 @@ def _batches_within(opened: Any, span_ns: Span | None) -> Iterator[Any]:
 
 def _parts(path: Path, schema: pa.Schema, span_ns: Span | None) -> Iterator[pd.DataFrame]:
     """Yield what `read_table` returns in parts; the first has the columns and no rows."""
-    import pyarrow.parquet as pq
-
-    try:
-        with path.open("rb") as file:
-            opened = pq.ParquetFile(file)
-            _refuse_bomb(path, opened.metadata)
-            yield _frame_of(path, opened.schema_arrow.empty_table(), schema)
-            for batch in _batches_within(opened, span_ns):
-                yield _frame_of(path, pa.Table.from_batches([batch], opened.schema_arrow), schema)
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
+    with _opened(path) as opened:
+        yield _frame_of(path, opened.schema_arrow.empty_table(), schema)
+        for batch in _batches_within(opened, span_ns):
+            yield _frame_of(path, pa.Table.from_batches([batch], opened.schema_arrow), schema)
 
 
 def _frame_of(path: Path, table: pa.Table, schema: pa.Schema) -> pd.DataFrame:

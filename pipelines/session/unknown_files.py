@@ -15,7 +15,6 @@ from pipelines.session.storage import plain_text, text_encoding
 _HEAD_BYTES = 64 * 1024
 _LARGEST_PARSED = 8 << 20  # bytes; larger text is described by its first line
 _SHOWN = 8  # names of keys, columns or endings in a message
-_WIDEST = 60  # characters of a quoted line
 
 
 EXPECTED = (
@@ -216,7 +215,7 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
                 return Likeness(problem, remedy)
             remedy = "poses need a time, x, y, z, qx, qy, qz, qw; joints person, joint, x, y, z"
             return Likeness(f"is a table with {columns}", f"{remedy}, by name in the first line")
-    return Likeness(f"is text that begins with {lines[0][:_WIDEST]!r}")
+    return Likeness("is text of no known kind")  # what it says may be a secret
 
 
 def _of_json(path: Path) -> Likeness:

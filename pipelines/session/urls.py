@@ -22,6 +22,7 @@ from filelock import FileLock
 
 from pipelines.session.errors import BusyError, DataError, MocapError
 from pipelines.session.registries import need
+from pipelines.session.stages import origin_of
 from pipelines.session.storage import (
     as_data_error,
     hash_of,
@@ -88,7 +89,7 @@ def located(base: Path, stated: str | Path) -> Path:
         DataError: the store cannot be read, or holds no such thing.
     """
     url = source_url(base, stated)
-    return base / stated if url is None else fetched(url)
+    return origin_of(base) / stated if url is None else fetched(url)
 
 
 def source_url(base: Path, stated: str | Path) -> str | None:

@@ -8,7 +8,15 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from pipelines.session.errors import DataError
 from pipelines.session.storage import code_of, plain_text, refuse_special
@@ -51,12 +59,34 @@ class YamlModel(BaseModel):
     def _expand_shorthand(cls, value: object) -> object:
         return {cls.shorthand: value} if cls.shorthand and isinstance(value, str | list) else value
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _true_is_no_number(cls, value: object, info: ValidationInfo) -> object:
+        annotation = cls.model_fields[info.field_name or ""].annotation
+        if _holds_truth_value(value) and not _allows_truth_value(annotation):
+            raise ValueError("is true or false where a number or text belongs")
+        return value
+
     @model_validator(mode="after")
     def _exactly_one(self) -> YamlModel:
         stated = [name for name in self.one_of if getattr(self, name) is not None]
         if self.one_of and len(stated) != 1:
             raise ValueError(f"needs exactly one of {', '.join(self.one_of)}" + f" (has {len(stated)})")
         return self
+
+
+def _holds_truth_value(value: object) -> bool:
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    return any(map(_holds_truth_value, value)) if isinstance(value, list) else isinstance(value, bool)
+
+
+def _allows_truth_value(annotation: object) -> bool:
+    """Return True for a type that is or contains `bool`, anything, or a model with fields of its own."""
+    is_model = isinstance(annotation, type) and issubclass(annotation, BaseModel)
+    if annotation in (bool, Any, object) or isinstance(annotation, bool) or is_model:
+        return True
+    return any(map(_allows_truth_value, get_args(annotation)))
 
 
 M = TypeVar("M", bound=YamlModel)

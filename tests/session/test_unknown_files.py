@@ -55,7 +55,7 @@ SUBTITLE = "1\n00:00:00,000 --> 00:00:01,000\nHello\n"
         ("a.mp4", bytes(range(200)), "is called .mp4 but holds nothing of that kind"),
         ("a.csv", b"Datetime (UTC),Latitude,Longitude\n1,2,3\n", "places on Earth"),
         ("a.dat", b"\x01\x02\x03\x04\0\0", "01 02 03 04"),
-        ("a.txt", b"Dear diary\n", "Dear diary"),
+        ("a.txt", b"Dear diary\n", "text"),
         ("a.csv", b"time,latitude,longitude,altitude,heading,pitch,roll\n0,1,2,3,4,5,6\n", "places on Earth"),
         ("a.npz", b"PK\x03\x04" + bytes(26) + b"camera.npy", "NumPy"),
         ("a.e57", b"ASTM-E57" + bytes(40), "E57"),
