@@ -101,9 +101,8 @@ def assert_every_stage_is_whole(folder: Path) -> None:
     """Check that each stage is the old or the new one, never a mixture, without files that are not listed."""
     try:
         session = open_session(folder)
-    except DataError as error:
-        assert error.code == "not-a-session"
-        with locked(folder) as session:  # completes it
+    except DataError:  # of an interrupted publication, which a writer completes
+        with locked(folder) as session:
             pass
     listed = set()
     for stage in ("ingest", "reconstruct"):
