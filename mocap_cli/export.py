@@ -16,7 +16,8 @@ from mocap_cli.options import (
 from mocap_cli.several import each
 from mocap_cli.terminal import say, watching
 
-_LONGEST_LIST = 4  # files
+# Of more files than this only the first ones are printed.
+_LONGEST_LIST = 4
 
 
 class _ListsFormats(click.Command):

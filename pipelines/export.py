@@ -54,6 +54,7 @@ PICTURES_HZ = 2.0
 _FRAMES_AT_ONCE = 300
 _RECORD = "export.json"
 _WORK = ".writing"
+# A reader of export.json refuses a larger number.
 _SCHEMA = 1
 
 

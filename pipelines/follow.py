@@ -40,9 +40,12 @@ BLOCK = 300
 # A process takes 2 s to start, in which this one looks at 150 pictures. Fewer than these are not worth it.
 MIN_PICTURES_FOR_PROCESSES = 600
 
-_STILL_S = 0.9  # between stills
+# A still about every second shows the ground from every place that a drone passes.
+_STILL_S = 0.9
+# Of a long flight no more stills than this are kept; they lie further apart.
 _MOST_STILLS = 200
-_QUALITY = 85  # of JPEG
+# JPEG of this quality changes smooth grey values by some steps.
+_QUALITY = 85
 
 
 def cameras_to_follow(description: Description) -> list[str]:

@@ -46,11 +46,14 @@ from pipelines.simulation.renderer import ExposedMoment, Renderer, exposed_momen
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.world import World
 
+# It is raised whenever the same scenario gives other files than before.
 _REVISION = 5
 _OWN = ("drone*", "flight.yaml", "true_poses.yaml", "scenario.yaml", "site.*", "truth", SIMULATION_MARK)
-_BLOCK = 60  # pictures that are rendered and encoded together, and kept after an interrupt
+# An interrupt costs at most so many pictures, and a block still encodes well.
+_BLOCK = 60
 _RING = "ring"
-_LEAST_SIGMA_M = 0.01  # of the actor's estimate, for a filter that does not accept 0
+# A filter of the actor cannot work with a standard deviation of 0.
+_LEAST_SIGMA_M = 0.01
 
 
 @dataclass(frozen=True)

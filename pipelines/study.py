@@ -83,6 +83,7 @@ from pipelines.simulation.walks import (
 )
 from pipelines.simulation.world import build_world
 
+# It is raised whenever the same study gives other figures than before.
 _REVISION = 6
 _PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
 # The camera looks exactly at the person, so that the hint of the person's position is nearly exact.

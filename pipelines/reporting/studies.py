@@ -56,13 +56,17 @@ METRICS = {
 _SHARES = {"pck150", "reconstructed_share", "fell_back"}  # in percent there
 _DRAWN = ("mpjpe_mm", "root_mpjpe_mm")
 _CONDITION = ("tilt_deg", "robots", "noise", "noise_model", "method")
-_NOTHING_MM = 1e-3  # errors below are none: no ratio is taken to them
+# Errors below this are rounding, and a ratio to them means nothing.
+_NOTHING_MM = 1e-3
 
 _PANEL_IN, _ROW_IN, _SMALLEST_IN = 2.7, 2.0, 5.4
 _MARKERS = "osD^vPX*"
-_BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves if the axis has words
-_LETTERS_PER_IN = 16  # of the title
+# Error bars of neighbouring curves lie this share of the axis apart, so that none hides another.
+_BESIDE = 0.012
+# About so many letters of the title fit into an inch.
+_LETTERS_PER_IN = 16
 _HEADROOM, _LEAST_TOP = 1.04, 1.0  # above the highest marker; least top of the axis
+# Figures as PNG have so many pixels to the inch.
 _DPI = 160
 
 _TITLES = {

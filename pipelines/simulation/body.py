@@ -44,7 +44,8 @@ from pipelines.simulation.scenario import Body
 from pipelines.simulation.surfaces import TriangleSurface
 
 _ASSET = Path(__file__).parent / "data" / "body.npz"
-_FRAMES_AT_ONCE = 1024  # bounds the memory of long motions: 5 MB of transforms
+# Transforms of so many frames take 5 MB, however long the motion.
+_FRAMES_AT_ONCE = 1024
 _HAIR_M = {"female": 0.016, "male": 0.01}
 
 # Arms lean outward by the least of these that keeps hands and forearms off hips and trunk.

@@ -19,6 +19,7 @@ from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES
 SEXES = ("female", "male")
 BUILDS = ("average", "slim", "heavy")
 PARTS = ("skin", "lips", "brow", "white", "iris", "cloth")
+# The asset stores places as whole tenths of a millimetre.
 UNIT_M = 1e-4
 
 
@@ -176,14 +177,19 @@ Colour = tuple[float, float, float]
 
 # Places along a limb: 0 at its root, 1 at the knee or elbow, 2 at the ankle or wrist.
 _SOCK_TOP, _SHOE_TOP = 1.78, 1.88
-_TUCKED = 0.12  # length of skin under a hem, in those places: about 4 cm
+# Skin goes on for about 4 cm under a hem, so that no gap shows when a limb bends.
+_TUCKED = 0.12
 
 # Metres for a body of 1.75 m; scaled with it.
 _USUAL_HEIGHT_M = 1.75
-_SOLE_M = 0.016  # below the bare foot
-_SOLE_EDGE_M = 0.008  # above it
+# A shoe has its sole this far below the bare foot.
+_SOLE_M = 0.016
+# The edge of a sole ends this far above the bare foot.
+_SOLE_EDGE_M = 0.008
+# Cloth stands off by this much for each unit of its wrinkle.
 _WRINKLE_M = 0.004
-_WRINKLE_PER_M = 28.0  # standard deviation of the wave numbers, rad: folds of about 20 cm
+# Waves with this standard deviation of their numbers make folds of about 20 cm.
+_WRINKLE_PER_M = 28.0
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ ANY_JOINT = "*"
 
 REFERENCE_TILT_DEG = 15.0
 """Tilt at which a scenario's shares of missed joints and outliers hold; they grow with the measured ones."""
-_LEAST_MISSED = 0.01  # a few hundred pictures do not resolve smaller shares
+# A few hundred measured pictures do not resolve smaller shares.
+_LEAST_MISSED = 0.01
 
 KEPT_PER_FRAME = 0.7
 """Autocorrelation of a joint's error from one frame to the next: 0.1 s at 30 frames a second."""

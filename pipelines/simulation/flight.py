@@ -40,13 +40,18 @@ Moving = Callable[[Float], BodyMotion]
 LEAD_S = 0.2
 """Time that logs run, and the actor moves, before the first picture and after the last, s."""
 
-_PLANNER_HZ = 50.0  # rate of the planner's calls; it may replan less often
-_NODES = 5  # of the polynomial that a joint follows during a readout
-_ROW_STEPS = 5  # each takes away all but some percent of what is left
-_WAY_S = 0.25  # between the points of the actor's way that the wood keeps clear of
+# The planner is called as often as its tracking steps; it may replan less often.
+_PLANNER_HZ = 50.0
+# A polynomial through five moments follows an accelerating limb during a readout.
+_NODES = 5
+# Each step takes away all but some percent of the row error that is left.
+_ROW_STEPS = 5
+# The wood keeps clear of the place of the actor at every quarter of a second.
+_WAY_S = 0.25
 # What chance decides, each with numbers of its own: changing one thing leaves the others as they were.
 _FRAMES, _LOG, _NOISE, _ACTOR, _KEYPOINTS, _MOTION = range(6)
-_REACH_M = 0.4  # of a body beyond its keypoints: hands, feet, crown and girth, of a person of 2.2 m
+# Hands, feet, crown and girth of a person of 2.2 m reach this far beyond the keypoints.
+_REACH_M = 0.4
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ from pipelines.simulation.flight import (
 )
 from pipelines.simulation.flying import LEVER_ARM
 
-_BOX_MARGIN = 0.15  # of the keypoints' extent, as a person detector's box is larger than the joints
+# The box of a person detector is about this much larger than the extent of the joints.
+_BOX_MARGIN = 0.15
 
 
 class TrackedKeypoints(NamedTuple):
@@ -152,6 +153,7 @@ def write_keypoints(folder: Path, flight: SimulatedFlight, drone: SimulatedDrone
     write_lines(folder / f"{drone.name}_frames.csv", lines)
 
 
+# Someone who starts cameras by hand knows their clocks to about a third of a second.
 _UNKNOWN_CLOCK_SIGMA_S = 0.3
 
 
@@ -265,7 +267,9 @@ def _poses(flight: SimulatedFlight, drone: SimulatedDrone, true_poses: bool) -> 
     return lines
 
 
-_RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
+# The recorder on board receives a message about 2 ms after its own stamp.
+_RECEIVED_NS = 2_000_000
+# Drivers repeat the calibration about once a second.
 _CAMERA_INFO_NS = 1_000_000_000
 
 

@@ -98,15 +98,20 @@ LEVER_ARM = (0.10, 0.0, -0.05)
 """Position of the camera in the body (forward, left, up), m."""
 
 POSITION_GAIN_PER_S, VELOCITY_GAIN_PER_S = 1.5, 4.0
-ATTITUDE_LAG_S = 0.15  # delay of a commanded acceleration: the body must lean first
-_BRAKING_SHARE = 0.5  # of the acceleration limit, for coming to a stop; the rest is for corrections
+# A commanded acceleration comes late because the body must lean first.
+ATTITUDE_LAG_S = 0.15
+# Half of the acceleration limit brakes, and the rest is left for corrections.
+_BRAKING_SHARE = 0.5
 
 HEADING_LAG_S, HEADING_RATE_RADPS = 0.3, math.radians(90.0)
 GIMBAL_LAG_S, GIMBAL_RATE_RADPS = 0.05, math.radians(120.0)
 
+# This is the acceleration of gravity in middle latitudes.
 _GRAVITY_MPS2 = 9.81
-_DRAG_PER_S = 0.15  # of the rotors and the frame, linear in speed: 7 degrees of lean at 8 m/s
-_LEAST_LIFT = 0.2  # of gravity: rotors do not push down
+# Rotors and frame brake in proportion to the speed, which leans a drone by 7 degrees at 8 m/s.
+_DRAG_PER_S = 0.15
+# Rotors do not push down, so a falling drone keeps this share of its lift.
+_LEAST_LIFT = 0.2
 
 
 @dataclass(frozen=True)
@@ -402,7 +407,9 @@ def _follow(t_s: Float, target: Float, lag_s: float, fastest_radps: float, angle
 
 # --- recorders -----------------------------------------------------------------------------------------
 
-JITTER_SHARE = 0.02  # sigma of a log's stamps, of the time between them; at most ten times that
+# The stamps of a log scatter by this share of the time between them.
+JITTER_SHARE = 0.02
+# Stamps that scatter by more would lose their order.
 _LARGEST_JITTER = 0.2
 
 ACTOR_CORRELATION_S = 0.5

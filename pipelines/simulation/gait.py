@@ -14,14 +14,20 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 
+# People walk at this speed if no other one is stated; the curves of feet and knees were fitted at it.
 WALK_SPEED_MPS = 1.3
+# People jog at this speed if no other one is stated.
 JOG_SPEED_MPS = 2.7
-FASTEST_WALK_MPS = 2.1  # faster people run (Novacheck 1998)
+# People who go faster than this run (Novacheck 1998).
+FASTEST_WALK_MPS = 2.1
 _RUNNING_FROM_MPS, _RUNNING_FULLY_MPS = 1.0, 1.9
 
-_WALK_RATIO_M_S = 0.0064 * 60  # step length by cadence
+# Step length over cadence is the same at all speeds of walking (Sekiya & Nagasaki 1998).
+_WALK_RATIO_M_S = 0.0064 * 60
+# The walk ratio holds for people with legs of this length.
 _LEG_OF_WALK_RATIO_M = 0.93
-_SLOWEST_CADENCE = 1.1  # steps per s, of a first or last step
+# A first or last step takes no longer than at this cadence.
+_SLOWEST_CADENCE = 1.1
 
 # Foot against the ground in stance: share of stance and degrees, toes up; the strike and the lift are added.
 _STANCE_WALK = ((0.13, 0.0), (0.34, 0.0), (0.66, -11.5), (0.78, -16.5))

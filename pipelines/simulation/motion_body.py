@@ -21,12 +21,18 @@ from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig, about,
 
 Heights = Callable[[Float], Float]
 
-_FULL_SWING_M = 1.3  # of a leg of 0.93 m
+# A foot swings this far in a full stride of walking, with a leg of 0.93 m.
+_FULL_SWING_M = 1.3
+# Toes bend by no more than this before the foot tips over their end.
 _TOES_BEND = np.radians(42.0)
 _SOFTNESS_M = (0.0003, 0.02)  # range over which the point changes that a foot turns about: planted, swung
-_LONGEST_ROLL_S = 0.8  # in a longer stance the foot is flat for the rest
-_STILL_SHARE = 0.05  # of the swing at either end; there the foot goes only up or down
-_SET_DOWN = 0.65  # share of the stance that belongs to the strike, the rest to the lift
+# In a longer stance the foot is flat for the rest of the time.
+_LONGEST_ROLL_S = 0.8
+# At either end of its swing the foot goes only up or down for this share.
+_STILL_SHARE = 0.05
+# The first part of a stance belongs to the strike, and the rest to the lift.
+_SET_DOWN = 0.65
+# The tilt of the ground is measured over the width of a foot.
 _HALF_WIDTH_M = 0.04
 
 
@@ -211,8 +217,10 @@ def _on_ground(
     return base, tilt, rise
 
 
-_HANGS_FREE_M = 0.02  # allowed height of the pelvis above the reach of a leg that does not carry
-_STRETCHED_M = 0.002  # near a straight limb, its reach is softened over about this length
+# The pelvis may be this far above the reach of a leg that carries nothing.
+_HANGS_FREE_M = 0.02
+# Near a straight limb the reach is softened over this length, so that the knee does not snap.
+_STRETCHED_M = 0.002
 
 
 def two_bones(upper: Float, lower: Float, towards: Float, hinge: Float) -> tuple[Float, Float]:
@@ -319,7 +327,8 @@ def _lower(one: Float, other: Float, softness_m: Float) -> Float:
 # --- bones ---------------------------------------------------------------------------------------------
 
 _WALKING_SOFTNESS_M, _RUNNING_SOFTNESS_M = 0.006, 0.026
-_SCRAPES_M = 0.02  # a kicking foot that comes as near to the ground is lifted
+# A kicking foot that comes as near as this to the ground is lifted.
+_SCRAPES_M = 0.02
 # The wanted height of an upright pelvis is more than the legs allow, by this much.
 _STANDING_HEADROOM_M, _WALKING_HEADROOM_M = 0.015, 0.004
 

@@ -9,9 +9,11 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.simulation import gait
 
+# Points this close follow an arc of half a metre to a tenth of a millimetre.
 _SPACING_M = 0.02
 _WALK_MPS2, _RUN_MPS2 = 0.9, 1.9  # mean accelerations
-_ROUNDED_M = 0.4  # a corner is cut over this far on either side
+# A person cuts a corner over about this length on either side.
+_ROUNDED_M = 0.4
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,7 @@ def pace(parts: Sequence[WayPart]) -> Pace:
     return Pace(tuple(knots))
 
 
+# Keys closer than this count as one moment, so that no curve jumps.
 _SAME_MOMENT_S = 1e-6
 
 
@@ -176,13 +179,18 @@ Curve = Callable[[Float], Float]
 
 LEFT, RIGHT = 0, 1
 _STANDING_HALF_M, _WALKING_HALF_M, _RUNNING_HALF_M = 0.085, 0.048, 0.025  # between the feet, per 1.75 m
+# The feet of somebody who stands point outward by this angle.
 _TOE_OUT = np.radians(6.0)
 _TURN_RATE, _TURN_CADENCE = np.radians(65.0), 1.9
+# The last steps before a stand are no slower than this.
 _LAST_STEPS_CADENCE = 1.5
-_REACH = 0.72  # of the leg, ahead or behind: a foot farther away is lifted
-_SHORTER_UPHILL = 0.9  # cadence rises by this times the slope
+# A foot that is farther away than this share of the leg is lifted.
+_REACH = 0.72
+# The cadence rises by this times the slope, because steps are shorter uphill.
+_SHORTER_UPHILL = 0.9
 _STILL_M, _STILL_RAD = 0.01, np.radians(2.0)
-_LOOKED_AHEAD = 400  # moments, 2 s
+# The time at which a foot is out of reach is searched for in pieces of 2 s.
+_LOOKED_AHEAD = 400
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,8 @@ _KICK_ARMS = {  # of the support side, of the kicking side
 }
 _FASTEST_RUN_UP_MPS, _RUN_UP_MPS2 = 3.3, 2.6
 _AFTER_PLANT_S = (0.22, 0.75)
-_SLOWED_TO = 0.30  # of the speed of the run-up, by the impact
+# By the impact a kicker has slowed down to this share of the run-up.
+_SLOWED_TO = 0.30
 _LIFT_S, _LAND_S, _CLOSE_S, _STAND_S = -0.15, 0.68, 0.78, 1.22
 
 
@@ -145,7 +146,9 @@ def kick(plan: Plan, side: str, run_up_m: float) -> None:
     plan.t_s = plant + _STAND_S
 
 
+# Ways that meet at a sharper angle are walked with a stop and a turn.
 _STOPS_AT_CORNER = np.radians(50.0)
+# A person pauses for this time after a way.
 _PAUSE_S = 0.25
 
 

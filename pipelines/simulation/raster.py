@@ -85,12 +85,15 @@ def _corner_normals(vertices: Float, faces: Int32) -> Float32:
 _EMPTY = TriangleSurface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
 
+# Four samples of a pixel with four distinct x and y smooth edges of any direction.
 SUBROWS = 4
 SHIFTS_PX = np.array([-0.125, 0.375, -0.375, 0.125])
 CENTRES_PX = np.zeros(1)
 """Shift in x of the samples of each sample row from the pixel's centre; their y is evenly spaced."""
 
+# Triangles are cut at this distance in front of the camera.
 NEAR_M = 0.05
+# No face has this number, so it marks samples that see none.
 NOTHING = -1
 
 
@@ -423,8 +426,10 @@ def gather(
 
 # --- shadows -------------------------------------------------------------------------------------------
 
-_MARGIN = 4  # texels around the region
-_STEP = 6.0  # texels of height between neighbours: more than on slopes that the sun lights well
+# A shadow map has so many texels around its region, for the look-ups at its border.
+_MARGIN = 4
+# Neighbouring texels differ by more than this only at an edge, not on slopes that the sun lights well.
+_STEP = 6.0
 
 
 class ShadowMap(NamedTuple):

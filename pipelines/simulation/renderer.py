@@ -35,8 +35,10 @@ from pipelines.simulation.raster import (
 from pipelines.simulation.shading import ground_texture, paint, shade
 from pipelines.simulation.surfaces import TriangleSurface
 
-_KNOT_PX = 8  # between rays that are solved for; a cubic spline lies between, right to 1e-5 px
-_MARGIN_PX = 3  # around what the lens sees: cubic interpolation takes two pixels on each side
+# A cubic spline between rays so far apart is right to 1e-5 px.
+_KNOT_PX = 8
+# Cubic interpolation takes two pixels on each side.
+_MARGIN_PX = 3
 
 
 class DistortingLens:
@@ -98,11 +100,16 @@ def _rays(intrinsics: Intrinsics) -> Float:
     return rays
 
 
+# Light is multiplied by this before the tone curve.
 EXPOSURE = 1.6
-NOISE = 1.8  # standard deviation, in steps of 8 bits
-_SOFTNESS = 0.11  # share of the light that goes to either neighbour, per axis: a blur of 0.47 px
+# The noise of the sensor has this standard deviation in steps of 8 bits.
+NOISE = 1.8
+# This share of the light goes to either neighbour, which is a blur of 0.47 px.
+_SOFTNESS = 0.11
+# The tone curve is looked up in a table of so many steps.
 _CURVE_STEPS = 1024
-_BRIGHTEST = 4.0  # of the exposed light; the curve is constant above
+# The tone curve is constant for exposed light above this.
+_BRIGHTEST = 4.0
 
 
 def developed(light: Float32, key: int) -> Bytes:
@@ -210,10 +217,12 @@ def _integral(moments: Float, until: Float) -> Float:
 
 # --- pictures ------------------------------------------------------------------------------------------
 
-_BAND_ROWS = 16  # pixel rows whose samples fit a processor's cache
+# The samples of so many pixel rows fit into the cache of a processor.
+_BAND_ROWS = 16
 _STATIC_TEXEL_M, _STATIC_TEXELS = 0.02, 2048
 _PERSON_TEXEL_M, _PERSON_TEXELS = 0.008, 1024
-_LEVEL_M = 0.05  # ground this close to its median height casts no shadow worth a map
+# Ground this close to its median height casts no shadow worth a map.
+_LEVEL_M = 0.05
 
 
 class ExposedMoment(NamedTuple):

@@ -144,10 +144,14 @@ def _trunk(source: SkeletalMotion, found: dict[str, int]) -> None:
 
 
 _END_OF_LIMB = {"thigh": "shank", "shank": "foot", "upper_arm": "forearm", "forearm": "hand", "foot": "toes"}
-_FLAT_FOOT = np.radians(30.0)  # feet that point down by less than this in the rest pose are meant to stand
-_T_POSE_TURN = np.radians(20.0)  # in one frame: no person turns a joint so fast
-_SEAM_S = 0.5  # time over which the end of a repeated motion is blended to its beginning
-_AT_REST_MPS = 0.3  # a foot that is slower stands
+# Feet that point down by less than this in the rest pose are meant to stand.
+_FLAT_FOOT = np.radians(30.0)
+# No person turns a joint by more than this in one frame.
+_T_POSE_TURN = np.radians(20.0)
+# Half a second blends the end of a repeated motion to its beginning without a jerk.
+_SEAM_S = 0.5
+# A foot that is slower than this stands on the ground.
+_AT_REST_MPS = 0.3
 
 
 def retarget(

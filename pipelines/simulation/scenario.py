@@ -24,10 +24,13 @@ from pydantic import (
 from pipelines.geometry.cameras import COEFFICIENT_COUNTS, Intrinsics
 from pipelines.session.yaml_files import SecondsAsNs, YamlModel, read_yaml_model
 
+# Files with a larger number come from a later version.
 SCHEMA = 2
+# A larger map would take hundreds of megabytes.
 _MOST_VOXELS = 20_000_000
 _MOST_ACTORS, _LONGEST_NAME = 16, 50
-_FARTHEST_VOXEL = 32_768  # from the origin along an axis, in an OctoMap
+# An OctoMap has no voxels further from the origin along an axis.
+_FARTHEST_VOXEL = 32_768
 # Logs begin before the flight and clocks run off; stamps in ROS are neither negative nor after January 2038.
 _EARLIEST_NS, _LATEST_NS = 60 * 10**9, (2**31 - 60) * 10**9
 

@@ -20,7 +20,8 @@ SKY_RGB = np.array([0.21, 0.25, 0.31])  # from above, on a level surface
 BOUNCE_RGB = np.array([0.09, 0.09, 0.06])  # from the ground, on a surface that faces down
 HORIZON_RGB = np.array([0.50, 0.56, 0.62])
 ZENITH_RGB = np.array([0.14, 0.25, 0.47])
-HAZE_M = 700.0  # distance at which haze has half its effect
+# Haze has half of its effect at this distance.
+HAZE_M = 700.0
 
 
 def shade(
@@ -91,7 +92,8 @@ def _add(
 
 TILE_TEXELS, TILE_M = 2048, 10.24
 SITE_TEXELS, SITE_M = 256, 71.3  # no multiple of the tile, so that nothing repeats in sight
-FULL_SCALE = 3.0  # factor of a texel of 255
+# A texel of 255 means this factor.
+FULL_SCALE = 3.0
 
 _TEXELS_PER_M = TILE_TEXELS / TILE_M
 _SITE_TEXELS_PER_M = SITE_TEXELS / SITE_M
@@ -99,7 +101,9 @@ _COARSEST = TILE_TEXELS.bit_length() - 3  # the level of 4 x 4 texels
 
 _DITHER = (np.array([0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5]) + 0.5) / 16  # Bayer 1973
 
+# A tile of the ground has so many blades of grass.
 _BLADES = 240_000
+# A blade is drawn in so many steps along its length.
 _BLADE_STEPS = 24
 
 

@@ -52,8 +52,10 @@ MIN_CONFIDENCE = 0.3
 IMITATED = DetectorErrors().detector
 """Detector whose measured errors the modelled keypoints have."""
 
+# The person of a study walks at an even, usual pace.
 _SPEED_MPS = 1.2
-_UNDER_WAY_S = 2.0  # the person starts from a stand; filmed is a walk
+# The person starts from a stand, and filming begins when it has become a walk.
+_UNDER_WAY_S = 2.0
 _AIM_S, _AIM_STEP_S = 1.0, 0.05  # cameras follow the mean over a stride, not every bob of the hip
 # One random stream for each.
 _POSES, _KEYPOINTS = range(2)
@@ -237,6 +239,7 @@ def views_of(
 NEAR_SHARE = 0.1
 """Largest error of a right keypoint, as a share of the height in pixels of a person at that place."""
 
+# A tilt within this of the wanted one counts as kept.
 _NEAR_TILT_DEG = 5.0
 _ERRORS = ("reconstructed_share", "mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150")
 

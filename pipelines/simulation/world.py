@@ -84,11 +84,16 @@ def _rows(points: Float, columns: int) -> Float:
     return np.ascontiguousarray(points, dtype=np.float64).reshape(-1, columns)
 
 
-_FAR_M = 2000.0  # beyond, the horizon is less than two pixels away for a drone at 5 m
-_CELLS = 16  # along the ground's square, at least
-_GROWTH = 0.5  # cells outside are at most half as wide as their distance from it
-_FLATNESS_M = 0.02  # largest distance of triangles from the ground
-_FINEST = 17  # halvings of the whole: cells of 3 to 6 cm, however steep a mound
+# Beyond this the horizon is less than two pixels away for a drone at 5 m.
+_FAR_M = 2000.0
+# The square of the ground has at least so many cells along a side.
+_CELLS = 16
+# Cells outside of the square are at most half as wide as their distance from it.
+_GROWTH = 0.5
+# Triangles lie no further than this from the ground.
+_FLATNESS_M = 0.02
+# So many halvings give cells of 3 to 6 cm, however steep a mound is.
+_FINEST = 17
 _GRASS = (0.115, 0.15, 0.055)  # mean reflectance of a meadow; the texture of the ground varies it
 
 
@@ -140,9 +145,12 @@ def _too_wide(
     return wide
 
 
-_TRIES = 200  # places tried for each tree
-_APART = 0.9  # crown radii between the trunks of two trees: crowns may mingle, trees do not coincide
-_HEIGHT_SPREAD = 0.25  # a tree is up to this share lower or higher than the wood
+# A wood that has no room after so many tries is too dense.
+_TRIES = 200
+# Trunks stand at least this share of a crown radius apart, so that no two trees coincide.
+_APART = 0.9
+# A tree is up to this share lower or higher than the wood.
+_HEIGHT_SPREAD = 0.25
 _SLENDER, _STOUT = 0.21, 0.31  # crown radius of the tree's height
 
 
@@ -223,8 +231,11 @@ def _away_from(wall: scenario.Wall, x: float, y: float) -> float:
     return math.hypot(x - ax - share * (bx - ax), y - ay - share * (by - ay))
 
 
-_CROWN_SHARE = 0.62  # of a tree's height
-_TRUNK_SHARE = 0.03  # its radius, of the tree's height
+# The crown takes this upper share of the height of a tree.
+_CROWN_SHARE = 0.62
+# The radius of a trunk is this share of the height of the tree.
+_TRUNK_SHARE = 0.03
+# Solids reach no deeper than this into steep ground.
 _MOST_BURIED_M = 50.0
 
 
@@ -289,13 +300,20 @@ def _slab(terrain: MoundedGround, k: int, wall: scenario.Wall) -> tuple[float, .
     return (*middle, *along, length / 2, wall.thickness_m / 2, low, under[:, 1].max() + wall.height_m)
 
 
-_SIDES = 10  # of a trunk
+# A trunk is drawn as a prism with so many sides.
+_SIDES = 10
+# Bark is mottled at so many heights of a trunk.
 _RINGS = 5
-_CLUSTERS = 16  # of leaves in a crown
-_HEART = 0.8  # radius of the part that is always filled with leaves: no line of sight slips through
+# The leaves of a crown stand in so many clusters.
+_CLUSTERS = 16
+# Leaves always fill this share of the radius, so that no line of sight slips through.
+_HEART = 0.8
+# This power mean of the radii is 1, so that the outline of a crown has the size of its ellipsoid.
 _OUTLINE = 12
-_RAGGED = 0.04  # deviation of leaves from their cluster, of the crown's radius (sigma)
-_MANY_TREES = 40  # more are drawn with fewer triangles each
+# Leaves deviate from their cluster by this share of the radius of the crown.
+_RAGGED = 0.04
+# More trees than this are drawn with fewer triangles each.
+_MANY_TREES = 40
 _BARK = (0.16, 0.115, 0.08)
 _GREENS = ((0.10, 0.19, 0.045), (0.13, 0.22, 0.05), (0.075, 0.155, 0.05), (0.165, 0.22, 0.06))
 _STONE = (0.36, 0.33, 0.29)
@@ -451,7 +469,8 @@ def _sphere(halvings: int) -> tuple[Float, Int32]:
     return corners / np.sqrt((corners**2).sum(axis=1, keepdims=True)), faces.astype(np.int32)
 
 
-_LOOKS = 2  # keeps these random numbers apart from the wood's
+# This number keeps the random numbers of looks apart from those of the wood.
+_LOOKS = 2
 
 
 # --- the world -----------------------------------------------------------------------------------------
@@ -545,12 +564,16 @@ def build_world(spec: scenario.WorldSettings, seed: int, *, keep_clear: Float) -
     return World(spec.ground, terrain, erect(terrain, trees, spec.walls), seed)
 
 
-_WOOD = 1  # keeps the wood's random numbers apart from those of looks
+# This number keeps the random numbers of the wood apart from those of looks.
+_WOOD = 1
 
 
-_TOUCH_M = 1e-9  # level ground on the border between two voxels fills the lower one alone
-_FINE_ENOUGH = 0.05  # of a voxel: allowed rise of the ground between samples
-_MOST_SAMPLES = 16  # along a voxel
+# Level ground on the border between two voxels fills the lower one alone.
+_TOUCH_M = 1e-9
+# The ground rises by at most this share of a voxel between two samples.
+_FINE_ENOUGH = 0.05
+# A voxel over a steep mound is sampled at no more places than this along a side.
+_MOST_SAMPLES = 16
 
 
 def map_world(

@@ -23,7 +23,8 @@ from pipelines.geometry.compilation import cached, helper
 GRAZE_M = 1e-3
 """Allowed depth of a line of sight in the ground, m; steps can overlook another such depth."""
 
-_TOUCH_M = 1e-9  # voxels and solids that share a plane do not overlap for a rounding error
+# Voxels and solids that share a plane do not overlap for a rounding error.
+_TOUCH_M = 1e-9
 
 
 # --- the ground ----------------------------------------------------------------------------------------
