@@ -293,7 +293,7 @@ class _FlightReader:
         """Return a setting of the log that is a source; None if the source is no log."""
         if not self._files.is_log(part, source):
             return None
-        return setting(self._logs.settings(source.file or ""))
+        return setting(self._logs.settings(source.file))
 
     def _read_camera(self, name: str) -> CameraData:
         """Read everything about one camera, and check the parts against each other."""
@@ -361,9 +361,9 @@ class _FlightReader:
             return None
         base = self._flight_path.parent
         motion = self._files.true_joints(truth) if truth.file else None
-        if motion is not None and truth.file is not None:
+        if motion is not None and truth.file:
             place = located(base, truth.file)
-            own_axes = truth.axes is not None
+            own_axes = truth.axes is not None or truth.up is not None
             position = self._poses.joints(place, motion.position, own_axes=own_axes)
             motion = replace(motion, position=position)
             refuse_no_overlap(named(base, truth.file), motion.t_ns, entries)

@@ -24,7 +24,6 @@ from pipelines.session.storage import refuse_camera_names, refuse_names_of_peopl
 from pipelines.session.yaml_files import (
     SecondsAsNs,
     YamlModel,
-    nanoseconds,
     read_yaml_model,
     unknown_key,
 )
@@ -63,15 +62,8 @@ def _fps(value: object) -> Fraction:
     return fps
 
 
-def _seconds(value: float) -> float:
-    nanoseconds(value)
-    return value
-
-
 Quaternion = Annotated[list[float], Field(min_length=4, max_length=4), AfterValidator(_unit_quaternion)]
 Fps = Annotated[Fraction, BeforeValidator(_fps)]
-Seconds = Annotated[float, AfterValidator(_seconds)]
-"""Seconds that can be added to any time."""
 
 
 class Guess(YamlModel):
@@ -89,7 +81,8 @@ class FileSource(Guess):
     part: ClassVar[str] = ""
     """Name of the part of the manifest, by which formats declare their options."""
 
-    file: str | None = None
+    needs_file: ClassVar[bool] = True
+    file: str = ""
     """Path or URL of a file or folder, or the name of one of the `logs`; its content says what it is."""
     topic: str | None = None
     """Topic, where the file is a log; without it, the only one of its kind."""
@@ -98,6 +91,8 @@ class FileSource(Guess):
 
     @model_validator(mode="after")
     def _options_exist(self) -> FileSource:
+        if self.needs_file and not self.file:
+            raise ValueError("file: is missing")
         known = option_names(self.part)
         for key in self.options:
             if key not in known:
@@ -110,11 +105,75 @@ class FileSource(Guess):
         return dict(self.model_extra or {})
 
 
-class NamedFile(FileSource):
-    """A file, or a topic of a log, that must be named."""
+class RigidTransform(YamlModel):
+    """A place and a rotation."""
 
-    file: str
-    """As of any source; it must be there."""
+    translation: Vector = [0.0, 0.0, 0.0]
+    """Place, m: of the camera on its body (forward, left, up), or of a source's zero in the world."""
+    rotation_xyzw: Quaternion | None = None
+    """Rotation body_from_camera or world_from_source, in place of `looks` or `yaw_deg`."""
+
+
+class Scaled(YamlModel):
+    """Positions in a unit of their own."""
+
+    scale: float = Field(1.0, gt=0)
+    """Metres in the world for a metre of the source."""
+
+
+class Placement(RigidTransform, Scaled):
+    """Pose in the world of the origin of a source."""
+
+    yaw_deg: float = 0.0
+    """Angle from the world's axes to the source's about the vertical, degrees."""
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> Placement:
+        if self.yaw_deg and self.rotation_xyzw is not None:
+            raise ValueError("has yaw_deg and rotation_xyzw: leave one of them out")
+        return self
+
+
+class OwnAxes(YamlModel):
+    """A source with axes of its own."""
+
+    axes: Axes | None = None
+    """Axes; without them, those of the log or the world."""
+
+
+class Placed(OwnAxes):
+    """A source with a place of its own."""
+
+    world_from_source: Placement = Placement()
+    """Place in the world of the source's zero, and its axes."""
+
+
+class Upright(YamlModel):
+    """A source with an up axis of its own."""
+
+    up: Up | None = None
+    """Axis that points up, z if nothing says so; of the world, in all sources without axes of their own."""
+
+
+class Projected(YamlModel):
+    """Coordinates that may be those of a map projection."""
+
+    crs: str | None = None
+    """Map projection of the coordinates, `EPSG:32632` for example; of the world, in all sources."""
+
+
+class Written(YamlModel):
+    """Numbers with a unit of length."""
+
+    unit: Unit | None = None
+    """Unit of the positions, m unless the file states another one."""
+
+
+class Delayed(YamlModel):
+    """Times with a zero of their own."""
+
+    offset_ns: SecondsAsNs = Field(0, alias="offset_s")
+    """Seconds that are added to the times."""
 
 
 class WorldOrigin(YamlModel):
@@ -128,56 +187,29 @@ class WorldOrigin(YamlModel):
     """Height, m."""
 
 
-class WorldAxes(Guess):
+class WorldAxes(Guess, Upright, Projected, Scaled):
     """The axes of all sources that do not state their own, and the world's origin."""
 
     frame: Axes = "enu"
     """Axes of all sources that do not state their own: east, north, up or north, east, down."""
-    up: Up = "z"
-    """Axis that points up in all sources that do not state their own axes."""
-    scale: float = Field(1.0, gt=0)
-    """Metres in a unit of all sources that do not state their own axes."""
     origin: WorldOrigin | None = None
     """Place on Earth of the world's origin; without it, the first position of the first camera."""
-    crs: str | None = None
-    """Map projection of all positions that are coordinates of one, `EPSG:32632` for example."""
 
     @model_validator(mode="after")
     def _one_way_up(self) -> WorldAxes:
-        if self.frame == "ned" and self.up != "z":
+        if self.frame == "ned" and self.up not in {None, "z"}:
             raise ValueError("up: frame: ned has z down: leave one of them out")
         return self
 
 
-class LogClock(YamlModel):
+class LogClock(Delayed):
     """Relation of a recorder's clock to the world's."""
 
-    offset_s: Seconds = 0.0
-    """Seconds that are added to the log's times."""
     drift_ppm: float = Field(0.0, ge=-100_000, le=100_000)
     """Drift of the log's clock since its first message, parts per million."""
 
 
-class Placement(YamlModel):
-    """Pose in the world of the origin of a source."""
-
-    translation: Vector = [0.0, 0.0, 0.0]
-    """Place in the world of the source's zero, m."""
-    yaw_deg: float = 0.0
-    """Angle from the world's axes to the source's about the vertical, degrees."""
-    rotation_xyzw: Quaternion | None = None
-    """Rotation from the source's axes to the world's, in place of `yaw_deg`."""
-    scale: float = Field(1.0, gt=0)
-    """Metres in the world for a metre of the source."""
-
-    @model_validator(mode="after")
-    def _one_rotation(self) -> Placement:
-        if self.yaw_deg and self.rotation_xyzw is not None:
-            raise ValueError("has yaw_deg and rotation_xyzw: leave one of them out")
-        return self
-
-
-class LogSource(Guess):
+class LogSource(Guess, Placed):
     """A recording: one file or several parts of it."""
 
     shorthand = "file"
@@ -187,21 +219,18 @@ class LogSource(Guess):
     """A file, the folder of a bag, or the parts of a split log in their order."""
     stamps: Literal["header", "receive"] = "header"
     """Times that count: those in the messages, or those at which the recorder received them."""
-    axes: Axes | None = None
-    """Axes of the log; without them, those of the world."""
     clock: LogClock = LogClock()
     """Relation of the log's clock to the world's."""
-    world_from_source: Placement = Placement()
-    """Place in the world of the log's origin."""
 
 
-class VideoSource(NamedFile):
+class VideoSource(FileSource):
     """A video, a folder of pictures, or pictures in a log."""
 
 
 class FrameTimes(FileSource):
     """Source of the frames' times; by default the container's stamps, counted from `start`."""
 
+    needs_file = False
     start_ns: SecondsAsNs = Field(0, alias="start")
     """Time of the first picture, s."""
     start_from: Literal["container", "motion"] | None = None
@@ -213,10 +242,10 @@ class FrameTimes(FileSource):
     def _from_one_place(self) -> FrameTimes:
         counted = (("start", "start_ns"), ("start_from", "start_from"), ("fps", "fps"))
         stated = [key for key, name in counted if name in self.model_fields_set]
-        if self.file is not None and stated:
+        if self.file and stated:
             problem = f"has {', '.join(['file', *stated])}, which say different things of the same pictures"
             raise ValueError(f"{problem}: leave all but one of them out")
-        if self.topic is not None and self.file is None:
+        if self.topic is not None and not self.file:
             raise ValueError("topic: needs the file of the log that holds it")
         return self
 
@@ -228,33 +257,25 @@ class FrameTimes(FileSource):
     @property
     def is_placed(self) -> bool:
         """True if the times are world times: more than a rate, or the container's stamps from 0 on."""
-        return self.has_start or self.start_from is not None or self.file is not None
+        return self.has_start or self.start_from is not None or bool(self.file)
 
 
-class CameraClock(Guess):
+class CameraClock(Guess, Delayed):
     """World time = video time + offset."""
 
-    offset_ns: SecondsAsNs = Field(0, alias="offset_s")
-    """Seconds that are added to the times of the pictures."""
     sigma_s: float = Field(0.2, ge=0)
     """Standard deviation of the offset, s; 0 means that it is known."""
 
 
-class PoseSource(NamedFile):
+class PoseSource(Placed, Written, FileSource):
     """Source of a camera's poses: a trajectory, a log, a drone's own log or a calibration."""
 
     part = "pose"
     of: Literal["camera", "body"] | None = None
     """What the poses are of: the camera, or the body that carries it by a mount or gimbal."""
-    axes: Axes | None = None
-    """Axes of the poses; without them, those of the log or the world."""
-    unit: Unit = "m"
-    """Unit of the positions."""
-    world_from_source: Placement = Placement()
-    """Place in the world of the source's zero, and its north."""
 
 
-class Mount(Guess):
+class Mount(Guess, RigidTransform):
     """Pose of the camera on the body."""
 
     one_of = ("looks", "rotation_xyzw")
@@ -262,15 +283,12 @@ class Mount(Guess):
     """Direction in which the camera looks, seen from the body."""
     down_deg: float = 0.0
     """Angle by which the camera looks down from there, degrees."""
-    rotation_xyzw: Quaternion | None = None
-    """Rotation body_from_camera, in place of `looks`."""
-    translation: Vector = [0.0, 0.0, 0.0]
-    """Place of the camera on the body: forward, left, up, m."""
 
 
-class GimbalSource(FileSource):
+class GimbalSource(OwnAxes, FileSource):
     """Source of the gimbal's angles: a topic, fixed angles, another log, or the log that gives the pose."""
 
+    needs_file = False
     part = "gimbal"
     yaw_deg: float | None = Field(None, ge=-360, le=360)
     """Constant yaw from north to east, degrees; beside a file without north, that of the first picture."""
@@ -280,12 +298,10 @@ class GimbalSource(FileSource):
     """Constant roll to the right, degrees."""
     relative_to: RelativeTo | None = None
     """What the angles are relative to: the world, the body, or a level frame with the body's heading."""
-    axes: Axes | None = None
-    """Axes of the angles; without them, those of the log or the world."""
 
     @model_validator(mode="after")
     def _complete(self) -> GimbalSource:
-        if self.file is None:
+        if not self.file:
             if self.topic is not None:
                 raise ValueError("topic: needs the file of the log that holds it")
             if (self.yaw_deg is None) != (self.pitch_deg is None):
@@ -309,12 +325,13 @@ class GimbalSource(FileSource):
     @property
     def is_of_pose(self) -> bool:
         """True if the angles are those of the log that gives the pose."""
-        return self.file is None and not self.is_fixed
+        return not self.file and not self.is_fixed
 
 
 class IntrinsicsSource(FileSource):
     """A calibration file (and which of its cameras), a topic, or the numbers themselves."""
 
+    needs_file = False
     part = "intrinsics"
     one_of = ("file", "fx")
     width: Side | None = None
@@ -345,7 +362,7 @@ class IntrinsicsSource(FileSource):
         return self
 
 
-class KeypointSource(NamedFile):
+class KeypointSource(FileSource):
     """2D keypoints of this camera, made by a detector of the user's own."""
 
     part = "keypoints"
@@ -402,7 +419,7 @@ class CameraSources(YamlModel):
         return self.mount is not None or self.gimbal is not None
 
 
-class ActorSource(NamedFile):
+class ActorSource(FileSource):
     """Source of a person's positions, logged in flight."""
 
     point: Literal["hip", "head", "feet", "centre"] = "hip"
@@ -411,34 +428,27 @@ class ActorSource(NamedFile):
     """Weight of this person for the planners, among several."""
 
 
-class MapSource(NamedFile):
+class MapSource(Projected, FileSource):
     """Source of the map of the surroundings."""
 
     part = "map"
-    crs: str | None = None
-    """Map projection of its coordinates; without it, the file's own or `world.crs`."""
     unknown: Literal["free", "occupied"] = "free"
     """State of voxels that nothing is known of."""
     resolution_m: float | None = Field(None, gt=0)
     """Side of the voxels that a cloud of points is divided into, m."""
 
 
-class TruthSource(FileSource):
+class TruthSource(OwnAxes, Upright, Written, Delayed, FileSource):
     """Sources of ground truth: joints, and camera poses by camera."""
 
-    unit: Literal["m", "cm", "mm"] | None = None
-    """Unit of the joints, where the file does not state it."""
+    needs_file = False
     subject: str | None = None
     """Name of the person before the joints' names, in a file of several."""
-    axes: Literal["z-up", "y-up", "ned"] | None = None
-    """Axes of the joints, where they are neither the file's own nor those of the world."""
-    offset_s: Seconds = 0.0
-    """Seconds that are added to the times of the joints."""
     poses: dict[str, str] = {}
     """Files of true poses by camera."""
 
 
-class PlanSource(NamedFile):
+class PlanSource(FileSource):
     """Setpoints of the on-board planner for one drone."""
 
 

@@ -36,6 +36,10 @@ OLD_SPELLINGS: dict[str, str] = {
 """Old spellings and the new ones; `*` is any name."""
 
 
+_UP = {"z-up": "z", "y-up": "y"}
+"""Values of `truth.axes` that are values of `truth.up` now."""
+
+
 def old_spellings(flight: Mapping[object, object]) -> list[str]:
     """List the old spellings in a manifest, each with the new one."""
     found = []
@@ -43,7 +47,9 @@ def old_spellings(flight: Mapping[object, object]) -> list[str]:
         for names in _matches(flight, old.split(".")):
             place = _filled(old, names)
             found.append(f"{place}: is now {_filled(new, names).removeprefix(_parent(place))}")
-    return found
+    truth = flight.get("truth")
+    axes = truth.get("axes") if isinstance(truth, Mapping) else None
+    return found + ([f"truth.axes: {axes} is now truth.up: {_UP[axes]}"] if axes in _UP else [])
 
 
 def _matches(mapping: object, keys: list[str]) -> Iterator[list[str]]:

@@ -17,6 +17,7 @@ from pipelines.session.registries import (
     Format,
     KeypointFormat,
     LogFormat,
+    PositionChoice,
     TelemetryChoice,
     TelemetryFormat,
     TrajectoryFormat,
@@ -37,11 +38,16 @@ class FiledPose(YamlModel):
     """Direction in which positions count z where the attitudes are in east, north, up."""
 
 
-class LoggedPose(FiledPose):
-    """Options of poses in a log of topics."""
+class FramedSource(YamlModel):
+    """A source in a frame of its own."""
 
     parent: str | None = None
-    """Frame of the world, for poses that are chained from transforms."""
+    """Frame that is the log's world."""
+
+
+class LoggedPose(FiledPose, FramedSource, PositionChoice):
+    """Options of poses in a log of topics."""
+
     child: str | None = None
     """Frame of the camera or body, for poses that are chained from transforms."""
     preset: Literal["dji_osdk", "mavros", "px4"] | None = None
@@ -50,8 +56,6 @@ class LoggedPose(FiledPose):
     """Namespace of the preset's topics in a log of several drones."""
     attitude: str | None = None
     """Topic of attitudes, for a topic that has only positions."""
-    position: Literal["local", "global", "gps"] | None = None
-    """Position that is read of those that a preset finds."""
 
     @model_validator(mode="after")
     def _complete(self) -> LoggedPose:
@@ -80,11 +84,9 @@ class LoggedAngles(YamlModel):
     """Unit of the angles in a message of three numbers."""
 
 
-class LoggedMap(YamlModel):
+class LoggedMap(FramedSource):
     """Options of a map in a log of topics."""
 
-    parent: str | None = None
-    """Frame that is the log's world."""
     height_m: float | None = Field(None, gt=0, le=1000)
     """Height of what stands on a floor plan, m."""
 

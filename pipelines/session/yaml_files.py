@@ -69,7 +69,7 @@ class YamlModel(BaseModel):
 
     @model_validator(mode="after")
     def _exactly_one(self) -> YamlModel:
-        stated = [name for name in self.one_of if getattr(self, name) is not None]
+        stated = [name for name in self.one_of if getattr(self, name) not in (None, "")]
         if self.one_of and len(stated) != 1:
             raise ValueError(f"needs exactly one of {', '.join(self.one_of)}" + f" (has {len(stated)})")
         return self

@@ -36,7 +36,7 @@ from pipelines.session.source_options import CameraOfCalibration, DetectorOutput
 from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
 from pipelines.session.urls import fetched, located, named, source_url
 from pipelines.session.yaml_files import YamlModel
-from pipelines.sources.world import losses
+from pipelines.sources.world import UP_ROWS, losses
 
 # In any flight a person's joints are closer to their median than this.
 MAX_JOINT_DISTANCE_M = 10_000
@@ -77,7 +77,7 @@ class FlightFiles:
 
     def format_of(self, part: str, source: FileSource) -> Format:
         """Recognise the file of a part of the manifest; errors as in `recognise`."""
-        key = (part, source.file or "", source.format)
+        key = (part, source.file, source.format)
         if key not in self._formats:
             noun, kinds = _KINDS[part]
             self._formats[key] = recognise_any(self.path(key[1]), kinds, noun, name=source.format)
@@ -85,7 +85,7 @@ class FlightFiles:
 
     def is_log(self, part: str, source: FileSource) -> bool:
         """Return True if a source is a log of topics."""
-        return source.file is not None and isinstance(self.format_of(part, source), LogFormat)
+        return bool(source.file) and isinstance(self.format_of(part, source), LogFormat)
 
     def options(self, part: str, source: FileSource, wanted: type[O], place: str = "") -> O:
         """Validate the options beside the file of a part of the manifest, and return them."""
@@ -106,7 +106,7 @@ class FlightFiles:
         parts += [("map", "map", self._flight.map), ("truth", "truth", self._flight.truth)]
         parts += [(f"plan.{name}", "plan", source) for name, source in self._flight.plan.items()]
         for place, part, source in parts:
-            if source is None or source.file is None:
+            if source is None or not source.file:
                 continue
             self.options(part, source, YamlModel, place)
             if source.topic is not None and not self.is_log(part, source):
@@ -150,7 +150,7 @@ class FlightFiles:
 
     def camera(self, name: str, part: str, source: FileSource) -> CalibratedCamera:
         """Return the camera that is asked for, or the one of this name, or the only one of the file."""
-        path, camera = source.file or "", self.options(part, source, CameraOfCalibration).camera
+        path, camera = source.file, self.options(part, source, CameraOfCalibration).camera
         if path not in self._calibrations:
             reader = self.format_of(part, source)
             if not isinstance(reader, CalibrationFormat):
@@ -169,40 +169,39 @@ class FlightFiles:
             )
         return cameras[camera or name]
 
-    def has_world_axes(self, source: TruthSource) -> bool:
-        """Return True if joints are in axes of the world that are not z up."""
-        return source.axes is None and self._flight.world.up != "z"
-
     def true_joints(self, source: TruthSource) -> JointMotion:
         """Read the true joints; drop and count positions too far from the others to be true.
 
         Raises:
             DataError: the file cannot be used, its axes are unknown, or no position is left.
         """
-        path = self.path(source.file or "")
+        path = self.path(source.file)
         reader = recognise(path, JointFormat, "file of true joints", name=source.format)
-        if source.axes is None and self._flight.world.frame == "ned":
+        own_axes = source.axes is not None or source.up is not None
+        if not own_axes and self._flight.world.frame == "ned":
             raise DataError(
                 path,
                 "has joints of unknown axes in a NED world",
-                "say truth: {axes: ned} or z-up, y-up",
+                "say truth: {axes: ned}, or up: z",
                 code="axes-unknown",
             )
-        is_ned = source.axes == "ned"
-        axes = "z-up" if is_ned or self.has_world_axes(source) else source.axes
+        as_written = own_axes or self._flight.world.up not in {None, "z"}
+        axes = "z-up" if as_written else None
         motion = reader.read_joints(path, unit=source.unit, axes=axes)
         motion = _without_zeros(_of_subject(path, motion, source.subject))
         if source.unit is None:
             self._refuse_wrong_unit(path, motion, reader, source, axes)
-        if is_ned:
+        if source.axes == "ned":
             motion = replace(motion, position=motion.position[..., [1, 0, 2]] * [1, 1, -1])
+        elif source.up is not None:
+            motion = replace(motion, position=motion.position @ np.transpose(UP_ROWS[source.up]))
         motion = _without_far_joints(motion)
         if not np.isfinite(motion.position).any():
             lost = f" ({losses(motion.dropped)})" if motion.dropped else ""
             raise DataError(
                 path, f"holds no position of a joint{lost}", "check what wrote it", code="no-positions"
             )
-        return replace(motion, t_ns=motion.t_ns + round(source.offset_s * 1e9))
+        return replace(motion, t_ns=motion.t_ns + source.offset_ns)
 
     @staticmethod
     def _refuse_wrong_unit(

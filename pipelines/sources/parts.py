@@ -194,7 +194,7 @@ def _poses_entry(
         gimbal=_gimbal_of(camera),
         gimbal_fixed=camera.gimbal is not None and camera.gimbal.is_fixed,
         gimbal_axes=axes[1],
-        gimbal_log=camera.gimbal.file if camera.gimbal is not None else None,
+        gimbal_log=(camera.gimbal.file or None) if camera.gimbal is not None else None,
         gimbal_topic=camera.gimbal.topic if camera.gimbal is not None else None,
         axes=axes[0],
         mount=None if camera.gimbal else _mount_entry(camera),

@@ -190,7 +190,7 @@ class FlightPoses:
                 position=calibrated.position[None],
                 quaternion_xyzw=calibrated.quaternion_xyzw[None],
             )
-            return path, self._enu(scaled(still, METRES[pose.unit]), pose.axes)
+            return path, self._enu(scaled(still, METRES[pose.unit or "m"]), pose.axes)
         if self._is_log(pose):
             settings, options = self._logs.settings(pose.file), self._logged(pose)
             logged = self._logs.trajectory(
@@ -240,7 +240,7 @@ class FlightPoses:
             if pose.of == "body" or camera.is_carried:
                 yield "pose: a still camera's pose is its own", "leave `of: body` and the mount out"
         elif self._is_joined(pose):
-            if pose.unit != "m":
+            if pose.unit:
                 yield f"pose: unit: a file of this kind ({title}) states its own", "leave it out"
             if pose.axes and not (is_log and self._logged(pose).attitude):
                 yield f"pose: axes: a file of this kind ({title}) states its own", "leave them out"
@@ -369,7 +369,7 @@ class FlightPoses:
             return AttitudeTrack(_FIXED, np.zeros(1, dtype=np.int64), turned, relative_to)
         if not self._files.is_log("gimbal", gimbal):
             return self._angles_alone(name, camera, gimbal, frames)
-        log, topic = gimbal.file or "", gimbal.topic or ""
+        log, topic = gimbal.file, gimbal.topic or ""
         options = self._files.options("gimbal", gimbal, LoggedAngles)
         logged = self._logs.attitudes(log, topic, order=options.order, units=options.units)
         axes = self._axes(gimbal.axes, self._logs.settings(log).axes)
@@ -390,7 +390,7 @@ class FlightPoses:
         Raises:
             DataError: there are none, or nothing places them in time.
         """
-        stated = gimbal.file or ""
+        stated = gimbal.file
         path, place = self._one_file(stated), f"{self._manifest}: cameras.{name}.gimbal"
         reader = self._files.format_of("gimbal", gimbal)
         if not isinstance(reader, AttitudeFormat):
@@ -625,7 +625,7 @@ class FlightPoses:
 
     def triggers(self, times: FrameTimes) -> Int64 | None:
         """Read the trigger times of pictures from a drone's own log, at world times; None if it is none."""
-        stated, reader = times.file or "", self._files.format_of("frame_times", times)
+        stated, reader = times.file, self._files.format_of("frame_times", times)
         if not isinstance(reader, TriggerFormat):
             return None
         t_ns = reader.picture_times(self._one_file(stated), TelemetryChoice())

@@ -55,7 +55,7 @@ UP_ROWS: dict[Up, tuple[tuple[int, int, int], ...]] = {
 
 def upright(world: WorldAxes) -> Placement:
     """Return the placement that turns the files' world upright, in metres."""
-    if world.up == "z":
+    if world.up is None or world.up == "z":
         return Placement(scale=world.scale)
     turn = quaternion_from_matrix(np.array(UP_ROWS[world.up], dtype=np.float64))
     return Placement(rotation_xyzw=turn.tolist(), scale=world.scale)
@@ -78,7 +78,7 @@ def as_stated(trajectory: Trajectory, pose: PoseSource, options: FiledPose) -> T
         turned = np.diag([*flip, 1.0, 1.0, 1.0])
         covariance = None if covariance is None else carried_covariance(turned, covariance)
     stated = replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
-    return scaled(stated, METRES[pose.unit])
+    return scaled(stated, METRES[pose.unit or "m"])
 
 
 def scaled(trajectory: Trajectory, factor: float) -> Trajectory:
@@ -94,7 +94,7 @@ def scaled(trajectory: Trajectory, factor: float) -> Trajectory:
 def world_times(clock: LogClock, t_ns: Int64, since_ns: int) -> Int64:
     """Convert a log's own times to world times [N]; its drift counts from `since_ns`."""
     drift_ns = np.round((t_ns - since_ns) * (clock.drift_ppm * 1e-6)).astype(np.int64)
-    world_ns: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
+    world_ns: Int64 = t_ns + drift_ns + clock.offset_ns
     return world_ns
 
 

@@ -161,7 +161,7 @@ def test_c3d_is_truth(tmp_path: Path) -> None:
     flight.settings["truth"] = {
         "file": "truth.c3d",
         "unit": "cm",
-        "axes": "y-up",
+        "up": "y",
         "offset_s": START_NS // 10**9,
     }
     flight.save()

@@ -17,6 +17,7 @@ from pipelines.session.maps import load_maps, write_grid
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import CalibrationFormat, recognise
 from pipelines.simulation.flight_files import write_tum
+from pipelines.sources.world import UP_ROWS
 from tests.raising import refused
 from tests.synthetic.flights import START_NS, SyntheticFlight, pose2sim_table, write_flight
 from tests.synthetic.logged_flights import header
@@ -229,3 +230,18 @@ def test_truth_of_zeros_is_missing_and_counted(tmp_path: Path) -> None:
     truth = ingested.description.truth
     assert truth is not None
     assert truth.missing == sum(truth.dropped.values()) == len(joints.loc[::7])
+
+
+@pytest.mark.parametrize("up", ["y", "-x"])
+def test_the_axis_of_the_truth_is_stated_for_itself(tmp_path: Path, up: str) -> None:
+    """Joints of a file that is y up, in feet, beside poses that are z up."""
+    flight = write_flight(tmp_path, cameras=2, seconds=0.2, clean=True)
+    right = tables(flight)["truth.parquet"]
+    joints = pd.read_csv(tmp_path / "truth.csv")
+    written = joints[list(NAMES)].to_numpy(copy=True) @ np.array(UP_ROWS[up]) / 0.3048  # type: ignore[index]
+    joints[list(NAMES)] = written
+    joints.to_csv(tmp_path / "truth.csv", index=False)
+    flight.settings["truth"] |= {"up": up, "unit": "ft"}
+    flight.save()
+    found = tables(flight)["truth.parquet"]
+    np.testing.assert_allclose(found[list(NAMES)], right[list(NAMES)], rtol=0, atol=1e-9)

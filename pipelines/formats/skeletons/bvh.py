@@ -101,7 +101,7 @@ class BvhFormat:
         """
         contents = _read(path)
         axes = axes or "y-up"
-        metres = METRES[unit] if unit else _likely_unit(path, contents.bones, axes)
+        metres = {**METRES, "ft": 0.3048}[unit] if unit else _likely_unit(path, contents.bones, axes)
         joints: list[Float] = []
         turned: list[Float] = []
         for bone in contents.bones:

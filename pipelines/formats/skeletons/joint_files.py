@@ -34,7 +34,7 @@ from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, pos
 if TYPE_CHECKING:
     import pyarrow as pa
 
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 AXES = ("z-up", "y-up")
 # A hand at 2 m/s moves by 1 mm in this time, so a sample so near keeps its position.
 _KEPT_NS = 500_000
