@@ -437,7 +437,7 @@ def _unequal(arms: Mapping[str, Mapping[str, Any]]) -> list[str]:
     ranges = {name: arm["range_m"]["mean"] for name, arm in arms.items()}
     if max(ranges.values()) - min(ranges.values()) > SAME_RANGE_M:
         said = ", ".join(f"{name} {mean:.1f} m" for name, mean in ranges.items())
-        found.append(f"the arms film from different mean ranges ({said}): part of a difference may be that")
+        found.append(f"the arms film from different mean ranges ({said}), which may explain a difference")
     return found
 
 

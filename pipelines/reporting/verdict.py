@@ -40,8 +40,6 @@ DOUBTFUL_COVERAGE = 0.8
 NOTABLE_LOSS = 0.01
 # A camera is named among the doubts when its reprojection error is this many times the usual one.
 ODD_CAMERA = 2.0
-# A calibrated 95 % ellipsoid holds 95 % of the truths; outside these shares the page says so.
-CALIBRATED_SHARES = (0.90, 0.99)
 # Measured joints further from truth than this are named among the doubts, however few.
 LARGE_ERROR_MM = 300.0
 # Root-relative error below this part of the absolute one: the cameras' poses carry most of the error.
@@ -233,17 +231,10 @@ def _certainty(summary: Summary) -> list[str]:
         return ["The method states no uncertainty for its positions."]
     sentences = [f"The stated uncertainty of a joint is {quantity(1000 * sigma, 'mm')} per axis (median)."]
     if summary.inside_95 is not None:
-        low, high = CALIBRATED_SHARES
-        judgement = (
-            "too small: do not rely on it"
-            if summary.inside_95 < low
-            else "larger than need be"
-            if summary.inside_95 > high
-            else "about right"
-        )
         sentences.append(
             f"{percent(summary.inside_95)} of the true positions lie inside the stated 95{chr(0x202F)}% "
-            f"ellipsoids, so it is {judgement}."
+            "ellipsoids. A flight is one draw of its constant pose errors, so only many flights tell if the "
+            "uncertainty is right."
         )
     return sentences
 
