@@ -12,13 +12,11 @@ import pytest
 
 from pipelines.formats.poses.trajectory_files import write_tum as write_trajectory
 from pipelines.geometry.geodesy import place_at
-from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
-from pipelines.session.maps import write_grid
-from pipelines.session.records import Occupancy, Trajectory
-from tests.commands.runner import refused, succeeds
+from pipelines.session.records import Trajectory
+from tests.commands.runner import succeeds
 from tests.synthetic.drone_logs import (
     HOME,
     LEVER_ARM,
@@ -193,101 +191,7 @@ def test_drones_that_log_body_and_gimbal(tmp_path: Path, write: Any, metres: flo
         assert off_deg < degrees
 
 
-@pytest.mark.parametrize("says_north", [True, False])
-@pytest.mark.parametrize("meant", ["world", "body", "heading"])
-def test_the_stated_reference_of_angles_is_used(tmp_path: Path, meant: str, says_north: bool) -> None:
-    """Check that the user's statement overrides the log's flags on the reference of its angles."""
-
-    def write(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
-        k = 0 if name == "drone1" else 1
-        ahead = rotate(truth.body, np.array([1.0, 0.0, 0.0]))
-        still = np.zeros(len(ahead))
-        yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
-        to_north = np.tile([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], (len(ahead), 1))  # FLU, forward is north
-        world_from = {
-            "world": to_north,
-            "body": truth.body,
-            "heading": np.stack([still, still, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1),
-        }
-        optical = conjugate(body_from_camera("forward"))
-        world_from_gimbal = multiply(cameras[k], optical)
-        x, y, z, w = multiply(conjugate(world_from[meant]), world_from_gimbal).T  # FLU
-        flags = 64 if says_north else 32
-        rows = [row for row in ulog_rows(truth) if row[0] != "gimbal_device_attitude_status"]
-        for us, turned in zip(truth.boot_us.tolist(), np.stack([w, x, -y, -z], axis=1).tolist(), strict=True):
-            rows.append(("gimbal_device_attitude_status", 0, (us, *turned, flags)))  # FRD
-        write_ulog(folder / f"{name}.ulg", rows)
-        return {"file": f"{name}.ulg"}
-
-    cameras = write_flight(tmp_path, cameras=2, seconds=1.0, clean=True).camera_quaternion
-    flight = with_poses(tmp_path, write, ON_GIMBAL)
-    for name in flight.cameras:
-        flight.settings["cameras"][name]["gimbal"] = {"relative_to": meant}
-    flight.save()
-    warnings = ingest(flight.manifest).description.warnings
-    assert sum(f" {meant} " in line and "stated" in line for line in warnings) == 2
-    for k in range(2):
-        off_m, off_deg = errors(flight, k)
-        assert off_m < 1e-4
-        assert off_deg < 1e-3  # quaternions of 32 bits, twice
-
-
 UTM = np.array([512_767.0, 5_403_710.0, 0.0])  # where the cloud below lies, zone 32N
-
-
-def _shifted_tum(flight: SyntheticFlight, path: Path, offset: Any) -> str:
-    trajectory = Trajectory(flight.t_ns, flight.camera_position[1] + offset, flight.camera_quaternion[1])
-    write_trajectory(path, trajectory)
-    return path.name
-
-
-def _utm_pose(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
-    flight.settings["cameras"]["drone2"]["pose"] = {"file": _shifted_tum(flight, folder / "b.tum", offset)}
-
-
-def _utm_log(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
-    entries = []
-    for row, stamp_ns in enumerate(flight.t_ns.tolist()):
-        position = (flight.camera_position[1][row] + offset).tolist()
-        turned = flight.camera_quaternion[1][row].tolist()
-        pose = {
-            "position": dict(zip("xyz", position, strict=True)),
-            "orientation": dict(zip("xyzw", turned, strict=True)),
-        }
-        said = {"header": header(stamp_ns, "utm"), "pose": pose}
-        entries.append(Entry("/pose", "geometry_msgs/msg/PoseStamped", stamp_ns, said))
-    write_log(folder, "b", "mcap-cdr", entries)
-    flight.settings["cameras"]["drone2"]["pose"] = {"file": "b.mcap", "topic": "/pose", "of": "camera"}
-
-
-def _utm_truth(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
-    flight.settings["truth"] = {"poses": {"drone2": _shifted_tum(flight, folder / "b.tum", offset)}}
-
-
-def _utm_plan(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
-    flight.settings["plan"] = {"drone2": _shifted_tum(flight, folder / "b.tum", offset)}
-
-
-def _utm_grid(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
-    write_grid(folder / "b.npz", Occupancy(np.zeros((2, 2, 2), np.float32), np.asarray(offset), 1.0))
-    flight.settings["map"] = "b.npz"
-
-
-@pytest.mark.parametrize("state", [_utm_pose, _utm_log, _utm_truth, _utm_plan, _utm_grid])
-def test_coordinates_of_a_map_projection_are_refused_beside_gps(tmp_path: Path, state: Any) -> None:
-    flight = with_poses(tmp_path, _osdk, ON_GIMBAL)
-    if state in (_utm_pose, _utm_log):
-        del flight.settings["cameras"]["drone2"]["mount"]
-    flight.settings.pop("truth", None)
-    state(flight, tmp_path, UTM)
-    flight.save()
-    said = refused("ingest", flight.manifest)
-    assert "b." in said
-    assert "UTM" in said
-    assert f"latitude {HOME.latitude_deg:.6f}" in said
-    state(flight, tmp_path, np.array([0.0, 0.0, 5.0]))  # the same, in metres about the origin
-    flight.save()
-    ingest(flight.manifest)
 
 
 def test_one_origin_for_all_where_none_is_stated(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from types import SimpleNamespace
 from typing import Any
@@ -119,7 +118,3 @@ def camera_info(ros_version: str, stamp_ns: int = 0, **changed: Any) -> Any:
 def from_json(**fields: Any) -> Any:
     """Convert fields through JSON to attribute objects."""
     return json.loads(json.dumps(fields), object_hook=lambda mapping: SimpleNamespace(**mapping))
-
-
-def as_base64(data: bytes) -> str:
-    return base64.b64encode(data).decode()

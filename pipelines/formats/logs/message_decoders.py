@@ -32,7 +32,7 @@ Decoder = Callable[[memoryview | bytes], Any]
 MESSAGE_LIMIT = 1 << 28
 # The largest definitions of ROS have some 10,000 bytes, and the parser is slow.
 _DEFINITION_LIMIT = 1 << 18
-# rosbags unrolls fixed arrays of messages into code, which must stay small.
+# The library rosbags unrolls fixed arrays of messages into code, which must stay small.
 ARRAY_LIMIT = 1 << 20
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)+", re.ASCII)
 OCTOMAP = "octomap_msgs/msg/Octomap"

@@ -159,7 +159,7 @@ _DELETE_ALL = {"header": {"frame_id": "world"}, "action": 3}
 _COLOURS = {"left": (0.35, 0.72, 0.96), "right": (1.0, 0.62, 0.36), "": (0.87, 0.89, 0.90)}
 # PointField means float32 by this number.
 _FLOAT32 = 7
-# rcl_interfaces/Log means a warning by this number.
+# A message of rcl_interfaces/Log means a warning by this number.
 _WARNING = 30
 
 Entry = tuple[int, str, str, Mapping[str, Any]]  # time, topic, type, fields

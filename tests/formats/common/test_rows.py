@@ -38,28 +38,6 @@ def test_formatted_stamps_read_back_exactly(stamps: list[int]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        (".5", 500_000_000),
-        ("5.", 5_000_000_000),
-        ("-0.25", -250_000_000),
-        ("+1.5e-3", 1_500_000),
-        ("  7 ", 7_000_000_000),
-        ("0.0166666666666666666", 16_666_667),  # the eleventh digit rounds up
-        ("0.0000000004", 0),
-        ("0.0000000005", 1),
-        ("0.9999999996", 1_000_000_000),
-        ("-0.0000000005", -1),
-        ("00000000000000000012.5", 12_500_000_000),
-    ],
-)
-def test_odd_forms(text: str, expected: int) -> None:
-    t_ns, readable = parse_stamps("log", [text])
-    assert readable.all()
-    assert t_ns.tolist() == [expected]
-
-
-@pytest.mark.parametrize(
     ("stamp", "word"),
     [
         ("1700000000000", "milliseconds"),

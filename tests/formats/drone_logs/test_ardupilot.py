@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,8 @@ from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
     BOOT_NS,
-    DATAFLASH,
     HOME,
     DroneTruth,
-    dataflash,
-    definition,
     drone_of,
     write_dataflash,
 )
@@ -161,38 +157,3 @@ def test_damage(tmp_path: Path, truth: DroneTruth, capfd: pytest.CaptureFixture[
     assert not FORMAT.recognises(path)
     with refuses(path, "ArduPilot"):
         read(path)
-
-
-def test_an_instance_is_that_of_an_estimator_and_never_that_of_a_mount(
-    tmp_path: Path, truth: DroneTruth
-) -> None:
-    """Use a second estimator 50 m further north, and a second mount that looks straight down."""
-    path = write_dataflash(tmp_path / "a.bin", truth)
-    with path.open("ab") as log:
-        for us, (east, north, up) in zip(truth.boot_us.tolist(), truth.enu.tolist(), strict=True):
-            log.write(dataflash("MNT", us, 1, 0, 0.0, 0, -90.0, 0, 0.0, 0, 0.0))
-            log.write(dataflash("XKF1", us, 1, 0, 0, 0, 0, 0, 0, 0, north + 50, east, -up, 0, 0, 0, 0))
-    first, second = read(path, position="local"), read(path, instance=1)
-    assert first.gimbal is not None
-    assert second.gimbal is not None
-    np.testing.assert_allclose(
-        second.position.values - first.position.values, [[0, 50, 0]] * len(truth.t_ns), atol=1e-5
-    )
-    np.testing.assert_array_equal(second.gimbal.quaternion_xyzw, first.gimbal.quaternion_xyzw)
-    assert any(re.search(r"\b2\b.*MNT.*\b0\b", note) for note in second.notes)
-    for position in ("global", "gps"):
-        with refuses(path, 1, position, "position: local"):
-            read(path, position=position, instance=1)
-    with refuses(path, 2, "local"):
-        read(path, instance=2)
-
-
-def test_pictures_of_2014_have_gps_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(DATAFLASH, "CAM", (15, "IHLL", "GPSTime,GPSWeek,Lat,Lng"))
-    path = tmp_path / "a.bin"
-    shots = [dataflash("CAM", 379_325_800 + 500 * k, 1813, 0, 0) for k in range(3)]
-    path.write_bytes(b"".join([definition("FMT"), definition("CAM"), *shots]))
-    # 1813 weeks and 379,325.8 s after 1980-01-06, less the 16 leap seconds of 2014
-    first_ns = (315_964_800 + 1813 * 604_800 + 379_325 - 16) * 10**9 + 800_000_000
-    expected = [first_ns + 500_000_000 * k for k in range(3)]
-    assert FORMAT.picture_times(path, TelemetryChoice()).tolist() == expected

@@ -15,7 +15,6 @@ from pipelines.formats.drone_logs.telemetry_rows import between_refreshed_angles
 from pipelines.geometry.poses import rotate
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice
-from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
 NAMES = [
@@ -135,20 +134,6 @@ def test_where_a_gimbal_looks(
     np.testing.assert_allclose(rotate(turned, np.array([0, 0, 1.0])), up, atol=1e-12)
 
 
-def test_which_height(tmp_path: Path) -> None:
-    text = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]"
-    path = subtitles(tmp_path / "a.srt", text, text)
-    assert read(path, altitude="absolute").position.values[0, 2] == 480
-    assert read(path, altitude=12.5).position.values[0, 2] == 12.5
-    assert read(path).position.height == "take-off"
-    bare = subtitles(tmp_path / "b.srt", "[latitude: 47.5] [longitude: 8.25]", "")
-    with refuses(bare, "altitude: 30"):
-        read(bare)
-    absolute = subtitles(tmp_path / "c.srt", "[latitude: 4.5] [longitude: 8.25] [abs_alt: 3]")
-    with refuses(absolute, "relative", "altitude: absolute"):
-        read(absolute, altitude="relative")
-
-
 @pytest.mark.parametrize(
     ("text", "stated", "height", "metres"),
     [
@@ -215,26 +200,6 @@ def test_repeated_measurements_become_lines() -> None:
     assert smooth[t_ns <= 2_000_000_000].max() == 0
     np.testing.assert_allclose(smooth[t_ns == 2_500_000_000], 2.5)
     np.testing.assert_array_equal(between_repeats(t_ns, np.ones((40, 1)))[0], 1)
-
-
-def test_an_angle_that_is_held_and_steps_does_so_where_it_was_logged(tmp_path: Path) -> None:
-    """Hold an angle for three seconds, or twice for half a second; rows before the step must not change."""
-    pitch = np.where(np.arange(150) < 90, -10.0, np.where(np.arange(150) < 105, -40.0, -80.0))
-    texts = [
-        f"[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5] [gb_yaw: 0.0 gb_pitch: {each} gb_roll: 0.0]"
-        for each in pitch
-    ]
-    path = tmp_path / "a.srt"
-    path.write_text(
-        "".join(
-            f"{n}\n00:00:0{n // 25},{n % 25 * 40:03d} --> 00:00:0{n // 25},{n % 25 * 40 + 39:03d}\n{text}\n\n"
-            for n, text in enumerate(texts)
-        )
-    )
-    gimbal = read(path).gimbal
-    assert gimbal is not None
-    ahead = rotate(gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
-    np.testing.assert_allclose(np.degrees(np.arcsin(ahead[:, 2])), pitch, atol=1e-5)
 
 
 @pytest.mark.parametrize("rows", [2, 3, 6])

@@ -122,17 +122,6 @@ def test_times_of_pictures(
             FORMAT.picture_times(path, TelemetryChoice(time="boot"))
 
 
-def test_several_vehicles_are_asked_for(tmp_path: Path, truth: DroneTruth) -> None:
-    path = write_tlog(tmp_path / "a.tlog", truth)
-    other = write_tlog(tmp_path / "b.tlog", truth, system=7)
-    path.write_bytes(path.read_bytes() + other.read_bytes())
-    with refuses(path, 2, "1, 7", "instance:"):
-        read(path)
-    with refuses(path, 3, "1, 7"):
-        read(path, instance=3)
-    assert len(read(path, instance=7).position.t_ns) == len(truth.t_ns)
-
-
 def test_damage_costs_the_packets_that_it_hits(tmp_path: Path, truth: DroneTruth) -> None:
     whole = write_tlog(tmp_path / "a.tlog", truth)
     data = bytearray(whole.read_bytes())

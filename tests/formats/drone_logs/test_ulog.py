@@ -67,19 +67,6 @@ def test_real_logs_are_read_as_their_facts_state(name: str) -> None:
         assert described["first_position"] == told["gps_lat_lon_alt_first"]
 
 
-def test_local_positions_before_the_estimator_was_ready_are_dropped() -> None:
-    path, told = real_data("logs/ulog/sample_px4_events.ulg"), facts("sample_px4_events.ulg")
-    telemetry = read(path)
-    assert list(telemetry.dropped.values()) == [98]
-    reference = [*told["local_ref_lat_lon_alt"]]
-    origin = telemetry.position.origin
-    assert origin is not None
-    assert [origin.latitude_deg, origin.longitude_deg, origin.altitude_m] == pytest.approx(reference)
-    assert telemetry.position.values[:, 2].max() == pytest.approx(
-        -told["local_position_ned_bbox"]["min"][2], abs=1e-4
-    )
-
-
 def test_axes_and_times(tmp_path: Path, truth: DroneTruth) -> None:
     telemetry = read(write_ulog(tmp_path / "a.ulg", ulog_rows(truth)))
     # Floats of 32 bits: 10 m to 1e-6, a quaternion to 1e-7.
@@ -132,29 +119,6 @@ def test_triggers(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_ulog(tmp_path / "b.ulg", rows)
     with refuses(path, "camera_capture", "camera_trigger"):
         FORMAT.picture_times(path, TelemetryChoice())
-
-
-def test_an_instance_is_taken_or_refused(tmp_path: Path, truth: DroneTruth) -> None:
-    """Use a second receiver with heights 7 m above the first one's, and a second, turned gimbal."""
-    rows = ulog_rows(truth)
-    for name, _, fields in ulog_rows(truth):
-        if name == "vehicle_gps_position":
-            rows.append((name, 1, (*fields[:4], fields[4] + 7000, *fields[5:])))
-        elif name == "gimbal_device_attitude_status":
-            rows.append((name, 1, (fields[0], 1.0, 0.0, 0.0, 0.0, fields[-1])))
-    path = write_ulog(tmp_path / "a.ulg", rows)
-    first, second = read(path, position="gps"), read(path, instance=1)
-    np.testing.assert_allclose(
-        second.position.values - first.position.values, [[0, 0, 7]] * len(truth.t_ns), atol=1e-6
-    )
-    assert first.gimbal is not None
-    assert second.gimbal is not None
-    np.testing.assert_array_equal(second.gimbal.quaternion_xyzw, first.gimbal.quaternion_xyzw)
-    assert any(re.search(r"\b2 gimbals.*\b0$", note) for note in second.notes)
-    with refuses(path, 2, "vehicle_local_position 0"):
-        read(path, instance=2)
-    with refuses(path, 1, "vehicle_local_position"):
-        read(path, position="local", instance=1)
 
 
 def test_damage(tmp_path: Path, truth: DroneTruth) -> None:

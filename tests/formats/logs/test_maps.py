@@ -17,7 +17,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from pipelines.formats.logs import maps as log_maps
-from pipelines.formats.logs.maps import cloud_points, evenly
+from pipelines.formats.logs.maps import cloud_points
 from pipelines.formats.maps import octomap
 from pipelines.formats.maps.voxel_grids import occupancy_of
 from pipelines.session.errors import DataError
@@ -143,17 +143,6 @@ def test_maps_that_follow_each_other(tmp_path: Path) -> None:
     assert any(re.search(r"\b3 maps\b.*\b3\b", note) for note in found.notes)
 
 
-@given(st.integers(1, 300), st.integers(1, 120))
-def test_what_is_kept_is_spread_evenly(count: int, most: int) -> None:
-    rows = evenly(count, most)
-    assert len(rows) == min(count, most)
-    assert rows[-1] == count - 1
-    assert (rows[0] == 0) or most == 1
-    steps = np.diff(rows)
-    # Each of the equal steps is rounded at both ends.
-    assert not len(steps) or (steps.min() >= 1 and np.ptp(steps) <= 2)
-
-
 def test_damaged_and_empty_maps_are_counted(tmp_path: Path) -> None:
     file = as_bt(box(), tmp_path / "site")
     entries = [
@@ -199,23 +188,6 @@ def in_order(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return rounded[np.lexsort(rounded.T)]
 
 
-@pytest.mark.parametrize("yaw_deg", [0, 90, 180, 270, -90, 450])
-@pytest.mark.parametrize("ned", [False, True])
-def test_right_angles_keep_every_voxel(tmp_path: Path, yaw_deg: float, ned: bool) -> None:
-    file = as_bt(box(), tmp_path / "site")
-    place = Placement(translation=[10.0, -3.3, 0.7], yaw_deg=yaw_deg)
-    one = Read(tmp_path, [octomap_entry(file, T0)], place=place, ned=ned).only
-    still = READER.read_map(tmp_path / "site" / "map.bt")
-    centres = occupied_centres(still)
-    if ned:
-        centres = centres[:, [1, 0, 2]] * [1, 1, -1]
-    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
-    expected = centres @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + place.translation
-    np.testing.assert_allclose(in_order(occupied_centres(one)), in_order(expected), rtol=0, atol=1e-5)
-    for state in (lambda p: p < 0.5, np.isnan):
-        assert int(state(one.probability).sum()) == int(state(still.probability).sum())
-
-
 @pytest.mark.parametrize("yaw_deg", [30.0, 45.0, -100.0])
 def test_other_turns_lose_no_obstacle_and_grow_by_a_voxel_at_most(tmp_path: Path, yaw_deg: float) -> None:
     file = as_bt(box(), tmp_path / "site")
@@ -234,17 +206,6 @@ def test_other_turns_lose_no_obstacle_and_grow_by_a_voxel_at_most(tmp_path: Path
     assert apart.min(axis=0).max() <= limit
 
 
-def test_tilted_grids_are_refused(tmp_path: Path) -> None:
-    file = as_bt(box(), tmp_path / "site")
-    tilted: Pose = ((0.0, 0.0, 0.0), (math.sin(0.2), 0.0, 0.0, math.cos(0.2)))
-    entries = [
-        transform_entry("map", "lidar", tilted, T0, topic="/tf_static"),
-        octomap_entry(file, T0, frame="lidar"),
-    ]
-    with pytest.raises(DataError):
-        Read(tmp_path, entries)
-
-
 def test_transforms_of_the_log_place_a_map(tmp_path: Path) -> None:
     """Yaw odom against map by a right angle; poses are in map."""
     file = as_bt(box(), tmp_path / "site")
@@ -260,18 +221,6 @@ def test_transforms_of_the_log_place_a_map(tmp_path: Path) -> None:
     true = true[:, [1, 0, 2]] * [-1, 1, 1] + [2, 0, 0]
     np.testing.assert_allclose(in_order(occupied_centres(found.only)), in_order(true), rtol=0, atol=1e-5)
     assert any(re.search("'site'.*'map'", note) for note in found.notes)
-
-
-def test_frames_that_nothing_connects(tmp_path: Path) -> None:
-    file = as_bt(box(), tmp_path / "site")
-    pose = {"header": {"stamp": T0, "frame_id": "odom"}, "pose": {"orientation": {"w": 1.0}}}
-    poses = [Entry("/pose", "geometry_msgs/msg/PoseStamped", T0, pose)]
-    found = Read(tmp_path, [*poses, octomap_entry(file, T0)], pose_topic="/pose")
-    assert any(re.search("'map'.*'odom'", note) for note in found.notes)
-    elsewhere = [*poses, octomap_entry(file, T0, frame="sensor")]
-    with pytest.raises(DataError):
-        Read(tmp_path, elsewhere, pose_topic="/pose")
-    same(Read(tmp_path, elsewhere, pose_topic="/pose", parent="/sensor").only, found.only)
 
 
 # --- floor plans ---------------------------------------------------------------------------------------
@@ -294,29 +243,6 @@ def test_plan_is_raised_from_its_origin(tmp_path: Path, container: Container) ->
         one.probability, np.repeat((cells / 100)[:, :, None], 4, axis=2).astype("f4")
     )
     assert (one.origin.tolist(), one.resolution_m) == ([-3.0, 7.0, 1.25], 0.5)
-
-
-def test_yawed_plan_loses_no_wall(tmp_path: Path) -> None:
-    cells = np.full((20, 3), 0, np.int8)
-    cells[:, 1] = 100
-    angle = math.radians(33)
-    origin: Pose = ((0.0, 0.0, 0.0), (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)))
-    for resolution_m in (None, 0.3, 1.0):
-        one = Read(tmp_path, [grid_entry(cells, T0, origin=origin)], resolution_m=resolution_m).only
-        along = np.linspace(0.01, 9.99, 400)
-        across = 0.75  # the middle of the wall
-        points = np.stack(
-            [
-                along * math.cos(angle) - across * math.sin(angle),
-                along * math.sin(angle) + across * math.cos(angle),
-            ],
-            axis=1,
-        )
-        index = np.floor((points - one.origin[:2]) / one.resolution_m).astype(int)
-        # The half-metre voxel at the middle of the wall, or a neighbour of it.
-        padded = np.pad(one.probability[:, :, 0], 1, constant_values=np.nan) >= 0.5
-        near = [padded[index[:, 0] + i, index[:, 1] + j] for i in range(3) for j in range(3)]
-        assert np.any(near, axis=0).all()
 
 
 @pytest.mark.parametrize(

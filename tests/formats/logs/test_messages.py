@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -15,14 +14,12 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import (
     AngleSample,
     IntrinsicsSample,
-    PictureSample,
     PoseSample,
     Topic,
 )
 from tests.formats.foxglove_protobuf import protobuf
 from tests.formats.log_values import (
     STORES,
-    as_base64,
     camera_info,
     from_json,
     header,
@@ -272,47 +269,6 @@ def test_what_is_no_camera_is_refused(stated: Any) -> None:
 
 
 # --- pictures ------------------------------------------------------------------------------------------
-
-GRADIENT = np.arange(24 * 32 * 3, dtype=np.uint8).reshape(24, 32, 3)
-
-
-@pytest.mark.parametrize("suffix", ["jpeg", "png"])
-@pytest.mark.parametrize("stated", ["", "JPG", "bgr8; png compressed bgr8"])
-def test_compressed_pictures_are_known_by_their_bytes(suffix: str, stated: str) -> None:
-    encoded = cv2.imencode(f".{suffix}", GRADIENT)[1].ravel()
-    name = "sensor_msgs/msg/CompressedImage"
-    in_ros = only(ros("ros2", name, header=header("ros2", STAMP), format=stated, data=encoded), name)
-    in_json = only(
-        from_json(timestamp=JSON_STAMP, data=as_base64(encoded.tobytes())), "foxglove.CompressedImage"
-    )
-    in_protobuf = only(
-        protobuf("CompressedImage", timestamp=PROTOBUF_STAMP, format=stated, data=encoded.tobytes()),
-        "foxglove.CompressedImage",
-    )
-    for sample in (in_ros, in_json, in_protobuf):
-        assert isinstance(sample, PictureSample)
-        assert (sample.stamp_ns, sample.receive_ns, sample.encoding) == (STAMP, RECEIVED, suffix)
-        np.testing.assert_array_equal(sample.data, encoded)
-
-
-def test_raw_pictures() -> None:
-    name = "sensor_msgs/msg/Image"
-    layout: dict[str, Any] = {"height": 24, "width": 32, "encoding": "rgb8", "step": 96}
-    found = [
-        only(
-            ros("ros1", name, header=header("ros1", STAMP), is_bigendian=0, data=GRADIENT.ravel(), **layout),
-            name,
-        ),
-        only(
-            protobuf("RawImage", timestamp=PROTOBUF_STAMP, data=GRADIENT.tobytes(), **layout),
-            "foxglove.RawImage",
-        ),
-    ]
-    for sample in found:
-        assert isinstance(sample, PictureSample)
-        assert (sample.encoding, sample.width, sample.height, sample.step) == ("rgb8", 32, 24, 96)
-        np.testing.assert_array_equal(sample.data, GRADIENT.ravel())
-
 
 # --- kinds and refusals --------------------------------------------------------------------------------
 

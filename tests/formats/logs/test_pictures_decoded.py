@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from pipelines.formats.logs.pictures import KNOWN, decode
+from pipelines.formats.logs.pictures import decode
 from pipelines.geometry.arrays import Picture
 from pipelines.session.records import PictureSample
-from pipelines.sources.pictures import LoggedPictures
-from tests.formats.refusals import refuses
-from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
 
 WIDTH, HEIGHT = 16, 12
 BLUE, GREEN, RED = 40, 120, 200
@@ -87,38 +82,3 @@ def test_colours_come_out_as_they_went_in(encoding: str, padding: int) -> None:
 @pytest.mark.parametrize("encoding", ENCODED)
 def test_pictures_that_are_cut_short_are_missing(encoding: str) -> None:
     assert decode(sample(encoding, ENCODED[encoding], cut=1)) is None
-
-
-def logged(folder: Path, container: Container, encoding: str, pixels: Picture) -> Path:
-    stated = {
-        "height": HEIGHT,
-        "width": WIDTH,
-        "encoding": encoding,
-        "step": pixels.nbytes // HEIGHT,
-        "data": pixels.ravel(),
-    }
-    entries = [
-        Entry(
-            "/camera",
-            "sensor_msgs/msg/Image",
-            10**18 + k,
-            {"header": {"stamp": 10**18 + k, "frame_id": ""}, **stated},
-        )
-        for k in range(3)
-    ]
-    return write_log(folder, "log", container, entries)
-
-
-@pytest.mark.parametrize("container", CONTAINERS)
-def test_raw_pictures_of_a_log(container: Container, tmp_path: Path) -> None:
-    path = logged(tmp_path, container, "bayer_gbrg8", ENCODED["bayer_gbrg8"])
-    with LoggedPictures([path], "/camera", "header") as pictures:
-        for number in (2, 0):
-            np.testing.assert_array_equal(pictures.read(number), PLAIN)
-        assert pictures.read(3) is None
-
-
-def test_an_encoding_that_nobody_knows_is_said_at_once(tmp_path: Path) -> None:
-    path = logged(tmp_path, "ros1", "32FC1", np.zeros((HEIGHT, 4 * WIDTH), np.uint8))
-    with refuses(path, "/camera", "32FC1", *KNOWN):
-        LoggedPictures([path], "/camera", "header")

@@ -172,17 +172,6 @@ def test_mavros(tmp_path: Path) -> None:
     np.testing.assert_allclose(ahead, expected, atol=1e-12)
 
 
-def test_what_a_receiver_says_of_itself(tmp_path: Path) -> None:
-    variance = [4.0, 0, 0, 0, 4.0, 0, 0, 0, 9.0]
-    known = fixes("/mavros/global_position/global", position_covariance=variance, position_covariance_type=2)
-    telemetry = read(tmp_path, "mavros", known, imu("/mavros/imu/data", (0, 0, 0, 1)))
-    assert telemetry.position.accuracy_m == (2.0, 3.0)
-    assert telemetry.position.height == "ellipsoid"
-    lost = fixes("/mavros/global_position/global", status={"status": -1})
-    with pytest.raises(DataError):
-        read(tmp_path / "lost", "mavros", lost, imu("/mavros/imu/data", (0, 0, 0, 1)))
-
-
 def test_several_drones(tmp_path: Path) -> None:
     topics = ["/a/mavros/local_position/pose", "/b/mavros/local_position/pose", "/dji_sdk/gps_position"]
     assert namespaces(topics) == [("dji_osdk", ""), ("mavros", "/a"), ("mavros", "/b")]

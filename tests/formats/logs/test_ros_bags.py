@@ -90,28 +90,6 @@ def test_ros2_compressions(tmp_path: Path, compression: Literal["message", "file
     assert positions(path) == ([float(k) for k in range(100)], {})
 
 
-def test_describe_says_what_is_inside(tmp_path: Path) -> None:
-    late = [e for e in FLIGHT if not START_NS + 200_000_000 < e.stamp_ns < START_NS + 500_000_000]
-    path = write_ros1(tmp_path / "a.bag", late)
-    described = log_format(path).describe(path)
-    assert list(described) == [
-        "files", "storage", "size_bytes", "messages", "first_ns", "last_ns", "span_s", "topics",
-    ]  # fmt: skip
-    assert described["messages"] == len(late)
-    assert described["size_bytes"] == path.stat().st_size
-    topics = described["topics"]
-    assert isinstance(topics, dict)
-    pose = topics[POSE]
-    # 100 Hz from 0 to 0.99 s without the 30 stamps from 0.20 to 0.49 s: 70 messages, 69 steps in 0.99 s.
-    assert pose["messages"] == 70
-    assert pose["rate_hz"] == pytest.approx(69 / 0.99, abs=1e-3)
-    assert pose["longest_gap_s"] == pytest.approx(0.31)
-    # A ROS 1 Odometry: header of 12 + 4 + 4 bytes with "odom", 4 of child, 56 + 288 of pose, 48 + 288 of
-    # twist. The connection of the next topic follows a message and counts to it.
-    assert pose["size_bytes"] >= 70 * 704
-    assert pose["size_bytes"] < 70 * 704 + 10_000
-
-
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 @pytest.mark.parametrize("metadata", [True, False])
 def test_split_bags_are_merged(tmp_path: Path, storage: Literal["sqlite3", "mcap"], metadata: bool) -> None:

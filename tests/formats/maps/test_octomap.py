@@ -17,7 +17,6 @@ from pipelines.formats.maps import octomap
 from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
 from tests.formats.damaged_maps import refuse_or_read
-from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
 READER: MapFormat = octomap.FORMAT
@@ -189,20 +188,6 @@ def test_unusable_files_are_one_clear_line(tmp_path: Path, content: bytes, probl
         READER.read_map(file)
     with pytest.raises(DataError, match=problem):
         READER.describe(file)
-
-
-def test_a_box_that_would_not_fit_is_refused_before_it_is_made(tmp_path: Path) -> None:
-    low, high = at([0] * 15, 3.5), at([7] * 15, 3.5)
-    assert isinstance(low, list)
-    assert isinstance(high, list)
-    file = tmp_path / "wide.bt"
-    file.write_bytes(file_of([low, *[None] * 6, high]))
-    with refuses(file, "65536 x 65536 x 65536", 0.2, "resolution_m"):
-        READER.read_map(file)
-    assert READER.describe(file)["occupied_voxels"] == 2
-    coarse = READER.read_map(file, resolution_m=0.2 * 2**8)
-    assert coarse.probability.shape == (256, 256, 256)
-    assert int((~np.isnan(coarse.probability)).sum()) == 2
 
 
 @pytest.mark.parametrize("kind", ["bt", "ot"])

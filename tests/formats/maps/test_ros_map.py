@@ -88,31 +88,6 @@ def test_every_kind_of_picture_gives_the_same_map(tmp_path: Path, picture: bytes
     np.testing.assert_array_equal(floor(write(tmp_path, picture)), [[0, 1], [0, 0], [0, np.nan]])
 
 
-def test_scale_is_in_proportion_between_the_thresholds(tmp_path: Path) -> None:
-    # Darkness 0.5 between 0.2 and 0.6 is 75 percent; a transparent pixel is unknown.
-    grey = np.array([[255 * 0.5, 0, 255, 0]]).round().astype(np.uint8)
-    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGRA)
-    picture[0, 3, 3] = 100
-    path = write(
-        tmp_path,
-        cv2.imencode(".png", picture)[1].tobytes(),
-        mode="scale",
-        occupied_thresh=0.6,
-        free_thresh=0.2,
-    )
-    np.testing.assert_allclose(floor(path), np.array([[0.75], [1], [0], [np.nan]]), rtol=0, atol=1e-7)
-
-
-@pytest.mark.parametrize("quarter_turns", [1, 2, 3, -1])
-def test_quarter_turns_turn_the_grid(tmp_path: Path, quarter_turns: int) -> None:
-    level = floor(write(tmp_path))
-    path = write(tmp_path, origin=[1.0, 2.0, quarter_turns * math.pi / 2])
-    # rot90 turns the first axis (x) to the second (y), as a positive yaw does.
-    np.testing.assert_array_equal(floor(path), np.rot90(level, quarter_turns))
-    extent = {1: (-1.0, 0), 2: (-1.5, -1.0), 3: (0, -1.5)}[quarter_turns % 4]
-    np.testing.assert_allclose(READER.read_map(path).origin, [1 + extent[0], 2 + extent[1], 0], atol=1e-12)
-
-
 @given(
     st.floats(-math.pi, math.pi),
     st.sampled_from([0.25, 0.5, 0.8, 1.0, 2.0]),
@@ -136,13 +111,6 @@ def test_turned_walls_are_neither_lost_nor_moved(
     reach = (0.5 + side) * math.sqrt(0.5) + 1e-9
     assert gaps.min(axis=1).max() <= reach
     assert gaps.min(axis=0).max() <= reach
-
-
-def test_a_renamed_picture_is_found_beside_its_plan(tmp_path: Path) -> None:
-    path = write(tmp_path, image="lost.png", name="map.pgm")
-    said = READER.describe(path)
-    assert said["image"] == "map.pgm"
-    assert "lost.png" in said.values()
 
 
 def test_a_picture_outside_of_the_folder_is_named_in_full_or_not_at_all(tmp_path: Path) -> None:

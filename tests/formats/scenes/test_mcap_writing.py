@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from tests.formats.exported import (
     SIGMA_M,
     START_NS,
     VOXEL_M,
-    angles_of_two,
     flown,
     recording,
     stamps,
@@ -96,25 +94,6 @@ def test_the_skeleton_is_there_at_its_own_times(log: Path) -> None:
         assert len(joints.points) == 19 - (row == 7)
     # One bone ends in the wrist, which is missing in frame 7.
     assert len(read[6][1].markers[1].points) - len(read[7][1].markers[1].points) == 2
-
-
-def test_sigmas_and_angles_are_series_by_name(tmp_path: Path) -> None:
-    made = recording()
-    assert made.motion is not None
-    (path,) = WRITER.write(replace(made, angles=angles_of_two), tmp_path)
-    (first, both), (second, one) = messages(path, "/angles")
-    assert [first, second] == made.motion.t_ns[:2].tolist()
-    assert (both.name, one.name) == (
-        ["left_knee_flexion", "person1/left_knee_flexion"],
-        ["left_knee_flexion"],
-    )
-    np.testing.assert_allclose(both.position, [np.pi, np.pi / 2], rtol=1e-15)
-    sigmas = [message.position for _, message in messages(path, "/angles/sigma")]
-    np.testing.assert_allclose(np.concatenate(sigmas), [np.pi / 10, np.pi / 20, np.nan], rtol=1e-15)
-    read = messages(path, "/sigma")
-    assert [len(message.name) for _, message in read] == [17 - (row == 7) for row in range(60)]
-    # The root mean square of the three axes.
-    np.testing.assert_allclose(read[0][1].position, np.sqrt(np.mean(np.square(SIGMA_M))), rtol=1e-12)
 
 
 def test_ellipsoids_hold_95_percent(log: Path) -> None:

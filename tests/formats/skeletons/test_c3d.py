@@ -77,16 +77,6 @@ def test_ezc3d_reads_unit_axes_rate_labels_and_residuals(tmp_path: Path) -> None
     np.testing.assert_allclose(file["data"]["points"][1, 0], asked.motion.position[:, 0, 0, 2], rtol=FLOAT32)
 
 
-def test_long_names_are_shortened_for_others_and_whole_for_us(tmp_path: Path) -> None:
-    long = [f"{'très' * 10}_{k}" for k in range(2)]
-    motion = JointMotion(stamps(2), (*long, "nose"), np.ones((2, 1, 3, 3)))
-    path = write(tmp_path / "a.c3d", motion)
-    labels = need("ezc3d", "c3d").c3d(str(path))["parameters"]["POINT"]["LABELS"]["value"]
-    assert len(set(labels)) == 3
-    assert max(len(label.encode()) for label in labels) <= 30
-    assert read(path).joints == motion.joints
-
-
 def test_more_frames_than_the_header_counts(tmp_path: Path) -> None:
     count = 65_600
     position = np.zeros((count, 1, 1, 3))

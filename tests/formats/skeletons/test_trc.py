@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given
 
-from pipelines.formats.skeletons import joint_files, trc
+from pipelines.formats.skeletons import trc
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import Export, JointFormat
-from tests.formats.exported import recording
 from tests.formats.motions import motions
 from tests.real_data import real_data
 
@@ -114,20 +111,6 @@ def test_writing_and_reading_gives_the_same(
     np.testing.assert_allclose(back.position, motion.position, rtol=0, atol=0.5001e-7)
 
 
-def test_people_with_names_get_files_of_their_names(tmp_path: Path) -> None:
-    motion = JointMotion(np.array([0, 33_333_333]), ("nose",), np.ones((2, 5, 1, 3)))
-    recording = Recording("x", motion, {}, people=("anna", "Jürgen B.", "ANNA", "anna_4", "Anna"))
-
-    paths = WRITER.write(recording, tmp_path)
-
-    # Names that differ in case alone would be one file on some systems.
-    assert sorted(path.name for path in paths) == sorted(
-        ["x_anna.trc", "x_Jürgen_B.trc", "x_ANNA_2.trc", "x_anna_4.trc", "x_Anna_4_4.trc"]
-    )
-    unnamed = WRITER.write(replace(recording, people=("anna",)), tmp_path)
-    assert {path.name for path in unnamed} == {"x_anna.trc", *(f"x_person{k}.trc" for k in range(1, 5))}
-
-
 def test_export_is_what_opensim_expects(tmp_path: Path) -> None:
     position = np.full((4, 2, 2, 3), np.nan)
     position[:, 0, 0] = [1.0, 2.0, 3.0]
@@ -212,32 +195,6 @@ def test_opensim_and_we_read_every_pattern_of_gaps(tmp_path: Path, gaps: list[An
     ]
     np.testing.assert_array_equal(np.isnan(older), np.isnan(turned))
     np.testing.assert_array_equal(np.isnan(read(path).position[:, 0]), np.isnan(position))
-
-
-def as_pose2sim_reads(path: Path) -> tuple[list[str], pd.DataFrame]:
-    """Read marker names in line four and numbers below line five, as Pose2Sim's own tools do."""
-    names = pd.read_csv(path, sep="\t", skiprows=3, nrows=0).columns[2:].tolist()
-    return names[::3], pd.read_csv(path, sep="\t", skiprows=4)
-
-
-def test_another_reader_finds_the_same(tmp_path: Path) -> None:
-    walked = recording()
-    motion = walked.motion
-    assert motion is not None
-    (path,) = WRITER.write(replace(walked, unit="mm", axes="z-up"), tmp_path)
-    names, table = as_pose2sim_reads(path)
-    assert names == [joint_files.marker_name(joint) for joint in motion.joints]
-    assert path.read_text().split("\n")[2].split("\t")[4] == "mm"
-    values = table.to_numpy()[:, 2:].reshape(60, -1, 3)
-    # Four decimals of a millimetre.
-    np.testing.assert_allclose(values / 1000, motion.position[:, 0], rtol=0, atol=0.5001e-7)
-    assert np.isnan(values[7, names.index("LWrist")]).all()
-    back = read(path, axes="z-up")
-    np.testing.assert_allclose(back.position, motion.position, rtol=0, atol=0.5001e-7)
-    # The same for a file of Pose2Sim's: the reader above is Pose2Sim's, not ours.
-    names, table = as_pose2sim_reads(real_data("motion/pose2sim_markers.trc"))
-    assert names[0] == "RHip"
-    assert table.iloc[0, 2:5].tolist() == pytest.approx([-0.065, 0.90151, -1.40057], abs=1e-5)
 
 
 def test_spellings_of_other_programs(tmp_path: Path) -> None:

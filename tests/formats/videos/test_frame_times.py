@@ -115,15 +115,6 @@ def test_real_subtitles(name: str, rows: int, last_frame: int, first_ns: int, la
     assert not any(key.startswith("dropped") for key in facts)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["matrice_300.srt", "old_format.SRT", "broken_incomplete.SRT", "p4_rtk.SRT", "broken_empty.SRT"],
-)
-def test_real_subtitles_without_frame_times(name: str) -> None:
-    with pytest.raises(DataError):
-        read_frame_times(real_data(f"logs/dji_srt/{name}"))
-
-
 def test_clocks_of_every_spelling(tmp_path: Path) -> None:
     clocks = ["2022-08-07 13:40:40,774,808", "2022-08-07 13:40:40.875", "2022.8.7 13:40:41"]
     stamps = read_frame_times(written(tmp_path / "f.srt", subtitles(clocks)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import av
 import cv2
@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.videos import video
-from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames, index_video, is_shown
+from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames, index_video
 from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
 from pipelines.session.registries import VideoFormat, recognise
@@ -126,26 +126,6 @@ def test_frames_that_vp8_never_shows_are_none(tmp_path: Path) -> None:
         assert [round(t / 1e9 * 30) for t in reader.index.pts_ns.tolist()] == shown
 
 
-@pytest.mark.parametrize(
-    ("content", "shown"),
-    [
-        (b"\x86", True),  # profile 0: marker 10, 00, not an existing frame, no key frame, shown
-        (b"\x84", False),
-        (b"\x94", False),  # profile 2
-        (b"\x96", True),
-        (b"\x88", True),  # shows an existing frame
-        (b"\xb1", True),  # profile 3 has a reserved bit: marker 10, 11, 0, 0, 0, shown
-        (b"\xb2", False),
-        (b"\x84..\x86.\xc1\x03\x02\xc1", True),  # a superframe of a hidden and a shown frame
-        (b"\x84..\x84.\xc1\x03\x02\xc1", False),
-    ],
-)
-def test_the_heads_of_vp9_frames_state_if_they_are_shown(content: bytes, shown: bool) -> None:
-    packet = cast("av.Packet[av.VideoStream]", av.Packet(content))
-    assert is_shown(packet, "vp9") == shown
-    assert is_shown(packet, "h264")
-
-
 # --- pictures ------------------------------------------------------------------------------------------
 
 
@@ -212,25 +192,6 @@ def test_a_damaged_frame_is_missing_and_the_others_keep_their_numbers(
     assert sorted(left) == sorted(set(range(30)) - {7, 20})
     assert all(np.array_equal(left[number], whole[number]) for number in left)
     assert capfd.readouterr().err == "", "FFmpeg's own words would stand beside ours"
-
-
-def test_damage_between_key_frames_ends_at_the_next(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "v.mp4", even_ticks(36), key_every=12, b_frames=2)
-    whole = dict(frames(path))
-    position, size = packets(path)[13]  # decoded right after the second key frame
-    content = bytearray(path.read_bytes())
-    content[position : position + size] = bytes(size)
-    path.write_bytes(content)
-    with VideoReader(path) as reader:
-        left = dict(reader.frames())
-        assert 1 <= len(reader.missing) <= 12
-        assert reader.missing <= set(range(12, 24))
-        for number in np.random.default_rng(2).permutation(36).tolist():
-            picture = reader.read(number)
-            assert (picture is None) == (number not in left)
-            assert picture is None or np.array_equal(picture, left[number])
-    for number in (*range(12), *range(24, 36)):
-        assert np.array_equal(left[number], whole[number])
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.8, 0.95])
@@ -374,22 +335,6 @@ def test_no_damage_escapes_as_anything_but_a_data_error(
 
 
 # --- registry and real recordings -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "codec", "width"),
-    [("cam01", "h264", 1080), ("cam02", "vp9", 1080), ("cam03", "h264", 1088), ("cam04", "h264", 1088)],
-)
-def test_real_recordings(name: str, codec: str, width: int) -> None:
-    path = real_data(f"pose2sim_single/videos/{name}.mp4")
-    facts = READER.describe(path)
-    assert (facts["frames"], facts["rate_hz"], facts["rate"], facts["codec"]) == (
-        100,
-        60.0,
-        "constant",
-        codec,
-    )
-    assert facts["picture"] == f"{width} x 1920 px"
 
 
 @pytest.mark.parametrize("name", ["cam01", "cam02"])
