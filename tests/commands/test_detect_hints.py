@@ -148,16 +148,6 @@ def test_only_another_log_of_the_actor_has_the_keypoints_detected_anew(tmp_path:
     assert len(set(found_with)) == 3
 
 
-def test_a_camera_that_gets_anothers_pictures_is_looked_at_again(tmp_path: Path) -> None:
-    # Both videos have the same stamps: nothing but the pictures changes.
-    flight, detector = Flight(tmp_path), spot_detector(tmp_path)
-    before = flight.key(detector)
-    left, right = (flight.settings["cameras"][name] for name in CAMERAS)
-    left["video"], right["video"] = right["video"], left["video"]
-
-    assert flight.key(detector) != before
-
-
 def test_a_span_counts_from_the_first_frame_of_cameras_with_keypoints_too(tmp_path: Path) -> None:
     flight, detector = Flight(tmp_path), spot_detector(tmp_path)
     right = flight.settings["cameras"]["right"]

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
-import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +11,8 @@ import pandas as pd
 import pytest
 
 from pipelines.session.registries import need
-from tests.commands.runner import MOCAP, content, refused, succeeds
-from tests.keypoints.spotted_flights import CAMERAS, FPS, person_at, spot_detector, write_spotted_flight
+from tests.commands.runner import refused, succeeds
+from tests.keypoints.spotted_flights import FPS, person_at, spot_detector, write_spotted_flight
 
 
 def test_keypoints_of_the_users_model_become_a_skeleton(tmp_path: Path) -> None:
@@ -96,47 +93,3 @@ def provider(session: Path) -> str:
     stage = json.loads((session / "detect" / "stage.json").read_text(encoding="utf-8"))
     stated = dict(option.split("=", 1) for option in stage["settings"]["detector"][len("onnx:") :].split(","))
     return str(stated["provider"])
-
-
-@pytest.mark.slow
-def test_stopped_in_the_middle_it_goes_on_with_what_is_finished(tmp_path: Path) -> None:
-    frames = 450  # two blocks for each camera
-    manifest = write_spotted_flight(tmp_path, frames)
-    detector = spot_detector(tmp_path)
-    undisturbed, session = tmp_path / "undisturbed.session", tmp_path / "stopped.session"
-    for folder in (undisturbed, session):
-        succeeds("ingest", manifest, "-o", folder)
-    succeeds("reconstruct", undisturbed, "--method", "robust", "--detector", detector, "--workers", "1")
-
-    kept: dict[str, int] = {}
-    for blocks, how, status in (
-        (1, signal.SIGKILL, -signal.SIGKILL),
-        (2, signal.SIGINT, 130),
-    ):
-        assert stopped_with(how, blocks, session, detector) == status
-        now = finished(session)
-        assert blocks <= len(now) < 2 * len(CAMERAS)
-        assert kept.items() <= now.items()  # the very same files: not made again
-        kept = now
-    succeeds("reconstruct", session, "--method", "robust", "--detector", detector, "--workers", "1")
-    assert content(session) == content(undisturbed)
-
-
-def stopped_with(how: signal.Signals, blocks: int, session: Path, detector: str) -> int:
-    """Send a signal to `mocap reconstruct` after some finished blocks; return its exit status."""
-    arguments = [MOCAP, "reconstruct", str(session), "--method", "robust"]
-    arguments += ["--detector", detector, "--workers", "1"]
-    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while len(finished(session)) < blocks:
-        assert process.poll() is None, "it ended before it could be stopped"
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    process.send_signal(how)
-    return process.wait(60)
-
-
-def finished(session: Path) -> dict[str, int]:
-    """Find the finished blocks, with the inode of their table."""
-    blocks = (session / ".partial").glob("detect-*/*/keypoints.parquet")
-    return {table.parent.name: table.stat().st_ino for table in blocks if table.parent.suffix != ".new"}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.detect import detect
 from pipelines.formats.skeletons.trc import FORMAT as TRC
-from pipelines.ingest import ingest
-from pipelines.keypoints import blazepose
 from pipelines.session.registries import find_detector
-from pipelines.session.stages import locked
 from pipelines.session.tables import motion_from
 from tests.commands.runner import content, mocap_process, refused, succeeds
 from tests.real_data import real_data
@@ -96,38 +91,3 @@ def test_unknown_detector_lists_those_there_are(flight: Path) -> None:
     assert "blazepose" in refused(
         "reconstruct", flight.with_suffix(".session"), "--method", "robust", "--detector", "magic"
     )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("people", [1, 2])
-def test_a_picture_costs_one_landmark_pass_and_hardly_a_search(
-    tmp_path: Path, people: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Look at the sample's first two seconds: one person, whom a log follows, and trees all around."""
-    _fetch()
-    runs: Counter[str] = Counter()
-
-    def count(owner: Any, method: str, name: str) -> None:
-        function = getattr(owner, method)
-
-        def counting(self: Any, *arguments: Any) -> Any:
-            runs[name] += 1
-            return function(self, *arguments)
-
-        monkeypatch.setattr(owner, method, counting)
-
-    count(blazepose._Network, "__call__", "all")
-    count(blazepose.BlazePose, "_locate", "landmarks")
-    sample = Path(__file__).parents[2] / "sample_data" / "mound_walk" / "flight.yaml"
-    with locked(ingest(sample, tmp_path / "sample.session").folder) as writable:
-        record = detect(writable, people=people, end_s=2.0)
-    assert record is not None
-    cameras = record.counts["cameras"].values()
-    pictures = sum(camera["frames"] for camera in cameras)
-    assert pictures == 120
-    # One picture each is looked at twice, where the person is found.
-    assert runs["landmarks"] <= 1.05 * pictures
-    assert sum(camera["detections"] for camera in cameras) == pictures, "nobody but the person"
-    if people == 1:
-        # Nine squares cover the places where the actor may be; then one in every tenth picture.
-        assert runs["all"] - runs["landmarks"] <= 2 * (9 + 60 // 10)
