@@ -12,7 +12,7 @@ from mocap_cli.terminal import say, say_warnings, watching
 from pipelines.session.errors import DataError
 
 
-@click.command("check", short_help="Doubt a flight that cannot be right, and name the mistake.")
+@click.command("check", short_help="Find mistakes in a flight.yaml and show the line to change.")
 @each("path", "FLIGHT.yaml|SESSION")
 @click.option(
     "--pose-noise", metavar="MODEL", help="As of `mocap reconstruct`: what is known of the poses' errors."
@@ -35,11 +35,11 @@ def check_command(
     workers: int,
     shown: Shown,
 ) -> dict[str, Any] | None:
-    """Doubt a flight that cannot be right, and name the mistake in its description.
+    """Find mistakes in a flight.yaml and show the line to change.
 
-    Cameras, clocks, poses and people are held against each other; every mistake that flight.yaml can hold is
-    tried, and the one that explains what is odd is named with the line that mends it (docs/mistakes.md).
-    `mocap reconstruct` does the same. A flight without keypoints is looked at for a few seconds.
+    Cameras, clocks, poses and people are compared with each other. Each mistake that flight.yaml can hold is
+    undone in turn, and the one that explains what is odd is named (docs/mistakes.md). `mocap reconstruct` does
+    the same. Of a flight without keypoints, the detector looks at a few seconds.
     """
     from pipelines.check import check
 
