@@ -38,8 +38,8 @@ def check_command(
     """Find mistakes in a flight.yaml and show the line to change.
 
     Cameras, clocks, poses and people are compared with each other. Each mistake that flight.yaml can hold is
-    undone in turn, and the one that explains what is odd is named (docs/mistakes.md). `mocap reconstruct` does
-    the same. Of a flight without keypoints, the detector looks at a few seconds.
+    undone in turn, and the one that explains what is odd is named (docs/mistakes.md). `mocap reconstruct`
+    does the same. Of a flight without keypoints, the detector looks at a few seconds.
     """
     from pipelines.check import check
 
