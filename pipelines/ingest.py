@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Self
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from pipelines.session.description import (
     read_description,
 )
 from pipelines.session.errors import DataError, MocapError
-from pipelines.session.manifest import Axes, CameraSources, FileSource, LogSource, Manifest, read_flight
+from pipelines.session.manifest import Axes, CameraSources, Manifest, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
@@ -77,7 +77,6 @@ from pipelines.sources.world import losses
 
 INGEST = Stage("ingest", revision=10)
 
-T = TypeVar("T")
 
 # Cameras that are read during hashing wait in memory: so many rows take 70 MB.
 MAX_ROWS_AHEAD = 200_000
@@ -257,6 +256,7 @@ class _FlightReader:
     def store_camera(self, name: str, folder: Path) -> None:
         """Write the tables of one camera, its entry and its warnings."""
         camera = self._flight.cameras[name]
+        logged = self._files.is_log("pose", camera.pose)
         data = self._ahead.pop(name, None) or self._read_camera(name)
         (folder / "tables").mkdir()
         store_camera(data, folder / "tables")
@@ -266,7 +266,7 @@ class _FlightReader:
             data,
             self._interpolation,
             base=self._flight_path.parent,
-            stamps=self._log_of("pose", camera.pose, lambda log: log.stamps),
+            stamps=self._logs.settings(camera.pose.file).stamps if logged else None,
             axes=(self._pose_axes(camera), self._gimbal_axes(camera)),
             note=self._take_note,
         )
@@ -276,8 +276,7 @@ class _FlightReader:
     def _pose_axes(self, camera: CameraSources) -> Axes:
         """Return the axes that the poses of a camera or its body are in."""
         pose = camera.pose
-        logged: Axes | None = self._log_of("pose", pose, lambda log: log.axes)
-        return pose.axes or logged or self._flight.world.frame
+        return pose.axes or self._logs.settings(pose.file).axes or self._flight.world.frame
 
     def _gimbal_axes(self, camera: CameraSources) -> Axes:
         """Return the axes that the angles of a camera's gimbal are in."""
@@ -286,14 +285,7 @@ class _FlightReader:
             return self._flight.world.frame
         if gimbal.is_fixed:
             return "ned"
-        logged: Axes | None = self._log_of("gimbal", gimbal, lambda log: log.axes)
-        return gimbal.axes or logged or self._flight.world.frame
-
-    def _log_of(self, part: str, source: FileSource, setting: Callable[[LogSource], T | None]) -> T | None:
-        """Return a setting of the log that is a source; None if the source is no log."""
-        if not self._files.is_log(part, source):
-            return None
-        return setting(self._logs.settings(source.file))
+        return gimbal.axes or self._logs.settings(gimbal.file).axes or self._flight.world.frame
 
     def _read_camera(self, name: str) -> CameraData:
         """Read everything about one camera, and check the parts against each other."""

@@ -115,9 +115,9 @@ class FoundFilm(Proposal):
 class FoundFrames(Proposal):
     """2D keypoints of one camera."""
 
-    frames: int = 0
-    first_frame: int = 0
-    last_frame: int = 0
+    frames: int = 0  # The number of frames that are listed.
+    first_frame: int = 0  # The smallest number of a frame.
+    last_frame: int = 0  # The largest number of a frame.
     ambiguous: str = ""  # its format, where others recognise it as well
 
 

@@ -114,14 +114,14 @@ class RigidTransform(YamlModel):
     """Rotation body_from_camera or world_from_source, in place of `looks` or `yaw_deg`."""
 
 
-class Scaled(YamlModel):
+class ScaledSource(YamlModel):
     """Positions in a unit of their own."""
 
     scale: float = Field(1.0, gt=0)
     """Metres in the world for a metre of the source."""
 
 
-class Placement(RigidTransform, Scaled):
+class Placement(RigidTransform, ScaledSource):
     """Pose in the world of the origin of a source."""
 
     yaw_deg: float = 0.0
@@ -141,35 +141,35 @@ class OwnAxes(YamlModel):
     """Axes; without them, those of the log or the world."""
 
 
-class Placed(OwnAxes):
+class PlacedSource(OwnAxes):
     """A source with a place of its own."""
 
     world_from_source: Placement = Placement()
     """Place in the world of the source's zero, and its axes."""
 
 
-class Upright(YamlModel):
+class UprightSource(YamlModel):
     """A source with an up axis of its own."""
 
     up: Up | None = None
     """Axis that points up, z if nothing says so; of the world, in all sources without axes of their own."""
 
 
-class Projected(YamlModel):
+class ProjectedSource(YamlModel):
     """Coordinates that may be those of a map projection."""
 
     crs: str | None = None
     """Map projection of the coordinates, `EPSG:32632` for example; of the world, in all sources."""
 
 
-class Written(YamlModel):
+class MeasuredSource(YamlModel):
     """Numbers with a unit of length."""
 
     unit: Unit | None = None
     """Unit of the positions, m unless the file states another one."""
 
 
-class Delayed(YamlModel):
+class DelayedSource(YamlModel):
     """Times with a zero of their own."""
 
     offset_ns: SecondsAsNs = Field(0, alias="offset_s")
@@ -187,7 +187,7 @@ class WorldOrigin(YamlModel):
     """Height, m."""
 
 
-class WorldAxes(Guess, Upright, Projected, Scaled):
+class WorldAxes(Guess, UprightSource, ProjectedSource, ScaledSource):
     """The axes of all sources that do not state their own, and the world's origin."""
 
     frame: Axes = "enu"
@@ -202,14 +202,14 @@ class WorldAxes(Guess, Upright, Projected, Scaled):
         return self
 
 
-class LogClock(Delayed):
+class LogClock(DelayedSource):
     """Relation of a recorder's clock to the world's."""
 
     drift_ppm: float = Field(0.0, ge=-100_000, le=100_000)
     """Drift of the log's clock since its first message, parts per million."""
 
 
-class LogSource(Guess, Placed):
+class LogSource(Guess, PlacedSource):
     """A recording: one file or several parts of it."""
 
     shorthand = "file"
@@ -260,14 +260,14 @@ class FrameTimes(FileSource):
         return self.has_start or self.start_from is not None or bool(self.file)
 
 
-class CameraClock(Guess, Delayed):
+class CameraClock(Guess, DelayedSource):
     """World time = video time + offset."""
 
     sigma_s: float = Field(0.2, ge=0)
     """Standard deviation of the offset, s; 0 means that it is known."""
 
 
-class PoseSource(Placed, Written, FileSource):
+class PoseSource(PlacedSource, MeasuredSource, FileSource):
     """Source of a camera's poses: a trajectory, a log, a drone's own log or a calibration."""
 
     part = "pose"
@@ -428,7 +428,7 @@ class ActorSource(FileSource):
     """Weight of this person for the planners, among several."""
 
 
-class MapSource(Projected, FileSource):
+class MapSource(ProjectedSource, FileSource):
     """Source of the map of the surroundings."""
 
     part = "map"
@@ -438,7 +438,7 @@ class MapSource(Projected, FileSource):
     """Side of the voxels that a cloud of points is divided into, m."""
 
 
-class TruthSource(OwnAxes, Upright, Written, Delayed, FileSource):
+class TruthSource(OwnAxes, UprightSource, MeasuredSource, DelayedSource, FileSource):
     """Sources of ground truth: joints, and camera poses by camera."""
 
     needs_file = False

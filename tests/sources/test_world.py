@@ -233,12 +233,12 @@ def test_truth_of_zeros_is_missing_and_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("up", ["y", "-x"])
-def test_the_axis_of_the_truth_is_stated_for_itself(tmp_path: Path, up: str) -> None:
+def test_the_axis_of_the_truth_is_stated_for_itself(tmp_path: Path, up: Any) -> None:
     """Joints of a file that is y up, in feet, beside poses that are z up."""
     flight = write_flight(tmp_path, cameras=2, seconds=0.2, clean=True)
     right = tables(flight)["truth.parquet"]
     joints = pd.read_csv(tmp_path / "truth.csv")
-    written = joints[list(NAMES)].to_numpy(copy=True) @ np.array(UP_ROWS[up]) / 0.3048  # type: ignore[index]
+    written = joints[list(NAMES)].to_numpy(copy=True) @ np.array(UP_ROWS[up], dtype=float) / 0.3048
     joints[list(NAMES)] = written
     joints.to_csv(tmp_path / "truth.csv", index=False)
     flight.settings["truth"] |= {"up": up, "unit": "ft"}
