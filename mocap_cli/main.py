@@ -6,7 +6,8 @@ import signal
 import sys
 from typing import Any
 
-_INTERRUPTED = 130  # the exit status that shells expect after Ctrl-C
+# Shells expect this exit status after Ctrl-C.
+_INTERRUPTED = 130
 _CONTINUES = "mocap: interrupted; nothing is lost, the same command continues"
 
 

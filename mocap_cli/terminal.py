@@ -22,14 +22,15 @@ if TYPE_CHECKING:
 
     from pipelines.session.progress import Progress
 
-_LONGEST_LINE = 2000
+# A longer line hides what was printed before it.
+MAX_LINE_CHARACTERS = 2000
 
 
 def one_line(text: str) -> str:
     """Remove line breaks and control characters from a text: names in files must not control a terminal."""
     printable = "".join(c if c.isprintable() else " " for c in text)
     shown = " ".join(printable.split())
-    return shown if len(shown) <= _LONGEST_LINE else shown[:_LONGEST_LINE] + " ..."
+    return shown if len(shown) <= MAX_LINE_CHARACTERS else shown[:MAX_LINE_CHARACTERS] + " ..."
 
 
 def say(text: str = "", *, err: bool = False) -> None:

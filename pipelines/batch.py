@@ -39,9 +39,11 @@ from pipelines.session.urls import as_urls, fetched, get, put, session_here, url
 
 STAGES = ("ingest", "reconstruct", "replan-compare", "report")
 
-_FOLDER = "batch"  # of the summary, if sessions lie beside their flights
+# The summary goes there if sessions lie beside their flights.
+_FOLDER = "batch"
 _TABLE, _PAGE, _TIMES = "summary.csv", "summary.html", "run.json"
-_OWNER_LEAVES_S = 30.0
+# A worker that lost its scheduler notices that within this time, and releases its session.
+MAX_WAIT_FOR_OWNER_S = 30.0
 
 T = TypeVar("T")
 
@@ -234,7 +236,7 @@ def _run(stage: str, job: Job) -> bool:
 
 def _patiently(call: Callable[[], T]) -> T:
     """Call a function; if a session is locked, wait a while for an abandoned worker that is still ending."""
-    until_s = time.monotonic() + _OWNER_LEAVES_S
+    until_s = time.monotonic() + MAX_WAIT_FOR_OWNER_S
     while True:
         try:
             return call()

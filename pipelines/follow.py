@@ -40,12 +40,12 @@ BLOCK = 300
 # A process takes 2 s to start, in which this one looks at 150 pictures. Fewer than these are not worth it.
 MIN_PICTURES_FOR_PROCESSES = 600
 
-# A still about every second shows the ground from every place that a drone passes.
-_STILL_S = 0.9
-# Of a long flight no more stills than this are kept; they lie further apart.
-_MOST_STILLS = 200
-# JPEG of this quality changes smooth grey values by some steps.
-_QUALITY = 85
+# A drone moves on by some metres in this time, so that stills differ enough to compare the ground.
+TIME_BETWEEN_STILLS_S = 0.9
+# More stills of a long flight fill the session and bind the cameras no better.
+MAX_STILLS = 200
+# A lower quality blurs the patches of ground that are compared.
+JPEG_QUALITY = 85
 
 
 def cameras_to_follow(description: Description) -> list[str]:
@@ -102,7 +102,7 @@ class FollowedPart:
         if grey is None:
             self._undecoded += 1
         elif number in self.block.stills:
-            _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             self._stills[number] = np.asarray(encoded, np.uint8)
 
     def write(self, folder: Path) -> None:
@@ -237,8 +237,8 @@ class Following:
         rows = rows[rows_to_follow(t_ns[rows])]
         stills = np.empty(0, np.int64)
         if len(rows):
-            evenly = round((t_ns[rows[-1]] - t_ns[rows[0]]) / 1e9 / _STILL_S) + 1
-            chosen = np.linspace(0, len(rows) - 1, min(evenly, _MOST_STILLS, len(rows)))
+            evenly = round((t_ns[rows[-1]] - t_ns[rows[0]]) / 1e9 / TIME_BETWEEN_STILLS_S) + 1
+            chosen = np.linspace(0, len(rows) - 1, min(evenly, MAX_STILLS, len(rows)))
             stills = rows[np.round(chosen).astype(np.int64)]
         blocks = []
         for first in span[::BLOCK]:

@@ -45,8 +45,10 @@ def poses_at(
 
 
 COMMAND_LINE = "--pose-noise"
-_SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
-_ROUNDED = 1e-6  # of an eigenvalue of correlations that logs have rounded
+# Logs write variances like 1e6 for "unknown". No log of a drone is off by 10 m or half a turn.
+MAX_KNOWN_VARIANCE_M2_RAD2 = (100.0, np.pi**2)
+# Logs round their covariances, which moves the eigenvalues of correlations by about this much.
+MAX_ROUNDING_OF_EIGENVALUE = 1e-6
 
 
 class StatedNoise(NamedTuple):
@@ -114,7 +116,7 @@ def logged_covariance(trajectory: Trajectory) -> Float | None:
     covariance[:, np.arange(6), np.arange(6)] = axes
     scale = np.sqrt(axes)
     correlation = covariance / (scale[:, :, None] * scale[:, None, :])
-    contradictory = np.linalg.eigvalsh(correlation)[:, 0] < -_ROUNDED
+    contradictory = np.linalg.eigvalsh(correlation)[:, 0] < -MAX_ROUNDING_OF_EIGENVALUE
     covariance[contradictory] = axes[contradictory, :, None] * np.eye(6)
     return covariance
 
@@ -125,7 +127,7 @@ def known_variances(covariance: Float) -> tuple[Float, NDArray[np.bool_]]:
     `covariance` is [N, 6, 6]. Logs write zero, negative, NaN and absurdly large variances for "unknown".
     """
     variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
-    return variances, (variances > 0) & (variances < np.array(_SANE_VARIANCE)[:, None])
+    return variances, (variances > 0) & (variances < np.array(MAX_KNOWN_VARIANCE_M2_RAD2)[:, None])
 
 
 def _level(covariance: Float) -> Float:

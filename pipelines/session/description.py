@@ -18,6 +18,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 from pipelines.session.storage import hash_of, read_json, refuse_camera_names
 
+# The first version of session.json is the only one so far.
 SCHEMA = 1
 
 
@@ -177,7 +178,8 @@ class CameraEntry(Entry):
     media: MediaEntry | None
 
 
-_HIP_ABOVE_M = {"hip": 0.0, "centre": 0.0, "feet": 0.95, "head": -0.70}  # of a standing person of 1.75 m
+# These are the heights of the hips above the logged point of a standing person of 1.75 m.
+HIP_ABOVE_POINT_M = {"hip": 0.0, "centre": 0.0, "feet": 0.95, "head": -0.70}
 
 
 class ActorEntry(Entry):
@@ -195,7 +197,7 @@ class ActorEntry(Entry):
     @property
     def hip_above_m(self) -> float:
         """Height of the hips above the logged point, m, for a standing person of 1.75 m."""
-        return _HIP_ABOVE_M[self.point]
+        return HIP_ABOVE_POINT_M[self.point]
 
 
 class HeldMap(Entry):

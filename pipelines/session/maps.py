@@ -35,13 +35,16 @@ from pipelines.session.storage import as_data_error, jsonable, read_json, refuse
 MOST_VOXELS = 200_000_000
 """The most voxels of a grid (0.8 GB as float32); a larger one is refused."""
 
-_MOST_DOUBLINGS = 5  # of a resolution: coarser maps are no obstacles any more
+# After more doublings, voxels of 0.2 m are wider than the trees and walls that they stand for.
+MAX_DOUBLINGS_OF_RESOLUTION = 5
 
 FINEST_M, COARSEST_M = 1e-4, 1e4
 """The smallest and the largest side of a voxel; anything else is a mistake in the file."""
 
-_SLAB_BYTES = 16 << 20  # how much of a stored grid is decoded at a time
-_SMALL_MEMBER = 4096  # bytes; origin, resolution and time are far smaller
+# A grid is decoded in slabs of this size, so that it is never in memory twice.
+SLAB_BYTES = 16 << 20
+# Origin, resolution and time have at most some hundred bytes with their header.
+MAX_SMALL_MEMBER_BYTES = 4096
 _WRITE_AGAIN = "write it again: probability [X, Y, Z], origin [3], resolution_m"
 
 # Exceptions that zipfile, zlib and numpy's header parser raise on damaged files.
@@ -102,7 +105,7 @@ def check_size(source: Path | str, shape: Sequence[float], resolution_m: float, 
     fitting_m = next(
         (
             resolution_m * 2**k
-            for k in range(1, _MOST_DOUBLINGS)
+            for k in range(1, MAX_DOUBLINGS_OF_RESOLUTION)
             if math.prod(side / 2**k + 1 for side in shape) <= MOST_VOXELS
         ),
         None,
@@ -306,8 +309,8 @@ class _StoredGrid:
         member = f"{name}.npy"
         try:
             info = self._archive.getinfo(member)
-            if max(info.file_size, info.compress_size) > _SMALL_MEMBER:
-                raise ValueError(f"{name} is larger than {_SMALL_MEMBER} bytes")
+            if max(info.file_size, info.compress_size) > MAX_SMALL_MEMBER_BYTES:
+                raise ValueError(f"{name} is larger than {MAX_SMALL_MEMBER_BYTES} bytes")
             array: NDArray[Any] = np.lib.format.read_array(
                 BytesIO(self._archive.read(member)), allow_pickle=False
             )
@@ -348,7 +351,7 @@ class _StoredGrid:
         header = self.header
         stored_shape = header.shape[::-1] if header.fortran_order else header.shape
         layer_bytes = stored_shape[1] * stored_shape[2] * header.dtype.itemsize
-        step = max(1, _SLAB_BYTES // layer_bytes)
+        step = max(1, SLAB_BYTES // layer_bytes)
         try:
             with self._archive.open(f"{header.name}.npy") as file:
                 file.read(header.offset)

@@ -13,9 +13,12 @@ from weakref import WeakSet
 
 T = TypeVar("T")
 
-_M_MMAP_THRESHOLD = -3  # of glibc's <malloc.h>
-_LARGE = 1 << 22  # bytes
-_ALIGNED = 64  # bytes
+# This is the number of M_MMAP_THRESHOLD in glibc's <malloc.h>.
+M_MMAP_THRESHOLD = -3
+# Arrays that fill the heap with holes have 4 MB and more; smaller ones are too many for the kernel.
+MIN_RETURNED_BYTES = 1 << 22
+# NumPy and its libraries are fastest with arrays that begin at a line of the cache.
+ALIGNMENT_BYTES = 64
 
 
 def return_freed_arrays() -> None:
@@ -27,7 +30,7 @@ def return_freed_arrays() -> None:
     """
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)
     if set_option is not None:
-        set_option(_M_MMAP_THRESHOLD, _LARGE)
+        set_option(M_MMAP_THRESHOLD, MIN_RETURNED_BYTES)
 
 
 def return_unused() -> None:
@@ -72,7 +75,7 @@ class Waiting:
         places, end = [], 0
         for buffer in buffers:
             places.append(slice(end, end + buffer.raw().nbytes))
-            end = -(-places[-1].stop // _ALIGNED) * _ALIGNED
+            end = -(-places[-1].stop // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
         if not end:
             return value
         with TemporaryFile(dir=self._folder) as file:

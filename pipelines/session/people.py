@@ -195,7 +195,8 @@ def with_derived(joints: tuple[str, ...], position: Float) -> tuple[tuple[str, .
     return joints, position
 
 
-_GAP_NS = 2_000_000_000  # no interpolation between two stamps that are further apart
+# A person who walks is up to 3 m away after a longer gap, and a line says nothing of the way.
+MAX_GAP_OF_ACTOR_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -207,7 +208,7 @@ class LoggedActor:
 
     def hips_at(self, t_ns: Int64) -> Float:
         """Interpolate the hips [T, 3] at given times; NaN where no logged position is near enough."""
-        return interpolate_points(self.t_ns, self.hips, t_ns, max_gap_ns=_GAP_NS)
+        return interpolate_points(self.t_ns, self.hips, t_ns, max_gap_ns=MAX_GAP_OF_ACTOR_NS)
 
 
 def logged_actor(folder: Path, description: Description, span_ns: Span | None = None) -> LoggedActor | None:
@@ -238,7 +239,7 @@ def logged_people(folder: Path, description: Description, span_ns: Span | None =
     entries = description.logged_people
     if not entries:
         return []
-    about = None if span_ns is None else (span_ns[0] - _GAP_NS, span_ns[1] + _GAP_NS)
+    about = None if span_ns is None else (span_ns[0] - MAX_GAP_OF_ACTOR_NS, span_ns[1] + MAX_GAP_OF_ACTOR_NS)
     table = read_table(folder / "actor.parquet", ACTOR, about)
     person, t_ns = table["person"].to_numpy(np.int64), table["t_ns"].to_numpy(np.int64)
     place = table[["x", "y", "z"]].to_numpy(np.float64)
@@ -248,13 +249,20 @@ def logged_people(folder: Path, description: Description, span_ns: Span | None =
     ]
 
 
-_MOST_STREAMS = 8  # most cameras or trackers with interleaved samples
-_LEAST_TURNS = 4  # fewest repetitions to call a pattern periodic
-_ALIKE = 0.2  # of the mean step: largest difference between times that count as equal
-_MOST = 0.6  # smallest share of times that must be equal
-_HARDLY_MORE = 0.1  # a larger number of streams must raise the share of equal times by more than this
-_LONGER = 1.2  # smallest limit, as a multiple of the usual longest step
-_OF_NO_ORDER = 1.5  # limit for steps that do not repeat, as a multiple of their 90th percentile
+# No flight has truth of more interleaved cameras or trackers.
+MAX_STREAMS = 8
+# With fewer repetitions, chance makes any steps look periodic.
+MIN_REPETITIONS = 4
+# Recorders are late by up to a fifth of a step; a missing sample makes a step twice as long.
+MAX_JITTER_SHARE = 0.2
+# Streams of different rates reach half of equal times by chance.
+MIN_SHARE_OF_EQUAL_TIMES = 0.6
+# More streams always fit a little better, so a larger number must raise the share by more than this.
+MIN_GAIN_OF_SHARE = 0.1
+# Where no missing sample was seen, jitter alone must not make a gap.
+MIN_GAP_IN_STEPS = 1.2
+# Half a step more than nine in ten steps is the same rule as for equal steps.
+GAP_OF_UNORDERED_STEPS = 1.5
 
 
 def true_joints_at(truth: JointMotion, t_ns: Int64) -> Float:
@@ -287,19 +295,19 @@ def longest_step_ns(t_ns: Int64) -> int:
         return 0
     turns = [
         np.lib.stride_tricks.sliding_window_view(steps, streams)
-        for streams in range(1, max(1, min(_MOST_STREAMS, len(steps) // _LEAST_TURNS)) + 1)
+        for streams in range(1, max(1, min(MAX_STREAMS, len(steps) // MIN_REPETITIONS)) + 1)
     ]
-    alike = [_alike(each.sum(axis=1), _ALIKE / each.shape[1]) for each in turns]
+    alike = [_alike(each.sum(axis=1), MAX_JITTER_SHARE / each.shape[1]) for each in turns]
     shares = [float(which.mean()) for which in alike]
-    if max(shares) <= _MOST:
-        return int(_OF_NO_ORDER * np.percentile(steps, 90))
-    least = next(k for k, share in enumerate(shares) if share >= max(shares) - _HARDLY_MORE)
+    if max(shares) <= MIN_SHARE_OF_EQUAL_TIMES:
+        return int(GAP_OF_UNORDERED_STEPS * np.percentile(steps, 90))
+    least = next(k for k, share in enumerate(shares) if share >= max(shares) - MIN_GAIN_OF_SHARE)
     usual = turns[least][alike[least]]
     longest = usual.max(axis=1)
     joined = usual + np.roll(usual, -1, axis=1)
     hole = np.where(joined > longest[:, None], joined, np.inf).min(axis=1)
     step = float(np.percentile(longest, 95))
-    return int(max((step + float(np.median(hole))) / 2, _LONGER * step))
+    return int(max((step + float(np.median(hole))) / 2, MIN_GAP_IN_STEPS * step))
 
 
 def _alike(times: Float, share: float) -> NDArray[np.bool_]:

@@ -33,7 +33,8 @@ from pipelines.session.errors import BusyError, DataError
 
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
-_UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # spreadsheets and some editors write them
+# Spreadsheets and some editors begin a file with one of these marks.
+_UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 _REMEDIES = {
     errno.ENOENT: "check the path; those in a flight.yaml are relative to it",
@@ -340,7 +341,8 @@ STUDY_MARK = "study.json"
 """The file that is in every folder of `mocap study`."""
 
 _LOCK = "lock"
-_RELEASED_S = 0.2  # a killed process can be gone some moments before the kernel has released its lock
+# A killed process can be gone some moments before the kernel has released its lock.
+MAX_WAIT_FOR_LOCK_S = 0.2
 _OF_SESSIONS = {"session.json": "a session", "stage.json": "a stage of a session"}
 
 
@@ -359,7 +361,7 @@ def held(lock: Path, target: Path | str) -> Iterator[None]:
     holder = lock.with_name(f"{lock.name}.pid")
     drop_link(lock)
     try:
-        acquired = FileLock(lock).acquire(timeout=_RELEASED_S)
+        acquired = FileLock(lock).acquire(timeout=MAX_WAIT_FOR_LOCK_S)
     except Timeout:
         raise BusyError(f"{target} is being written by {_process(holder)}; wait for it to finish") from None
     with acquired:

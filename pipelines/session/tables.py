@@ -262,7 +262,7 @@ def _batches(opened: Any, columns: Sequence[str] | None = None) -> Iterator[Any]
     A single iterator over all groups would hold memory of each until its end: 1.5 GB for 14.6 million rows.
     """
     for group in range(opened.metadata.num_row_groups):
-        yield from opened.iter_batches(_ROWS_AT_ONCE, row_groups=[group], columns=columns)
+        yield from opened.iter_batches(ROWS_PER_BATCH, row_groups=[group], columns=columns)
 
 
 def _batches_within(opened: Any, span_ns: Span | None) -> Iterator[Any]:
@@ -277,7 +277,7 @@ def _batches_within(opened: Any, span_ns: Span | None) -> Iterator[Any]:
     for number in range(opened.metadata.num_row_groups):
         known = opened.metadata.row_group(number).column(column).statistics
         if known is None or not known.has_min_max or (known.max >= span_ns[0] and known.min <= span_ns[1]):
-            for batch in opened.iter_batches(_ROWS_AT_ONCE, row_groups=[number]):
+            for batch in opened.iter_batches(ROWS_PER_BATCH, row_groups=[number]):
                 within = pc.and_(pc.greater_equal(batch["t_ns"], first), pc.less_equal(batch["t_ns"], last))
                 yield batch.filter(within)
 
@@ -312,7 +312,7 @@ def _refuse_absurd_numbers(path: Path, frame: pd.DataFrame, names: Sequence[str]
     for name in names:
         if frame[name].dtype.kind in "if" and len(frame):
             values = frame[name].to_numpy()
-            largest = LATEST_NS if name.endswith("_ns") else _LARGEST
+            largest = LATEST_NS if name.endswith("_ns") else MAX_NUMBER
             wrong = (values > largest) | (values < -largest)
             if name not in (*_POSITION, *_QUATERNION):
                 wrong &= np.isfinite(values)
@@ -324,19 +324,23 @@ def _refuse_absurd_numbers(path: Path, frame: pd.DataFrame, names: Sequence[str]
 def _refuse_bomb(path: Path, metadata: Any) -> None:
     """Refuse a table that takes far more memory than its file, before it is read."""
     groups = [metadata.row_group(k).total_byte_size for k in range(metadata.num_row_groups)]
-    size = max(metadata.num_rows * metadata.num_columns * _CELL, sum(groups))
-    if size > max(_INFLATED, _MOST_EXPANSION * path.stat().st_size):
+    size = max(metadata.num_rows * metadata.num_columns * BYTES_PER_CELL, sum(groups))
+    if size > max(MAX_BYTES_OF_ANY_TABLE, MAX_EXPANSION * path.stat().st_size):
         problem = f"holds {metadata.num_rows} rows, {size} bytes, in a file of {path.stat().st_size}"
         raise DataError(path, problem, _AGAIN)
 
 
 _AGAIN = "run the stage that wrote it again with --force"
-_ROWS_AT_ONCE = 1 << 16  # of a table of which only a span is kept
-_LARGEST = 1e15  # of any number; squares of much larger ones overflow
+# A batch of so many rows of the widest table has 20 MB.
+ROWS_PER_BATCH = 1 << 16
+# Products of several such numbers still fit a float; no stage writes larger ones.
+MAX_NUMBER = 1e15
 LATEST_NS = 2**62 - 1
 """The latest time; differences of two such times fit int64."""
-_CELL = 8  # bytes
-_INFLATED, _MOST_EXPANSION = 1 << 28, 100  # bytes of any table, and for each byte of its file
+# A number of a table takes so many bytes in memory.
+BYTES_PER_CELL = 8
+# A table of any content may have 256 MB. A larger one of real data is at most 100 times its file.
+MAX_BYTES_OF_ANY_TABLE, MAX_EXPANSION = 1 << 28, 100
 _POSITION = ["x", "y", "z"]
 _QUATERNION = ["qx", "qy", "qz", "qw"]
 

@@ -12,9 +12,12 @@ from typing import Any, NamedTuple
 
 from pipelines.session.storage import plain_text, text_encoding
 
-_HEAD_BYTES = 64 * 1024
-_LARGEST_PARSED = 8 << 20  # bytes; larger text is described by its first line
-_SHOWN = 8  # names of keys, columns or endings in a message
+# Every kind is known by less than its first 64 kB.
+HEAD_BYTES = 64 * 1024
+# Larger text takes seconds to parse, and is described by its first line.
+MAX_PARSED_BYTES = 8 << 20
+# A line with more names of keys, columns or endings is not read to its end.
+MAX_NAMES_IN_MESSAGE = 8
 
 
 EXPECTED = (
@@ -123,7 +126,7 @@ def describe_unknown(path: Path) -> Likeness:
             return Likeness("is a pipe, a socket or a device", "write what comes out of it to a file")
         size = of_path.st_size
         with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+            head = file.read(HEAD_BYTES)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         return Likeness(f"cannot be read ({reason})", "check its permissions")
@@ -188,7 +191,7 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
     if not lines:
         return Likeness("holds blank lines only", "")
     ending = path.suffix.lower()
-    if size <= _LARGEST_PARSED:
+    if size <= MAX_PARSED_BYTES:
         if ending == ".json":
             return _of_json(path)
         if ending == ".toml":
@@ -260,7 +263,9 @@ def _keys(content: dict[Any, Any]) -> str:
 
 def _listed(names: Iterable[str]) -> str:
     named = [" ".join(name.split()) for name in names]
-    return ", ".join(named[:_SHOWN]) + (f", ... ({len(named)})" if len(named) > _SHOWN else "")
+    return ", ".join(named[:MAX_NAMES_IN_MESSAGE]) + (
+        f", ... ({len(named)})" if len(named) > MAX_NAMES_IN_MESSAGE else ""
+    )
 
 
 def _quoted(first: bytes) -> str:

@@ -274,7 +274,7 @@ def test_session_that_is_held_for_a_moment_is_waited_for(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(time, "sleep", lambda _: None)
     assert batch._patiently(busy_once)
-    monkeypatch.setattr(batch, "_OWNER_LEAVES_S", -1.0)
+    monkeypatch.setattr(batch, "MAX_WAIT_FOR_OWNER_S", -1.0)
     calls.clear()
     with pytest.raises(BusyError):
         batch._patiently(busy_once)

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from tests.commands.runner import content, mocap, refused, succeeds
-from tests.synthetic.flights import write_flight
+from tests.synthetic.flights import SyntheticFlight, write_flight
 
 METHODS = ("dlt", "midpoint", "robust")
 
@@ -21,14 +21,23 @@ def metrics(session: Path, *options: str) -> dict[str, Any]:
     return result
 
 
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> SyntheticFlight:
+    return write_flight(tmp_path_factory.mktemp("flight"), cameras=3, seconds=0.5)
+
+
+@pytest.fixture(scope="module")
+def session(flight: SyntheticFlight) -> Path:
+    """Return a session with a skeleton by `robust`."""
+    succeeds("ingest", flight.manifest)
+    folder = flight.manifest.with_suffix(".session")
+    succeeds("reconstruct", folder, "--method", "robust")
+    return folder
+
+
 @pytest.mark.parametrize(
     ("cameras", "static", "keypoints", "poses"),
-    [
-        (2, False, "alphapose", "tum"),
-        (3, False, "openpose", "csv"),
-        (5, False, "coco", "tum"),
-        (3, True, "coco", "tum"),
-    ],
+    [(2, False, "alphapose", "tum"), (3, False, "openpose", "csv"), (5, True, "coco", "tum")],
 )
 def test_flight_without_noise_is_reconstructed_below_half_a_millimetre(
     tmp_path: Path, cameras: int, static: bool, keypoints: str, poses: str
@@ -41,6 +50,7 @@ def test_flight_without_noise_is_reconstructed_below_half_a_millimetre(
         clean=True,
         keypoint_format=keypoints,
         pose_format=poses,
+        seconds=0.5,
     )
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest)
@@ -55,7 +65,7 @@ def test_flight_without_noise_is_reconstructed_below_half_a_millimetre(
 def test_same_bytes_twice_and_with_one_or_two_workers(tmp_path: Path) -> None:
     sessions = []
     for place, workers in (("first", "1"), ("second", "2")):
-        flight = write_flight(tmp_path / place, cameras=3, bystander=True)
+        flight = write_flight(tmp_path / place, cameras=3, bystander=True, seconds=0.5)
         session = tmp_path / place / "flight.session"
         succeeds("ingest", flight.manifest)
         succeeds("reconstruct", session, "--method", "robust", "--workers", workers)
@@ -66,7 +76,7 @@ def test_same_bytes_twice_and_with_one_or_two_workers(tmp_path: Path) -> None:
 
 
 def test_bystander_whom_one_camera_misses_is_not_the_actor(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=4, bystander=True, clean=True)
+    flight = write_flight(tmp_path, cameras=4, bystander=True, clean=True, seconds=0.5)
     # The bystander stands first in every frame, but drone4's detector does not report him.
     keypoints = tmp_path / "drone4.json"
     people = json.loads(keypoints.read_text(encoding="utf-8"))
@@ -79,24 +89,7 @@ def test_bystander_whom_one_camera_misses_is_not_the_actor(tmp_path: Path) -> No
     assert both["status_counts"]["all"] == 2 * metrics(session)["status_counts"]["all"]
 
 
-def test_unchanged_stages_are_skipped_and_changed_settings_replace(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", session, "--method", "robust")
-    assert "unchanged" in succeeds("ingest", flight.manifest)
-    assert "unchanged" in succeeds("reconstruct", session, "--method", "robust")
-    assert "written" in succeeds("reconstruct", session, "--method", "robust", "--force")
-    replaced = mocap("reconstruct", session, "--method", "dlt")
-    assert re.search(r"\bmethod\b.*\brobust\b.*\bdlt\b", replaced.stderr)
-    assert "written" in replaced.stdout
-
-
-def test_tables_are_read_by_pandas_alone(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=3)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", session, "--method", "robust")
+def test_tables_are_read_by_pandas_alone(flight: SyntheticFlight, session: Path) -> None:
     skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
     assert len(skeleton) == len(flight.t_ns) * len(flight.joints)
     assert list(skeleton["t_ns"].unique()) == list(flight.t_ns)
@@ -108,35 +101,38 @@ def test_tables_are_read_by_pandas_alone(tmp_path: Path) -> None:
     assert list(frames.columns) == ["frame", "t_ns", "pts_ns"]
 
 
-def test_exports_lie_beside_the_session_and_are_not_overwritten(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest)
-    succeeds("reconstruct", session, "--method", "robust")
+def test_exports_lie_beside_the_session_and_are_not_overwritten(session: Path) -> None:
     result = json.loads(succeeds("export", session, "--to", "trc,csv,tum", "--json"))
-    names = {Path(path).suffix for path in result["written"]}
-    assert names == {".trc", ".csv", ".tum"}
+    assert {Path(path).suffix for path in result["written"]} == {".trc", ".csv", ".tum"}
     assert json.loads(succeeds("export", session, "--to", "trc", "--json"))["written"] == []
     trc = next(Path(path) for path in result["written"] if path.endswith(".trc"))
     trc.write_text("changed by hand", encoding="utf-8")
-    assert "--overwrite" in refused("export", session, "--to", "trc")
+    refused("export", session, "--to", "trc", code="exists")
     succeeds("export", session, "--to", "trc", "--overwrite")
     assert trc.read_text(encoding="utf-8").startswith("PathFileType")
 
 
-def test_info_knows_what_it_wrote_and_what_it_reads(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path)
-    succeeds("ingest", flight.manifest)
+def test_info_knows_what_it_wrote_and_what_it_reads(flight: SyntheticFlight, session: Path) -> None:
+    folder = flight.manifest.parent
     for path, kind in (
-        (tmp_path / "flight.session", "session"),
+        (session, "session"),
         (flight.manifest, "manifest"),
-        (tmp_path / "drone1.json", "AlphaPose"),
-        (tmp_path / "drone1.tum", "TUM"),
+        (folder / "drone1.json", "AlphaPose"),
+        (folder / "drone1.tum", "TUM"),
     ):
-        reading = json.loads(succeeds("info", path, "--json"))["readings"]
-        assert len(reading) == 1
-        assert kind in reading[0]["kind"]
-        assert kind in succeeds("info", path)
+        [reading] = json.loads(succeeds("info", path, "--json"))["readings"]
+        assert kind in reading["kind"]
+
+
+def test_unchanged_stages_are_skipped_and_changed_settings_replace(
+    flight: SyntheticFlight, session: Path
+) -> None:
+    assert "unchanged" in succeeds("ingest", flight.manifest)
+    assert "unchanged" in succeeds("reconstruct", session, "--method", "robust")
+    assert "written" in succeeds("reconstruct", session, "--method", "robust", "--force")
+    replaced = mocap("reconstruct", session, "--method", "dlt")
+    assert re.search(r"\bmethod\b.*\brobust\b.*\bdlt\b", replaced.stderr)
+    assert "written" in replaced.stdout
 
 
 def test_help_of_every_command() -> None:

@@ -39,7 +39,7 @@ def test_missing_numbers_and_large_ones_are_read(tmp_path: Path) -> None:
 def test_a_table_far_larger_than_its_file_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tables, "_INFLATED", 1 << 20)
+    monkeypatch.setattr(tables, "MAX_BYTES_OF_ANY_TABLE", 1 << 20)
     rows = 50_000  # of 7 columns of 8 bytes: 2.8 MB in some kilobytes
     numbers = {name: np.zeros(rows) for name in KEYPOINTS.names} | {"joint": np.full(rows, "nose")}
     write_table(tmp_path / "keypoints.parquet", pd.DataFrame(numbers), KEYPOINTS)

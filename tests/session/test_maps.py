@@ -191,7 +191,7 @@ def test_percent_and_yes_or_no_become_probabilities(tmp_path: Path) -> None:
 
 
 def test_large_grids_are_read_in_slabs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(maps, "_SLAB_BYTES", 100)
+    monkeypatch.setattr(maps, "SLAB_BYTES", 100)
     rng = np.random.default_rng(4)
     grid = rng.random((7, 5, 3), dtype=np.float32)
     for order in ("C", "F"):

@@ -8,10 +8,8 @@ import itertools
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -230,19 +228,6 @@ def test_what_is_published_was_synced_before(tmp_path: Path, monkeypatch: pytest
     assert {"first", "second", "ingest", "reconstruct"} <= published
 
 
-WRITER = """
-import sys
-from pathlib import Path
-from tests.session.test_stages import NEW, OLD, ingest, reconstruct
-folder = Path(sys.argv[1])
-print("ready", flush=True)
-while True:
-    ingest(folder, "old", OLD)
-    reconstruct(folder, "dlt")
-    ingest(folder, "new", NEW)
-    reconstruct(folder, "robust")
-"""
-
 HOLDER = """
 import sys
 from pathlib import Path
@@ -263,22 +248,6 @@ def other_process(script: str, folder: Path) -> Iterator[subprocess.Popen[bytes]
         assert process.stdout.readline() == b"ready\n"
         yield process
         process.kill()
-
-
-def test_sigkill_at_random_moments(tmp_path: Path) -> None:
-    work(tmp_path / "undisturbed.session")
-    folder = tmp_path / "a.session"
-    draw = np.random.default_rng(2)
-    for _ in range(5):
-        with other_process(WRITER, folder) as process:
-            time.sleep(draw.uniform(0.0, 0.2))
-            process.send_signal(signal.SIGKILL)
-        if (folder / "session.json").exists():
-            assert_every_stage_is_whole(folder)
-        work(folder)
-        # Chunks of the writer's other settings wait for those to come again.
-        shutil.rmtree(folder / ".partial", ignore_errors=True)
-        assert contents(folder) == contents(tmp_path / "undisturbed.session")
 
 
 def test_a_second_writer_is_told_who_writes_until_that_one_is_killed(tmp_path: Path) -> None:
