@@ -13,7 +13,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Occupancy, Recording, Trajectory
 
 CHI2_95 = 7.815
-"""95 % of a Gaussian in three dimensions lie within {x : x' S^-1 x = 7.815} (chi-square)."""
+"""An ellipsoid {x : x' S^-1 x = 7.815} holds 95 % of a Gaussian in three dimensions (chi-square)."""
 
 # Viewers stay fluent up to this number of cubes.
 MOST_CUBES = 1_000_000

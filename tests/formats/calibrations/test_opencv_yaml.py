@@ -128,6 +128,7 @@ def test_easymocap_has_its_poses_in_a_file_beside(tmp_path: Path) -> None:
         cameras = recognise(path, CalibrationFormat, "calibration").read_calibration(path)
         assert list(cameras) == ["01", "02"]
         expected = -cv2.Rodrigues(turns["02"])[0].T @ place
+        assert cameras["02"].position is not None
         np.testing.assert_allclose(cameras["02"].position, expected[:, 0], atol=1e-12)
         lens = cameras["02"].intrinsics
         assert lens is not None

@@ -58,7 +58,7 @@ PACKETS = [
 
 def read(monkeypatch: pytest.MonkeyPatch, packets: list[tuple[int, int, bytes]], **choice: str) -> Telemetry:
     monkeypatch.setattr(gpmf, "_packets", lambda *_: iter(packets))
-    return READER.read_telemetry(Path("a.mp4"), TelemetryChoice(**choice))  # type: ignore[arg-type]
+    return READER.read_telemetry(Path("a.mp4"), TelemetryChoice(**choice))
 
 
 def test_fixes_are_spread_over_their_packets_in_utc(monkeypatch: pytest.MonkeyPatch) -> None:

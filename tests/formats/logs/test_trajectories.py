@@ -150,7 +150,8 @@ def test_chains_of_moving_and_static_transforms() -> None:
 def test_other_values_of_a_static_transform_are_counted(beside_moving: bool) -> None:
     arm = static(("base", "camera"), (0.5, 0.0, 0.0))
     moved = replace(static(("base", "camera"), (0.5, 0.0, 1.0)), stamp_ns=arm.stamp_ns + 1)
-    turned_alike = replace(moved, quaternion_xyzw=tuple(-part for part in moved.quaternion_xyzw))
+    x, y, z, w = moved.quaternion_xyzw
+    turned_alike = replace(moved, quaternion_xyzw=(-x, -y, -z, -w))
     odometry = flown(10, rate_hz=50, frames=("map", "base"))
     transforms = transforms_of(
         [*odometry, *([moved] if beside_moving else [])],
