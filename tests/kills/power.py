@@ -29,7 +29,7 @@ from unittest.mock import patch
 import numpy as np
 
 from pipelines.session.errors import DataError
-from pipelines.session.stages import STAGES, open_session
+from pipelines.session.stages import STAGES, locked
 from tests.commands.runner import mocap, succeeds
 from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 from tests.kills.killing import SCENARIO, SMALL_STUDY, kept
@@ -462,8 +462,8 @@ def version_of_session(session: Path) -> dict[str, str]:
     """
     if not (session / "session.json").exists() and not (session / "ingest.new" / "stage.json").exists():
         return {}
-    opened = open_session(session)
-    records = {stage: opened.intact_record(stage) for stage in STAGES}
+    with locked(session) as opened:  # completes what was interrupted
+        records = {stage: opened.intact_record(stage) for stage in STAGES}
     return {stage: record.key for stage, record in records.items() if record is not None}
 
 
