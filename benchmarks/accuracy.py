@@ -47,8 +47,9 @@ from pipelines.follow import Following
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.joint_angles import ANGLES, joint_angles
 from pipelines.geometry.metrics import measure
-from pipelines.reconstruct import Settings, reconstruct
-from pipelines.reconstruction.refining import FoundClocks, RobustFlight, find_clocks
+from pipelines.reconstruct import ReconstructSettings, reconstruct
+from pipelines.reconstruction.clocks import FoundClocks
+from pipelines.reconstruction.refining import RobustFlight, find_clocks
 from pipelines.session.description import Doubt
 from pipelines.session.errors import DataError
 from pipelines.session.people import true_joints_at
@@ -275,7 +276,7 @@ def measure_draw(
             for case in cases:
                 timed = case is first and not case.draw
                 method = METHODS["robust" if case.method in _POSES else case.method]
-                settings = Settings(**method, people=1, detector=first.detector)
+                settings = ReconstructSettings(**method, people=1, detector=first.detector)
                 began_s = time.process_time()
                 try:
                     with nullcontext() if timed else patch("pipelines.attempt.doubts_of", _no_doubts):

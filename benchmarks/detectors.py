@@ -22,7 +22,7 @@ from benchmarks.results import fixed, markdown_table
 from pipelines.formats.skeletons.trc import FORMAT as TRC
 from pipelines.formats.videos.video import frames
 from pipelines.ingest import ingest
-from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.registries import find_detector
 from pipelines.session.tables import motion_from
 
@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
             ingest(real_flight(Path(folder)), Path(folder) / "real.session").folder if REAL.is_dir() else None
         )
         for detector in options.detectors:
-            settings = Settings(method="robust", detector=detector)
+            settings = ReconstructSettings(method="robust", detector=detector)
             found = reconstruct(sample, settings).metrics
             cells = [fixed(found[name], 1) for name in ("mpjpe_mm", "root_mpjpe_mm")]
             if real is None:

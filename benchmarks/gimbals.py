@@ -53,7 +53,7 @@ from benchmarks.results import fixed, markdown_table
 from pipelines.formats.skeletons.trc import FORMAT as TRC
 from pipelines.geometry.arrays import Float
 from pipelines.ingest import ingest
-from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.description import IntrinsicsEntry, read_description
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 
@@ -146,7 +146,7 @@ def prepare(folder: Path, detector: str) -> None:
     real_flight(place, "Calib_refit.toml", f"{{start: 0.0, fps: {_FPS}}}")
     session = place / f"{detector}.session"
     ingest(place / "flight.yaml", session)
-    reconstruct(session, Settings(method="robust", detector=detector), workers=2)
+    reconstruct(session, ReconstructSettings(method="robust", detector=detector), workers=2)
 
 
 def prepare_path(folder: Path, detector: str, logs: Sequence[Log], path: str) -> None:
@@ -164,7 +164,7 @@ def prepare_path(folder: Path, detector: str, logs: Sequence[Log], path: str) ->
             _write(place / f"{name}.shot", repr(shot))
     session = _session(place, detector, Log(0.0))
     ingest(place / "true.yaml", session)
-    reconstruct(session, Settings(method="robust", detector=detector))
+    reconstruct(session, ReconstructSettings(method="robust", detector=detector))
     for log, given in product(logs, (True, False)):
         copied = _session(place, detector, log, given=given)
         if not copied.exists():  # with the keypoints
@@ -298,7 +298,7 @@ def measured(
         # The code may have changed since: nothing of an earlier run is taken for a result.
         shutil.rmtree(session / "reconstruct", ignore_errors=True)
         started_s = time.process_time()
-        reconstruct(session, Settings(**METHODS[method], detector=detector), workers=1)
+        reconstruct(session, ReconstructSettings(**METHODS[method], detector=detector), workers=1)
         taken_s = time.process_time() - started_s
         found[method] = _figures(session, reference, true, taken_s)
     return found

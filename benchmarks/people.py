@@ -34,7 +34,7 @@ from benchmarks.flights import scenario_of, walker
 from benchmarks.results import fixed, markdown_table
 from pipelines.geometry.arrays import Bool
 from pipelines.ingest import ingest
-from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.people import true_joints_at
 from pipelines.session.registries import noise_models
 from pipelines.session.tables import KEYPOINTS, SKELETON, TRUTH, motion_from, read_table
@@ -181,7 +181,7 @@ def _modelled(people: str, seed: int) -> Path:
 
 def figures(session: Path, scenario: Path) -> dict[str, Any]:
     """Reconstruct everybody in a session, and compare with the truth."""
-    metrics = reconstruct(session, Settings(people="auto"), force=True).metrics
+    metrics = reconstruct(session, ReconstructSettings(people="auto"), force=True).metrics
     tracking, names = metrics["tracking"], metrics["people"]["names"]
     times = coverage(session, scenario)
     return {

@@ -26,7 +26,7 @@ from benchmarks.flights import SAMPLE
 from benchmarks.results import fixed, keep, markdown_table
 from pipelines.batch import BatchSettings, batch
 from pipelines.ingest import ingest
-from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.simulate import simulate
 from tests.synthetic.flights import write_flight
 
@@ -95,7 +95,10 @@ def accuracy(seed: int) -> Iterator[list[str]]:
             path = manifest.with_name(f"{stated}.yaml")
             path.write_text(yaml.safe_dump(document), encoding="utf-8")
             session = ingest(path, Path(folder) / f"{stated}.session").folder
-            found = [reconstruct(session, Settings(method=method)).metrics for method in ("robust", "auto")]
+            found = [
+                reconstruct(session, ReconstructSettings(method=method)).metrics
+                for method in ("robust", "auto")
+            ]
             yield [
                 f"{seed}, {len(document['cameras'])} drones, {'drifting' if seed % 2 else 'constant'}",
                 "yes" if stated else "no",

@@ -27,7 +27,7 @@ from mocap_cli.terminal import print_table, say, say_warnings, watching
 
 if TYPE_CHECKING:
     from mocap_cli.options import ChosenPictures
-    from pipelines.reconstruct import Reconstructed, Settings
+    from pipelines.reconstruct import Reconstructed, ReconstructSettings
 
 GONE = {
     "--refine-cameras": "--method auto does it",
@@ -58,8 +58,8 @@ class People(click.ParamType["int | str"]):
         return int(value)
 
 
-def _settings(pictures: ChosenPictures, smooth: str | None, **others: Any) -> Settings:
-    from pipelines.reconstruct import Settings
+def _settings(pictures: ChosenPictures, smooth: str | None, **others: Any) -> ReconstructSettings:
+    from pipelines.reconstruct import ReconstructSettings
 
     fill = re.fullmatch(r"\s*fill:max_s=([0-9.eE-]+)\s*(?:\+(.*))?", smooth or "")
     fill_s = None
@@ -68,7 +68,7 @@ def _settings(pictures: ChosenPictures, smooth: str | None, **others: Any) -> Se
             fill_s, smooth = float(fill[1]), fill[2]
         except ValueError:
             raise click.BadParameter(f"{fill[1]!r} is no number", param_hint="--smooth") from None
-    return Settings(
+    return ReconstructSettings(
         every=pictures.every,
         start_s=pictures.start_s,
         end_s=pictures.end_s,
@@ -164,7 +164,7 @@ _settings_options = grouped(
 def reconstruct_command(
     session: Path,
     output: Path | None,
-    settings: Settings,
+    settings: ReconstructSettings,
     strict: bool,
     workers: int,
     scheduler: str | None,

@@ -32,7 +32,7 @@ from pipelines.reconstruction.clocks import (
     is_wrong,
 )
 from pipelines.reconstruction.doubts.diagnosis import doubts_of, doubts_of_clocks
-from pipelines.reconstruction.doubts.scene import Ground as GroundOfMap
+from pipelines.reconstruction.doubts.scene import GroundOfMap
 from pipelines.reconstruction.doubts.turning import common_offset
 from pipelines.reconstruction.finishing import finish
 from pipelines.reconstruction.ground import bind_positions
@@ -97,7 +97,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Settings:
+class ReconstructSettings:
     """Settings that determine the result, in addition to the session itself."""
 
     method: Method | Literal["refined", "auto"] = "auto"
@@ -127,7 +127,7 @@ class Source:
 
     folder: Path
     description: Description
-    settings: Settings
+    settings: ReconstructSettings
     detected: StageRecord | None
     background: bool  # its moving cameras were followed
     left_out: str | None  # the reason why `auto` goes without backgrounds
@@ -152,7 +152,7 @@ class Source:
         cameras, swaps = _without_swaps(cameras)
         cameras = waiting.put(cameras)
         actors = logged_people(folder, description, span_ns)
-        flight = Flight(
+        flight = LoadedFlight(
             description,
             _followed(folder, cameras, self.left_out) if self.background or self.left_out else {},
             _stills(folder, cameras) if settings.method == "auto" else {},
@@ -186,13 +186,13 @@ class Loaded:
     """The cameras of a flight, or of a stretch of it, and what all trials share."""
 
     cameras: list[Camera]
-    flight: Flight
+    flight: LoadedFlight
     warnings: list[str]
     swaps: dict[str, dict[str, int]]  # of left and right that were undone over time, by camera
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ReconstructionOutcome:
     """Report of a reconstruction beside its tables."""
 
     metrics: dict[str, Any]
@@ -234,7 +234,7 @@ def counts_of(metrics: Mapping[str, Any], attempt: Attempt, swaps: Mapping[str, 
 
 
 @dataclass(frozen=True)
-class Flight:
+class LoadedFlight:
     """Data that all trials share."""
 
     description: Description
@@ -273,7 +273,11 @@ class Attempt:
 
 
 def reconstruct_once(
-    flight: Flight, cameras: list[Camera], settings: Settings, workers: int, progress: Progress
+    flight: LoadedFlight,
+    cameras: list[Camera],
+    settings: ReconstructSettings,
+    workers: int,
+    progress: Progress,
 ) -> Attempt:
     """Find clocks, correct cameras by background and ground, triangulate, refine, and measure the errors.
 
@@ -376,7 +380,7 @@ def reconstruct_once(
 
 
 def clocks_of(
-    flight: Flight, cameras: list[Camera], settings: Settings, workers: int
+    flight: LoadedFlight, cameras: list[Camera], settings: ReconstructSettings, workers: int
 ) -> tuple[FoundClocks | None, Float, _Triangulated | None]:
     """Estimate unknown clock offsets, and question stated ones.
 
@@ -447,7 +451,9 @@ class _Triangulated:
     solve: Callable[[Views], Triangulation]
 
 
-def _triangulated(flight: Flight, cameras: list[Camera], settings: Settings, workers: int) -> _Triangulated:
+def _triangulated(
+    flight: LoadedFlight, cameras: list[Camera], settings: ReconstructSettings, workers: int
+) -> _Triangulated:
     """Observe and triangulate by the method, or by what it starts from."""
     seen = flight.waiting.put(_observe(flight, cameras, settings))
     flight.waiting.release()
@@ -459,11 +465,11 @@ def _triangulated(flight: Flight, cameras: list[Camera], settings: Settings, wor
 
 
 def _robust_flight(
-    flight: Flight,
+    flight: LoadedFlight,
     cameras: list[Camera],
     made: _Triangulated,
     clock_sigma_s: Float,
-    settings: Settings,
+    settings: ReconstructSettings,
     workers: int,
 ) -> RobustFlight:
     """Collect what the refinement starts from."""
@@ -520,7 +526,7 @@ class _Seen:
     anybody: Bool  # [T] True if any person was detected
 
 
-def _observe(flight: Flight, cameras: list[Camera], settings: Settings) -> _Seen:
+def _observe(flight: LoadedFlight, cameras: list[Camera], settings: ReconstructSettings) -> _Seen:
     """Associate people, interpolate their keypoints to common times, and correct left-right swaps."""
     between, pixel_sigma = flight.description.pose_interpolation, settings.pixel_sigma
     found, association, sigma = find_people(
@@ -547,7 +553,7 @@ def find_people(
     actors: Sequence[LoggedActor],
     *,
     people: int | None = 1,
-    pixel_sigma: float = Settings.pixel_sigma,
+    pixel_sigma: float = ReconstructSettings.pixel_sigma,
     scene: Surroundings | None = None,
 ) -> tuple[Candidates, Association, Float]:
     """Collect all detections at common times, and associate them with people; those logged come first.
@@ -719,14 +725,14 @@ def _refine_cameras(
     cameras: list[Camera],
     followed: Mapping[str, Followed | str],
     description: Description,
-    settings: Settings,
+    settings: ReconstructSettings,
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
     errors = _stated_errors(cameras, description, settings)
     return refine_cameras(cameras, followed, errors, between=description.pose_interpolation)
 
 
 def _stated_errors(
-    cameras: Sequence[Camera], description: Description, settings: Settings
+    cameras: Sequence[Camera], description: Description, settings: ReconstructSettings
 ) -> list[PoseErrors | None]:
     """Load the errors of each camera's log that were stated; None where nobody did."""
     stated = [load_pose_errors(description, [camera], settings.pose_noise) for camera in cameras]

@@ -22,8 +22,7 @@ from typing import Any, Literal, TypeVar
 
 from pipelines.geometry.triangulation import Method
 from pipelines.ingest import ingest
-from pipelines.reconstruct import Settings as ReconstructSettings
-from pipelines.reconstruct import reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.replan import replan
 from pipelines.report import report
 from pipelines.reporting.page import COLUMNS, FlightRow, render_flights

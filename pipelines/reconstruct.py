@@ -16,8 +16,8 @@ import numpy as np
 
 from pipelines.attempt import (
     Attempt,
-    Outcome,
-    Settings,
+    ReconstructionOutcome,
+    ReconstructSettings,
     Source,
     counts_of,
     reconstruct_once,
@@ -43,9 +43,10 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Run, Stage, StageRecord, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of
 
-__all__ = ["RECONSTRUCT", "Reconstructed", "Settings", "reconstruct"]
+__all__ = ["RECONSTRUCT", "ReconstructSettings", "Reconstructed", "reconstruct"]
 
-RECONSTRUCT = Stage("reconstruct", revision=27)
+RECONSTRUCT = Stage("reconstruct", revision=28)
+# A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
 
@@ -61,7 +62,7 @@ class Reconstructed:
 
 def reconstruct(
     folder: Path,
-    settings: Settings | None = None,
+    settings: ReconstructSettings | None = None,
     *,
     strict: bool = False,
     workers: int = 1,
@@ -86,7 +87,7 @@ def reconstruct(
             them), or the flight is doubted and `strict`.
         BusyError: another process writes the session.
     """
-    settings = settings or Settings()
+    settings = settings or ReconstructSettings()
     progress = progress or Silent()
     disturbance = PoseDisturbance.parse(settings.disturb_poses) if settings.disturb_poses else None
     smoother(settings.smooth)
@@ -141,7 +142,7 @@ def _at_once(
     workers: int,
     strict: bool,
     progress: Progress,
-) -> Outcome:
+) -> ReconstructionOutcome:
     """Reconstruct a flight as a whole, with so many trials of pose errors, and write it into a folder."""
     folder, settings = source.folder, source.settings
     trials = 1 if disturbance is None else disturbance.trials
@@ -173,12 +174,12 @@ def _at_once(
     write_attempt(place, stored, gait)
     metrics = write_figures(place, metrics)
     warnings += [*stored.warnings, *unused_cameras(cameras, stored.result)]
-    return Outcome(metrics, doubts, counts_of(metrics, stored, loaded.swaps), warnings)
+    return ReconstructionOutcome(metrics, doubts, counts_of(metrics, stored, loaded.swaps), warnings)
 
 
 def _detected(
     session: WritableSession,
-    settings: Settings,
+    settings: ReconstructSettings,
     workers: int,
     force: bool,
     following: Following | None,
@@ -211,7 +212,7 @@ def _detected(
     return detected
 
 
-def _stated(settings: Settings, detected: StageRecord | None) -> dict[str, object]:
+def _stated(settings: ReconstructSettings, detected: StageRecord | None) -> dict[str, object]:
     """Return the settings; the detector's name is that of the detection, without the paths of model files."""
     return asdict(settings) | {"detector": detected.settings["detector"] if detected else None}
 
@@ -264,7 +265,7 @@ def _note_replaced(run: Run, progress: Progress) -> None:
 
 
 def _following(
-    session: WritableSession, description: Description, settings: Settings, force: bool
+    session: WritableSession, description: Description, settings: ReconstructSettings, force: bool
 ) -> tuple[Following | None, str | None]:
     """Prepare to follow the backgrounds of moving cameras; None, with the reason where `auto` cannot."""
     if not settings.asks_background or (settings.method == "auto" and not cameras_to_follow(description)):
@@ -279,7 +280,11 @@ def _following(
 
 
 def _finished(
-    following: Following, settings: Settings, workers: int, executor: Executor | None, progress: Progress
+    following: Following,
+    settings: ReconstructSettings,
+    workers: int,
+    executor: Executor | None,
+    progress: Progress,
 ) -> tuple[StageRecord | None, str | None]:
     """Follow what the detector did not show; None with the reason why `auto` goes without backgrounds."""
     try:

@@ -16,8 +16,8 @@ import numpy as np
 
 from pipelines.attempt import (
     Loaded,
-    Outcome,
-    Settings,
+    ReconstructionOutcome,
+    ReconstructSettings,
     Source,
     clocks_of,
     counts_of,
@@ -76,8 +76,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-_CLOCKED = 3  # segments in which unknown clocks are looked for: they are those of the whole flight
-_SEGMENT_BYTES = 1 << 30  # of memory that a segment takes
+# Unknown clocks are those of the whole flight: so many segments find them.
+_CLOCKED = 3
+# A segment takes so much memory.
+_SEGMENT_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class _Order:
     """A segment for a worker."""
 
     session: SharedSession
-    settings: Settings
+    settings: ReconstructSettings
     background: bool
     left_out: str | None
     segment: Segment
@@ -214,7 +216,7 @@ def by_segments(
     executor: Executor | None,
     strict: bool,
     progress: Progress,
-) -> Outcome:
+) -> ReconstructionOutcome:
     """Reconstruct a long flight segment by segment, and join them.
 
     Args:
@@ -261,7 +263,7 @@ def by_segments(
     refuse_doubted(folder, metrics["doubts"], strict=strict)
     flight.write(run.folder)
     metrics = write_figures(run.folder, jsonable(metrics))
-    return Outcome(metrics, doubts, flight.counts, flight.warnings)
+    return ReconstructionOutcome(metrics, doubts, flight.counts, flight.warnings)
 
 
 Each = Callable[[Callable[[_Order], Any], Sequence[_Order]], Generator[tuple[int, Any]]]

@@ -44,9 +44,9 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
 )
 from pipelines.reconstruction.background_kernels import (
-    Points,
-    Sightings,
-    Ties,
+    BackgroundPoints,
+    BackgroundSightings,
+    PosePriorArrays,
     add_ties,
     eliminate_points,
     factorise,
@@ -60,53 +60,83 @@ from pipelines.reconstruction.background_kernels import (
 STRETCH = 1500
 """Pictures adjusted together: memory stays bounded, and so many poses average their white errors."""
 
-_REACH = 10  # a stretch has a tenth more pictures on each side, over which it hands over to its neighbour
+# Neighbouring stretches share a tenth of their pictures on each side, over which one hands over to the
+# other.
+_REACH = 10
 
-_PIXEL_SIGMA = (
-    1.0  # px, of a followed point: 0.15 are seen, but neighbouring pictures and points share their errors
-)
-_LOSS = 1.0  # standard deviations at which a sighting counts half
+# Followed points err by 0.15 px, but neighbouring pictures and points share their errors.
+_PIXEL_SIGMA = 1.0
+# A sighting this many standard deviations off counts half.
+_LOSS = 1.0
 # Losses that come before it: where logged poses are many pixels off, a narrow one rejects all sightings
 # (graduated non-convexity: Blake and Zisserman 1987; Yang et al. 2020).
 _WIDE = (30.0, 5.0)
-_FEWEST_SIGHTINGS = 3  # of a point
+# Two sightings of a point determine its direction and depth and test nothing.
+_FEWEST_SIGHTINGS = 3
 _LONGEST_S, _LONGEST = 1.0, (12, 30)  # sightings of a point: time, and at least and at most these pictures
-_POINTS = 120  # in a picture: relative attitudes are known to 0.003 deg with them
-_FEWEST_SHARED = 8  # points that bind a picture to the one before
-_MOST_UNBOUND = 0.2  # share of the pictures
+# So many points in a picture show relative attitudes to 0.003 deg; more only take time.
+_POINTS = 120
+# Fewer points bind a picture to the one before too loosely for its attitude.
+_FEWEST_SHARED = 8
+# A background that loses more of the pictures than this share leaves too much to the log.
+_MOST_UNBOUND = 0.2
 _INVERSE_DEPTH = np.array([0.0, 0.01])  # mean (1/m) and precision (m^2) of the prior: farther than 1 m
+# A static background moves against itself by less.
 _WORST_PX = 2.0
 _ROUNDS, _CONVERGED = 8, (3e-4, 3e-5)  # m, rad: a tenth of what their posteriors leave
+# Poses that are farther from the log than this contradict it.
 _SIGMAS = 4.0
-_KNOT_S = 0.2  # between the knots of slow errors; what they do in between counts as white
-_SLOW_S = 10.0  # over which slow errors are counted in the level of all errors
+# Slow errors are linear between knots this far apart; what they do in between counts as white.
+_KNOT_S = 0.2
+# Slow errors are counted over this time in the level of all errors.
+_SLOW_S = 10.0
 _UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1] / 10)
 """Start of estimated levels. White positions that are free by more confuse far and near points at first."""
 
 _UNKNOWN_ARM_M, _USUAL_ARM_M = 0.05, 0.03  # constant shift in the camera: a lever arm that is wrong
-_USUAL_TURN = float(np.radians(0.15))  # constant rotation
-_LEVEL_STEPS = 20  # of the constant rotation's level; it halves its distance in each
-_DRAWS = 32  # of the posterior
+# Mounts and compasses of usual drones are off by this angle for good.
+_USUAL_TURN = float(np.radians(0.15))
+# The level of the constant rotation halves its distance to the fixed point in each of these steps.
+_LEVEL_STEPS = 20
+# So many draws of the posterior are enough for its levels.
+_DRAWS = 32
+# Levels have settled after so many rounds.
 _LEVEL_ROUNDS = 6
-_LEAST_DETERMINED = 0.3  # share of a level's errors that pictures determine; below it MacKay's rule leaps
+# MacKay's rule leaps where pictures determine a smaller share of a level's errors.
+_LEAST_DETERMINED = 0.3
 _LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
-_FEWEST_STANDING = 8  # pictures
-_SIGMAS_STANDING = 2.0  # of all errors: the log of a camera that stands moves by less
-_NEVER_MOVES_M = 1e-6  # a log that changes by less is that of a surveyed position, or frozen
-_STANDS_PX = 0.3  # largest median residual of a camera that only turns: twice what is seen of points
-_STANDS = 0.03  # px^2 of misfit that a free path may save: noise, not parallax
-_SLOW_LAG_S = 1.0  # over which slow errors of a camera that stands are read off its log
-_CLOCK_PICTURES = 600  # in which the clock is looked for
+# Fewer pictures do not tell a camera that stands from one that flies.
+_FEWEST_STANDING = 8
+# The log of a camera that stands moves by less than this many standard deviations of all errors.
+_SIGMAS_STANDING = 2.0
+# A log that changes by less is that of a surveyed position, or frozen.
+_NEVER_MOVES_M = 1e-6
+# A camera that only turns leaves residuals of half this size, in the median.
+_STANDS_PX = 0.3
+# A free path that saves less misfit (px^2) than this fits noise, not parallax.
+_STANDS = 0.03
+# Slow errors of a camera that stands are read off its log over this time.
+_SLOW_LAG_S = 1.0
+# So many pictures show the clock; more only take time.
+_CLOCK_PICTURES = 600
 # Some seconds show an offset of 50 ms by ten standard deviations where a camera turns.
 _QUICK_CLOCK_PICTURES = 150
-_CLOCK_ROUNDS = 8  # of which each moves the stamps
-_SETTLED = 0.5  # the last offset is at most this share of its standard deviation
-_ANY_CLOCK_S = 0.5  # standard deviation of what is left in each round
-_MOST_CLOCK_SIGMA_S = 0.03  # above it, rays of people tell a clock better
+# Stamps are moved at most so often.
+_CLOCK_ROUNDS = 8
+# An offset has settled when the next change is at most this share of its standard deviation.
+_SETTLED = 0.5
+# What is left of the offset in each round has this prior standard deviation.
+_ANY_CLOCK_S = 0.5
+# Rays of people show a clock better than a background that is less sure than this.
+_MOST_CLOCK_SIGMA_S = 0.03
 _LEAST_TURNING = UNKNOWN_SIGMA[1]  # rms: followed points drift by as much as a hovering camera turns
-_RATE_S = 0.1  # before and after a picture, over which the speed of turning is computed
-_MOST_MEANS = 200  # of its log, to which poses are averaged
-_SMALL = 0.02  # share of the constant variance, at most a usual one, below which slow errors are part of it
+# The speed of turning is computed over this time before and after a picture.
+_RATE_S = 0.1
+# Poses of a camera that stands are averaged to at most so many, which bounds the time to solve for its
+# place.
+_MOST_MEANS = 200
+# Slow errors whose variance is a smaller share of the constant one are counted to it.
+_SMALL = 0.02
 
 
 @dataclass(frozen=True)
@@ -436,7 +466,7 @@ def _structure(parts: Sequence[Float], lag: int) -> float:
 
 
 @dataclass(frozen=True)
-class _Solved:
+class _SolvedStretch:
     """Result of one stretch of T pictures."""
 
     errors: Float  # [T, 6] of the logged poses
@@ -455,7 +485,7 @@ class _Solved:
 
 
 @dataclass(frozen=True)
-class _State:
+class _StretchState:
     """Estimates of the unknowns."""
 
     errors: Float  # [T, 6]
@@ -479,8 +509,8 @@ class _Stretch:
     rows: Int64  # [T] of the camera's pictures
     position: Float  # [T, 3]
     rotation: Float  # [T, 3, 3]
-    seen: Sightings
-    points: Points
+    seen: BackgroundSightings
+    points: BackgroundPoints
     place: Int64  # [T] first unknown of each picture
     knot_place: Int64  # [N]
     knot_t_s: Float  # [N]
@@ -515,7 +545,7 @@ class _Stretch:
             rows,
             position[rows],
             rotation[rows],
-            Sightings(first, picture, rays, _PIXEL_SIGMA / whole.focal_px),
+            BackgroundSightings(first, picture, rays, _PIXEL_SIGMA / whole.focal_px),
             _far_points(first, picture, rays, position[rows][middle], rotation[rows]),
             place,
             knot_place,
@@ -527,7 +557,7 @@ class _Stretch:
             int((_shared(first, picture, len(rows)) < _FEWEST_SHARED).sum()),
         )
 
-    def solve_with_levels(self, prior: PosePrior) -> _Solved | None:
+    def solve_with_levels(self, prior: PosePrior) -> _SolvedStretch | None:
         """Solve, with levels of errors estimated if they are unknown; None without convergence.
 
         A camera that stands sees no parallax, whatever its log says. Inverse depths near 0 fit that with any
@@ -540,7 +570,7 @@ class _Stretch:
             return free
         return stands
 
-    def _standing(self, prior: PosePrior) -> _Solved | None:
+    def _standing(self, prior: PosePrior) -> _SolvedStretch | None:
         """Solve for a camera that only turns; None if its log moves more than its errors do."""
         t_s = self._times_s()
         away = self.position - self.position.mean(axis=0)
@@ -557,7 +587,7 @@ class _Stretch:
         still = replace(
             self,
             position=np.tile(place, (len(t_s), 1)),
-            points=Points(origin, *(array.copy() for array in self.points[1:])),
+            points=BackgroundPoints(origin, *(array.copy() for array in self.points[1:])),
         )
         tight = replace(prior, constant=(*prior.constant[:2], 0.0))
         tight = _with_position_levels(tight, EXACT, _unknown(SHIFT_IN_WORLD, EXACT))
@@ -579,9 +609,9 @@ class _Stretch:
 
     def _solved(
         self, prior: PosePrior, *, positions_known: bool = False, level_rounds: int = _LEVEL_ROUNDS
-    ) -> _Solved | None:
+    ) -> _SolvedStretch | None:
         constant = np.zeros(len(_sigma_of_constants(prior)))
-        state = _State(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), constant)
+        state = _StretchState(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), constant)
         settle_points(self.seen, self.points, self.position, self.rotation, _WIDE[0], _INVERSE_DEPTH, 8)
         for loss in _WIDE:
             found = self._solve(state, prior, rounds=2, loss=loss)
@@ -606,11 +636,11 @@ class _Stretch:
         clock = late if prior.clock_s > 0 else None
         missed *= _PIXEL_SIGMA
         covariance = self._covariance(factored)
-        return _Solved(state.errors, covariance, errors, missed, prior, clock, self.loosened)
+        return _SolvedStretch(state.errors, covariance, errors, missed, prior, clock, self.loosened)
 
     def _solve(
-        self, state: _State, prior: PosePrior, rounds: int, loss: float = _LOSS
-    ) -> tuple[_State, _Factored, Float] | None:
+        self, state: _StretchState, prior: PosePrior, rounds: int, loss: float = _LOSS
+    ) -> tuple[_StretchState, _Factored, Float] | None:
         """Make Gauss-Newton steps; return the estimate, the last equations, and residuals [K] in sigmas."""
         ties = self._ties(prior)
         steady = 1 / np.maximum(_sigma_of_constants(prior), EXACT) ** 2
@@ -637,7 +667,7 @@ class _Stretch:
             if not (np.isfinite(step).all() and (np.diagonal(covariance) > 0).all()):
                 return None
             move_points(self.seen, self.points, at, turn, loss, kept, self.place, step)
-            state = _State(
+            state = _StretchState(
                 state.errors + step[self.place[:, None] + np.arange(6)],
                 state.knots + step[self.knot_place[:, None] + np.arange(6)],
                 state.constant + shift,
@@ -669,7 +699,7 @@ class _Stretch:
             design[:, 3:, 9] = -vector / (t_s[after] - t_s[before])[:, None]
         return design
 
-    def _ties(self, prior: PosePrior) -> Ties:
+    def _ties(self, prior: PosePrior) -> PosePriorArrays:
         """Build the prior of errors about slow and constant ones, and of slow ones over time."""
         steps = np.diff(self.knot_t_s)
         variance = np.square(prior.white)
@@ -682,7 +712,7 @@ class _Stretch:
             left[k] = np.repeat([one[0] for one in both], 3)
             added[k] = 1 / np.maximum(np.repeat([one[1] for one in both], 3), EXACT**2)
         start = 1 / np.maximum(np.repeat([process.sigma0 for process in prior.slow], 3), EXACT) ** 2
-        return Ties(self.place, self.knot_place, self.knot, self.share, white, start, left, added)
+        return PosePriorArrays(self.place, self.knot_place, self.knot, self.share, white, start, left, added)
 
     def _width(self) -> int:
         """Compute the width of the band: the farthest pair of unknowns that meet in an equation."""
@@ -717,12 +747,16 @@ class _Stretch:
         border = factored.border[self.place[:, None] + np.arange(6)]
         return np.asarray(own + border @ factored.corner @ np.swapaxes(border, 1, 2))
 
-    def _estimated(self, state: _State, draws: tuple[Float, Float, Float], prior: PosePrior) -> PosePrior:
+    def _estimated(
+        self, state: _StretchState, draws: tuple[Float, Float, Float], prior: PosePrior
+    ) -> PosePrior:
         """Estimate the levels of white and slow errors again by MacKay's rule."""
         design = self._design(_without(state.errors, self.position, self.rotation)[1], prior)
         usual = ~(self.loosened > 0).any(axis=1)
         fresh = self._fresh(state, design)[usual]
-        spread = np.stack([self._fresh(_State(*draw), design)[usual] for draw in zip(*draws, strict=True)])
+        spread = np.stack(
+            [self._fresh(_StretchState(*draw), design)[usual] for draw in zip(*draws, strict=True)]
+        )
         white = [
             _level(fresh[:, of], spread[..., of], sigma, least)
             for of, sigma, least in zip(_KINDS, prior.white, _LEAST_WHITE, strict=True)
@@ -736,7 +770,7 @@ class _Stretch:
         slow = _unknown(SHIFT_IN_WORLD, rate[0]), _unknown(ROTATION, rate[1])
         return replace(prior, white=(white[0], white[1]), slow=slow)
 
-    def _fresh(self, state: _State, design: Float) -> Float:
+    def _fresh(self, state: _StretchState, design: Float) -> Float:
         """Compute the white part [T, 6] of the errors."""
         share = self.share[:, None]
         slow = (1 - share) * state.knots[self.knot] + share * state.knots[self.knot + 1]
@@ -778,7 +812,7 @@ def _constant_level(found: Float, covariance: Float, level: float, usual: float)
     return float(np.sqrt(variance))
 
 
-def _parts(state: _State) -> tuple[Float, Float, Float]:
+def _parts(state: _StretchState) -> tuple[Float, Float, Float]:
     return state.errors, state.knots, state.constant
 
 
@@ -799,7 +833,7 @@ def _level(estimates: Float, draws: Float, sigma: float, least: float) -> float:
 # --- cameras that stand ---------------------------------------------------------------------------------
 
 
-def _misfit(solved: _Solved) -> float:
+def _misfit(solved: _SolvedStretch) -> float:
     """Compute what a solution leaves of a sighting (px^2 if it is small), by Cauchy's loss."""
     return float(np.mean(np.log1p((solved.missed / _PIXEL_SIGMA) ** 2)))
 
@@ -871,19 +905,21 @@ def _shared(first: Int64, picture: Int64, pictures: int) -> Int64:
     return np.bincount(picture[~ends], minlength=pictures)[: pictures - 1]
 
 
-def _far_points(first: Int64, picture: Int64, rays: Float, origin: Float, rotation: Float) -> Points:
+def _far_points(
+    first: Int64, picture: Int64, rays: Float, origin: Float, rotation: Float
+) -> BackgroundPoints:
     """Place each piece's point far away, in the mean direction of its rays."""
     ray = np.einsum("kij,kj->ki", rotation[picture], np.append(rays, np.ones((len(rays), 1)), axis=1))
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     if not len(origin):
-        return Points(origin, origin.copy(), np.zeros(0), np.zeros((0, 2, 3)))
+        return BackgroundPoints(origin, origin.copy(), np.zeros(0), np.zeros((0, 2, 3)))
     direction = np.add.reduceat(ray, first[:-1], axis=0)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     least = np.eye(3)[np.abs(direction).argmin(axis=1)]
     side = np.cross(direction, least)
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     across = np.stack([side, np.cross(direction, side)], axis=1)
-    return Points(np.ascontiguousarray(origin), direction, np.full(len(origin), 0.05), across)
+    return BackgroundPoints(np.ascontiguousarray(origin), direction, np.full(len(origin), 0.05), across)
 
 
 def _places(t_s: Float, knot_t_s: Float) -> tuple[Int64, Int64]:

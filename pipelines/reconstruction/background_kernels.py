@@ -15,10 +15,11 @@ import numpy as np
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.compilation import cached, helper
 
-_BEHIND = 0.05  # least depth of a direction of unit length in front of the camera
+# A direction of unit length with a smaller depth is not in front of the camera.
+_BEHIND = 0.05
 
 
-class Sightings(NamedTuple):
+class BackgroundSightings(NamedTuple):
     """Sightings of points, sorted by point; point `n` has those from `first[n]` to `first[n + 1]`."""
 
     first: Int64  # [N + 1]
@@ -27,7 +28,7 @@ class Sightings(NamedTuple):
     sigma: float  # of one
 
 
-class Points(NamedTuple):
+class BackgroundPoints(NamedTuple):
     """Points X as homogeneous world coordinates: direction + inverse depth * (origin - place)."""
 
     origin: Float  # [N, 3] place from which direction and inverse depth are counted
@@ -36,7 +37,7 @@ class Points(NamedTuple):
     across: Float  # [N, 2, 3] unit vectors across the direction, along which it is moved
 
 
-class Ties(NamedTuple):
+class PosePriorArrays(NamedTuple):
     """Prior of the errors of T pictures, about slow errors at N knots in time and constant errors."""
 
     place: Int64  # [T] first unknown of each picture
@@ -102,7 +103,13 @@ def _factor3(a: Float) -> None:
 
 @cached
 def settle_points(
-    seen: Sightings, points: Points, place: Float, turned: Float, loss: float, prior: Float, rounds: int
+    seen: BackgroundSightings,
+    points: BackgroundPoints,
+    place: Float,
+    turned: Float,
+    loss: float,
+    prior: Float,
+    rounds: int,
 ) -> None:
     """Move every point to where the cameras see it, their poses held.
 
@@ -162,7 +169,7 @@ def _solve3(factor: Float, force: Float) -> Float:
 
 
 @helper
-def _move(points: Points, n: int, step: Float) -> None:
+def _move(points: BackgroundPoints, n: int, step: Float) -> None:
     for k in range(3):
         points.direction[n, k] += step[0] * points.across[n, 0, k] + step[1] * points.across[n, 1, k]
     points.inverse_depth[n] += min(max(step[2], -0.2), 0.2)
@@ -170,8 +177,8 @@ def _move(points: Points, n: int, step: Float) -> None:
 
 @cached
 def eliminate_points(
-    seen: Sightings,
-    points: Points,
+    seen: BackgroundSightings,
+    points: BackgroundPoints,
     place: Float,
     turned: Float,
     loss: float,
@@ -273,8 +280,8 @@ def eliminate_points(
 
 @cached
 def move_points(
-    seen: Sightings,
-    points: Points,
+    seen: BackgroundSightings,
+    points: BackgroundPoints,
     place: Float,
     turned: Float,
     loss: float,
@@ -332,7 +339,7 @@ def _tie(band: Float, one: int, other: int, value: float) -> None:
 
 @cached
 def add_ties(
-    ties: Ties,
+    ties: PosePriorArrays,
     design: Float,
     errors: Float,
     knots: Float,

@@ -26,11 +26,14 @@ if TYPE_CHECKING:
 
 _MOST, _FEWEST = 300, 200  # points in a picture; new ones are looked for when fewer are left
 _APART_PX, _EDGE_PX = 20, 8
-_QUALITY = 0.005  # of the best corner
+# Corners weaker than this share of the best one drift along edges.
+_QUALITY = 0.005
+# A point that is followed back to another place than it came from was lost.
 _RETURN_PX = 0.3
 _WINDOW_PX, _LEVELS = 21, 3
 _AROUND, _AROUND_PX = 0.03, 10.0  # of a person's box on each side, and px: arms beyond joints
-_MOST_HZ = 60.0  # of the pictures that are followed
+# More pictures a second show the same motion and take more time.
+_MOST_HZ = 60.0
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ QUESTIONED_SIGMA_S = 0.5
 
 # A stated clock is moved only beyond both limits: smaller offsets of right clocks occur by chance.
 MIN_SIGMAS_TO_MOVE = 5.0
+# A smaller offset matters less than the keypoints' own errors.
 MIN_OFFSET_TO_MOVE_S = 0.010
 
 # Where a background would miss an offset of this size (s), the rays of people are asked, too.
@@ -68,10 +69,12 @@ USUAL_SHARE = 0.9
 
 # Residuals of fewer times say nothing, nor do those of less than this share of the times that are stated.
 FEWEST_TIMES = 20
+# Residuals of a smaller share of the stated times are another sample, and cannot be compared.
 LEAST_SHARE_OF_TIMES = 0.5
 
 # The search looks at steps of this size (s) around zero and around the best offset.
 FINE_STEP_S = 1 / 60
+# So many fine steps on each side reach over to the neighbouring coarse ones.
 FINE_STEPS = 3
 
 # Of two cameras, a shift of either explains the same. Within this factor, the reference's clock is right.

@@ -67,8 +67,11 @@ def finish(
 # --- gaps ----------------------------------------------------------------------------------------------
 
 _OK, _FILLED = STATUS.index("ok"), STATUS.index("filled")
-_SIDES = 2  # measured samples on each side of a gap that decide what lies in it
-_PLACES = 24  # stretches at which the interpolation error is measured, at most
+# PCHIP uses so many measured samples on each side of a gap.
+_SIDES = 2
+# The interpolation error is measured at so many stretches at most, which takes little time.
+_PLACES = 24
+# Fewer stretches give no error of the interpolation.
 _FEWEST_PLACES = 4
 
 

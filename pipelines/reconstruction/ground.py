@@ -33,51 +33,89 @@ from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks,
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 
-_FEWEST_SIGHTINGS = 5  # of a point of the cloud
-_PIXEL_SIGMA = 0.5  # of a followed point
-_POINT_SIGMA_M = 0.15  # the largest: of a point's place, all axes together
-_WORST_PX = 1.5  # mean residual of a point
-_ANYWHERE_M = 300.0  # prior of a point's place, about the origin: it keeps equations regular
+# Points of the cloud that were seen in fewer pictures are placed too badly.
+_FEWEST_SIGHTINGS = 5
+# Followed points err by this much over a track, with their drift.
+_PIXEL_SIGMA = 0.5
+# Points that are placed worse than this, all axes together, tell nothing of an offset of 0.1 m.
+_POINT_SIGMA_M = 0.15
+# A point with a larger mean residual moved, or was lost.
+_WORST_PX = 1.5
+# A prior of this standard deviation about the origin keeps the equations of points regular.
+_ANYWHERE_M = 300.0
 _NEAREST_M, _FARTHEST_M = 1.5, 40.0
 
-_GRID_M = 0.8  # of patches: at most one point of a cloud in a cube of this size
-_MOST_PATCHES = 3000  # of all pairs together
+# At most one patch is cut out in a cube of this size: patches that overlap say the same.
+_GRID_M = 0.8
+# This bounds the time that the patches of all pairs take.
+_MOST_PATCHES = 3000
+# More patches of a pair of cameras do not make its offset surer.
 _MOST_OF_PAIR = 120
-_AROUND_M = 1.5  # of a point, where its ground plane is fitted
-_NEIGHBOURS = 6  # needed there
-_ROUGH_M = 0.05  # rms of the neighbours about the plane, at most
-_STEEPEST = 0.6  # cosine of the slope
-_GRAZING = 0.12  # sine of the angle between ray and ground, at least
+# The ground plane of a point is fitted to its neighbours within this distance.
+_AROUND_M = 1.5
+# Fewer neighbours leave the plane's normal worse than 5 deg.
+_NEIGHBOURS = 6
+# Ground that is rougher than this about its plane looks different from two sides.
+_ROUGH_M = 0.05
+# Planes at a smaller cosine of the slope are walls.
+_STEEPEST = 0.6
+# Ground at a smaller sine of the angle to the ray is too blurred to compare.
+_GRAZING = 0.12
 
 _PASSES = (2, 2, 1)  # of the comparison, each about what the one before found: one in so many patches
-_PAIRS_OF_STILLS = 3  # in which a patch is compared
-_HALF_CELLS = 20  # of a patch, on each side of its centre
+# A patch is compared in so many pairs of stills; errors of more of them are alike.
+_PAIRS_OF_STILLS = 3
+# Patches reach this many cells to each side of their centre, which holds enough texture.
+_HALF_CELLS = 20
+# Cells are as large as a pixel shows of the ground at usual distances.
 _CELL_M = 0.03
-_FARTHEST_REACH_CELLS = 100  # of a search: patches that may lie farther off are found by chance
+# Patches that may lie farther off than this are found by chance.
+_FARTHEST_REACH_CELLS = 100
+# Both pictures are blurred by this much, so that their sharpness is alike.
 _BLUR_CELLS = 3.0
-_FLAT = 2.5  # grey levels: a patch whose standard deviation is smaller shows nothing
+# A patch whose grey levels have a smaller standard deviation shows nothing.
+_FLAT = 2.5
 _ALIKE, _CLEARER = 0.75, 0.08  # correlation, and by how much it must exceed that of any other place
+# Places within this distance of the best one belong to the same peak.
 _PEAK_CELLS = 4
+# Lenses are calibrated badly nearer to the edge of the picture.
 _EDGE_PX = 40
 
-_MOST_STILLS = 40  # of a camera
-_MOST_PIXELS = 2_500_000  # of a still: larger ones are halved
-_LEVELS = 3  # of the stills' pyramids
-_SIGMAS = 3.0  # of where a patch should be, that are searched
-_MOST_SIGHTINGS = 500_000  # of a cloud
-_MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
-_AGREEING = 9.2  # 99 % of it
-_PAIR_SIGMA_M = 0.012  # of an error that all patches of a pair share: clouds and paths are bent a little
+# So many stills of a camera show its ground from all its directions.
+_MOST_STILLS = 40
+# Larger stills are halved, which bounds their memory.
+_MOST_PIXELS = 2_500_000
+# Stills are halved so often at most: the ground is never seen from nearer than that asks for.
+_LEVELS = 3
+# Patches are searched within this many standard deviations of where they should be.
+_SIGMAS = 3.0
+# More sightings of a cloud are thinned out, which bounds its memory.
+_MOST_SIGHTINGS = 500_000
+# This is the median of the chi-square distribution with two degrees of freedom.
+_MEDIAN_OF_TWO = 2 * np.log(2)
+# Of the chi-square distribution with two degrees of freedom, 99 % are below this.
+_AGREEING = 9.2
+# Clouds and paths are bent a little: all patches of a pair share an error of this size.
+_PAIR_SIGMA_M = 0.012
 
-_MATCH_SIGMA_M = 0.03  # of one comparison
-_TURN_SIGMA = np.radians(0.1)  # of attitudes from the background, at least: followed points drift alike
-_USUAL_RANGE_M = 10.0  # at which a slow error of an attitude moves a patch
-_REPEATED = 0.5  # correlation of the errors of comparisons of the same patch
-_LOSS = 2.0  # standard deviations at which a patch counts half
+# One comparison errs by one cell.
+_MATCH_SIGMA_M = 0.03
+# Attitudes from the background err by this much at least: followed points drift alike.
+_TURN_SIGMA = np.radians(0.1)
+# A slow error of an attitude moves a patch as if it were this far away.
+_USUAL_RANGE_M = 10.0
+# Comparisons of one patch have errors with this correlation.
+_REPEATED = 0.5
+# A patch that is this many standard deviations off counts half.
+_LOSS = 2.0
+# Weights settle in fewer rounds than this.
 _ROUNDS = 8
-_LEVEL_ROUNDS = 6  # of the level of constant position errors
-_FEWEST_PATCHES = 10  # of a pair of cameras, distinct and in agreement
-_AGREE = 0.5  # share of a pair's patches that must agree
+# The level of constant position errors settles in fewer rounds.
+_LEVEL_ROUNDS = 6
+# Fewer distinct patches of a pair of cameras agree by chance.
+_FEWEST_PATCHES = 10
+# If no more than this share of a pair's patches agrees, the match is one by chance.
+_AGREE = 0.5
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,8 @@ from pipelines.session.tables import (
 if TYPE_CHECKING:
     import pandas as pd
 
-_MOST_PEOPLE = 12  # in one picture; more are detector errors, and memory grows with their number
+# More people in one picture are errors of the detector, and memory grows with their number.
+_MOST_PEOPLE = 12
 
 Calibrated = Callable[[Float, NDArray[np.str_]], Float]
 

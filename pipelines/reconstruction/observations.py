@@ -24,8 +24,10 @@ from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Detections, Trajectory
 
-_FRAME_GAP_NS = 500_000_000  # consecutive frames further apart than this, and than usual, are not bridged
-_USUAL = 1.5  # times the median frame period
+# Keypoints are not interpolated between frames that are farther apart than this, and than usual.
+_FRAME_GAP_NS = 500_000_000
+# A gap of more than this many median frame periods is a missing picture.
+_USUAL = 1.5
 
 
 @dataclass(frozen=True)

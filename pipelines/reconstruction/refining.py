@@ -52,14 +52,18 @@ from pipelines.session.people import bones_of
 if TYPE_CHECKING:
     import pandas as pd
 
-_SEARCHED = 300  # times of the skeleton that the search for clock offsets uses, at most
-_MOST_SHIFTS = 6  # of the clocks; offsets of 0.2 s took one to five
-_UNDETERMINED = 0.5  # a clock is determined if its posterior sigma is below this share of its prior sigma
+# The search for clock offsets uses at most so many times of the skeleton; more find no other offset.
+_SEARCHED = 300
+# Clocks are moved at most so often; offsets of 0.2 s took one to five times.
+_MOST_SHIFTS = 6
+# A clock is determined if its posterior sigma is below this share of its prior sigma.
+_UNDETERMINED = 0.5
+# Fewer joints of limbs show no clock; then all joints are taken.
 _FEWEST_LIMBS = 6
-_WORST = (
-    75.0  # percentile of a person's squared residuals: the right views of half of a flight hide no others
-)
-_LARGEST_RATIO = 2.0  # of squared residuals to the first person's; those of right people were within 1.3
+# The 75th percentile of a person's residuals: right views of half of a flight hide no others.
+_WORST = 75.0
+# People whose squared residuals exceed the first person's by this factor are doubted.
+_LARGEST_RATIO = 2.0
 _OF_LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # ends of the names of limbs' joints
 _HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid as a bone
 

@@ -425,7 +425,8 @@ It is below 1 because a detector misplaces a limb or the trunk as a whole, and l
 trunk take part. For the ankle it contains the offset of heel and toe from the sole. Chosen on the flights for
 tuning: about 97 % of the errors are inside two standard deviations (`python -m benchmarks.accuracy corpus`).
 """
-_TIMES_AT_ONCE = 8192  # of the angles: their table is larger than the skeleton's arrays
+# Tables of angles are larger than the skeleton's arrays, and are made of so many times at once.
+_TIMES_AT_ONCE = 8192
 
 
 def angles_parts(observations: Observations, views: Views, result: Triangulation) -> Iterator[pd.DataFrame]:

@@ -43,9 +43,12 @@ OVERLAP_S = 10.0
 APART_M = 1.0
 """People of two segments who are further apart at the same times are not the same."""
 
-_BLENDED_NS = 6_000_000_000  # about the middle of an overlap, away from the ends of both segments
-_AROUND_NS = 2_000_000_000  # pictures around the times of a segment: other cameras, other clocks
-_FEWEST_TIMES = 10  # at which both must be seen to say so
+# Segments are blended over this time about the middle of an overlap, away from the ends of both.
+_BLENDED_NS = 6_000_000_000
+# Other cameras and clocks need pictures this long before and after the times of a segment.
+_AROUND_NS = 2_000_000_000
+# Two people seen together at fewer times are not said to be the same.
+_FEWEST_TIMES = 10
 
 _XYZ = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")

@@ -22,8 +22,10 @@ from pipelines.geometry.noise import parse
 from pipelines.session.errors import DataError
 
 _PLACE = "--smooth"
-_USUAL_STEP = 1.5  # times the median step: a longer one is a gap
-_UNEVEN = 0.25  # of the step: a filter of fixed rate is wrong for larger jitter of the stamps
+# A step of more than so many median ones is a gap.
+_USUAL_STEP = 1.5
+# A filter of fixed rate is wrong for stamps that jitter by a larger share of the step.
+_UNEVEN = 0.25
 
 
 @dataclass(frozen=True)
@@ -274,7 +276,8 @@ UNKNOWN = (1e2, 1e2, 1e3, 1e4)
 A body's motion is a hundredth of it; a larger value would lose digits.
 """
 
-_CORNERS = np.logspace(-2, 0.5, 26)  # rad per sample: the smoother's corner frequency
+# The smoother's corner frequency lies between these (rad per sample).
+_CORNERS = np.logspace(-2, 0.5, 26)
 
 
 def smooth_positions(

@@ -167,8 +167,10 @@ def triangulate_widened(views: Views, *, solve: Callable[[Views], Triangulation]
 
 # --- full pose covariances -----------------------------------------------------------------------------
 
-_REFITS = 4  # the last moves the median joint by less than a thousandth of its standard deviation
-_REFITTED = 8192  # joint-frames at once: memory
+# The last of so many steps moves the median joint by less than a thousandth of its standard deviation.
+_REFITS = 4
+# So many joint-frames are fitted at once, which bounds the memory.
+_REFITTED = 8192
 
 
 def triangulate_weighted(
@@ -232,7 +234,8 @@ def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int
 
 # --- heavy-tailed loss ---------------------------------------------------------------------------------
 
-_ROUNDS = 12  # the effect of more rounds: docs/estimate.md
+# More rounds change little (docs/estimate.md).
+_ROUNDS = 12
 
 
 def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:

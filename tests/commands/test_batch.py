@@ -26,8 +26,7 @@ from pipelines import detect as detection
 from pipelines.batch import BatchSettings, Job, Outcome, run_flight
 from pipelines.detect import detect
 from pipelines.follow import Following
-from pipelines.reconstruct import Settings as ReconstructSettings
-from pipelines.reconstruct import reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.reconstruction import segments
 from pipelines.report import Reported
 from pipelines.reporting.page import FlightRow, render_flights

@@ -12,7 +12,7 @@ import pipelines.reporting.overlays
 from pipelines.export import export
 from pipelines.ingest import ingest
 from pipelines.keypoints.calibration import Calibration, write_calibration
-from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.report import report
 from pipelines.reporting.overlays import FilmedCamera, views_of
 from pipelines.session.tables import JOINT_ERRORS, figures_by_joint, read_table
@@ -30,7 +30,7 @@ def test_keypoints_of_little_worth_are_used_and_drawn(
         monkeypatch.setattr(f"{place}.measured_for", lambda _: measured)
     session = tmp_path / "flight.session"
     ingest(write_spotted_flight(tmp_path, 6), session)
-    reconstruct(session, Settings(detector=spot_detector(tmp_path)))
+    reconstruct(session, ReconstructSettings(detector=spot_detector(tmp_path)))
     stored = read_table(session / "reconstruct" / "joint_errors.parquet", JOINT_ERRORS)
     for joint in ("left_wrist", "left_elbow"):
         assert figures_by_joint(stored)[joint]["reconstructed_share"] == 1

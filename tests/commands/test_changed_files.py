@@ -16,7 +16,7 @@ from pipelines.export import export, load_recording
 from pipelines.film import film
 from pipelines.formats.videos.video import VideoReader
 from pipelines.ingest import ingest
-from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.report import compare_sessions
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
@@ -147,7 +147,7 @@ def test_nothing_is_kept_of_a_video_that_is_exchanged_while_it_is_looked_at(
     for module in (detect, follow):
         monkeypatch.setattr(module, "BLOCK", FRAMES // 2)
     session, video = flight / "flight.session", flight / ("left.mp4" if steps < FRAMES else "right.mp4")
-    settings = Settings(detector=spot_detector(flight))
+    settings = ReconstructSettings(detector=spot_detector(flight))
     reconstruct(session, settings)
     expected = content(session)
     assert any(name.startswith("background/left/") for name in expected), "the camera that moves is followed"

@@ -14,7 +14,7 @@ import pytest
 from pipelines import report, segmented
 from pipelines.attempt import Source
 from pipelines.check import check
-from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.reconstruction import segments
 from pipelines.reconstruction.observations import Camera
 from pipelines.report import content_of
@@ -105,23 +105,23 @@ def test_a_long_flight_goes_on_with_the_segments_that_are_missing(
 
     monkeypatch.setattr(segmented, "reconstruct_segment", killed)
     with pytest.raises(DataError, match="failed"):
-        reconstruct(session, Settings(method="robust"), workers=1)
+        reconstruct(session, ReconstructSettings(method="robust"), workers=1)
     monkeypatch.setattr(segmented, "reconstruct_segment", counted)
-    reconstruct(session, Settings(method="robust"), workers=1)
+    reconstruct(session, ReconstructSettings(method="robust"), workers=1)
     assert done == [0, 1, 2]
-    assert reconstruct(session, Settings(method="robust"), workers=1).skipped
+    assert reconstruct(session, ReconstructSettings(method="robust"), workers=1).skipped
 
 
 def test_the_person_stays_the_same_where_another_walks_through(tmp_path: Path, short_segments: None) -> None:
     flight = write_flight(tmp_path, cameras=3, seconds=6.0, bystander=True)
     session = ingested(flight)
-    reconstruct(session, Settings(method="robust", people=1), workers=1)
+    reconstruct(session, ReconstructSettings(method="robust", people=1), workers=1)
     skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
     place = skeleton[["x", "y", "z"]].to_numpy().reshape(len(flight.t_ns), -1, 3)
     middle = np.nanmedian(place, axis=1)
     # Steps of a walk are some centimetres; two people are metres apart.
     assert np.nanmax(np.linalg.norm(np.diff(middle, axis=0), axis=1)) < 0.5
-    reconstruct(session, Settings(method="robust", people=2), workers=1)
+    reconstruct(session, ReconstructSettings(method="robust", people=2), workers=1)
     skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
     assert len(skeleton) == 2 * len(flight.t_ns) * 17
     for person in range(2):
@@ -153,7 +153,7 @@ def test_a_stretch_without_views_is_open_and_said(tmp_path: Path, short_segments
     lines = log.read_text(encoding="utf-8").splitlines(keepends=True)
     log.write_text("".join(lines[: round(len(lines) * 3.5 / 6.2)]), encoding="utf-8")
     session = ingested(flight)
-    reconstruct(session, Settings(method="robust"), workers=1)
+    reconstruct(session, ReconstructSettings(method="robust"), workers=1)
     skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
     late = skeleton[skeleton["t_ns"] > flight.t_ns[0] + 4_000_000_000]
     assert len(skeleton) == len(flight.t_ns) * 17
@@ -168,7 +168,7 @@ def test_segments_with_the_pictures_of_one_camera_are_open_and_said(
     film_at(flight, "drone2", flight.t_ns[:100])
     flight.save()
     session = ingested(flight)
-    result = reconstruct(session, Settings(method="robust"), workers=1)
+    result = reconstruct(session, ReconstructSettings(method="robust"), workers=1)
     skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
     angles = pd.read_parquet(session / "reconstruct" / "angles.parquet")
     assert len(skeleton) == len(flight.t_ns) * 17
@@ -189,7 +189,7 @@ def test_a_doubted_long_flight_is_refused_when_asked(
     assert "is doubted: it is late (clock)" in refused(
         "reconstruct", session, "--method", "robust", "--strict", "--workers", "1"
     )
-    result = reconstruct(session, Settings(method="robust"), workers=1, progress=Silent())
+    result = reconstruct(session, ReconstructSettings(method="robust"), workers=1, progress=Silent())
     assert [doubt["code"] for doubt in result.metrics["doubts"]] == ["clock"]
 
 
@@ -239,7 +239,7 @@ def test_the_page_of_a_long_flight_is_drawn_from_some_of_its_times(
 ) -> None:
     flight = write_flight(tmp_path, seconds=2.0)
     session = ingested(flight)
-    reconstruct(session, Settings(method="robust"), workers=1)
+    reconstruct(session, ReconstructSettings(method="robust"), workers=1)
     whole = content_of(session)
     monkeypatch.setattr(report, limit, most)
     some = content_of(session)

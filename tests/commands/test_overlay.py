@@ -16,7 +16,7 @@ from pipelines.formats.videos.video import VideoReader, index_video
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.poses import conjugate, rotate
 from pipelines.ingest import ingest
-from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.reporting.pictures import GREY as BLANK
 from pipelines.reporting.pictures import SIDES
 from pipelines.session.errors import DataError
@@ -68,7 +68,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SyntheticFlight, P
 def session_of(flight: SyntheticFlight) -> Path:
     session = flight.manifest.with_name("flight.session")
     ingest(flight.manifest, session)
-    reconstruct(session, Settings(method="robust"))
+    reconstruct(session, ReconstructSettings(method="robust"))
     return session
 
 

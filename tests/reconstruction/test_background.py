@@ -41,7 +41,12 @@ from pipelines.reconstruction.background_adjustment import (
     adjust,
     with_constant_levels,
 )
-from pipelines.reconstruction.background_kernels import Points, Sightings, eliminate_points, settle_points
+from pipelines.reconstruction.background_kernels import (
+    BackgroundPoints,
+    BackgroundSightings,
+    eliminate_points,
+    settle_points,
+)
 from pipelines.reconstruction.background_tracks import Followed, Tracks, follow, off_people
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
@@ -504,8 +509,8 @@ def test_a_camera_of_which_nothing_is_seen_keeps_its_logged_poses(posed: bool, r
 
 def test_a_point_behind_all_of_its_pictures_spoils_nothing() -> None:
     rays, sides = np.zeros((3, 2)), np.eye(3)[None, :2].copy()
-    seen = Sightings(np.array([0, 3]), np.arange(3), rays, 1e-3)
-    points = Points(np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.full(1, 0.05), sides)
+    seen = BackgroundSightings(np.array([0, 3]), np.arange(3), rays, 1e-3)
+    points = BackgroundPoints(np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.full(1, 0.05), sides)
     place, turned, prior = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)), np.array([0.0, 0.01])
     settle_points(seen, points, place, turned, 1.0, prior, 8)
     np.testing.assert_array_equal(points.direction, [[0.0, 0.0, -1.0]])

@@ -36,7 +36,8 @@ def held(log: Trajectory, every: int, rows: slice = slice(None)) -> Trajectory:
 
 
 def off_m(log: Trajectory, truth: Trajectory) -> Float:
-    return np.linalg.norm(log.position - truth.position, axis=1)
+    apart: Float = np.linalg.norm(log.position - truth.position, axis=1)
+    return apart
 
 
 def test_a_frozen_stretch_is_bridged_and_loosened() -> None:
@@ -82,7 +83,7 @@ def test_a_jump_and_back_is_bridged() -> None:
         flown(noise_m=0.0, speed_mps=0.0),
         held(flown(), 10),
         held(flown(noise_m=0.01, speed_mps=0.0), RATE_HZ),
-        Trajectory(*(part[:1] for part in (flown().t_ns, flown().position, flown().quaternion_xyzw))),
+        Trajectory(flown().t_ns[:1], flown().position[:1], flown().quaternion_xyzw[:1]),
     ],
     ids=["flies", "noisy", "hovers", "stands", "at 5 Hz", "hovers at 1 Hz", "one pose"],
 )

@@ -12,7 +12,7 @@ from pipelines.geometry.poses import look_at, matrix_from_quaternion
 from pipelines.reconstruction.doubts.diagnosis import GAIN
 from pipelines.reconstruction.doubts.faults import fit, undone
 from pipelines.reconstruction.doubts.kernels import joints_of, normal_equations
-from pipelines.reconstruction.doubts.scene import JOINTS, MOMENTS, Sampled, Scene
+from pipelines.reconstruction.doubts.scene import JOINTS, MOMENTS, Sampled, SceneOfMoments
 from pipelines.reconstruction.doubts.score import STATURE_M, stature_m
 
 WITHOUT_ACTOR = cast(Sampled, type("", (), {"hips": None})())
@@ -28,7 +28,7 @@ def people() -> Float:
     return joints + np.stack([along, 0.5 * np.sin(along), 0 * along], axis=1)[:, None]
 
 
-def scene(cameras: int) -> Scene:
+def scene(cameras: int) -> SceneOfMoments:
     """Look at them from drones that hover 9 m away."""
     joints = people()
     yaw = np.radians(20 + 110.0 * np.arange(cameras))
@@ -39,7 +39,7 @@ def scene(cameras: int) -> Scene:
     local = np.einsum("ctji,ctkj->ctki", rotation, joints[None] - position[:, :, None])
     rays = local[..., :2] / local[..., 2:]
     sigma = np.repeat(SIGMA[None], cameras, axis=0)
-    return Scene(rays, position, rotation, np.full(cameras, 760.0), sigma, np.full(cameras, 140.0))
+    return SceneOfMoments(rays, position, rotation, np.full(cameras, 760.0), sigma, np.full(cameras, 140.0))
 
 
 @pytest.mark.parametrize(

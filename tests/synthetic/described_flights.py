@@ -32,7 +32,7 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
 )
 from pipelines.ingest import ingest
-from pipelines.reconstruct import Settings, reconstruct
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.reconstruction.doubts.diagnosis import Diagnosis
 from pipelines.reconstruction.doubts.scene import Sampled
 from pipelines.session.errors import MocapError
@@ -682,7 +682,7 @@ def measured(manifest: Path, error: str = "mpjpe_mm") -> tuple[float | None, lis
     shutil.rmtree(session, ignore_errors=True)
     try:
         ingest(manifest, session)
-        metrics = reconstruct(session, Settings(method="robust")).metrics
+        metrics = reconstruct(session, ReconstructSettings(method="robust")).metrics
     except MocapError as stop:
         doubts = check(session).doubts if (session / "session.json").exists() else []
         return None, [doubt.as_json() for doubt in doubts], str(stop)

@@ -43,7 +43,7 @@ from pipelines.reconstruction.doubts.hypotheses import (
     turn_about,
 )
 from pipelines.reconstruction.doubts.logs import doubts_of_logs
-from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
+from pipelines.reconstruction.doubts.scene import CameraLike, Sampled, SceneOfMoments, sample, scene_of
 from pipelines.reconstruction.doubts.score import (
     STATURE_M,
     Score,
@@ -88,14 +88,22 @@ GAIN = 14.0
 DOUBTFUL = 6.0
 """Score of a description above which it is doubted although no mistake explains it."""
 
-_HOVERING_M = 0.5  # apart: too little to tell own origins from positions in a smaller unit
-_BELOW_M = 1.0  # below zero, of drones
-_ALIKE = 1.0  # hypotheses whose scores are this close are stated together
-_COST_OF_NUMBER = 2.0  # of chi^2, as in Akaike's criterion
-_ALIKE_COST = 4.0  # of faults that are stated together
+# Logs nearer to each other than this do not tell own origins from positions in a smaller unit.
+_HOVERING_M = 0.5
+# Drones that all fly lower than this below zero count heights downwards.
+_BELOW_M = 1.0
+# Hypotheses whose scores are this close are stated together.
+_ALIKE = 1.0
+# Each free number costs this much chi^2, as in Akaike's criterion.
+_COST_OF_NUMBER = 2.0
+# Faults whose chi^2 are this close are stated together.
+_ALIKE_COST = 4.0
+# A right hypothesis raises the residual of the rays by less than this factor.
 _SAME_RESIDUAL = 1.1
-_PENALTY_OF_CAMERA = 2.5  # of leaving one out
-_DISCRETE = 0.8  # the largest penalty of a hypothesis without a free number
+# Leaving a camera out explains much by chance, and must gain this much more.
+_PENALTY_OF_CAMERA = 2.5
+# Hypotheses without a free number have at most this penalty.
+_DISCRETE = 0.8
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,7 @@ class Diagnosis:
 def doubts_of(
     folder: Path,
     description: Description,
-    cameras: Sequence[Camera],
+    cameras: Sequence[CameraLike],
     *,
     chosen: Sequence[Int64],
     followed: Mapping[str, object],
@@ -297,7 +305,7 @@ def _of_one_clock(trial: Trial, hypotheses: Sequence[Hypothesis], stated: float)
     return [each for each in found if np.isfinite(each.cost)]
 
 
-def _same_moments(trial: Trial, scene: Scene) -> Scene:
+def _same_moments(trial: Trial, scene: SceneOfMoments) -> SceneOfMoments:
     """Return the description where another scene has rays, too."""
     seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
     return replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
@@ -398,13 +406,13 @@ def _bad_camera(trial: Trial) -> list[Hypothesis]:
     return [best] if explains and _leaves_no_doubt(trial.flight, best) else []
 
 
-def _is_noise(flight: Sampled, cause: Scene, hypotheses: list[Hypothesis]) -> bool:
+def _is_noise(flight: Sampled, cause: SceneOfMoments, hypotheses: list[Hypothesis]) -> bool:
     """Return True if larger errors of the poses fit markedly better than the scene without a mistake."""
     noise = min((each.cost for each in hypotheses if each.code == "noise"), default=np.inf)
     return bool(noise < np.inf) and noise < fit(flight, cause, "none", 0).cost - GAIN
 
 
-def _faults(hypotheses: list[Hypothesis], stated: float, scene: Scene) -> list[Hypothesis]:
+def _faults(hypotheses: list[Hypothesis], stated: float, scene: SceneOfMoments) -> list[Hypothesis]:
     """Return the faults of one camera's poses that fit best, one of each code; none if they gain too little.
 
     Args:
@@ -649,7 +657,7 @@ def _with_sigma(trial: Trial, cause: Hypothesis) -> Hypothesis:
     return replace(cause, sigmas={"turn_sigma_deg": round(sigma_deg, 2)})
 
 
-def _doubt(cause: Hypothesis, described: Score, scene: Scene) -> Doubt:
+def _doubt(cause: Hypothesis, described: Score, scene: SceneOfMoments) -> Doubt:
     evidence = {"residual_px": residual_px(scene, solve(scene)), "score": round(described.total, 2)}
     if cause.score is not None and cause.scene is not None:
         evidence |= {
@@ -697,10 +705,11 @@ _ODD = {
     "behind": ("residual", "joints are behind the cameras that see them"),
     "parallax": ("residual", "the cameras look from the same side: the rays hardly cross"),
 }
-_LEAST_ODD = 2.0  # standard deviations
+# What is less odd than this many standard deviations is not worth a sentence.
+_LEAST_ODD = 2.0
 
 
-def _oddities(described: Score, scene: Scene, flight: Sampled, *, alone: bool) -> list[Doubt]:
+def _oddities(described: Score, scene: SceneOfMoments, flight: Sampled, *, alone: bool) -> list[Doubt]:
     """State what is odd about the description as such, the oddest of each code, the oddest first.
 
     Where no cause is stated beside it (`alone`), the rays are what is odd if nothing else is.

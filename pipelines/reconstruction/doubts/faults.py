@@ -16,8 +16,8 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.reconstruction.doubts.kernels import misses_of, normal_equations
-from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene
-from pipelines.reconstruction.doubts.score import STATURE_M, Solved, pixel_variance, solve, stature_m
+from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, SceneOfMoments
+from pipelines.reconstruction.doubts.score import STATURE_M, SolvedJoints, pixel_variance, solve, stature_m
 
 FREE = {
     "none": 0,
@@ -38,18 +38,29 @@ focal length is another; the turn is then the logarithm of the factor. `origins`
 place of its own; the shifts are then the constant errors, which nothing bounds.
 """
 
+# Fits of faults converge in fewer steps than this.
 _STEPS = 20
-_MOST_ZOOM = 3.0  # logarithm of the factor on a focal length
-_CONVERGED = 0.05  # of the cost
+# Focal lengths are wrong by at most this logarithm: a factor of twenty.
+_MOST_ZOOM = 3.0
+# A step that changes the chi^2 by less is the last.
+_CONVERGED = 0.05
 _LEAST_SIGMA = (0.02, np.radians(0.1))  # of constant errors, m and rad
-_NOSE_TO_ANKLES = 0.9  # share of the stature; Winter 2009
-_LOOSE_M = 30.0  # sigma of a shift that is a fault: any is as likely
-_SIZE_SIGMA = 0.09  # of the logarithm of statures
+# The nose is this share of the stature above the ankles (Winter 2009).
+_NOSE_TO_ANKLES = 0.9
+# The shift of a fault has this standard deviation: any shift is as likely.
+_LOOSE_M = 30.0
+# Statures of grown-ups have this standard deviation of their logarithm.
+_SIZE_SIGMA = 0.09
+# Derivatives are taken over this distance, small against that of a person.
 _PROBE_M = 0.05
-_PLACED_M = 0.3  # sigma of the logged actor's hips, of which `_FEW` are independent
+# The logged hips of an actor err by this much.
+_PLACED_M = 0.3
+# Residuals beyond this many standard deviations count linearly.
 _HUBER = 1.5
+# Errors of a logged actor wander, and count as so many independent ones.
 _FEW = 3
-_USUAL_M = 10.0  # distance of a person
+# A person is filmed from about this distance where none is known.
+_USUAL_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -62,7 +73,7 @@ class Fault:
     strain: float  # the part of it that is of constant errors, the logged actor and the person's stature
     shift: Float  # [3] m
     turn_rad: float
-    scene: Scene  # without the fault; constant errors stay
+    scene: SceneOfMoments  # without the fault; constant errors stay
     errors: Float  # [C, 6] of all poses, m and rad, besides it
     covariance: (
         Float  # [n, n] of its numbers: what the constant errors leave of it; without a number, of all errors
@@ -84,7 +95,7 @@ class Fault:
         return float(np.degrees(self.turn_rad))
 
 
-def fit(flight: Sampled, scene: Scene, name: str, index: int, start_rad: float = 0.0) -> Fault:
+def fit(flight: Sampled, scene: SceneOfMoments, name: str, index: int, start_rad: float = 0.0) -> Fault:
     """Fit a fault of one camera, and the constant errors of all.
 
     Args:
@@ -119,7 +130,7 @@ def fit(flight: Sampled, scene: Scene, name: str, index: int, start_rad: float =
     return best
 
 
-def undone(scene: Scene, name: str, index: int, shift: Float, turn_rad: float) -> Scene:
+def undone(scene: SceneOfMoments, name: str, index: int, shift: Float, turn_rad: float) -> SceneOfMoments:
     """Return the scene without a fault of one camera."""
     if name == "focal":
         factor = np.ones(len(scene.focal_px))
@@ -137,7 +148,7 @@ def undone(scene: Scene, name: str, index: int, shift: Float, turn_rad: float) -
     return replace(scene, rotation=rotation, position=position)
 
 
-def origins(flight: Sampled, scene: Scene) -> tuple[Float, Float]:
+def origins(flight: Sampled, scene: SceneOfMoments) -> tuple[Float, Float]:
     """Place the logs of all drones, of which each counts from a place of its own.
 
     The search begins where each camera by itself sees a person of usual stature: as far away as they are
@@ -173,7 +184,7 @@ def origins(flight: Sampled, scene: Scene) -> tuple[Float, Float]:
     return shifts, sigma
 
 
-def tilt_sigma_deg(flight: Sampled, scene: Scene, group: Sequence[int]) -> float:
+def tilt_sigma_deg(flight: Sampled, scene: SceneOfMoments, group: Sequence[int]) -> float:
     """Return the standard deviation of one tilt that cameras have in common, beside all constant errors.
 
     With the normal matrix N of a fit without a fault, the inverse variances P of the constant errors, and the
@@ -224,12 +235,12 @@ def _rotation(vector: Float) -> Float:
     return matrix
 
 
-def _with_errors(scene: Scene, errors: Float) -> Scene:
+def _with_errors(scene: SceneOfMoments, errors: Float) -> SceneOfMoments:
     turn = _rotation(errors[:, 3:])[:, None]
     return replace(scene, rotation=turn @ scene.rotation, position=scene.position + errors[:, None, :3])
 
 
-def _constant_sigma(scene: Scene) -> Float:
+def _constant_sigma(scene: SceneOfMoments) -> Float:
     """Return the standard deviations [C, 6] of the constant errors."""
     level = np.sqrt(np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0))
     sigma: Float = np.repeat(np.maximum(level, _LEAST_SIGMA), 3, axis=1)
@@ -237,7 +248,9 @@ def _constant_sigma(scene: Scene) -> Float:
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
-def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[float, float, Float, Float]:
+def _step(
+    flight: Sampled, scene: SceneOfMoments, fault: Fault, errors: Float
+) -> tuple[float, float, Float, Float]:
     """Return cost and strain of a scene, the changes of constant errors [C, 6] and a fault's numbers [n].
 
     Also the covariance [n, n] of these numbers.
@@ -301,7 +314,7 @@ def _step(flight: Sampled, scene: Scene, fault: Fault, errors: Float) -> tuple[f
     return cost, strain, -covariance @ right, covariance[kept:, kept:]
 
 
-def picture_variance(scene: Scene) -> Float:
+def picture_variance(scene: SceneOfMoments) -> Float:
     """Return the variance [C] rad^2 of what a picture shows: keypoints, and errors of poses that change."""
     times = scene.rays.shape[1]
     turned2 = _varying2(scene.sigma[:, 5], scene.sigma[:, 3], times)
@@ -320,13 +333,13 @@ def _varying2(varying: Float, white: Float, times: int) -> Float:
     return variance
 
 
-def _size(solved: Solved) -> float:
+def _size(solved: SolvedJoints) -> float:
     """Return how far the person's stature is from a grown-up's, in standard deviations."""
     stature = stature_m(solved.joints)
     return float(np.log(stature / STATURE_M)) / _SIZE_SIGMA if np.isfinite(stature) else 0.0
 
 
-def _size_by_shift(scene: Scene, index: int, size: float) -> Float:
+def _size_by_shift(scene: SceneOfMoments, index: int, size: float) -> Float:
     """Return the derivative [3] of `_size` by a camera's position."""
     slope = np.zeros(3)
     for axis in range(3):
@@ -336,7 +349,7 @@ def _size_by_shift(scene: Scene, index: int, size: float) -> Float:
     return slope
 
 
-def _basis(scene: Scene, fault: Fault) -> Float:
+def _basis(scene: SceneOfMoments, fault: Fault) -> Float:
     """Return how a camera's shift and turn [T, 6] change with each number of the fault."""
     times = scene.position.shape[1]
     basis = np.zeros((times, 6, FREE[fault.name]))
@@ -352,7 +365,7 @@ def _basis(scene: Scene, fault: Fault) -> Float:
     return np.nan_to_num(basis)
 
 
-def _placed(flight: Sampled, solved: Solved) -> tuple[Float, Float, float]:
+def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]:
     """Pull hips to the logged actor; return weights [T, J], pulls [T, J, 3] and the cost."""
     weight, pull = np.zeros(solved.views.shape), np.zeros(solved.joints.shape)
     if flight.hips is None:

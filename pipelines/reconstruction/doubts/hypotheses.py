@@ -17,7 +17,7 @@ from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.mounting import level_heading
 from pipelines.geometry.poses import interpolate_poses, matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
-from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene, scene_of
+from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, SceneOfMoments, scene_of
 from pipelines.reconstruction.doubts.score import Base, Score, score, solve
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
@@ -34,12 +34,19 @@ _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _FLU_FROM_FRD = np.diag([1.0, -1, -1])
 _BODY_AXES = {"enu": "FLU", "ned": "FRD"}
 _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
-_SPARE = 2.0  # hypotheses whose scores are farther from the best need no exact score
-_REACH = 10.0  # how much worse than the description the best of a grid may be, beside which a best may lie
-_REACH_OF_TIMES = 1.0  # the same of the finer grid of clocks
-_USUAL_STATURE = 0.17  # 95 % of grown-ups differ by less, logarithm
+# Hypotheses whose scores are farther from the best need no exact score.
+_SPARE = 2.0
+# Beside a value of the grid that is worse than the description by more than this lies no better one.
+_REACH = 10.0
+# The grid of clocks is finer, and so is this limit.
+_REACH_OF_TIMES = 1.0
+# The statures of 95 % of grown-ups differ by less than this logarithm.
+_USUAL_STATURE = 0.17
+# Clocks that are off by more leave no pictures in common in short flights.
 _LONGEST_CLOCK_S = 3.0
+# Smaller offsets cannot be told from noise by the score.
 _LEAST_CLOCK_S = 0.05
+# Focal lengths that are wrong by less cannot be told from noise by the score.
 _LEAST_OCTAVES = 0.15
 _LEFT_RIGHT = [
     JOINTS.index(name.replace("left", "@").replace("right", "left").replace("@", "right")) for name in JOINTS
@@ -55,7 +62,7 @@ class Hypothesis:
     what: str
     remedy: str
     penalty: float
-    scene: Scene | None
+    scene: SceneOfMoments | None
     score: Score | None = None
     same_scatter: bool = False
     cost: float = np.inf  # chi^2 of a fitted fault, with 2 for each of its numbers
@@ -71,7 +78,7 @@ class Hypothesis:
 class Trial:
     """The flight as described, with which hypotheses are made and scored."""
 
-    def __init__(self, flight: Sampled, described: Scene, base: Base) -> None:
+    def __init__(self, flight: Sampled, described: SceneOfMoments, base: Base) -> None:
         self.flight = flight
         self.described = described
         self.base = base
@@ -141,15 +148,15 @@ class Trial:
 
     # --- scenes that differ in one thing ----------------------------------------------------------------
 
-    def turned_in_camera(self, turn: Float, cameras: Sequence[int]) -> Scene:
+    def turned_in_camera(self, turn: Float, cameras: Sequence[int]) -> SceneOfMoments:
         """Turn cameras [3, 3] about their own axes."""
         return self._rotated(lambda _, rotation: rotation @ turn, cameras)
 
-    def turned_in_world(self, turn: Float, cameras: Sequence[int]) -> Scene:
+    def turned_in_world(self, turn: Float, cameras: Sequence[int]) -> SceneOfMoments:
         """Turn cameras [3, 3] about the world's axes, where they are."""
         return self._rotated(lambda _, rotation: turn @ rotation, cameras)
 
-    def turned_in_body(self, turn: Float, cameras: Sequence[int]) -> Scene:
+    def turned_in_body(self, turn: Float, cameras: Sequence[int]) -> SceneOfMoments:
         """Turn cameras [3, 3] about the axes of the bodies that carry them."""
         return self._rotated(
             lambda index, rotation: rotation @ self.mount(index).T @ turn @ self.mount(index), cameras
@@ -160,32 +167,34 @@ class Trial:
         stored = self.flight.cameras[index].mount
         return _FLU_FROM_OPTICAL if stored is None else stored
 
-    def _rotated(self, turned: Callable[[int, Float], Float], cameras: Sequence[int]) -> Scene:
+    def _rotated(self, turned: Callable[[int, Float], Float], cameras: Sequence[int]) -> SceneOfMoments:
         rotation = self.described.rotation.copy()
         for index in cameras:
             rotation[index] = turned(index, rotation[index])
         return self.described.with_rotation(rotation)
 
-    def late(self, seconds: float, cameras: Sequence[int]) -> Scene:
+    def late(self, seconds: float, cameras: Sequence[int]) -> SceneOfMoments:
         """Add seconds to the times of cameras' pictures."""
         late_s = np.zeros(len(self.names))
         late_s[list(cameras)] = seconds
         return scene_of(self.flight, self.described, late_s=late_s)
 
-    def as_stated(self, late_s: float, slower: float) -> tuple[Sampled, Scene]:
+    def as_stated(self, late_s: float, slower: float) -> tuple[Sampled, SceneOfMoments]:
         """Look at the pictures that another time of all cameras shows, at the times that are stated."""
         since = (self.flight.t_ns - self.flight.t_ns[0]) / slower - late_s * 1e9
         flight = self.flight._replace(t_ns=self.flight.t_ns[0] + since.astype(np.int64), hips=None)
         return flight, scene_of(flight)
 
-    def focal(self, factor: float, cameras: Sequence[int]) -> Scene:
+    def focal(self, factor: float, cameras: Sequence[int]) -> SceneOfMoments:
         """Multiply the focal lengths of cameras."""
         rays, focal_px = self.described.rays.copy(), self.described.focal_px.copy()
         rays[list(cameras)] /= factor
         focal_px[list(cameras)] *= factor
         return replace(self.described, rays=rays, focal_px=focal_px)
 
-    def with_pixels(self, change: Callable[[Float, Intrinsics], Float], cameras: Sequence[int]) -> Scene:
+    def with_pixels(
+        self, change: Callable[[Float, Intrinsics], Float], cameras: Sequence[int]
+    ) -> SceneOfMoments:
         """Change the pixels [F, J, 2] of cameras."""
         return scene_of(
             self.flight,
@@ -196,7 +205,7 @@ class Trial:
             ],
         )
 
-    def shifted(self, scene: Scene, index: int) -> tuple[Scene, Float]:
+    def shifted(self, scene: SceneOfMoments, index: int) -> tuple[SceneOfMoments, Float]:
         """Shift a camera [3] m to where its rays meet the others' best: linear, with a prior of 10 m."""
         solved = solve(scene)
         normals, distances = [], []
@@ -221,7 +230,7 @@ class Trial:
         position[index] = position[index] + shift
         return replace(scene, position=position), shift
 
-    def apart(self) -> Scene:
+    def apart(self) -> SceneOfMoments:
         """Shift all cameras but the first that moves, each to where its rays meet the others' best."""
         scene = self.described
         for _ in range(8 if len(self.names) > 2 else 1):

@@ -10,12 +10,17 @@ import numpy as np
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.compilation import cached, helper
 
-_FIRST_M = 10.0  # distance of a joint before any is known
+# Joints are taken to be this far away before any distance is known.
+_FIRST_M = 10.0
 _NEAREST_M, _FARTHEST_M = 1e-3, 1e5
+# A smaller determinant is that of rays along one line.
 _SINGULAR = 1e-30
-_NEAR_M = 0.5  # a ray's angle to a joint nearer than this is not larger
-_PARALLEL = 0.15  # rays that cross by less tell no distance
-_FIRM = 1e-9  # of a joint's weight matrix
+# A ray's angle to a joint that is nearer than this is not larger.
+_NEAR_M = 0.5
+# Rays that cross by less than this sine tell no distance.
+_PARALLEL = 0.15
+# This share of a joint's weight keeps its equations regular.
+_FIRM = 1e-9
 
 
 @helper

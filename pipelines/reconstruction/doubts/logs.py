@@ -11,14 +11,21 @@ from pipelines.geometry.arrays import Float
 from pipelines.session.description import CameraEntry, Doubt
 from pipelines.session.records import Trajectory
 
+# Paths are compared at so many moments, which is enough for drones.
 _MOMENTS = 60
-_ONE_FLIGHT_M = 5000.0  # no team films from farther apart
-_PROJECTED_M = 100_000.0  # UTM eastings begin at 166 km
+# No team films one person from places that are farther apart.
+_ONE_FLIGHT_M = 5000.0
+# Eastings of UTM begin at 166 km, so positions beyond this are projected ones.
+_PROJECTED_M = 100_000.0
+# No drone that films people flies faster than this.
 _TOO_FAST_MPS = 60.0
 _UNITS_M = {"cm": 0.01, "mm": 0.001}
+# Two drones cannot fly within this distance of each other all the time.
 _SAME_PATH_M = 0.1
+# Two drones cannot start at places that are nearer to each other than this.
 _SAME_START_M = 0.5
-_ONE_BODY_DEG = 45.0  # cameras that are together and look alike are on one drone
+# Cameras that are together and look alike to this angle are on one drone.
+_ONE_BODY_DEG = 45.0
 
 
 def doubts_of_logs(cameras: Mapping[str, tuple[CameraEntry, Trajectory]]) -> list[Doubt]:

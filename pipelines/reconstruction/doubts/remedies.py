@@ -14,7 +14,8 @@ from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_mat
 from pipelines.reconstruction.doubts.scene import Filmed
 from pipelines.session.description import CameraEntry
 
-_SAME = 1e-3  # of rotation matrices
+# Entries of equal rotation matrices differ by less than this.
+_SAME = 1e-3
 
 
 def _lines(cameras: Sequence[Filmed], group: Sequence[int], said: Callable[[Filmed], str]) -> str:

@@ -41,12 +41,15 @@ STEP_NS = 100_000_000
 # Of poses whose noise nobody states, in a usual flight.
 _UNKNOWN = (0.3, np.radians(1.0), 0.1, np.radians(0.3), 0.1, np.radians(0.3))
 _CALIBRATED = (0.003, 0.001, 0.0, 0.0, 0.0, 0.0)  # of a still camera
-_LONGEST_GAP_NS = 250_000_000  # between two pictures across which a keypoint is interpolated
-_CHOSEN_SHARE = 0.5  # of the pictures with people
-_NEW_SHARE = 0.5  # of a logged covariance: the part that is drawn anew in every pose
+# A keypoint is interpolated over at most this time between two pictures.
+_LONGEST_GAP_NS = 250_000_000
+# A person chosen in a smaller share of the pictures with people is not the one to judge by.
+_CHOSEN_SHARE = 0.5
+# This share of a logged covariance is drawn anew in every pose.
+_NEW_SHARE = 0.5
 
 
-class Camera(Protocol):
+class CameraLike(Protocol):
     """A camera as `reconstruction.observations` has it; the doubts need no more of it."""
 
     @property
@@ -108,7 +111,7 @@ class Filmed:
     intrinsics: Intrinsics
     t_ns: Int64  # [F] of its pictures
     pixels: Float  # [F, J, 2] of `JOINTS`; NaN where nothing was found
-    camera: Camera
+    camera: CameraLike
     entry: CameraEntry
     sigma: PoseSigma
 
@@ -139,7 +142,7 @@ class Filmed:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneOfMoments:
     """View of C cameras at T moments."""
 
     rays: Float  # [C, T, J, 2] normalised image coordinates; NaN where nothing was seen
@@ -149,7 +152,7 @@ class Scene:
     sigma: Float  # [C, 6] as `PoseSigma`
     person_px: Float  # [C] height of the person in the pictures, median
 
-    def with_rotation(self, rotation: Float) -> Scene:
+    def with_rotation(self, rotation: Float) -> SceneOfMoments:
         """Replace the attitudes."""
         return replace(self, rotation=rotation)
 
@@ -163,10 +166,10 @@ class Sampled(NamedTuple):
     first: Int64  # [T / 2] index of the first moment of each pair
     second: Int64  # [T / 2]
     hips: Float | None  # [T, 3] m, logged; None without a logged actor
-    ground: Ground | None
+    ground: GroundOfMap | None
 
 
-class Ground(NamedTuple):
+class GroundOfMap(NamedTuple):
     """Height of the ground, the top of the lowest occupied run of every column of a map."""
 
     corner: Float  # [2] m
@@ -174,7 +177,7 @@ class Ground(NamedTuple):
     height: Float  # [X, Y] m; NaN where nothing is occupied
 
     @classmethod
-    def of(cls, occupancy: Occupancy) -> Ground:
+    def of(cls, occupancy: Occupancy) -> GroundOfMap:
         """Find the ground of a map."""
         occupied = occupancy.probability > 0.5
         first = np.argmax(occupied, axis=2)
@@ -202,7 +205,7 @@ class Ground(NamedTuple):
 
 
 def sample(
-    cameras: Sequence[Camera],
+    cameras: Sequence[CameraLike],
     description: Description,
     *,
     actor: LoggedActor | None,
@@ -246,11 +249,11 @@ def sample(
         np.searchsorted(t_ns, before),
         np.searchsorted(t_ns, before + STEP_NS),
         None if actor is None else actor.hips_at(t_ns),
-        None if last_map is None else Ground.of(last_map),
+        None if last_map is None else GroundOfMap.of(last_map),
     )
 
 
-def _most_seen(camera: Camera) -> Int64:
+def _most_seen(camera: CameraLike) -> Int64:
     """Return the detections of the person whom the camera shows in most pictures.
 
     People are told apart by the detector's own number; where that person is missing, the next is taken.
@@ -264,7 +267,7 @@ def _most_seen(camera: Camera) -> Int64:
     return first
 
 
-def _chosen(camera: Camera, of_frame: Int64) -> Int64:
+def _chosen(camera: CameraLike, of_frame: Int64) -> Int64:
     """Return the detections that were chosen, by their rank [F] among those of their picture.
 
     A camera of which few were chosen fits the others badly: its person is whom it shows most, since what is
@@ -276,7 +279,7 @@ def _chosen(camera: Camera, of_frame: Int64) -> Int64:
     return np.searchsorted(camera.detections.frame, frame) + of_frame[frame]
 
 
-def _pixels(camera: Camera, detection: Int64) -> Float:
+def _pixels(camera: CameraLike, detection: Int64) -> Float:
     """Return the pixels [F, J, 2] of given detections, at most one of a picture."""
     found = camera.detections
     pixels = np.full((len(camera.frame_t_ns), len(JOINTS), 2), np.nan)
@@ -286,7 +289,7 @@ def _pixels(camera: Camera, detection: Int64) -> Float:
     return pixels
 
 
-def _sigma(camera: Camera, entry: CameraEntry, pose_noise: str | None) -> PoseSigma:
+def _sigma(camera: CameraLike, entry: CameraEntry, pose_noise: str | None) -> PoseSigma:
     models = stated_models(camera.name, entry, pose_noise)
     if models is not None:
         length_s = float(np.ptp(camera.frame_t_ns)) / 1e9
@@ -327,13 +330,13 @@ def _variances(model: NoiseModel, length_s: float) -> list[float]:
 
 def scene_of(
     flight: Sampled,
-    posed: Scene | None = None,
+    posed: SceneOfMoments | None = None,
     *,
     late_s: Float | None = None,
     slower: Float | None = None,
     order: tuple[int, ...] | None = None,
     pixels: list[Float] | None = None,
-) -> Scene:
+) -> SceneOfMoments:
     """Look at the flight's moments.
 
     Args:
@@ -359,7 +362,7 @@ def scene_of(
         rays.append(undistort(at, camera.intrinsics))
         person_px.append(_median(_extent(at)))
     position, rotation = (posed.position, posed.rotation) if posed else _poses(flight)
-    return Scene(
+    return SceneOfMoments(
         np.array(rays),
         position,
         rotation,

@@ -18,21 +18,25 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.reconstruction.doubts.kernels import distances_of, joints_of
-from pipelines.reconstruction.doubts.scene import JOINTS, STEP_NS, Sampled, Scene
+from pipelines.reconstruction.doubts.scene import JOINTS, STEP_NS, Sampled, SceneOfMoments
 
 IMPOSSIBLE = 99.0
 """Score of a scene in which next to nothing is seen by two cameras."""
 
 _INDEX = {name: index for index, name in enumerate(JOINTS)}
+# Good keypoints err by this much at least.
 _KEYPOINT_PX = 3.0
-_KEYPOINT_SHARE = (
-    0.015  # of the person's height in the picture; measured for BlazePose at 0 to 30 deg of tilt
-)
+# Keypoints err by this share of the size of the person in the picture.
+_KEYPOINT_SHARE = 0.015
 _CHI2_MEDIAN = {1: 0.455, 3: 0.789, 5: 0.870}  # median of chi^2 over its degrees of freedom, by those
+# With more degrees of freedom, the median of chi-square over them is about this.
 _CHI2_MEDIAN_MORE = 0.9
-_FARTHEST_M = 30.0  # a joint farther away says nothing of how far stated errors move it
-_FEWEST_MOMENTS = 20  # in which joints are seen, to say on which side they are
-_FEWEST = 60  # joints that two cameras see, in all moments
+# A joint that is farther away does not tell how far stated errors move it.
+_FARTHEST_M = 30.0
+# Joints seen in fewer moments do not tell on which side they are.
+_FEWEST_MOMENTS = 20
+# With fewer joints that two cameras see in all moments nothing can be said.
+_FEWEST = 60
 
 # Lengths of limbs over stature: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., fig. 4.1,
 # after Drillis and Contini 1964; from the middle of the hips to that of the shoulders for the torso.
@@ -46,25 +50,42 @@ _LIMBS = (
     ("left_elbow", "left_wrist", 0.150),
     ("right_elbow", "right_wrist", 0.150),
 )
+# The torso is so long as a share of the stature.
 _TORSO = 0.295
 STATURE_M = 1.73
 """Of a grown-up; 95 % are within 17 % of it (NCD-RisC 2016, men and women together)."""
 
+# Ankles of somebody who stands are this high above the ground.
 _ANKLE_ABOVE_GROUND_M = 0.08
-_WALK_NS = 1_000_000_000  # how far apart two moments may be that tell where somebody walks
-_LEAST_PACE_MPS = 0.3  # over the flight, of somebody who walks
+# Two moments farther apart than this do not tell the direction in which somebody walks.
+_WALK_NS = 1_000_000_000
+# Somebody who is slower than this over the flight does not walk.
+_LEAST_PACE_MPS = 0.3
+# People run no faster than this.
 _FASTEST_MPS = 6.0
-_LYING = 1.2  # the most that lying counts, and bending down or a cartwheel: people do that, if seldom
-_WALKING = 0.7  # least cosine of a body against the vertical, of somebody who walks
-_WALKING_SHARE = 0.8  # least share of the moments in which they do: else they lie down, or turn cartwheels
-_HEAD_DOWN = -0.3  # cosine of a body against the vertical: less is head down for most of a flight
+# Lying, bending down and cartwheels are rare, and count at most so much.
+_LYING = 1.2
+# A body at a smaller cosine against the vertical is not that of somebody who walks.
+_WALKING = 0.7
+# Somebody who walks in a smaller share of the moments lies down, or turns cartwheels.
+_WALKING_SHARE = 0.8
+# A body at a smaller cosine against the vertical is head down.
+_HEAD_DOWN = -0.3
+# Rays that miss each other by more standard deviations cannot be used.
 _UNUSED_SIGMAS = 4.0
-_USUALLY_UNUSED = 0.2  # most of the joints; below 0.01 on right flights
-_BENT_COSINE = np.cos(np.radians(30))  # of a limb's two parts: less is clearly bent
-_CLEARLY = 0.5  # least cosine of where a joint bends, against forwards
-_HANGING = 0.5  # least cosine of an upper arm against downwards
-_SLOPE = 0.3  # of ground that no map shows
+# Right flights have less than 0.01 of joints that cannot be used.
+_USUALLY_UNUSED = 0.2
+# Two parts of a limb at a smaller cosine are clearly bent.
+_BENT_COSINE = np.cos(np.radians(30))
+# A joint that bends at a smaller cosine against forwards may bend to the side.
+_CLEARLY = 0.5
+# An upper arm at a smaller cosine against downwards does not hang.
+_HANGING = 0.5
+# Ground that no map shows is no steeper than this.
+_SLOPE = 0.3
+# Half of a body is this long: turning it moves its ends by the angle times that.
 _HALF_BODY_M = 0.5
+# The scatter of rays counts this much beside what is odd about a person.
 SCATTER_WEIGHT = 12.0
 SCATTER_RANGE = (0.4, 30.0)  # what is less is no better: keypoints scatter by themselves
 
@@ -94,7 +115,7 @@ class Base(NamedTuple):
     covered: float  # share of joints and moments that two cameras see
 
 
-class Solved(NamedTuple):
+class SolvedJoints(NamedTuple):
     """Joints of a scene."""
 
     joints: Float  # [T, J, 3] m; NaN where fewer than two cameras see one
@@ -106,14 +127,14 @@ class Solved(NamedTuple):
     depth: Float  # [C, T, J] m
 
 
-def solve(scene: Scene) -> Solved:
+def solve(scene: SceneOfMoments) -> SolvedJoints:
     """Triangulate by least squares of distances to rays, weighted by what keypoints and poses err by."""
     angle2 = pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2
     arrays = (scene.rays, scene.rotation, scene.position, angle2, scene.sigma[:, 0] ** 2)
-    return Solved(*joints_of(*(np.ascontiguousarray(array, dtype=np.float64) for array in arrays)))
+    return SolvedJoints(*joints_of(*(np.ascontiguousarray(array, dtype=np.float64) for array in arrays)))
 
 
-def pixel_variance(scene: Scene) -> Float:
+def pixel_variance(scene: SceneOfMoments) -> Float:
     """Return the variance [C] px^2 of keypoints: it grows with the person in the picture."""
     variance: Float = _KEYPOINT_PX**2 + (_KEYPOINT_SHARE * scene.person_px) ** 2
     return variance
@@ -122,7 +143,7 @@ def pixel_variance(scene: Scene) -> Float:
 @np.errstate(invalid="ignore", divide="ignore")
 def score(
     flight: Sampled,
-    scene: Scene,
+    scene: SceneOfMoments,
     base: Base | None = None,
     *,
     same_scatter: bool = False,
@@ -166,7 +187,7 @@ def score(
     return Score(total, misfit, scatter, odd, person.stature_m)
 
 
-def base_of(flight: Sampled, scene: Scene) -> tuple[Base, Score]:
+def base_of(flight: Sampled, scene: SceneOfMoments) -> tuple[Base, Score]:
     """Score the scene as described; other scenes are scored against it."""
     described = score(flight, scene)
     scatter = float(np.clip(described.scatter, *SCATTER_RANGE))
@@ -174,7 +195,7 @@ def base_of(flight: Sampled, scene: Scene) -> tuple[Base, Score]:
     return Base(described.total, scatter, covered), described
 
 
-def _misfit(solved: Solved, good: Bool) -> float:
+def _misfit(solved: SolvedJoints, good: Bool) -> float:
     """Return the root of the median chi^2 over its freedom: 1 where all is as stated."""
     freedom = 2 * solved.views - 3
     total, count = 0.0, 0
@@ -186,7 +207,7 @@ def _misfit(solved: Solved, good: Bool) -> float:
     return float(np.sqrt(total / count))
 
 
-def _unused(solved: Solved, good: Bool, misfit: float) -> Oddity:
+def _unused(solved: SolvedJoints, good: Bool, misfit: float) -> Oddity:
     """Measure the share of joints whose rays miss each other by far more than usual: gates reject them."""
     freedom = 2 * solved.views[good] - 3
     gate = (_UNUSED_SIGMAS * max(misfit, 1.0)) ** 2
@@ -194,7 +215,7 @@ def _unused(solved: Solved, good: Bool, misfit: float) -> Oddity:
     return Oddity(max(0.0, share - _USUALLY_UNUSED) / 0.05, {"unused_share": share})
 
 
-def _parallax(solved: Solved) -> Oddity:
+def _parallax(solved: SolvedJoints) -> Oddity:
     """Say how far the best pair of cameras is from seeing a person from two sides (0.1 rad)."""
     best = 0.0
     for one, other in combinations(range(len(solved.seen)), 2):
@@ -206,7 +227,7 @@ def _parallax(solved: Solved) -> Oddity:
     return Oddity(max(0.0, 0.1 / max(best, 1e-4) - 1), {"parallax_deg": float(np.degrees(np.arcsin(best)))})
 
 
-def _scatter(scene: Scene, solved: Solved) -> float:
+def _scatter(scene: SceneOfMoments, solved: SolvedJoints) -> float:
     """Return the scatter of two cameras' rays within pictures over their noise, mean over the pairs."""
     variance = pixel_variance(scene) / scene.focal_px**2
     distance = np.clip(np.abs(solved.depth), 1e-4, 1e5)
@@ -219,7 +240,7 @@ def _scatter(scene: Scene, solved: Solved) -> float:
 
 
 def _scatter_of_pair(
-    scene: Scene, solved: Solved, distance: Float, variance: Float, pair: tuple[int, int]
+    scene: SceneOfMoments, solved: SolvedJoints, distance: Float, variance: Float, pair: tuple[int, int]
 ) -> float | None:
     """Fit constant errors of both poses to the rays' distances, and measure what they leave."""
     both = list(pair)
@@ -267,14 +288,14 @@ def _median_of_rows(values: Float) -> Float:
     return middle
 
 
-class _Person(NamedTuple):
+class _ScoredPerson(NamedTuple):
     odd: dict[str, Oddity]
     stature_m: float
 
 
-def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
+def _person(flight: Sampled, scene: SceneOfMoments, solved: SolvedJoints) -> _ScoredPerson | None:
     """Say how odd the person is; None if too few limbs are seen, or most have no length."""
-    body = _Body(solved.joints)
+    body = _ScoredBody(solved.joints)
     lengths = body.lengths()
     statures = _statures(lengths)
     if np.isfinite(statures).sum() < 5 or not np.nanmedian(statures) > 0:
@@ -294,7 +315,7 @@ def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
     keypoint_m = float(np.sqrt(np.mean(pixel_variance(scene)) * np.mean((far_m / scene.focal_px) ** 2)))
     odd |= body.motion(flight, stature, _moved_by(scene.sigma[:, 2:4], far_m), keypoint_m)
     odd |= _place(flight, scene, body, far_m)
-    return _Person(odd, stature)
+    return _ScoredPerson(odd, stature)
 
 
 def _statures(lengths: list[tuple[Float, float]]) -> Float:
@@ -305,7 +326,7 @@ def _statures(lengths: list[tuple[Float, float]]) -> Float:
 
 def stature_m(joints: Float) -> float:
     """Return a person's stature from their joints [T, J, 3]; NaN if too few limbs are seen."""
-    return _median(_statures(_Body(joints).lengths()))
+    return _median(_statures(_ScoredBody(joints).lengths()))
 
 
 def _shape(lengths: list[tuple[Float, float]], stature: float) -> Oddity:
@@ -318,7 +339,7 @@ def _shape(lengths: list[tuple[Float, float]], stature: float) -> Oddity:
     return Oddity(min(float(np.nanmedian(off)), 5.0) / 0.10, measured)
 
 
-def _unposed(scene: Scene) -> Oddity:
+def _unposed(scene: SceneOfMoments) -> Oddity:
     """Measure the share of moments with a person in the picture and no pose, of the camera with the most."""
     seen = np.isfinite(scene.rays[..., 0]).any(axis=-1)
     posed = np.isfinite(scene.position).all(axis=-1)
@@ -326,7 +347,7 @@ def _unposed(scene: Scene) -> Oddity:
     return Oddity(min(0.2, share) / 0.05, {"unposed_share": share})
 
 
-class _Body:
+class _ScoredBody:
     """The joints of a person [T, J, 3] by name."""
 
     def __init__(self, joints: Float) -> None:
@@ -472,7 +493,7 @@ class _Body:
         return ahead / pace if pace > _LEAST_PACE_MPS + 3 * white_m * np.sqrt(2 / weight) else 1.0
 
 
-def _distances(solved: Solved) -> Float:
+def _distances(solved: SolvedJoints) -> Float:
     """Return the median distance [C] m of the joints from each camera."""
     far = [_median(np.abs(depth[seen])) for depth, seen in zip(solved.depth, solved.seen, strict=True)]
     near_enough: Float = np.minimum(np.nan_to_num(np.array(far), nan=10.0), _FARTHEST_M)
@@ -484,7 +505,7 @@ def _moved_by(sigma: Float, far_m: Float) -> float:
     return float(np.sqrt(np.mean(sigma[:, 0] ** 2 + (far_m * sigma[:, 1]) ** 2)))
 
 
-def _place(flight: Sampled, scene: Scene, body: _Body, far_m: Float) -> dict[str, Oddity]:
+def _place(flight: Sampled, scene: SceneOfMoments, body: _ScoredBody, far_m: Float) -> dict[str, Oddity]:
     """Measure how far the person is from where people are: under drones, on the ground, at the actor."""
     odd: dict[str, Oddity] = {}
     stated_m, white_m = _moved_by(scene.sigma[:, :2], far_m), _moved_by(scene.sigma[:, 2:4], far_m)
@@ -514,7 +535,7 @@ def _place(flight: Sampled, scene: Scene, body: _Body, far_m: Float) -> dict[str
     return {name: each for name, each in odd.items() if np.isfinite(each.sigmas)}
 
 
-def _level(body: _Body, white_m: float) -> Oddity:
+def _level(body: _ScoredBody, white_m: float) -> Oddity:
     """Measure by how much the lowest joint rises above its lowest level, more than slopes excuse."""
     lowest = np.fmin.reduce(body.joints[..., 2], axis=1)
     rise_m = _quantile(lowest, 0.9) - _quantile(lowest, 0.1)
@@ -546,17 +567,17 @@ def _spread(values: Float) -> float:
     return 0.74 * (_quantile(values, 0.75) - _quantile(values, 0.25)) / max(_median(values), 1e-9)
 
 
-def residual_px(scene: Scene, solved: Solved) -> float:
+def residual_px(scene: SceneOfMoments, solved: SolvedJoints) -> float:
     """Return the median distance (px) of keypoints from the joints that were triangulated from them."""
     return round(_median(_residuals_px(scene, solved)), 2)
 
 
-def residuals_px(scene: Scene, solved: Solved) -> list[float]:
+def residuals_px(scene: SceneOfMoments, solved: SolvedJoints) -> list[float]:
     """Return the same of each camera."""
     return [round(_median(each), 2) for each in _residuals_px(scene, solved)]
 
 
-def _residuals_px(scene: Scene, solved: Solved) -> Float:
+def _residuals_px(scene: SceneOfMoments, solved: SolvedJoints) -> Float:
     toward = solved.joints[None] - np.nan_to_num(scene.position)[:, :, None, :]
     with np.errstate(invalid="ignore", divide="ignore"):
         across = np.linalg.norm(np.cross(solved.direction, toward), axis=-1) / np.abs(solved.depth)

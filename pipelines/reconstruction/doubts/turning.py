@@ -22,21 +22,29 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
 )
 from pipelines.reconstruction.background_tracks import Followed, Tracks
-from pipelines.reconstruction.doubts.scene import Camera
+from pipelines.reconstruction.doubts.scene import CameraLike
 from pipelines.session.description import Interpolation
 
-_SPAN_NS = 200_000_000  # between the two pictures of a turn
+# Over this time cameras turn by more than the errors of followed points, and points are still seen.
+_SPAN_NS = 200_000_000
 _MOST_PARTS, _MOST_TURNS = 20, 200  # of a camera that are looked at, spread over the flight
 _FEWEST_POINTS, _POINTS = 12, 40  # that two pictures share, and of these that are looked at
+# Fewer turns do not show a clock.
 _FEWEST_TURNS = 10
+# The rotation between two pictures converges in fewer steps.
 _STEPS = 3
-_BASELINE_M = 1e-3  # below it, a camera only turned
+# A camera that moved by less than this only turned.
+_BASELINE_M = 1e-3
+# Points beyond this many standard deviations count linearly.
 _HUBER = 1.5
 _LONGEST_S, _STEP_S = 1.0, 0.1  # of clocks that are tried
 _FINE_STEP_S, _FINE_STEPS = 0.02, 4  # around the best of them
-_LEAST_LATE_S = 0.2  # of clocks: errors of attitudes that wander pass for less
-_USUAL_SHARE = 0.9  # of turns; the others are outliers
-_UNEXPLAINED = 0.5  # most of the turning that the logs may leave unexplained, to say anything
+# Errors of attitudes that wander pass for smaller offsets of clocks.
+_LEAST_LATE_S = 0.2
+# The turns beyond this share are outliers.
+_USUAL_SHARE = 0.9
+# Logs that leave a larger share of the turning unexplained tell no time.
+_UNEXPLAINED = 0.5
 
 LEAST_GAIN = 16.0
 """Least gain of chi^2 with which other times of pictures are accepted."""
@@ -62,7 +70,7 @@ class Lateness:
     sigma_s: float  # of `late_s`; NaN of a factor
 
 
-def turns_of(camera: Camera, followed: Followed) -> Turns:
+def turns_of(camera: CameraLike, followed: Followed) -> Turns:
     """Choose pairs of pictures, 0.2 s apart, whose backgrounds tell how a camera turned between them."""
     t_ns = camera.frame_t_ns[followed.rows]
     step_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else np.inf
@@ -134,7 +142,7 @@ def _vectors(rotation: Float) -> Float:
 
 
 def lateness(
-    cameras: Sequence[Camera],
+    cameras: Sequence[CameraLike],
     turns: Mapping[int, Turns],
     between: Interpolation,
     factors: Sequence[float],
@@ -173,7 +181,7 @@ def lateness(
 
 
 def common_offset(
-    cameras: Sequence[Camera], followed: Mapping[str, object], between: Interpolation
+    cameras: Sequence[CameraLike], followed: Mapping[str, object], between: Interpolation
 ) -> Lateness | None:
     """Estimate the clock offset that all cameras share, from the turning of their backgrounds.
 
@@ -212,7 +220,7 @@ def is_sure_clock(late: Lateness) -> bool:
 
 
 def _gains(
-    camera: Camera,
+    camera: CameraLike,
     turns: Turns,
     between: Interpolation,
     times: Sequence[tuple[float, float]],
@@ -248,7 +256,7 @@ def _gains(
 
 
 def _left(
-    camera: Camera, turns: Turns, between: Interpolation, first_ns: Int64, second_ns: Int64
+    camera: CameraLike, turns: Turns, between: Interpolation, first_ns: Int64, second_ns: Int64
 ) -> tuple[Float, Float]:
     """Return the angles [N] by which the log turns otherwise at given times, and by which it turns.
 

@@ -28,10 +28,14 @@ from pipelines.session.progress import Halt, side_by_side
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 
-_SEGMENT = 256  # times of the skeleton
-_KEPT_BYTES = 40e6  # of a half's factors, before segments are factorised twice
-_WORTH = 0.1  # share of a half's factors below which none are kept
-_HELD = 1e10  # 1 / m^2, of a bone length
+# Factors of so many times of the skeleton are computed again together.
+_SEGMENT = 256
+# Where a half's factors take more bytes, segments are factorised twice.
+_KEPT_BYTES = 40e6
+# Keeping a smaller share of the factors saves no time.
+_WORTH = 0.1
+# Bone lengths with this precision (1 / m^2) do not move.
+_HELD = 1e10
 
 
 @dataclass

@@ -34,12 +34,17 @@ BOUND = 3.5
 """Residual, in standard deviations, beyond which an image point's weight falls: one good view in 450."""
 
 
+# A step that moves joints by less than this changes no figure.
 _CONVERGED_M = 2e-4
 _BOUNDS = (20.0, 8.0, BOUND)
-_MOST_GROWTH = 0.15  # of the body in a step: the linearisation in its size is not valid further
-_LEAST = 0.01  # smallest share of a step that is tried; it is made even if it raises the cost
-_SETTLED = 3  # rounds after which an estimate fits its prior
-_WIDE = 4.0  # times the usual residual of the start, because poses are not corrected yet
+# The linearisation in the body's size is not valid for a larger step.
+_MOST_GROWTH = 0.15
+# Of a step, no smaller share is tried; that is made even if it raises the cost.
+_LEAST = 0.01
+# An estimate fits its prior after so many rounds.
+_SETTLED = 3
+# The first bounds are so many times the usual residual of the start, because poses are not corrected yet.
+_WIDE = 4.0
 
 
 def solve(
@@ -182,13 +187,19 @@ def initial_state(problem: Problem, known: Knowledge, position: Float) -> State:
 
 # --- levels --------------------------------------------------------------------------------------------
 
-_GAP = 3.0  # usual steps: between stretches of a flight
-_EVERY = 3  # pictures of every third time are enough to estimate image noise and white errors
+# A step of more than so many usual ones lies between two stretches of a flight.
+_GAP = 3.0
+# Pictures of every third time are enough to estimate image noise and white errors.
+_EVERY = 3
 _BODY_ACCELERATION, _BODY_COUNT = 1.5, 3.0  # m/s^2, weight of this prior; the simulated walk's is 1.1
-_LEAST_ACCELERATION = 0.1  # m/s^2, along any combination of joints
+# No combination of joints accelerates by less (m/s^2); smaller priors make the equations singular.
+_LEAST_ACCELERATION = 0.1
+# Bones of a detector vary by more than this.
 _LEAST_BONE_M = 0.001
-_STRIDE = 1.5  # overshoot of a step over its goal, on a logarithmic scale
-_LEAST_DETERMINED = 0.03  # least share of a level determined by data: levels without data stay unchanged
+# Levels move this much farther than the goal of a round, on a logarithmic scale, to save rounds.
+_STRIDE = 1.5
+# A level of which data determine a smaller share stays unchanged.
+_LEAST_DETERMINED = 0.03
 _CHANGES = (0.04, 6.0)  # bounds of the change of a variance in one round
 _MOST_OF_CONSTANT = 1.6
 """Upper bound for constant errors: they are only a few numbers, and can diverge with the scale."""
@@ -318,8 +329,11 @@ def _process(process: Process, places: list[tuple[bool, int]], found: Moments, k
 
 # --- memory of keypoint errors -------------------------------------------------------------------------
 
-_LONGEST_S = 2.0  # lags up to here
-_STOPS = 0.02  # an autocorrelation below this is chance; the sum stops there
+# Correlations of keypoint errors over longer times cannot be told from motion.
+_LONGEST_S = 2.0
+# A smaller autocorrelation is chance, and the sum stops there.
+_STOPS = 0.02
+# A longer memory cannot be measured in stretches of a hundred times.
 _MOST = 30.0
 
 

@@ -16,9 +16,12 @@ import numpy as np
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.compilation import cached, helper
 
-NUMBERS = 10  # of a picture: shift in the world, rotation, shift in the camera, clock
-WHITE = 6  # the first of them have a white part
-_NEAREST_M = 0.1  # a joint nearer to the camera's plane is not used
+# Each picture has so many: shift in the world, rotation, shift in the camera, clock.
+NUMBERS = 10
+# The first so many numbers of a picture have a white part.
+WHITE = 6
+# A joint nearer to the camera's plane is not used.
+_NEAREST_M = 0.1
 
 
 class State(NamedTuple):

@@ -39,7 +39,7 @@ class Pictures:
 
 
 @dataclass(frozen=True)
-class Layout:
+class UnknownLayout:
     """Places of the unknowns other than joints: at knots in time, or shared by all times.
 
     A process adds to three of its camera's ten numbers. Shared unknowns are constant errors, then clocks,
@@ -55,7 +55,7 @@ class Layout:
     knot_t_s: Float  # [K]
 
 
-def lay_out(errors: Sequence[PoseErrors], clock_sigma_s: Float, bones: int, knot_t_s: Float) -> Layout:
+def lay_out(errors: Sequence[PoseErrors], clock_sigma_s: Float, bones: int, knot_t_s: Float) -> UnknownLayout:
     """Assign a place to every unknown; `clock_sigma_s` is 0 for a known clock."""
     processes, place = [], []
     start, number, knot, column = [0], [], [], []
@@ -81,7 +81,7 @@ def lay_out(errors: Sequence[PoseErrors], clock_sigma_s: Float, bones: int, knot
             column.append(shared_count)
             shared_count += 1
         start.append(len(number))
-    return Layout(
+    return UnknownLayout(
         processes=tuple(processes),
         place=tuple(place),
         entries=Entries(
@@ -148,9 +148,12 @@ class Problem:
 KNOT_S = 0.5
 """Distance of the knots between which slow pose errors are linear; deviations from that count as white."""
 
-_NEAR = 0.75  # steps of the skeleton: a picture further from its nearest time is not used
-_RATE_S = 0.25  # to both sides
-_GAP = 3.5  # usual steps: no interpolation if three consecutive times span more than this
+# A picture farther from its nearest time, in steps of the skeleton, is not used.
+_NEAR = 0.75
+# Rates of poses are taken over this time on both sides: over less, noise would exceed motion.
+_RATE_S = 0.25
+# If three consecutive times span more than so many usual steps, nothing is interpolated between them.
+_GAP = 3.5
 
 
 @dataclass(frozen=True)

@@ -45,34 +45,52 @@ from pipelines.reconstruction.refinement.system import System, misfit
 
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
 _LEARNING_ROUNDS, _FEWER_ROUNDS = 8, 3
+# Estimates converge in fewer rounds.
 _ROUNDS = 8
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a walking body, its limbs
+# Lengths between keypoints vary by this much before they are learned.
 _BONE_SIGMA_M = 0.02
+# Fewer times do not determine accelerations.
 _FEWEST_TIMES = 20
 # A gait repeats, and its accelerations are not random: the tight prior makes swings smaller. With bones of
 # constant length, it biases clock offsets by 7 ms in flights of 4 s. So clocks have this factor.
 LOOSE_MOTION = 3.0
-_FAST_MOTION = 2.0  # times the accelerations of the prior, where they were learned in uncorrected poses
+# Accelerations learned in uncorrected poses are too small for kicks by this factor.
+_FAST_MOTION = 2.0
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
-_UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
+# A prior that leaves more than so many times the image noise between neighbours is wrong.
+_UNEXPLAINED = 1.15
 _LEFT_BY_GIVEN = 2**0.5
 """Factor on the image noise under estimated levels: twice the variance. Right levels leave less."""
+# Right flights are not so many standard deviations from their prior.
 _SIGMAS = 4.0
-_SETTLING = 4  # rounds to test how well given levels explain the pictures
-_STATED = 10.0  # bonus on the log evidence of stated levels
-_STATED_DRIFT = 0.5  # bonus per picture if errors change over time: between knots they count as white
+# So many rounds show how well given levels explain the pictures.
+_SETTLING = 4
+# Other levels must exceed the log evidence of stated ones by this much.
+_STATED = 10.0
+# The same for each picture if errors change over time: between knots they count as white.
+_STATED_DRIFT = 0.5
+# Levels of constant errors settle in so many rounds.
 _LEVEL_ROUNDS = 3
-_HELD = 0.1  # of the usual level: constant errors stay as logged where the pictures let the scene grow
-_UNDETERMINED = 0.3  # of the usual level: a constant error with a smaller one is known from the background
+# Constant errors have this share of the usual level where the pictures let the scene grow.
+_HELD = 0.1
+# A constant error below this share of the usual level is known from the background.
+_UNDETERMINED = 0.3
 _UNINFORMATIVE_MEMORY = 30.0
 """Memory of image points from which levels of slow pose errors cannot be estimated."""
-_SMALL_SCALE = 0.01  # standard deviation of the formation's scale that does not matter
-_UNSEEN_SCALE = 0.85  # posterior over prior sigma of the scale above which pictures do not determine it
-_SLOW_SHARE = 0.2  # of the disagreement of views: least initial level of slow errors
-_LEAST_TURN = 2e-3  # rad, of the level of attitudes that is guessed
-_TURN_SHARE = 0.6  # of the disagreement of views: the level of attitudes where positions err, too
-_MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
+# A smaller standard deviation of the formation's scale does not matter.
+_SMALL_SCALE = 0.01
+# Pictures do not determine a scale whose posterior is a larger share of its prior than this.
+_UNSEEN_SCALE = 0.85
+# Slow errors begin with at least this share of the disagreement of views.
+_SLOW_SHARE = 0.2
+# The level of attitudes begins with at least this angle (rad).
+_LEAST_TURN = 2e-3
+# Attitudes make this share of the disagreement of views where positions err, too.
+_TURN_SHARE = 0.6
+# This is the median of the chi-square distribution with two degrees of freedom.
+_MEDIAN_OF_TWO = 2 * np.log(2)
 _FARTHEST = 1.8
 """Factor on the move expected from the disagreement of the views; good estimates moved by up to 1.6."""
 _FARTHEST_STATED = 3.2
@@ -83,7 +101,8 @@ a million times.
 """
 _DETERMINED_PLACE = 0.7
 """Share of a triangulated point's error by slow pose errors; above it, pictures do not determine a place."""
-_REFUSED = 0.5  # per picture: log evidence that stated levels may lie below the refused ones
+# Stated levels are tried after refused ones if their log evidence is at most this much lower per picture.
+_REFUSED = 0.5
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; "
 _INSTEAD = {"estimated": "it was estimated instead", "exact": "the poses were taken as they are"}
 PLACED_AS_LOGGED = (
@@ -143,7 +162,7 @@ def refine(
     part = _participating(start)
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
         return _none(len(clock_sigma_s), start, "too few joints or times were triangulated")
-    views = _Views(
+    views = _RefinementInput(
         t_s,
         tuple(_of_joints(sighting, part) for sighting in sightings),
         _renumbered(bones, part),
@@ -174,7 +193,7 @@ def refine(
 
 
 @dataclass(frozen=True)
-class _Views:
+class _RefinementInput:
     """Constants from which a problem is built."""
 
     t_s: Float  # [T]
@@ -205,7 +224,7 @@ class _Prior:
     held_m: float = 0.0  # standard deviation per axis by constant errors that are held as logged
 
 
-def _refined(views: _Views, prior: _Prior, *, measured: bool) -> Refined:
+def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails.
 
     `measured` is True if the prior of the poses was measured.

@@ -24,7 +24,8 @@ from pipelines.reconstruction.refinement.kernels import (
     posterior_of_picture,
 )
 
-_STRIP = 48  # rows; with fewer, products are too small to be fast
+# Products of fewer rows are too small to be fast.
+_STRIP = 48
 
 
 class Ties(NamedTuple):

@@ -17,13 +17,14 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.noise import EXACT, PoseErrors
 from pipelines.reconstruction.refinement import kernels
 from pipelines.reconstruction.refinement.kernels import Equations, PictureArrays, State
-from pipelines.reconstruction.refinement.problem import Knowledge, Layout, Problem
+from pipelines.reconstruction.refinement.problem import Knowledge, Problem, UnknownLayout
 from pipelines.reconstruction.refinement.sweeps import Sweep, Ties
 
 AT_ONCE = 4096
 """Pictures whose residuals are in memory together where only a sum over them is asked for."""
 
-_ANYWHERE_M = 100.0  # prior sigma of an unseen joint around its start
+# An unseen joint is within this distance of its start.
+_ANYWHERE_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class System:
 
     problem: Problem
     knowledge: Knowledge
-    layout: Layout
+    layout: UnknownLayout
     bound2: float  # of the robust loss
     held: bool = False  # bone lengths stay as they are
     pictures: PictureArrays = field(init=False)
@@ -124,7 +125,7 @@ def _loosened(problem: Problem, row: Int64, precision: Float) -> tuple[Int64, Fl
     return row, np.concatenate([precision, np.linalg.inv(covariance)])
 
 
-def _ties(layout: Layout) -> tuple[Float, Float]:
+def _ties(layout: UnknownLayout) -> tuple[Float, Float]:
     """Compute the share kept and the variance added [K - 1, c] from each knot to the next."""
     elapsed_s = np.diff(layout.knot_t_s)
     kept, variance = (
