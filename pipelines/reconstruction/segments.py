@@ -329,7 +329,15 @@ def _linear(left: pd.DataFrame, right: pd.DataFrame, share: Float, name: str) ->
 # --- figures -------------------------------------------------------------------------------------------
 
 _SUMMED = {
-    *("joint_frames", "e_recon_m2", "e_recon_terms", "root_frames_left_out", "pa_frames_left_out", "times"),
+    *(
+        "joint_frames",
+        "frames",
+        "e_recon_m2",
+        "e_recon_terms",
+        "root_frames_left_out",
+        "pa_frames_left_out",
+        "times",
+    ),
     *(
         "times_with_more",
         "status_counts",
