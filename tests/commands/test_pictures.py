@@ -84,11 +84,11 @@ def test_overlays_lie_on_frames_until_the_video_is_gone(tmp_path: Path) -> None:
     assert json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))["mpjpe_mm"] < 2
     succeeds("report", session)
     page = session / "report" / "index.html"
-    pictures = page.read_text(encoding="utf-8").count("data:image/webp;base64,U")
+    pictures = page.read_text(encoding="utf-8").count("UklGR")
     assert pictures > 0
     (tmp_path / "drone1.mp4").unlink()
     succeeds("report", session)
-    fewer = page.read_text(encoding="utf-8").count("data:image/webp;base64,U")
+    fewer = page.read_text(encoding="utf-8").count("UklGR")
     assert 0 < fewer < pictures
     stage = json.loads((session / "report" / "stage.json").read_text(encoding="utf-8"))
     assert any("drone1" in warning for warning in stage["warnings"])
@@ -101,7 +101,7 @@ def test_overlays_on_pictures_of_a_log(tmp_path: Path) -> None:
     succeeds("reconstruct", session, "--method", "robust")
     succeeds("report", session)
     page = session / "report" / "index.html"
-    assert "data:image/webp;base64,U" in page.read_text(encoding="utf-8")
+    assert "UklGR" in page.read_text(encoding="utf-8")
 
 
 def test_a_letterboxed_video_gets_the_intrinsics_of_what_lies_between_its_bars(tmp_path: Path) -> None:
