@@ -82,6 +82,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 REPORT = Stage("report", revision=15)
+# Figures of another revision are drawn again.
 _FIGURES_REVISION = 7
 
 

@@ -38,9 +38,9 @@ LOGGED = (FLOWN, PLANNED)
 
 # Pictures of a person who walks differ from second to second.
 LOOK_PERIOD_S = 1.0
-# `mocap reconstruct` first takes this standard deviation of a good keypoint, too.
+# The same standard deviation of a good keypoint is the first guess of `mocap reconstruct`.
 PIXEL_SIGMA_PX = 3.0
-# `mocap reconstruct` leaves out keypoints below this confidence, too.
+# Keypoints below this confidence are left out, as in `mocap reconstruct`.
 MIN_CONFIDENCE = 0.3
 
 _POSITION = ["x", "y", "z"]

@@ -61,8 +61,6 @@ TIME_ROUNDING_S = 1e-6
 # More rounds of planning in turn change no path in practice.
 MAX_ROUNDS_IN_TURN = 10
 
-_TRIANGLE = np.triu_indices(3)
-
 RollOut = Callable[[FormationPath], tuple[Float, Float]]
 """Predicts the places of the drones [n, N, 3] and of the actor [N, 3], in m, at the times of N waypoints."""
 
@@ -191,7 +189,7 @@ class _JointPlanner(_TeamPlanner):
         states = _all_states(yaw_set(self._yaws, yaw_rad), np.unique(tilts), ranges)
         self._lattice = _lattice_of(states, config)
         self._offsets = slot_offsets(states)
-        information = ray_information(self._offsets, config.tuning.errors)[:, *_TRIANGLE]
+        information = ray_information(self._offsets, config.tuning.errors)[:, *np.triu_indices(3)]
         per_yaw = len(states) // self._yaws
         first = np.arange(len(states))[:, None] + np.arange(drones) * (self._yaws // neighbour) * per_yaw
         formations = first % len(states)

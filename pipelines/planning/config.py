@@ -62,9 +62,9 @@ class PlannerTuning:
     prior_sigma_m: float = 2.0
     # Plans replace each other every 0.5 s, because slots move little in that time.
     team_plan_period_s: float = 0.5
-    # `group` chooses slots this much farther from everybody than drones have to be, for the actor walks on.
+    # Slots of `group` are this much farther from everybody than drones have to be, for people walk on.
     group_margin_m: float = 1.0
-    # `joint` judges the first 5 s of a flown path, because the rest is planned anew before it is flown.
+    # The arm `joint` judges the first 5 s of a path, because the rest is planned anew before it is flown.
     rolled_out_s: float = 5.0
     # A flown path that is 10 deg steeper than asked, or 2 m from the actor's distance, costs more.
     steeper_deg: float = 10.0
@@ -193,34 +193,44 @@ class PlannerConfig:
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    radius_m: Positive = 10.0  # distance of the slots from the actor's hips
-    tilt_deg: Annotated[float, Field(ge=-10, le=85, strict=True)] = 15.0  # elevation of the slots
+    # Slots have this distance from the actor's hips.
+    radius_m: Positive = 10.0
+    # Slots have this elevation above the actor's hips.
+    tilt_deg: Annotated[float, Field(ge=-10, le=85, strict=True)] = 15.0
+    # The arm `joint` chooses ranges between the least and the largest of these.
     ranges_m: Annotated[tuple[Positive, ...], Field(min_length=1)] = (8.0, 10.0, 12.0)
-    """`joint` chooses ranges between the least and the largest of these"""
+    # Yaws count from east, or from the actor's heading.
     yaw_frame: Literal["world", "heading"] = "world"
-    """zero of yaws: east, or the actor's heading"""
-    yaw_rate_deg_per_s: Positive = 22.5  # formations turn no faster
+    # Formations turn no faster than this.
+    yaw_rate_deg_per_s: Positive = 22.5
+    # The formation search looks so far ahead.
     horizon_s: Annotated[float, Field(gt=0, le=60, strict=True)] = 10.0
-    """the formation search looks so far ahead"""
-
-    w_obs: NotNegative = 1.0  # formation search: weight of a slot near an obstacle
-    w_occ: NotNegative = 1.0  # formation search: weight of the occupied share of a line of sight
-
-    l_obs: NotNegative = 50.0  # local planner: weight of obstacles
-    l_occ: NotNegative = 5.0  # local planner: weight of occupied lines of sight
-    l_form: Positive = 3.0  # local planner: weight of the distance from the slot
-
-    separation_m: Positive = 3.0  # least distance of two drones
-    drone_radius_m: NotNegative = 0.5  # least distance of a drone from obstacles
-    actor_distance_m: NotNegative = 3.0  # least distance of a drone from everybody
-    zones: Annotated[tuple[Zone, ...], BeforeValidator(_zones)] = ()  # where drones must not fly
-
-    acceleration_mps2: Positive = 4.0  # limit of a drone
-    speed_mps: Positive = 8.0  # limit of a drone
-    jerk_mps3: Positive = 50.0  # limit of a drone
-
+    # The formation search weighs slots near obstacles by this.
+    w_obs: NotNegative = 1.0
+    # The formation search weighs the occupied share of a line of sight by this.
+    w_occ: NotNegative = 1.0
+    # The local planner weighs obstacles by this.
+    l_obs: NotNegative = 50.0
+    # The local planner weighs occupied lines of sight by this.
+    l_occ: NotNegative = 5.0
+    # The local planner weighs the distance from the slot by this.
+    l_form: Positive = 3.0
+    # Two drones keep this distance from each other.
+    separation_m: Positive = 3.0
+    # A drone keeps this distance from obstacles.
+    drone_radius_m: NotNegative = 0.5
+    # A drone keeps this distance from everybody.
+    actor_distance_m: NotNegative = 3.0
+    # Drones must not fly in these prisms.
+    zones: Annotated[tuple[Zone, ...], BeforeValidator(_zones)] = ()
+    # A drone accelerates by no more than this.
+    acceleration_mps2: Positive = 4.0
+    # A drone flies no faster than this.
+    speed_mps: Positive = 8.0
+    # The acceleration of a drone changes no faster than this.
+    jerk_mps3: Positive = 50.0
+    # The actor's acceleration has this spectral density, m²/s³: 0.1 for walking, 1.5 for jogging.
     actor_q: Positive = 0.1
-    """spectral density of the actor's acceleration, m²/s³: 0.1 for who walks, 1.5 for who jogs and stops"""
 
     tuning: PlannerTuning = field(default=PlannerTuning(), repr=False)
 

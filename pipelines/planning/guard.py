@@ -41,6 +41,7 @@ INSIDE_M = 1e-3
 WAY_OUT_MARGIN_M = 0.1
 # A drone stops from 2 m/s within its radius of half a metre.
 CLIMB_MPS = 2.0
+# A way aside is shorter than a climb.
 ASIDE_MPS = 1.5
 # A drone takes up another velocity with this share of its acceleration; tracking needs the rest.
 ACCELERATION_SHARE = 0.75

@@ -46,8 +46,9 @@ from pipelines.session.records import Occupancy
 MOST_DRONES = 8
 # The detector's errors are modelled for 30 Hz, and 25 divide the 50 of the tracking.
 PICTURES_HZ = 25.0
-# The report's cost map has a column every half second and a row every 5 deg.
+# The report's cost map has a column every half second.
 COST_MAP_HZ = 2.0
+# The report's cost map has a row every 5 deg.
 COST_MAP_YAWS = 72
 # Errors of poses change slowly along a flight, so that the mean over 200 moments is that of all.
 NOISE_LOOKS = 200

@@ -31,21 +31,30 @@ LIMIT_ROUNDING = 1.0 + 1e-6
 LOOKS_PER_S = 5.0
 # A point needs two views.
 MIN_VIEWS = 2
-# The person of Hughes et al. 2024 is a hexagonal prism with a lid: distance of a side from the axis, height.
+# The person of Hughes et al. 2024 is a hexagonal prism with a lid.
 PRISM_SIDES = 6
+# The sides of that prism are this far from the axis.
 PRISM_APOTHEM_M = 0.484
+# The prism of Hughes et al. has this height.
 PRISM_HEIGHT_M = 1.8
-# The values of a rotary-wing aircraft of 20 N are those of Zeng, Xu & Zhang 2019 ("Energy Minimization for
-# Wireless Communication with Rotary-Wing UAV", IEEE Trans. Wireless Commun. 18(4), table I and eq. 12).
-BLADE_POWER_W = 79.8563  # in hovering
-INDUCED_POWER_W = 88.6279  # in hovering
+# The rotary-wing aircraft of Zeng, Xu & Zhang 2019 ("Energy Minimization for Wireless Communication with
+# Rotary-Wing UAV", IEEE Trans. Wireless Commun. 18(4), table I and eq. 12) hovers with this blade power.
+BLADE_POWER_W = 79.8563
+# The aircraft of table I hovers with this induced power.
+INDUCED_POWER_W = 88.6279
+# The tips of its rotors have this speed (table I).
 TIP_SPEED_MPS = 120.0
+# The air through its rotors has this mean speed in hovering (table I).
 INDUCED_SPEED_MPS = 4.03
-PARASITE_W_PER_MPS3 = 0.5 * 0.6 * 1.225 * 0.05 * 0.503  # drag ratio, air density, solidity, disc area
+# The factors are drag ratio, air density, solidity and disc area of table I.
+PARASITE_W_PER_MPS3 = 0.5 * 0.6 * 1.225 * 0.05 * 0.503
+# The aircraft of table I has this weight.
 WEIGHT_N = 20.0
-# A standing person of 1.75 m is a cylinder of this radius and these heights about the hips.
+# A standing person of 1.75 m is a cylinder of this radius.
 BODY_RADIUS_M = 0.25
+# The cylinder reaches from the hips down to the ground.
 BODY_BELOW_HIPS_M = 0.95
+# The cylinder reaches from the hips up to the crown.
 BODY_ABOVE_HIPS_M = 0.8
 
 

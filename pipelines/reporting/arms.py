@@ -39,9 +39,9 @@ from pipelines.reporting.chart import (
     stacked,
     stride_for,
     table,
+    way_m,
 )
 from pipelines.reporting.content import ReplanContent, items, number, section, text
-from pipelines.reporting.figures import way_m
 from pipelines.reporting.wording import (
     ABSENT,
     THIN,
@@ -80,13 +80,13 @@ KEYFRAMES = 6
 HEIGHT_LEVELS_M = (LOWEST_OBSTACLE_M, 1.0, 2.0, 4.0, 8.0, 16.0)
 # More columns of the cost map cannot be told apart.
 MAX_COST_TIMES = 200
-# More moments, or cameras of an arm, make the people too small to see.
+# More moments make the people too small to see.
 SEEN_MOMENTS = 4
+# More cameras of an arm make the people too small to see.
 SEEN_CAMERAS = 2
 # The sides of a panel are this many lengths of the largest person.
 SEEN_ROOM = 1.3
 
-TURN_DEG = 360.0
 _HIDDEN = STATUS_COLOURS["rejected"]
 _ZONE_HATCH = "////"
 
@@ -344,7 +344,7 @@ def _continuous_deg(angle_rad: Float, start_deg: float) -> Float:
     result = np.full(angle_rad.shape, np.nan)
     if known.any():
         degrees = np.degrees(np.unwrap(angle_rad[known]))
-        result[known] = degrees - TURN_DEG * np.round((degrees[0] - start_deg) / TURN_DEG)
+        result[known] = degrees - 360.0 * np.round((degrees[0] - start_deg) / 360.0)
     return result
 
 
@@ -792,7 +792,7 @@ def draw_yaw(arms: tuple[ArmTrack, ...], costs: CostMap | None) -> Plate:
     everything = np.concatenate([line for arm in arms for line in (arm.yaw_deg, arm.commanded_yaw_deg)])
     known = everything[np.isfinite(everything)]
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
-    spare = max(TURN_DEG - (high - low), 40.0) / 2  # one turn at least
+    spare = max(360.0 - (high - low), 40.0) / 2  # one turn at least
     low, high = low - spare, high + spare
     with page_style():
         figure = new_figure(3.3)
@@ -858,8 +858,8 @@ def _draw_costs(axes: Axes, costs: CostMap, low: float, high: float) -> tuple[li
     levels = [float(v) for v in MaxNLocator(5).tick_values(least, most) if least < v < float(np.nanmax(cost))]
     if most <= least or not levels:
         return [], step
-    turns = range(int(np.floor((low - costs.yaw_deg[0]) / TURN_DEG)) - 1, int(np.ceil(high / TURN_DEG)) + 2)
-    yaw_deg = np.concatenate([costs.yaw_deg + TURN_DEG * turn for turn in turns])
+    turns = range(int(np.floor((low - costs.yaw_deg[0]) / 360.0)) - 1, int(np.ceil(high / 360.0)) + 2)
+    yaw_deg = np.concatenate([costs.yaw_deg + 360.0 * turn for turn in turns])
     drawn = (yaw_deg > low - 20) & (yaw_deg < high + 20)
     shade(axes, t_s, yaw_deg[drawn], np.tile(cost, (1, len(turns)))[:, drawn], levels)
     return levels, step

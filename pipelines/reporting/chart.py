@@ -278,6 +278,17 @@ def stacked(tables: list[pd.DataFrame]) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
+def colour_and_style(k: int) -> tuple[str, Any]:
+    """Return the colour and the line style of camera, arm or session k."""
+    return CAMERAS[k % len(CAMERAS)], LINE_STYLES[k // len(CAMERAS) % len(LINE_STYLES)]
+
+
+def way_m(path: Float) -> float:
+    """Compute the length of a path [T, 2 or 3] over ground, without its gaps."""
+    steps = np.sqrt((np.diff(path[:, :2], axis=0) ** 2).sum(axis=1))
+    return float(steps[np.isfinite(steps)].sum())
+
+
 def stride_for(count: int, most: int = MOST_POINTS) -> int:
     """Return the stride that leaves at most `most` of `count`."""
     return max(1, -(-count // most))

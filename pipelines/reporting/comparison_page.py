@@ -23,6 +23,7 @@ from pipelines.reporting.chart import (
     RowPoints,
     as_csv,
     chart,
+    colour_and_style,
     means,
     percentiles,
     stacked,
@@ -31,7 +32,6 @@ from pipelines.reporting.chart import (
     time_bins,
 )
 from pipelines.reporting.content import SessionContent, section, text
-from pipelines.reporting.figures import colour_and_style
 from pipelines.reporting.session_comparison import (
     MEASURE_OF,
     MEASURES,

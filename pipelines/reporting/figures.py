@@ -17,9 +17,7 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import rotate
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.chart import (
-    CAMERAS,
     INK,
-    LINE_STYLES,
     MOST_BINS,
     MUTED,
     PAPER,
@@ -37,6 +35,7 @@ from pipelines.reporting.chart import (
     axis_label,
     bounds,
     chart,
+    colour_and_style,
     near_zero,
     new_figure,
     page_style,
@@ -47,6 +46,7 @@ from pipelines.reporting.chart import (
     table,
     tabled,
     time_bins,
+    way_m,
 )
 from pipelines.reporting.content import MeasuredMotion, middles, side_of, standing_heights
 from pipelines.reporting.summary import CameraRow, Summary
@@ -84,7 +84,6 @@ STILL_SHARE = 0.005
 SIDE_COLOURS = "Left in blue, right in orange."
 """Words for the colours of limbs, which no camera has."""
 
-_COLUMNS = 2  # of panels of joints and of angles
 _SHOWN_ANGLES = (
     *("hip_flexion", "knee_flexion", "ankle_dorsiflexion"),
     *("trunk_flexion", "shoulder_elevation", "elbow_flexion"),
@@ -121,11 +120,6 @@ def draw_all(
         if summary.bones:
             plates.append(_bone_lengths(summary))
     return {plate.key: plate for plate in plates if plate is not None}
-
-
-def colour_and_style(k: int) -> tuple[str, Any]:
-    """Return the colour and the line style of camera, arm or session k."""
-    return CAMERAS[k % len(CAMERAS)], LINE_STYLES[k // len(CAMERAS) % len(LINE_STYLES)]
 
 
 def stretch_words(bins: Float, times: int) -> str:
@@ -253,12 +247,6 @@ def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> tuple[Flo
         if rows.size:
             pieces += [path[np.unique([*rows[::stride], rows[-1]])], np.full((1, 2), np.nan)]
     return (np.concatenate(pieces), stride) if pieces else (path, stride)
-
-
-def way_m(path: Float) -> float:
-    """Compute the length of a path [T, 2 or 3] over ground, without its gaps."""
-    steps = np.sqrt((np.diff(path[:, :2], axis=0) ** 2).sum(axis=1))
-    return float(steps[np.isfinite(steps)].sum())
 
 
 # --- joint by joint ---
@@ -485,10 +473,10 @@ def _angles(summary: Summary, angles: pd.DataFrame) -> Plate | None:
 
 
 def _in_columns(panels: list[Panel]) -> list[list[Panel]]:
-    """Set panels side by side, and label the time below the last ones."""
-    last = (len(panels) - 1) // _COLUMNS * _COLUMNS
+    """Set two panels side by side, and label the time below the last ones."""
+    last = (len(panels) - 1) // 2 * 2
     labelled = [replace(each, x_label=TIME_LABEL if k >= last else "") for k, each in enumerate(panels)]
-    return [labelled[k : k + _COLUMNS] for k in range(0, len(panels), _COLUMNS)]
+    return [labelled[k : k + 2] for k in range(0, len(panels), 2)]
 
 
 # --- the body ---

@@ -52,6 +52,7 @@ SIDES: dict[str, Colour] = {"left": (245, 183, 89), "right": (92, 157, 255), "":
 FOUND: Colour = (224, 142, 255)
 REJECTED: Colour = (69, 90, 255)
 UNMEASURED: Colour = (209, 205, 201)
+# Light and dark marks are both seen on this grey.
 GREY = 96
 _DARK: Colour = (0, 0, 0)
 _PAPER: Colour = (255, 255, 255)
@@ -62,8 +63,9 @@ BONE_OF_DIAGONAL = 1 / 700
 TEXT_OF_DIAGONAL = 1 / 2000
 # No letter can be read below this scale of OpenCV.
 MIN_TEXT_SCALE = 0.3
-# The box of a person has this much room at each side, and arms of this length at its corners.
+# The box of a person has this much room at each side.
 BOX_MARGIN = 0.1
+# Longer arms of the corners would close the box.
 BOX_CORNER = 0.15
 # The enlarged square takes so much of the picture's height that the person stays visible.
 INLET_SHARE = 0.42
@@ -71,15 +73,17 @@ INLET_SHARE = 0.42
 CHI2_95 = 5.991
 # OpenCV counts in 32 bits: a point just before the camera's plane lies farther out.
 MAX_COORDINATE_PX = 1e6
-# A panel shows the people with a third of their size around them, and at least so many pixels.
+# A panel shows the people with a third of their size around them.
 PANEL_MARGIN = 1.3
+# Fewer pixels would show single pixels as squares.
 MIN_PANEL_PX = 96.0
 # A panel this wide, by the picture's width, shows nearly all of it and needs no map.
 WHOLE_SHARE = 0.8
 # The map takes a quarter of the panel's width.
 MAP_SHARE = 0.27
-# Wider panels show no more on the page; all pictures of a page together have at most so many pixels.
+# Wider panels show no more on the page.
 MAX_PANEL_PX = 640
+# All panels of a page together have at most so many pixels, about 1.5 MB.
 MAX_PIXELS_OF_PAGE = 6_000_000
 # Marks stay sharp at this quality of WebP.
 PANEL_QUALITY = 80

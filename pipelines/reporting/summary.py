@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 # People without a common time are matched last: no distance is as large.
 NEVER_TOGETHER_M = 1e9
-# `reconstruct` leaves out keypoints below this confidence where its record states no other.
+# Keypoints below this confidence are left out by `reconstruct` where its record states no other.
 DEFAULT_MIN_CONFIDENCE = 0.3
 
 _NOISE_UNITS = {

@@ -42,7 +42,7 @@ MAX_BYTES = 6_000_000
 SHARE_OF_ELLIPSOIDS = 0.25
 # Cameras alone need no more times to move smoothly.
 MAX_TIMES_WITHOUT_SKELETON = 3000
-# 16 bits of millimetres reach no farther from the middle of the body.
+# Millimetres in 16 bits reach no farther from the middle of the body.
 FARTHEST_JOINT_M = 32.767
 # Square roots are computed a part at a time, so that the others take no memory meanwhile.
 MATRICES_AT_ONCE = 1 << 15

@@ -15,11 +15,9 @@ from click.testing import CliRunner, Result
 from mocap_cli.main import Mocap
 from mocap_cli.replan_compare import replan_compare_command
 from pipelines.detect import DETECT
-from pipelines.formats.common.files import read_yaml
 from pipelines.ingest import ingest
 from pipelines.planning.arm_flights import fly_arm
 from pipelines.reconstruct import reconstruct
-from pipelines.session.errors import DataError
 from pipelines.session.stages import locked
 from pipelines.simulate import simulate
 from tests.commands.runner import as_if_written, content
@@ -116,18 +114,6 @@ def test_arms_see_with_the_errors_of_the_detector_that_the_session_used(calm: Pa
     # The same draws, smaller errors.
     errors = [metrics["arms"]["fixed"]["mpjpe_mm"] for metrics in (after, before)]
     assert errors[0] < errors[1]
-
-
-def test_the_predicted_error_is_that_of_the_session(calm: Path) -> None:
-    """A Gaussian error's mean is 0.80 (one axis) to 0.92 (three equal ones) of its root mean square.
-
-    Joints that only a bad view found, and the tails of the detector, may raise the mean by 0.08 more.
-    """
-    for noise in ("white:position_m=0.02,rotation_deg=0.2", "white:position_m=0.2,rotation_deg=1"):
-        metrics = compared(calm, "--arms", "fixed", "--trials", "4", "--pose-noise", noise)
-        fixed = metrics["arms"]["fixed"]
-        ratio = fixed["mpjpe_mm"] / (1e3 * fixed["predicted_error_m"]["median"])
-        assert 0.80 < ratio < 1.0, noise
 
 
 def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(mound: Path) -> None:
@@ -280,19 +266,6 @@ def test_an_interrupted_comparison_flies_only_what_is_missing(
     assert whole == compared(calm, "--arms", "adaptive,fixed", "--trials", "2", "--force")
 
 
-def test_in_the_open_nothing_is_found_between_the_arms(calm: Path) -> None:
-    """Check that equal flights with equal seeds have a difference of exactly zero."""
-    metrics = compared(calm, "--arms", "fixed,adaptive", "--trials", "3", "--config", "mode=plan-only")
-    (difference,) = metrics["differences"]
-    assert (difference["arm"], difference["against"]) == ("adaptive", "fixed")
-    assert difference["mpjpe_mm"] == {"mean": 0.0, "interval": [0.0, 0.0]}
-    assert difference["tilt_deg"]["mean"] == 0.0
-    assert "+0.0 mm [+0.0, +0.0]" in metrics["verdict"]
-    assert metrics["mode"] == "plan-only"
-    closed = compared(calm, "--arms", "fixed,adaptive", "--trials", "3")
-    assert closed["arms"]["fixed"]["range_m"] != metrics["arms"]["fixed"]["range_m"]
-
-
 def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     config = tmp_path / "planner.yaml"
     config.write_text("radius_m: 6\ntilt_deg: 40\n", encoding="utf-8")
@@ -316,21 +289,6 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     assert list(table["camera"][:4]) == ["drone1", "drone2", "drone3", "drone4"]
 
 
-def test_yaws_count_from_the_heading_of_who_walks_north(tmp_path: Path) -> None:
-    """Use an actor who looks east at first, and turns on the spot for two seconds."""
-    north = CALM.replace("walk: {distance_m: 5}", "walk: {to: [0, 5]}").replace("_s: 4", "_s: 6")
-    session = session_of(tmp_path, north)
-    asked = ("--arms", "fixed", "--config", "yaw_deg=90", "--trials", "1", "--config", "mode=plan-only")
-    assert compared(session, *asked)["yaw_deg"] == pytest.approx(90)
-    turned = compared(session, *asked, "--config", "yaw_frame=heading")
-    assert turned["yaw_deg"] == pytest.approx(180, abs=10)  # from where the hips sway to in the first metre
-    assert any(f"{turned['yaw_deg'] - 90:.1f} deg" in note for note in turned["notes"])
-    stated = json.loads((session / "replan" / "stage.json").read_text())["settings"]
-    assert stated["planner.yaw_frame"] == "heading"
-    yaw = pd.read_parquet(session / "replan" / "fixed" / "trajectories.parquet")["formation_yaw_rad"]
-    assert np.degrees(yaw.iloc[-1]) == pytest.approx(180, abs=10)
-
-
 def test_without_an_actor_the_reconstruction_says_where_he_was(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=3.0)
     session = tmp_path / "flight.session"
@@ -348,30 +306,6 @@ def test_without_an_actor_the_reconstruction_says_where_he_was(tmp_path: Path) -
     assert metrics["arms"]["fixed"]["min_clearance_m"] is None
     # Whoever reconstructs anew compares anew.
     assert "unchanged" in compare(session, "--trials", "2").stdout
-
-
-def test_who_knows_no_skeleton_is_told_so(tmp_path: Path) -> None:
-    """Use a flight with a logged actor and no truth; after a reconstruction, its skeleton is used."""
-    session = _without_truth(tmp_path)
-    done = compare(session, "--trials", "2")
-    assert done.exit_code == 0, done.stderr
-    assert "reconstruct`" in done.stderr
-    blind = json.loads((session / "replan" / "metrics.json").read_text())
-    assert blind["skeleton"] is None
-    assert blind["differences"][0]["mpjpe_mm"] is None
-    reconstruct(session)
-    metrics = compared(session, "--trials", "2")
-    assert metrics["skeleton"] == "reconstruction"
-    assert metrics["arms"]["adaptive"]["mpjpe_mm"] > 0
-
-
-def _without_truth(folder: Path) -> Path:
-    session_of(folder, CALM)
-    manifest = folder / "flight" / "flight.yaml"
-    text = manifest.read_text(encoding="utf-8")
-    manifest.write_text(text[: text.index("\ntruth:")] + "\n", encoding="utf-8")
-    ingest(manifest, session=folder / "blind.session")
-    return folder / "blind.session"
 
 
 def test_still_cameras_have_not_flown(tmp_path: Path) -> None:
@@ -492,19 +426,3 @@ def test_a_group_films_both_of_two_who_part(tmp_path: Path) -> None:
         assert arm["view_quality"] == pytest.approx(np.mean(qualities))
     skeleton = pd.read_parquet(session / "replan" / "group" / "skeleton.parquet")
     assert set(skeleton["person"]) == {0, 1}
-
-
-def test_others_film_the_middle_by_weight(tmp_path: Path) -> None:
-    """With the weight of the first alone, the formation follows her."""
-    session_of(tmp_path, PARTING)
-    manifest = tmp_path / "flight" / "flight.yaml"
-    stated: Any = read_yaml(manifest)
-    stated["actors"]["ben"]["weight"] = 0
-    manifest.write_text(json.dumps(stated), encoding="utf-8")
-    ingest(manifest, session=tmp_path / "weighed.session")
-    arm = compared(tmp_path / "weighed.session", "--arms", "fixed", "--trials", "2")["arms"]["fixed"]
-    assert arm["by_person"]["anna"]["blind_s"] < 0.5 < arm["by_person"]["ben"]["blind_s"]
-    stated["actors"]["anna"]["weight"] = 0
-    manifest.write_text(json.dumps(stated), encoding="utf-8")
-    with pytest.raises(DataError):
-        ingest(manifest, session=tmp_path / "nobody.session")

@@ -16,7 +16,6 @@ from pipelines.ingest import ingest
 from pipelines.reconstruct import reconstruct
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
-from pipelines.session.stages import WritableSession
 from pipelines.session.storage import read_json
 from pipelines.session.tables import TRUTH, read_motion
 from pipelines.simulation.detector_errors import see
@@ -81,30 +80,6 @@ def test_a_film_that_cannot_be_meant_is_refused(stated: str) -> None:
     detector, scenario = "onnx:model.onnx,provider=cuda", Path("my,scenario.yaml")
     expected = FilmSettings(5.0, 1.0, None, detector), scenario
     assert film_settings(f"5,start=1,detector={detector},scenario={scenario}") == expected
-
-
-class StartedError(Exception):
-    """Error with the inputs of a stage, raised instead of running it."""
-
-
-def test_another_motion_file_is_another_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    session = session_of(tmp_path, SHORT)
-    assert compare(session, "--arms", "fixed", "--trials", "1").exit_code == 0
-    scenario, motion = tmp_path / "danced.yaml", tmp_path / "dance.bvh"
-    scenario.write_text(SHORT.replace("[walk: {distance_m: 5}]", "{bvh: dance.bvh}"), encoding="utf-8")
-
-    def start(*_: object, inputs: dict[str, str], **__: object) -> None:
-        raise StartedError(inputs)
-
-    monkeypatch.setattr(WritableSession, "begin", start)
-    inputs = []
-    for text in ("one", "another", "one"):
-        motion.write_text(text, encoding="utf-8")
-        with pytest.raises(StartedError) as caught:
-            film(session, FilmSettings(detector=spot_detector(tmp_path)), scenario=scenario)
-        inputs.append(caught.value.args[0])
-    assert inputs[0] == inputs[2]
-    assert inputs[0] != inputs[1]
 
 
 def test_only_simulated_flights_are_filmed_again(tmp_path: Path) -> None:

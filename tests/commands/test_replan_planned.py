@@ -126,10 +126,3 @@ def test_a_plan_that_cannot_be_used_gets_one_line(flown: Path, tmp_path: Path, c
     (flown / "old.tum").write_text("5.0 0 0 0 0 0 0 1\n6.0 0 0 0 0 0 0 1\n", encoding="utf-8")
     plan, said = REFUSED[case]
     assert said in refused("ingest", with_plan(flown, "bad", **plan), "-o", tmp_path / "bad.session")
-
-
-def test_who_has_no_plan_cannot_compare_with_it(flown: Path) -> None:
-    session = flown.parent / "flight.session"
-    line = refused("replan-compare", session, "--arms", "planned")
-    assert "flight.session" in line
-    assert "`plan:`" in line

@@ -55,15 +55,6 @@ def nanoseconds(t_s: Float) -> Int64:
     return np.round(t_s * 1e9).astype(np.int64)
 
 
-def test_only_what_counts_is_in_the_mean_over_time() -> None:
-    t_s = np.arange(0, 20, 0.5)
-    estimate = mean_over_time(np.where(t_s < 10, 3.0, 99.0), t_s < 10, nanoseconds(t_s), seed=0)
-    assert estimate is not None
-    assert estimate.mean == pytest.approx(3.0)
-    assert estimate.interval == pytest.approx((3.0, 3.0))
-    assert mean_over_time(t_s, np.zeros(len(t_s), dtype=bool), nanoseconds(t_s), seed=0) is None
-
-
 def test_errors_on_common_joint_frames() -> None:
     """Two trials, two times, one joint: the second arm misses one, a third arm everything."""
     nan = np.nan

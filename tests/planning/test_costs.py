@@ -53,14 +53,6 @@ def test_error_of_two_cameras_as_in_closed_form() -> None:
         assert error**2 == pytest.approx(s2 / placed * (0.5 + 2 / np.sin(gamma) ** 2), rel=1e-9)
 
 
-def test_one_camera_or_two_face_to_face_determine_nothing() -> None:
-    offset = np.array([[10.0, 1.0, 2.0], [-10.0, -1.0, -2.0]])
-    information = ray_information(offset, CONFIG.tuning.errors)
-    assert np.isinf(predicted_error(information)).all()
-    assert np.isinf(predicted_error(information.sum(axis=0)))
-    assert np.isinf(predicted_error(np.zeros((3, 3))))
-
-
 @given(st.integers(0, 10_000))
 def test_closed_forms_equal_linear_algebra(seed: int) -> None:
     rng = np.random.default_rng(seed)

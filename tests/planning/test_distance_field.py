@@ -77,16 +77,6 @@ def test_gradient_is_the_derivative_of_the_interpolated_value() -> None:
         assert np.abs(gradient[:, axis] - numeric).max() < 1e-8
 
 
-def test_outside_the_grid_as_at_its_border() -> None:
-    field = distance_field(slab())
-    inside, _ = field.sample(np.array([0.0, 0.0, 4 - RES / 2]))
-    above, gradient = field.sample(np.array([[0.0, 0.0, 30.0], [50.0, -50.0, 2.0]]))
-    assert above[0] == inside
-    assert gradient[0].tolist() == [0, 0, 0]
-    assert above[1] == pytest.approx(1.0, abs=1e-5)
-    assert gradient[1] == pytest.approx([0, 0, 1], abs=1e-5)
-
-
 def test_unknown_is_free_or_occupied_as_asked() -> None:
     point = np.array([0.0, 0.0, 3.0])
     assert distance_field(slab(unknown_above=True)).sample(point)[0] == pytest.approx(2.0, abs=1e-5)

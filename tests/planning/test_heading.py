@@ -13,7 +13,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT, Arm
 from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import open_space
-from pipelines.planning.forecast import Forecast, YawZero, first_heading
+from pipelines.planning.forecast import Forecast, YawZero
 from pipelines.planning.formation import (
     YAW,
     cost_map,
@@ -50,14 +50,6 @@ def test_the_zero_follows_the_heading_as_fast_as_a_formation_turns_and_no_faster
     assert zero_deg(zero, 11.0, 12.0, 13.0) == pytest.approx([22.5, 45.0, 45.0])
 
 
-def test_it_turns_the_shorter_way_and_goes_on_counting() -> None:
-    zero = YawZero(HEADING_FRAME, heading_rad=np.radians(170.0))
-    zero.follow(0.0, towards(-170.0), SURE)
-    assert zero_deg(zero, 9.0) == pytest.approx([190.0])
-    zero.follow(9.0, towards(-60.0), SURE)
-    assert zero_deg(zero, 20.0) == pytest.approx([300.0])
-
-
 @pytest.mark.parametrize(
     ("speed_mps", "sigma_mps", "taken"),
     [(0.49, 0.01, False), (0.51, 0.01, True), (0.89, 0.3, False), (0.91, 0.3, True), (0.0, 0.0, False)],
@@ -70,13 +62,6 @@ def test_who_stands_keeps_the_last_heading(speed_mps: float, sigma_mps: float, t
     up = YawZero(HEADING_FRAME, heading_rad=0.5)
     up.follow(0.0, np.array([0.0, 0.0, 3.0]), SURE)  # who climbs a ladder heads nowhere
     assert up.at(np.array([9.0])) == 0.5
-
-
-def test_the_first_heading_of_a_log_is_where_the_actor_leaves_to() -> None:
-    standing = np.tile([3.0, 4.0, 1.0], (5, 1))
-    walked = standing[0] + np.outer(np.arange(4), [0.0, -0.5, 0.1])
-    assert first_heading(np.concatenate([standing, walked])) == pytest.approx(-np.pi / 2)
-    assert first_heading(np.concatenate([[[np.nan] * 3], standing])) == 0.0
 
 
 @pytest.mark.parametrize("arm", [FIXED, ADAPTIVE, JOINT], ids=lambda arm: arm.name)

@@ -155,26 +155,6 @@ def test_terms_of_a_steady_flight_in_closed_form() -> None:
     assert total == pytest.approx(2.0 + CONFIG.l_form * 1.125 + CONFIG.tuning.l_sep * 0.125)
 
 
-def test_descent_never_ends_higher_than_it_began() -> None:
-    planner, field = LocalPlanner(CONFIG), boulders()
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        slots = np.cumsum(rng.normal(size=(20, 3)), axis=0)
-        position, velocity = rng.normal(size=(2, 3))
-        before, _, _ = planner.cost(
-            position, velocity, slots, slots=slots, actor=slots + 8, others=NOBODY, field=field
-        )
-        made = planner.plan(
-            0.0, position, velocity, slots=slots, actor=slots + 8, others=[], field=field, previous=None
-        )
-        assert made.cost < before
-        after, _, _ = planner.cost(
-            position, velocity, made.plan.path[1:], slots=slots, actor=slots + 8, others=NOBODY, field=field
-        )
-        assert after == pytest.approx(made.cost)
-        assert made.separation is Separation.KEPT
-
-
 @pytest.mark.parametrize(("speed_floor", "gets_out"), [(1.0, True), (0.0, False)])
 def test_who_stands_inside_the_mound_gets_out_if_speed_has_a_floor(
     speed_floor: float, gets_out: bool

@@ -13,7 +13,7 @@ from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT, Arm, FormationPlanne
 from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.formation import FormationPath
-from pipelines.planning.replay import Pilot, Replay, Start, replay
+from pipelines.planning.replay import Replay, Start, replay
 from pipelines.planning.scores import near_obstacle, score
 from tests.planning.worlds import bare_ground, high_wall, mound, trees, walker, wall
 
@@ -87,35 +87,6 @@ def test_over_bare_ground_and_in_the_open_nothing_turns_or_climbs(
     assert np.degrees(result.formation_yaw_rad) == pytest.approx(np.full(len(result.t_ns), yaw_deg))
 
 
-@pytest.mark.parametrize("speed", [0.0, 0.02])
-def test_a_slot_inside_the_mound_of_a_standing_actor_is_left(speed: float) -> None:
-    field = mound()
-    stamps, hips = walker(15.0, speed)
-    hips = hips + np.array([30.0, -1.0, 0.0])  # the slot: 9.7 m north, 2.6 m up
-    inside = hips[0] + [0.0, 9.66, 2.59]
-    assert field.sample(inside)[0] < -0.5
-    result = replay(FIXED, stamps, hips, [field], Start(1, np.pi / 2), config=CONFIG)
-    assert field.sample(result.position[0, -1])[0] > 0
-
-
-def test_who_starts_beside_the_mound_turns_away_in_time() -> None:
-    """A drone begins less than 3 m from the mound's western end, and its slot goes into the mound."""
-    field = mound()
-    stamps, hips = walker(20.0)
-    hips = hips + np.array([17.0, 0.0, 0.0])
-    results = [
-        replay(arm, stamps, hips, [field], Start(2, np.pi / 2), config=CONFIG) for arm in (ADAPTIVE, FIXED)
-    ]
-    adaptive, fixed = (tilt_deg(result) for result in results)
-    assert adaptive.max() < 20
-    assert fixed.max() > 30
-    for result in results:
-        figures = score(*positions_of(result), field, CONFIG)
-        assert 0 < field.sample(result.position[:, 0])[0].min() < 3
-        assert isinstance(figures["limit_violations"], dict)
-        assert figures["limit_violations"]["collision"] == figures["limit_violations"]["separation"] == 0
-
-
 @pytest.mark.parametrize("arm", [FIXED, JOINT], ids=lambda arm: arm.name)
 @pytest.mark.parametrize("world", [wall, trees], ids=["wall", "trees"])
 def test_no_collision_and_enough_distance_past_wall_and_trees(arm: Arm, world: object) -> None:
@@ -183,31 +154,6 @@ def test_nothing_is_seen_before_its_time() -> None:
     assert not np.allclose(plain.position[:, -1], changed.position[:, -1], atol=0.5)
     assert np.ptp(changed.formation_yaw_rad[before]) == 0
     assert np.ptp(changed.formation_yaw_rad) > 0
-
-
-def test_plan_only_is_where_the_plans_are() -> None:
-    """Both modes agree where flying is easy; the plans' velocity is the derivative of their position.
-
-    20 ms at the largest acceleration of these plans, below 3 m/s^2, change the velocity by less than 0.06.
-    """
-    open_loop, closed = (fly(FIXED, bare_ground(), seconds=10.0, closed=closed) for closed in (False, True))
-    assert np.abs(open_loop.position - closed.position).max() < 0.5
-    assert not np.array_equal(open_loop.position, closed.position)
-    steps = np.diff(open_loop.position, axis=1) * 50
-    assert np.abs(steps - open_loop.velocity[:, 1:]).max() < 0.1
-
-
-def test_rows_without_a_measurement_are_left_out() -> None:
-    stamps, hips = walker(5.0)
-    gappy = hips.copy()
-    gappy[7:12] = np.nan
-    result = replay(FIXED, stamps, gappy, [], Start(1), config=CONFIG)
-    assert result.actor == pytest.approx(hips[0] + np.outer(result.t_s, [1.2, 0, 0]))
-    for bad in (stamps[:1], stamps[::-1]):
-        with pytest.raises(ValueError, match="ascending"):
-            replay(FIXED, bad, hips[: len(bad)], [], Start(1), config=CONFIG)
-    with pytest.raises(ValueError, match="17 drones"):
-        Pilot(FIXED, CONFIG, Start(17))
 
 
 def test_the_rates_of_planning() -> None:

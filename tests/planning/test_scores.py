@@ -102,30 +102,6 @@ def test_what_the_wall_hides_and_who_flies_into_it() -> None:
     assert figures["tilt_deg"] == pytest.approx({"mean": 0, "max": 0, "near_obstacle": 0}, abs=1e-9)
 
 
-def test_one_drone_has_no_pairs_and_two_in_one_place_are_too_near() -> None:
-    position, actor = ring(1, 15.0)
-    alone = score(T_S, position, actor, open_space(), CONFIG)
-    assert alone["yaw_separation_deg"] is None
-    assert alone["min_separation_m"] is None
-    assert alone["predicted_error_m"] == {"median": None, "p95": None}
-    assert alone["undetermined_share"] == 1.0
-    together = np.concatenate([position, position + np.array([0.1, 0, 0])])
-    figures = score(T_S, together, actor, open_space(), CONFIG)
-    assert isinstance(figures["limit_violations"], dict)
-    assert figures["limit_violations"]["separation"] == 1
-
-
-def test_who_comes_near_without_touching_is_counted_apart() -> None:
-    """The wall's near face is y = 6.5. Two episodes within 0.5 m of it, and one within 3 m of the actor."""
-    position, actor = ring(1, 15.0)
-    position[0] = [12.0, -10.0, 1.0]
-    position[0, (T_S >= 3) & (T_S < 4)] = position[0, (T_S >= 6) & (T_S < 7)] = [12.0, 6.1, 1.0]
-    position[0, (T_S >= 9) & (T_S < 10)] = actor[0] + [2.9, 0.0, 0.0]
-    violations = score(T_S, position, actor, wall(), CONFIG)["limit_violations"]
-    assert isinstance(violations, dict)
-    assert (violations["collision"], violations["clearance"], violations["actor"]) == (0, 2, 1)
-
-
 def test_near_is_what_stands_above_the_actor_within_fifteen_metres() -> None:
     """The wall's near face is y = 6.5; a slot that comes from the south is near from y = -8.5 on.
 

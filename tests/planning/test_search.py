@@ -86,22 +86,6 @@ def test_no_sequence_of_yaw_tilt_and_range_is_cheaper(seed: int) -> None:
     assert len(found) == 3
 
 
-@pytest.mark.parametrize("w_turn", [0.0, 0.05])
-def test_ties_stay(w_turn: float) -> None:
-    grid = yaw_ring(8, w_turn=w_turn)
-    for s in range(8):
-        found, value = best_sequence(np.full((5, 8), 0.5), grid, grid.states[s])
-        assert (found == s).all()
-        assert value == pytest.approx(2.5)
-
-
-@pytest.mark.parametrize(("yaws", "knot_s", "cells"), [(8, 2.0, 1), (16, 2.0, 2), (72, 0.5, 2), (72, 2.0, 9)])
-def test_reach_is_a_rate_and_not_a_number_of_cells(yaws: int, knot_s: float, cells: int) -> None:
-    grid = yaw_ring(yaws, knot_s=knot_s)
-    assert ((grid.neighbours >= 0).sum(axis=1) == 2 * cells + 1).all()
-    assert (grid.neighbours[:, 0] == np.arange(yaws)).all()
-
-
 @settings(max_examples=5)
 @given(st.integers(0, 10_000), st.sampled_from([2, 3]))
 def test_no_drone_of_a_team_has_a_cheaper_sequence(seed: int, drones: int) -> None:

@@ -90,13 +90,3 @@ def test_the_end_at_the_actor_is_left_out() -> None:
     assert occupied_share(field, camera, actor, start_m=1.5) == 0
     assert occupied_share(field, camera, actor, start_m=0.0) == pytest.approx(0.25 / 10, abs=0.25 / 10)
     assert visible(field, actor + np.array([0, 0, 1.0]), actor, start_m=1.5)
-
-
-def test_a_share_is_what_lies_in_the_way() -> None:
-    """5 m of 20 m are occupied; each end of the block is found to half a sample of 0.25 m."""
-    occupied = np.zeros((40, 3, 3), dtype=np.float32)
-    occupied[10:20] = 1
-    field = distance_field(Occupancy(occupied, np.zeros(3), RES))
-    share = occupied_share(field, np.array([[20.0, 0.7, 0.7]]), np.array([0.0, 0.7, 0.7]), start_m=0.0)
-    assert share.shape == (1,)
-    assert share[0] == pytest.approx(5 / 20, abs=0.25 / 20)

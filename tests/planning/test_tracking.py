@@ -64,23 +64,6 @@ def test_a_step_is_reached_without_staying_off() -> None:
         assert states[-1, VELOCITY] == pytest.approx(np.zeros(3), abs=0.02)
 
 
-def test_the_acceleration_rises_with_the_largest_jerk_and_keeps_its_limit() -> None:
-    """From rest towards a place far away: a = 50 t for 0.08 s, then 4 m/s^2; v and x by exact sums.
-
-    With period h: a_k = min(k, 4) m/s^2 in period k = 1, 2, ...
-    """
-    flying = flying_of(CONFIG)._replace(k_velocity=1e-9, k_integral=0.0)
-    goal = np.array([300.0, 400.0, 0.0])
-    states = track(still_at(goal), at_rest(), flying, 1.0)
-    towards = np.array([0.6, 0.8, 0.0])
-    wanted = np.minimum(np.arange(1, 51), 4.0)
-    h = 1 / CONFIG.tuning.tracking_hz
-    assert states[1:, ACCELERATION] == pytest.approx(wanted[:, None] * towards)
-    assert states[-1, VELOCITY] == pytest.approx(h * wanted.sum() * towards)
-    speed = np.concatenate([[0.0], h * np.cumsum(wanted)[:-1]])
-    assert states[-1, POSITION] == pytest.approx((h * speed + h * h / 2 * wanted).sum() * towards)
-
-
 def test_a_moving_reference_is_followed_closely() -> None:
     """A circle that needs 2 m/s^2: with the reference's acceleration only the 20 ms steps remain.
 

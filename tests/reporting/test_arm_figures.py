@@ -13,7 +13,6 @@ from pipelines.reporting.arms import (
     Replan,
     draw_arms,
     draw_from_above,
-    hidden_spans,
     summarise_replan,
 )
 from pipelines.reporting.chart import Plate
@@ -94,13 +93,6 @@ def test_hidden_sight_lines_are_told_apart(plates: dict[str, Plate]) -> None:
     assert "--status-rejected" not in clear
 
 
-def test_hidden_spans_last_until_the_next_moment() -> None:
-    seconds = np.arange(6) / 2
-    seen = np.array([False, True, False, False, True, False])
-    assert hidden_spans(seconds, seen) == [(0.0, 0.5), (1.0, 2.0), (2.5, 2.5)]
-    assert hidden_spans(seconds, np.ones(6, dtype=np.bool_)) == []
-
-
 def test_heights_of_the_map_are_shaded_as_far_as_they_go(plates: dict[str, Plate]) -> None:
     # 4.5 m: above 0.5, 1, 2 and 4 m; 8 m is not reached.
     svg = plates["arms-top"].svg
@@ -122,15 +114,6 @@ def test_no_fly_zones_are_hatched_and_named() -> None:
     assert drawn.svg.count("<pattern") == bare.svg.count("<pattern") + 1
     assert drawn.svg.count("url(#") >= bare.svg.count("url(#") + len(content.arms)
     assert "no-fly" not in bare.svg + bare.caption
-
-
-@pytest.mark.parametrize("rows", [2, 40])  # a single moment, and twenty
-def test_short_flights_are_drawn(rows: int) -> None:
-    content = make_comparison()
-    short = {name: table[:rows] for name, table in content.arms.items()}
-    plates = draw_arms(summarise_replan(replace(content, arms=short), START_NS, 2))
-    assert len(plates) == 3
-    assert all(said[-1] == 2 * min(rows // 2, KEYFRAMES) for said in _told(plates["arms-top"]).values())
 
 
 def test_the_same_comparison_gives_the_same_bytes(compared: Replan, plates: dict[str, Plate]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 from collections.abc import Iterator
 from dataclasses import replace
@@ -118,26 +117,6 @@ def test_dragging_turns_and_the_wheel_zooms(opened: Browser) -> None:
     assert _limbs(opened, "body") == before
 
 
-def test_keys_turn_zoom_step_and_play(opened: Browser) -> None:
-    _go_to(opened, 3.0)
-    opened.evaluate("document.getElementById('viewer-body').focus()")
-    before = _limbs(opened, "body")
-    opened.press(".")
-    opened.wait_for(f"Math.abs({_NOW} - 3.03) < 0.006")
-    opened.press(",")
-    opened.wait_for(f"Math.abs({_NOW} - 3.0) < 0.006")
-    opened.press("ArrowLeft")
-    assert _limbs(opened, "body") != before
-    opened.press("ArrowRight")
-    opened.press("+")
-    assert _limbs(opened, "body")[0] > before[0]
-    opened.press("0")
-    assert _limbs(opened, "body") == before
-    opened.press(" ")
-    opened.wait_for(f"{_NOW} > 3.2")
-    opened.press(" ")
-
-
 _FOCUSED = """(() => {
   const e = document.activeElement;
   const style = getComputedStyle(e);
@@ -177,21 +156,6 @@ def test_tab_alone_reaches_player_slider_curves_tables_and_links_with_a_visible_
     assert places == sorted(places)  # in the order of the page
 
 
-def test_a_moment_leads_to_the_viewer(opened: Browser) -> None:
-    opened.click(".moments label:nth-of-type(5) input")
-    shown = "[...document.querySelectorAll('.moment')].map((m) => getComputedStyle(m).display !== 'none')"
-    assert opened.evaluate(shown) == [False] * 4 + [True, False]
-    opened.click(".moment:nth-of-type(5) a")
-    moment = float(opened.evaluate("document.querySelectorAll('.moment a')[4].hash").removeprefix("#t="))
-    opened.wait_for(f"Math.abs({_NOW} - {moment}) < 0.006")
-    # Away, and by the same link back.
-    opened.evaluate("document.getElementById('viewer-flight').focus()")
-    opened.press(".")
-    opened.wait_for(f"Math.abs({_NOW} - {moment}) > 0.02")
-    opened.click(".moment:nth-of-type(5) a")
-    opened.wait_for(f"Math.abs({_NOW} - {moment}) < 0.006")
-
-
 def test_every_picture_is_shown(opened: Browser) -> None:
     opened.wait_for("document.querySelectorAll('.panel img').length === 18")
     # A picture that the policy forbids, or that is damaged, has no size of its own.
@@ -212,20 +176,6 @@ def test_paper_has_dark_lines_on_white_even_from_a_dark_screen(opened: Browser) 
     assert _limbs(opened, "body")[0] > 50  # counted by the colour that the page has now
     visible = "[...document.querySelectorAll('.moment')].every((m) => getComputedStyle(m).display !== 'none')"
     assert opened.evaluate(visible)
-
-
-def test_nothing_sticks_out_of_the_paper(opened: Browser) -> None:
-    opened.show_as(media="print", width=673)  # A4 without its margins of 16 mm, at 96 px an inch
-    assert opened.evaluate(_DRAWN)
-    assert opened.evaluate("document.documentElement.scrollWidth") <= 673
-    beyond = (
-        "[...document.querySelectorAll('table, figure, canvas, svg:not(svg svg), h1, p')]"
-        ".filter((e) => e.getBoundingClientRect().right > 674).map((e) => e.outerHTML.slice(0, 80))"
-    )
-    assert opened.evaluate(beyond) == []
-    printed = base64.b64decode(opened.send("Page.printToPDF", preferCSSPageSize=True)["data"])
-    assert printed.startswith(b"%PDF-")
-    assert printed.count(b"/Type /Page\n") > 5
 
 
 def test_a_foreign_script_does_not_run(chromium: Browser, page: Path, tmp_path: Path) -> None:

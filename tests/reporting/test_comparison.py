@@ -101,21 +101,6 @@ def test_other_times_are_compared_joint_by_joint(content: SessionContent) -> Non
     assert numbers(_verdict({"a": content, "b": other}).certainty[0]) == [0, len(JOINTS)]
 
 
-def test_another_motion_at_the_same_times_is_compared_joint_by_joint(content: SessionContent) -> None:
-    assert content.skeleton is not None
-    assert content.truth is not None
-    elsewhere = replace(
-        content,
-        skeleton=content.skeleton.assign(y=content.skeleton["y"] + 3),
-        truth=content.truth.assign(y=content.truth["y"] + 3),
-    )
-    assert not compare({"a": content, "b": elsewhere}).pairs[0].by_time
-    # Without truth the same place is what tells.
-    blind = {name: replace(one, truth=None) for name, one in (("a", content), ("b", elsewhere))}
-    assert not compare(blind).pairs[0].by_time
-    assert compare({"a": blind["a"], "b": replace(_moved(content, 2), truth=None)}).pairs[0].by_time
-
-
 @pytest.mark.parametrize("apart", [False, True])
 def test_intervals_are_those_of_known_variances(content: SessionContent, apart: bool) -> None:
     """White errors, uniform over 20 mm: the difference of two means has the variance 2 * 20^2 / 12 / T."""
@@ -194,13 +179,6 @@ def test_figures_and_tables_come_with_their_numbers(page: str) -> None:
     row = pairs[(pairs["measure"] == "mpjpe") & (pairs["other"] == "c")].iloc[0]
     assert row["value"] == pytest.approx(of["c"] - of["a"])
     assert (row["first_mean"], row["other_mean"]) == pytest.approx((of["a"], of["c"]))
-
-
-def test_settings_that_differ_are_listed(page: str) -> None:
-    text = Outline(page).text
-    assert "reconstruct: gates.pixel_sigma_px 3.0 3.0 2.0" in text
-    assert f"reconstruct: key {'b2' * 32} {'b2' * 32} {'c3' * 32}" in text
-    assert "reconstruct: method" not in text
 
 
 def test_names_from_files_stay_text(content: SessionContent, page: str) -> None:

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -65,12 +63,6 @@ def test_bystander_is_another_person(content: SessionContent) -> None:
             assert len(view.others) == 2  # nobody can tell who is who without a pose
 
 
-def test_camera_in_a_gap_has_pictures_but_no_residuals(content: SessionContent) -> None:
-    (view,) = [view for view in _views(content, "drone2") if not view.has_pose]
-    assert view.median_px is None
-    assert np.isnan(view.reprojected).all()
-
-
 def test_a_rejected_joint_is_marked_and_has_no_residual(content: SessionContent) -> None:
     wrist = JOINTS.index("left_wrist")
     early = [view for view in _views(content, "mast") if view.t_s < 10]
@@ -78,17 +70,6 @@ def test_a_rejected_joint_is_marked_and_has_no_residual(content: SessionContent)
     assert len(early) == len(late) == 3
     assert all(view.rejected[0, wrist] and np.isnan(view.residual_px[0, wrist]) for view in early)
     assert not any(view.rejected.any() for view in late)
-
-
-def test_a_joint_that_was_lost_otherwise_is_no_rejected_one(content: SessionContent) -> None:
-    assert content.skeleton is not None
-    lost = content.skeleton.copy()
-    nose = lost["joint"] == "nose"
-    lost.loc[nose, ["x", "y", "z"]] = np.nan
-    lost.loc[nose, "status"] = "few_views"
-    for view in _views(replace(content, skeleton=lost), "drone1"):
-        assert view.unmeasured[0, JOINTS.index("nose")]
-        assert not view.rejected[0, JOINTS.index("nose")]
 
 
 def test_pictures_are_asked_for_by_camera_and_frame(content: SessionContent) -> None:
@@ -126,13 +107,6 @@ def test_the_worst_moment_is_that_of_the_largest_error_where_truth_is_known() ->
 
 
 BODY = np.array([[100.0, 100.0], [140.0, 100.0], [100.0, 300.0], [140.0, 300.0]])
-
-
-def test_somebody_far_away_is_nobody_known() -> None:
-    assert match_people(BODY[None], BODY[None] + [90.0, 0.0]) == [0]  # half the diagonal is 102 px
-    assert match_people(BODY[None], BODY[None] + [120.0, 0.0]) == [None]
-    assert match_people(BODY[None], np.zeros((0, 4, 2))) == [None]
-    assert match_people(np.full((1, 4, 2), np.nan), BODY[None]) == [None]
 
 
 @given(st.permutations(range(4)), st.floats(-9.0, 9.0))

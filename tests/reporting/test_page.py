@@ -139,34 +139,12 @@ def test_numbers_of_the_page_are_those_of_the_data(page: str) -> None:
     assert arc == pytest.approx(1.2 * 17, rel=0.05)
 
 
-def test_page_without_truth(content: SessionContent) -> None:
-    metrics: dict[str, object] = {
-        "method": "dlt",
-        "reprojection_px": {"median": 4.4, "mean": 4.2},
-    }
-    outline = Outline(render_page(replace(content, truth=None, metrics=metrics, joint_errors=None)))
-    assert "(px)" in outline.text  # of the errors over time
-    assert "from truth" not in outline.text
-    assert "MPJPE" not in outline.text
-
-
 def test_page_before_the_reconstruction(content: SessionContent) -> None:
     ingested = replace(content, skeleton=None, metrics=None, truth=None, stages={})
     outline = Outline(render_page(ingested))
     assert "MPJPE" not in outline.text
     assert outline.count("figure") == 3
     assert outline.count("canvas") == 1  # the cameras alone
-
-
-def test_page_of_a_single_frame(content: SessionContent) -> None:
-    single = replace(
-        content,
-        session=described(make_session(1)),
-        skeleton=make_skeleton(1).assign(status="ok", x=1.0, y=2.0, z=3.0, reprojection_px=1.0),
-        truth=make_truth(1),
-        poses={name: table[:1] for name, table in make_poses().items()},
-    )
-    assert Outline(render_page(single)).count("figure") == 9  # one picture has no residuals to compare
 
 
 def test_page_of_unknown_joints_and_two_people(content: SessionContent) -> None:

@@ -97,34 +97,6 @@ def test_keypoints_are_rings_and_lost_ones_crosses(view: OverlayView) -> None:
         assert (drawn[y, x] == GREY).all() == (colour == FOUND)  # a ring leaves its middle free
 
 
-def test_a_picture_of_another_size_is_the_same_view_at_another_scale(view: OverlayView) -> None:
-    half = draw_frame(np.ascontiguousarray(GROUND[::2, ::2]), replace(view, reprojected=_only(0)), ())
-    rows, columns = np.nonzero(changed(half))
-    # Pixel 620 covers 619.5 to 620.5 of 1280, that is 309.75 to 310.25 of 640: (620 + 0.5) / 2 - 0.5.
-    assert abs((columns.min() + columns.max()) / 2 - 309.75) <= 0.5
-    assert abs((rows.min() + rows.max()) / 2 - 149.75) <= 0.5
-
-
-@pytest.mark.parametrize("size", [(1280, 720), (1920, 1080), (480, 800), (320, 96)])
-def test_captions_fit_their_ground(view: OverlayView, size: tuple[int, int]) -> None:
-    width, height = size
-    lines = (
-        "drone1   frame 123456   1234.567 s",
-        "robust: 12 ok, 2 rejected, 1 low_parallax, 2 not_detected",
-    )
-    white = np.full((height, width, 3), 255, np.uint8)
-    drawn = draw_frame(white, replace(view, reprojected=MISSING), lines)
-    rows, columns = np.nonzero((drawn < 128).any(axis=-1))
-    right, lower = columns.max() + 1, rows.max() + 1
-    assert right <= width
-    assert lower < height / 2
-    # White letters on a ground of 85: some, none of them in its last columns or rows.
-    ground = drawn[:lower, :right]
-    assert (ground > 240).any()
-    assert (ground[:, -3:] < 100).all()
-    assert (ground[-2:] < 100).all()
-
-
 def test_ellipses_hold_95_percent(view: OverlayView) -> None:
     covariance = np.array([[400.0, 150.0], [150.0, 100.0]])
     spread = np.full((1, 4, 2, 2), np.nan)

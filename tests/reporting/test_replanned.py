@@ -62,14 +62,6 @@ def test_tracks_are_those_of_the_tables(compared: Replan) -> None:
     assert np.isnan(fixed.predicted_error_m).sum() == 100
 
 
-def test_a_yaw_beyond_half_a_turn_does_not_jump() -> None:
-    content = make_comparison()
-    table = content.arms["adaptive"].copy()
-    table["formation_yaw_rad"] += 2 * np.pi  # commanded from 405 deg on, past 495
-    arm = summarise_replan(replace(content, arms={"adaptive": table}), START_NS, 2).arms[0]
-    np.testing.assert_allclose(arm.yaw_deg, yaw_deg("adaptive") + 360, atol=1e-9)
-
-
 def test_the_tables_hold_what_the_metrics_hold(compared: Replan) -> None:
     arms, differences = compared.tables
     cells = [" ".join(cell) if isinstance(cell, tuple) else str(cell) for cell in arms.rows[0]]
@@ -132,17 +124,6 @@ def test_heights_count_from_the_ground() -> None:
     assert found.above_m.sum() == 8 * 6 * 4.5
     # The middle of the block's first column: 20.5 voxels from -20 m and 50.5 from -25 m.
     assert (found.east_m[20], found.north_m[50]) == (-9.75, 0.25)
-
-
-def test_large_maps_keep_their_highest_columns() -> None:
-    probability = np.zeros((500, 40, 8), dtype=np.float32)
-    probability[:, :, 0] = 1.0
-    probability[333, 17, 5] = 1.0  # a single voxel, 6 voxels up
-    found = heights(_around(Occupancy(probability, np.zeros(3), 0.2), (-1.0, -1.0), (200.0, 200.0)))
-    assert found.above_m.shape == (100, 8)  # five columns to a cell
-    assert np.argwhere(found.above_m > 0).tolist() == [[66, 3]]
-    assert found.above_m.max() == pytest.approx(1.0)
-    assert (found.east_m[66], found.north_m[3]) == (pytest.approx(66.5), pytest.approx(3.5))
 
 
 def test_the_surface_is_the_shell_of_what_rises() -> None:

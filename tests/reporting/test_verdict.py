@@ -84,16 +84,6 @@ def test_nothing_reconstructed_names_the_gate(content: SessionContent, word: str
     assert all(part in lead for part in (STATUS_REASONS[word], STATUS_REMEDIES[word], f"({word})"))
 
 
-def test_a_camera_that_disagrees_with_the_others_is_doubtful(content: SessionContent) -> None:
-    medians = {"drone1": 5.0, "drone2": 6.0, "mast": 20.0}
-    metrics = (content.metrics or {}) | {
-        "reprojection_px_per_camera": {name: {"median": m, "mean": m} for name, m in medians.items()}
-    }
-    doubt = one(_verdict(replace(content, metrics=metrics)).doubts, "px")
-    assert doubt.startswith("mast:")
-    assert numbers(doubt) == [20.0, 6.0]
-
-
 def test_a_doubt_comes_before_everything_else(content: SessionContent) -> None:
     doubt = {"code": "mount", "cameras": ["mast"], "what": "W1", "evidence": {}, "remedy": "R1"}
     doubted = replace(content, metrics={**(content.metrics or {}), "doubts": [doubt]})

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from pipelines.reporting import viewer
@@ -101,22 +100,6 @@ def test_cameras_are_where_their_poses_say_and_nowhere_in_a_gap(content: Session
     )
 
 
-def test_uncertainty_comes_back_as_its_square_root(content: SessionContent) -> None:
-    assert content.skeleton is not None
-    rng = np.random.default_rng(5)
-    factor = np.diag([0.05, 0.03, 0.02]) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    covariance = factor.T @ factor
-    upper = dict(zip(("cxx", "cxy", "cxz", "cyy", "cyz", "czz"), covariance[np.triu_indices(3)], strict=True))
-    scene = _scene(replace(content, skeleton=content.skeleton.assign(**upper)))
-    body: Any = scene.data["body"]
-    root = _numbers(body["root"], np.int16, 6) / 1e4
-    assert np.array_equal(np.isfinite(root[:, 0]), (statuses(FRAMES) == "ok").reshape(-1))
-    lower = np.zeros((3, 3))
-    lower[np.tril_indices(3)] = root[np.isfinite(root[:, 0])][0]
-    # Entries rounded to 0.05 mm, times two of at most 50 mm.
-    assert lower @ lower.T == pytest.approx(covariance, abs=2 * 0.05 * 5e-5 * 3)
-
-
 def test_long_flight_is_thinned_and_says_so(content: SessionContent, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "MAX_BYTES", 1_500_000)
     frames = 6000
@@ -167,24 +150,6 @@ def test_bones_know_their_side_and_join_what_is_derived(content: SessionContent)
         ["left_shoulder", "right_shoulder"],
         ["left_hip", "right_hip"],
     ]
-
-
-def test_two_people_keep_apart(content: SessionContent) -> None:
-    first = make_skeleton(40)
-    both = pd.concat([first, first.assign(person=1, x=first["x"] + 3)])
-    scene = _scene(replace(content, skeleton=both, truth=None))
-    assert scene.people == ("person0", "person1")
-    joints = _joints(scene)
-    apart = joints[:, 1] - joints[:, 0]
-    assert np.nanmax(np.abs(apart - [3.0, 0.0, 0.0])) < 2 * ROUNDING_M
-
-
-def test_cameras_alone_before_the_reconstruction(content: SessionContent) -> None:
-    scene = _scene(replace(content, skeleton=None, truth=None))
-    assert scene.people == ()
-    assert "body" not in scene.data
-    t_s = _numbers(scene.data["t"], np.int32, 1)[:, 0] / 1e4
-    assert t_s == pytest.approx(np.arange(FRAMES) / 30, abs=1e-4)
 
 
 def test_simulated_arms_bring_their_cameras_and_the_map(content: SessionContent) -> None:
