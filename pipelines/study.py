@@ -606,7 +606,7 @@ def _figures(
     """Return the figures of one combination; way and energy are those of all drones together."""
     errors = scores["reconstruction_error"]
     estimate = mean_of_trials(capped, scene.settings.seed)
-    low, high = estimate.interval if estimate is not None and estimate.interval else (None, None)
+    low, high = estimate["interval"] if estimate is not None and estimate["interval"] else (None, None)
     mpjpe, share, covered = (errors[key] for key in ("mpjpe_mm", "pck150", "coverage"))
     return {
         "arm": cell["arm"],
@@ -616,7 +616,7 @@ def _figures(
         **{name: value for name, value in cell.items() if name not in _OF_SESSION},
         "best": False,
         "tradeoff": False,
-        "capped_mm": None if estimate is None else estimate.mean,
+        "capped_mm": None if estimate is None else estimate["mean"],
         "low_mm": low,
         "high_mm": high,
         "mpjpe_mm": None if mpjpe is None else mpjpe["mean"],
@@ -657,7 +657,7 @@ def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any], seed: int)
     alike = []
     for k in kept:
         found = mean_of_trials(capped[k] - capped[best], seed)
-        if k != best and found is not None and found.interval and found.interval[0] <= 0.0:
+        if k != best and found is not None and found["interval"] and found["interval"][0] <= 0.0:
             alike.append(k)
     return {"cell": best, "alike": alike}
 

@@ -31,16 +31,8 @@ SAME_RANGE_M = 0.3
 PCK_M = 0.15
 
 
-@dataclass(frozen=True)
-class MeanWithInterval:
-    """A mean and the interval that holds it with `LEVEL` probability; None where it cannot be computed."""
-
-    mean: float
-    interval: tuple[float, float] | None
-
-    def as_json(self) -> dict[str, object]:
-        """Return the estimate as stored in metrics.json."""
-        return {"mean": self.mean, "interval": None if self.interval is None else list(self.interval)}
+MeanWithInterval = dict[str, Any]
+"""`mean`, and `interval`: the ends that hold it with `LEVEL` probability; None where there is none."""
 
 
 def mean_of_trials(values: Float, seed: int) -> MeanWithInterval | None:
@@ -49,14 +41,15 @@ def mean_of_trials(values: Float, seed: int) -> MeanWithInterval | None:
 
 
 def mean_over_time(values: Float, counted: Bool, t_ns: Int64, seed: int) -> MeanWithInterval | None:
-    """Compute the mean over the moments that count, which are joined and resampled in stretches.
-
-    Args:
-        values: [T] or [N, T].
-        counted: [T].
-        t_ns: [T] strictly increasing.
-    """
+    """Compute the mean of [T] or [N, T] over the moments [T] that count, resampled in stretches."""
     return _mean(np.atleast_2d(values).mean(axis=0)[counted], t_ns[counted], seed)
+
+
+def _mean(values: Float, t_ns: Int64 | None, seed: int) -> MeanWithInterval | None:
+    if not len(values):
+        return None
+    ends = intervals({"mean": (values, np.ones(len(values)))}, t_ns, seed=seed)["mean"]
+    return {"mean": float(values.mean()), "interval": None if ends is None else list(ends)}
 
 
 def common_frames(errors: Mapping[str, Float32]) -> Bool:
@@ -106,14 +99,6 @@ def coverage(error_m: Float32, joint_frames: int) -> Float:
     """Compute the share [K] of the joint-frames with a truth that were measured, 0..1."""
     share: Float = np.isfinite(error_m).sum(axis=(1, 2)) / max(joint_frames, 1)
     return share
-
-
-def _mean(values: Float, t_ns: Int64 | None, seed: int) -> MeanWithInterval | None:
-    """Compute the mean of values over trials or times, and its interval."""
-    if not len(values):
-        return None
-    interval = intervals({"mean": (values, np.ones(len(values)))}, t_ns, seed=seed)["mean"]
-    return MeanWithInterval(float(values.mean()), interval)
 
 
 @dataclass(frozen=True)
@@ -201,17 +186,17 @@ def _scores(scene: ReplayScene, name: str, result: ArmResult, shared: Bool | Non
     own, common, covered = _errors(scene, result, shared)
     return {
         **found,
-        "mpjpe_mm": None if common is None else common.mean,
+        "mpjpe_mm": None if common is None else common["mean"],
         "simulated": name not in LOGGED,
         "drones": len(flown.position),
         "local_plans": flown.separation or None,
         "safety": flown.safety or None,
         "reconstruction_error": {
             "simulated": True,
-            "mpjpe_mm": _json(common),
-            "mpjpe_of_all_it_measured_mm": _json(own),
-            "coverage": _json(covered),
-            "pck150": _json(_pck(scene, result)),
+            "mpjpe_mm": common,
+            "mpjpe_of_all_it_measured_mm": own,
+            "coverage": covered,
+            "pck150": _pck(scene, result),
             "seen_share": result.seen_share,
             "joint_frames": result.joint_frames,
         },
@@ -249,9 +234,9 @@ def _by_person(scene: ReplayScene, result: ArmResult, seen: Bool, shared: Bool |
         error, frames = result.error_m[:, :, own], int(np.isfinite(scene.joints[:, own, 0]).sum())
         seed = scene.settings.seed
         figures |= {
-            "mpjpe_mm": _json(mean_of_trials(mpjpe_mm(error, shared[:, :, own]), seed)),
-            "coverage": _json(mean_of_trials(coverage(error, frames), seed)),
-            "pck150": _json(mean_of_trials(pck(error, frames), seed)),
+            "mpjpe_mm": mean_of_trials(mpjpe_mm(error, shared[:, :, own]), seed),
+            "coverage": mean_of_trials(coverage(error, frames), seed),
+            "pck150": mean_of_trials(pck(error, frames), seed),
         }
     return over_all | {"by_person": by_person}
 
@@ -295,12 +280,12 @@ def _difference(scene: ReplayScene, one: ArmResult, other: ArmResult, shared: Bo
         )
         over_flights = _over_flights(scene, one.error_m, other.error_m, both)
     return {
-        "tilt_deg": _json(mean_over_time(tilt_deg, always, scene.t_ns, seed)),
-        "tilt_near_obstacle_deg": _json(mean_over_time(tilt_deg, scene.near, scene.t_ns, seed)),
-        "occluded_share": _json(mean_over_time(hidden, always, scene.t_ns, seed)),
-        "mpjpe_mm": _json(error),
-        "coverage": _json(cover),
-        "pck150": _json(right),
+        "tilt_deg": mean_over_time(tilt_deg, always, scene.t_ns, seed),
+        "tilt_near_obstacle_deg": mean_over_time(tilt_deg, scene.near, scene.t_ns, seed),
+        "occluded_share": mean_over_time(hidden, always, scene.t_ns, seed),
+        "mpjpe_mm": error,
+        "coverage": cover,
+        "pck150": right,
         "interval_over_flights": over_flights,
         "simulated": True,
     }
@@ -470,10 +455,6 @@ def _warnings(results: Mapping[str, ArmResult]) -> list[str]:
         if result.error_m is not None and not np.isfinite(result.error_m).any():
             warnings.append(f"{name}: not a single joint could be measured from its cameras")
     return warnings
-
-
-def _json(estimate: MeanWithInterval | None) -> dict[str, object] | None:
-    return None if estimate is None else estimate.as_json()
 
 
 def verdict(

@@ -271,19 +271,6 @@ def fill_bricks(grid: Grid, bricks: NDArray[np.uint8]) -> None:
                 bricks[i // BRICK, j // BRICK, k // BRICK, within] = 2 * leap + (d[i, j, k] < 0.0)
 
 
-@cached
-def line_shares(grid: Grid, sight: Sight, actor: Float, camera: Float, start_m: float, share: Float) -> None:
-    """Compute occupied shares [P] of the sight lines between points [P, 3] and [P, 3], into `share`."""
-    rule = np.zeros(11)
-    for p in range(actor.shape[0]):
-        x, y, z = camera[p, 0] - actor[p, 0], camera[p, 1] - actor[p, 1], camera[p, 2] - actor[p, 2]
-        count = sampling(x, y, z, start_m, grid.resolution_m, rule)
-        share[p] = 0.0
-        if count:
-            x, y, z = (actor[p] - grid.origin) / grid.resolution_m
-            share[p] = occupied_samples(sight, x, y, z, rule, 0.0, float(count)) / count
-
-
 Unknown = Literal["free", "occupied"]
 
 
@@ -477,17 +464,6 @@ def visible(field: DistanceField, camera: Float, actor: Float, *, start_m: float
     seen = np.empty(camera.shape[:-1], dtype=np.bool_)
     _traverse(field.grid, _flat(camera), _flat(actor), start_m, seen.reshape(-1))
     return seen
-
-
-def occupied_share(field: DistanceField, camera: Float, actor: Float, *, start_m: float) -> Float:
-    """Compute the occupied share of the sight line, 0..1: samples every half voxel at most.
-
-    The end next to the actor is left out as in `visible`; arguments as there.
-    """
-    camera, actor = np.broadcast_arrays(camera, actor)
-    share = np.empty(camera.shape[:-1])
-    line_shares(field.grid, field.sight, _flat(actor), _flat(camera), start_m, share.reshape(-1))
-    return share
 
 
 def _flat(points: Float) -> Float:

@@ -26,11 +26,11 @@ def test_the_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:
     values = np.random.default_rng(3).normal(5.0, 2.0, 400)
     estimate = mean_of_trials(values, seed=0)
     assert estimate is not None
-    assert estimate.interval is not None
+    assert estimate["interval"] is not None
     standard_error = values.std() / 20
-    assert estimate.mean == pytest.approx(values.mean())
+    assert estimate["mean"] == pytest.approx(values.mean())
     expected = values.mean() + 1.96 * standard_error * np.array([-1, 1])
-    assert estimate.interval == pytest.approx(tuple(expected), abs=0.25 * standard_error)
+    assert estimate["interval"] == pytest.approx(tuple(expected), abs=0.25 * standard_error)
     assert mean_of_trials(values, seed=0) == estimate
 
 
@@ -46,8 +46,8 @@ def test_a_finer_time_makes_a_mean_no_surer() -> None:
         values = held[(t_s // 5).astype(np.int64)]
         estimate = mean_over_time(values, np.ones(len(t_s), dtype=bool), nanoseconds(t_s), seed=0)
         assert estimate is not None
-        assert estimate.interval is not None
-        width = estimate.interval[1] - estimate.interval[0]
+        assert estimate["interval"] is not None
+        width = estimate["interval"][1] - estimate["interval"][0]
         assert width == pytest.approx(2 * 1.96 * held.std() * np.sqrt(2 / 3 / 100), rel=0.15)
 
 

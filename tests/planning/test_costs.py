@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.planning.config import ErrorModel, PlannerConfig, PlannerTuning
-from pipelines.planning.distance_field import distance_field, occupied_share
+from pipelines.planning.distance_field import distance_field
 from pipelines.planning.formation import cost_map, costs_of_slots, formation_slots, slot_offsets
 from pipelines.planning.scores import log_determinant, predicted_error, ray_information
 from pipelines.session.records import Occupancy
+from tests.planning.worlds import occupied_share
 
 CONFIG = PlannerConfig(w_obs=2.0, w_occ=3.0)
 
@@ -33,7 +34,9 @@ def test_what_the_ends_of_a_line_tell_changes_no_cost(seed: int, share: float, e
     distance, _ = field.sample(cameras)
     assert costs.obstacle == pytest.approx(np.clip(1 - distance / eps_m, 0, 1), abs=1e-12)
     expected = occupied_share(field, cameras, actor[:, None, None], start_m=config.tuning.sight_start_m)
-    assert np.array_equal(costs.occluded, expected)
+    # One sample, of 18 or more, on the face between two voxels may be rounded to the other side.
+    assert np.abs(costs.occluded - expected).max() < 1 / 18 + 1e-9
+    assert (costs.occluded == expected).mean() > 0.95
     total = (2 * costs.obstacle + 3 * costs.occluded).sum(axis=2)
     assert cost_map(costs, CONFIG) == pytest.approx(total, abs=1e-12)
 

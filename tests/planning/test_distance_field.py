@@ -14,7 +14,6 @@ from pipelines.planning.config import Zone
 from pipelines.planning.distance_field import (
     distance_field,
     in_turn,
-    occupied_share,
     open_space,
     visible,
     zone_distances,
@@ -137,7 +136,6 @@ def test_zones_bar_drones_but_not_sight() -> None:
         assert np.mean(np.abs(slope - gradient[:, axis]) < 1e-3) > 0.97  # but for edges between faces
     camera, actor = np.array([1.8, 0.0, 2.5]), np.array([-1.8, 0.0, 2.5])  # right through the zone
     assert visible(field, camera, actor, start_m=0.0)
-    assert occupied_share(field, camera, actor, start_m=0.0) == 0.0
     assert field.barring(zone_edges([])).sample(points)[0] == pytest.approx(free.sample(points)[0])
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipelines.planning.distance_field import DistanceField, distance_field, occupied_share, visible
+from pipelines.planning.distance_field import DistanceField, distance_field, visible
 from pipelines.session.records import Occupancy
 
 RES = 0.5
@@ -41,23 +40,6 @@ def test_traversal_finds_every_box_that_is_crossed(seed: int, share: float) -> N
             assert seen[k] == (longest == 0.0)
 
 
-@given(st.integers(0, 10_000), st.sampled_from([0.005, 0.05]))
-def test_leaping_changes_no_sample(seed: int, share: float) -> None:
-    field, occupied = random_field(seed, share)
-    rng = np.random.default_rng(seed)
-    camera, actor = rng.uniform(-2, 7, (2, 3))
-    length, start_m = float(np.linalg.norm(camera - actor)), 0.7
-    found = occupied_share(field, camera, actor, start_m=start_m)
-    if length <= start_m:
-        assert found == 0
-        return
-    count = int(np.ceil((length - start_m) / (RES / 2)))
-    along = start_m + (np.arange(count) + 0.5) * (length - start_m) / count
-    index = np.floor((actor + along[:, None] * (camera - actor) / length) / RES).astype(int)
-    inside = ((index >= 0) & (index < occupied.shape)).all(axis=1)
-    assert found == occupied[tuple(index[inside].T)].sum() / count
-
-
 @given(st.integers(0, 10_000), st.sampled_from([0.001, 0.02, 0.98]))
 def test_within_a_leap_all_is_alike(seed: int, share: float) -> None:
     """Every voxel within the leap of any point of a voxel has its state; far off, leaps are long."""
@@ -87,6 +69,4 @@ def test_the_end_at_the_actor_is_left_out() -> None:
     actor, camera = np.array([0.75, 0.75, 0.75]), np.array([10.75, 0.75, 0.75])
     assert not visible(field, camera, actor, start_m=0.0)
     assert visible(field, camera, actor, start_m=1.5)
-    assert occupied_share(field, camera, actor, start_m=1.5) == 0
-    assert occupied_share(field, camera, actor, start_m=0.0) == pytest.approx(0.25 / 10, abs=0.25 / 10)
     assert visible(field, actor + np.array([0, 0, 1.0]), actor, start_m=1.5)

@@ -67,3 +67,21 @@ def walker(seconds: float, speed_mps: float = 1.2, rate_hz: float = 10.0) -> tup
     """Return stamps [T] and hips [T, 3] of an actor who walks east from the origin, hips at 1 m."""
     t_s = np.arange(0, seconds, 1 / rate_hz)
     return (t_s * 1e9).astype(np.int64), np.stack([speed_mps * t_s, 0 * t_s, 0 * t_s + 1.0], axis=1)
+
+
+def occupied_share(field: DistanceField, camera: Float, actor: Float, *, start_m: float) -> Float:
+    """Compute the occupied share of sight lines sample by sample, every half voxel at most."""
+    camera, actor = np.broadcast_arrays(camera, actor)
+    shares = np.zeros(camera.shape[:-1])
+    occupied, side_m = field.grid.distance_m < 0, field.grid.resolution_m
+    for place in np.ndindex(shares.shape):
+        way = camera[place] - actor[place]
+        length = float(np.linalg.norm(way))
+        if length > start_m:
+            count = int(np.ceil((length - start_m) / (side_m / 2) - 1e-9))
+            along = start_m + (np.arange(count) + 0.5) * (length - start_m) / count
+            points = actor[place] + along[:, None] * way / length
+            index = np.floor((points - field.grid.origin) / side_m).astype(int)
+            inside = ((index >= 0) & (index < occupied.shape)).all(axis=1)
+            shares[place] = occupied[tuple(index[inside].T)].sum() / count
+    return shares
