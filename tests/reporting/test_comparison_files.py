@@ -8,9 +8,10 @@ import pytest
 
 import pipelines.report
 from pipelines.report import compare_sessions
-from pipelines.reporting.comparison_page import GENERATOR
 from pipelines.reporting.content import SessionContent
 from pipelines.session.errors import DataError
+
+GENERATOR = '<meta name="generator" content="mocap'
 
 
 @pytest.fixture
