@@ -348,7 +348,7 @@ _SUMMED = {
         "pictures",
     ),
     *("undone_over_time", "between_views", "association", "present", "misses", "switches", "gaps", "filled"),
-    *("gaps_without_example", "count", "points", "joint_frames_in_runs_too_short"),
+    *("gaps_without_example", "count", "points", "joint_frames_in_runs_too_short", "frames"),
 }
 """Names of figures that count something; whatever stands below such a name is summed as well."""
 

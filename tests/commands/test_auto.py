@@ -62,7 +62,7 @@ def test_a_flight_too_short_for_motion_and_bones_keeps_the_rest(tmp_path: Path) 
     assert unasked["method_used"]["summary"] in said.stdout
 
 
-@pytest.mark.parametrize("method", ["auto", "robust", "midpoint", "dlt"])
+@pytest.mark.parametrize("method", ["auto", "dlt"])
 def test_every_method_is_served_by_the_clocks_that_were_found(tmp_path: Path, method: str) -> None:
     flight = write_flight(tmp_path, cameras=2, seconds=3.0, static=True, pose_noise={})
     # Stamped 200 ms too early: at 1.2 m/s 240 mm beside one of two cameras; keypoints err by 26 mm.

@@ -104,8 +104,8 @@ def test_a_clock_that_does_not_settle_is_told(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("offset_s", [0.2, -0.2])
-def test_refined_finds_the_clock_of_a_moving_camera(offset_s: float, tmp_path: Path) -> None:
+def test_refined_finds_the_clock_of_a_moving_camera(tmp_path: Path) -> None:
+    offset_s = -0.2
     flight = write_flight(tmp_path, cameras=2, seconds=8.0, pose_noise={})
     flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -offset_s, "sigma_s": 0.2}
     flight.save()
