@@ -16,7 +16,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import compose, invert
+from pipelines.geometry.poses import compose, invert, matrix_from_quaternion, multiply, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.diagnosis import diagnose
 from pipelines.reconstruction.doubts.scene import scene_of
@@ -379,6 +379,39 @@ def test_what_is_stated_wrongly_of_drones_with_gimbals_is_taken_back(
     assert with_remedy(manifest, first["remedy"])
     if remedy.endswith((": ", ", ")):  # numbers
         assert doubts_of(manifest) == []
+
+
+def in_world(rotation: Float) -> Change:
+    """Write all poses in a world that is turned."""
+    turn = quaternion_from_matrix(rotation)
+    return of_poses(lambda pose: (pose[0] @ rotation.T, multiply(turn, pose[1])))
+
+
+WORLDS = {
+    "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "-y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "x": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    "-z": np.diag([1.0, -1, -1]),
+    "of SLAM": matrix_from_quaternion(np.array([0.6, -0.2, 0.1, 0.768115])),
+}
+
+
+@pytest.mark.parametrize("up", sorted(WORLDS))
+def test_a_world_on_its_side_is_named_and_turned_back(flight: Described, up: str) -> None:
+    manifest = mistaken(flight, in_world(WORLDS[up]))
+    document = YAML(typ="safe").load(manifest.read_text())
+    written({key: part for key, part in document.items() if key not in ("map", "actor")}, manifest)
+    first = doubts_of(manifest)[0]
+    assert first["code"] == "level"
+    assert with_remedy(manifest, first["remedy"])
+    assert doubts_of(manifest) == []
+
+
+@pytest.mark.parametrize("factor", [0.4, 0.65, 1.6, 2.2])
+def test_a_world_of_another_scale_is_named_with_its_scale(flight: Described, factor: float) -> None:
+    manifest = mistaken(flight, of_poses(lambda pose: (factor * pose[0], pose[1])))
+    first = doubts_of(manifest)[0]
+    assert first["code"] == "scale"
 
 
 def test_limbs_that_cross_are_doubted_without_a_cause(flight: Described) -> None:

@@ -696,7 +696,7 @@ def with_remedy(manifest: Path, remedy: str) -> bool:
     for line in remedy.split("; "):
         path, _, value = line.partition(": ")
         keys = path.split(".")
-        if not value or keys[0] not in document or "..." in value:
+        if not value or keys[0] not in {"world", *document} or "..." in value:
             return False
         place = document
         for key in keys[:-1]:

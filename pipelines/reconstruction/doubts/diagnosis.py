@@ -37,6 +37,8 @@ from pipelines.reconstruction.doubts.hypotheses import (
     Trial,
     higher_or_lower,
     of_descriptions,
+    of_level,
+    of_scale,
     of_times,
     pair_of,
     relative_to,
@@ -84,6 +86,12 @@ STRAINED = 10.0
 
 GAIN = 14.0
 """By how much a fault must lower the chi^2 of the rays, to be named."""
+
+STRANGE = 5.0
+"""Standard deviations from which one oddity is said, whatever the score."""
+
+STRANGE_SIZE = 2.5
+"""The same of the stature: mistakes of scale are less rare than people below 1.27 m or above 2.35 m."""
 
 DOUBTFUL = 6.0
 """Score of a description above which it is doubted although no mistake explains it."""
@@ -204,12 +212,19 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> Diagnosis
     described = scene_of(flight)
     base, found = base_of(flight, described)
     trial = Trial(flight, described, base)
-    hypotheses = [*_of_logs(trial), *_of_turns(trial, late), *of_times(trial)]
+    # A turned world leaves rays and bodies as they are; rolled cameras mirror the body.
+    mirrored = any(found.odd[name].sigmas >= STRANGE for name in ("face", "bend") if name in found.odd)
+    fits = found.misfit < MISSED and found.scatter < SCATTERED and not mirrored
+    level = of_level(trial) if fits else ()
+    hypotheses = [*level, *_of_logs(trial), *_of_turns(trial, late), *of_times(trial)]
     stated = fit(flight, described, "none", 0)
     explained = min((each.total for each in hypotheses), default=np.inf)
-    odd = base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
+    strange = _is_strange(found)
+    odd = strange or base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
     if odd or explained <= base.total - MARGIN_OF_TIMES:
         hypotheses += list(of_descriptions(trial))
+    if strange and np.isfinite(found.stature_m):
+        hypotheses.append(trial.scored(of_scale(trial, found.stature_m)))
     if odd or stated.strain >= STRAINED:
         hypotheses += list(_of_faults(trial))
         hypotheses += [trial.scored(noisy) for noisy in _of_noise(trial, stated.cost)]
@@ -226,10 +241,21 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> Diagnosis
     causes = [each for each in causes if _leaves_no_doubt(flight, each)] or below_zero
     if not causes and base.total >= DOUBTFUL:
         causes = _bad_camera(trial)
+    if any(each.code == "scale" for each in causes):  # others change the size by making the rays fit worse
+        causes = [each for each in causes if each.code == "scale"]
     doubts = [_doubt(_with_sigma(trial, each), found, described) for each in causes]
-    if doubts or base.total >= DOUBTFUL:
-        doubts += _oddities(found, described, flight, alone=not doubts)
+    if doubts or strange or base.total >= DOUBTFUL:
+        named = {doubt.code for doubt in doubts}
+        named |= {"scale"} if "unit" in named else set()
+        oddities = _oddities(found, described, flight, alone=not doubts)
+        doubts += [doubt for doubt in oddities if doubt.code not in named]
     return Diagnosis(doubts, base.total, len(hypotheses))
+
+
+def _is_strange(described: Score) -> bool:
+    """Test if a single oddity is so large that it is said, whatever the total."""
+    limits = {"size": STRANGE_SIZE}
+    return any(each.sigmas >= limits.get(name, STRANGE) for name, each in described.odd.items())
 
 
 def _causes(trial: Trial, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
@@ -323,7 +349,7 @@ def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
         return True
     if not _leaves_no_doubt(trial.flight, hypothesis):
         return False
-    is_odd = trial.base.total >= ODD
+    is_odd = trial.base.total >= ODD or hypothesis.code in ("scale", "unit")
     described = _same_moments(trial, hypothesis.scene)
     if hypothesis.code in TIMES or not is_odd:
         of_one_clock = hypothesis.code in TIMES and hypothesis.alike is None
@@ -682,7 +708,7 @@ def _rounded(value: float) -> float:
 
 # What is odd about a person, by the name it has in a score: the code of its doubt, and the sentence.
 _ODD = {
-    "size": ("body", "the person is {stature_m:.3g} m tall; grown-ups are {usual:.2f} m, 95 % within 17 %"),
+    "size": ("scale", "the person is {stature_m:.3g} m tall; grown-ups are {usual:.2f} m, 95 % within 17 %"),
     "shape": ("body", "the lengths of the limbs are not in the proportions of people"),
     "limp": ("body", "the lengths of the limbs change over time, by {limb_spread:.0%}"),
     "upright": ("body", "the person does not stand upright, but leans by {lean_deg:.0f} deg"),

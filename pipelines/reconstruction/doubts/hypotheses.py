@@ -18,7 +18,14 @@ from pipelines.geometry.mounting import level_heading
 from pipelines.geometry.poses import interpolate_poses, matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, SceneOfMoments, scene_of
-from pipelines.reconstruction.doubts.score import Base, Score, score, solve
+from pipelines.reconstruction.doubts.score import (
+    STATURE_M,
+    Base,
+    Score,
+    score,
+    solve,
+    trunk_direction,
+)
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 """Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
@@ -293,6 +300,76 @@ def of_times(trial: Trial) -> Iterator[Hypothesis]:
 
 
 # --- what is tried where something is odd --------------------------------------------------------------
+
+
+# Up is where neither people nor cameras say, if both say another direction that is this far from z.
+LEAST_TILT_OF_WORLD_DEG = 40.0
+# The trunk of somebody who does more than lie or stand points elsewhere in some pictures.
+LEAST_STEADY_TRUNK = 0.7
+# Upper edges of pictures must be higher by this cosine along the other direction.
+LEAST_GAIN_OF_PICTURES = 0.25
+# A direction this near to an axis is that axis, since people lean.
+AXIS_WITHIN_DEG = 12.0
+# Two in three grown-ups have a stature within this share of the usual one.
+STATURE_SHARE = 0.09
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048}
+_UPS = {
+    f"{sign}{axis}": turn * np.eye(3)[k]
+    for sign, turn in (("", 1), ("-", -1))
+    for k, axis in enumerate("xyz")
+}
+
+
+def of_level(trial: Trial) -> Iterator[Hypothesis]:
+    """Find a world whose z does not point up: people stand, and pictures are upright, along another axis.
+
+    Both must say so: somebody may lie, and a camera may be rolled or look straight down.
+    """
+    up = trunk_direction(solve(trial.described).joints)
+    steady = float(np.linalg.norm(up))
+    if not steady > LEAST_STEADY_TRUNK:
+        return
+    up = up / steady
+    tilt_deg = float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
+    upper = -np.nanmean(trial.described.rotation[..., 1], axis=1)  # [C, 3] of each camera's pictures
+    gain = float(np.nanmean(upper @ up) - np.nanmean(upper[:, 2]))
+    if tilt_deg < LEAST_TILT_OF_WORLD_DEG or gain < LEAST_GAIN_OF_PICTURES:
+        return
+    axis = max(_UPS, key=lambda name: float(_UPS[name] @ up))
+    beside_deg = float(np.degrees(np.arccos(np.clip(_UPS[axis] @ up, -1, 1))))
+    remedy = f"world.up: {axis}"
+    if beside_deg > AXIS_WITHIN_DEG:
+        remedy = remedies.turned_world(trial.flight.cameras, up)
+    yield Hypothesis(
+        "level",
+        trial.names,
+        f"the world's z does not point up: people and pictures are upright {tilt_deg:.0f} deg from it",
+        remedy,
+        0.0,
+        None,
+        sigmas={"tilt_deg": round(tilt_deg, 1), "beside_axis_deg": round(beside_deg, 1)},
+    )
+
+
+def of_scale(trial: Trial, stature: float) -> Hypothesis:
+    """Scale all positions so that the person has a usual stature: rays that fit go on fitting."""
+    factor, code = STATURE_M / stature, "scale"
+    what = f"all positions are {1 / factor:.2g} times what they should be: the person is {stature:.3g} m tall"
+    remedy, sigmas = f"world.scale: {factor:.3g}", {"scale_sigma_share": STATURE_SHARE}
+    for unit, metres in _UNITS.items():
+        if abs(np.log(factor / metres)) < STATURE_SHARE:
+            factor, code, sigmas = metres, "unit", {}
+            what, remedy = f"the positions are in {unit}", remedies.unit(trial.flight.cameras, unit)
+    return Hypothesis(
+        code,
+        trial.names,
+        what,
+        remedy,
+        0.5,
+        replace(trial.described, position=trial.described.position * factor),
+        same_scatter=True,
+        sigmas=sigmas,
+    )
 
 
 def of_descriptions(trial: Trial) -> Iterator[Hypothesis]:

@@ -131,6 +131,20 @@ def _levels() -> dict[Looks, Float]:
     return {looks: matrix_from_quaternion(body_from_camera(looks)) for looks in get_args(Looks)}
 
 
+def turned_world(cameras: Sequence[Filmed], up: Float) -> str:
+    """State for every camera the shortest rotation of its source that turns a direction [3] upwards."""
+    quaternion = np.append(np.cross(up, [0.0, 0.0, 1.0]), 1.0 + up[2])
+    quaternion /= np.linalg.norm(quaternion)
+    numbers = ", ".join(f"{value:.5g}" for value in quaternion)
+    every = range(len(cameras))
+    return _lines(cameras, every, lambda _: f"pose.world_from_source: {{rotation_xyzw: [{numbers}]}}")
+
+
+def unit(cameras: Sequence[Filmed], name: str) -> str:
+    """State the unit of all cameras' positions."""
+    return _lines(cameras, range(len(cameras)), lambda _: f"pose.unit: {name}")
+
+
 def pose(cameras: Sequence[Filmed], key: str) -> str:
     """State how the poses of the moving cameras are written."""
     return _lines(cameras, _moving(cameras), lambda _: f"pose.{key}")

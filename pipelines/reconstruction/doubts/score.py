@@ -329,6 +329,16 @@ def stature_m(joints: Float) -> float:
     return _median(_statures(_ScoredBody(joints).lengths()))
 
 
+def trunk_direction(joints: Float) -> Float:
+    """Return the mean [3] of the unit vectors from hips to shoulders; it is shorter if they vary."""
+    body = _Body(joints)
+    trunk = body.shoulders - body.hips
+    trunk = trunk / np.linalg.norm(trunk, axis=-1, keepdims=True)
+    known = trunk[np.isfinite(trunk).all(axis=-1)]
+    mean: Float = known.mean(axis=0) if len(known) > _FEWEST_MOMENTS else np.full(3, np.nan)
+    return mean
+
+
 def _shape(lengths: list[tuple[Float, float]], stature: float) -> Oddity:
     """Measure the limbs' proportions: the lengths of limbs over those that are usual for a stature in m."""
     names = [f"{start}_to_{end}" for start, end, _ in _LIMBS] + ["torso"]
