@@ -331,7 +331,7 @@ def stature_m(joints: Float) -> float:
 
 def trunk_direction(joints: Float) -> Float:
     """Return the mean [3] of the unit vectors from hips to shoulders; it is shorter if they vary."""
-    body = SolvedJoints(joints)
+    body = _ScoredBody(joints)
     trunk = body.shoulders - body.hips
     trunk = trunk / np.linalg.norm(trunk, axis=-1, keepdims=True)
     known = trunk[np.isfinite(trunk).all(axis=-1)]
