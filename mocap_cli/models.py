@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from mocap_cli.options import any_path, json_option
-from mocap_cli.terminal import print_json, print_table, say, watching
+from mocap_cli.terminal import print_json, print_table, say
 
 if TYPE_CHECKING:
     from pipelines.session.registries import FetchesModels
@@ -87,18 +86,11 @@ def _list(as_json: bool) -> None:
 )
 @json_option
 def fetch_command(name: str, source: Path | None, as_json: bool) -> None:
-    """Get the model files of a detector, or of the export osim, and make ready what runs on them.
-
-    The numerical functions of `mocap reconstruct` and `mocap replan-compare` are compiled for this processor.
-    Without this, their first run does so.
-    """
-    from pipelines.precompile import precompile
+    """Get the model files of a detector, or of the export osim."""
     from pipelines.session.registries import find_models
 
     detector = find_models(name)
     detector.fetch(source)
-    with watching(0) as progress:
-        precompile(os.cpu_count() or 1, progress)
     if as_json:
         print_json(_listed(detector))
         return

@@ -172,18 +172,16 @@ def reconstruct_command(
     shown: Shown,
 ) -> dict[str, Any] | None:
     """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
-    from pipelines.precompile import precompile_for
     from pipelines.reconstruct import reconstruct
     from pipelines.session.parallel import connected
     from pipelines.session.stages import copy_session, refuse_no_session
 
-    refuse_no_session(session)  # a wrong session is refused before anything is compiled
+    refuse_no_session(session)
     if output is not None:
         copy_session(session, output)
         session = output
     with watching(shown.level) as progress, ExitStack() as stack:
         client = stack.enter_context(connected(scheduler, progress)) if scheduler else None
-        precompile_for("reconstruct", progress)
         result = reconstruct(
             session,
             settings,

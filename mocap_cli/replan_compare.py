@@ -108,14 +108,12 @@ def replan_compare_command(
     What each planner's cameras would measure of the actor's own skeleton is simulated, with errors of
     detector and poses. Every figure of a replay is simulated; `flown` and `planned` are what the log says.
     """
-    from pipelines.precompile import precompile_for
     from pipelines.replan import refuse_name, replan
     from pipelines.session.stages import refuse_no_session
 
     refuse_name(name)
-    refuse_no_session(session)  # a wrong session is refused before anything is compiled
+    refuse_no_session(session)
     with watching(shown.level) as progress:
-        precompile_for("replan", progress)
         result = replan(session, settings, name=name, force=force, progress=progress)
         figures = None
         if filmed is not None:

@@ -6,10 +6,6 @@ outermost function changed. With this module, it does so also if the file of a
 helper changed, and it compares what the files contain, not their age. The first compilation of a process is
 logged, because it takes seconds. Of several processes that start together one compiles, and the others wait
 for what it writes into the cache.
-
-What the cache lacks is looked up among the code that `pipelines.precompile` put beside the program, and that
-a wheel brings along. It is for every processor of the level `EVERY_PROCESSOR`, and for one version of numba
-and of Python. With others it is not used.
 """
 
 import hashlib
@@ -17,7 +13,7 @@ import logging
 import os
 import stat
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, wraps
 from pathlib import Path
@@ -26,17 +22,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numba
 from filelock import FileLock, Timeout
-from llvmlite.binding import get_host_cpu_features
 from numba.core import event
-from numba.core.caching import IndexDataCacheFile
-
-SHIPPED = Path(__file__).parents[1] / "data" / "compiled"
-"""Folder of the code that comes with the program."""
-
-EVERY_PROCESSOR = "x86-64-v3"
-"""Processor that this code is for: x86-64 with AVX2, since 2013 (psABI of x86-64, table 3.1)."""
-
-_NEEDED = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")  # by that level
 
 LOGGER = logging.getLogger(__name__)
 """Logger of one line, at level INFO, when a process compiles for the first time."""
@@ -77,7 +63,6 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
     try:
         compiled = _with_cache(function, options)
         _watch_helpers(compiled, function)
-        _use_shipped(compiled)
         _compile_in_one_process(compiled)
     except RuntimeError:
         uncached: Callable[Arguments, Result] = numba.njit(function, **options)
@@ -123,7 +108,7 @@ class _Announcement(event.Listener):  # type: ignore[misc]  # numba has no types
         """Log the line once."""
         if not self._done:
             self._done = True
-            LOGGER.info("compiling numerical functions for this processor, once: for up to a minute")
+            LOGGER.info("compiling numerical functions for this processor, once: for a minute at most")
 
     def on_end(self, event: object) -> None:
         """Do nothing: only the beginning is announced."""
@@ -133,12 +118,6 @@ class _Announcement(event.Listener):  # type: ignore[misc]  # numba has no types
 
 _ANNOUNCEMENT = _Announcement()
 event.register("numba:compile", _ANNOUNCEMENT)
-
-
-def dispatcher_of(function: Callable[..., object]) -> Any:
-    """Return numba's compiler of a function that `cached` or `helper` made; None of any other function."""
-    made = (getattr(cell, "cell_contents", None) for cell in function.__closure__ or ())
-    return next((one for one in (function, *made) if hasattr(one, "py_func")), None)
 
 
 def _watch_helpers(compiled: Any, function: Callable[..., object]) -> None:
@@ -168,75 +147,6 @@ def _content(name: str) -> bytes:
 @cache
 def _content_of(name: str, mtime_ns: int, size: int) -> bytes:  # noqa: ARG001  # the state keys the cache
     return hashlib.sha256(Path(name).read_bytes()).digest()
-
-
-def has_code(function: Callable[..., object]) -> bool:
-    """Test if there is any code of a function, for any types, that this process need not compile.
-
-    Raises:
-        AttributeError: nothing of the function is cached.
-    """
-    own = dispatcher_of(function)._cache
-    if Path(own._cache_file._index_path).is_file():
-        return True
-    with suppress(*_UNREADABLE):
-        return has_every_feature() and bool(_shipped(own)._load_index())
-    return False
-
-
-def outdated_files(functions: Iterable[Callable[..., object]]) -> list[Path]:
-    """List the files beside the program, of this version of Python, that hold no code of these functions."""
-    kept = {_shipped_index(dispatcher_of(function)._cache) for function in functions}
-    tags = {index.stem.rpartition(".")[2] for index in kept}
-    return [
-        path
-        for path in SHIPPED.glob("*/*")
-        if not any(path.parent == index.parent and path.name.startswith(f"{index.stem}.") for index in kept)
-        and any(f".{tag}." in path.name for tag in tags)
-    ]
-
-
-def _shipped(own: Any) -> Any:
-    """Return numba's cache file of the code that comes with the program, beside a function's own cache."""
-    index = _shipped_index(own)
-    return IndexDataCacheFile(index.parent, index.stem, own._cache_file._source_stamp)
-
-
-def _shipped_index(own: Any) -> Path:
-    module: str = own._py_func.__module__
-    return SHIPPED / module / f"{own._impl.filename_base}.nbi"
-
-
-@cache
-def has_every_feature() -> bool:
-    """Test if this processor can run code for `EVERY_PROCESSOR`."""
-    features = get_host_cpu_features()
-    return all(features.get(name) for name in _NEEDED)
-
-
-def _use_shipped(compiled: Any) -> None:
-    """Look up what the cache lacks in the code that comes with the program.
-
-    If numba compiles for `EVERY_PROCESSOR`, that code is the cache. numba has no public interface for this.
-    """
-    with suppress(AttributeError):
-        own, load = compiled._cache, compiled._cache.load_overload
-        index, shipped = _shipped_index(own), _shipped(own)
-        if numba.config.CPU_NAME == EVERY_PROCESSOR:
-            index.parent.mkdir(parents=True, exist_ok=True)
-            own._cache_file = shipped
-            return
-
-        def load_or_take(signature: object, context: Any) -> object:
-            found = load(signature, context)
-            if found is None and own._enabled and index.is_file() and has_every_feature():
-                types, (triple, _, _), code = own._index_key(signature, context.codegen())
-                with suppress(*_UNREADABLE):
-                    data = shipped.load((types, (triple, EVERY_PROCESSOR, ""), code))
-                    found = None if data is None else own._impl.rebuild(context, data)
-            return found
-
-        own.load_overload = load_or_take
 
 
 def _compile_in_one_process(compiled: Any) -> None:

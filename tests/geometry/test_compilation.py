@@ -2,29 +2,15 @@
 
 import importlib
 import importlib.util
-import inspect
 import logging
 import os
-import pickle
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from pipelines import precompile
-from pipelines.geometry import compilation
-from pipelines.geometry.compilation import (
-    EVERY_PROCESSOR,
-    LOGGER,
-    _Announcement,
-    cached,
-    dispatcher_of,
-    has_every_feature,
-)
-from pipelines.precompile import Outcome, compile_function, entry_of, listed, type_of
-from pipelines.session.progress import Silent
+from pipelines.geometry.compilation import LOGGER, _Announcement, cached
 
 SOURCE = """
 from pipelines.geometry.compilation import cached, helper
@@ -190,127 +176,10 @@ def test_of_processes_that_start_together_one_compiles(
             os.close(begin)
             os.read(began, 1)  # until the parent closes its end: all at once
             right = load_quarter()(2.0) == 0.5
-            dispatcher = dispatcher_of(sys.modules["quarters"].quarter)
-            os._exit(sum(dispatcher.stats.cache_misses.values()) if right else 100)
+            [inner] = [cell.cell_contents for cell in sys.modules["quarters"].quarter.__closure__]
+            os._exit(sum(inner.stats.cache_misses.values()) if right else 100)
         children.append(child)
     os.close(begin)
     misses = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
     os.close(began)
     assert sorted(misses) == [0, 0, 0, 1]
-
-
-def test_what_was_compiled_ahead_is_found_in_the_cache(
-    load_quarter: Callable[[], Callable[[float], float]],
-) -> None:
-    load_quarter()
-    assert compile_function("quarters:quarter", [["float64"]]) is Outcome.COMPILED
-    load_quarter()
-    assert compile_function("quarters:quarter", [["float64"]]) is Outcome.CACHED
-
-
-def test_a_function_is_compiled_once_its_code_is_in_the_cache(
-    load_quarter: Callable[[], Callable[[float], float]],
-) -> None:
-    quarter = load_quarter()
-    assert not precompile.is_compiled("quarters:quarter")
-    quarter(2.0)
-    assert precompile.is_compiled("quarters:quarter")
-    assert precompile.is_compiled("quarters:gone")  # nothing that could be compiled ahead
-
-
-SHIPPING = """
-import sys
-from pathlib import Path
-from pipelines.geometry import compilation
-compilation.SHIPPED = Path("shipped").absolute()
-sys.path.insert(0, "")
-from quarters import quarter
-known = compilation.has_code(quarter)
-assert quarter(2.0) == 0.5
-print(known, sum(compilation.dispatcher_of(quarter).stats.cache_misses.values()))
-"""
-
-
-def start(folder: Path, **environment: str) -> str:
-    """Run a process with a cache of its own; return if there was code, and how often it compiled."""
-    variables = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache"), **environment}
-    done = subprocess.run(
-        [sys.executable, "-c", SHIPPING],
-        cwd=folder,
-        env=variables,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return done.stdout.strip()
-
-
-@pytest.mark.skipif(not has_every_feature(), reason="this processor cannot run the code that is shipped")
-@pytest.mark.parametrize("change", ["nothing", "source", "index", "data", "numba"])
-def test_code_that_comes_with_the_program_is_not_compiled_again(tmp_path: Path, change: str) -> None:
-    """Compile for every processor, and start anew, after a change of the source or of the shipped files."""
-    source = tmp_path / "quarters.py"
-    source.write_text(SOURCE)
-    assert start(tmp_path, NUMBA_CPU_NAME=EVERY_PROCESSOR, NUMBA_CPU_FEATURES="") == "False 1"
-    [index] = tmp_path.glob("shipped/quarters/*.nbi")
-    [data] = tmp_path.glob("shipped/quarters/*.nbc")
-    assert not [*tmp_path.glob("cache/**/*.nb[ci]")]
-    match change:
-        case "source":
-            source.write_text(f"{SOURCE}# another line\n")
-        case "index" | "data":
-            victim = index if change == "index" else data
-            victim.write_bytes(victim.read_bytes()[:-20])
-        case "numba":
-            index.write_bytes(pickle.dumps("0.1", protocol=-1) + b"of another version")
-    os.utime(source, ns=(0, 0))  # as after a copy: it is the contents that count
-    of_data = change == "data"
-    assert start(tmp_path) == ("True 0" if change == "nothing" else f"{of_data} 1")
-    assert start(tmp_path) == "True 0"  # what was compiled is in the cache
-
-
-def test_code_of_functions_that_are_gone_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compilation, "SHIPPED", tmp_path)
-    name = "pipelines.reconstruction.refinement.kernels:turned"
-    function = importlib.import_module(name.partition(":")[0]).turned
-    index = compilation._shipped_index(dispatcher_of(function)._cache)
-    index.parent.mkdir()
-    tag = index.stem.rpartition(".")[2]
-    kept = [index, index.with_suffix(".1.nbc"), index.parent / "kernels.turned-1.py39.nbi"]
-    gone = [index.parent / f"kernels.turned-1.{tag}.nbi", index.parent / f"kernels.gone-7.{tag}.1.nbc"]
-    for path in (*kept, *gone):
-        path.touch()
-    assert sorted(compilation.outdated_files([function])) == sorted(gone)
-
-
-@pytest.mark.parametrize(("there", "compiled"), [(0, True), (1, True), (2, False)])
-def test_a_stage_compiles_its_own_functions_ahead_where_most_are_missing(
-    monkeypatch: pytest.MonkeyPatch, there: int, compiled: bool
-) -> None:
-    of_stage = ["pipelines.planning.search:a", "pipelines.planning.local:b", "pipelines.planning.local:c"]
-    names = [*of_stage, "pipelines.geometry.x:d"]
-    done: list[list[str]] = []
-    monkeypatch.setattr(precompile, "listed", lambda: {name: [] for name in names})
-    monkeypatch.setattr(precompile, "is_compiled", lambda name: name in names[:there])
-    monkeypatch.setattr(precompile, "precompile", lambda _workers, _progress, some: done.append(some))
-    precompile.precompile_for("replan", Silent())
-    assert done == ([of_stage] if compiled else [])
-
-
-@pytest.mark.parametrize("entry", ["float64 1A", "float64"])
-def test_a_list_older_than_the_code_is_named_without_a_traceback(
-    load_quarter: Callable[[], Callable[[float], float]], entry: str
-) -> None:
-    load_quarter()
-    name = "quarters:quarter" if entry != "float64" else "quarters:gone"
-    assert compile_function(name, [[entry, entry]]) is Outcome.OUTDATED
-
-
-@pytest.mark.parametrize("name", sorted(listed()))
-def test_the_list_names_functions_with_their_arguments(name: str) -> None:
-    """Compare with the code; a list that lags behind it costs time at the first use, and nothing else."""
-    module, _, function = name.partition(":")
-    compiled = dispatcher_of(getattr(importlib.import_module(module), function))
-    for signature in listed()[name]:
-        assert len(signature) == len(inspect.signature(compiled.py_func).parameters)
-        assert [entry_of(type_of(entry)) for entry in signature] == signature
