@@ -191,7 +191,7 @@ run()
 @pytest.mark.parametrize("module", ["click", "pipelines.session", "mocap_cli.info", "pipelines.survey"])
 def test_ctrl_c_while_modules_are_loaded_is_one_line(session: Path, module: str) -> None:
     python = Path(MOCAP).with_name("python")
-    program = [python, "-c", INTERRUPTED_WHILE_IMPORTING, module, "info", session]
+    program: list[str | Path] = [python, "-c", INTERRUPTED_WHILE_IMPORTING, module, "info", session]
     done = subprocess.run(program, capture_output=True, text=True, check=False)
     assert done.returncode == 130
     assert len(done.stderr.strip().splitlines()) == 1
