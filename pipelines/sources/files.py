@@ -268,7 +268,9 @@ def _body_size_m(motion: JointMotion) -> float:
     people = motion.position[known]
     if not len(people):
         return np.nan
-    return float(np.median(np.linalg.norm(np.nanmax(people, axis=1) - np.nanmin(people, axis=1), axis=-1)))
+    with np.errstate(over="ignore", invalid="ignore"):  # 1e308 is infinitely far from its negative
+        sides_m = np.nanmax(people, axis=1) - np.nanmin(people, axis=1)
+        return float(np.median(np.linalg.norm(sides_m, axis=-1)))
 
 
 def _without_far_joints(motion: JointMotion) -> JointMotion:

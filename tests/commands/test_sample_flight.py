@@ -42,7 +42,7 @@ def test_the_detector_and_true_poses_give_the_skeleton(
     assert record["inputs"]["calibration of confidences"] == sha256_of(measured)
     succeeds("report", session)
     page = (session / "report" / "index.html").read_text(encoding="utf-8")
-    assert page.count(f"<td>{detector}, ") == 2  # in the row of each camera
+    assert page.count(f">{detector}, ") == 2  # in the row of each camera
 
 
 @pytest.mark.slow

@@ -37,7 +37,7 @@ Writer = Callable[[Path], object]
 """Writer into an empty folder. A single entry is then read itself; of several entries, the folder is read."""
 
 
-HEADS = frozenset({"map.yaml", "flight.yaml", "00.txt"})
+HEADS = frozenset({"map.yaml", "flight.yaml", "00.txt", "intri.yml"})
 """Files that name others beside them, or need them."""
 
 TREE = test_octomap.at([7] * 13, [3.5, None, -2.0, [3.5, None] * 4, *[None] * 4])
@@ -127,6 +127,11 @@ def _turned_gopro(folder: Path) -> None:
 
 
 SEEDS: dict[str, Writer] = {
+    "airsim": _text(
+        "airsim_rec.txt",
+        "VehicleName\tTimeStamp\tPOS_X\tPOS_Y\tPOS_Z\tQ_W\tQ_X\tQ_Y\tQ_Z\tImageFile\n"
+        + "".join(f"Drone1\t17000000000{k}0\t1\t2\t-34\t1\t0\t0\t0\ta.png\n" for k in range(9)),
+    ),
     "alphapose": _keypoints("alphapose"),
     "anipose": _text("calib.toml", test_anipose_toml.CAMERA),
     "ardupilot": lambda folder: drone_logs.write_dataflash(folder / "a.bin", _truth(folder)),
@@ -143,6 +148,7 @@ SEEDS: dict[str, Writer] = {
     "dji": lambda folder: drone_logs.write_srt(folder / "a.SRT", _truth(folder)),
     "dji_binary": _text("FLY022.DAT", bytes(16) + b"BUILD" + bytes(221) + b"DJI_LOG_V3" + bytes(100)),
     "dji_record": lambda folder: test_dji_records.airdata(folder / "a.csv"),
+    "easymocap": test_opencv_yaml.write_easymocap,
     "flight": lambda folder: write_flight(folder, seconds=0.2),
     "flight from logs": _logged_flight,
     "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),

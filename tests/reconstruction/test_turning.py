@@ -32,6 +32,7 @@ class Turning:
     swings: bool = True
     drift_deg: float = 0.0  # of the log's attitudes, per sqrt(s)
     focal_px: float = LENS.fx
+    loosened: None = None
 
     def poses_at(self, t_ns: Int64, _: Interpolation) -> tuple[Float, Float]:
         """Return position [N, 3] and world_from_camera [N, 3, 3], as the log has them."""

@@ -104,30 +104,39 @@ def test_faulty_content_is_refused(tmp_path: Path, values: dict[str, object]) ->
         READER.read_calibration(store(tmp_path / "c.yml", **values))
 
 
-def test_easymocap_has_its_poses_in_a_file_beside(tmp_path: Path) -> None:
-    matrix, place = np.array([[900.0, 0, 640], [0, 901, 360], [0, 0, 1]]), np.array([[0.1], [0.2], [3.0]])
-    turns = {f"0{k}": np.array([[0.1 * k], [-0.2], [0.3]]) for k in (1, 2)}
+EASYMOCAP_MATRIX, EASYMOCAP_PLACE = (
+    np.array([[900.0, 0, 640], [0, 901, 360], [0, 0, 1]]),
+    [[0.1], [0.2], [3.0]],
+)
+EASYMOCAP_TURNS = {f"0{k}": np.array([[0.1 * k], [-0.2], [0.3]]) for k in (1, 2)}
+
+
+def write_easymocap(folder: Path) -> None:
     for name in ("intri", "extri"):
-        storage = cv2.FileStorage(str(tmp_path / f"{name}.yml"), cv2.FILE_STORAGE_WRITE)
+        storage = cv2.FileStorage(str(folder / f"{name}.yml"), cv2.FILE_STORAGE_WRITE)
         storage.startWriteStruct("names", cv2.FileNode_SEQ)
-        for camera in turns:
+        for camera in EASYMOCAP_TURNS:
             storage.write("", camera)
         storage.endWriteStruct()
-        for camera, turn in turns.items():
+        for camera, turn in EASYMOCAP_TURNS.items():
             if name == "intri":
-                storage.write(f"K_{camera}", matrix)
+                storage.write(f"K_{camera}", EASYMOCAP_MATRIX)
                 storage.write(f"dist_{camera}", np.zeros((5, 1)))
             else:
                 storage.write(f"R_{camera}", turn)
                 storage.write(f"Rot_{camera}", cv2.Rodrigues(turn)[0])
-                storage.write(f"T_{camera}", place)
+                storage.write(f"T_{camera}", np.array(EASYMOCAP_PLACE))
         storage.release()
+
+
+def test_easymocap_has_its_poses_in_a_file_beside(tmp_path: Path) -> None:
+    write_easymocap(tmp_path)
     for name in ("intri", "extri"):
         path = tmp_path / f"{name}.yml"
         assert recognise(path, CalibrationFormat, "calibration").name == "easymocap"
         cameras = recognise(path, CalibrationFormat, "calibration").read_calibration(path)
         assert list(cameras) == ["01", "02"]
-        expected = -cv2.Rodrigues(turns["02"])[0].T @ place
+        expected = -cv2.Rodrigues(EASYMOCAP_TURNS["02"])[0].T @ EASYMOCAP_PLACE
         assert cameras["02"].position is not None
         np.testing.assert_allclose(cameras["02"].position, expected[:, 0], atol=1e-12)
         lens = cameras["02"].intrinsics
