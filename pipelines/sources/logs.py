@@ -5,11 +5,13 @@ is one pass over the messages of one topic: logs of any size stream.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, Self
+
+import numpy as np
 
 from pipelines.formats.logs.maps import (
     MAP_TYPES,
@@ -43,6 +45,7 @@ from pipelines.formats.logs.trajectories import (
     transforms_in,
 )
 from pipelines.geometry.arrays import Int64
+from pipelines.geometry.clock_steps import ClockStep, find_steps, without_steps
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import LogSource, Manifest, MapSource
 from pipelines.session.records import IntrinsicsSample, Message, Occupancy, PictureSample, Trajectory
@@ -140,8 +143,14 @@ class FlightLog:
         """Convert the log's times to world times."""
         return world_times(self.settings.clock, t_ns, self.started_ns)
 
-    def at_world_times(self, gathered: Gathered) -> Trajectory:
+    def note_steps(self, topic: str, steps: Iterable[ClockStep]) -> None:
+        """Note the steps of the header's clock, if its stamps are used."""
+        for step in steps if self.settings.stamps == "header" else ():
+            self.note(f"{self.source} {topic}: {step}")
+
+    def at_world_times(self, gathered: Gathered, topic: str) -> Trajectory:
         """Return a trajectory at world times, with all losses; note how its stamps disagree."""
+        self.note_steps(topic, gathered.stamps.steps)
         for doubt in doubts_of_stamps(gathered.stamps, self.settings.stamps):
             self.note(f"{self.source}: {doubt}")
         trajectory = gathered.trajectory
@@ -226,13 +235,15 @@ class FlightLogs:
             recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
             if parent is not None and child is not None:
                 named = None if topic is None else opened.choose("transforms", topic)
+                name = named or f"transforms to {child}"
                 transforms = transforms_in(recording, source, named)
                 gathered = chained(
                     transforms, source, parent=parent, child=child, stamps=stamps, max_gap_ns=max_gap_ns
                 )
             else:
-                gathered = poses_of(recording, opened.choose("poses", topic), source, stamps)
-            return opened.at_world_times(gathered)
+                name = opened.choose("poses", topic)
+                gathered = poses_of(recording, name, source, stamps)
+            return opened.at_world_times(gathered, name)
 
     def triggers(self, log: str, topic: str | None) -> Frames | None:
         """Read trigger times of pictures from a topic, at world times; None if it is no topic of triggers."""
@@ -266,7 +277,7 @@ class FlightLogs:
             samples = all_samples(opened.recording.messages([name]), source)
             stamps = opened.settings.stamps
             gathered = attitudes_of(samples, f"{source} {name}", stamps=stamps, order=order, units=units)
-            return opened.at_world_times(gathered)
+            return opened.at_world_times(gathered, name)
 
     def intrinsics(self, log: str, topic: str | None) -> IntrinsicsSample:
         """Return the first camera info of a topic.
@@ -311,6 +322,12 @@ class FlightLogs:
                     opened.source, f"{name} holds no picture", "name another topic", code="no-pictures"
                 )
             lost = opened.lost + Counter({"picture without a later stamp": len(taken_ns) - len(t_ns)})
+            if opened.settings.stamps == "header" and (steps := find_steps(taken_ns, received_ns)):
+                opened.note_steps(name, steps)
+                stamps_ns, first = np.unique(taken_ns, return_index=True)
+                place = first[np.searchsorted(stamps_ns, t_ns).clip(max=len(first) - 1)]
+                mended = without_steps(taken_ns, steps)[place]
+                t_ns = np.maximum.accumulate(np.where(taken_ns[place] == t_ns, mended, t_ns))
             return Frames(name, opened.world_times(t_ns), dict(lost))
 
     def picture_size(self, log: str, topic: str | None) -> tuple[int, int] | None:

@@ -36,6 +36,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
 )
 from pipelines.formats.logs.messages import FAULTS, Stamps, nanoseconds, unreadable
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.clock_steps import find_steps, without_steps
 from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
@@ -127,10 +128,18 @@ class _TopicRows:
     frames: set[str] = field(default_factory=set)
 
     def times(self, stamps: Stamps) -> Int64:
-        header, receive = (
-            np.frombuffer(column, dtype=np.int64) for column in (self.header_ns, self.receive_ns)
-        )
-        return receive if stamps == "receive" else np.where(header == 0, receive, header)
+        header, receive = self._stamps()
+        if stamps == "receive":
+            return receive
+        header = without_steps(header, find_steps(header, receive))
+        return np.where(header == 0, receive, header)
+
+    def notes(self, source: str, topic: str, stamps: Stamps) -> list[str]:
+        """Describe the steps of the header's clock."""
+        return [f"{source} {topic}: {step}" for step in find_steps(*self._stamps()) if stamps == "header"]
+
+    def _stamps(self) -> tuple[Int64, Int64]:
+        return np.frombuffer(self.header_ns, np.int64), np.frombuffer(self.receive_ns, np.int64)
 
     def values(self) -> Float:
         return np.frombuffer(self.numbers, dtype=np.float64).reshape(len(self.header_ns), -1)
@@ -247,7 +256,7 @@ def read_preset(
     kind, place = next(iter(places.items()))
     dropped: dict[str, int] = {}
     notes = [f"{source}: took the {kind} position from {place}"]
-    position = read_positions(recording, source, place, stamps, dropped, driver.height)
+    position = read_positions(recording, source, place, stamps, dropped, driver.height, notes)
     fixes = first([part for kind in ("global", "gps") for part in driver.positions[kind]])
     if not position.on_earth and fixes:
         on_earth = read_positions(recording, source, fixes, stamps, {}, driver.height)
@@ -257,6 +266,7 @@ def read_preset(
     body: AttitudeTrack | None = None
     if attitude := first(driver.attitude):
         rows = _read(recording, source, attitude, _quaternion_of)
+        notes += rows.notes(source, attitude, stamps)
         body = attitude_track(attitude, rows.times(stamps), rows.values(), dropped)
     gimbal: AttitudeTrack | None = None
     if angles := first(driver.gimbal):
@@ -285,8 +295,10 @@ def read_pair(
         if not counts.get(name):
             raise DataError(source, f"has no topic {name}, or nothing in it", "name another")
     dropped: dict[str, int] = {}
-    track = read_positions(recording, source, position, stamps, dropped)
+    notes: list[str] = []
+    track = read_positions(recording, source, position, stamps, dropped, notes=notes)
     rows = _read(recording, source, attitude, _quaternion_of)
+    notes += rows.notes(source, attitude, stamps)
     turned = rows.values()
     if axes == "ned":
         turned = attitude_in_enu(turned, relative_to="world", axes="ned")
@@ -297,6 +309,7 @@ def read_pair(
         body=attitude_track(attitude, rows.times(stamps), turned, dropped),
         gimbal=None,
         clock=f"{stamps} stamps",
+        notes=tuple(notes),
         dropped=dropped,
     )
 
@@ -308,12 +321,15 @@ def read_positions(
     stamps: Stamps,
     dropped: dict[str, int],
     height: Height = "ellipsoid",
+    notes: list[str] | None = None,
 ) -> PositionTrack:
-    """Read a topic of positions alone; unusable rows are counted in `dropped`."""
-    if _type_of(recording, topic) not in FIXES:
-        rows = _read(recording, source, topic, _point_of)
+    """Read a topic of positions alone; unusable rows are counted in `dropped`, steps told in `notes`."""
+    is_fix = _type_of(recording, topic) in FIXES
+    rows = _read(recording, source, topic, _fix_of if is_fix else _point_of)
+    if notes is not None:
+        notes += rows.notes(source, topic, stamps)
+    if not is_fix:
         return position_track(source, topic, rows.times(stamps), rows.values(), dropped, on_earth=False)
-    rows = _read(recording, source, topic, _fix_of)
     values = rows.values()
     track = position_track(
         source,

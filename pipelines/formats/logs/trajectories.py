@@ -9,6 +9,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -28,6 +29,7 @@ from pipelines.formats.logs.messages import (
 from pipelines.formats.logs.recordings import messages_alike
 from pipelines.formats.poses.trajectory_files import clean_poses
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.clock_steps import ClockStep, find_steps, without_steps
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.geometry.poses import pose_covariance_in_body
@@ -83,6 +85,7 @@ class StampCheck:
     largest_disagreement_s: float  # header - receipt, where that is largest in size
     jumps: tuple[ClockJump, ...]
     drift: ClockFit | None = None  # from receipt to header, for samples with both
+    steps: tuple[ClockStep, ...] = ()  # of the header's clock; the clear ones are taken out of all else
 
 
 @dataclass(frozen=True)
@@ -104,11 +107,17 @@ class LoggedRows:
     covariance: Float | None = None  # [N, 36], for poses that have one
     frames: Edge = ("", "")  # as the log names them; empty if it names none
 
+    @cached_property
+    def steps(self) -> list[ClockStep]:
+        """Steps of the header's clock."""
+        return find_steps(self.header_ns, self.receive_ns)
+
     def times(self, stamps: Stamps) -> Int64:
-        """Return the stamps asked for [N]; without a header stamp, that of receipt."""
+        """Return the stamps asked for [N], without steps; without a header stamp, that of receipt."""
         if stamps == "receive":
             return self.receive_ns
-        return np.where(self.header_ns == 0, self.receive_ns, self.header_ns)
+        header_ns = without_steps(self.header_ns, self.steps)
+        return np.where(header_ns == 0, self.receive_ns, header_ns)
 
     def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
         """Return the poses, cleaned, with covariances whose rotation is in the body's axes."""
@@ -130,7 +139,8 @@ class LoggedRows:
     def check(self) -> StampCheck:
         """Compare the stamps of header and receipt."""
         (stamped,) = np.nonzero(self.header_ns)
-        header_ns, receive_ns = self.header_ns[stamped], self.receive_ns[stamped]
+        header_ns = without_steps(self.header_ns, self.steps)[stamped]
+        receive_ns = self.receive_ns[stamped]
         lead_ns = header_ns - receive_ns
         jump_ns = np.diff(lead_ns)
         return StampCheck(
@@ -143,6 +153,7 @@ class LoggedRows:
                 for k in np.flatnonzero(np.abs(jump_ns) > _MAY_JUMP_S * 1e9)
             ),
             drift=fit_clock(receive_ns, header_ns) if lead_ns.any() else None,
+            steps=tuple(self.steps),
         )
 
 
@@ -480,6 +491,7 @@ def _together(checks: Sequence[StampCheck]) -> StampCheck:
         largest_disagreement_s=max((c.largest_disagreement_s for c in checks), key=abs, default=0.0),
         jumps=tuple(jump for check in checks for jump in check.jumps),
         drift=next((check.drift for check in checks if check.drift), None),
+        steps=tuple(dict.fromkeys(step for check in checks for step in check.steps)),
     )
 
 
