@@ -81,6 +81,39 @@ def test_without_gps_time_the_station_s_clock_counts(tmp_path: Path, truth: Dron
         read(path, time="gps")
 
 
+def test_a_restart_of_the_vehicle_is_told_and_its_times_go_on(
+    tmp_path: Path, truth: DroneTruth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    half = len(truth.boot_us) // 2
+    boot_us = truth.boot_us.copy()
+    boot_us[half:] -= boot_us[half] - 500_000
+    monkeypatch.setattr(DroneTruth, "boot_us", boot_us)
+    path = write_tlog(tmp_path / "a.tlog", truth, gps_time=False)
+    monkeypatch.undo()
+    telemetry = read(path)
+    late_ns = telemetry.position.t_ns - truth.t_ns
+    assert np.abs(late_ns - 4_000_000_000).max() < 2_500_000  # the station's clock, and whole ms since boot
+    at_s = (truth.t_ns[half] - truth.t_ns[0]) / 1e9
+    (told,) = (note for note in telemetry.notes if "restarted" in note)
+    assert f"at {at_s:.1f} s: the {len(boot_us) - half} attitudes" in told
+    assert FORMAT.describe(path)["restarts"] == [f"at {at_s:.1f} s"]
+    whole = write_tlog(tmp_path / "b.tlog", truth)
+    assert "restarts" not in FORMAT.describe(whole)
+
+
+def test_a_restart_in_a_real_log_moves_nothing() -> None:
+    whole = read(real_data("second/vtol.tlog")).position
+    restarted = read(real_data("third/logs/08-tlog-with-a-reboot/reboot.tlog")).position
+    places, first = np.unique(whole.values, axis=0, return_index=True)
+    late_s = [
+        (t_ns - whole.t_ns[first[same[0]]]) / 1e9
+        for t_ns, place in zip(restarted.t_ns, restarted.values, strict=True)
+        if len(same := np.flatnonzero((places == place).all(axis=1)))
+    ]
+    assert len(late_s) > 100
+    assert np.abs(late_s).max() < 0.003
+
+
 def test_a_mount_s_angles(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_tlog(tmp_path / "a.tlog", truth, version=1)
     packets = [
