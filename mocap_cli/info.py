@@ -10,7 +10,9 @@ from mocap_cli.options import json_option
 from mocap_cli.several import each
 from mocap_cli.terminal import one_line, say
 
-_LONGEST_LIST = 12
+# Longer lists are cut, so that each stays on a line or two.
+_MAX_LISTED = 12
+# Numbers from here on are written with all digits before the point: stamps and counts.
 _LARGE = 1e6
 
 
@@ -54,6 +56,6 @@ def _text(value: object, digits: int = 6) -> str:
         # Times of day need their milliseconds: the page on drones says to take them over into flight.yaml.
         return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) >= _LARGE else f"{value:.{digits}g}"
     if isinstance(value, list | tuple):
-        shown = ", ".join(_text(item, digits) for item in value[:_LONGEST_LIST])
-        return f"{shown}, ... ({len(value)})" if len(value) > _LONGEST_LIST else shown
+        shown = ", ".join(_text(item, digits) for item in value[:_MAX_LISTED])
+        return f"{shown}, ... ({len(value)})" if len(value) > _MAX_LISTED else shown
     return one_line(str(value))

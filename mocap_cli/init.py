@@ -15,7 +15,8 @@ from mocap_cli.options import (
 )
 from mocap_cli.terminal import one_line, print_json, say, watching
 
-_MANY = 5  # most files of one kind in one folder that are listed one by one
+# More files of one kind in one folder are counted instead of listed.
+_MANY = 5
 
 
 @click.command("init", short_help="Draft a flight.yaml from the files of a flight.")
