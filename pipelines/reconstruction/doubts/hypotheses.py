@@ -331,8 +331,9 @@ def of_level(trial: Trial) -> Iterator[Hypothesis]:
         return
     up = up / steady
     tilt_deg = float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
-    upper = -np.nanmean(trial.described.rotation[..., 1], axis=1)  # [C, 3] of each camera's pictures
-    gain = float(np.nanmean(upper @ up) - np.nanmean(upper[:, 2]))
+    edge = -trial.described.rotation[..., 1].reshape(-1, 3)  # of each picture, upwards
+    higher = (edge @ (up - [0.0, 0.0, 1.0]))[np.isfinite(edge).all(axis=1)]
+    gain = float(higher.mean()) if len(higher) else 0.0
     if tilt_deg < LEAST_TILT_OF_WORLD_DEG or gain < LEAST_GAIN_OF_PICTURES:
         return
     axis = max(_UPS, key=lambda name: float(_UPS[name] @ up))

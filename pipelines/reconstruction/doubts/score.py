@@ -329,6 +329,7 @@ def stature_m(joints: Float) -> float:
     return _median(_statures(_ScoredBody(joints).lengths()))
 
 
+@np.errstate(invalid="ignore", divide="ignore")
 def trunk_direction(joints: Float) -> Float:
     """Return the mean [3] of the unit vectors from hips to shoulders; it is shorter if they vary."""
     body = _ScoredBody(joints)
