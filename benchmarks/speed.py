@@ -61,7 +61,7 @@ from tests.synthetic.keypoints import KeypointNoise, detect
 from tests.synthetic.walk import walk
 
 Row = tuple[str, str, str]
-"""What was timed, how fast it is, and how well, or what it is to be compared with."""
+"""Timed operation: its name, its speed, its error or its peer."""
 
 
 def best_s(run: Callable[[], object], repeats: int = 5) -> float:

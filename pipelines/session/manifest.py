@@ -272,7 +272,7 @@ class PoseSource(PlacedSource, MeasuredSource, FileSource):
 
     part = "pose"
     of: Literal["camera", "body"] | None = None
-    """What the poses are of: the camera, or the body that carries it by a mount or gimbal."""
+    """Object of the poses: the camera, or the body that carries it by a mount or gimbal."""
 
 
 class Mount(Guess, RigidTransform):
@@ -297,7 +297,7 @@ class GimbalSource(OwnAxes, FileSource):
     roll_deg: float = Field(0.0, ge=-180, le=180)
     """Constant roll to the right, degrees."""
     relative_to: RelativeTo | None = None
-    """What the angles are relative to: the world, the body, or a level frame with the body's heading."""
+    """Reference of the angles: the world, the body, or a level frame with the body's heading."""
 
     @model_validator(mode="after")
     def _complete(self) -> GimbalSource:
@@ -380,13 +380,13 @@ class CameraSources(YamlModel):
     video: VideoSource | None = None
     """The pictures."""
     frame_times: FrameTimes | None = None
-    """When the pictures were taken."""
+    """Times of the pictures."""
     clock: CameraClock | None = None
     """Clock of the pictures, relative to the world's."""
     pose: PoseSource
-    """Where the camera was."""
+    """Poses of the camera."""
     mount: Mount | None = None
-    """How the camera is fixed to the body whose poses are logged."""
+    """Pose of the camera on the body whose poses are logged."""
     gimbal: GimbalSource | None = None
     """Angles of the gimbal that turns the camera."""
     intrinsics: IntrinsicsSource
@@ -394,7 +394,7 @@ class CameraSources(YamlModel):
     keypoints: KeypointSource | None = None
     """Keypoints of a detector of your own."""
     pose_noise: dict[str, dict[str, float | str]] | None = None
-    """What is known of the errors of the poses: parameters by noise model."""
+    """Known errors of the poses: parameters by noise model."""
 
     @model_validator(mode="after")
     def _has_pictures(self) -> CameraSources:
@@ -474,9 +474,9 @@ class Manifest(YamlModel):
     actors: dict[str, ActorSource] = {}
     """Logged positions of several people by name."""
     map: MapSource | None = None
-    """What stands around."""
+    """Map of the surroundings."""
     truth: TruthSource | None = None
-    """What is known to be true."""
+    """Ground truth of joints and camera poses."""
     plan: dict[str, PlanSource] = {}
     """Commands of the on-board planner by camera."""
 

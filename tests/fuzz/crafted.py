@@ -49,7 +49,7 @@ class Crafted:
 
 Content = Writer | bytes | str
 _Input = tuple[str, Content] | tuple[str, str, str, Content]
-"""What it is, and its content or writer; before that format and entry, if not those of the class."""
+"""Crafted file: its name and content, after format and entry where they differ from the class."""
 _Make = Callable[[], Iterable[_Input]]
 
 KINDS: dict[str, tuple[str, str, _Make]] = {}
