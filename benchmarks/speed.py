@@ -40,7 +40,7 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.noise import pose_errors
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.geometry.triangulation import Views, estimate_noise, locate, triangulate
+from pipelines.geometry.triangulation import Views, estimate_noise, triangulate
 from pipelines.keypoints.association import associate
 from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT
 from pipelines.planning.config import PlannerConfig
@@ -87,8 +87,8 @@ def triangulation() -> Iterator[Row]:
     for name, views in (("2 px", noisy), ("outliers", outliers)):
         seen = replace(views, pixel_sigma=estimate_noise(views))
         for method in ("midpoint", "robust"):
-            points = locate(seen, method=method, threads=1).points
-            took_s = best_s(lambda: triangulate(seen, method=method, threads=1))  # noqa: B023
+            points = triangulate(seen, method=method).points
+            took_s = best_s(lambda: triangulate(seen, method=method))  # noqa: B023
             yield _points_row(f"triangulation, {method}, {name}", took_s, points, truth)
         own = _part(views, few)
         peers = {"pycolmap LO-RANSAC": pycolmap_ransac}
@@ -185,7 +185,7 @@ def association() -> Iterator[Row]:
     took_ms = 1e3 * best_s(choose, 3) / _FRAMES
     yield "association, five people in five cameras", f"{took_ms:.2f} ms/frame", ""
     views = _views_of(found[0], xy, confidence, position, rotation)
-    took_ms = 1e3 * best_s(lambda: triangulate(views, method="robust", threads=1), 3) / _FRAMES
+    took_ms = 1e3 * best_s(lambda: triangulate(views, method="robust"), 3) / _FRAMES
     yield "their triangulation", f"{took_ms:.2f} ms/frame", "RapidPoseTriangulation claims 1 ms"
 
 

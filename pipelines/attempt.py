@@ -307,7 +307,7 @@ def reconstruct_once(
         )
         cameras, background["ground"] = binding.cameras, binding.entry
     if made is None or cameras is not logged:
-        made = _triangulated(flight, cameras, settings, workers)
+        made = _triangulated(flight, cameras, settings)
     seen, views, result, solve = made.seen, made.views, made.result, made.solve
     observations = seen.observations
     if settings.method == "auto" and are_calibrated(cameras, observations):
@@ -325,9 +325,7 @@ def reconstruct_once(
         result = refused_people(refined.result, observations, seen.anybody)
         if refined.cameras is None:  # refinement rejected: fall back to `robust`, with its own loss
             solves = "robust"
-            solve = solver_for(
-                solves, cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers
-            )
+            solve = solver_for(solves, cameras, observations, pixel_sigma=settings.pixel_sigma)
             result = refused_people(solve(views), observations, seen.anybody)
     if binding is not None:
         result = replace(result, covariance=result.covariance + binding.common)
@@ -337,7 +335,7 @@ def reconstruct_once(
     own = observations, views, result
     if flight.segment is not None:
         own = of_times(*own, flight.segment.own)
-        solve = solver_for(solves, cameras, own[0], pixel_sigma=settings.pixel_sigma, threads=workers)
+        solve = solver_for(solves, cameras, own[0], pixel_sigma=settings.pixel_sigma)
     truth = None if flight.truth is None else true_joints_at(flight.truth, own[0].t_ns)
     metrics = assess(
         *own,
@@ -420,14 +418,14 @@ def clocks_of(
     prior_s = with_reference(description, cameras, prior_s)
     made = None
     if (exact & ~known).any():
-        made = _triangulated(flight, cameras, settings, workers)
+        made = _triangulated(flight, cameras, settings)
         robust = _robust_flight(flight, cameras, made, prior_s, settings, workers)
         late = find_wrong_clocks(robust, exact & ~known, prior_s == 0, description.clock_reference)
         if late.wrong:
             cameras, made = shifted(cameras, late.offset_s), None
             clocks = late if clocks is None else clocks.with_others(late)
     if prior_s.any():
-        made = made or _triangulated(flight, cameras, settings, workers)
+        made = made or _triangulated(flight, cameras, settings)
         found = find_clocks(_robust_flight(flight, cameras, made, prior_s, settings, workers), stated)
         cameras, prior_s = shifted(cameras, found.offset_s), found.prior_s
         clocks = found if clocks is None else clocks.with_others(found)
@@ -452,15 +450,13 @@ class _Triangulated:
 
 
 def _triangulated(
-    flight: LoadedFlight, cameras: list[Camera], settings: ReconstructSettings, workers: int
+    flight: LoadedFlight, cameras: list[Camera], settings: ReconstructSettings
 ) -> _Triangulated:
     """Observe and triangulate by the method, or by what it starts from."""
     seen = flight.waiting.put(_observe(flight, cameras, settings))
     flight.waiting.release()
-    views = views_with_noise(cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers)
-    solve = solver_for(
-        settings.method, cameras, seen.observations, pixel_sigma=settings.pixel_sigma, threads=workers
-    )
+    views = views_with_noise(cameras, seen.observations, pixel_sigma=settings.pixel_sigma)
+    solve = solver_for(settings.method, cameras, seen.observations, pixel_sigma=settings.pixel_sigma)
     return _Triangulated(seen, views, flight.waiting.put(solve(views)), solve)
 
 

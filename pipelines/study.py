@@ -21,7 +21,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
-from pipelines.geometry.triangulation import Views, locate
+from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.keypoints.hints import project_actor
 from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.planning.comparison import capped_mm, mean_of_trials, measure_alone
@@ -362,7 +362,7 @@ def _reconstructed(
         return refined_points(views, elapsed_s, tuple(filmed.person.joints), models)[1:]
     if method == "robust":
         return triangulate_robustly(views)[1], None
-    return locate(views, method=method).points, None
+    return triangulate(views, method=method).points, None
 
 
 def _compared(points: Mapping[StudyMethod, Float], filmed: Walk) -> dict[StudyMethod, Row]:

@@ -31,22 +31,17 @@ docs/estimate.md.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations, islice
 from itertools import count as count_up
 from math import comb, cos, gcd, radians
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int8, Int64
-
-if TYPE_CHECKING:
-    from pipelines.geometry.triangulation_kernels import TriangulationArrays
 
 Method = Literal["dlt", "midpoint", "robust"]
 
@@ -61,7 +56,7 @@ STATUS = ("ok", "filled", "few_views", "low_parallax", "rejected", "not_detected
 
 # These are all pairs of 8 views. Of more views, even if half are bad, 28 nearly always hold a clean pair.
 _MAX_PAIRS = 28
-# A thread takes this many joint-frames at once.
+# The intermediate arrays of this many joint-frames stay in a processor's cache.
 _BLOCK = 4096
 # A median over this many joint-frames is accurate to one per cent.
 _NOISE_SAMPLE = 20_000
@@ -124,36 +119,23 @@ class Views:
 
 
 @dataclass(frozen=True)
-class Points:
-    """Points without uncertainty; NaN, and no inliers, wherever `status` is not "ok"."""
-
-    points: Float  # [N, 3] m, world
-    inlier: Bool  # [N, C]
-    status: Int8  # [N] index into STATUS
-
-
-@dataclass(frozen=True)
-class Triangulation(Points):
-    """Points with their uncertainty and residuals, NaN wherever `status` is not "ok".
+class Triangulation:
+    """Points with their uncertainty and residuals, NaN (and no inliers) wherever `status` is not "ok".
 
     `covariance` is of first order: pixel and pose noise of the inlier views, independent between cameras. It
     includes the part of a pose error that all joints share, so it is that of the absolute position.
     """
 
+    points: Float  # [N, 3] m, world
+    inlier: Bool  # [N, C]
+    status: Int8  # [N] index into STATUS
     covariance: Float  # [N, 3, 3] m^2
     views: Int64  # [N] inlier views
     residual_px: Float  # [N, C] reprojection distance of every view, also rejected ones; inf behind a camera
 
 
-def triangulate(
-    views: Views,
-    *,
-    method: Method,
-    min_views: int = 2,
-    gate: float = GATE,
-    threads: int = 1,
-) -> Triangulation:
-    """Triangulate every joint-frame; the result has the same bytes for any number of threads.
+def triangulate(views: Views, *, method: Method, min_views: int = 2, gate: float = GATE) -> Triangulation:
+    """Triangulate every joint-frame.
 
     Statuses besides "ok":
 
@@ -168,91 +150,172 @@ def triangulate(
         method: see the module; `min_views` and the parallax apply to all three, `gate` to `robust`.
         min_views: views needed, and inliers needed; at least 2.
         gate: in standard deviations of a view's image point, pixel and pose noise together.
-        threads: at most this many, and no more than there are processors.
 
     Raises:
         ValueError: min_views below 2, or a gate that is not above 0.
     """
-    found = _run(views, method, min_views, gate, threads, len(views.weight))
-    return Triangulation(*found)
-
-
-def locate(views: Views, *, method: Method, gate: float = GATE, threads: int = 1) -> Points:
-    """Triangulate without covariances and residuals, for studies over many draws of noise."""
-    return Points(*_run(views, method, 2, gate, threads, 0)[:3])
-
-
-def _run(
-    views: Views, method: Method, min_views: int, gate: float, threads: int, described: int
-) -> TriangulationArrays:
-    """Run the kernel over blocks of joint-frames; `described` is the length of the last three results."""
     if min_views < 2 or not gate > 0:
         raise ValueError(f"min_views={min_views}, gate={gate}: out of range")
-    from pipelines.geometry import triangulation_kernels as kernels
+    poses = _poses_of(views)
+    blocks = []
+    for first in range(0, max(len(views.weight), 1), _BLOCK):
+        part = slice(first, first + _BLOCK)
+        block = replace(
+            views, rays=views.rays[part], weight=views.weight[part], pose_index=views.pose_index[part]
+        )
+        blocks.append(_triangulate_block(block, poses, method, min_views, gate))
+    return Triangulation(*(np.concatenate(results) for results in zip(*blocks, strict=True)))
 
-    n, cameras = views.weight.shape
-    found = kernels.TriangulationArrays(
-        _linear_points(views) if method == "dlt" else np.empty((n, 3)),
-        np.empty((n, cameras), np.bool_),
-        np.empty(n, np.int8),
-        np.empty((described, 3, 3)),
-        np.empty(described, np.int64),
-        np.empty((described, cameras)),
+
+class _Poses(NamedTuple):
+    """Poses of all instants in a world moved to the mean centre of the cameras of each; 0 where unknown."""
+
+    known: Bool  # [F, C]
+    middle: Float  # [F, 3] m
+    rows: Float  # [F, C, 12]: rotation by rows, centre
+
+
+def _poses_of(views: Views) -> _Poses:
+    finite = np.isfinite(views.position).all(axis=-1) & np.isfinite(views.rotation).all(axis=(-1, -2))
+    known: Bool = np.asarray(finite, np.bool_)
+    count = np.maximum(known.sum(axis=1), 1)[:, None]
+    middle = np.where(known[..., None], views.position, 0.0).sum(axis=1) / count
+    rotation = views.rotation.reshape(*known.shape, 9)
+    rows = np.concatenate([rotation, views.position - middle[:, None]], axis=-1)
+    return _Poses(known, middle, np.where(known[..., None], rows, 0.0))
+
+
+def _triangulate_block(
+    views: Views, poses: _Poses, method: Method, min_views: int, gate: float
+) -> tuple[Float, Bool, Int8, Float, Int64, Float]:
+    """Triangulate some joint-frames; return the fields of `Triangulation`."""
+    at = views.pose_index
+    detected: Bool = np.asarray(
+        (views.weight > 0) & np.isfinite(views.weight) & np.isfinite(views.rays).all(axis=-1)
     )
-    contiguous: list[Any] = [
-        np.ascontiguousarray(getattr(views, name), np.int64 if name == "pose_index" else np.float64)
-        for name in kernels.ViewArrays._fields
-    ]
-    arrays = kernels.ViewArrays(*contiguous)
-    gates = kernels.Gates(
-        {"dlt": kernels.DLT, "midpoint": kernels.MIDPOINT, "robust": kernels.ROBUST}[method],
-        min_views,
-        cos(radians(MIN_PARALLAX_DEG)) ** 2,
-        float(gate) ** 2,
-        *_pair_table(cameras),
+    seen: Bool = detected & poses.known[at]
+    rays = np.where(seen[..., None], views.rays, 0.0)
+    weight = np.where(seen, views.weight, 0.0)
+    rows = poses.rows[at]
+    rotation, centre = rows[..., :9].reshape(*seen.shape, 3, 3), rows[..., 9:]
+    along = np.concatenate([rays, np.ones((*seen.shape, 1))], axis=-1)
+    direction = (rotation @ along[..., None])[..., 0]
+    length2 = (along**2).sum(axis=-1)
+    cos2_min = cos(radians(MIN_PARALLAX_DEG)) ** 2
+    apart = (direction @ direction.mT) ** 2 < cos2_min * length2[:, :, None] * length2[:, None]
+    wide = (apart & seen[:, :, None] & seen[:, None]).any(axis=(1, 2))
+    reasons = (
+        ("not_detected", ~detected.any(axis=1)),
+        ("few_views", detected.sum(axis=1) < min_views),
+        ("no_pose", seen.sum(axis=1) < min_views),
+        ("low_parallax", ~wide),
     )
-    starts = range(0, n, _BLOCK)
-    workers = min(threads, os.cpu_count() or 1, len(starts))
-    if workers <= 1:
-        kernels.triangulate_range(0, n, arrays, gates, found)
-        return found
-    # The kernel releases the interpreter lock and each block writes its own rows, so plain threads suffice.
-    # Unlike numba's own threads, they may be started from several threads at once.
-    with ThreadPoolExecutor(workers) as pool:
-        for done in [
-            pool.submit(kernels.triangulate_range, first, min(first + _BLOCK, n), arrays, gates, found)
-            for first in starts
-        ]:
-            done.result()
-    return found
+    status = np.select([where for _, where in reasons], [STATUS.index(word) for word, _ in reasons], 0)
+    status = status.astype(np.int8)
+    inlier = seen.copy()
+    if method == "dlt":
+        point = _linear_points(rotation, centre, along, seen & (status == 0)[:, None])
+    else:
+        point = _midpoints(direction / np.sqrt(length2)[..., None], centre, weight**2, status == 0)
+    noise = _image_covariance(views, rays, weight)
+    if method == "robust":
+        from pipelines.geometry.triangulation_kernels import fit_robustly
+
+        view = np.concatenate([rays, direction, length2[..., None], *noise], axis=-1)
+        pairs = _pair_table(seen.shape[1])
+        fit_robustly(view, poses.rows, at, *pairs, gate**2, cos2_min, min_views, point, inlier, status)
+    place = (rotation.mT @ (point[:, None] - centre)[..., None])[..., 0]
+    if method != "robust":
+        behind = (seen & ~(place[..., 2] > 0)).any(axis=1)
+        status[(status == 0) & behind] = STATUS.index("rejected")
+    ok = status == 0
+    inlier &= ok[:, None]
+    covariance = _covariance(method, place, rotation, length2, weight, noise, inlier)
+    points = np.where(ok[:, None], point + poses.middle[at], np.nan)
+    covariance = np.where(ok[:, None, None], covariance, np.nan)
+    return points, inlier, status, covariance, inlier.sum(axis=1), reprojection_px(views, points)
 
 
-def _linear_points(views: Views) -> Float:
-    """Triangulate each joint-frame [N, 3] by pycolmap from all its views; NaN where it finds no point."""
+def _linear_points(rotation: Float, centre: Float, along: Float, seen: Bool) -> Float:
+    """Triangulate each joint-frame [N, 3] by pycolmap from the seen views; NaN where it finds no point."""
     from pycolmap import triangulate_multi_view_point
 
-    known = np.isfinite(views.position).all(axis=-1) & np.isfinite(views.rotation).all(axis=(-1, -2))
-    posed: Bool = np.asarray(known, np.bool_)
-    count = np.maximum(posed.sum(axis=1), 1)[:, None]
-    centre = np.where(posed[..., None], views.position, 0.0).sum(axis=1) / count  # [F, 3]
-    away = views.position - centre[:, None]
-    spread = np.where(posed, (away**2).sum(axis=-1), 0.0).sum(axis=1, keepdims=True)
-    unit = np.where(spread > 0, np.sqrt(spread / count), 1.0)  # [F, 1] m
-    camera_from_world = np.swapaxes(views.rotation, -1, -2)
-    shift = -camera_from_world @ (away / unit[..., None])[..., None]
-    projection = np.concatenate([camera_from_world, shift], axis=-1)
-    seen = (views.weight > 0) & np.isfinite(views.rays).all(axis=-1) & posed[views.pose_index]
-    rays = np.where(seen[..., None], views.rays, 0.0)
-    direction = np.concatenate([rays, np.ones((*seen.shape, 1))], axis=-1)
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    spread = (np.where(seen[..., None], centre, 0.0) ** 2).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=1), 1)
+    unit = np.where(spread > 0, np.sqrt(spread), 1.0)  # [N] m
+    shift = -rotation.mT @ (centre / unit[:, None, None])[..., None]
+    projection = np.concatenate([rotation.mT, shift], axis=-1)
+    direction = along / np.linalg.norm(along, axis=-1, keepdims=True)
     points = np.full((len(seen), 3), np.nan)
-    for n in np.flatnonzero(seen.sum(axis=1) >= 2):
-        own = seen[n]
-        found = triangulate_multi_view_point(list(projection[views.pose_index[n], own]), direction[n, own])
+    for n in np.flatnonzero(seen.any(axis=1)):
+        found = triangulate_multi_view_point(list(projection[n, seen[n]]), direction[n, seen[n]])
         if found is not None:
             points[n] = found.ravel()
-    result: Float = points * unit[views.pose_index] + centre[views.pose_index]
-    return result
+    return points * unit[:, None]
+
+
+def _midpoints(direction: Float, centre: Float, weight: Float, wanted: Bool) -> Float:
+    """Compute the points [N, 3] closest to the viewing lines: sum w (I - d d') (X - c) = 0."""
+    across = weight[..., None, None] * (np.eye(3) - direction[..., :, None] * direction[..., None, :])
+    normal = np.where(wanted[:, None, None], across.sum(axis=1), np.eye(3))
+    right = (across @ centre[..., None]).sum(axis=1)
+    points: Float = np.linalg.solve(normal, right)[..., 0]
+    return points
+
+
+def _image_covariance(views: Views, rays: Float, weight: Float) -> tuple[Float, Float]:
+    """Compute covariances xx, xy, yy of image points: from pixels and rotation; and from position at depth 1.
+
+    The image moves by J t under a shift t and by L w under a turn w of the camera, with the interaction
+    matrices J = [1 0 -x; 0 1 -y]/z and L = [xy, -1-x^2, y; 1+y^2, -xy, -x] (Chaumette and Hutchinson
+    2006, eq. 11).
+    """
+    shift, turn = np.moveaxis(views.pose_sigma[views.pose_index] ** 2, -1, 0)
+    pixel = (views.pixel_sigma / views.focal) ** 2 / np.where(weight > 0, weight, 1.0) ** 2
+    x, y = np.moveaxis(rays, -1, 0)
+    xx, yy, cross = 1.0 + x * x, 1.0 + y * y, x * y
+    turned = (
+        pixel + turn * (cross * cross + xx * xx + y * y),
+        turn * cross * (xx + yy - 1.0),
+        pixel + turn * (cross * cross + yy * yy + x * x),
+    )
+    return np.stack(turned, axis=-1), np.stack([shift * xx, shift * cross, shift * yy], axis=-1)
+
+
+def _covariance(
+    method: Method,
+    place: Float,
+    rotation: Float,
+    length2: Float,
+    weight: Float,
+    noise: tuple[Float, Float],
+    inlier: Bool,
+) -> Float:
+    """Compute the covariances [N, 3, 3] of points that are at `place` [N, C, 3] in the cameras' frames.
+
+    To first order, every method solves sum J'V(r + J dX) = 0 with its own weight V of a view's image residual
+    r. So with H = sum J'VJ, the noise S of the views gives H^-1 (sum J'VSVJ) H^-1. For `robust`, V is S^-1.
+    The distance to a line is z times the part of (r, 0) across the direction (u, v, 1). `midpoint` minimises
+    its square times that of the confidence, `dlt` its square.
+    """
+    depth = np.where(inlier & (place[..., 2] > 0), place[..., 2], 1.0)
+    image = place[..., :2] / depth[..., None]
+    jacobian = (rotation.mT[..., :2, :] - image[..., None] * rotation.mT[..., 2:, :]) / depth[..., None, None]
+    spread = (noise[0] + noise[1] / depth[..., None] ** 2)[..., [[0, 1], [1, 2]]]
+    if method == "robust":
+        determinant = np.linalg.det(spread)[..., None, None]
+        by_view = spread[..., ::-1, ::-1] * [[1.0, -1.0], [-1.0, 1.0]] / determinant
+    else:
+        scale = depth**2 * (weight**2 if method == "midpoint" else 1.0)
+        outer = image[..., :, None] * image[..., None, :]
+        by_view = scale[..., None, None] * (np.eye(2) - outer / length2[..., None, None])
+    by_view = np.where(inlier[..., None, None], by_view, 0.0)
+    weighted = by_view @ jacobian
+    normal = (jacobian.mT @ weighted).sum(axis=1)
+    known: Bool = np.asarray(inlier.any(axis=1))
+    inverse: Float = np.linalg.inv(np.where(known[:, None, None], normal, np.eye(3)))
+    if method != "robust":
+        inverse = inverse @ (weighted.mT @ spread @ weighted).sum(axis=1) @ inverse
+    return inverse
 
 
 def reprojection_px(views: Views, points: Float) -> Float:
@@ -265,12 +328,12 @@ def reprojection_px(views: Views, points: Float) -> Float:
     x, y, z = np.einsum("ncij,nci->jnc", rotation, points[:, None] - position)
     depth = np.where(z > 0, z, 1.0)
     distance = views.focal * np.hypot(x / depth - views.rays[..., 0], y / depth - views.rays[..., 1])
-    seen = (views.weight > 0) & np.isfinite(distance)
+    seen = (views.weight > 0) & np.isfinite(distance + z)
     result: Float = np.where(seen, np.where(z > 0, distance, np.inf), np.nan)
     return result
 
 
-def estimate_noise(views: Views, *, threads: int = 1) -> Float:
+def estimate_noise(views: Views) -> Float:
     """Estimate the pixel noise per axis [C] that explains the views' residuals; at least the stated one.
 
     Residuals may be larger than the stated pixel and pose noise explain, because poses are worse than their
@@ -296,7 +359,7 @@ def estimate_noise(views: Views, *, threads: int = 1) -> Float:
     )
 
     def explain(seen: Views, method: Method, sigma: Float) -> Float:
-        result = triangulate(replace(seen, pixel_sigma=sigma), method=method, threads=threads)
+        result = triangulate(replace(seen, pixel_sigma=sigma), method=method)
         return residual_sigma(sample, result, views.pixel_sigma)
 
     table, count = _pair_table(cameras)
@@ -391,9 +454,7 @@ _MIN_JOINTS = 5
 _GROSS_ROUNDS = 2
 
 
-def triangulate_pictures(
-    views: Views, *, picture: Int64, pixel_sigma: Float, threads: int = 1
-) -> Triangulation:
+def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) -> Triangulation:
     """Triangulate with `robust`, without views that have gross errors relative to the rest of their picture.
 
     Without gross errors, the result is that of `triangulate`, byte for byte. A wrong clock offset moves
@@ -409,11 +470,11 @@ def triangulate_pictures(
         As `triangulate`. Views that are left out are not inliers but have their residuals. A joint-frame with
         too few views because of them is `rejected`.
     """
-    first = triangulate(views, method="robust", threads=threads)
-    gross = _gross(views, picture, first.points, pixel_sigma, threads)
+    first = triangulate(views, method="robust")
+    gross = _gross(views, picture, first.points, pixel_sigma)
     if not gross.any():
         return first
-    found = triangulate(_without(gross, views), method="robust", threads=threads)
+    found = triangulate(_without(gross, views), method="robust")
     (rows,) = np.nonzero(gross.any(axis=1))
     lost = rows[np.isnan(found.points[rows, 0])]
     status, residual_px = found.status.copy(), found.residual_px.copy()
@@ -423,18 +484,18 @@ def triangulate_pictures(
     return replace(found, status=status, residual_px=residual_px)
 
 
-def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float, threads: int) -> Bool:
+def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float) -> Bool:
     """Find views [N, C] with gross errors; `points` are approximate positions of the joint-frames."""
     gross = np.zeros(views.weight.shape, dtype=np.bool_)
     for _ in range(_GROSS_ROUNDS):
         moved, judged = _moved(replace(views, pixel_sigma=pixel_sigma), picture, points)
-        moved = replace(moved, pixel_sigma=estimate_noise(moved, threads=threads))
-        agreed = locate(moved, method="robust", gate=_GROSS_GATE, threads=threads)
+        moved = replace(moved, pixel_sigma=estimate_noise(moved))
+        agreed = triangulate(moved, method="robust", gate=_GROSS_GATE)
         located = np.isin(agreed.status, (STATUS.index("ok"), STATUS.index("rejected")))
         before, gross = gross, located[:, None] & judged & ~agreed.inlier
         if np.array_equal(before, gross):
             break
-        points = locate(_without(gross, views), method="robust", threads=threads).points
+        points = triangulate(_without(gross, views), method="robust").points
     return gross
 
 
@@ -443,24 +504,22 @@ def _moved(views: Views, picture: Int64, points: Float) -> tuple[Views, Bool]:
 
     The moved views have exact poses. The others count as not seen.
     """
-    from pipelines.geometry.triangulation_kernels import move_pictures
-
-    order = np.argsort(picture, kind="stable")
-    starts = np.flatnonzero(np.diff(picture[order], prepend=-1, append=-1))
-    rays, judged = np.array(views.rays, np.float64, order="C"), np.zeros(views.weight.shape, dtype=np.bool_)
-    move_pictures(
-        order,
-        starts,
-        _MIN_JOINTS,
-        np.ascontiguousarray(points),
-        np.ascontiguousarray(views.rays, np.float64),
-        np.ascontiguousarray(views.weight, np.float64),
-        np.ascontiguousarray(views.pose_index, np.int64),
-        np.ascontiguousarray(views.position, np.float64),
-        np.ascontiguousarray(views.rotation, np.float64),
-        rays,
-        judged,
-    )
+    rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
+    place = (rotation.mT @ (points[:, None] - position)[..., None])[..., 0]
+    seen: Bool = np.asarray((views.weight > 0) & np.isfinite(views.rays).all(axis=-1))
+    depth = np.where(seen & (place[..., 2] > 0), place[..., 2], np.nan)[..., None]
+    _, row, count = np.unique(picture, return_inverse=True, return_counts=True)
+    order = np.argsort(row, kind="stable")
+    column = np.empty_like(row)
+    column[order] = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
+    residual = np.full((len(count), count.max(initial=1), *depth.shape[1:2], 2), np.nan)
+    residual[row, column] = place[..., :2] / depth - views.rays
+    residual.sort(axis=1)  # NaN last
+    known = np.isfinite(residual).all(axis=-1).sum(axis=1)[:, None, :, None]
+    low, high = (np.take_along_axis(residual, np.maximum(known - k, 0) // 2, axis=1)[:, 0] for k in (1, 0))
+    shift = np.where(known[:, 0] >= _MIN_JOINTS, (low + high) / 2, np.nan)[row]
+    judged: Bool = np.asarray(seen & np.isfinite(shift).all(axis=-1))
+    rays = np.where(judged[..., None], views.rays + shift, views.rays)
     weight = np.where(judged, views.weight, 0.0)
     return replace(views, rays=rays, weight=weight, pose_sigma=np.zeros_like(views.pose_sigma)), judged
 

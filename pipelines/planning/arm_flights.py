@@ -16,7 +16,7 @@ from pipelines.geometry.arrays import Bool, Float, Float32, Int64
 from pipelines.geometry.cameras import Intrinsics, project, undistort
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import invert, look_at, matrix_from_quaternion, rates, transform
-from pipelines.geometry.triangulation import Views, locate
+from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.planning.arms import Arm
 from pipelines.planning.distance_field import DistanceField, MapsInTurn, looked, visible
 from pipelines.planning.forecast import ActorFilter, PeopleFilter
@@ -370,7 +370,7 @@ def measure(
             pixel_sigma=np.full(cameras, PIXEL_SIGMA_PX),
             pose_sigma=sigma,
         )
-        points = locate(views, method="robust").points.reshape(joints.shape)
+        points = triangulate(views, method="robust").points.reshape(joints.shape)
         points[~known] = np.nan
         error[trial] = np.sqrt(np.sum((points - joints) ** 2, axis=-1))
         if trial == 0:

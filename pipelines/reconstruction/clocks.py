@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
-from pipelines.geometry.triangulation import Views, locate
+from pipelines.geometry.triangulation import Views, triangulate
 
 # --- tuning ---
 
@@ -314,7 +314,7 @@ def _mean(values: Float) -> Float:
 
 def _missed_px(views: Views, instants: int, camera: int) -> Float:
     """Compute residuals [T', J, C, 2] px, beside the median of each view, at times when the camera sees."""
-    points = locate(views, method="midpoint").points
+    points = triangulate(views, method="midpoint").points
     away = points[:, None] - views.position[views.pose_index]
     seen = np.einsum("ncij,nci->ncj", views.rotation[views.pose_index], away)
     depth = np.where(seen[..., 2] > 0, seen[..., 2], np.nan)

@@ -84,7 +84,7 @@ class RobustFlight:
     clock_sigma_s: Float  # [C] prior standard deviation of each clock offset, 0 for a known clock
     pixel_sigma: float  # px, of a good keypoint
     between: Interpolation  # rules for interpolating between logged poses
-    threads: int  # see `triangulate`
+    threads: int  # see `refine`
     trusted: Bool  # [P] people who determine cameras and clocks; the others are triangulated afterwards
     only_limbs: bool = False  # other joints are not refined
     waiting: Waiting | None = None  # where the arrays wait meanwhile
@@ -174,7 +174,7 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
         return RefinedFlight(flight.observations, flight.views, flight.result, None, metrics, warnings)
 
     observed, views = _observe_refined(refined, flight, offset_s)
-    result = _keep_reconstructed_joints(refined, views, flight.threads)
+    result = _keep_reconstructed_joints(refined, views)
     poses = _camera_table(flight, refined, offset_s)
     return RefinedFlight(observed, views, result, poses, metrics, warnings)
 
@@ -302,12 +302,11 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
 def _triangulate_with_offsets(flight: RobustFlight, offset_s: Float) -> Triangulation:
     """Triangulate the flight by `robust` with these clock offsets."""
     _, views = _observe_with_offsets(flight, offset_s)
-    views = replace(views, pixel_sigma=estimate_noise(views, threads=flight.threads))
+    views = replace(views, pixel_sigma=estimate_noise(views))
     return triangulate_pictures(
         views,
         picture=pictures_of(flight.observations),
         pixel_sigma=np.full(len(flight.cameras), flight.pixel_sigma),
-        threads=flight.threads,
     )
 
 
@@ -377,13 +376,13 @@ def _observe_refined(refined: Refined, flight: RobustFlight, offset_s: Float) ->
         pixel_sigma=np.full(len(flight.cameras), flight.pixel_sigma),
         pose_sigma=np.zeros_like(views.pose_sigma),
     )
-    views = replace(views, pixel_sigma=estimate_noise(views, threads=flight.threads))
+    views = replace(views, pixel_sigma=estimate_noise(views))
     return replace(observed, position=position, rotation=rotation), views
 
 
-def _keep_reconstructed_joints(refined: Refined, views: Views, threads: int) -> Triangulation:
+def _keep_reconstructed_joints(refined: Refined, views: Views) -> Triangulation:
     """Keep the estimate's points and covariances where `robust` reconstructs the joint from these views."""
-    gated = triangulate(views, method="robust", threads=threads)
+    gated = triangulate(views, method="robust")
     position, covariance = refined.position.reshape(-1, 3), refined.covariance.reshape(-1, 3, 3)
     ok = (gated.status == STATUS.index("ok")) & ~np.isnan(position[:, 0])
     np.copyto(gated.points, position, where=ok[:, None])

@@ -69,9 +69,7 @@ def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_
     return np.stack(columns, axis=1)
 
 
-def views_with_noise(
-    cameras: Sequence[Camera], observations: Observations, *, pixel_sigma: float, threads: int
-) -> Views:
+def views_with_noise(cameras: Sequence[Camera], observations: Observations, *, pixel_sigma: float) -> Views:
     """Build the views, one row for each joint-frame, with the noise that the gates need.
 
     Residuals that the stated noise does not explain are added as pixel noise: with too little noise the
@@ -90,7 +88,7 @@ def views_with_noise(
         pixel_sigma=np.full(count, pixel_sigma),
         pose_sigma=np.zeros((times, count, 2)) if stated is None else stated,
     )
-    return replace(views, pixel_sigma=estimate_noise(views, threads=threads))
+    return replace(views, pixel_sigma=estimate_noise(views))
 
 
 def solver_for(
@@ -99,7 +97,6 @@ def solver_for(
     observations: Observations,
     *,
     pixel_sigma: float,
-    threads: int,
 ) -> Callable[[Views], Triangulation]:
     """Choose the solver from views to points; for `refined` and `auto`, the solver of their start.
 
@@ -108,11 +105,11 @@ def solver_for(
     residuals say where nothing is known of the poses' errors.
     """
     if method in ("robust", "auto") and are_calibrated(cameras, observations):
-        return partial(triangulate_heavy_tailed, threads=threads)
+        return triangulate_heavy_tailed
     if method in ("dlt", "midpoint"):
-        return partial(triangulate, method=method, threads=threads)
+        return partial(triangulate, method=method)
     picture, of_detector = pictures_of(observations), np.full(len(cameras), pixel_sigma)
-    in_pictures = partial(triangulate_pictures, picture=picture, pixel_sigma=of_detector, threads=threads)
+    in_pictures = partial(triangulate_pictures, picture=picture, pixel_sigma=of_detector)
     if observations.pose_sigma is None:
         return partial(triangulate_widened, solve=in_pictures)
     if observations.pose_covariance is not None:
@@ -238,7 +235,7 @@ def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int
 _ROUNDS = 12
 
 
-def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:
+def triangulate_heavy_tailed(views: Views) -> Triangulation:
     """Triangulate with `robust`, then weigh its inliers by Cauchy's loss (iteratively reweighted).
 
     A view of whitened residual r gets the weight 1 / (1 + r^2) (Holland and Welsch 1977, table 1, with
@@ -247,9 +244,8 @@ def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:
 
     Args:
         views: the views; `pixel_sigma` from `estimate_noise`.
-        threads: see `triangulate`.
     """
-    first = triangulate(views, method="robust", threads=threads)
+    first = triangulate(views, method="robust")
     inliers = np.where(first.inlier, views.weight, 0.0)
     result = first
     for _ in range(_ROUNDS):
@@ -257,7 +253,7 @@ def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:
         # Without a residual (not reconstructed, behind the camera) there is nothing to weight by.
         loss = np.where(np.isfinite(whitened), np.nan_to_num(whitened) ** 2, 0.0)
         weighted = replace(views, weight=inliers / np.sqrt(1.0 + loss))
-        result = triangulate(weighted, method="robust", threads=threads)
+        result = triangulate(weighted, method="robust")
     lost = first.points[:, :1] * result.points[:, :1]  # NaN where either has no point
     return replace(
         result,

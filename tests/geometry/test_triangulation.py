@@ -15,7 +15,6 @@ from pipelines.geometry.triangulation import (
     Triangulation,
     _pair_table,
     estimate_noise,
-    locate,
     triangulate,
 )
 from tests.geometry.rings import (
@@ -163,16 +162,19 @@ def test_the_covariance_is_that_of_the_errors(method: Method, cameras: int, nois
     assert inside == pytest.approx(0.95, abs=0.015)
 
 
-def test_any_number_of_threads_gives_the_same_bytes() -> None:
+def test_any_division_of_the_joint_frames_gives_the_same_bytes() -> None:
     rng = np.random.default_rng(6)
-    _, views = ring(600, 5)
+    _, views = ring(300, 5)
     views, _ = with_outliers(with_pixel_noise(views, rng), rng, uniform=False)
 
-    for method in METHODS:
-        one, two = triangulate(views, method=method), triangulate(views, method=method, threads=2)
-        for name in ("points", "covariance", "views", "inlier", "residual_px", "status"):
-            assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
-        assert locate(views, method=method).points.tobytes() == one.points.tobytes()
+    whole = triangulate(views, method="robust")
+    late = slice(100, None)
+    part = triangulate(
+        replace(views, rays=views.rays[late], weight=views.weight[late], pose_index=views.pose_index[late]),
+        method="robust",
+    )
+    for name in ("points", "covariance", "views", "inlier", "residual_px", "status"):
+        assert getattr(whole, name)[late].tobytes() == getattr(part, name).tobytes()
 
 
 def test_two_clean_views_among_three_outliers_are_found() -> None:
