@@ -629,7 +629,7 @@ def _drivers(log: Log, path: Path, place: NamePlace) -> Iterator[Proposal]:
         parts = parts_of(preset, namespace, list(topics))
         alone = len([known for known, _ in every if known == preset]) == 1
         settings: dict[str, object] = {"preset": preset} | ({} if alone else {"namespace": namespace or "/"})
-        by_gps = preset == "px4" or any(topics[name].type in FIXES for name in parts.position)
+        by_gps = any(topics[name].type in FIXES for name in parts.position)
         named = "" if alone else namespace
         found.append(
             (settings, named, list(parts.position), bool(parts.attitude), bool(parts.gimbal), by_gps)
@@ -658,7 +658,7 @@ def _drivers(log: Log, path: Path, place: NamePlace) -> Iterator[Proposal]:
             unturned=not (body or gimbal),
             by_gps=by_gps,
             topic=named,
-            lead_ns=0 if settings.get("preset") == "px4" else _lead_ns(log, names[0]),
+            lead_ns=_lead_ns(log, names[0]),
         )
 
 

@@ -137,7 +137,7 @@ def ingest(
         check_sources = partial(refuse_written, flight, flight_path.parent, stamps)
         # If nothing can be skipped, sources are read while they are hashed.
         meanwhile = reader.read_ahead() if force or _is_new(target) else iter(())
-        sources, damage = hash_sources(flight, flight_path.parent, progress, meanwhile)
+        sources = hash_sources(flight, flight_path.parent, progress, meanwhile)
         with locked(target, create=True, overwrite=overwrite) as writable:
             run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
             if run.finished:
@@ -158,7 +158,6 @@ def ingest(
             check_sources()
             warnings += reader.take_notes()
             warnings += assumptions_as_warnings(flight.assumptions)
-            warnings += [f"{path}: {losses(causes)}: copy it again" for path, causes in damage.items()]
 
             tracks = {name: _track(run, name) for name in entries}
             doubts = doubts_of_logs({name: (entry, tracks[name]) for name, entry in entries.items()})
@@ -179,7 +178,6 @@ def ingest(
                 truth=truth,
                 plan=plan,
                 sources=sources,
-                damage=damage,
                 assumptions=flight.assumptions,
                 doubts=doubts,
                 warnings=warnings,
@@ -547,7 +545,6 @@ def _refuse_unsound(flight_path: Path, description: Description) -> None:
             ("keypoints", camera.keypoints.dropped if camera.keypoints else {}),
         )
     }
-    parts |= description.damage
     parts |= {actor.name or "actor": actor.dropped for actor in description.logged_people}
     parts["truth"] = description.truth.dropped if description.truth else {}
     poses_dropped = description.truth.poses_dropped if description.truth else {}

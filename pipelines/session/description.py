@@ -358,7 +358,6 @@ class Description(Entry):
     truth: TruthEntry | None
     plan: dict[str, PlannedEntry] | None = None  # by camera
     sources: dict[str, str]  # path as the manifest states it -> sha256
-    damage: dict[str, dict[str, int]] = {}  # of sources as wholes: path -> how often, by cause
     assumptions: list[str] = []  # keys of the manifest that `mocap init` guessed and nobody confirmed
     doubts: list[Doubt] = []  # that the logs raise by themselves; those of the pictures are in metrics.json
     warnings: list[str]

@@ -50,7 +50,7 @@ class LoggedPose(FiledPose, FramedSource, PositionChoice):
 
     child: str | None = None
     """Frame of the camera or body, for poses that are chained from transforms."""
-    preset: Literal["dji_osdk", "mavros", "px4"] | None = None
+    preset: Literal["dji_osdk", "mavros"] | None = None
     """Driver whose usual topics are read."""
     namespace: str | None = None
     """Namespace of the preset's topics in a log of several drones."""

@@ -148,13 +148,10 @@ def plain_text(content: bytes, errors: str = "replace") -> str:
     return content.decode(text_encoding(content), errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
-def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sha256()) -> str:
+def sha256_of(path: Path) -> str:
     """Hash the content of a file, or of a folder: the relative names and contents of its files, sorted.
 
     Empty folders and the content of linked folders are ignored.
-
-    Args:
-        hash_for: makes the object that receives the bytes of a file and has their SHA-256 as its digest.
 
     Raises:
         DataError: the path is missing, cannot be read, or is no file or folder.
@@ -162,11 +159,11 @@ def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sh
     refuse_special(path)
     try:
         if not path.is_dir():
-            return _file_digest(path, hash_for).hex()
+            return _file_digest(path).hex()
         digest = hashlib.sha256()
         for name, file in sorted((file.relative_to(path).as_posix(), file) for file in _files(path)):
             # Zero byte after the name, a digest of fixed length: no two folders run together.
-            digest.update(os.fsencode(name) + b"\0" + _file_digest(file, hash_for))
+            digest.update(os.fsencode(name) + b"\0" + _file_digest(file))
         return digest.hexdigest()
     except OSError as error:
         raise as_data_error(error, path) from error
@@ -194,9 +191,9 @@ def _size_and_change(path: Path) -> list[int]:
     return [status.st_size, status.st_mtime_ns]
 
 
-def _file_digest(path: Path, hash_for: Callable[[Path], Any]) -> bytes:
+def _file_digest(path: Path) -> bytes:
     with path.open("rb") as file:
-        return hashlib.file_digest(file, lambda: hash_for(path)).digest()
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 def _files(folder: Path) -> list[Path]:

@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM, CheckedHash, stated_checksum
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.formats.skeletons.joint_files import joint_names
 from pipelines.formats.videos.frame_times import FrameTimesFormat
@@ -303,8 +302,8 @@ HASHING_THREADS = 4
 
 def hash_sources(
     flight: Manifest, base: Path, progress: Progress, meanwhile: Iterator[object]
-) -> tuple[dict[str, str], dict[str, dict[str, int]]]:
-    """Compute the sha256 of every file that is read, and the damage, both by the manifest's path.
+) -> dict[str, str]:
+    """Compute the sha256 of every file that is read, by the manifest's path.
 
     Steps of `meanwhile` run until all is hashed.
     """
@@ -312,7 +311,7 @@ def hash_sources(
     for path in unique:  # before anything waits for one of them
         refuse_special(located(base, path))
     progress.start("Hashing sources", len(unique))
-    hashes, damage = {}, {}
+    hashes = {}
     with ThreadPoolExecutor(
         HASHING_THREADS
     ) as pool:  # hashing releases the GIL, so long logs run in parallel
@@ -321,14 +320,12 @@ def hash_sources(
             while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
                 pass
             for path, digest in hashing.items():
-                hashes[path], differing = digest.result()
-                if differing:
-                    damage[path] = {OTHER_CHECKSUM: differing}
+                hashes[path] = digest.result()
                 progress.advance()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return hashes, damage
+    return hashes
 
 
 def fetch_sources(flight: Manifest, base: Path, progress: Progress) -> None:
@@ -373,20 +370,10 @@ def refuse_written(flight: Manifest, base: Path, stamps: Mapping[str, str]) -> N
             )
 
 
-def _hash_of(path: Path) -> tuple[str, int]:
-    """Compute the sha256 of a source, and count its files that differ from their own checksum.
-
-    A floor plan's YAML is hashed together with the picture that it names.
-    """
-    hashes: list[CheckedHash] = []
-
-    def hash_for(file: Path) -> CheckedHash:
-        hashes.append(CheckedHash(stated_checksum(file)))
-        return hashes[-1]
-
-    digests = [sha256_of(file, hash_for) for file in _source_files(path)]
-    digest = digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
-    return digest, sum(each.differs for each in hashes)
+def _hash_of(path: Path) -> str:
+    """Compute the sha256 of a source; that of a floor plan includes its picture."""
+    digests = [sha256_of(file) for file in _source_files(path)]
+    return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
 
 
 def _source_files(path: Path) -> list[Path]:

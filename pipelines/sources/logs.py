@@ -115,9 +115,7 @@ class FlightLog:
             type_ = self.type_of(topic)
             problem = f"topic {topic} holds {type_}, no {noun}" if type_ else f"has no topic {topic}"
             remedy = f"topics with {noun}: {listed}"
-            if (type_ or "").startswith("px4_msgs/") and noun == _NOUNS["poses"]:
-                remedy = "write preset: px4 instead of the topic"
-            elif type_ in FIXES and noun == _NOUNS["poses"]:
+            if type_ in FIXES and noun == _NOUNS["poses"]:
                 turned = next((b for a, b in pairs_of(self.recording.topics) if a == topic), "TOPIC")
                 problem += ", but positions alone"
                 remedy = f"name the attitudes beside it, attitude: {turned}; {remedy}"

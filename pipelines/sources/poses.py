@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
-from pipelines.formats.logs.presets import FIXES, px4_names, read_pair, read_positions, read_preset
-from pipelines.formats.logs.px4_topics import read_px4
+from pipelines.formats.logs.presets import FIXES, read_pair, read_positions, read_preset
 from pipelines.formats.maps.voxel_grids import placed
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit
@@ -602,10 +601,7 @@ class FlightPoses:
         choice = TelemetryChoice(position=options.position)
         with self._logs.open(pose.file) as opened:
             recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
-            if options.preset == "px4":
-                names = px4_names(recording, source, options.namespace)
-                found = read_px4(recording, source, names, choice, stamps)
-            elif options.preset:
+            if options.preset:
                 found = read_preset(recording, source, options.preset, options.namespace, choice, stamps)
             else:
                 axes = self._axes(pose.axes, opened.settings.axes)

@@ -22,7 +22,6 @@ from tests.synthetic.drone_logs import (
     LEVER_ARM,
     DroneTruth,
     drone_of,
-    px4_entries,
     tlog_pictures,
     ulog_rows,
     write_dataflash,
@@ -33,7 +32,7 @@ from tests.synthetic.drone_logs import (
 )
 from tests.synthetic.flights import SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import header
-from tests.synthetic.logs import Entry, write_log, write_mcap, write_ros2
+from tests.synthetic.logs import Entry, write_log
 from tests.synthetic.video_tracks import gopro_turns, write_gopro
 from tests.synthetic.videos import SIZE
 
@@ -148,16 +147,6 @@ def _tlog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"file": f"{name}.tlog"}
 
 
-def _px4(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
-    write_mcap(folder / f"{name}.mcap", px4_entries(truth, "/px4_1"))
-    return {"file": f"{name}.mcap", "preset": "px4", "namespace": "/px4_1"}
-
-
-def _px4_since_boot(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
-    write_ros2(folder / name, px4_entries(truth, synchronised=False), storage="mcap")
-    return {"file": name, "preset": "px4"}
-
-
 def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
     return {
         "header": header(int(truth.t_ns[row]), "/gps"),
@@ -176,8 +165,6 @@ def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
         # ms (at 1 m/s), and the origin to 1e-7 deg (11 mm).
         (_dataflash, 0.013, 0.1),
         (_osdk, 1e-4, 1e-4),
-        (_px4, 1e-4, 1e-4),
-        (_px4_since_boot, 0.002, 0.1),  # receipt is 1 ms late, at 1 m/s and 60 deg/s
         (_tlog, 0.015, 0.1),  # 1e-7 deg are 11 mm, and a ms of the boot time 1 mm and 0.06 deg
         (_record, 1e-3, 1e-4),  # 1e-9 deg are 0.1 mm
     ],

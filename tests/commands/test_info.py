@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import zlib
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM
 from pipelines.session.storage import read_json, write_json
 from tests.commands.runner import refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, spot_detector, write_spotted_flight
 from tests.synthetic.flights import write_flight
-from tests.synthetic.logged_flights import write_logged_flight
 
 NAME = "A short one"
 STALE = "out of date"  # a key of a stage
@@ -95,21 +90,6 @@ def test_a_study_tells_the_error_of_every_condition(tmp_path: Path) -> None:
     ]
     for tilt, condition in zip((0, 30), facts["mpjpe_mm"], strict=True):
         assert re.fullmatch(rf"{tilt} deg, 2 \w+, \w+ low", condition)
-
-
-@pytest.mark.parametrize("right", [True, False])
-def test_the_data_section_of_an_mcap_file_is_checked(tmp_path: Path, right: bool) -> None:
-    flight = write_logged_flight(tmp_path, "mcap-cdr")
-    log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["file"]
-    assert "right" not in reading(log)["checksum"]
-    whole = log.read_bytes()
-    # The summary begins where the footer says; before it the end of the data states 0, no checksum.
-    end = int.from_bytes(whole[-28:-20], "little") - 13
-    crc = zlib.crc32(whole[:end]) if right else 1
-    log.write_bytes(whole[: end + 9] + crc.to_bytes(4, "little") + whole[end + 13 :])
-    facts = reading(log)
-    assert facts.get("checksum") == ("right" if right else None)
-    assert (OTHER_CHECKSUM in facts.get("damage", "")) != right
 
 
 def test_a_stage_whose_data_changed_is_out_of_date(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from tests.commands.runner import refused, succeeds
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
     drone_of,
-    px4_entries,
     ulog_rows,
     write_record,
     write_srt,
@@ -105,10 +104,7 @@ def test_one_kind_of_stamps_is_chosen_for_all(tmp_path: Path, others: list[Any],
     assert frames_with_poses(result.path) == FRAMES
 
 
-def test_px4_messages_and_fixes_with_attitudes_are_drafted(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path / "x", cameras=1, seconds=1.0, clean=True)
-    write_mcap(tmp_path / "drone1.mcap", px4_entries(drone_of(flight, 0), "/px4_1"))
-    shutil.rmtree(tmp_path / "x")
+def test_fixes_with_attitudes_are_drafted(tmp_path: Path) -> None:
     entries = []
     for k in range(30):
         t = START_NS + k * 33_333_333
@@ -120,13 +116,10 @@ def test_px4_messages_and_fixes_with_attitudes_are_drafted(tmp_path: Path) -> No
             Entry("/drone2/imu/data", "sensor_msgs/msg/Imu", t, turned),
         ]
     write_log(tmp_path, "drone2", "ros1", entries)
-    for name in ("drone1", "drone2"):
-        write_pictures(tmp_path, name)
+    write_pictures(tmp_path, "drone2")
     result, stated = drafted(tmp_path)
     assert not result.missing
-    of_px4, of_gps = (stated["cameras"][name]["pose"] for name in ("drone1", "drone2"))
-    assert of_px4 == {"file": "drone1", "preset": "px4"}
-    assert of_gps == {
+    assert stated["cameras"]["drone2"]["pose"] == {
         "file": "drone2",
         "topic": "/drone2/gps",
         "attitude": "/drone2/imu/data",
@@ -206,24 +199,6 @@ def test_a_gopros_turns_are_drafted_without_a_heading(tmp_path: Path, places: bo
     assert ("yaw_deg" if places else "gimbal:") in said
     _uncommented(result.path, "gimbal: {file: GX010001.MP4, yaw_deg: 90}")
     assert frames_with_poses(result.path) == 33
-
-
-def test_two_of_px4s_namespaces_are_two_drones(tmp_path: Path) -> None:
-    """The 4 of px4 is no number of a drone."""
-    flight = write_flight(tmp_path / "x", cameras=2, seconds=0.5, clean=True)
-    entries = [entry for k in (0, 1) for entry in px4_entries(drone_of(flight, k), f"/px4_{k + 1}")]
-    shutil.rmtree(tmp_path / "x")
-    write_mcap(tmp_path / "rosbag.mcap", sorted(entries, key=lambda entry: entry.stamp_ns))
-    for name in ("drone1", "drone2"):
-        write_video(tmp_path / f"{name}.mp4", even_ticks(15))
-    write_lens(tmp_path)
-    result, stated = drafted(tmp_path)
-    spaces = [camera["pose"]["namespace"] for camera in stated["cameras"].values()]
-    assert (spaces, result.missing) == (["/px4_1", "/px4_2"], [])
-    for name in ("drone1", "drone2"):
-        (tmp_path / f"{name}.mp4").rename(tmp_path / f"{name}00.mp4")
-    result = draft([tmp_path], overwrite=True)
-    assert "px4 of /px4_2" in result.text
 
 
 def test_logs_of_which_one_has_simulation_time_are_ordered_by_receipt(tmp_path: Path) -> None:

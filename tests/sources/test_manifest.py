@@ -17,9 +17,21 @@ from pipelines.session.yaml_files import YamlModel
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.poses import FlightPoses
-from tests.synthetic.drone_logs import drone_of, px4_entries, write_dataflash, write_srt
+from tests.synthetic.drone_logs import drone_of, write_dataflash, write_srt
 from tests.synthetic.flights import SyntheticFlight, write_flight
-from tests.synthetic.logs import write_mcap
+from tests.synthetic.logged_flights import header
+from tests.synthetic.logs import Entry, write_mcap
+
+MAVROS = [
+    Entry(
+        "/mavros/global_position/raw/fix",
+        "sensor_msgs/msg/NavSatFix",
+        k * 10**9,
+        {"header": header(k * 10**9, "gps"), "latitude": 47.5, "longitude": 8.5, "altitude": 400.0},
+    )
+    for k in range(1, 4)
+]
+"""Log with positions of MAVROS."""
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +111,7 @@ def checked(flight: SyntheticFlight, change: dict[str, Any]) -> None:
         ("a.SRT", {"altitude": "high"}, "bad-value", "altitude"),
         ("a.bin", {"altitude": 3}, "wrong-option", "altitude"),
         ("a.mcap", {"preset": "mavos"}, "bad-value", "preset"),
-        ("a.mcap", {"preset": "px4", "topic": "/pose"}, "wrong-option", "topic"),
+        ("a.mcap", {"preset": "mavros", "topic": "/pose"}, "wrong-option", "topic"),
         ("a.mcap", {"attitude": "/imu"}, "wrong-option", "attitude"),
         ("a.mcap", {"parent": "map"}, "bad-value", "parent"),
         ("drone1.tum", {"camera": "left"}, "wrong-option", "camera"),
@@ -112,7 +124,7 @@ def test_an_option_belongs_to_the_format_of_its_file(
     folder, truth = flight.manifest.parent, drone_of(flight, 0)
     write_srt(folder / "a.SRT", truth)
     write_dataflash(folder / "a.bin", truth)
-    write_mcap(folder / "a.mcap", px4_entries(truth))
+    write_mcap(folder / "a.mcap", MAVROS)
     with pytest.raises(DataError) as caught:
         checked(flight, {"pose": {"file": file, **options}, "mount": None})
     assert caught.value.code == code
@@ -124,7 +136,7 @@ def test_an_option_belongs_to_the_format_of_its_file(
     [
         {"file": "a.SRT", "altitude": 30},
         {"file": "a.bin", "position": "local", "instance": 1, "time": "boot"},
-        {"file": "a.mcap", "preset": "px4", "position": "gps"},
+        {"file": "a.mcap", "preset": "mavros", "position": "gps"},
         {"file": "drone1.tum", "inverse": True, "quaternion": "wxyz", "z": "down", "unit": "mm"},
         {"file": "drone1.tum", "format": "tum"},
     ],
@@ -135,7 +147,7 @@ def test_an_option_is_taken_by_the_format_of_its_file(
     folder, truth = flight.manifest.parent, drone_of(flight, 0)
     write_srt(folder / "a.SRT", truth)
     write_dataflash(folder / "a.bin", truth)
-    write_mcap(folder / "a.mcap", px4_entries(truth))
+    write_mcap(folder / "a.mcap", MAVROS)
     checked(flight, {"pose": options})
 
 

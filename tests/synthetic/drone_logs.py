@@ -24,7 +24,6 @@ from pipelines.geometry.poses import (
     rotate,
 )
 from tests.synthetic.flights import SyntheticFlight
-from tests.synthetic.logs import Entry
 
 Int64 = NDArray[np.int64]
 
@@ -394,35 +393,6 @@ def ulog_rows(
             ("camera_trigger", 0, (us, utc_us, row)),
         ]
     return rows
-
-
-def px4_entries(truth: DroneTruth, namespace: str = "", *, synchronised: bool = True) -> list[Entry]:
-    """List PX4's messages of ROS 2, in the agent's time or since boot, received 1 ms after their stamps."""
-    types = {
-        "vehicle_local_position": ("VehicleLocalPosition", "vehicle_local_position_v1"),
-        "vehicle_attitude": ("VehicleAttitude", "vehicle_attitude"),
-        "gimbal_device_attitude_status": ("GimbalDeviceAttitudeStatus", "gimbal_device_attitude_status"),
-    }
-    ahead_us = (int(truth.t_ns[0]) - BOOT_NS) // 1000
-    entries = []
-    for name, _, values in ulog_rows(truth):
-        if name not in types:
-            continue
-        fields: dict[str, Any] = {}
-        rest = list(values)
-        for stated in ULOG[name][0].split(";"):
-            kind, _, field = stated.partition(" ")
-            if field and not field.startswith("_"):
-                count = int(kind[kind.index("[") + 1 : -1]) if "[" in kind else 1
-                fields[field] = rest[:count] if count > 1 else rest[0]
-                del rest[:count]
-        received_ns = (fields["timestamp"] + ahead_us) * 1000 + 1_000_000
-        for key in ("timestamp", "timestamp_sample"):
-            if key in fields and synchronised:
-                fields[key] += ahead_us
-        type_, topic = types[name]
-        entries.append(Entry(f"{namespace}/fmu/out/{topic}", f"px4_msgs/msg/{type_}", received_ns, fields))
-    return sorted(entries, key=lambda entry: entry.stamp_ns)
 
 
 def _wxyz(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, ...]:

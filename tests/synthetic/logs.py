@@ -29,8 +29,8 @@ from pipelines.formats.scenes.mcap_writing import build
 from tests.formats.foxglove_protobuf import protobuf
 from tests.synthetic.driver_messages import register
 
-ROS1 = register(get_typestore(Stores.ROS1_NOETIC), px4=False)
-ROS2 = register(get_typestore(Stores.LATEST), px4=True)
+ROS1 = register(get_typestore(Stores.ROS1_NOETIC))
+ROS2 = register(get_typestore(Stores.LATEST))
 
 Container = Literal["ros1", "ros2-sqlite3", "ros2-mcap", "mcap-cdr", "mcap-ros1"]
 CONTAINERS: tuple[Container, ...] = ("ros1", "ros2-sqlite3", "ros2-mcap", "mcap-cdr", "mcap-ros1")

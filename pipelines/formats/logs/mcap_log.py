@@ -1,4 +1,4 @@
-"""MCAP files (mcap.dev/spec), whole or cut off, chunked or not, with any profile, and their checksums.
+"""MCAP files (mcap.dev/spec), whole or cut off, chunked or not, with any profile.
 
 The mcap library parses the records. But its readers stop at the first damage, and the one for files
 without an index ignores checksums and size limits. So this module walks the file itself.
@@ -6,12 +6,8 @@ without an index ignores checksums and size limits. So this module walks the fil
 
 from __future__ import annotations
 
-import hashlib
 import struct
-import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
 from io import BytesIO
 from pathlib import Path
 
@@ -27,8 +23,6 @@ from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.storage import is_special
 
-OTHER_CHECKSUM = "data section that differs from its checksum"
-
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _STATISTICS = 2, 3, 4, 5, 6, 7, 11
 _DAMAGE = (McapError, struct.error, ValueError)  # errors of the library for invalid records
@@ -41,21 +35,10 @@ _NO_SCHEMA = records.Schema(id=0, data=b"", encoding="", name="")
 _RUN = 1 << 20
 # Stamps are int64, and MCAP's are unsigned.
 _STAMP_LIMIT = 1 << 63
-# A checksum is computed over blocks of this many bytes.
-_BLOCK = 1 << 20
-# MCAP marks the end of its data with this kind of record.
-_DATA_END = 15
-_FOOTER_RECORD = struct.Struct("<BQQQI8s")  # kind, length, start of summary, of its offsets, checksum, magic
-_DATA_END_RECORD = struct.Struct("<BQI")  # kind, length; checksum
-_FOOTER_LENGTH, _DATA_END_LENGTH = 20, 4  # of the records, without kind and length
 
 
 class McapLog:
-    """Reader of MCAP files with messages in ros1, cdr, json or protobuf.
-
-    Checksums of chunks are verified here. That of the whole data section is verified when the file is
-    hashed or described.
-    """
+    """Reader of MCAP files with messages in ros1, cdr, json or protobuf; checksums of chunks are verified."""
 
     name = "mcap"
     title = "MCAP log"
@@ -73,13 +56,9 @@ class McapLog:
         return head == _MAGIC or (not head and path.suffix.lower() in self.suffixes)
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Describe messages, times, storage, topics, losses, and the checksum's result."""
+        """Describe messages, times, storage, topics, and losses."""
         with self.open_log([path]) as log:
-            facts = describe_log(log)
-        right = checksum_is_right(path)
-        if right is None:
-            return facts | {"checksum": "not stated"}
-        return facts | ({"checksum": "right"} if right else {"damage": f"a {OTHER_CHECKSUM}: copy it again"})
+            return describe_log(log)
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open one file, or the parts of a split one."""
@@ -219,79 +198,6 @@ def _message_row(content: memoryview | bytes, position: int) -> tuple[int, int, 
     if stamp >= _STAMP_LIMIT:
         raise ValueError("a stamp after the year 2262")
     return channel, stamp, position
-
-
-# --- the checksum of the data section ---------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class StatedChecksum:
-    """Checksum that a file states of its own data section."""
-
-    crc: int
-    size: int  # of the data section: bytes from the beginning of the file
-
-
-class CheckedHash:
-    """Hash for `hashlib.file_digest` that also computes the checksum of the first bytes."""
-
-    def __init__(self, stated: StatedChecksum | None) -> None:
-        self._sha256 = hashlib.sha256()
-        self._stated = stated
-        self._left = stated.size if stated else 0
-        self._crc = 0
-
-    @property
-    def differs(self) -> bool:
-        """True if the file states a checksum and its bytes have another one."""
-        return self._stated is not None and self._crc != self._stated.crc
-
-    def update(self, data: memoryview) -> None:
-        """Add some more bytes."""
-        self._sha256.update(data)
-        if self._left:
-            begin = data[: self._left]
-            self._crc = zlib.crc32(begin, self._crc)
-            self._left -= len(begin)
-
-    def digest(self) -> bytes:
-        """Return the SHA-256 of all bytes."""
-        return self._sha256.digest()
-
-
-def checksum_is_right(path: Path) -> bool | None:
-    """Return True if the data section has the stated checksum; reads it all. None if none is stated."""
-    stated = stated_checksum(path)
-    if stated is None:
-        return None
-    checked = CheckedHash(stated)
-    with path.open("rb") as file:
-        for data in iter(partial(file.read, _BLOCK), b""):
-            checked.update(memoryview(data))
-    return not checked.differs
-
-
-def stated_checksum(path: Path) -> StatedChecksum | None:
-    """Return the checksum that a file states; None if it has none, is no MCAP, or has lost its end."""
-    with path.open("rb") as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
-            return None
-        size = file.seek(0, 2)
-        if size < len(_MAGIC) + _DATA_END_RECORD.size + _FOOTER_RECORD.size:
-            return None
-        footer_at = file.seek(size - _FOOTER_RECORD.size)
-        kind, length, summary_at, _, _, magic = _FOOTER_RECORD.unpack(file.read(_FOOTER_RECORD.size))
-        if (kind, length, magic) != (_FOOTER, _FOOTER_LENGTH, _MAGIC):
-            return None
-        # The summary follows the end of the data. Without a summary the footer does.
-        end = (summary_at or footer_at) - _DATA_END_RECORD.size
-        if not len(_MAGIC) <= end <= footer_at - _DATA_END_RECORD.size:
-            return None
-        file.seek(end)
-        kind, length, crc = _DATA_END_RECORD.unpack(file.read(_DATA_END_RECORD.size))
-    if (kind, length) != (_DATA_END, _DATA_END_LENGTH) or not crc:
-        return None
-    return StatedChecksum(crc, end)
 
 
 FORMAT = McapLog()

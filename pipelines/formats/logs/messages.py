@@ -330,7 +330,7 @@ def _stamp_ns(message: Message) -> int:
 def header_ns(message: Message) -> int:
     """Return the stamp that a message of any type has of its own; 0 without one, or if it is no time.
 
-    Of transforms it is that of the first. The stamps of px4_msgs are no header stamps: see `px4_topics`.
+    Of transforms it is that of the first.
     """
     value = message.value
     stated = next(iter(getattr(value, "transforms", ())), value)

@@ -11,18 +11,11 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from pipelines.formats.logs.message_decoders import MessageLayout, find_layout
-from pipelines.formats.logs.messages import FAULTS, LATEST_NS, all_samples, nanoseconds, unreadable
-from pipelines.formats.logs.recordings import messages_alike
+from pipelines.formats.logs.messages import FAULTS, all_samples, nanoseconds, unreadable
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample
 from pipelines.session.registries import Log
-
-_LAID_OUT = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
-
-HEAD_LENGTH = 256
-"""Bytes at the start of a picture message that hold all fields before the picture, unless names are long."""
 
 # Transport and decoding delay a picture by less.
 _MAY_LEAP_NS = 1_000_000_000
@@ -83,10 +76,8 @@ _Stamped = TypeVar("_Stamped", bound=Stamped)
 def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int64, Int64]:
     """Return header stamps [N] (0 without one) and stamps of receipt [N] of a topic's pictures.
 
-    The order is that of receipt. If the messages have one layout, only the beginning of each is read.
+    The order is that of receipt.
     """
-    if (at_once := stamps_at_once(recording, topic)) is not None:
-        return at_once
     header_ns, receive_ns = array("q"), array("q")
     for sample in all_samples(recording.messages([topic]), source):
         if not isinstance(sample, PictureSample):
@@ -94,25 +85,6 @@ def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int6
         header_ns.append(sample.stamp_ns)
         receive_ns.append(sample.receive_ns)
     return np.array(header_ns, np.int64), np.array(receive_ns, np.int64)
-
-
-def stamps_at_once(recording: Log, topic: str) -> tuple[Int64, Int64] | None:
-    """Return stamps like `picture_stamps`; None if the messages must be decoded one by one."""
-    alike = messages_alike(recording, topic)
-    if alike is None or alike.schema.type not in _LAID_OUT:
-        return None
-    header_ns: list[Int64] = [np.zeros(0, np.int64)]
-    receive_ns: list[Int64] = [np.zeros(0, np.int64)]
-    layout: MessageLayout | None = None
-    for received, sizes, heads in alike.log.heads(alike.topic, HEAD_LENGTH):
-        layout = layout or find_layout(alike.schema, heads[0].tobytes())
-        if layout is None or not layout.fits(heads, sizes) or np.abs(received).max() >= LATEST_NS:
-            return None
-        header_ns.append(layout.stamps_ns(heads))
-        receive_ns.append(received)
-    every = np.concatenate(receive_ns)
-    order = np.argsort(every, kind="stable")
-    return np.concatenate(header_ns)[order], every[order]
 
 
 def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamped]:

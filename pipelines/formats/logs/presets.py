@@ -10,13 +10,10 @@ frame_id is ground_ENU, as roll, pitch, yaw (M100, M600 and others: broadcast).
 `mavros`: local_position and imu/data are ENU and FLU; global_position/global is NavSatFix above the
 ellipsoid; mount_control/orientation is a quaternion without a stamp, of FRD angles that count yaw from
 the nose.
-
-`px4` (px4_msgs of ROS 2, by way of uXRCE-DDS): the autopilot's own messages, as in its .ulg (px4_topics.py).
 """
 
 from __future__ import annotations
 
-import re
 from array import array
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -37,14 +34,13 @@ from pipelines.formats.drone_logs.telemetry_rows import (
 from pipelines.formats.logs.messages import FAULTS, Stamps, nanoseconds, unreadable
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clock_steps import find_steps, without_steps
-from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes
 from pipelines.session.records import AttitudeTrack, Height, Message, PositionTrack, Telemetry, Topic
 from pipelines.session.registries import Log, TelemetryChoice
 
-Preset = Literal["dji_osdk", "mavros", "px4"]
+Preset = Literal["dji_osdk", "mavros"]
 Position = Literal["local", "global", "gps"]
 
 FIXES = (
@@ -61,8 +57,6 @@ _MOST_NAMED = 8
 # NavSatFix and GPSFix say by this status that there is no fix.
 _NO_FIX = -1
 _TURNED = ("sensor_msgs/msg/Imu", "geometry_msgs/msg/QuaternionStamped")
-_VERSION = re.compile(r"_v\d+")  # PX4 appends it to the names of topics whose messages changed
-_TIME_REFERENCE = "sensor_msgs/msg/TimeReference"
 
 _POSES = (
     "geometry_msgs/msg/PoseStamped",
@@ -104,17 +98,6 @@ DRIVERS: dict[Preset, _Driver] = {
         gimbal=("mount_control/orientation",),
         height="ellipsoid",
     ),
-    "px4": _Driver(
-        names=("fmu/out",),
-        positions={
-            "local": ("vehicle_local_position", "vehicle_odometry"),
-            "global": ("vehicle_global_position",),
-            "gps": ("vehicle_gps_position", "sensor_gps"),
-        },
-        attitude=("vehicle_attitude", "vehicle_odometry"),
-        gimbal=("gimbal_device_attitude_status",),
-        height="sea level",
-    ),
 }
 
 
@@ -154,7 +137,7 @@ def namespaces(names: Sequence[str]) -> list[tuple[Preset, str]]:
     for preset, driver in DRIVERS.items():
         for base in driver.names:
             for name in names:
-                before, mark, rest = _plain(name).rpartition(f"/{base}/")
+                before, mark, rest = name.rpartition(f"/{base}/")
                 if mark and any(rest in topics for topics in driver.positions.values()):
                     found.append((preset, before))
     return sorted(set(found))
@@ -176,14 +159,8 @@ def parts_of(preset: Preset, namespace: str, names: Collection[str]) -> Parts:
 
 
 def _among(names: Collection[str], prefix: str, driver: _Driver, parts: Iterable[str]) -> list[str]:
-    named = {_plain(name): name for name in names}
     topics = [f"{prefix}/{base}/{part}" for part in parts for base in driver.names]
-    return [named[topic] for topic in topics if topic in named]
-
-
-def _plain(name: str) -> str:
-    """Return the name of a topic without the version of its message."""
-    return _VERSION.sub("", name) if "/fmu/" in name else name
+    return [topic for topic in topics if topic in names]
 
 
 def pairs_of(topics: Sequence[Topic]) -> list[tuple[str, str]]:
@@ -215,14 +192,6 @@ def _shared(one: str, other: str) -> int:
     )
 
 
-def px4_names(recording: Log, source: str, namespace: str | None) -> dict[str, str]:
-    """List the topics of one PX4 drone that have messages, by PX4's name of each (vehicle_attitude)."""
-    prefix = _prefix(source, "px4", namespace, [topic.name for topic in recording.topics])
-    with_messages = {topic.name for topic in recording.topics if topic.count}
-    there = {name for parts in parts_of("px4", prefix, with_messages) for name in parts}
-    return {_plain(name).rpartition("/")[2]: name for name in there}
-
-
 def read_preset(
     recording: Log,
     source: str,
@@ -233,8 +202,7 @@ def read_preset(
 ) -> Telemetry:
     """Read position, attitude and gimbal of a drone, from the usual topics of its driver.
 
-    A namespace is needed if the log holds several drones. The autopilot's own topics, `px4`, have a reader of
-    their own, `px4_topics`.
+    A namespace is needed if the log holds several drones.
     """
     driver = DRIVERS[preset]
     prefix = _prefix(source, preset, namespace, [topic.name for topic in recording.topics])
@@ -271,8 +239,6 @@ def read_preset(
     gimbal: AttitudeTrack | None = None
     if angles := first(driver.gimbal):
         gimbal = _gimbal(recording, source, angles, preset, body, stamps, dropped)
-    if f"{prefix}/mavros/time_reference" in with_messages:
-        notes += _gps_time(recording, source, f"{prefix}/mavros/time_reference")
     return Telemetry(
         position=position,
         body=body,
@@ -409,26 +375,6 @@ def _gimbal(
     angles = rows.values()[:, [order.index(letter) for letter in "ypr"]]
     stated = whatever_from(of_angles(angles))
     return attitude_track(topic, rows.times(stamps), turned_as_stated(angles), dropped, stated=stated)
-
-
-def _gps_time(recording: Log, source: str, topic: str) -> list[str]:
-    """Describe offset and drift of the log's stamps to the autopilot's GPS time; empty without GPS time."""
-    if _type_of(recording, topic) != _TIME_REFERENCE:
-        return []
-    pairs = []
-    for message in recording.messages([topic]):
-        try:
-            pairs.append((nanoseconds(message.value.header.stamp), nanoseconds(message.value.time_ref)))
-        except FAULTS as error:
-            raise unreadable(message, source, error) from error
-    stamped = np.array([pair for pair in pairs if min(pair) > 0], dtype=np.int64).reshape(-1, 2)
-    fit = fit_clock(stamped[:, 0], stamped[:, 1])
-    if fit is None:
-        return []
-    return [
-        f"{source}: GPS time is {fit.offset_ns / 1e9:.3f} s ahead of its stamps, drifting"
-        f" {fit.drift_ppm:.1f} ppm (+- {fit.drift_sigma_ppm:.1f}; {topic}, not applied)"
-    ]
 
 
 def _type_of(recording: Log, topic: str) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from pipelines.formats.logs.message_decoders import Schema, decoder
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Message, Topic
-from pipelines.session.registries import Log
 from pipelines.session.storage import code_of
 from pipelines.session.unknown_files import describe_lfs_pointer
 
@@ -43,8 +42,6 @@ NOT_FOUND = "messages stated but not found"
 _BATCH = 1 << 16
 # A type takes a millisecond to understand, and PX4 has 250.
 _MOST_TYPES = 2000
-# The heads of so many messages are read at a time.
-_HEADS = 4096
 
 
 @dataclass(frozen=True)
@@ -87,21 +84,6 @@ class LogPart(ABC):
     @abstractmethod
     def read(self, rows: Int64) -> Iterator[tuple[int, memoryview | bytes]]:
         """Yield the bytes of messages, by rows of the table; pass unreadable rows to `lose`."""
-
-    def read_heads(self, rows: Int64, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
-        """Yield the first bytes of messages, many at a time; unreadable rows are passed to `lose`.
-
-        Yields:
-            Rows of the table, in the order given; the length of each message in bytes [n]; its first bytes
-            [n, length], with zeros after the end of a shorter one.
-        """
-        for start in range(0, len(rows), _HEADS):
-            batch = rows[start : start + _HEADS]
-            found = [(k, len(data), bytes(data[:length])) for k, data in self.read(batch)]
-            if found:
-                which, sizes, heads = zip(*found, strict=True)
-                padded = np.array(heads, f"S{length}").view(np.uint8).reshape(-1, length)
-                yield batch[list(which)], np.array(sizes, np.int64), padded
 
     def take(self, table: MessageTable) -> None:
         """Keep the table of found messages, without those of undefined channels, which are counted."""
@@ -189,20 +171,6 @@ class OpenLog:
         """Yield the messages of some topics in the order of receipt; others are neither read nor decoded."""
         streams = [self._of_part(part, frozenset(topics)) for part in self.parts]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
-
-    def heads(self, topic: Topic, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
-        """Yield the heads of a topic's messages: stamps of receipt [n], sizes [n], first bytes [n, length].
-
-        In the order of the files; a stable sort by the stamps gives that of `messages`. Shorter messages
-        are padded with zeros.
-        """
-        for part, rows in self._rows_of(topic):
-            for found, sizes, heads in part.read_heads(np.sort(rows), length):
-                yield part.table.stamp_ns[found], sizes, heads
-
-    def schemas(self, topic: Topic) -> set[Schema]:
-        """Return the schemas of a topic's messages; parts may differ."""
-        return {part.channels[c].schema for part, channels in self._channels_of(topic) for c in channels}
 
     def stamps(self, topic: Topic) -> Int64:
         """Return the stamps of receipt of a topic's messages, sorted."""
@@ -310,25 +278,6 @@ def require_content(part: LogPart) -> None:
         raise DataError(
             part.path, f"holds no message that can be read ({causes})", "copy it again from the drone"
         )
-
-
-class Alike(NamedTuple):
-    """Topic whose messages can be read many at a time, because all have the same schema."""
-
-    log: OpenLog
-    topic: Topic
-    schema: Schema
-
-
-def messages_alike(recording: Log, name: str) -> Alike | None:
-    """Return the topic of that name, if our own reader opened the log and its messages have one schema."""
-    if not isinstance(recording, OpenLog):
-        return None
-    of_that_name = [topic for topic in recording.topics if topic.name == name]
-    schemas = {schema for topic in of_that_name for schema in recording.schemas(topic)}
-    if len(of_that_name) != 1 or len(schemas) != 1:
-        return None
-    return Alike(recording, of_that_name[0], schemas.pop())
 
 
 def describe_log(log: OpenLog) -> dict[str, object]:

@@ -16,17 +16,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.formats.logs.message_decoders import MessageLayout, find_layout
 from pipelines.formats.logs.messages import (
     FAULTS,
-    LATEST_NS,
     Stamps,
     all_samples,
     kind_of,
     nanoseconds,
     unreadable,
 )
-from pipelines.formats.logs.recordings import messages_alike
 from pipelines.formats.poses.trajectory_files import clean_poses
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clock_steps import ClockStep, find_steps, without_steps
@@ -42,8 +39,6 @@ Source = Path | str
 Edge = tuple[str, str]
 """Target and source of a transform."""
 
-# An Odometry with two covariances and two names of frames has 720 bytes; longer names are read one by one.
-_LONGEST_POSE = 1024
 _MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
 _MAY_JUMP_S = 1.0  # from one message to the next, in addition to the time that passed
 _SAME_VALUE = 1e-6  # m, and parts of a quaternion: rounding
@@ -51,19 +46,6 @@ _FIXED_FRAMES = ("world", "map", "odom", "earth")  # names of fixed frames in RE
 
 _THE_WORLD = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]))
 """Identity pose, for a frame that is the log's world."""
-
-_XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
-_POSE = tuple([f"pose.position.{axis}" for axis in _XYZ] + [f"pose.orientation.{axis}" for axis in _XYZW])
-_LINK = tuple(
-    [f"transform.translation.{axis}" for axis in _XYZ] + [f"transform.rotation.{axis}" for axis in _XYZW]
-)
-_LAID_OUT: dict[str, tuple[str, ...]] = {
-    "geometry_msgs/msg/PoseStamped": _POSE,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": (*(f"pose.{path}" for path in _POSE), "pose.covariance"),
-    "geometry_msgs/msg/TransformStamped": _LINK,
-    "nav_msgs/msg/Odometry": (*(f"pose.{path}" for path in _POSE), "pose.covariance"),
-}
-"""Fields of types that can be read many at a time: position, quaternion, covariance if there is one."""
 
 
 @dataclass(frozen=True)
@@ -202,20 +184,18 @@ class _Samples:
 def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gathered:
     """Read the trajectory of one body, in the axes of the log; covariances in ours (rotation in the body).
 
-    Messages of one layout are read many at a time, others one by one, with the same result. Rows are cleaned
-    by `clean_poses`, every loss counted. A covariance that is zero throughout is unknown and left out.
+    Rows are cleaned by `clean_poses`, every loss counted. A covariance that is zero throughout is unknown and
+    left out.
 
     Args:
         stamps: which stamp is the time of a pose. A pose without a header stamp (0) takes that of receipt.
     """
     place = f"{source} {topic}"
-    rows = poses_at_once(recording, topic)
-    if rows is None:
-        rows = poses_one_by_one(all_samples(recording.messages([topic]), source), place)
+    rows = logged_poses(all_samples(recording.messages([topic]), source), place)
     return Gathered(rows.trajectory(place, stamps), rows.check(), rows.frames)
 
 
-def poses_one_by_one(samples: Iterable[Sample], source: Source) -> LoggedRows:
+def logged_poses(samples: Iterable[Sample], source: Source) -> LoggedRows:
     """Gather the poses of one body."""
     gathered = _Samples()
     frames: Edge | None = None
@@ -232,42 +212,6 @@ def poses_one_by_one(samples: Iterable[Sample], source: Source) -> LoggedRows:
         frames = edge
         gathered.add_pose(sample)
     return replace(gathered.rows(7), frames=frames or ("", ""))
-
-
-def poses_at_once(recording: Log, topic: str) -> LoggedRows | None:
-    """Gather the poses like `poses_one_by_one`; None unless our own reader finds all of one known layout."""
-    alike = messages_alike(recording, topic)
-    if alike is None or alike.schema.type not in _LAID_OUT:
-        return None
-    paths = _LAID_OUT[alike.schema.type]
-    # These grow in place: joining parts would need the memory of a long log twice.
-    header, received, numbers = array("q"), array("q"), array("d")
-    layout: MessageLayout | None = None
-    try:
-        for receive_ns, sizes, raw in alike.log.heads(alike.topic, _LONGEST_POSE):
-            layout = layout or find_layout(alike.schema, raw[0].tobytes())
-            if layout is None or not layout.fits(raw, sizes):
-                return None
-            received.frombytes(receive_ns.tobytes())
-            header.frombytes(layout.stamps_ns(raw).tobytes())
-            numbers.frombytes(layout.column(raw, *paths).astype(np.float64, copy=False).tobytes())
-    except KeyError:  # a type of a known name with other fields
-        return None
-    if layout is None:
-        return None
-    rows = LoggedRows(
-        np.frombuffer(header, np.int64),
-        np.frombuffer(received, np.int64),
-        np.frombuffer(numbers, np.float64).reshape(len(header), -1),
-    )
-    if np.abs(rows.receive_ns).max() >= LATEST_NS:
-        return None
-    if (np.diff(rows.receive_ns) < 0).any():
-        order = np.argsort(rows.receive_ns, kind="stable")
-        rows = LoggedRows(rows.header_ns[order], rows.receive_ns[order], rows.values[order])
-    covariance = rows.values[:, 7:] if len(paths) > 7 else None
-    frames = layout.texts["header.frame_id"], layout.texts.get("child_frame_id", "")
-    return replace(rows, values=rows.values[:, :7], covariance=covariance, frames=frames)
 
 
 def attitudes_of(

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.pictures import (
     later_pictures,
     later_times,
-    picture_stamps,
     stamp_of,
-    stamps_at_once,
 )
 from pipelines.geometry.arrays import Int64
 from pipelines.session.records import PictureSample
-from pipelines.session.registries import LogFormat, recognise
-from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
+from tests.synthetic.logs import Entry
 
 TOPIC = "/pictures"
 COMPRESSED, RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
@@ -69,22 +63,3 @@ def test_later_times_are_those_of_the_later_pictures(rows: list[tuple[int, int]]
     ]
     expected = [stamp_of(picture, stamps) for picture in later_pictures(iter(samples), stamps)]
     assert later_times(header_ns, receive_ns, stamps).tolist() == expected
-
-
-@pytest.mark.parametrize("container", CONTAINERS)
-def test_stamps_at_once_are_those_of_the_pictures(tmp_path: Path, container: Container) -> None:
-    """Interleave two files, with equal stamps of receipt and some out of order."""
-    received = np.random.default_rng(3).integers(0, 30, 60).tolist()
-    entries = [alike(k, START_NS + r) for k, r in enumerate(received)]
-    paths = [
-        write_log(tmp_path, name, container, part)
-        for name, part in (("first", entries[:30]), ("second", entries[30:]))
-    ]
-    with recognise(paths[0], LogFormat, "log").open_log(paths) as log:
-        expected = [(s.stamp_ns, s.receive_ns) for s in all_samples(log.messages([TOPIC]), "log")]
-        found = stamps_of(picture_stamps(log, TOPIC, "log"))
-        at_once = stamps_at_once(log, TOPIC)
-        (topic,) = log.topics
-    assert found == expected
-    assert len(expected) == 60
-    assert (at_once is not None) == (topic.encoding in {"cdr", "ros1"})

@@ -12,12 +12,10 @@ from pipelines.formats.logs.presets import (
     Preset,
     namespaces,
     parts_of,
-    px4_names,
     read_pair,
     read_positions,
     read_preset,
 )
-from pipelines.formats.logs.px4_topics import read_px4
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import rotate
 from pipelines.session.errors import DataError
@@ -217,47 +215,3 @@ def test_fixes_of_foxglove(tmp_path: Path, encoding: Any) -> None:
         track = read_positions(log, "a", "/place", "header", {})
     assert (track.on_earth, track.t_ns.tolist()) == (True, stamps())
     np.testing.assert_array_equal(track.values, [[47.5 + k, 8.5, 400.0] for k in range(ROWS)])
-
-
-def odometry(frame: int, **more: Any) -> list[Entry]:
-    half = 0.5**0.5
-    return [
-        Entry(
-            "/fmu/out/vehicle_odometry",
-            "px4_msgs/msg/VehicleOdometry",
-            t,
-            # 1 m north, 2 m east, 3 m up, heading east
-            {
-                "timestamp": t // 1000,
-                "pose_frame": frame,
-                "position": [1, 2, -3],
-                "q": [half, 0, 0, half],
-                **more,
-            },
-        )
-        for t in stamps()
-    ]
-
-
-def test_the_odometry_of_px4_is_turned_to_enu(tmp_path: Path) -> None:
-    path = write_log(tmp_path, "a", "ros2-mcap", odometry(1))
-    with recognise(path, LogFormat, "log").open_log([path]) as log:
-        telemetry = read_px4(log, str(path), px4_names(log, str(path), None), TelemetryChoice(), "header")
-        other = read_px4(
-            log, str(path), px4_names(log, str(path), None), TelemetryChoice(position="local"), "receive"
-        )
-    np.testing.assert_allclose(telemetry.position.values, [[2, 1, 3]] * ROWS)
-    np.testing.assert_array_equal(telemetry.position.t_ns, stamps())
-    np.testing.assert_array_equal(other.position.t_ns, stamps())
-    assert telemetry.body is not None
-    nose = rotate(telemetry.body.quaternion_xyzw[0], np.array([1.0, 0, 0]))
-    np.testing.assert_allclose(nose, [1, 0, 0], atol=1e-6)
-    assert not any("FRD" in note for note in telemetry.notes)
-    path = write_log(tmp_path, "b", "ros2-mcap", odometry(2))
-    with recognise(path, LogFormat, "log").open_log([path]) as log:
-        telemetry = read_px4(log, str(path), px4_names(log, str(path), None), TelemetryChoice(), "header")
-        assert any("FRD" in note for note in telemetry.notes)
-        with pytest.raises(DataError):
-            read_px4(
-                log, str(path), px4_names(log, str(path), None), TelemetryChoice(position="gps"), "header"
-            )

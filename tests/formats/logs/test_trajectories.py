@@ -18,7 +18,7 @@ from pipelines.formats.logs.trajectories import (
     Source,
     attitudes_of,
     chained,
-    poses_one_by_one,
+    logged_poses,
     transforms_of,
 )
 from pipelines.geometry.poses import matrix_from_quaternion
@@ -32,7 +32,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 def trajectory_of(samples: Iterable[Sample], source: Source, *, stamps: Stamps) -> Gathered:
-    rows = poses_one_by_one(samples, source)
+    rows = logged_poses(samples, source)
     return Gathered(rows.trajectory(source, stamps), rows.check(), rows.frames)
 
 
