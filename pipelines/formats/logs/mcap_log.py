@@ -16,12 +16,19 @@ from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 
-from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT, Chunk, ChunkedPart, Content
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
-from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
+from pipelines.formats.logs.recordings import (
+    CHUNK_LIMIT,
+    Channel,
+    Chunk,
+    ChunkedPart,
+    Content,
+    OpenLog,
+    begins_like,
+    open_parts,
+)
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.storage import is_special
 
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _STATISTICS = 2, 3, 4, 5, 6, 7, 11
@@ -46,28 +53,16 @@ class McapLog:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins with MCAP's magic bytes, or is empty and named `.mcap`."""
-        if is_special(path):
-            return False
-        try:
-            with path.open("rb") as file:
-                head = file.read(len(_MAGIC))
-        except OSError:
-            return False
-        return head == _MAGIC or (not head and path.suffix.lower() in self.suffixes)
+        return begins_like(path, _MAGIC, self.suffixes)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe messages, times, storage, topics, and losses."""
         with self.open_log([path]) as log:
-            return describe_log(log)
+            return log.describe()
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open one file, or the parts of a split one."""
-        return OpenLog(*open_parts(paths, open_mcap))
-
-
-def open_mcap(path: Path) -> McapPart:
-    """Open one file as a part of a recording."""
-    return McapPart(path, *open_file(path))
+        return OpenLog(*open_parts(paths, McapPart))
 
 
 class McapPart(ChunkedPart):
@@ -153,8 +148,6 @@ class McapPart(ChunkedPart):
         if here < 0:
             raise ValueError("nothing of the chunk's content is here")
         self.take_chunk(Chunk(data_at, here, name, size, crc, cut=here < stated))
-        if (name or "uncompressed") not in self.storage:
-            self.storage.append(name or "uncompressed")
 
     def _extended(self, run: Chunk | None, position: int, end: int) -> Chunk:
         """Add a message outside chunks to the run; begin a new run if there is none or it is full."""

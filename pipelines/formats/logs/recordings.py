@@ -1,28 +1,31 @@
-"""Log as files that each list their messages: topics, order of receipt over all files, and losses.
+"""Recordings: files that each list their messages; topics, order of receipt over all files, and losses.
 
 A part (one file) knows the position of every message before any is read. So messages come in order and
-filtered without being kept in memory, and every loss has a cause and a count.
+filtered without being kept in memory, and every loss has a cause and a count. ROS 1 bags and MCAP are files
+of chunks: they are walked from record to record, without their summary, so the same code reads a whole file
+and one that ends early. Only chunks without an index are decompressed to find their messages.
 """
 
 from __future__ import annotations
 
 import heapq
+import zlib
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.formats.logs.message_decoders import Schema, decoder
+from pipelines.formats.common.files import first_bytes
+from pipelines.formats.logs.message_decoders import Schema, decoder, inflate
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Message, Topic
-from pipelines.session.storage import code_of
+from pipelines.session.storage import as_data_error, refuse_special
 from pipelines.session.unknown_files import describe_lfs_pointer
 
 # Causes of losses, as sessions and `mocap info` state them.
@@ -38,10 +41,25 @@ UNREADABLE_FILES = "files that cannot be read"
 UNINDEXED = "damaged blocks without an index"
 NOT_FOUND = "messages stated but not found"
 
+# No recorder writes larger chunks, so a larger size in a header is damage.
+CHUNK_LIMIT = 1 << 28
+RECORD_AGAIN = "no recorder writes this; copy it again from the drone"
 # The places of so many messages are Python integers at a time, which takes 10 MB.
 _BATCH = 1 << 16
 # A type takes a millisecond to understand, and PX4 has 250.
 _MOST_TYPES = 2000
+# Chunks that overlap in time are kept up to this many bytes.
+_CACHE = 64 << 20
+# Even an empty chunk counts as so many bytes.
+_CACHED_CHUNK = 1 << 16
+# A small file may inflate to anything. Logs compress to a tenth, black pictures to a hundredth. The stamps of
+# messages differ, so that a message takes a byte at the least.
+_INFLATED = 1 << 30  # bytes of all chunks in any file
+_MOST_EXPANSION = 100  # bytes for one in the file
+_RECORDS = 100_000  # in the chunks of any file; one more for each of its bytes
+# Some recorders leave indices of chunks out, and some write an index of no message for each channel.
+_BARE = 10_000  # such chunks and indices in any file; one more for each 256 bytes
+_BARE_SIZE = 256
 
 
 @dataclass(frozen=True)
@@ -50,6 +68,11 @@ class Channel:
 
     topic: str
     schema: Schema
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Name, type and encoding, by which channels of several files are one topic."""
+        return self.topic, self.schema.type, self.schema.encoding
 
 
 @dataclass(frozen=True)
@@ -62,6 +85,11 @@ class MessageTable:
     place: Int64  # within the block
     size: Int64  # bytes, uncompressed; bytes between two messages count to the first of them
 
+    def rows(self, which: object) -> MessageTable:
+        """Return some rows."""
+        columns = (self.channel, self.stamp_ns, self.block, self.place, self.size)
+        return MessageTable(*(column[which] for column in columns))
+
 
 class LogPart(ABC):
     """Open file of a log."""
@@ -72,10 +100,10 @@ class LogPart(ABC):
         self.channels: dict[int, Channel] = {}
         self.storage: list[str] = []  # kinds of storage, for `mocap info`
         self.lost: Counter[str] = Counter()  # losses of the file as a whole
-        self.table = _empty_table()
-        self._fates: NDArray[np.uint8] = np.zeros(0, np.uint8)
+        none = np.zeros(0, np.int64)
+        self.table = MessageTable(none, none, none, none, none)
+        self._fates: dict[int, str] = {}  # cause of loss, by row of the table
         self._rows: dict[int, Int64] = {}  # of each channel, in the order of the file
-        self._causes = [""]
 
     @abstractmethod
     def close(self) -> None:
@@ -86,7 +114,11 @@ class LogPart(ABC):
         """Yield the bytes of messages, by rows of the table; pass unreadable rows to `lose`."""
 
     def take(self, table: MessageTable) -> None:
-        """Keep the table of found messages, without those of undefined channels, which are counted."""
+        """Keep the table of found messages, without those of undefined channels, which are counted.
+
+        Raises:
+            DataError: the file defines too many types, or is damaged and holds no message.
+        """
         types = len({channel.schema for channel in self.channels.values()})
         if types > _MOST_TYPES:
             raise DataError(
@@ -95,35 +127,33 @@ class LogPart(ABC):
         named = np.isin(table.channel, list(self.channels))
         if strangers := int(np.count_nonzero(~named)):
             self.lost[UNNAMED] += strangers
-            table = MessageTable(
-                table.channel[named],
-                table.stamp_ns[named],
-                table.block[named],
-                table.place[named],
-                table.size[named],
-            )
+            table = table.rows(named)
         self.table = table
-        self._fates = np.zeros(len(table.channel), np.uint8)
         by_channel = np.argsort(table.channel, kind="stable")
         numbers, first = np.unique(table.channel[by_channel], return_index=True)
         rows = np.split(by_channel.astype(np.int64), first[1:]) if len(numbers) else []
         self._rows = dict(zip(numbers.tolist(), rows, strict=True))
 
-    def lose(self, rows: Int64 | int, cause: str) -> None:
+    def require_content(self) -> None:
+        """Refuse a damaged file without any readable message; an undamaged file may be empty."""
+        if self.lost and not len(self.table.stamp_ns):
+            causes = ", ".join(f"{cause}: {count}" for cause, count in sorted(self.lost.items()))
+            raise DataError(
+                self.path, f"holds no message that can be read ({causes})", "copy it again from the drone"
+            )
+
+    def lose(self, rows: Int64, cause: str) -> None:
         """Note why messages could not be read; a second reading counts them once only."""
-        if cause not in self._causes:
-            self._causes.append(cause)
-        self._fates[rows] = self._causes.index(cause)
+        self._fates |= dict.fromkeys(rows.tolist(), cause)
 
     def forget(self) -> None:
         """Forget the losses of the readings so far; those of the file as a whole stay."""
-        self._fates[:] = 0
+        self._fates.clear()
 
     @property
     def dropped(self) -> Counter[str]:
         """All losses so far, by cause."""
-        counts = np.bincount(self._fates, minlength=len(self._causes))[1:]
-        return self.lost + Counter(dict(zip(self._causes[1:], counts.tolist(), strict=True)))
+        return self.lost + Counter(self._fates.values())
 
     def rows_of(self, channels: Collection[int]) -> Int64:
         """Return the rows of some channels, in the order of receipt; equal stamps keep the file's order."""
@@ -132,14 +162,209 @@ class LogPart(ABC):
         return rows[np.argsort(self.table.stamp_ns[rows], kind="stable")]
 
 
+# --- files of chunks -----------------------------------------------------------------------------------
+
+
+@dataclass
+class Chunk:
+    """Position of a chunk's content in the file, and the positions of its messages by the index."""
+
+    offset: int
+    length: int  # bytes in the file
+    compression: str
+    size: int  # bytes once decompressed
+    crc: int = 0  # 0: the file has none
+    cut: bool = False  # the file ends within this chunk
+    index: list[Int64] = field(default_factory=list)  # a channel's [n, 3] each: channel, stamp, place
+
+
+@dataclass(frozen=True)
+class Content:
+    """Records found in a chunk."""
+
+    channels: dict[int, Channel]
+    index: list[tuple[int, int, int]]  # channel, stamp, place
+    end: int  # of the last complete record
+
+
+class ChunkedPart(LogPart):
+    """File of chunks. A format walks its records, searches chunks and finds a message's bytes."""
+
+    record_overhead: int  # bytes of a message's record besides the message
+
+    def __init__(self, path: Path) -> None:
+        self.file, file_size = open_file(path)
+        super().__init__(path, file_size)
+        self.chunks: list[Chunk] = []
+        self.messages_stated = 0  # by the file's summary
+        self._bare = 0  # chunks without an index, other than the last, and indices of no message
+        self._cache: dict[int, memoryview | None] = {}
+        self._cached = 0
+        self._records_left = _RECORDS + file_size
+        try:
+            end, closed = self.walk()
+            self._note_end(end, closed)
+            self._refuse_bombs()
+            self._look_into_chunks(closed)
+            self.take(self._table())
+            found = len(self.table.stamp_ns) + self.lost[UNNAMED]
+            self.lost += Counter({NOT_FOUND: self.messages_stated - found})
+            self.require_content()
+        except BaseException:
+            self.file.close()
+            raise
+
+    @abstractmethod
+    def walk(self) -> tuple[int, bool]:
+        """Find chunks, index and channels; return the end of the last complete record, and True if closed."""
+
+    @abstractmethod
+    def look(self, content: memoryview) -> Content:
+        """Find the records of a chunk."""
+
+    @abstractmethod
+    def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
+        """Return the bytes of the message at the index's place; ValueError if it is not there."""
+
+    def take_chunk(self, chunk: Chunk) -> None:
+        """Add the next chunk of the file."""
+        self._count_bare(bare=bool(self.chunks) and not self.chunks[-1].index)
+        self.chunks.append(chunk)
+        if (kind := chunk.compression or "uncompressed") not in self.storage:
+            self.storage.append(kind)
+
+    def take_index(self, rows: Int64) -> None:
+        """Add an index [n, 3] of channel, stamp and place to the last chunk."""
+        self._count_bare(bare=not len(rows))
+        self.chunks[-1].index.append(rows)
+
+    def count_record(self) -> None:
+        """Count a record that was found in a chunk."""
+        self._records_left -= 1
+        if self._records_left < 0:
+            raise DataError(
+                self.path, "inflates to more messages than it has bytes", RECORD_AGAIN, code="too-large"
+            )
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+    def forget(self) -> None:
+        """Forget the losses, and free the chunks of the last reading."""
+        super().forget()
+        self._cache.clear()
+        self._cached = 0
+
+    def read(self, rows: Int64) -> Iterator[tuple[int, memoryview]]:
+        """Yield the bytes of messages, as views into their chunk."""
+        table = self.table.rows(rows)
+        places = (table.block, table.place, table.channel, table.stamp_ns)
+        for k, (block, place, channel, stamp_ns) in enumerate(
+            zip(*(column.tolist() for column in places), strict=True)
+        ):
+            content = self._content(block)
+            try:
+                data = None if content is None else self.payload(content, place, channel, stamp_ns)
+            except ValueError:
+                self.lose(rows[k : k + 1], MISPLACED)
+                continue
+            if data is None:
+                self.lose(rows[k : k + 1], DAMAGED)
+            else:
+                yield k, data
+
+    def bytes_at(self, offset: int, length: int) -> bytes:
+        """Read bytes of the file; fewer at its end."""
+        self.file.seek(offset)
+        return self.file.read(max(0, min(length, self.file_size - offset)))
+
+    def _count_bare(self, *, bare: bool) -> None:
+        self._bare += bare
+        if self._bare > max(_BARE, self.file_size // _BARE_SIZE):
+            problem = f"holds {self._bare} chunks without an index or empty indices in {self.file_size} bytes"
+            raise DataError(self.path, problem, RECORD_AGAIN)
+
+    def _note_end(self, end: int, closed: bool) -> None:
+        if not closed:
+            self.lost[TRUNCATED if end < self.file_size else UNCLOSED] += 1
+        cut_chunk = bool(self.chunks) and self.chunks[-1].cut
+        if end < self.file_size and not cut_chunk:
+            self.lost[TAIL] += self.file_size - end
+
+    def _look_into_chunks(self, closed: bool) -> None:
+        for number, chunk in enumerate(self.chunks):
+            # The index of the last chunk may be incomplete.
+            unindexed = not chunk.index or (not closed and chunk is self.chunks[-1])
+            mentioned = {int(rows[0, 0]) for rows in chunk.index if len(rows)}
+            if not unindexed and mentioned <= self.channels.keys():
+                continue
+            content = self._content(number)
+            if content is None:
+                self.lost += Counter({UNINDEXED: int(unindexed)})
+                continue
+            found = self.look(content)
+            self.channels = found.channels | self.channels
+            if unindexed:
+                chunk.index = [np.array(found.index, np.int64).reshape(-1, 3)]
+                self.lost += Counter({TAIL: len(content) - found.end})
+
+    def _content(self, number: int) -> memoryview | None:
+        if number not in self._cache:
+            content = self._cache[number] = self._inflated(self.chunks[number])
+            self._cached += len(content or b"") + _CACHED_CHUNK
+            while len(self._cache) > 1 and self._cached > _CACHE:
+                self._cached -= len(self._cache.pop(next(iter(self._cache))) or b"") + _CACHED_CHUNK
+        return self._cache[number]
+
+    def _refuse_bombs(self) -> None:
+        """Refuse a file whose chunks inflate beyond reason; none is inflated to more than it states."""
+        sizes = [chunk.size for chunk in self.chunks if chunk.size <= CHUNK_LIMIT]
+        if sum(sizes) > inflated_limit(self.file_size):
+            raise DataError(self.path, f"inflates from {self.file_size} to {sum(sizes)} bytes", RECORD_AGAIN)
+
+    def _inflated(self, chunk: Chunk) -> memoryview | None:
+        if max(chunk.size, chunk.length) > CHUNK_LIMIT:
+            return None
+        try:
+            data = self.bytes_at(chunk.offset, chunk.length)
+            content, complete = inflate(data, chunk.compression, chunk.size)
+        except ValueError:
+            return None
+        if not chunk.cut and not (complete and len(content) == chunk.size):
+            return None
+        if chunk.crc and not chunk.cut and zlib.crc32(content) != chunk.crc:
+            return None
+        return memoryview(content)
+
+    def _table(self) -> MessageTable:
+        blocks = [np.full(sum(map(len, c.index)), n, np.int64) for n, c in enumerate(self.chunks)]
+        block = np.concatenate([*blocks, np.zeros(0, np.int64)])
+        rows = np.concatenate([*(part for c in self.chunks for part in c.index), np.zeros((0, 3), np.int64)])
+        order = np.lexsort((rows[:, 2], block))
+        block, rows = block[order], rows[order]
+        ends = np.array([min(chunk.size, CHUNK_LIMIT) for chunk in self.chunks], np.int64)[block]
+        same_block = np.append(block[1:] == block[:-1], False) if len(block) else np.zeros(0, bool)
+        next_place = np.where(same_block, np.roll(rows[:, 2], -1), ends)
+        size = np.maximum(next_place - rows[:, 2] - self.record_overhead, 0)
+        return MessageTable(rows[:, 0], rows[:, 1], block, rows[:, 2], size)
+
+
+def inflated_limit(file_size: int) -> int:
+    """Return the most bytes to which a compressed log may inflate."""
+    return max(_INFLATED, _MOST_EXPANSION * file_size)
+
+
+# --- logs of one file or several --------------------------------------------------------------------------
+
+
 class OpenLog:
     """Open log of one or more parts."""
 
     def __init__(self, parts: Sequence[LogPart], lost: Counter[str]) -> None:
         self.parts = parts
         self._lost = lost
-        self._channels = [_channels_by_key(part) for part in parts]
-        keys = {key for channels in self._channels for key in channels}
+        keys = {channel.key for part in parts for channel in part.channels.values()}
         self._topics = {key: self._summary(*key) for key in sorted(keys)}
 
     def __enter__(self) -> OpenLog:
@@ -172,44 +397,62 @@ class OpenLog:
         streams = [self._of_part(part, frozenset(topics)) for part in self.parts]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
 
-    def stamps(self, topic: Topic) -> Int64:
-        """Return the stamps of receipt of a topic's messages, sorted."""
-        return np.sort(np.concatenate([part.table.stamp_ns[rows] for part, rows in self._rows_of(topic)]))
+    def describe(self) -> dict[str, object]:
+        """Describe files, messages, times and storage of a log, each topic, and losses by cause."""
+        topics = self.topics
+        first = min((t.first_ns for t in topics if t.first_ns is not None), default=None)
+        last = max((t.last_ns for t in topics if t.last_ns is not None), default=None)
+        facts: dict[str, object] = {
+            "files": len(self.parts),
+            "storage": sorted({word for part in self.parts for word in part.storage}),
+            "size_bytes": sum(part.file_size for part in self.parts),
+            "messages": sum(topic.count for topic in topics),
+        }
+        if first is not None and last is not None:
+            facts |= {"first_ns": first, "last_ns": last, "span_s": (last - first) / 1e9}
+        named = Counter(topic.name for topic in topics)
+        facts["topics"] = {
+            topic.name if named[topic.name] == 1 else f"{topic.name} ({topic.type})": self._described(topic)
+            for topic in topics
+        }
+        return facts | {f"dropped: {cause}": count for cause, count in self.dropped.items()}
 
-    def size(self, topic: Topic) -> int:
-        """Return the size of a topic's messages in bytes, uncompressed."""
-        return sum(int(part.table.size[rows].sum()) for part, rows in self._rows_of(topic))
-
-    def problem(self, topic: Topic) -> str:
-        """Return why the messages of a topic cannot be decoded; empty if they can."""
-        for schema in dict.fromkeys(
-            part.channels[channel].schema
-            for part, channels in self._channels_of(topic)
-            for channel in channels
-        ):
+    def _described(self, topic: Topic) -> dict[str, object]:
+        tables, schemas = self._messages_of(topic.name, topic.type, topic.encoding)
+        facts: dict[str, object] = {
+            "type": topic.type,
+            "encoding": topic.encoding,
+            "messages": topic.count,
+            "size_bytes": sum(int(table.size.sum()) for table in tables),
+        }
+        if topic.first_ns is not None and topic.last_ns is not None:
+            span_ns = topic.last_ns - topic.first_ns
+            facts |= {"first_ns": topic.first_ns, "last_ns": topic.last_ns}
+            if span_ns:
+                stamps = np.sort(np.concatenate([table.stamp_ns for table in tables]))
+                facts["rate_hz"] = round((topic.count - 1) / span_ns * 1e9, 3)
+                facts["longest_gap_s"] = round(int(np.diff(stamps).max()) / 1e9, 6)
+        for schema in schemas:
             try:
                 decoder(schema)
             except ValueError as error:
-                return str(error)
-        return ""
+                facts["cannot be decoded"] = str(error)
+                break
+        return facts
 
-    def _channels_of(self, topic: Topic) -> Iterator[tuple[LogPart, list[int]]]:
-        """Yield the numbers of a topic's channels by part."""
-        key = topic.name, topic.type, topic.encoding
-        for part, channels in zip(self.parts, self._channels, strict=True):
-            yield part, channels.get(key, [])
-
-    def _rows_of(self, topic: Topic) -> Iterator[tuple[LogPart, Int64]]:
-        """Yield the rows of a topic's messages by part, in the order of receipt."""
-        for part, channels in self._channels_of(topic):
-            yield part, part.rows_of(channels)
+    def _messages_of(self, *key: str) -> tuple[list[MessageTable], list[Schema]]:
+        """Return the messages of a topic by part, and their schemas, each once."""
+        numbers = [[n for n, channel in part.channels.items() if channel.key == key] for part in self.parts]
+        pairs = list(zip(self.parts, numbers, strict=True))
+        schemas = dict.fromkeys(part.channels[n].schema for part, own in pairs for n in own)
+        return [part.table.rows(part.rows_of(own)) for part, own in pairs], list(schemas)
 
     def _of_part(self, part: LogPart, topics: frozenset[str]) -> Iterator[Message]:
         decoders = {}
         for number, channel in part.channels.items():
             if channel.topic in topics:
                 try:
-                    decoders[number] = decoder(channel.schema), self._topics[_key(channel)]
+                    decoders[number] = decoder(channel.schema), self._topics[channel.key]
                 except ValueError:
                     part.lose(part.rows_of([number]), UNDEFINED)
         rows = part.rows_of(decoders)
@@ -222,32 +465,38 @@ class OpenLog:
                 try:
                     value = decode(data)
                 except ValueError:
-                    part.lose(int(batch[k]), UNDECODABLE)
+                    part.lose(batch[k : k + 1], UNDECODABLE)
                     continue
                 yield Message(topic, stamps[k], value)
 
     def _summary(self, name: str, type_: str, encoding: str) -> Topic:
-        stamps = self.stamps(Topic(name, type_, encoding, 0, None, None))
-        first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
+        tables, _ = self._messages_of(name, type_, encoding)
+        stamps = np.concatenate([table.stamp_ns for table in tables])
+        first, last = (int(stamps.min()), int(stamps.max())) if len(stamps) else (None, None)
         return Topic(name, type_, encoding, len(stamps), first, last)
+
+
+def begins_like(path: Path, magic: bytes, suffixes: Collection[str]) -> bool:
+    """Return True if a file begins with some bytes, or is empty and named like such a file."""
+    head = first_bytes(path, len(magic))
+    return head == magic or (not head and path.is_file() and path.suffix.lower() in suffixes)
 
 
 def open_file(path: Path) -> tuple[IO[bytes], int]:
     """Open a file; return it with its size."""
+    refuse_special(path)
     try:
         size = path.stat().st_size
         if not size:
             raise DataError(path, "is empty (0 bytes)", "copy it again from the drone")
         file = path.open("rb")
-        if pointer := describe_lfs_pointer(file.read(1024)):
-            file.close()
-            raise DataError(path, *pointer, code="wrong-kind")
-        file.seek(0)
-        return file, size
     except OSError as error:
-        raise DataError(
-            path, f"cannot be opened ({error.strerror})", "check the path", code=code_of(error)
-        ) from None
+        raise as_data_error(error, path) from None
+    if pointer := describe_lfs_pointer(file.read(1024)):
+        file.close()
+        raise DataError(path, *pointer, code="wrong-kind")
+    file.seek(0)
+    return file, size
 
 
 def open_parts(
@@ -268,68 +517,3 @@ def open_parts(
     if refusals and not parts:
         raise refusals[0]
     return parts, Counter({UNREADABLE_FILES: len(refusals)} if refusals else {})
-
-
-def require_content(part: LogPart) -> None:
-    """Refuse a damaged file without any readable message; an undamaged file may be empty."""
-    if part.lost and not len(part.table.stamp_ns):
-        causes = ", ".join(f"{cause}: {count}" for cause, count in sorted(part.lost.items()))
-        part.close()
-        raise DataError(
-            part.path, f"holds no message that can be read ({causes})", "copy it again from the drone"
-        )
-
-
-def describe_log(log: OpenLog) -> dict[str, object]:
-    """Describe files, messages, times and storage of a log, each topic, and losses by cause."""
-    topics = log.topics
-    first = min((t.first_ns for t in topics if t.first_ns is not None), default=None)
-    last = max((t.last_ns for t in topics if t.last_ns is not None), default=None)
-    facts: dict[str, object] = {
-        "files": len(log.parts),
-        "storage": sorted({word for part in log.parts for word in part.storage}),
-        "size_bytes": sum(part.file_size for part in log.parts),
-        "messages": sum(topic.count for topic in topics),
-    }
-    if first is not None and last is not None:
-        facts |= {"first_ns": first, "last_ns": last, "span_s": (last - first) / 1e9}
-    named = Counter(topic.name for topic in topics)
-    facts["topics"] = {
-        topic.name if named[topic.name] == 1 else f"{topic.name} ({topic.type})": _describe_topic(log, topic)
-        for topic in topics
-    }
-    return facts | {f"dropped: {cause}": count for cause, count in log.dropped.items()}
-
-
-def _describe_topic(log: OpenLog, topic: Topic) -> dict[str, object]:
-    facts: dict[str, object] = {
-        "type": topic.type,
-        "encoding": topic.encoding,
-        "messages": topic.count,
-        "size_bytes": log.size(topic),
-    }
-    if topic.first_ns is not None and topic.last_ns is not None:
-        span_ns = topic.last_ns - topic.first_ns
-        facts |= {"first_ns": topic.first_ns, "last_ns": topic.last_ns}
-        if span_ns:
-            facts["rate_hz"] = round((topic.count - 1) / span_ns * 1e9, 3)
-            facts["longest_gap_s"] = round(int(np.diff(log.stamps(topic)).max()) / 1e9, 6)
-    if problem := log.problem(topic):
-        facts["cannot be decoded"] = problem
-    return facts
-
-
-def _key(channel: Channel) -> tuple[str, str, str]:
-    return channel.topic, channel.schema.type, channel.schema.encoding
-
-
-def _channels_by_key(part: LogPart) -> dict[tuple[str, str, str], list[int]]:
-    found: dict[tuple[str, str, str], list[int]] = {}
-    for number, channel in part.channels.items():
-        found.setdefault(_key(channel), []).append(number)
-    return found
-
-
-def _empty_table() -> MessageTable:
-    none = np.zeros(0, np.int64)
-    return MessageTable(none, none, none, none, none)

@@ -11,13 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.logs.chunked_logs import Chunk, ChunkedPart, Content
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
-from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
+from pipelines.formats.logs.recordings import (
+    Channel,
+    Chunk,
+    ChunkedPart,
+    Content,
+    OpenLog,
+    begins_like,
+    open_parts,
+)
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.storage import is_special
 
+_BEGINNING = b"#ROSBAG V"
 _MAGIC = re.compile(rb"#ROSBAG V(\d+)\.(\d+)\n")
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 # The header of a record has some hundred bytes, so more is damage.
@@ -39,23 +46,16 @@ class Ros1Bag:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins with a bag's first line, or is empty and named `.bag`."""
-        if is_special(path):
-            return False
-        try:
-            with path.open("rb") as file:
-                head = file.read(16)
-        except OSError:
-            return False
-        return bool(_MAGIC.match(head)) or (not head and path.suffix.lower() in self.suffixes)
+        return begins_like(path, _BEGINNING, self.suffixes)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe messages, times, storage, topics, and losses."""
         with self.open_log([path]) as log:
-            return describe_log(log)
+            return log.describe()
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open one bag, or several as one recording."""
-        return OpenLog(*open_parts(paths, _open_part))
+        return OpenLog(*open_parts(paths, _Bag))
 
 
 class _Bag(ChunkedPart):
@@ -153,10 +153,7 @@ class _Bag(ChunkedPart):
     def _take_chunk(self, fields: Fields, data_at: int, length: int) -> None:
         compression = fields[b"compression"].decode()
         here = min(length, self.file_size - data_at)
-        chunk = Chunk(data_at, here, compression, _U32.unpack(fields[b"size"])[0], cut=here < length)
-        self.take_chunk(chunk)
-        if compression not in self.storage:
-            self.storage.append(compression)
+        self.take_chunk(Chunk(data_at, here, compression, _U32.unpack(fields[b"size"])[0], cut=here < length))
 
     def _take_connection(self, fields: Fields, data: bytes) -> None:
         number, channel = _connection(fields, data)
@@ -198,10 +195,6 @@ def _connection(fields: Fields, data: bytes) -> tuple[int, Channel]:
     about = _fields(data)
     schema = Schema(ros2_name(about[b"type"].decode()), "ros1", "ros1msg", about[b"message_definition"])
     return _U32.unpack(fields[b"conn"])[0], Channel(fields[b"topic"].decode(), schema)
-
-
-def _open_part(path: Path) -> _Bag:
-    return _Bag(path, *open_file(path))
 
 
 FORMAT = Ros1Bag()

@@ -23,24 +23,25 @@ from typing import Any
 import apsw
 import numpy as np
 
-from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT, RECORD_AGAIN, inflated_limit
-from pipelines.formats.logs.mcap_log import open_mcap
+from pipelines.formats.logs.mcap_log import McapPart
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import (
+    CHUNK_LIMIT,
     DAMAGED,
+    RECORD_AGAIN,
     TRUNCATED,
     Channel,
     LogPart,
     MessageTable,
     OpenLog,
-    describe_log,
+    begins_like,
+    inflated_limit,
     open_file,
     open_parts,
-    require_content,
 )
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error, is_special
+from pipelines.session.storage import as_data_error
 from pipelines.session.yaml_files import plain_yaml
 
 # Causes of losses.
@@ -84,20 +85,14 @@ class Ros2Bag:
         try:
             if path.is_dir():
                 return _states_a_bag(path / "metadata.yaml") or _is_one_bag(_storage_files(path))
-            if is_special(path):
-                return False
-            with path.open("rb") as file:
-                head = file.read(len(_MAGIC))
+            return begins_like(path, _MAGIC, self.suffixes) and _has_bag_tables(path)
         except OSError:
             return False
-        if head != _MAGIC:
-            return not head and path.suffix.lower() in self.suffixes
-        return _has_bag_tables(path)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe messages, times, storage, topics, losses, and differences from metadata.yaml."""
         with self.open_log([path]) as log:
-            facts = describe_log(log)
+            facts = log.describe()
         stated = _contents(path).stated
         if stated and facts["messages"] and stated.times != {key: facts[key] for key in stated.times}:
             facts["metadata.yaml states"] = stated.times
@@ -138,7 +133,7 @@ def _open_part(path: Path) -> LogPart:
     with file:
         head = file.read(len(_MAGIC))
     if head != _MAGIC:
-        return open_mcap(path)
+        return McapPart(path)
     if not _write_ahead_log(path):
         return Sqlite3Part(path, path, size)
     with TemporaryDirectory() as folder:
@@ -284,7 +279,7 @@ class Sqlite3Part(LogPart):
             self._read_topics()
             self.take(self._list_messages())
             self._check_length(database)
-            require_content(self)
+            self.require_content()
         except _UNREADABLE as error:
             self.close()
             raise DataError(
@@ -306,7 +301,7 @@ class Sqlite3Part(LogPart):
         for k, place in enumerate(self.table.place[rows].tolist()):
             message = self._message(place)
             if message is None:
-                self.lose(int(rows[k]), DAMAGED)
+                self.lose(rows[k : k + 1], DAMAGED)
             else:
                 yield k, message
 
@@ -414,7 +409,7 @@ def _connect(path: Path) -> apsw.Connection:
 
 def _has_bag_tables(path: Path) -> bool:
     """Return True if a sqlite3 file has the tables of a bag; if it is unreadable, judge by its suffix."""
-    if _write_ahead_log(path):
+    if _write_ahead_log(path) or not path.stat().st_size:
         return path.suffix.lower() == ".db3"
     query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
     database = _connect(path)

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT
 from pipelines.formats.logs.recordings import (
+    CHUNK_LIMIT,
     DAMAGED,
     TAIL,
     TRUNCATED,
