@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.bootstrap import Series
+
+Series = tuple[Float, Float]
+"""Sums [T] and weights [T] of a figure at every moment or trial: the figure is the ratio of their totals."""
 
 # The benchmark MPI-INF-3DHP counts joints within 150 mm (3DPCK).
 PCK_THRESHOLD_M = 0.15
@@ -81,17 +83,17 @@ def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -
     rooted = np.isfinite(_root(estimate, joints) - _root(truth, joints)).all(axis=-1)
     aligned = np.isfinite(distances.aligned).any(axis=-1)
     return {
-        **_jsonable(asdict(distances.errors(slice(None)))),
+        **distances.errors(slice(None)),
         "root_frames_left_out": int((shared & ~rooted).sum()),
         "pa_frames_left_out": int((shared & ~aligned).sum()),
-        "per_joint": {name: _jsonable(asdict(distances.errors(index))) for index, name in enumerate(joints)},
+        "per_joint": {name: distances.errors(slice(j, j + 1)) for j, name in enumerate(joints)},
     }
 
 
 def error_series(
     estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64
 ) -> tuple[dict[str, Series], dict[str, dict[str, Series]]]:
-    """Compute the errors of `measure` at each time, for their intervals (`bootstrap.intervals`).
+    """Compute the errors of `measure` at each time, for their intervals (`intervals`).
 
     Returns:
         The series over all joints, by the names of `JointErrors`; and the same per joint.
@@ -221,27 +223,14 @@ class _Distances:
     aligned: Float
     acceleration: Float  # [T - 2, P, J]
 
-    def errors(self, joints: slice | int) -> JointErrors:
-        absolute = self.absolute[:, :, joints]
-        present = absolute[np.isfinite(absolute)]
-        judged = int(self.has_truth[:, :, joints].sum())
-        squared = float(np.sum(present**2))
-        # The integral of the share below a threshold, in closed form: each joint counts from its own
-        # distance on.
-        area = float(np.sum(np.maximum(0.0, 1 - present / PCK_THRESHOLD_M)))
-        return JointErrors(
-            joint_frames=judged,
-            reconstructed_share=_ratio(present.size, judged),
-            mpjpe_mm=1e3 * _mean(present),
-            root_mpjpe_mm=1e3 * _mean(self.root[:, :, joints]),
-            pa_mpjpe_mm=1e3 * _mean(self.aligned[:, :, joints]),
-            e_recon_m2=squared if present.size else math.nan,
-            e_recon_terms=present.size,
-            e_recon_per_joint_frame_m2=_ratio(squared, present.size),
-            pck150=_ratio(int((present <= PCK_THRESHOLD_M).sum()), judged),
-            pck150_auc=_ratio(area, judged),
-            acceleration_error_mm_s2=1e3 * _mean(self.acceleration[:, :, joints]),
-        )
+    def errors(self, joints: slice) -> dict[str, float | None]:
+        """Compute the fields of `JointErrors`, JSON-able."""
+        totals = {name: (sums.sum(), weights.sum()) for name, (sums, weights) in self.series(joints).items()}
+        terms, judged = totals["reconstructed_share"]
+        found = {name: total / weight if weight else math.nan for name, (total, weight) in totals.items()}
+        found["e_recon_m2"] = found["e_recon_m2"] if terms else math.nan
+        errors = JointErrors(joint_frames=int(judged), e_recon_terms=int(terms), **found)
+        return _jsonable(asdict(errors))
 
     def series(self, joints: slice) -> dict[str, Series]:
         """Compute the same errors at each time; an acceleration is at the middle of its three samples."""
@@ -328,10 +317,6 @@ def _mean(values: Float) -> float:
 def _median(values: Float) -> float:
     present = values[np.isfinite(values)]
     return float(np.median(present)) if present.size else math.nan
-
-
-def _ratio(part: float, whole: int) -> float:
-    return part / whole if whole else math.nan
 
 
 def _number(value: float) -> float | None:
@@ -477,3 +462,88 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
             for p in range(position.shape[1])
         ],
     }
+
+
+# --- confidence intervals ----------------------------------------------------------------------------------
+
+# Intervals of means by the bootstrap. Trials are independent: as many are drawn from them with replacement
+# as there are (Efron & Tibshirani 1993, 13.3). In a flight neighbours correlate: the flight is treated as a
+# circle, and stretches of a fixed length are drawn from it (circular block bootstrap, Politis & Romano
+# 1992). The interval holds the middle 95 % of the means of many draws. Errors that are the same throughout
+# are not in it: it is valid for this flight, not for the next.
+
+# Papers of the field state intervals of 95 %.
+LEVEL = 0.95
+STRETCH_S = 5.0
+"""Length of a stretch: the longest time over which the figures of a flight correlate.
+
+Errors of detectors and white pose errors decorrelate within two steps of a walk, 2 s; tilt, occlusion and
+drifting pose errors follow the actor's path, past an obstacle or around a turn, for up to 5 s. Too short a
+stretch makes the interval too narrow. Too long a one makes only its ends less certain.
+"""
+
+RESAMPLES = 2000
+"""Draws; the ends of an interval scatter by 4 % of half its width."""
+
+# An interval of `LEVEL` leaves 2.5 % of the draws on either side.
+_TAIL_PERCENT = 2.5
+# Draws from fewer stretches repeat each other, and the interval would be too narrow.
+_MIN_STRETCHES = 5
+# Fewer samples or trials do not tell how a figure scatters.
+_MIN_SAMPLES, _MIN_TRIALS = 10, 2
+
+
+def stretch_samples(t_ns: Int64) -> int:
+    """Return the samples of a stretch: `STRETCH_S`, at most a fifth of the flight, and at least one."""
+    step_s = float(np.median(np.diff(t_ns))) / 1e9
+    return max(min(round(STRETCH_S / step_s), len(t_ns) // _MIN_STRETCHES), 1)
+
+
+def intervals(
+    series: Mapping[str, Series], t_ns: Int64 | None, *, seed: int = 0
+) -> dict[str, tuple[float, float] | None]:
+    """Compute the interval of every figure, with the same draws for all of them.
+
+    Args:
+        series: by name, [T] each; nothing may be NaN.
+        t_ns: [T] strictly increasing; None for independent trials.
+
+    Returns:
+        By name; None with fewer than ten samples or two trials, or if a draw has no data for the figure.
+    """
+    return {name: interval_of(values) for name, values in resampled(series, t_ns, seed=seed).items()}
+
+
+def resampled(series: Mapping[str, Series], t_ns: Int64 | None, *, seed: int = 0) -> dict[str, Float]:
+    """Compute every figure of every draw, [RESAMPLES], with the same draws for all figures.
+
+    The arguments are those of `intervals`. A value is NaN if a draw has no data for the figure. All values
+    are NaN with fewer than ten samples or two trials.
+    """
+    count = len(next(iter(series.values()))[0]) if series else 0
+    if count < (_MIN_TRIALS if t_ns is None else _MIN_SAMPLES):
+        return {name: np.full(RESAMPLES, np.nan) for name in series}
+    length = 1 if t_ns is None else stretch_samples(t_ns)
+    first = np.random.default_rng([seed, count]).integers(count, size=(RESAMPLES, math.ceil(count / length)))
+    found = {}
+    for name, (sums, weights) in series.items():
+        total, weight = (_of_stretches(values, length)[first].sum(axis=1) for values in (sums, weights))
+        there = weight > 0
+        found[name] = np.where(there, total / np.where(there, weight, 1.0), np.nan)
+    return found
+
+
+def interval_of(values: Float) -> tuple[float, float] | None:
+    """Return the middle 95 % of a figure's draws; None if any of them has no data for it."""
+    if not np.isfinite(values).all():
+        return None
+    low, high = np.percentile(values, [_TAIL_PERCENT, 100 - _TAIL_PERCENT])
+    return float(low), float(high)
+
+
+def _of_stretches(values: Float, length: int) -> Float:
+    """Sum [T] the stretch that begins at each sample; stretches wrap around the end."""
+    if length == 1:
+        return values
+    total = np.concatenate([[0.0], np.cumsum(np.concatenate([values, values[: length - 1]]))])
+    return np.asarray(total[length:] - total[:-length], dtype=np.float64)

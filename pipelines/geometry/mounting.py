@@ -11,7 +11,6 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import (
-    compose,
     enu_from_ned,
     multiply,
     quaternion_from_rotation_vector,
@@ -55,19 +54,6 @@ def body_from_camera(looks: Looks, down_deg: float = 0.0) -> Float:
     # About the left axis a positive angle turns forward to down.
     tilt = _turn("y", np.radians(_STRAIGHT_DEG.get(looks, down_deg)))
     return multiply(multiply(azimuth, tilt), _FLU_FROM_OPTICAL)
-
-
-def compose_mount(world_from_body: Pose, body_from_camera: Pose) -> Pose:
-    """Compute the poses of a camera fixed to the body; its lever arm turns with the body.
-
-    Args:
-        world_from_body: position [N, 3] m and quaternion [N, 4].
-        body_from_camera: position [3] m and quaternion [4].
-
-    Returns:
-        world_from_camera: position [N, 3] and quaternion [N, 4].
-    """
-    return compose(world_from_body, body_from_camera)
 
 
 # --- gimbals -------------------------------------------------------------------------------------------

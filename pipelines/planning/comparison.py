@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Float32, Int64
-from pipelines.geometry.bootstrap import LEVEL, STRETCH_S, intervals
+from pipelines.geometry.metrics import LEVEL, STRETCH_S, intervals
 from pipelines.planning.arm_flights import LOGGED, ArmFlight, aimed_at, looks_rad, seen_people
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.formation import TILT, slot_of

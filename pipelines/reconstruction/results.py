@@ -15,10 +15,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int8, Int64
-from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, Series, intervals, stretch_samples
 from pipelines.geometry.gait import HEEL_STRIKE, SIDES, TOE_OFF, GaitEvents, gait_events, summary
 from pipelines.geometry.joint_angles import ANGLE_STATUS, ANGLES, joint_angles
-from pipelines.geometry.metrics import JointErrors, error_series, measure, measure_shape, tracking_errors
+from pipelines.geometry.metrics import (
+    LEVEL,
+    RESAMPLES,
+    JointErrors,
+    Series,
+    error_series,
+    intervals,
+    measure,
+    measure_shape,
+    stretch_samples,
+    tracking_errors,
+)
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.observations import Camera, Observations

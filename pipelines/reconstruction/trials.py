@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.geometry import bootstrap
+from pipelines.geometry.metrics import intervals
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.errors import DataError
@@ -94,7 +94,7 @@ def summary_of_trials(metrics: Sequence[Mapping[str, Any]], text: str, seed: int
 
     Returns:
         JSON-able, null for figures that could not be measured: `each` trial's figures, their `mean`, `std`
-        (about the mean, n - 1) and the `intervals` of `geometry.bootstrap` over trials; both null for less
+        (about the mean, n - 1) and the `intervals` of `geometry.metrics` over trials; both null for less
         than two trials.
     """
     each = [_figures(trial) for trial in metrics]
@@ -107,7 +107,7 @@ def summary_of_trials(metrics: Sequence[Mapping[str, Any]], text: str, seed: int
         std[name] = ends[name] = None
         if values.size > 1:
             std[name] = float(values.std(ddof=1))
-            found = bootstrap.intervals({name: (values, np.ones(values.size))}, None, seed=seed)[name]
+            found = intervals({name: (values, np.ones(values.size))}, None, seed=seed)[name]
             ends[name] = None if found is None else list(found)
     return {
         "disturb_poses": text,

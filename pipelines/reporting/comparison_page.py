@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, STRETCH_S
+from pipelines.geometry.metrics import LEVEL, RESAMPLES, STRETCH_S
 from pipelines.reporting import wording
 from pipelines.reporting.chart import (
     MUTED,

@@ -16,8 +16,15 @@ from typing import Literal
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.bootstrap import Series, interval_of, intervals, resampled
-from pipelines.geometry.metrics import aligned_distances, bone_lengths, root_relative_distances
+from pipelines.geometry.metrics import (
+    Series,
+    aligned_distances,
+    bone_lengths,
+    interval_of,
+    intervals,
+    resampled,
+    root_relative_distances,
+)
 from pipelines.reporting.content import MeasuredMotion, SessionContent, middles, text
 from pipelines.reporting.summary import Summary, summarise
 from pipelines.session.camera_poses import poses_at

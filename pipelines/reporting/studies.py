@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.bootstrap import interval_of, resampled
+from pipelines.geometry.metrics import interval_of, resampled
 from pipelines.reporting.chart import (
     CAMERAS,
     GRID,

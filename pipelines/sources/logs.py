@@ -45,7 +45,7 @@ from pipelines.formats.logs.trajectories import (
     transforms_in,
 )
 from pipelines.geometry.arrays import Int64
-from pipelines.geometry.clock_steps import ClockStep, find_steps, without_steps
+from pipelines.geometry.clocks import ClockStep, find_steps, without_steps
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import LogSource, Manifest, MapSource
 from pipelines.session.records import IntrinsicsSample, Message, Occupancy, PictureSample, Trajectory

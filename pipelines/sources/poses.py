@@ -20,7 +20,6 @@ from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
 from pipelines.geometry.mounting import (
     attitude_in_enu,
     compose_gimbal,
-    compose_mount,
     level_heading,
 )
 from pipelines.geometry.poses import (
@@ -309,7 +308,7 @@ class FlightPoses:
         world_from_body = (body.position, body.quaternion_xyzw)
         dropped = dict(body.dropped)
         if angles is None:
-            position, quaternion = compose_mount(world_from_body, (lever_arm, rotation))
+            position, quaternion = compose(world_from_body, (lever_arm, rotation))
         else:
             position, quaternion, lost = self._on_gimbal(angles, body, lever_arm, rotation)
             dropped |= lost
@@ -753,7 +752,7 @@ class FlightPoses:
         attitude = None if gimbal is None else self._at(gimbal, t_ns)
         world_from_body = None if body is None else self._at(body, t_ns)
         if attitude is None and world_from_body is not None:
-            position, quaternion = compose_mount((position, world_from_body), (lever_arm, rotation))
+            position, quaternion = compose((position, world_from_body), (lever_arm, rotation))
         elif attitude is not None and gimbal is not None:
             if world_from_body is None:
                 world_from_body = level_heading(attitude)  # the heading is all that is known of it

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.bootstrap import RESAMPLES, STRETCH_S, intervals, stretch_samples
+from pipelines.geometry.metrics import RESAMPLES, STRETCH_S, intervals, stretch_samples
 
 RATE = 30
 SAMPLES = 60 * RATE

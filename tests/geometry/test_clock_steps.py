@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.clock_steps import find_steps, without_steps
+from pipelines.geometry.clocks import find_steps, without_steps
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S

@@ -21,9 +21,9 @@ from pipelines.geometry.mounting import (
     attitude_in_enu,
     body_from_camera,
     compose_gimbal,
-    compose_mount,
 )
 from pipelines.geometry.poses import (
+    compose,
     conjugate,
     invert,
     matrix_from_quaternion,
@@ -75,7 +75,7 @@ def same_rotation(a: Float, b: Float) -> None:
 
 
 def test_paper_case_1_fixed_mount() -> None:
-    camera = compose_mount(LEVEL, (LEVER_ARM, body_from_camera("forward", 30)))
+    camera = compose(LEVEL, (LEVER_ARM, body_from_camera("forward", 30)))
     assert f"= {on_paper(camera[0])}\n\nThe optical axis" in PAPER
     for name, direction in (("axis ", AXIS), ("right", RIGHT_OF_PICTURE), ("bottom", BOTTOM_OF_PICTURE)):
         line = next(line for line in PAPER.splitlines() if line.strip().startswith(name) and "= (" in line)

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.poses import compose, invert, matrix_from_quaternion
-from pipelines.geometry.transform_tree import Link, chain, find_route
+from pipelines.geometry.poses import Link, chain, compose, find_route, invert, matrix_from_quaternion
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.geometry.bootstrap import RESAMPLES, STRETCH_S
+from pipelines.geometry.metrics import RESAMPLES, STRETCH_S
 from pipelines.reporting.comparison_page import judge, render_comparison
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.session_comparison import compare, labels_of

@@ -33,7 +33,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
 )
 from pipelines.formats.logs.messages import FAULTS, Stamps, nanoseconds, unreadable
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.clock_steps import find_steps, without_steps
+from pipelines.geometry.clocks import find_steps, without_steps
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes

@@ -26,11 +26,9 @@ from pipelines.formats.logs.messages import (
 )
 from pipelines.formats.poses.trajectory_files import clean_poses
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.clock_steps import ClockStep, find_steps, without_steps
-from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.geometry.clocks import ClockFit, ClockStep, find_steps, fit_clock, without_steps
 from pipelines.geometry.mounting import attitude_from_angles
-from pipelines.geometry.poses import pose_covariance_in_body
-from pipelines.geometry.transform_tree import Link, chain, find_route
+from pipelines.geometry.poses import Link, chain, find_route, pose_covariance_in_body
 from pipelines.session.errors import DataError
 from pipelines.session.records import AngleSample, Message, PoseSample, Sample, Trajectory
 from pipelines.session.registries import Log
