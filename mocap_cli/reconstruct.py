@@ -123,10 +123,9 @@ _settings_options = grouped(
     click.option(
         "--smooth",
         metavar="FILTER",
-        help='"butterworth:cutoff_hz=6,order=4" (forwards and backwards, no lag) or "rts" (Kalman smoother'
-        ' that weighs covariances; "rts:model=jerk"). Never across gaps. "fill:max_s=0.2", alone or before'
-        ' another as in "fill:max_s=0.2 + rts", interpolates a joint across gaps of at most this length; its'
-        " status there is `filled`.",
+        help='"butterworth:cutoff_hz=6,order=4" (forwards and backwards, no lag), never across gaps.'
+        ' "fill:max_s=0.2", alone or before it as in "fill:max_s=0.2 + butterworth", interpolates a joint'
+        " across gaps of at most this length; its status there is `filled`.",
     ),
     click.option(
         "--detector",
@@ -209,8 +208,7 @@ def _print(result: Reconstructed, *, every_joint: bool) -> None:
         say(metrics["method_used"]["summary"])
     if metrics.get("smoothing"):
         done = metrics["smoothing"]
-        cutoff = done["cutoff_hz"]
-        say(f"smoothed: {done['filter']}" + (f", cutoff {cutoff:.2g} Hz" if cutoff else ""))
+        say(f"smoothed: {done['filter']}, cutoff {done['cutoff_hz']:.2g} Hz")
     _print_summary(metrics)
     if every_joint:
         say()

@@ -34,7 +34,7 @@ from pipelines.reconstruction.clocks import (
 from pipelines.reconstruction.doubts.diagnosis import doubts_of, doubts_of_clocks
 from pipelines.reconstruction.doubts.scene import GroundOfMap
 from pipelines.reconstruction.doubts.turning import common_offset
-from pipelines.reconstruction.finishing import finish
+from pipelines.reconstruction.finishing import finish, smoother
 from pipelines.reconstruction.ground import bind_positions
 from pipelines.reconstruction.loading import (
     is_time_unknown,
@@ -74,7 +74,6 @@ from pipelines.reconstruction.results import (
     skeleton_table,
 )
 from pipelines.reconstruction.segments import Segment
-from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import (
     are_calibrated,
     ray_sigma,
@@ -111,7 +110,7 @@ class ReconstructSettings:
     start_s: float | None = None  # since the flight's first picture: span of pictures for the detector
     end_s: float | None = None
     fill_s: float | None = None  # the longest gap that is filled
-    smooth: str | None = None  # as `smoothing.smoother` reads it
+    smooth: str | None = None  # as `finishing.smoother` reads it
     refine_cameras: Literal["background"] | None = None  # before the triangulation; `auto` does it unasked
     disturb_poses: str | None = None  # errors added to the logged poses, as `PoseDisturbance.parse` reads it
 

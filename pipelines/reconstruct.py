@@ -29,10 +29,10 @@ from pipelines.detect import detect, hints_from, hints_of
 from pipelines.follow import Following, cameras_to_follow
 from pipelines.geometry.triangulation import STATUS
 from pipelines.keypoints.calibration import measured_for
+from pipelines.reconstruction.finishing import smoother
 from pipelines.reconstruction.loading import common_joints, load_time_base
 from pipelines.reconstruction.results import gait_of, write_figures
 from pipelines.reconstruction.segments import divided
-from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import noise_text
 from pipelines.reconstruction.trials import PoseDisturbance, disturbed, summary_of_trials
 from pipelines.segmented import by_segments, stated_segments

@@ -1,21 +1,160 @@
-"""Optional steps after triangulation: filling of short gaps, always marked, then smoothing.
+"""Optional steps after triangulation: filling of short gaps, always marked, then a low-pass filter.
 
 A gap is a stretch of times at which a joint was not measured, between two at which it was; its length is the
 time between those two. A joint is interpolated by PCHIP (Fritsch & Butland 1984), which uses the two measured
 samples before and after, and never swings beyond them. The interpolation error is measured on complete
 stretches of the same joint: the same number of samples is left out, interpolated and compared. The
 covariance grows by that error.
+
+The filter is the usual one in biomechanics: Butterworth's, a pass of order n/2 forwards and one backwards,
+so that there is no lag. The cutoff of a pass is raised so that both together have -3 dB at `cutoff_hz`
+(Robertson & Dowling 2003; Winter 2009, 3.4.4.2), exactly, for the digital filter. It works on contiguous
+runs of a joint's samples and never across a gap; filled samples belong to runs. Covariances stay, because
+the filter's effect on correlated errors is unknown.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int8, Int64
+from pipelines.geometry.noise import parse
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.observations import Observations
-from pipelines.reconstruction.smoothing import Smoother
+from pipelines.session.errors import DataError
+
+_PLACE = "--smooth"
+# A step of more than so many median ones is a gap.
+_USUAL_STEP = 1.5
+# A filter of fixed rate is wrong for stamps that jitter by a larger share of the step.
+_UNEVEN = 0.25
+
+
+@dataclass(frozen=True)
+class Butterworth:
+    """Zero-phase low-pass filter with the options of `--smooth butterworth`."""
+
+    # Biomechanics filters gait at 6 Hz (Winter 2009).
+    cutoff_hz: float = 6.0
+    # Twice a filter of second order, forwards and backwards, is usual in biomechanics.
+    order: float = 4
+
+    def __post_init__(self) -> None:
+        if not 0 < self.cutoff_hz < math.inf:
+            raise ValueError(f"cutoff_hz is {self.cutoff_hz:g}; it must be above 0")
+        if self.order not in (2, 4, 6, 8):
+            raise ValueError(f"order is {self.order:g}; both passes together have 2, 4, 6 or 8")
+
+    def apply(self, t_ns: Int64, position: Float) -> tuple[Float, dict[str, Any]]:
+        """Filter every run of positions [T, P, J, 3] m; return them and a JSON-able report."""
+        from scipy.signal import butter, sosfiltfilt
+
+        step_s, rate_hz = _even_rate(t_ns)
+        if self.cutoff_hz >= rate_hz / 2:
+            raise DataError(
+                _PLACE,
+                f"cutoff_hz={self.cutoff_hz:g} is not below half the skeleton's rate ({rate_hz / 2:.4g} Hz)",
+                "state a lower cutoff",
+            )
+        passes = int(self.order) // 2
+        design_hz = self._design_hz(rate_hz)
+        sections = butter(passes, design_hz, fs=rate_hz, output="sos")
+        # Ends are mirrored in their last sample, over the memory of the filter.
+        padding = max(3 * (2 * len(sections) + 1), round(rate_hz / self.cutoff_hz))
+        smooth = position.copy()
+        runs = _runs(t_ns, position, step_s)
+        short = 0
+        for person, joint, first, stop in runs:
+            if stop - first <= padding:
+                short += stop - first
+                continue
+            own = position[first:stop, person, joint]
+            smooth[first:stop, person, joint] = (
+                sosfiltfilt(sections, own - own[0], axis=0, padlen=padding) + own[0]
+            )  # far from the origin digits are lost
+        report = {
+            "filter": "butterworth",
+            "passes": "one forwards, one backwards: no lag",
+            "order": int(self.order),
+            "order_of_a_pass": passes,
+            "cutoff_hz": self.cutoff_hz,
+            "cutoff_of_a_pass_hz": design_hz,
+            "rate_hz": rate_hz,
+            "runs": len(runs),
+            "joint_frames_in_runs_too_short": short,
+            "covariances": "as before smoothing",
+        }
+        return smooth, report
+
+    def _design_hz(self, rate_hz: float) -> float:
+        """Compute the -3 dB frequency of one pass for which two passes have theirs at `cutoff_hz`.
+
+        A digital pass has the gain 1 / (1 + (tan(pi f / rate) / tan(pi d / rate))^2m) (bilinear transform),
+        two have its square; that is 1/2 where the ratio to the power of 2m is sqrt(2) - 1.
+        """
+        passes = int(self.order) // 2
+        tangent = math.tan(math.pi * self.cutoff_hz / rate_hz) / (math.sqrt(2) - 1) ** (1 / (2 * passes))
+        return math.atan(tangent) * rate_hz / math.pi
+
+
+def smoother(text: str | None) -> Butterworth | None:
+    """Parse a text like `butterworth:cutoff_hz=6,order=4` to a filter; None stays None.
+
+    Raises:
+        DataError: the text has another form, or an unknown filter or option.
+    """
+    if text is None:
+        return None
+    remedy = "write butterworth:cutoff_hz=6,order=4"
+    try:
+        (name, parameters), *others = [(text.strip(), {})] if text.strip() == "butterworth" else parse(text)
+    except ValueError as error:
+        raise DataError(_PLACE, str(error), remedy) from None
+    if others or name != "butterworth":
+        raise DataError(_PLACE, f"no such filter: {text}", remedy, code="no-such-name")
+    unknown = sorted(set(parameters) - {"cutoff_hz", "order"})
+    if unknown:
+        raise DataError(_PLACE, f"{name} has no {', '.join(unknown)}", "it has cutoff_hz, order")
+    for key, value in parameters.items():
+        if not isinstance(value, float):
+            raise DataError(_PLACE, f"{key} is {value!r} instead of a number", remedy, code="bad-value")
+    try:
+        return Butterworth(**parameters)  # type: ignore[arg-type]
+    except ValueError as error:
+        raise DataError(_PLACE, f"{name}: {error}", remedy) from None
+
+
+def _even_rate(t_ns: Int64) -> tuple[float, float]:
+    """Compute the skeleton's step (s) and rate (Hz); refuse uneven times."""
+    if len(t_ns) < 2:
+        raise DataError(_PLACE, "a single sample has no rate to filter at", "leave it out")
+    steps = np.diff(t_ns)
+    step = float(np.median(steps))
+    near = steps <= _USUAL_STEP * step
+    if np.mean(np.abs(steps[near] - step) > _UNEVEN * step) > _UNEVEN:
+        raise DataError(
+            _PLACE,
+            f"the skeleton's times are uneven ({steps.min() / 1e6:.1f} ms apart and more)",
+            "state --rate as well",
+        )
+    # The mean, not the median: stamps in whole ns or jitter make no bias.
+    mean_s = float(steps[near].mean()) / 1e9
+    return mean_s, 1 / mean_s
+
+
+def _runs(t_ns: Int64, position: Float, step_s: float) -> list[tuple[int, int, int, int]]:
+    """List every run without a gap: person, joint, first sample, and the one after the last."""
+    runs = []
+    gap = np.append(np.diff(t_ns) > _USUAL_STEP * step_s * 1e9, True)
+    there = np.isfinite(position[..., 0])
+    for person, joint in np.ndindex(there.shape[1:]):
+        own = there[:, person, joint]
+        (first,) = np.nonzero(own & ~np.append(False, own[:-1] & ~gap[:-1]))
+        (last,) = np.nonzero(own & (gap | ~np.append(own[1:], False)))
+        runs += [(person, joint, int(a), int(b) + 1) for a, b in zip(first, last, strict=True)]
+    return runs
 
 
 def finish(
@@ -24,7 +163,7 @@ def finish(
     result: Triangulation,
     *,
     fill_s: float | None,
-    smoother: Smoother | None,
+    smoother: Butterworth | None,
 ) -> tuple[Triangulation, dict[str, Any]]:
     """Fill gaps of at most `fill_s`, smooth, and report both.
 
@@ -32,7 +171,7 @@ def finish(
         observations: the triangulated observations.
         views: the same, one row for each joint-frame.
         fill_s: the longest gap to fill, None to fill none.
-        smoother: the smoother, None for no smoothing.
+        smoother: the filter, None for no smoothing.
 
     Returns:
         The result, and JSON-able `filled` and `smoothing`, None for a step not requested. Residuals are
@@ -49,9 +188,7 @@ def finish(
         report["filled"] = {"longest_gap_s": fill_s, **filled.counts}
     residual_px = result.residual_px
     if smoother is not None:
-        smooth = smoother.apply(observations.t_ns, position, covariance)
-        position, covariance = smooth.position, smooth.covariance
-        report["smoothing"] = smooth.report
+        position, report["smoothing"] = smoother.apply(observations.t_ns, position)
         measured = result.status == STATUS.index("ok")
         again = reprojection_px(views, position.reshape(-1, 3))
         residual_px = np.where(measured[:, None], again, result.residual_px)
