@@ -13,15 +13,12 @@ The same map gives the same bytes. Nothing in a file is unpickled, and nothing i
 from __future__ import annotations
 
 import math
-import struct
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from tokenize import TokenError
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,26 +38,14 @@ MAX_DOUBLINGS_OF_RESOLUTION = 5
 FINEST_M, COARSEST_M = 1e-4, 1e4
 """The smallest and the largest side of a voxel; anything else is a mistake in the file."""
 
-# A grid is decoded in slabs of this size, so that it is never in memory twice.
-SLAB_BYTES = 16 << 20
 # Origin, resolution and time have at most some hundred bytes with their header.
 MAX_SMALL_MEMBER_BYTES = 4096
 _WRITE_AGAIN = "write it again: probability [X, Y, Z], origin [3], resolution_m"
 
-# Exceptions that zipfile, zlib and numpy's header parser raise on damaged files.
+# zipfile, zlib and numpy's parser of headers raise these on damaged files.
 _DAMAGED = (
-    zipfile.BadZipFile,
-    zlib.error,
-    EOFError,
-    KeyError,
-    NotImplementedError,
-    OverflowError,
-    RuntimeError,
-    SyntaxError,
-    TokenError,
-    TypeError,
-    ValueError,
-    struct.error,
+    *(zipfile.BadZipFile, zlib.error, EOFError, KeyError, NotImplementedError, OverflowError),
+    *(RuntimeError, SyntaxError, TokenError, TypeError, ValueError),
 )
 
 
@@ -222,173 +207,76 @@ def read_grid(path: Path) -> Occupancy:
         DataError: no zip, damaged, arrays missing or of another shape or kind, a probability outside 0..1,
             an impossible resolution, or more than `MOST_VOXELS`.
     """
-    with _StoredGrid(path) as stored:
-        probability = np.empty(stored.header.shape, dtype=np.float32)
-        for place, slab in stored.slabs():
-            probability[place] = slab
-        return Occupancy(probability, stored.origin, stored.resolution_m, stored.from_ns)
+    refuse_special(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _read(path, archive)
+    except OSError as error:
+        raise as_data_error(error, path) from error
+    except DataError:
+        raise
+    except _DAMAGED as error:
+        raise DataError(
+            path, f"is no readable npz ({str(error)[:200]})", _WRITE_AGAIN, code="damaged"
+        ) from error
 
 
 def describe_stored(path: Path) -> dict[str, object]:
-    """Describe a stored map (box, voxels, states), one slab in memory at a time.
-
-    Raises:
-        DataError: as `read_grid`.
-    """
-    with _StoredGrid(path) as stored:
-        occupied = known = 0
-        for _, slab in stored.slabs():
-            occupied += int((slab >= 0.5).sum())
-            known += int((~np.isnan(slab)).sum())
-        return {
-            "array": stored.header.name,
-            "dtype": str(stored.header.dtype),
-            **describe_grid(
-                stored.resolution_m,
-                stored.origin,
-                stored.header.shape,
-                occupied=occupied,
-                free=known - occupied,
-            ),
-            "from_ns": stored.from_ns,
-        }
+    """Describe a stored map for `mocap info`: box, voxels and their states; errors as of `read_grid`."""
+    stored = read_grid(path)
+    held = HeldMap.of(stored)
+    box = describe_grid(
+        stored.resolution_m, stored.origin, held.shape, occupied=held.occupied, free=held.free
+    )
+    return {**box, "from_ns": stored.from_ns}
 
 
-@dataclass(frozen=True)
-class _Header:
-    name: str  # probability or occupancy
-    shape: tuple[int, int, int]
-    fortran_order: bool
-    dtype: np.dtype[Any]
-    offset: int  # where the numbers begin
+def _read(path: Path, archive: zipfile.ZipFile) -> Occupancy:
+    names = {name.removesuffix(".npy") for name in archive.namelist()}
+    missing = sorted({"origin", "resolution_m"} - names)
+    if len(grid := names & {"probability", "occupancy"}) != 1:
+        missing.insert(0, "either probability or occupancy")
+    if missing:
+        raise DataError(path, f"lacks {', '.join(missing)}", _WRITE_AGAIN, code="missing-column")
+    small = {"resolution_m": ("fiu", ()), "origin": ("fiu", (3,)), "from_ns": ("iu", ())}
+    for name in names & set(small):
+        if archive.getinfo(f"{name}.npy").file_size > MAX_SMALL_MEMBER_BYTES:
+            raise ValueError(f"{name} is larger than {MAX_SMALL_MEMBER_BYTES} bytes")
+        kinds, shape = small[name]
+        if (found := _header(archive, name))[0] != shape or found[1].kind not in kinds:
+            problem = f"{name} is {found[1]} {list(found[0])} instead of numbers {list(shape)}"
+            raise DataError(path, problem, _WRITE_AGAIN, code="bad-value")
+    resolution_m = check_resolution(path, float(_array(archive, "resolution_m")))
+    origin: Float = _array(archive, "origin").astype(np.float64)
+    if not np.isfinite(origin).all():
+        raise DataError(path, "origin is not finite", _WRITE_AGAIN, code="bad-value")
+    (name,) = grid
+    shape, dtype = _header(archive, name)
+    if len(shape) != 3 or dtype.kind not in {"probability": "f", "occupancy": "biu"}[name] or min(shape) < 1:
+        raise DataError(path, f"{name} is {dtype} {list(shape)}", _WRITE_AGAIN, code="bad-value")
+    check_size(path, shape, resolution_m, "store a coarser or smaller grid")
+    values = _array(archive, name)
+    is_percent = name == "occupancy" and values.dtype != bool
+    low, high = (-1, 100) if is_percent else (0, 1)
+    least, largest = np.fmin.reduce(values, axis=None), np.fmax.reduce(values, axis=None)
+    if least < low or largest > high:
+        worst = least if least < low else largest
+        raise DataError(path, f"{name} holds {worst}", "0..1, or -1 and 0..100 percent", code="bad-value")
+    if is_percent:
+        values = np.where(values == -1, np.nan, values / 100)
+    from_ns = int(_array(archive, "from_ns")) if "from_ns" in names else 0
+    return Occupancy(values.astype(np.float32), origin, resolution_m, from_ns)
 
 
-class _StoredGrid:
-    """An open npz whose header and small arrays were checked."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> _StoredGrid:
-        refuse_special(self._path)
-        try:
-            self._archive = zipfile.ZipFile(self._path)
-        except OSError as error:
-            raise as_data_error(error, self._path) from error
-        except _DAMAGED as error:
-            raise self._damaged(error) from error
-        try:
-            self._read_headers()
-        except BaseException:
-            self._archive.close()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._archive.close()
-
-    def _read_headers(self) -> None:
-        names = set(self._archive.namelist())
-        grids = [name for name in ("probability", "occupancy") if f"{name}.npy" in names]
-        missing = [name for name in ("origin", "resolution_m") if f"{name}.npy" not in names]
-        if len(grids) != 1:
-            missing.insert(0, "either probability or occupancy")
-        if missing:
-            raise DataError(self._path, f"lacks {', '.join(missing)}", _WRITE_AGAIN, code="missing-column")
-        self.resolution_m = check_resolution(self._path, float(self._small("resolution_m", "fiu", ())))
-        self.origin: Float = self._small("origin", "fiu", (3,)).astype(np.float64)
-        if not np.isfinite(self.origin).all():
-            raise DataError(self._path, "origin is not finite", _WRITE_AGAIN, code="bad-value")
-        self.from_ns = int(self._small("from_ns", "iu", ())) if "from_ns.npy" in names else 0
-        try:
-            self.header = self._grid_header(grids[0])
-        except (*_DAMAGED, OSError) as error:
-            raise self._damaged(error) from error
-
-    def _small(self, name: str, kinds: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        member = f"{name}.npy"
-        try:
-            info = self._archive.getinfo(member)
-            if max(info.file_size, info.compress_size) > MAX_SMALL_MEMBER_BYTES:
-                raise ValueError(f"{name} is larger than {MAX_SMALL_MEMBER_BYTES} bytes")
-            array: NDArray[Any] = np.lib.format.read_array(
-                BytesIO(self._archive.read(member)), allow_pickle=False
-            )
-        except (*_DAMAGED, OSError) as error:
-            raise self._damaged(error) from error
-        if array.dtype.kind not in kinds or array.shape != shape:
-            raise DataError(
-                self._path,
-                f"{name} is {array.dtype} {list(array.shape)} instead of numbers {list(shape)}",
-                _WRITE_AGAIN,
-                code="bad-value",
-            )
-        return array
-
-    def _grid_header(self, name: str) -> _Header:
-        with self._archive.open(f"{name}.npy") as file:
-            version = np.lib.format.read_magic(file)
-            read = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }.get(version)
-            if read is None:
-                raise ValueError(f"npy version {version}")
-            shape, fortran_order, dtype = read(file)
-            offset = file.tell()
-        if len(shape) != 3 or dtype.kind not in {"probability": "f", "occupancy": "biu"}[name]:
-            raise DataError(self._path, f"{name} is {dtype} {list(shape)}", _WRITE_AGAIN)
-        if min(shape) < 1:
-            raise DataError(self._path, f"{name} is empty, {list(shape)}", _WRITE_AGAIN)
-        check_size(self._path, shape, self.resolution_m, "store a coarser or smaller grid")
-        stated = self._archive.getinfo(f"{name}.npy").file_size
-        if stated != offset + math.prod(shape) * dtype.itemsize:
-            raise ValueError(f"{stated} bytes do not hold {list(shape)} of {dtype}")
-        return _Header(name, shape, fortran_order, dtype, offset)
-
-    def slabs(self) -> Iterator[tuple[tuple[slice, ...], NDArray[np.float32]]]:
-        """Yield the place of each part in the grid and its probabilities, part after part."""
-        header = self.header
-        stored_shape = header.shape[::-1] if header.fortran_order else header.shape
-        layer_bytes = stored_shape[1] * stored_shape[2] * header.dtype.itemsize
-        step = max(1, SLAB_BYTES // layer_bytes)
-        try:
-            with self._archive.open(f"{header.name}.npy") as file:
-                file.read(header.offset)
-                for first in range(0, stored_shape[0], step):
-                    last = min(first + step, stored_shape[0])
-                    slab = np.frombuffer(_read_exactly(file, (last - first) * layer_bytes), header.dtype)
-                    slab = slab.reshape(last - first, *stored_shape[1:])
-                    place = (slice(first, last), slice(None), slice(None))
-                    if header.fortran_order:
-                        slab, place = slab.T, place[::-1]
-                    yield place, self._as_probability(slab)
-        except (*_DAMAGED, OSError) as error:
-            raise self._damaged(error) from error
-
-    def _as_probability(self, values: NDArray[Any]) -> NDArray[np.float32]:
-        if self.header.name == "probability":
-            usable, probability = np.isnan(values) | ((values >= 0) & (values <= 1)), values
-        elif values.dtype == bool:
-            usable, probability = np.True_, values
-        else:
-            usable = (values <= 100) & ((values >= 0) | (values == -1))
-            probability = np.where(values == -1, np.nan, values / 100)
-        if not np.all(usable):
-            worst = values[~usable].flat[0]
-            raise DataError(self._path, f"{self.header.name} holds {worst}", "0..1, or -1 and 0..100 percent")
-        with np.errstate(invalid="ignore"):  # a NaN that signals becomes one that does not
-            return probability.astype(np.float32)
-
-    def _damaged(self, error: BaseException) -> DataError:
-        return DataError(self._path, f"is no readable npz ({str(error)[:200]})", _WRITE_AGAIN, code="damaged")
+def _header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type of an array; other versions of npy than 1 and 2 are refused."""
+    with archive.open(f"{name}.npy") as file:
+        readers = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
+        shape, _, dtype = readers[np.lib.format.read_magic(file)[0]](file)
+    return shape, dtype
 
 
-def _read_exactly(file: IO[bytes], size: int) -> bytearray:
-    content = bytearray()
-    while len(content) < size:
-        part = file.read(size - len(content))
-        if not part:
-            raise EOFError(f"it breaks off, {size - len(content)} bytes are missing")
-        content += part
-    return content
+def _array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    with archive.open(f"{name}.npy") as file:
+        array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+    return array

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import interpolate_points
@@ -249,20 +248,10 @@ def logged_people(folder: Path, description: Description, span_ns: Span | None =
     ]
 
 
-# No flight has truth of more interleaved cameras or trackers.
-MAX_STREAMS = 8
-# With fewer repetitions, chance makes any steps look periodic.
-MIN_REPETITIONS = 4
-# Recorders are late by up to a fifth of a step; a missing sample makes a step twice as long.
-MAX_JITTER_SHARE = 0.2
-# Streams of different rates reach half of equal times by chance.
-MIN_SHARE_OF_EQUAL_TIMES = 0.6
-# More streams always fit a little better, so a larger number must raise the share by more than this.
-MIN_GAIN_OF_SHARE = 0.1
-# Where no missing sample was seen, jitter alone must not make a gap.
-MIN_GAP_IN_STEPS = 1.2
-# Half a step more than nine in ten steps is the same rule as for equal steps.
-GAP_OF_UNORDERED_STEPS = 1.5
+# Up to four cameras that take turns give one long step in four, which the percentile must reach.
+PERCENTILE_OF_USUAL_STEPS = 80.0
+# A missing sample of regular ones makes a step twice as long.
+GAP_IN_USUAL_STEPS = 1.5
 
 
 def true_joints_at(truth: JointMotion, t_ns: Int64) -> Float:
@@ -275,42 +264,10 @@ def true_joints_at(truth: JointMotion, t_ns: Int64) -> Float:
 
 
 def longest_step_ns(t_ns: Int64) -> int:
-    """Return the longest step between samples that is not a gap.
+    """Return the longest step between samples that is not a gap; 0 for fewer than two samples.
 
     Truth may be sampled whenever one of several cameras takes a picture. Two cameras of 25 Hz that are not
-    synchronised give alternating steps of 8 and 32 ms. Neither is a gap, and the median step is no measure.
-    So the function finds the number of steps after which they repeat. A missing sample joins two steps. The
-    limit lies half way between the longest usual step and the shortest such sum above it, which is 1.5 steps
-    if all are equal. Streams of different rates never repeat; for them the limit is 1.5 times the 90th
-    percentile of the steps.
-
-    Args:
-        t_ns: [N] strictly increasing.
-
-    Returns:
-        0 for fewer than two samples.
+    synchronised give alternating steps of 8 and 32 ms, and neither is a gap.
     """
-    steps = np.diff(t_ns).astype(np.float64)
-    if not len(steps):
-        return 0
-    turns = [
-        np.lib.stride_tricks.sliding_window_view(steps, streams)
-        for streams in range(1, max(1, min(MAX_STREAMS, len(steps) // MIN_REPETITIONS)) + 1)
-    ]
-    alike = [_alike(each.sum(axis=1), MAX_JITTER_SHARE / each.shape[1]) for each in turns]
-    shares = [float(which.mean()) for which in alike]
-    if max(shares) <= MIN_SHARE_OF_EQUAL_TIMES:
-        return int(GAP_OF_UNORDERED_STEPS * np.percentile(steps, 90))
-    least = next(k for k, share in enumerate(shares) if share >= max(shares) - MIN_GAIN_OF_SHARE)
-    usual = turns[least][alike[least]]
-    longest = usual.max(axis=1)
-    joined = usual + np.roll(usual, -1, axis=1)
-    hole = np.where(joined > longest[:, None], joined, np.inf).min(axis=1)
-    step = float(np.percentile(longest, 95))
-    return int(max((step + float(np.median(hole))) / 2, MIN_GAP_IN_STEPS * step))
-
-
-def _alike(times: Float, share: float) -> NDArray[np.bool_]:
-    """Mark the times that differ from their median by no more than a share of it."""
-    usual = np.median(times)
-    return np.asarray(np.abs(times - usual) <= share * usual)
+    steps = np.diff(t_ns)
+    return int(GAP_IN_USUAL_STEPS * np.percentile(steps, PERCENTILE_OF_USUAL_STEPS)) if len(steps) else 0
