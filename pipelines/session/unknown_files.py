@@ -6,7 +6,6 @@ import stat
 import tomllib
 from collections import Counter
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -191,74 +190,51 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
     if not lines:
         return Likeness("holds blank lines only", "")
     ending = path.suffix.lower()
-    if size <= MAX_PARSED_BYTES:
-        if ending == ".json":
-            return _of_json(path)
-        if ending == ".toml":
-            return _of_toml(path)
-        if ending in {".yaml", ".yml"}:
-            return _of_yaml(path)
+    if ending in _PARSERS and size <= MAX_PARSED_BYTES:
+        return _of_data(path, ending)
+    if ending in {".yaml", ".yml"}:
+        keys = re.findall(r"(?m)^(\w[\w.-]*)\s*:", re.sub(r"\A%YAML:", "#", text))
+        return Likeness(
+            f"is YAML with the keys {_listed(keys)}" if keys else "is YAML without names at its top"
+        )
     if ending == ".srt":
         remedy = "turn on subtitles (captions) on the drone, or name its flight record or its video"
         return Likeness("holds subtitles without the positions and times of a drone", remedy)
     for mark in ",;\t":
         cells = [cell.strip(' "#') for cell in lines[0].split(mark)]
         if len(cells) > 2 and len(lines) > 1 and lines[1].count(mark) > len(cells) // 2:
-            named = sum(bool(re.match(r"[A-Za-z_]", cell)) for cell in cells) > len(cells) / 2
-            columns = f"the columns {_listed(cells)}" if named else f"{len(cells)} columns without names"
-            names = {cell.lower() for cell in cells}
-            if names & {"latitude", "lat"} and names & {"longitude", "lon", "lng", "long"}:
-                problem = f"is a table of places on Earth whose writer is not known, with {columns}"
-                turned = any(angle in name for name in names for angle in ("yaw", "heading", "pitch"))
-                remedy = _AS_RECORD if turned else "poses need attitudes, too: give the drone's own log"
-                return Likeness(problem, remedy)
-            if {"roll", "pitch", "yaw"} <= names:
-                problem = f"is a table of angles, with {columns}"
-                remedy = "convert them to quaternions qx, qy, qz, qw: their order and axes are not stated"
-                return Likeness(problem, remedy)
-            remedy = "poses need a time, x, y, z, qx, qy, qz, qw; joints person, joint, x, y, z"
-            return Likeness(f"is a table with {columns}", f"{remedy}, by name in the first line")
+            return _of_table(cells)
     return Likeness("is text of no known kind")  # what it says may be a secret
 
 
-def _of_json(path: Path) -> Likeness:
+def _of_table(cells: list[str]) -> Likeness:
+    named = sum(bool(re.match(r"[A-Za-z_]", cell)) for cell in cells) > len(cells) / 2
+    columns = f"the columns {_listed(cells)}" if named else f"{len(cells)} columns without names"
+    names = {cell.lower() for cell in cells}
+    if names & {"latitude", "lat"} and names & {"longitude", "lon", "lng", "long"}:
+        turned = any(angle in name for name in names for angle in ("yaw", "heading", "pitch"))
+        remedy = _AS_RECORD if turned else "poses need attitudes, too: give the drone's own log"
+        return Likeness(f"is a table of places on Earth whose writer is not known, with {columns}", remedy)
+    if {"roll", "pitch", "yaw"} <= names:
+        remedy = "convert them to quaternions qx, qy, qz, qw: their order and axes are not stated"
+        return Likeness(f"is a table of angles, with {columns}", remedy)
+    remedy = "poses need a time, x, y, z, qx, qy, qz, qw; joints person, joint, x, y, z"
+    return Likeness(f"is a table with {columns}", f"{remedy}, by name in the first line")
+
+
+_PARSERS = {".json": json.loads, ".toml": tomllib.loads}
+
+
+def _of_data(path: Path, ending: str) -> Likeness:
+    kind = ending[1:].upper()
     try:
-        content = json.loads(path.read_bytes())
+        content: Any = _PARSERS[ending](plain_text(path.read_bytes(), errors="strict"))
     except (OSError, ValueError, RecursionError) as error:
-        return Likeness(f"is no valid JSON ({str(error)[:100]})", "it may be cut off: copy it again")
-    if isinstance(content, list):
-        first: Any = content[0] if content else None
-        keys = f" of objects with {_keys(first)}" if isinstance(first, dict) else ""
-        return Likeness(f"is JSON, a list of {len(content)}{keys}")
-    return Likeness(f"is JSON with {_keys(content)}" if isinstance(content, dict) else "is JSON, one value")
-
-
-def _of_toml(path: Path) -> Likeness:
-    try:
-        content = tomllib.loads(plain_text(path.read_bytes(), errors="strict"))
-    except (OSError, ValueError, RecursionError) as error:
-        return Likeness(f"is no valid TOML ({str(error)[:100]})", "write it again")
-    return Likeness(
-        f"is TOML with {_keys(content)}",
-        "a calibration has a table for each camera, with `matrix`, `distortions` and `size`",
-    )
-
-
-def _of_yaml(path: Path) -> Likeness:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    content: object = None
-    with suppress(YAMLError, OSError, ValueError, RecursionError):
-        text = plain_text(path.read_bytes(), errors="strict")
-        content = YAML(typ="safe", pure=True).load(re.sub(r"\A%YAML:", "#", text))
-    if not isinstance(content, dict):
-        return Likeness("is YAML without names at its top")
-    return Likeness(f"is YAML with {_keys(content)}")
-
-
-def _keys(content: dict[Any, Any]) -> str:
-    return f"the keys {_listed(str(key)[:40] for key in content)}" if content else "no keys"
+        return Likeness(f"is no valid {kind} ({str(error)[:100]})", "it may be cut off: copy it again")
+    count = f", a list of {len(content)}" if isinstance(content, list) else ""
+    first = content[0] if content and isinstance(content, list) else content
+    keys = f" with the keys {_listed(str(key)[:40] for key in first)}" if isinstance(first, dict) else ""
+    return Likeness(f"is {kind}{count}{keys}")
 
 
 def _listed(names: Iterable[str]) -> str:
