@@ -253,9 +253,9 @@ def exports() -> str:
     """List the formats that are written, with their choices."""
     rows = []
     for export in registries.EXPORTS.all():
-        choice = export if isinstance(export, registries.ChoiceOfAxes) else None
-        units, axes = (choice.units, choice.axes) if choice else ((), ())
-        rows.append((f"`{export.name}`", sentence(export.title), ", ".join(units), ", ".join(axes)))
+        there = export.choices if isinstance(export, registries.ExportWithChoices) else {}
+        choices = (", ".join(there.get(what, ())) for what in ("unit", "axes"))
+        rows.append((f"`{export.name}`", sentence(export.title), *choices))
     return table(("`--to`", "is", "unit", "axes"), rows)
 
 

@@ -25,13 +25,13 @@ class _ListsFormats(click.Command):
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         """Write one line for each format: its name, its title, and its units and axes."""
-        from pipelines.session.registries import EXPORTS, ChoiceOfAxes
+        from pipelines.session.registries import EXPORTS, ExportWithChoices
 
         rows = []
         for format_ in EXPORTS.all():
             line = format_.title
-            if isinstance(format_, ChoiceOfAxes):
-                line += f"; {'|'.join(format_.units)}, {'|'.join(format_.axes)}"
+            if isinstance(format_, ExportWithChoices):
+                line += f"; {'|'.join(format_.choices['unit'])}, {'|'.join(format_.choices['axes'])}"
             rows.append((format_.name, line))
         with formatter.section("Formats (the first unit and axes are the usual ones, else metres with z up)"):
             formatter.write_dl(rows)

@@ -28,7 +28,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Recording
-from pipelines.session.registries import ChoiceOfAxes, ChoiceOfTime, Export, find_export
+from pipelines.session.registries import Export, ExportWithChoices, find_export
 from pipelines.session.stages import StageRecord, open_session, session_name
 from pipelines.session.storage import (
     as_data_error,
@@ -100,9 +100,8 @@ def export(
     """
     progress = progress or Silent()
     exports = [find_export(name) for name in dict.fromkeys(formats)]
-    shapes = {format_.name: _shape(format_, unit, axes) for format_ in exports}
-    _refuse_idle_choice(shapes, unit, axes)
-    zeros = {format_.name: _zero(format_, time) for format_ in exports}
+    asked = {"unit": unit, "axes": axes, "time": time}
+    chosen = {format_.name: _chosen(format_, asked) for format_ in exports}
     recording = load_recording(folder, pictures_hz=pictures_hz)
     target = output or folder.resolve().with_name(f"{session_name(folder)}.export")
     is_new = not target.exists()
@@ -114,18 +113,18 @@ def export(
                 own = work / format_.name
                 own.mkdir()
                 notes = _KeptNotes(progress)
-                unit_, axes_ = shapes[format_.name] or (None, None)
-                zero = zeros[format_.name]
-                zero_ns = recording.zero_ns if zero == "zero" else 0
-                wanted = replace(recording, unit=unit_, axes=axes_, zero_ns=zero_ns, progress=notes)
+                facts: dict[str, Any] = {"unit": "m", "axes": "z-up", **chosen[format_.name]}
+                if "time" in facts:
+                    facts["zero_ns"] = recording.zero_ns if facts["time"] == "zero" else 0
+                wanted = replace(
+                    recording,
+                    unit=chosen[format_.name].get("unit"),
+                    axes=chosen[format_.name].get("axes"),
+                    zero_ns=facts.get("zero_ns", 0),
+                    progress=notes,
+                )
                 for path in format_.write(wanted, own):
-                    made[path] = {
-                        "format": format_.name,
-                        "unit": unit_ or "m",
-                        "axes": axes_ or "z-up",
-                        **({} if zero is None else {"time": zero, "zero_ns": zero_ns}),
-                        "notes": notes.kept,
-                    }
+                    made[path] = {"format": format_.name, **facts, "notes": notes.kept}
             return _move(made, target, overwrite)
     except OSError as error:
         raise as_data_error(error, target) from error
@@ -152,54 +151,16 @@ class _KeptNotes:
         self.whom.note(message)
 
 
-# --- units and axes ------------------------------------------------------------------------------------
-
-
-def _shape(format_: Export, unit: str | None, axes: str | None) -> tuple[str, str] | None:
-    """Choose the unit and axes of a format; None if it has no choice."""
-    if not isinstance(format_, ChoiceOfAxes):
-        return None
-    for wanted, there, what in ((unit, format_.units, "unit"), (axes, format_.axes, "axes")):
-        if wanted is not None and wanted not in there:
-            raise DataError(
-                format_.name, f"has no {what} {wanted}", f"there are {', '.join(there)}", code="no-such-name"
-            )
-    return unit or format_.units[0], axes or format_.axes[0]
-
-
-def _refuse_idle_choice(
-    shapes: Mapping[str, tuple[str, str] | None], unit: str | None, axes: str | None
-) -> None:
-    """Refuse a choice for formats that are always metres with z up."""
-    fixed = [name for name, shape in shapes.items() if shape is None]
-    if fixed and (unit is not None or axes is not None):
-        raise DataError(
-            ", ".join(fixed),
-            f"{'are' if len(fixed) > 1 else 'is'} always in metres with z up",
-            "leave --unit and --axes out, or export the others by themselves",
-        )
-
-
-def _zero(format_: Export, time: str | None) -> str | None:
-    """Choose the zero of a format's seconds; None if it has no choice.
-
-    Raises:
-        DataError: a choice for a format without one, or one that it does not have.
-    """
-    if not isinstance(format_, ChoiceOfTime):
-        if time is not None:
-            raise DataError(
-                format_.name,
-                "has no choice of time",
-                "leave --time out, or export the others by themselves",
-                code="no-such-name",
-            )
-        return None
-    if time is not None and time not in format_.times:
-        raise DataError(
-            format_.name, f"has no time {time}", f"there are {', '.join(format_.times)}", code="no-such-name"
-        )
-    return time or format_.times[0]
+def _chosen(format_: Export, asked: Mapping[str, str | None]) -> dict[str, str]:
+    """Choose unit, axes and time of a format as far as it has a choice: as asked, else its defaults."""
+    there = format_.choices if isinstance(format_, ExportWithChoices) else {}
+    for what, wanted in asked.items():
+        if wanted is not None and wanted not in there.get(what, ()):
+            remedy = f"leave --{what} out, or export the others by themselves"
+            if what in there:
+                remedy = f"there are {', '.join(there[what])}"
+            raise DataError(format_.name, f"has no {what} {wanted}", remedy, code="no-such-name")
+    return {what: asked[what] or values[0] for what, values in there.items()}
 
 
 # --- what is exported ----------------------------------------------------------------------------------

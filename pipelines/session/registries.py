@@ -273,15 +273,6 @@ class MeasuredDetector(Detector, Protocol):
 
 
 @runtime_checkable
-class AcceleratedDetector(Detector, Protocol):
-    """A detector whose networks can run on a graphics card."""
-
-    @property
-    def provider(self) -> str:
-        """The short name of what runs the networks: `cpu`, or an accelerator such as `cuda`."""
-
-
-@runtime_checkable
 class DetectorFamily(Protocol):
     """Detectors with an argument after a colon that says which model to run: `--detector NAME:ARGUMENT`."""
 
@@ -331,25 +322,15 @@ class ExportFamily(Export, Protocol):
 
 
 @runtime_checkable
-class ChoiceOfAxes(Export, Protocol):
-    """An export that obeys `recording.unit` and `recording.axes`; others write metres with z up."""
+class ExportWithChoices(Export, Protocol):
+    """An export that obeys `recording.unit` and `recording.axes`, or counts from `recording.zero_ns`.
+
+    Others write metres with z up at the session's own times.
+    """
 
     @property
-    def units(self) -> tuple[str, ...]:
-        """The units of length that the export can write, the default first."""
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        """The axes (z-up, y-up) that the export can write, the default first."""
-
-
-@runtime_checkable
-class ChoiceOfTime(Export, Protocol):
-    """An export in seconds that counts from `recording.zero_ns`."""
-
-    @property
-    def times(self) -> tuple[str, ...]:
-        """The zeros of time (zero: the flight's first picture; epoch: the session's own), default first."""
+    def choices(self) -> Mapping[str, tuple[str, ...]]:
+        """The values of `unit`, `axes` (z-up, y-up) and `time` (zero, epoch), the default of each first."""
 
 
 class Registry(Generic[T]):

@@ -22,6 +22,7 @@ rotation against its parent (before the first, its first). All of this is counte
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,8 +62,7 @@ class BvhExport:
 
     name = "bvh"
     title = "a rig of constant bones that follows the skeleton, for Blender"
-    units = ("cm", "m", "mm", "inch")
-    axes = ("y-up", "z-up")
+    choices: Mapping[str, tuple[str, ...]] = {"unit": ("cm", "m", "mm", "inch"), "axes": ("y-up", "z-up")}
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write every person to whom a rig can be fitted; a note gives the reason for each other one."""

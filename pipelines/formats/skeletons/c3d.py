@@ -13,7 +13,7 @@ number.
 import math
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -279,8 +279,7 @@ class C3dExport:
 
     name = "c3d"
     title = "C3D points with their uncertainty as residual; float32 (extra c3d)"
-    units = ("mm", "cm", "m")
-    axes = ("z-up", "y-up")
+    choices: Mapping[str, tuple[str, ...]] = {"unit": ("mm", "cm", "m"), "axes": ("z-up", "y-up")}
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write every person with at least one known joint."""

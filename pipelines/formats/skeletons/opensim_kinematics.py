@@ -8,7 +8,7 @@ used.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -111,9 +111,7 @@ class OpenSimExport:
 
     name = "osim"
     title = "scaled model and inverse kinematics by OpenSim (extra opensim)"
-    units = ("m",)
-    axes = ("y-up",)
-    times = ("zero", "epoch")
+    choices: Mapping[str, tuple[str, ...]] = {"unit": ("m",), "axes": ("y-up",), "time": ("zero", "epoch")}
 
     def models(self) -> dict[str, Path | None]:
         """List the files of Pose2Sim's model; see `registries.FetchesModels`."""
@@ -404,9 +402,7 @@ class AnglesExport:
 
     name = "angles"
     title = "joint angles with standard deviations, as CSV and for OpenSim (STO)"
-    units = ("deg",)
-    axes = ("none",)
-    times = ("zero", "epoch")
+    choices: Mapping[str, tuple[str, ...]] = {"unit": ("deg",), "axes": ("none",), "time": ("zero", "epoch")}
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write both files; a person without any angle gets no STO."""

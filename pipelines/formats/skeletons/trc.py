@@ -9,6 +9,7 @@ because OpenSim 4.6 ignores blank cells at the end of a line and refuses a file 
 import math
 import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -148,9 +149,11 @@ class TrcExport:
 
     name = "trc"
     title = "markers for OpenSim and Pose2Sim"
-    units = ("m", "cm", "mm")
-    axes = ("y-up", "z-up")
-    times = ("zero", "epoch")
+    choices: Mapping[str, tuple[str, ...]] = {
+        "unit": ("m", "cm", "mm"),
+        "axes": ("y-up", "z-up"),
+        "time": ("zero", "epoch"),
+    }
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write every person with at least one known joint."""
