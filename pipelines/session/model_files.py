@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Protocol
 
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error, sha256_of
+from pipelines.session.storage import as_data_error, make_folder, sha256_of, write_whole
 
 
 @dataclass(frozen=True)
@@ -40,27 +40,26 @@ class ModelFile:
 class Package(Protocol):
     """Pinned version of a published package that ships model files."""
 
-    @property
-    def title(self) -> str:
-        """Its name, version and kind of file, for messages."""
+    name: str
+    version: str
+    noun: str  # its kind of file
 
-    @property
-    def noun(self) -> str:
-        """Its kind of file."""
+    def download(self, folder: Path) -> subprocess.CompletedProcess[str]:
+        """Let the package's own program download it into a folder; OSError if that is not installed."""
 
-    def download(self, folder: Path, detector: str, remedy: str) -> Path:
-        """Download it into a folder and return its path; DataError about `detector` where that fails."""
+    def reason(self, done: subprocess.CompletedProcess[str]) -> str:
+        """Return why the program failed, in its own words."""
 
     def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
         """Read files from the package, at most one byte more than expected of each; skip absent files.
 
         Raises:
-            OSError: it cannot be read.
-            DataError: it is damaged, or of another kind.
+            OSError, tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError: it is
+                damaged, or of another kind.
         """
 
 
-@dataclass(frozen=True)
+@dataclass
 class Wheel:
     """A wheel, which pip downloads."""
 
@@ -69,45 +68,37 @@ class Wheel:
     tags: tuple[str, str, str]  # Python, ABI and platform of the wheel to take; any machine can open it
     noun: str = "wheel"
 
-    @property
-    def title(self) -> str:
-        """Its name, version and kind of file."""
-        return f"{self.name} {self.version} wheel"
-
-    def download(self, folder: Path, detector: str, remedy: str) -> Path:
-        """Download it with pip; raises the errors of `Package.download`."""
+    def download(self, folder: Path) -> subprocess.CompletedProcess[str]:
+        """Download it with pip."""
         python, abi, platform = self.tags
-        done = _ran(
+        return _ran(
             [
                 *(sys.executable, "-m", "pip", "download", "--quiet", "--no-input", "--no-deps"),
                 # Two attempts: without a network the user should not wait a minute for the error.
                 *("--disable-pip-version-check", "--retries", "1", "--only-binary", ":all:"),
                 *("--implementation", "cp", "--python-version", python, "--abi", abi),
-                *("--platform", platform, "--dest", str(folder), f"{self.name}=={self.version}"),
-            ]
+                *("--platform", platform, f"{self.name}=={self.version}"),
+            ],
+            folder,
         )
-        wheels = sorted(folder.glob("*.whl"))
-        if done.returncode == 0 and wheels:
-            return wheels[0]
-        reason = (done.stderr.strip().splitlines() or [f"pip exited with {done.returncode}"])[-1]
-        raise _not_downloaded(detector, reason.removeprefix("ERROR: "), remedy)
+
+    def reason(self, done: subprocess.CompletedProcess[str]) -> str:
+        """Return pip's last line."""
+        lines = done.stderr.strip().splitlines() or [f"pip exited with {done.returncode}"]
+        return lines[-1].removeprefix("ERROR: ")
 
     def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
         """Read files out of it; see `Package.read`."""
         contents = {}
-        try:
-            with zipfile.ZipFile(archive) as wheel:
-                there = set(wheel.namelist())
-                for file in files:
-                    if file.member in there:
-                        with wheel.open(file.member) as member:
-                            contents[file] = member.read(file.size + 1)
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
-            raise _not_readable(archive, self, error) from None
+        with zipfile.ZipFile(archive) as wheel:
+            there = set(wheel.namelist())
+            for file in (file for file in files if file.member in there):
+                with wheel.open(file.member) as member:
+                    contents[file] = member.read(file.size + 1)
         return contents
 
 
-@dataclass(frozen=True)
+@dataclass
 class NpmPackage:
     """A tarball, which npm downloads."""
 
@@ -115,50 +106,34 @@ class NpmPackage:
     version: str
     noun: str = "tarball"
 
-    @property
-    def title(self) -> str:
-        """Its name, version and kind of file."""
-        return f"{self.name} {self.version} tarball"
-
-    def download(self, folder: Path, detector: str, remedy: str) -> Path:
-        """Download it with npm; raises the errors of `Package.download`."""
-        npm = shutil.which("npm")
-        if npm is None:
-            command = f"npm pack {self.name}@{self.version}"
-            raise DataError(
-                detector,
-                f"its model file comes by npm, which is not installed here ({self.title})",
-                f"install Node.js; or run `{command}` where npm is, and here {remedy}",
-                code="missing-library",
-            )
-        done = _ran(
+    def download(self, folder: Path) -> subprocess.CompletedProcess[str]:
+        """Download it with npm, which writes where it is run, and heeds the settings of a project there."""
+        return _ran(
             [
-                *(npm, "pack", f"{self.name}@{self.version}", "--ignore-scripts", "--loglevel", "error"),
+                *(shutil.which("npm") or "npm", "pack", f"{self.name}@{self.version}", "--ignore-scripts"),
                 # Two attempts, as with pip.
-                *("--fetch-retries", "1", "--fetch-retry-mintimeout", "1000"),
+                *("--loglevel", "error", "--fetch-retries", "1", "--fetch-retry-mintimeout", "1000"),
             ],
-            within=folder,  # npm writes where it is run, and heeds the settings of a project there
+            folder,
         )
-        tarballs = sorted(folder.glob("*.tgz"))
-        if done.returncode == 0 and tarballs:
-            return tarballs[0]
-        raise _not_downloaded(detector, _reason_of_npm(done), remedy)
+
+    def reason(self, done: subprocess.CompletedProcess[str]) -> str:
+        """Return the code and the first sentence of npm's error, without proxy advice and the trace."""
+        lines = re.findall(r"^npm (?:error|ERR!) +(.+)$", done.stderr, re.MULTILINE)
+        code = [line for line in lines if line.startswith("code ")][:1]
+        sentence = [line for line in lines if line.split()[0] not in ("code", "syscall", "errno")][:1]
+        return ": ".join(code + sentence) or f"npm exited with {done.returncode}"
 
     def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
         """Read files out of it; see `Package.read`."""
         by_member = {file.member: file for file in files}
         contents: dict[ModelFile, bytes] = {}
-        try:
-            with tarfile.open(archive, "r|gz") as tarball:
-                for member in tarball:
-                    file = by_member.get(member.name)
-                    stream = None if file is None else tarball.extractfile(member)
-                    if file is not None and stream is not None:
-                        contents[file] = stream.read(file.size + 1)
-                    if len(contents) == len(by_member):
-                        break
-        except (tarfile.TarError, zlib.error, EOFError) as error:
-            raise _not_readable(archive, self, error) from None
+        with tarfile.open(archive, "r|gz") as tarball:
+            for member in tarball:
+                file = by_member.get(member.name)
+                stream = None if file is None else tarball.extractfile(member)
+                if file is not None and stream is not None:
+                    contents[file] = stream.read(file.size + 1)
         return contents
 
 
@@ -215,59 +190,63 @@ class PackagedModels:
             DataError: no network, or a file is not the expected one. The cache stays unchanged.
         """
         wanted = [file for file in self.files if not self._is_good(file)]
-        if not wanted:
-            return
-        if source is not None:
+        if wanted and source is not None:
             self._take(wanted, source)
-            return
-        remedy = (
-            f"run `mocap models fetch {self.detector} --from PATH` with the {self.package.title} or a folder "
-            f"that holds {' and '.join(file.name for file in self.files)}"
+        elif wanted:
+            with tempfile.TemporaryDirectory(prefix="mocap-") as folder:
+                self._take(wanted, self._downloaded(Path(folder)))
+
+    def _downloaded(self, folder: Path) -> Path:
+        package = self.package
+        try:
+            done = package.download(folder)
+            if done.returncode == 0 and (found := sorted(folder.iterdir())):
+                return found[0]
+            reason = package.reason(done)
+        except OSError as error:
+            reason = f"{error.filename} is not installed"
+        raise DataError(
+            self.detector,
+            f"its model files could not be downloaded ({reason})",
+            f"connect to the network, or run `mocap models fetch {self.detector} --from PATH` with the"
+            f" {package.name} {package.version} {package.noun} or a folder that holds"
+            f" {' and '.join(file.name for file in self.files)}",
         )
-        with tempfile.TemporaryDirectory(prefix="mocap-") as folder:
-            self._take(wanted, self.package.download(Path(folder), self.detector, remedy))
 
     def _is_good(self, file: ModelFile) -> bool:
         path = self.folder / file.name
         return path.is_file() and sha256_of(path) == file.sha256
 
     def _take(self, wanted: list[ModelFile], source: Path) -> None:
+        """Check the contents of files from a folder or from the package, and put them into the cache."""
+        noun = self.package.noun
         try:
-            contents = self._contents(source, wanted)
-            self.folder.mkdir(parents=True, exist_ok=True)
-            for file, content in contents.items():
-                _write(self.folder / file.name, content)
+            if source.is_dir():
+                paths = {file: path for file in wanted if (path := find_file(source, file.name)) is not None}
+                contents = {file: path.read_bytes() for file, path in paths.items()}
+            else:
+                contents = self.package.read(source, wanted)
+            for file in wanted:
+                if file not in contents:
+                    name = file.name if source.is_dir() else file.member
+                    raise DataError(source, f"holds no {name}", f"give the {noun} or the folder that does")
+                if (found := hashlib.sha256(contents[file]).hexdigest()) != file.sha256:
+                    raise DataError(
+                        source,
+                        f"its {file.name} is not the one that was expected (SHA-256 {found[:8]}..., "
+                        f"not {file.sha256[:8]}... of {file.size} bytes)",
+                        "give the one of the version that was asked for",
+                        code="wrong-model",
+                    )
+            make_folder(self.folder)
+            for file in wanted:
+                write_whole(self.folder / file.name, contents[file])
         except OSError as error:
             raise as_data_error(error, source) from error
-
-    def _contents(self, source: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
-        """Read the contents of files from a folder or from the package, and check their SHA-256."""
-        noun = self.package.noun
-        if source.is_dir():
-            paths = {file: path for file in files if (path := find_file(source, file.name)) is not None}
-            contents = {file: _beginning(path, file.size + 1) for file, path in paths.items()}
-            missing = [file.name for file in files if file not in contents]
-            remedy = f"give the folder that does, or the {noun}"
-        else:
-            paths = dict.fromkeys(files, source)
-            contents = self.package.read(source, files)
-            missing = [file.member for file in files if file not in contents]
-            remedy = f"give the {noun} that does"
-        if missing:
-            raise DataError(source, f"holds no {missing[0]}", remedy)
-        for file, content in contents.items():
-            if (found := hashlib.sha256(content).hexdigest()) != file.sha256:
-                size = (
-                    f"{len(content)} bytes" if len(content) <= file.size else f"more than {file.size} bytes"
-                )
-                raise DataError(
-                    paths[file],
-                    f"its {file.name} is not the one that was expected (SHA-256 {found[:8]}... of {size}, "
-                    f"not {file.sha256[:8]}... of {file.size})",
-                    "give the one of the version that was asked for",
-                    code="wrong-model",
-                )
-        return contents
+        except (tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
+            raise DataError(
+                source, f"is no readable {noun} ({error})", "download it again", code="damaged"
+            ) from None
 
 
 def find_file(folder: Path, name: str) -> Path | None:
@@ -275,42 +254,7 @@ def find_file(folder: Path, name: str) -> Path | None:
     return next(iter(sorted(folder.rglob(name))), None)
 
 
-def _beginning(path: Path, count: int) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(count)
-
-
-def _ran(command: list[str], *, within: Path | None = None) -> subprocess.CompletedProcess[str]:
+def _ran(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(  # noqa: S603  # our own arguments, no shell
-        command, cwd=within, capture_output=True, text=True, errors="replace", check=False
+        command, cwd=folder, capture_output=True, text=True, errors="replace", check=False
     )
-
-
-def _reason_of_npm(done: subprocess.CompletedProcess[str]) -> str:
-    """Return the code and the first sentence of npm's error; leave out proxy advice and the trace."""
-    lines = re.findall(r"^npm (?:error|ERR!) +(.+)$", done.stderr, re.MULTILINE)
-    code = [line for line in lines if line.startswith("code ")][:1]
-    sentence = [line for line in lines if line.split()[0] not in ("code", "syscall", "errno")][:1]
-    return ": ".join(code + sentence) or f"npm exited with {done.returncode}"
-
-
-def _not_downloaded(detector: str, reason: str, remedy: str) -> DataError:
-    what = f"its model files could not be downloaded ({reason})"
-    return DataError(detector, what, f"connect to the network, or {remedy}")
-
-
-def _not_readable(archive: Path, package: Package, error: Exception) -> DataError:
-    return DataError(archive, f"is no readable {package.noun} ({error})", "download it again", code="damaged")
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write a file atomically: readers find all of it or nothing, also with several writers."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    partial = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            os.fsync(stream.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

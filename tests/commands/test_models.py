@@ -68,7 +68,6 @@ def test_heavy_from_a_tarball_of_something_else_is_refused(empty_cache: Path, tm
     with tarfile.open(tarball, "w:gz") as made:
         made.add(tmp_path / "package", "package")
     line = refused("models", "fetch", "blazepose-heavy", "--from", tarball)
-    assert "of 15 bytes" in line
     assert "of 27709200" in line
     assert not empty_cache.exists()
 
