@@ -679,7 +679,7 @@ def _repair(folder: Path) -> None:
         if usable_record(_new_folder(folder, stage) / "stage.json") is not None:
             _roll_forward(folder, stage)
         remove_tree(_new_folder(folder, stage))
-        _settle_old(folder, stage)
+        remove_tree(_old(folder, stage))
     remove_tree(folder / "run.json.new")
 
 
@@ -704,16 +704,6 @@ def _roll_forward(folder: Path, stage: str) -> None:
     _move(folder / stage, old / stage)
     new.rename(folder / stage)
     sync(folder)
-    remove_tree(old)
-
-
-def _settle_old(folder: Path, stage: str) -> None:
-    """Remove replaced files, or put them back if the user has removed their successor since."""
-    old = _old(folder, stage)
-    if old.exists() and not (folder / stage).exists():
-        for entry in sorted(old.iterdir()):
-            if not (folder / entry.name).exists():
-                entry.rename(folder / entry.name)
     remove_tree(old)
 
 

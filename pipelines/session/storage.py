@@ -513,20 +513,11 @@ def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
 
 
 def is_made(target: Path, key: str, *, mark: str) -> bool:
-    """Return True if the target exists with this key, which its mark file states.
-
-    In that case, leftovers of a later attempt that was killed are useless and are removed.
-    """
+    """Return True if the target exists with this key, which its mark file states."""
     try:
-        made = bool(read_json(target / mark).get("key") == key)
+        return bool(read_json(target / mark).get("key") == key)
     except DataError:
         return False
-    work = _work_of(target.absolute())
-    if made and work.is_dir() and not work.is_symlink():
-        with suppress(OSError, BusyError), working_folder(work, target):
-            for left in [path for path in work.iterdir() if path.is_dir()]:
-                remove_tree(left)
-    return made
 
 
 def _work_of(target: Path) -> Path:

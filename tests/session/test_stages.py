@@ -281,18 +281,6 @@ def test_a_reader_refuses_what_was_published_halfway_and_a_writer_finishes_it(tm
     assert contents(folder) == expected
 
 
-def test_a_stage_whose_successor_was_removed_by_hand_comes_back(tmp_path: Path) -> None:
-    folder = tmp_path / "a.session"
-    work(folder)
-    expected = contents(folder)
-    (folder / ".reconstruct.old").mkdir()
-    (folder / "reconstruct").rename(folder / ".reconstruct.old" / "reconstruct")
-    assert open_session(folder).record("reconstruct") is None
-    with locked(folder):
-        pass
-    assert contents(folder) == expected
-
-
 def test_a_copy_kept_by_the_user_stays(tmp_path: Path) -> None:
     folder = tmp_path / "a.session"
     work(folder)

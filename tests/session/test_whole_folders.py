@@ -110,20 +110,6 @@ def test_a_kill_between_the_two_renames_is_mended(tmp_path: Path, monkeypatch: p
         assert is_made(target, "k", mark=MARK)
 
 
-def test_what_was_begun_again_and_killed_goes_where_there_is_nothing_to_do(tmp_path: Path) -> None:
-    target, work = tmp_path / "flight", tmp_path / ".flight.making"
-    make(target)
-    for left in ("whole", "k/one", "old"):
-        (work / left).mkdir(parents=True)
-        (work / left / "half").write_text("1")
-    (work / "lock").touch()
-    assert not is_made(target, "other", mark=MARK)
-    assert names(work) == ["k", "lock", "old", "whole"]
-    assert is_made(target, "k", mark=MARK)
-    assert names(tmp_path) == ["flight"]
-    assert names(target) == ["copy", MARK]
-
-
 def test_two_do_not_make_one_folder(tmp_path: Path) -> None:
     target = tmp_path / "flight"
     with whole_folder(target, "k", mark=MARK, overwrite=False), pytest.raises(BusyError):
