@@ -217,6 +217,8 @@ def test_wrong_and_damaged_tarballs_are_refused_and_not_kept(shelf: Path, tmp_pa
         with pytest.raises(DataError, match=rf"{name}: .*{reason}"):
             npm_models().fetch(source)
     empty = write_tarball(tmp_path, {"package/fourth.tflite": b"another"})
-    with pytest.raises(DataError, match=r"holds no package/third\.tflite; give the tarball or the folder that does"):
+    with pytest.raises(
+        DataError, match=r"holds no package/third\.tflite; give the tarball or the folder that does"
+    ):
         npm_models().fetch(empty)
     assert not npm_models().folder.exists()
