@@ -20,10 +20,10 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, multiply, rotate
 from pipelines.session.people import take_joints, with_derived
 from pipelines.session.records import JointMotion, SkeletalMotion
-from pipelines.session.registries import ChoiceOfAxes
+from pipelines.session.registries import ExportWithChoices
 from tests.formats.exported import Listener, recording, walking, without
 
-WRITER: ChoiceOfAxes = bvh_writing.EXPORT
+WRITER: ExportWithChoices = bvh_writing.EXPORT
 WRITTEN_M = 1e-6  # six decimals of a degree over 2 m of bones, and of a centimetre: 0.04 micrometres
 
 

@@ -14,12 +14,12 @@ from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
-from pipelines.session.registries import ChoiceOfAxes, JointFormat, need
+from pipelines.session.registries import ExportWithChoices, JointFormat, need
 from tests.formats.exported import SIGMA_M, Listener, recording, stamps, walking, without
 from tests.formats.refusals import refuses
 
 READER: JointFormat = c3d.FORMAT
-WRITER: ChoiceOfAxes = c3d.EXPORT
+WRITER: ExportWithChoices = c3d.EXPORT
 FLOAT32 = 2.0**-24  # half a step of a float of 24 bits, relative
 
 
