@@ -462,7 +462,7 @@ def _refined(path: _Path, followed: TrackedPoints, start_s: float, scatter: floa
 # Transport delays of a good link change by less, and a pose 20 ms late is 2 cm off at 1 m/s.
 _MIN_STEP_S = 0.02
 # A clock that is set by more was never set before, or the log is played again: that is told, not mended.
-_MAX_STEP_S = 2.0
+MAX_STEP_S = 2.0
 # A step is this many times the scatter of the messages before and after it.
 _SIGNIFICANT_STEP_SIGMAS = 8.0
 # A step holds for at least this time before and after.
@@ -471,6 +471,12 @@ _MIN_DURATION_S = 0.5
 _MIN_MESSAGES = 5
 # So many of the messages before and after lie nearer to their own median than to the other one.
 _SEPARATED_SHARE = 0.9
+# A log with more gaps loses messages all the time, and its gaps say nothing of clocks.
+_MOST_GAPS = 3
+# A mean velocity over less time is mostly noise.
+_VELOCITY_S = 0.2
+# Drones that film people accelerate by less, in m/s^2; as rotation, this many parts of a quaternion per s^2.
+_MOST_ACCELERATION = 2.0
 
 
 @dataclass(frozen=True)
@@ -525,7 +531,7 @@ def find_steps(header_ns: Int64, receive_ns: Int64) -> list[ClockStep]:
         uneven_s = np.quantile(np.abs(around_s - np.median(around_s)), _SEPARATED_SHARE)
         least_s = max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * 1.4826 * float(np.median(off)))
         if (
-            least_s < abs(step_s) <= _MAX_STEP_S
+            least_s < abs(step_s) <= MAX_STEP_S
             and abs(own_s - step_s) < abs(step_s) / 2
             and abs(near_s - step_s) < abs(step_s) / 4
             and pause_s < 3 * usual_s + abs(step_s) / 2  # the receipt goes on
@@ -534,7 +540,7 @@ def find_steps(header_ns: Int64, receive_ns: Int64) -> list[ClockStep]:
             and np.quantile(off, _SEPARATED_SHARE) < abs(step_s) / 2
         ):
             delay_s = -offset_s - level_s  # before the step, as if earlier steps had not been
-            is_queue = 0 < step_s <= delay_s < _MAX_STEP_S
+            is_queue = 0 < step_s <= delay_s < MAX_STEP_S
             offset_s -= 0 if is_queue else step_s
             since_s = float(receive[k + 1] - receive[0]) / 1e9
             found.append(ClockStep(int(stamped[k + 1]), since_s, step_s, not is_queue))
@@ -559,3 +565,66 @@ def _candidates(lead_s: Float, interval_s: Float) -> Int64:
     changed[steady] = np.abs(five[_MIN_MESSAGES:] - five[:-_MIN_MESSAGES]) > _MIN_STEP_S / 2
     unusual = np.abs(interval_s - np.median(interval_s)) > _MIN_STEP_S / 2
     return np.flatnonzero(changed & unusual)
+
+
+@dataclass(frozen=True)
+class StampGap:
+    """Interval of an even sequence of stamps that is too long, or that goes back."""
+
+    index: int  # of the first message after it
+    usual_s: float  # the other intervals
+    excess_s: float  # by which it is longer; negative where the stamps go back
+
+
+def find_gaps(stamps_ns: Int64) -> list[StampGap]:
+    """Find the few gaps of an even sequence of stamps [N], which are in the order of writing."""
+    interval_s = np.diff(stamps_ns) / 1e9
+    if len(interval_s) < 4 * _MIN_MESSAGES:
+        return []
+    usual_s = float(np.median(interval_s))
+    off_s = np.abs(interval_s - usual_s)
+    least_s = max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * 1.4826 * float(np.median(off_s)))
+    places = np.flatnonzero((off_s > least_s) & ((interval_s > 0) | (interval_s < -_MIN_STEP_S)))
+    found = []
+    for k in places.tolist() if len(places) <= _MOST_GAPS else []:
+        before_s, after_s = off_s[max(k - 2 * _MIN_MESSAGES, 0) : k], off_s[k + 1 :][: 2 * _MIN_MESSAGES]
+        around = np.concatenate([before_s, after_s])
+        if min(k, len(interval_s) - 1 - k) >= _MIN_MESSAGES and (
+            np.quantile(around, _SEPARATED_SHARE) < off_s[k] / 4
+        ):
+            found.append(StampGap(k + 1, usual_s, float(interval_s[k]) - usual_s))
+    return found
+
+
+def time_passed(t_ns: Int64, values: Float, gap: StampGap, at: int) -> bool | None:
+    """Test by motion if the time of a gap passed; False if its clock stepped, None if motion does not tell.
+
+    The mean of the velocities before and after says how far the body moves in the usual interval, and in the
+    whole gap.
+
+    Args:
+        t_ns: [N] stamps.
+        values: [N, D] positions in m, or quaternions of continuous sign.
+        gap: the gap.
+        at: the row of the first message after it.
+    """
+    t_s = (t_ns - t_ns[at]) / 1e9
+    count = max(_MIN_MESSAGES, int(_VELOCITY_S / max(gap.usual_s, 1e-3)))
+    sides = slice(max(at - count, 0), at), slice(at, at + count)
+    if min(at, len(t_s) - at) < _MIN_MESSAGES:
+        return None
+    lines = [np.polyfit(t_s[side], values[side], 1) for side in sides]
+    left = [values[side] - np.outer(t_s[side], b) - a for side, (b, a) in zip(sides, lines, strict=True)]
+    scatter = float(np.sqrt(np.mean(np.concatenate(left) ** 2) * values.shape[1]))
+    moved = lines[1][0] * t_s[at] + lines[1][1] - lines[0][0] * t_s[at - 1] - lines[0][1]
+    velocity, change = (lines[0][0] + lines[1][0]) / 2, float(np.linalg.norm(lines[1][0] - lines[0][0]))
+
+    def misfit(passed_s: float) -> float:
+        """Return the distance from where the body should be, in units of what is usual."""
+        off = float(np.linalg.norm(moved - velocity * passed_s))
+        return off / (3 * scatter + _MOST_ACCELERATION * passed_s**2 / 8 + change * passed_s / 4 + 1e-6)
+
+    stepped, passed = misfit(gap.usual_s), misfit(gap.usual_s + gap.excess_s)
+    if stepped < 1 and passed > 2:
+        return False
+    return True if passed < 1 and stepped > 2 else None

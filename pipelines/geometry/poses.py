@@ -188,7 +188,7 @@ def interpolate_poses(
     between = _bracket(t_ns, at_ns, max_gap_ns, max_extrapolation_ns)
     if not len(t_ns):
         return np.full((len(at_ns), 3), np.nan), np.full((len(at_ns), 4), np.nan)
-    continuous = _continuous_signs(quaternion_xyzw)
+    continuous = continuous_signs(quaternion_xyzw)
     fraction = between.fraction[:, None]
     positions = position[between.before] + fraction * (position[between.after] - position[between.before])
     quaternions = _slerp(continuous[between.before], continuous[between.after], fraction)
@@ -291,7 +291,7 @@ def _bracket(t_ns: Int64, at_ns: Int64, max_gap_ns: int, max_extrapolation_ns: i
     return _Bracket(before, after, fraction, known)
 
 
-def _continuous_signs(quaternion_xyzw: Float) -> Float:
+def continuous_signs(quaternion_xyzw: Float) -> Float:
     """Choose the signs of quaternions such that every row is on the same side as the row before it."""
     same_side = np.sum(quaternion_xyzw[1:] * quaternion_xyzw[:-1], axis=-1) >= 0
     flips = np.concatenate([[1.0], np.where(same_side, 1.0, -1.0)])
@@ -418,7 +418,7 @@ class Link(NamedTuple):
     t_ns: Int64  # [N] strictly increasing
     position: Float  # [N, 3] m
     quaternion_xyzw: Float  # [N, 4] unit
-    static: bool = False  # if True, the last row is valid at all times
+    static: bool = False  # if True, each row is valid until the next, and the first before it, too
 
 
 class FrameChain(NamedTuple):
@@ -506,7 +506,8 @@ def find_route(edges: Collection[tuple[str, str]], parent: str, child: str) -> R
 
 def _link_at(link: Link, t_ns: Int64, max_gap_ns: int, max_extrapolation_ns: int) -> tuple[Float, Float]:
     if link.static:
-        return link.position[-1:], link.quaternion_xyzw[-1:]
+        rows = np.searchsorted(link.t_ns[1:], t_ns, side="right")
+        return link.position[rows], link.quaternion_xyzw[rows]
     return interpolate_poses(
         link.t_ns,
         link.position,

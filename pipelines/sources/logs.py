@@ -149,6 +149,8 @@ class FlightLog:
     def at_world_times(self, gathered: Gathered, topic: str) -> Trajectory:
         """Return a trajectory at world times, with all losses; note how its stamps disagree."""
         self.note_steps(topic, gathered.stamps.steps)
+        for line in gathered.notes:
+            self.note(line)
         for doubt in doubts_of_stamps(gathered.stamps, self.settings.stamps):
             self.note(f"{self.source}: {doubt}")
         trajectory = gathered.trajectory
@@ -203,6 +205,8 @@ class FlightLogs:
         recording: Log | None = self._kept.pop(paths, None)
         if recording is None:
             recording = recognise(paths[0], LogFormat, "log").open_log(paths)
+            for line in recording.notes if isinstance(recording, OpenLog) else ():
+                self._note(f"{paths[0]}: {line}")
         opened = FlightLog(recording, str(paths[0]), self.settings(log), self._note)
         if not isinstance(recording, OpenLog):
             with recording:

@@ -10,9 +10,10 @@ import pytest
 
 from pipelines.formats.logs.presets import read_pair
 from pipelines.session.manifest import LogSource, Manifest
+from pipelines.session.records import Trajectory
 from pipelines.session.registries import LogFormat, recognise
 from pipelines.sources.logs import FlightLogs
-from tests.synthetic.logs import Entry, write_log
+from tests.synthetic.logs import Container, Entry, write_log
 
 EPOCH_NS, INTERVAL_NS, DELAY_NS, STEP_AT = 1_700_000_000_000_000_000, 50_000_000, 4_000_000, 60
 TIMES_NS = EPOCH_NS + INTERVAL_NS * np.arange(120)
@@ -24,11 +25,13 @@ TYPES = {
 }
 
 
-def entries(step_ns: int) -> list[Entry]:
+def entries(step_ns: int, *, together: bool = False, speed_m: float = 0.1) -> list[Entry]:
+    """Make messages of which the header steps, or header and receipt together."""
     logged = []
     for k, t_ns in enumerate(TIMES_NS.tolist()):
         header = {"stamp": t_ns + (step_ns if k >= STEP_AT else 0), "frame_id": "map"}
-        place, turned = {"x": 0.1 * k, "y": 0.0, "z": 5.0}, {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+        received_ns = t_ns + DELAY_NS + (step_ns if together and k >= STEP_AT else 0)
+        place, turned = {"x": speed_m * k, "y": 0.0, "z": 5.0}, {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
         contents: dict[str, dict[str, Any]] = {
             "/pose": {"pose": {"position": place, "orientation": turned}},
             "/pictures": {"format": "jpeg", "data": np.array([0xFF, 0xD8, 0xFF], np.uint8)},
@@ -36,7 +39,7 @@ def entries(step_ns: int) -> list[Entry]:
             "/turned": {"quaternion": turned},
         }
         logged += [
-            Entry(topic, TYPES[topic], t_ns + DELAY_NS, {"header": header, **fields})
+            Entry(topic, TYPES[topic], received_ns, {"header": header, **fields})
             for topic, fields in contents.items()
         ]
     return logged
@@ -69,3 +72,52 @@ def test_what_a_stepping_clock_stamped_is_at_the_right_times(tmp_path: Path, ste
     assert pair.body is not None
     np.testing.assert_array_equal(pair.body.t_ns, TIMES_NS)
     assert [told in note for note in pair.notes] == [True, True]
+
+
+def trajectory(log: Path) -> tuple[Trajectory, list[str]]:
+    """Read the poses of a log, and what is noted of them."""
+    camera = {"pose": {"file": "a", "topic": "/pose"}, "intrinsics": "x", "keypoints": "y"}
+    stated = {"schema": 1, "cameras": {"c": camera}, "logs": {"a": LogSource(file=[log.name])}}
+    notes: list[str] = []
+    with FlightLogs(Manifest.model_validate(stated), log.parent, notes.append) as logs:
+        return logs.trajectory("a", "/pose", None, None, max_gap_ns=10**9), notes
+
+
+@pytest.mark.parametrize("container", ["ros1", "ros2-sqlite3", "mcap-cdr"])
+@pytest.mark.parametrize("step_s", [-1.5, -0.8, -0.1, 0.1, 0.3, 0.8, 1.5])
+def test_a_step_of_all_clocks_of_a_log_is_taken_out(
+    tmp_path: Path, step_s: float, container: Container
+) -> None:
+    poses, notes = trajectory(
+        write_log(tmp_path, "log", container, entries(round(step_s * 1e9), together=True))
+    )
+    np.testing.assert_array_equal(poses.t_ns, TIMES_NS)
+    np.testing.assert_allclose(poses.position[:, 0], 0.1 * np.arange(120), atol=1e-12)
+    assert [f"{step_s:+.3f} s at " in note for note in notes] == [True, True]  # of the recorder, the header
+
+
+@pytest.mark.parametrize("step_s", [0.2, 1.0])
+def test_a_step_of_all_clocks_that_nothing_shows_is_noted(tmp_path: Path, step_s: float) -> None:
+    still = entries(round(step_s * 1e9), together=True, speed_m=0.0)
+    poses, notes = trajectory(write_log(tmp_path, "log", "mcap-cdr", still))
+    np.testing.assert_array_equal(poses.t_ns, TIMES_NS + (np.arange(120) >= STEP_AT) * round(step_s * 1e9))
+    assert [f"{step_s:+.3f} s at " in note for note in notes] == [True]
+
+
+@pytest.mark.parametrize("lost", [2, 10])
+def test_lost_messages_are_no_step(tmp_path: Path, lost: int) -> None:
+    every = entries(0)
+    some = every[: 4 * STEP_AT] + every[4 * (STEP_AT + lost) :]
+    poses, notes = trajectory(write_log(tmp_path, "log", "mcap-cdr", some))
+    np.testing.assert_array_equal(poses.t_ns, np.delete(TIMES_NS, np.arange(STEP_AT, STEP_AT + lost)))
+    assert notes == []
+
+
+def test_messages_of_another_topic_in_the_gap_show_that_time_passed(tmp_path: Path) -> None:
+    still = entries(300_000_000, together=True, speed_m=0.0)
+    t_ns = int(TIMES_NS[STEP_AT])
+    stamp = {"stamp": t_ns + 150_000_000, "frame_id": ""}
+    still.insert(
+        4 * STEP_AT, Entry("/fix", "sensor_msgs/msg/NavSatFix", t_ns + 150_000_000, {"header": stamp})
+    )
+    assert trajectory(write_log(tmp_path, "log", "mcap-cdr", still))[1] == []

@@ -25,8 +25,8 @@ from pipelines.formats.logs.recordings import (
     Content,
     OpenLog,
     begins_like,
-    open_parts,
 )
+from pipelines.formats.logs.trajectories import open_recording
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 
@@ -62,7 +62,7 @@ class McapLog:
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open one file, or the parts of a split one."""
-        return OpenLog(*open_parts(paths, McapPart))
+        return open_recording(paths, McapPart)
 
 
 class McapPart(ChunkedPart):

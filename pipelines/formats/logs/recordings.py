@@ -22,7 +22,7 @@ import numpy as np
 
 from pipelines.formats.common.files import first_bytes
 from pipelines.formats.logs.message_decoders import Schema, decoder, inflate
-from pipelines.geometry.arrays import Int64
+from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Message, Topic
 from pipelines.session.storage import as_data_error, refuse_special
@@ -85,7 +85,7 @@ class MessageTable:
     place: Int64  # within the block
     size: Int64  # bytes, uncompressed; bytes between two messages count to the first of them
 
-    def rows(self, which: object) -> MessageTable:
+    def rows(self, which: Int64 | Bool) -> MessageTable:
         """Return some rows."""
         columns = (self.channel, self.stamp_ns, self.block, self.place, self.size)
         return MessageTable(*(column[which] for column in columns))
@@ -102,6 +102,7 @@ class LogPart(ABC):
         self.lost: Counter[str] = Counter()  # losses of the file as a whole
         none = np.zeros(0, np.int64)
         self.table = MessageTable(none, none, none, none, none)
+        self.received_ns = none  # [M] stamps of receipt, without steps of the recorder's clock
         self._fates: dict[int, str] = {}  # cause of loss, by row of the table
         self._rows: dict[int, Int64] = {}  # of each channel, in the order of the file
 
@@ -128,7 +129,7 @@ class LogPart(ABC):
         if strangers := int(np.count_nonzero(~named)):
             self.lost[UNNAMED] += strangers
             table = table.rows(named)
-        self.table = table
+        self.table, self.received_ns = table, table.stamp_ns
         by_channel = np.argsort(table.channel, kind="stable")
         numbers, first = np.unique(table.channel[by_channel], return_index=True)
         rows = np.split(by_channel.astype(np.int64), first[1:]) if len(numbers) else []
@@ -159,7 +160,7 @@ class LogPart(ABC):
         """Return the rows of some channels, in the order of receipt; equal stamps keep the file's order."""
         found = [rows for channel in dict.fromkeys(channels) if (rows := self._rows.get(channel)) is not None]
         rows = np.sort(np.concatenate([np.zeros(0, np.int64), *found]))
-        return rows[np.argsort(self.table.stamp_ns[rows], kind="stable")]
+        return rows[np.argsort(self.received_ns[rows], kind="stable")]
 
 
 # --- files of chunks -----------------------------------------------------------------------------------
@@ -363,7 +364,8 @@ class OpenLog:
 
     def __init__(self, parts: Sequence[LogPart], lost: Counter[str]) -> None:
         self.parts = parts
-        self._lost = lost
+        self.notes: list[str] = []  # on steps of the recorder's clock
+        self.lost = lost
         keys = {channel.key for part in parts for channel in part.channels.values()}
         self._topics = {key: self._summary(*key) for key in sorted(keys)}
 
@@ -384,7 +386,7 @@ class OpenLog:
     @property
     def dropped(self) -> dict[str, int]:
         """Losses so far, counted by cause: of the files, then of the messages asked for."""
-        total = sum((part.dropped for part in self.parts), Counter(self._lost))
+        total = sum((part.dropped for part in self.parts), Counter(self.lost))
         return dict(sorted(total.items()))
 
     def forget(self) -> None:
@@ -392,9 +394,14 @@ class OpenLog:
         for part in self.parts:
             part.forget()
 
-    def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Yield the messages of some topics in the order of receipt; others are neither read nor decoded."""
-        streams = [self._of_part(part, frozenset(topics)) for part in self.parts]
+    def messages(
+        self, topics: Collection[str], *, first_ns: int = -(2**63), last_ns: int = 2**63 - 1
+    ) -> Iterator[Message]:
+        """Yield the messages of some topics in the order of receipt; others are neither read nor decoded.
+
+        Messages that were received before `first_ns` or after `last_ns` are left out.
+        """
+        streams = [self._of_part(part, frozenset(topics), first_ns, last_ns) for part in self.parts]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
 
     def describe(self) -> dict[str, object]:
@@ -415,21 +422,21 @@ class OpenLog:
             topic.name if named[topic.name] == 1 else f"{topic.name} ({topic.type})": self._described(topic)
             for topic in topics
         }
+        facts |= {"notes": self.notes} if self.notes else {}
         return facts | {f"dropped: {cause}": count for cause, count in self.dropped.items()}
 
     def _described(self, topic: Topic) -> dict[str, object]:
-        tables, schemas = self._messages_of(topic.name, topic.type, topic.encoding)
+        schemas, stamps, size_bytes = self._messages_of(topic.name, topic.type, topic.encoding)
         facts: dict[str, object] = {
             "type": topic.type,
             "encoding": topic.encoding,
             "messages": topic.count,
-            "size_bytes": sum(int(table.size.sum()) for table in tables),
+            "size_bytes": size_bytes,
         }
         if topic.first_ns is not None and topic.last_ns is not None:
             span_ns = topic.last_ns - topic.first_ns
             facts |= {"first_ns": topic.first_ns, "last_ns": topic.last_ns}
             if span_ns:
-                stamps = np.sort(np.concatenate([table.stamp_ns for table in tables]))
                 facts["rate_hz"] = round((topic.count - 1) / span_ns * 1e9, 3)
                 facts["longest_gap_s"] = round(int(np.diff(stamps).max()) / 1e9, 6)
         for schema in schemas:
@@ -440,14 +447,26 @@ class OpenLog:
                 break
         return facts
 
-    def _messages_of(self, *key: str) -> tuple[list[MessageTable], list[Schema]]:
-        """Return the messages of a topic by part, and their schemas, each once."""
+    def _messages_of(self, *key: str) -> tuple[list[Schema], Int64, int]:
+        """Return the schemas of a topic, each once, its stamps of receipt, sorted, and its size in bytes."""
         numbers = [[n for n, channel in part.channels.items() if channel.key == key] for part in self.parts]
         pairs = list(zip(self.parts, numbers, strict=True))
         schemas = dict.fromkeys(part.channels[n].schema for part, own in pairs for n in own)
-        return [part.table.rows(part.rows_of(own)) for part, own in pairs], list(schemas)
+        rows = [(part, part.rows_of(own)) for part, own in pairs]
+        stamps = np.sort(np.concatenate([part.received_ns[own] for part, own in rows]))
+        return list(schemas), stamps, sum(int(part.table.size[own].sum()) for part, own in rows)
 
-    def _of_part(self, part: LogPart, topics: frozenset[str]) -> Iterator[Message]:
+    def take_out(self, part: LogPart, row: int, step_ns: int) -> None:
+        """Take a step of the recorder's clock out of the stamps of receipt, from a row of a part on."""
+        part.received_ns = part.received_ns.copy()
+        part.received_ns[row:] -= step_ns
+        for later in self.parts[self.parts.index(part) + 1 :]:
+            later.received_ns = later.received_ns - step_ns
+        self._topics = {key: self._summary(*key) for key in self._topics}
+
+    def _of_part(
+        self, part: LogPart, topics: frozenset[str], first_ns: int, last_ns: int
+    ) -> Iterator[Message]:
         decoders = {}
         for number, channel in part.channels.items():
             if channel.topic in topics:
@@ -456,9 +475,11 @@ class OpenLog:
                 except ValueError:
                     part.lose(part.rows_of([number]), UNDEFINED)
         rows = part.rows_of(decoders)
+        received_ns = part.received_ns[rows]
+        rows = rows[(received_ns >= first_ns) & (received_ns <= last_ns)]
         for start in range(0, len(rows), _BATCH):
             batch = rows[start : start + _BATCH]
-            stamps = part.table.stamp_ns[batch].tolist()
+            stamps = part.received_ns[batch].tolist()
             channels = part.table.channel[batch].tolist()
             for k, data in part.read(batch):
                 decode, topic = decoders[channels[k]]
@@ -470,9 +491,8 @@ class OpenLog:
                 yield Message(topic, stamps[k], value)
 
     def _summary(self, name: str, type_: str, encoding: str) -> Topic:
-        tables, _ = self._messages_of(name, type_, encoding)
-        stamps = np.concatenate([table.stamp_ns for table in tables])
-        first, last = (int(stamps.min()), int(stamps.max())) if len(stamps) else (None, None)
+        _, stamps, _ = self._messages_of(name, type_, encoding)
+        first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
         return Topic(name, type_, encoding, len(stamps), first, last)
 
 

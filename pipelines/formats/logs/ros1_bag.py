@@ -12,15 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
-from pipelines.formats.logs.recordings import (
-    Channel,
-    Chunk,
-    ChunkedPart,
-    Content,
-    OpenLog,
-    begins_like,
-    open_parts,
-)
+from pipelines.formats.logs.recordings import Channel, Chunk, ChunkedPart, Content, OpenLog, begins_like
+from pipelines.formats.logs.trajectories import open_recording
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 
@@ -55,7 +48,7 @@ class Ros1Bag:
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open one bag, or several as one recording."""
-        return OpenLog(*open_parts(paths, _Bag))
+        return open_recording(paths, _Bag)
 
 
 class _Bag(ChunkedPart):

@@ -37,8 +37,8 @@ from pipelines.formats.logs.recordings import (
     begins_like,
     inflated_limit,
     open_file,
-    open_parts,
 )
+from pipelines.formats.logs.trajectories import open_recording
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 from pipelines.session.storage import as_data_error
@@ -101,13 +101,13 @@ class Ros2Bag:
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open a bag's folder, or its files."""
         contents = [_contents(path) for path in paths]
-        parts, lost = open_parts([file for c in contents for file in c.files], _open_part)
-        lost = sum((c.lost for c in contents), lost)
+        log = open_recording([file for c in contents for file in c.files], _open_part)
+        log.lost += sum((c.lost for c in contents), Counter())
         stated = [c.stated.messages for c in contents if c.stated]
-        found = sum(len(part.table.stamp_ns) for part in parts)
+        found = sum(len(part.table.stamp_ns) for part in log.parts)
         if len(stated) == len(contents) and found < sum(stated):
-            lost[NOT_IN_FILES] = sum(stated) - found
-        return OpenLog(parts, lost)
+            log.lost[NOT_IN_FILES] = sum(stated) - found
+        return log
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,22 @@ from pipelines.formats.logs.messages import (
     nanoseconds,
     unreadable,
 )
+from pipelines.formats.logs.recordings import LogPart, OpenLog, open_parts
 from pipelines.formats.poses.trajectory_files import clean_poses
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.clocks import ClockFit, ClockStep, find_steps, fit_clock, without_steps
+from pipelines.geometry.clocks import (
+    MAX_STEP_S,
+    ClockFit,
+    ClockStep,
+    StampGap,
+    find_gaps,
+    find_steps,
+    fit_clock,
+    time_passed,
+    without_steps,
+)
 from pipelines.geometry.mounting import attitude_from_angles
-from pipelines.geometry.poses import Link, chain, find_route, pose_covariance_in_body
+from pipelines.geometry.poses import Link, chain, continuous_signs, find_route, pose_covariance_in_body
 from pipelines.session.errors import DataError
 from pipelines.session.records import AngleSample, Message, PoseSample, Sample, Trajectory
 from pipelines.session.registries import Log
@@ -75,6 +86,7 @@ class Gathered:
     trajectory: Trajectory
     stamps: StampCheck
     frames: Edge  # as the log names them; empty if it names none
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -283,7 +295,9 @@ def chained(
     """Compute the pose of one frame in another over time, through the log's tree of transforms.
 
     The stamps are those of the transform with the highest rate on the route. A transform is static if it was
-    given as such, or is logged only once, as in Foxglove's logs. Losses are counted by cause and transform.
+    given as such, or is logged only once, as in Foxglove's logs. Of several values of a static transform,
+    each holds from its publication on, and the first before it, too. Losses are counted by cause and
+    transform.
     Stamps at which another transform on the route is unknown are counted under "no transform".
 
     Args:
@@ -300,14 +314,22 @@ def chained(
         raise DataError(source, str(error), "name `parent` and `child` as the log does") from None
     links: dict[Edge, Link] = {}
     dropped: dict[str, int] = {}
+    notes: list[str] = []
     checks = []
     for edge in route.edges:
         rows = every[edge]
+        if is_static := edge not in transforms.moving or len(rows.header_ns) == 1:
+            rows = _published_values(
+                [log[edge] for log in (transforms.static, transforms.moving) if edge in log]
+            )
         poses = rows.trajectory(f"{source}: {_named(edge)}", stamps)
-        is_static = edge not in transforms.moving or len(rows.header_ns) == 1
         links[edge] = Link(poses.t_ns, poses.position, poses.quaternion_xyzw, is_static)
-        if is_static and (others := _other_values(edge, transforms, poses)):
-            dropped[f"other values of a static transform ({_named(edge)})"] = others
+        if is_static and len(poses.t_ns) > 1:
+            apart_m = float(np.linalg.norm(np.diff(poses.position, axis=0), axis=1).max())
+            notes.append(
+                f"{source}: the static transform of {_named(edge)} has {len(poses.t_ns)} values, up to"
+                f" {apart_m:.3g} m apart; each is used from its publication on"
+            )
         if not is_static:
             checks.append(rows.check())
             dropped |= {f"{cause} ({_named(edge)})": count for cause, count in poses.dropped.items()}
@@ -324,17 +346,27 @@ def chained(
     trajectory = Trajectory(
         found.t_ns[known], found.position[known], found.quaternion_xyzw[known], dropped=dropped
     )
-    return Gathered(trajectory, _together(checks), (parent, child))
+    return Gathered(trajectory, _together(checks), (parent, child), tuple(notes))
 
 
-def _other_values(edge: Edge, transforms: TransformLog, used: Trajectory) -> int:
-    """Count the logged values of a static transform that differ from the one that is used, the latest."""
-    values = [log[edge].values for log in (transforms.static, transforms.moving) if edge in log]
-    expected = np.concatenate([used.position[-1], used.quaternion_xyzw[-1]])
-    turned = expected * np.array([1, 1, 1, -1, -1, -1, -1])  # the same rotation
-    every = np.concatenate(values)
-    same = [np.abs(every - each).max(axis=1) < _SAME_VALUE for each in (expected, turned)]
-    return int(np.count_nonzero(~(same[0] | same[1])))
+def _published_values(logged: Sequence[LoggedRows]) -> LoggedRows:
+    """Join the rows of a static transform in the order of receipt, without repeated values.
+
+    Their times are those of receipt, unless the headers rise with every new value.
+    """
+    receive_ns = np.concatenate([rows.receive_ns for rows in logged])
+    order = np.argsort(receive_ns, kind="stable")
+    receive_ns = receive_ns[order]
+    header_ns = np.concatenate([rows.header_ns for rows in logged])[order]
+    values = np.concatenate([rows.values for rows in logged])[order]
+    kept = [0]
+    for row in range(1, len(values)):
+        alike = values[kept[-1]] * np.array([[1] * 7, [1] * 3 + [-1] * 4])  # both signs are one rotation
+        if np.abs(values[row] - alike).max(axis=1).min() >= _SAME_VALUE:
+            kept.append(row)
+    if not header_ns[kept].all() or (np.diff(header_ns[kept]) <= 0).any():
+        header_ns = receive_ns
+    return LoggedRows(header_ns[kept], receive_ns[kept], values[kept])
 
 
 def frames_of_poses(recording: Log, source: str, taken: Iterable[tuple[str | None, str | None]]) -> list[str]:
@@ -440,6 +472,77 @@ def _together(checks: Sequence[StampCheck]) -> StampCheck:
 def _named(edge: Edge) -> str:
     target, source = edge
     return f"{source!r} in {target!r}"
+
+
+# --- the recorder's clock ----------------------------------------------------------------------------------
+
+# The motion of a body before and after a gap is seen within this time.
+_AROUND_GAP_NS = 1_000_000_000
+# A shorter gap that motion does not explain is usual loss, and not worth a line.
+_NOTED_GAP_S = 0.1
+
+
+def open_recording(paths: Sequence[Path], open_part: Callable[[Path], LogPart]) -> OpenLog:
+    """Open the files of a log, without steps of the recorder's clock, which `notes` of the log describe.
+
+    The recorder's computer sets its clock: all stamps of receipt step, and with them those of the headers
+    that the same clock makes (`find_steps` then finds these). Stamps that go back in the order of writing
+    show it. A gap shows it if bodies moved on as if no time had passed.
+    """
+    log = OpenLog(*open_parts(paths, open_part))
+    for part in log.parts:
+        counts = {channel: len(part.rows_of([channel])) for channel in part.channels}
+        if not counts:
+            continue
+        densest = np.sort(part.rows_of([max(counts, key=lambda channel: (counts[channel], -channel))]))
+        for gap in find_gaps(part.received_ns[densest]):
+            _take_out_gap(log, part, densest, gap)
+    return log
+
+
+def _take_out_gap(log: OpenLog, part: LogPart, densest: Int64, gap: StampGap) -> None:
+    """Take out a step of the clock that is the gap between two rows of a part; note it."""
+    first, last = densest[gap.index - 1 : gap.index + 1].tolist()
+    leaps_s = np.diff(part.received_ns[first : last + 1]) / 1e9
+    row = first + 1 + int(np.argmax(leaps_s * np.sign(gap.excess_s)))
+    if abs(leaps_s[row - first - 1] - gap.excess_s) > max(1.5 * gap.usual_s, abs(gap.excess_s) / 4):
+        return  # other messages were received in the gap
+    after_s = int(part.received_ns[first] - part.received_ns[densest[0]]) / 1e9
+    told = f"all stamps step by {gap.excess_s:+.3f} s at {after_s:.2f} s"
+    stepped = True if gap.excess_s < 0 else _clock_stepped(log, gap, int(part.received_ns[row]))
+    if stepped and abs(gap.excess_s) <= MAX_STEP_S:
+        log.take_out(part, row, round(gap.excess_s * 1e9))
+        log.notes.append(f"{told}: the recorder's clock was set; taken out")
+    elif stepped or (stepped is None and gap.excess_s >= _NOTED_GAP_S):
+        log.notes.append(
+            f"{told}: the log does not tell if its clock was set or messages were lost; not taken out"
+        )
+
+
+def _clock_stepped(log: OpenLog, gap: StampGap, at_ns: int) -> bool | None:
+    """Test by all bodies of a log if a clock was set in a gap that ends at `at_ns`; None if none tells."""
+    topics = [topic.name for topic in log.topics if kind_of(topic) in {"poses", "transforms"}]
+    found: set[bool] = set()
+    messages = log.messages(
+        topics, first_ns=at_ns - round(gap.excess_s * 1e9) - _AROUND_GAP_NS, last_ns=at_ns + _AROUND_GAP_NS
+    )
+    bodies: dict[tuple[str, str], _Samples] = {}
+    for sample in all_samples(messages, "log"):
+        if isinstance(sample, PoseSample):
+            bodies.setdefault((sample.target, sample.source), _Samples()).add_pose(sample)
+    for body in bodies.values():
+        rows = body.rows(7)
+        at = int(np.searchsorted(rows.receive_ns, at_ns))
+        if not 0 < at < len(rows.receive_ns):
+            continue
+        leap_s = float(rows.header_ns[at] - rows.header_ns[at - 1]) / 1e9
+        if rows.header_ns[at - 1] and abs(leap_s - gap.usual_s - gap.excess_s) > gap.excess_s / 4:
+            return False  # the headers have a clock of their own
+        turned = continuous_signs(rows.values[:, 3:])
+        for values in (rows.values[:, :3], turned):
+            passed = time_passed(rows.receive_ns, values, gap, at)
+            found |= set() if passed is None else {not passed}
+    return found.pop() if len(found) == 1 else None
 
 
 # --- commanded positions ---------------------------------------------------------------------------------

@@ -146,21 +146,29 @@ def test_chains_of_moving_and_static_transforms() -> None:
     assert found.stamps.count == 55  # static ones have no time to compare
 
 
+@pytest.mark.parametrize("stamped", [False, True])
 @pytest.mark.parametrize("beside_moving", [False, True])
-def test_other_values_of_a_static_transform_are_counted(beside_moving: bool) -> None:
-    arm = static(("base", "camera"), (0.5, 0.0, 0.0))
-    moved = replace(static(("base", "camera"), (0.5, 0.0, 1.0)), stamp_ns=arm.stamp_ns + 1)
+@pytest.mark.parametrize("apart_m", [0.01, 1.0])
+def test_each_value_of_a_static_transform_holds_from_its_publication_on(
+    beside_moving: bool, stamped: bool, apart_m: float
+) -> None:
+    odometry = flown(50, rate_hz=50, frames=("map", "base"))
+    times = [EPOCH + S // 10, EPOCH + S // 2]  # the first is published after the first poses
+    arm, moved = (
+        replace(static(("base", "camera"), (0.5, 0.0, z)), receive_ns=t, stamp_ns=t if stamped else 0)
+        for t, z in zip(times, (0.0, apart_m), strict=True)
+    )
     x, y, z, w = moved.quaternion_xyzw
-    turned_alike = replace(moved, quaternion_xyzw=(-x, -y, -z, -w))
-    odometry = flown(10, rate_hz=50, frames=("map", "base"))
+    turned_alike = replace(moved, quaternion_xyzw=(-x, -y, -z, -w), receive_ns=times[1] + 1)
     transforms = transforms_of(
         [*odometry, *([moved] if beside_moving else [])],
         "d1",
         static=[arm] if beside_moving else [arm, moved, turned_alike],
     )
     found = chained(transforms, "d1", parent="map", child="camera", stamps="header", max_gap_ns=S)
-    assert list(found.trajectory.dropped.values()) == [1]
-    np.testing.assert_allclose(found.trajectory.position[:, 2], 1.0)
+    assert found.trajectory.dropped == {}
+    np.testing.assert_allclose(found.trajectory.position[:, 2], np.where(np.arange(50) < 25, 0, apart_m))
+    assert [f"{apart_m:.3g} m apart" in note for note in found.notes] == [True]
 
 
 def test_frames_that_cannot_be_chained_are_refused() -> None:
