@@ -11,7 +11,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import (
-    enu_from_ned,
+    ENU_FROM_NED,
     multiply,
     quaternion_from_rotation_vector,
     rotate,
@@ -22,8 +22,8 @@ Looks = Literal["forward", "backward", "left", "right", "down", "up"]
 
 # The optical axis along x, the picture's right along -y, its bottom along -z.
 _FLU_FROM_OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
-# A half turn about x: forward stays, left becomes right, up becomes down. It is its own inverse.
-_FLU_FROM_FRD = np.array([1.0, 0.0, 0.0, 0.0])
+FLU_FROM_FRD = np.array([1.0, 0.0, 0.0, 0.0])
+"""A half turn about x: forward stays, left becomes right, up becomes down. It is its own inverse."""
 
 _AZIMUTH_DEG = {"forward": 0.0, "left": 90.0, "backward": 180.0, "right": -90.0, "down": 0.0, "up": 0.0}
 _STRAIGHT_DEG = {"down": 90.0, "up": -90.0}
@@ -104,10 +104,10 @@ def attitude_in_enu(quaternion_xyzw: Float, *, relative_to: RelativeTo, axes: Li
     """
     if axes == "enu":
         return quaternion_xyzw
-    of_flu_gimbal = multiply(quaternion_xyzw, _FLU_FROM_FRD)
+    of_flu_gimbal = multiply(quaternion_xyzw, FLU_FROM_FRD)
     if relative_to == "world":
-        return enu_from_ned(np.zeros(3), of_flu_gimbal)[1]
-    return multiply(_FLU_FROM_FRD, of_flu_gimbal)
+        return multiply(ENU_FROM_NED, of_flu_gimbal)
+    return multiply(FLU_FROM_FRD, of_flu_gimbal)
 
 
 def level_heading(quaternion_xyzw: Float) -> Float:
@@ -148,24 +148,6 @@ def compose_gimbal(
     else:
         attitude = multiply(level_heading(world_from_body_xyzw), attitude_xyzw)
     return position + rotate(world_from_body_xyzw, lever_arm), multiply(attitude, gimbal_from_camera_xyzw)
-
-
-# --- axes of the body ----------------------------------------------------------------------------------
-
-
-def flu_body_from_frd(quaternion_xyzw: Float, covariance: Float | None = None) -> tuple[Float, Float | None]:
-    """Convert poses of a body logged as FRD (x forward, y right, z down) to those of the same body in FLU.
-
-    Args:
-        quaternion_xyzw: [..., 4] world_from_frd.
-        covariance: [..., 6, 6] position in world, rotation vector in the body.
-
-    Returns:
-        world_from_flu, and the covariance with its rotation vector in FLU.
-    """
-    signs = np.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
-    turned = None if covariance is None else covariance * np.outer(signs, signs)
-    return multiply(quaternion_xyzw, _FLU_FROM_FRD), turned
 
 
 def _turn(axis: Literal["x", "y", "z"], angle: Float | np.float64) -> Float:

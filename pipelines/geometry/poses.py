@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 
-# A half turn about the diagonal between north and east: (x, y, z) -> (y, x, -z).
-_ENU_FROM_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+ENU_FROM_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+"""A half turn about the diagonal between north and east: (x, y, z) -> (y, x, -z). It is its own inverse."""
 
 # --- rotations -----------------------------------------------------------------------------------------
 
@@ -142,14 +142,6 @@ def look_at(position: Float, target: Float) -> Float:
     right = np.where(level > 1e-9, right / np.maximum(level, 1e-9), [1.0, 0.0, 0.0])
     down = np.cross(forward, right)
     return quaternion_from_matrix(np.stack([right, down, forward], axis=-1))
-
-
-def enu_from_ned(position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
-    """Convert poses in a north-east-down world to an east-north-up world of the same origin.
-
-    Only the world's axes change; the body keeps its own.
-    """
-    return compose((np.zeros(3), _ENU_FROM_NED), (position, quaternion_xyzw))
 
 
 # --- poses and points over time ------------------------------------------------------------------------
@@ -317,6 +309,33 @@ def _slerp(start: Float, end: Float, fraction: Float) -> Float:
 
 # Intermediate arrays stay small for any length of log with this many poses at a time.
 _BLOCK = 4096
+_NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def carried_covariance(
+    covariance: Float,
+    *,
+    position_xyzw: Float = _NO_TURN,
+    rotation_xyzw: Float = _NO_TURN,
+    scale: float = 1.0,
+) -> Float:
+    """Transform covariances of poses to other axes.
+
+    Args:
+        covariance: [..., 6, 6] position, then rotation vector.
+        position_xyzw: [..., 4] rotation of the axes of positions, which are then scaled.
+        rotation_xyzw: [..., 4] rotation of the axes of rotation vectors.
+        scale: factor on positions.
+    """
+
+    def turned(covariance: Float, position_xyzw: Float, rotation_xyzw: Float) -> Float:
+        turns = (matrix_from_quaternion(each) for each in (position_xyzw, rotation_xyzw))
+        of_position, of_rotation = np.broadcast_arrays(*turns)
+        jacobian = _block_diagonal(of_rotation)
+        jacobian[..., :3, :3] = scale * of_position
+        return _propagated(jacobian, covariance)
+
+    return _by_blocks(turned, covariance, position_xyzw, rotation_xyzw)
 
 
 def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> Float:
@@ -324,20 +343,8 @@ def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> F
 
     geometry_msgs/PoseWithCovariance turns about fixed axes: R_true = exp(w) R. As exp(w) R = R exp(R' w),
     the rotation vector in the body is R' w; the position stays in the world.
-
-    Args:
-        covariance: [..., 6, 6] x, y, z, then rotation about the fixed x, y, z axes of the pose's frame.
-        world_from_body_xyzw: [..., 4] unit, broadcast.
-
-    Returns:
-        [..., 6, 6] position in the world, then rotation vector in the body.
     """
-
-    def turned(covariance: Float, world_from_body_xyzw: Float) -> Float:
-        jacobian = _block_diagonal(np.swapaxes(matrix_from_quaternion(world_from_body_xyzw), -1, -2))
-        return _propagated(jacobian, covariance)
-
-    return _by_blocks(turned, covariance, world_from_body_xyzw)
+    return carried_covariance(covariance, rotation_xyzw=conjugate(world_from_body_xyzw))
 
 
 def mounted_covariance(
@@ -369,11 +376,6 @@ def mounted_covariance(
         return _propagated(jacobian, covariance)
 
     return _by_blocks(mounted, covariance, world_from_body_xyzw, lever_arm, world_from_camera_xyzw)
-
-
-def carried_covariance(jacobian: Float, covariance: Float) -> Float:
-    """Transform covariances [..., 6, 6] by one linear map [6, 6]."""
-    return _by_blocks(lambda block: _propagated(jacobian, block), covariance)
 
 
 def _by_blocks(carry: Callable[..., Float], covariance: Float, *vectors: Float) -> Float:

@@ -1,6 +1,6 @@
 """Comparison of arms, as in metrics.json: scores, differences with their intervals, and the verdict.
 
-Intervals are those of `geometry.bootstrap`: over the trials for errors, which are independent draws, and over
+Intervals are those of `geometry.metrics`: over the trials for errors, which are independent draws, and over
 stretches of the flight for figures that depend on the flight's course.
 """
 

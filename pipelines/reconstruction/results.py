@@ -185,7 +185,7 @@ def _intervals(
     joints: tuple[str, ...],
     t_ns: Int64,
 ) -> dict[str, Any]:
-    """Compute confidence intervals of the means over the flight by block bootstrap (`geometry.bootstrap`)."""
+    """Compute confidence intervals of the means over the flight by block bootstrap (`geometry.metrics`)."""
     whole: dict[str, Series] = {}
     per_joint: dict[str, dict[str, Series]] = {name: {} for name in joints}
     if own is not None:

@@ -5,7 +5,7 @@ there is none. Where two sessions hold the same motion at the same times, they a
 and the interval is that of the mean of those differences. Otherwise they are compared joint by joint: the
 mean of a joint in one flight against its mean in the other, every joint with the same weight; the stretches
 of the two flights are then resampled independently. In both cases the intervals are those of
-`geometry.bootstrap`, and are valid for these flights only.
+`geometry.metrics`, and are valid for these flights only.
 """
 
 from collections.abc import Mapping, Sequence

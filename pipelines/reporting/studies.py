@@ -100,7 +100,7 @@ _BEST = ("auto", "robust", "midpoint", "dlt")  # the sentence is about the first
 def estimates(rows: Sequence[Row], axis: str, *, seed: int) -> list[dict[str, Any]]:
     """Compute the means over trials of every condition and method.
 
-    Intervals are those of `geometry.bootstrap` over trials.
+    Intervals are those of `geometry.metrics` over trials.
 
     Args:
         axis: tilt_deg, robots or noise: the condition that the ratio compares.

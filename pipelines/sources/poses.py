@@ -67,14 +67,13 @@ from pipelines.sources.world import (
     METRES,
     Projection,
     as_stated,
-    body_in_enu,
     in_enu,
     in_world,
     is_usable,
     losses,
     mounted,
+    moved,
     refuse_projected,
-    scaled,
     turn_of,
     upright,
     world_times,
@@ -163,7 +162,7 @@ class FlightPoses:
                 f"{name}: poses in {pose.file} are taken as the camera's (say `of: body` with a mount if not)"
             )
         # The lever arm of the mount is in metres: positions are scaled before it is added.
-        local = scaled(self._local(source, stated), pose.world_from_source.scale)
+        local = moved(self._local(source, stated), scale=pose.world_from_source.scale)
         if not of_camera:
             local = self._on_body(name, camera, local, angles)
         return in_world(local, pose.world_from_source.model_copy(update={"scale": 1.0}))
@@ -188,7 +187,7 @@ class FlightPoses:
                 position=calibrated.position[None],
                 quaternion_xyzw=calibrated.quaternion_xyzw[None],
             )
-            return path, self._enu(scaled(still, METRES[pose.unit or "m"]), pose.axes)
+            return path, self._enu(moved(still, scale=METRES[pose.unit or "m"]), pose.axes)
         if self._is_log(pose):
             settings, options = self._logs.settings(pose.file), self._logged(pose)
             logged = self._logs.trajectory(
@@ -268,16 +267,11 @@ class FlightPoses:
         return camera.pose.of != "body"
 
     def _turned(self, camera: CameraSources, poses: Trajectory, *stated: Axes | None) -> Trajectory:
-        return self._enu(poses, *stated, convert=in_enu if self._is_of_camera(camera) else body_in_enu)
+        return self._enu(poses, *stated, of_body=not self._is_of_camera(camera))
 
-    def _enu(
-        self,
-        trajectory: Trajectory,
-        *stated: Axes | None,
-        convert: Callable[[Trajectory, Axes], Trajectory] = in_enu,
-    ) -> Trajectory:
+    def _enu(self, trajectory: Trajectory, *stated: Axes | None, of_body: bool = False) -> Trajectory:
         """Convert poses to east, north, up: from the axes that are stated for them, else from the world's."""
-        turned = convert(trajectory, self._axes(*stated))
+        turned = in_enu(trajectory, self._axes(*stated), of_body=of_body)
         return turned if any(stated) else in_world(turned, self._upright)
 
     def _filed_trajectory(self, pose: PoseSource) -> Trajectory:

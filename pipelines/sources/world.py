@@ -11,16 +11,17 @@ import numpy as np
 from pipelines.formats.maps.voxel_grids import placed
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.geodesy import Place, enu_from_geodetic
-from pipelines.geometry.mounting import body_from_camera, flu_body_from_frd
+from pipelines.geometry.mounting import FLU_FROM_FRD, body_from_camera
 from pipelines.geometry.poses import (
+    ENU_FROM_NED,
     carried_covariance,
-    compose,
-    enu_from_ned,
+    conjugate,
     invert,
     matrix_from_quaternion,
     multiply,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
+    rotate,
 )
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, LogClock, Mount, Placement, PoseSource, Up, WorldAxes
@@ -36,6 +37,7 @@ FROZEN_S = 1.0
 
 # A slow log repeats a pose a few times: frozen are at least so many messages.
 FROZEN_POSES = 10
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 
 # No drone flies so far from the origin, and eastings of UTM begin at 166 km.
@@ -66,29 +68,58 @@ def as_stated(trajectory: Trajectory, pose: PoseSource, options: FiledPose) -> T
 
     Covariances of inverted poses are left out: they are those of another pose.
     """
-    position, quaternion, covariance = trajectory.position, trajectory.quaternion_xyzw, trajectory.covariance
     if options.quaternion == "wxyz":
-        quaternion = np.roll(quaternion, -1, axis=-1)
+        trajectory = replace(trajectory, quaternion_xyzw=np.roll(trajectory.quaternion_xyzw, -1, axis=-1))
     if options.inverse:
-        position, quaternion = invert(position, quaternion)
-        covariance = None
+        position, quaternion = invert(trajectory.position, trajectory.quaternion_xyzw)
+        trajectory = replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=None)
     if options.z == "down":
-        flip = np.array([1.0, 1.0, -1.0])
-        position = position * flip
-        turned = np.diag([*flip, 1.0, 1.0, 1.0])
-        covariance = None if covariance is None else carried_covariance(turned, covariance)
-    stated = replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
-    return scaled(stated, METRES[pose.unit or "m"])
+        covariance = trajectory.covariance
+        if covariance is not None:
+            signs = np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
+            covariance = covariance * np.outer(signs, signs)
+        trajectory = replace(
+            trajectory, position=trajectory.position * [1.0, 1.0, -1.0], covariance=covariance
+        )
+    return moved(trajectory, scale=METRES[pose.unit or "m"])
 
 
-def scaled(trajectory: Trajectory, factor: float) -> Trajectory:
-    """Multiply the positions of a trajectory, with their covariances."""
-    if factor == 1.0:
-        return trajectory
-    scale = np.diag([factor] * 3 + [1.0] * 3)
-    covariance = trajectory.covariance
-    covariance = None if covariance is None else carried_covariance(scale, covariance)
-    return replace(trajectory, position=trajectory.position * factor, covariance=covariance)
+def moved(
+    trajectory: Trajectory,
+    *,
+    turn: Float | None = None,
+    shift: Float | None = None,
+    scale: float = 1.0,
+    new_from_old_body: Float | None = None,
+) -> Trajectory:
+    """Change the axes of poses: scale, turn and shift the world, and turn the axes of the body itself.
+
+    Args:
+        turn: [4] or [N, 4] new from old world.
+        shift: [3] or [N, 3] m, the old origin in the new world.
+        new_from_old_body: [4].
+    """
+    position, quaternion = scale * trajectory.position, trajectory.quaternion_xyzw
+    covariance, body = trajectory.covariance, trajectory.body_xyzw
+    if turn is not None:
+        position, quaternion = rotate(turn, position), multiply(turn, quaternion)
+        body = None if body is None else multiply(turn, body)
+    if new_from_old_body is not None:
+        quaternion = multiply(quaternion, conjugate(new_from_old_body))
+    if covariance is not None and not (turn is None and new_from_old_body is None and scale == 1.0):
+        covariance = carried_covariance(
+            covariance,
+            position_xyzw=LEVEL if turn is None else turn,
+            rotation_xyzw=LEVEL if new_from_old_body is None else new_from_old_body,
+            scale=scale,
+        )
+    return replace(
+        trajectory,
+        position=position if shift is None else position + shift,
+        quaternion_xyzw=quaternion,
+        covariance=covariance,
+        body_xyzw=body,
+    )
 
 
 def world_times(clock: LogClock, t_ns: Int64, since_ns: int) -> Int64:
@@ -98,50 +129,18 @@ def world_times(clock: LogClock, t_ns: Int64, since_ns: int) -> Int64:
     return world_ns
 
 
-def in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
-    """Convert poses to an ENU world; the axes of the body itself stay."""
+def in_enu(trajectory: Trajectory, axes: Axes, *, of_body: bool = False) -> Trajectory:
+    """Convert poses to an ENU world; the body of a log in NED has FRD axes, which become FLU."""
     if axes == "enu":
         return trajectory
-    position, quaternion = enu_from_ned(trajectory.position, trajectory.quaternion_xyzw)
-    covariance = trajectory.covariance
-    if covariance is not None:
-        swap = np.eye(6)
-        swap[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
-        covariance = carried_covariance(swap, covariance)
-    return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
-
-
-def body_in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
-    """Convert the poses of a body: a log in NED has its body in FRD."""
-    turned = in_enu(trajectory, axes)
-    if axes == "enu":
-        return turned
-    quaternion, covariance = flu_body_from_frd(turned.quaternion_xyzw, turned.covariance)
-    return replace(turned, quaternion_xyzw=quaternion, covariance=covariance)
+    return moved(trajectory, turn=ENU_FROM_NED, new_from_old_body=FLU_FROM_FRD if of_body else None)
 
 
 def in_world(trajectory: Trajectory, place: Placement) -> Trajectory:
     """Scale and move a trajectory in the ENU axes of its source to where the source lies in the world."""
     if place == Placement():
         return trajectory
-    trajectory = scaled(trajectory, place.scale)
-    turn = turn_of(place)
-    position, quaternion = compose(
-        (np.array(place.translation), turn), (trajectory.position, trajectory.quaternion_xyzw)
-    )
-    covariance = trajectory.covariance
-    if covariance is not None and (place.yaw_deg or place.rotation_xyzw):
-        rotated = np.eye(6)
-        rotated[:3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
-        covariance = carried_covariance(rotated, covariance)
-    body = trajectory.body_xyzw
-    return replace(
-        trajectory,
-        position=position,
-        quaternion_xyzw=quaternion,
-        covariance=covariance,
-        body_xyzw=None if body is None else multiply(turn, body),
-    )
+    return moved(trajectory, turn=turn_of(place), shift=np.array(place.translation), scale=place.scale)
 
 
 def turn_of(place: Placement) -> Float:
@@ -309,15 +308,8 @@ class Projection:
 
     def trajectory(self, source: Path | str, poses: Trajectory, origin: Place) -> Trajectory:
         """Convert poses in the grid's axes to the world; covariances of positions turn with them."""
-        position = self.points(source, poses.position, origin)
-        turn = self._turn(source, poses.position, origin)
-        covariance = poses.covariance
-        if covariance is not None:
-            rotated = np.tile(np.eye(6), (len(turn), 1, 1))
-            rotated[:, :3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
-            covariance = carried_covariance(rotated, covariance)
-        quaternion = multiply(turn, poses.quaternion_xyzw)
-        return replace(poses, position=position, quaternion_xyzw=quaternion, covariance=covariance)
+        turned = moved(poses, turn=self._turn(source, poses.position, origin))
+        return replace(turned, position=self.points(source, poses.position, origin))
 
     def map(self, source: Path | str, grid: Occupancy, origin: Place) -> tuple[Occupancy, float]:
         """Convert a map to the world about its own centre; return also the largest error (m) of that.

@@ -75,8 +75,10 @@ def test_a_long_log_gives_the_same_as_its_parts() -> None:
     some = [0, 4095, 4096, 8191, 8192, 8999]
     in_body = pose_covariance_in_body(covariance, body)
     mounted = mounted_covariance(covariance, body, LEVER_ARM, camera)
-    moved = carried_covariance(logged_covariance(), covariance)
+    moved = carried_covariance(covariance, position_xyzw=body, scale=2.0)
     np.testing.assert_array_equal(in_body[some], pose_covariance_in_body(covariance[some], body[some]))
     alone = mounted_covariance(covariance[some], body[some], LEVER_ARM, camera[some])
     np.testing.assert_array_equal(mounted[some], alone)
-    np.testing.assert_array_equal(moved[some], carried_covariance(logged_covariance(), covariance[some]))
+    np.testing.assert_array_equal(
+        moved[some], carried_covariance(covariance[some], position_xyzw=body[some], scale=2.0)
+    )

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import (
+    ENU_FROM_NED,
     compose,
     conjugate,
-    enu_from_ned,
     gaps,
     interpolate_points,
     interpolate_poses,
@@ -108,7 +108,8 @@ def test_chains_of_transforms(p: Float, r: Float, q: Float, s: Float, point: Flo
 def test_north_east_down_becomes_east_north_up() -> None:
     matrix = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
     positions, quaternions = turning(np.linspace(0, 3, 5))
-    enu_positions, enu_quaternions = enu_from_ned(positions, quaternions)
+    enu_positions = rotate(ENU_FROM_NED, positions)
+    enu_quaternions = multiply(ENU_FROM_NED, quaternions)
     np.testing.assert_allclose(enu_positions, positions @ matrix.T, rtol=0, atol=1e-14)
     np.testing.assert_allclose(
         matrix_from_quaternion(enu_quaternions),

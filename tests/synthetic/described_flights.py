@@ -23,13 +23,14 @@ from pipelines.check import check
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import (
+    ENU_FROM_NED,
     compose,
-    enu_from_ned,
     invert,
     matrix_from_quaternion,
     multiply,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
+    rotate,
 )
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
@@ -461,8 +462,9 @@ def _both(pixels: Float, width: int) -> Float:
 
 def as_ned(pose: Pose) -> Pose:
     """Write the pose of a FLU body as an autopilot does: of its FRD axes, in NED."""
-    position, quaternion = enu_from_ned(*pose)  # the same exchange of axes both ways
-    return position, multiply(quaternion, turned("x", 180))
+    position, quaternion = pose  # the same exchange of axes both ways
+    turn = multiply(ENU_FROM_NED, quaternion)
+    return rotate(ENU_FROM_NED, position), multiply(turn, turned("x", 180))
 
 
 def ned_of_camera(pose: Pose) -> Pose:
