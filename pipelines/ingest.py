@@ -30,7 +30,7 @@ from pipelines.session.description import (
     assumptions_as_warnings,
     read_description,
 )
-from pipelines.session.errors import DataError, MocapError
+from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, CameraSources, Manifest, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
@@ -76,10 +76,6 @@ from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
 INGEST = Stage("ingest", revision=10)
-
-
-# Cameras that are read during hashing wait in memory: so many rows take 70 MB.
-MAX_ROWS_AHEAD = 200_000
 
 
 @dataclass(frozen=True)
@@ -135,9 +131,7 @@ def ingest(
         reader.refuse_unfit()
         stamps = source_stamps(flight, flight_path.parent)
         check_sources = partial(refuse_written, flight, flight_path.parent, stamps)
-        # If nothing can be skipped, sources are read while they are hashed.
-        meanwhile = reader.read_ahead() if force or _is_new(target) else iter(())
-        sources = hash_sources(flight, flight_path.parent, progress, meanwhile)
+        sources = hash_sources(flight, flight_path.parent, progress)
         with locked(target, create=True, overwrite=overwrite) as writable:
             run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
             if run.finished:
@@ -211,7 +205,6 @@ class _FlightReader:
         self._cameras = FlightCameras(
             flight_path, self._logs, self._files, self._poses, max_gap_ns=gap_ns, note=note
         )
-        self._ahead: dict[str, CameraData] = {}
         self.map_box: tuple[Float, Float] | None = None  # of the first map, once it is stored
 
     def __enter__(self) -> Self:
@@ -230,21 +223,6 @@ class _FlightReader:
     def _take_note(self, line: str) -> None:
         self._notes.append(as_urls(line))
 
-    def read_ahead(self) -> Iterator[str]:
-        """Read cameras in advance for `store_camera`, one after the other, up to `MAX_ROWS_AHEAD` rows.
-
-        An error ends it. The same error is raised again when that camera is stored.
-        """
-        for name in self._flight.cameras:
-            if sum(data.rows for data in self._ahead.values()) > MAX_ROWS_AHEAD:
-                return
-            try:
-                self._ahead[name] = self._read_camera(name)
-            except (MocapError, OSError):
-                self._notes.clear()
-                return
-            yield name
-
     def take_notes(self) -> list[str]:
         """Return the notes since the last call, each once."""
         taken = list(dict.fromkeys(self._notes))
@@ -255,7 +233,7 @@ class _FlightReader:
         """Write the tables of one camera, its entry and its warnings."""
         camera = self._flight.cameras[name]
         logged = self._files.is_log("pose", camera.pose)
-        data = self._ahead.pop(name, None) or self._read_camera(name)
+        data = self._read_camera(name)
         (folder / "tables").mkdir()
         store_camera(data, folder / "tables")
         entry = camera_entry(
@@ -590,11 +568,6 @@ def _refuse_other_flight(target: Path, flight: Manifest, overwrite: bool) -> Non
             "choose another place with --output, or replace it with --overwrite",
             code="exists",
         )
-
-
-def _is_new(target: Path) -> bool:
-    """Return True if no ingest was finished or interrupted here."""
-    return not any((target / entry).exists() for entry in (INGEST.name, ".partial"))
 
 
 def _counts(entries: Mapping[str, CameraEntry]) -> dict[str, object]:

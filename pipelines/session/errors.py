@@ -102,12 +102,6 @@ class DataError(MocapError):
         return type(self), (self.source, self.problem, self.remedy), {"code": self.code}
 
 
-class NoPositionsError(DataError):
-    """A log holds no position; its attitudes may be of use all the same."""
-
-    code = "no-positions"
-
-
 class NoViewsError(DataError):
     """At no time do two cameras have pictures and a pose."""
 

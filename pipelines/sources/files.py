@@ -1,7 +1,6 @@
 """Files that a manifest names for one flight: their formats, and readers in the files' axes and times."""
 
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -296,35 +295,17 @@ MIN_JOINTS_OF_A_BODY = 8
 # The diagonal of the box around a person's joints: curled up, and tall with raised arms.
 BODY_SIZE_M = (0.4, 3.0)
 
-# More threads than four read no faster from one disk.
-HASHING_THREADS = 4
 
-
-def hash_sources(
-    flight: Manifest, base: Path, progress: Progress, meanwhile: Iterator[object]
-) -> dict[str, str]:
-    """Compute the sha256 of every file that is read, by the manifest's path.
-
-    Steps of `meanwhile` run until all is hashed.
-    """
+def hash_sources(flight: Manifest, base: Path, progress: Progress) -> dict[str, str]:
+    """Compute the sha256 of every file that is read, by the manifest's path."""
     unique = flight.files
     for path in unique:  # before anything waits for one of them
         refuse_special(located(base, path))
     progress.start("Hashing sources", len(unique))
     hashes = {}
-    with ThreadPoolExecutor(
-        HASHING_THREADS
-    ) as pool:  # hashing releases the GIL, so long logs run in parallel
-        hashing = {path: pool.submit(_hash_of, located(base, path)) for path in unique}
-        try:
-            while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
-                pass
-            for path, digest in hashing.items():
-                hashes[path] = digest.result()
-                progress.advance()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    for path in unique:
+        hashes[path] = _hash_of(located(base, path))
+        progress.advance()
     return hashes
 
 

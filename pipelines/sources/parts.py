@@ -73,15 +73,6 @@ class CameraData:
     still: bool  # it stands still, with one pose
     notes: list[str]
 
-    @property
-    def rows(self) -> int:
-        """Approximate number of its rows in all tables."""
-        return (
-            len(self.frames.t_ns)
-            + len(self.trajectory.t_ns)
-            + (len(self.detections.frame) if self.detections else 0)
-        )
-
 
 def store_camera(data: CameraData, folder: Path) -> None:
     """Write the tables of one camera."""

@@ -31,16 +31,16 @@ from pipelines.geometry.poses import (
     multiply,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
+    rotate,
 )
 from pipelines.session.description import Doubt
-from pipelines.session.errors import DataError, NoPositionsError
+from pipelines.session.errors import DataError
 from pipelines.session.manifest import (
     ActorSource,
     Axes,
     CameraSources,
     FrameTimes,
     GimbalSource,
-    LogSource,
     Manifest,
     Mount,
     Placement,
@@ -51,7 +51,6 @@ from pipelines.session.records import AttitudeTrack, Occupancy, PositionTrack, T
 from pipelines.session.registries import (
     AttitudeFormat,
     CalibrationFormat,
-    Format,
     TelemetryChoice,
     TelemetryFormat,
     TrajectoryFormat,
@@ -86,7 +85,8 @@ SAME_PLACE_M = 1.0
 
 _ABOVE_TAKE_OFF = ("take-off", "stated")
 _ADD_ANGLES = (
-    "add gimbal: {file, topic, relative_to: world} with the angles of another log, or"
+    "add gimbal: {file, topic, relative_to: world} with the angles of another log,"
+    " gimbal: {file, yaw_deg: 90} with those in a GoPro's video and its first heading, or"
     " gimbal: {yaw_deg: 90, pitch_deg: -30} if the camera never turned"
 )
 _ADD_MOUNT = "say how the camera sits on the body, mount: {looks: forward, down_deg: 0}, or add a gimbal"
@@ -584,7 +584,7 @@ class FlightPoses:
             reader = self._files.format_of("pose", pose)
             if isinstance(reader, TelemetryFormat):
                 choice = self._files.options("pose", pose, TelemetryChoice)
-                self._telemetry[key] = _positions_of(reader, self._one_file(pose.file), choice)
+                self._telemetry[key] = reader.read_telemetry(self._one_file(pose.file), choice)
             else:
                 self._telemetry[key] = self._logged_telemetry(pose, self._logged(pose))
         return self._telemetry[key]
@@ -600,13 +600,18 @@ class FlightPoses:
                 axes = self._axes(pose.axes, opened.settings.axes)
                 topics = pose.topic or "", options.attitude or ""
                 found = read_pair(recording, source, *topics, axes, stamps)
+                if not (pose.axes or opened.settings.axes):
+                    found = self._upright_pair(found)
             return replace(found, dropped=dict(Counter(found.dropped) + opened.lost))
 
-    def _own_angles(self, pose: PoseSource) -> str:
-        """Return the gimbal's entry that takes the attitudes without north in the log of a pose, or ""."""
-        if self._is_log(pose):
-            return ""
-        return _entry_of_angles(self._files.format_of("pose", pose), self._one_file(pose.file))
+    def _upright_pair(self, telemetry: Telemetry) -> Telemetry:
+        """Turn positions and attitudes of separate topics upright, and scale positions that are in metres."""
+        turn, track, body = turn_of(self._upright), telemetry.position, telemetry.body
+        if not track.on_earth:
+            track = replace(track, values=self._upright.scale * rotate(turn, track.values))
+        if body is not None:
+            body = replace(body, quaternion_xyzw=multiply(turn, body.quaternion_xyzw))
+        return replace(telemetry, position=track, body=body)
 
     def log_clock(self, camera: CameraSources) -> ClockFit | None:
         """Return the fit of a drone's log clock to GPS time; None without one."""
@@ -724,41 +729,49 @@ class FlightPoses:
             DataError: the log cannot be used, does not give the camera's rotation, or its parts share
                 no time.
         """
-        pose = camera.pose
-        telemetry = self._read(pose)
+        stated = camera.pose.file
+        telemetry = self._read(camera.pose)
         for note in telemetry.notes:
             self._note(note)
-        body, gimbal = telemetry.body, angles or self._gimbal(name, camera, telemetry)
+        gimbal = angles or self._gimbal(name, camera, telemetry)
         self._refuse_unturned(name, camera, telemetry, gimbal)
-        stated = pose.file
-        settings = self._logs.settings(stated)
-        track = telemetry.position
-        since_ns = int(track.t_ns[0])
+        since_ns = int(telemetry.position.t_ns[0])
+        track, body = telemetry.position, telemetry.body
         track = replace(track, t_ns=self._world_times(stated, track.t_ns, since_ns))
         if body is not None:
             body = replace(body, t_ns=self._world_times(stated, body.t_ns, since_ns))
-        values, turned = self._in_world(name, track)
+        values, turn = self._in_world(name, track)
         self._doubt(name, track)
-
         t_ns = _fastest(track.t_ns, [part.t_ns for part in (gimbal or body,) if part is not None])
         position = interpolate_points(track.t_ns, values, t_ns, max_gap_ns=self._max_gap_ns)
-        lever_arm, rotation = self._mounted(name, camera.mount)
-        attitude = None if gimbal is None else self._at(gimbal, t_ns)
-        world_from_body = None if body is None else self._at(body, t_ns)
-        if attitude is None and world_from_body is not None:
-            position, quaternion = compose((position, world_from_body), (lever_arm, rotation))
-        elif attitude is not None and gimbal is not None:
-            if world_from_body is None:
-                world_from_body = level_heading(attitude)  # the heading is all that is known of it
-                if lever_arm.any():
-                    self._note(f"{name}: {stated} does not say how its body was turned: taken as level")
-            position, quaternion = compose_gimbal(
-                (position, world_from_body), lever_arm, attitude, rotation, relative_to=gimbal.relative_to
-            )
+        if body is not None:
+            quaternion = self._at(body, t_ns)
+        elif gimbal is not None:
+            quaternion = level_heading(self._at(gimbal, t_ns))  # the heading is all that is known of it
+            if camera.mount is not None and any(camera.mount.translation):
+                self._note(f"{name}: {stated} does not say how its body was turned: taken as level")
         else:
             raise AssertionError("refused above")
-        dropped = dict(telemetry.dropped) | (dict(gimbal.dropped) if gimbal is not None else {})
-        return self._complete(name, settings, dropped, t_ns, position, multiply(turned, quaternion))
+        if gimbal is not None and gimbal.relative_to == "world":
+            gimbal = replace(gimbal, quaternion_xyzw=multiply(turn, gimbal.quaternion_xyzw))
+        placed, turned = ~np.isnan(position[:, 0]), ~np.isnan(quaternion[:, 0])
+        known = placed & turned
+        if not known.any():
+            raise DataError(
+                self._manifest,
+                f"cameras.{name}: its positions and attitudes share no time (or are further apart than"
+                f" {self._max_gap_ns / 1e9:g} s)",
+                "check the clocks of the two logs, or raise --max-pose-gap",
+                code="no-overlap",
+            )
+        causes = {
+            "attitude without a position": int(np.count_nonzero(~placed)),
+            "position without an attitude": int(np.count_nonzero(placed & ~turned)),
+        }
+        dropped = dict(telemetry.dropped) | {cause: count for cause, count in causes.items() if count}
+        carrier = Trajectory(t_ns[known], position[known], multiply(turn, quaternion[known]), dropped=dropped)
+        poses = replace(self._on_body(name, camera, carrier, gimbal), body_xyzw=None)
+        return in_world(poses, self._logs.settings(stated).world_from_source)
 
     def _gimbal(self, name: str, camera: CameraSources, telemetry: Telemetry) -> AttitudeTrack | None:
         """Return the angles of the drone's own log, unless the body's attitudes are asked for."""
@@ -794,14 +807,8 @@ class FlightPoses:
         place = f"{self._manifest}: cameras.{name}"
         stated = camera.pose.file
         if telemetry.body is None and gimbal is None:
-            own = self._own_angles(camera.pose)
-            remedy = f"add {own} with the heading of its first picture" if own else _ADD_ANGLES
-            raise DataError(
-                place,
-                f"{stated} says where the drone was but not how it was turned",
-                remedy,
-                code="no-attitude",
-            )
+            problem = f"{stated} says where the drone was but not how it was turned"
+            raise DataError(place, problem, _ADD_ANGLES, code="no-attitude")
         if telemetry.body is None and gimbal is not None and gimbal.relative_to != "world":
             raise DataError(
                 place,
@@ -812,34 +819,6 @@ class FlightPoses:
             )
         if gimbal is None and camera.mount is None:
             raise DataError(place, f"{stated} holds no gimbal angles", _ADD_MOUNT, code="no-attitude")
-
-    def _complete(
-        self,
-        name: str,
-        settings: LogSource,
-        dropped: dict[str, int],
-        t_ns: Int64,
-        position: Float,
-        quaternion: Float,
-    ) -> Trajectory:
-        placed, turned = ~np.isnan(position[:, 0]), ~np.isnan(quaternion[:, 0])
-        known = placed & turned
-        if not known.any():
-            raise DataError(
-                self._manifest,
-                f"cameras.{name}: its positions and attitudes share no time (or are further apart than"
-                f" {self._max_gap_ns / 1e9:g} s)",
-                "check the clocks of the two logs, or raise --max-pose-gap",
-                code="no-overlap",
-            )
-        for cause, count in (
-            ("attitude without a position", np.count_nonzero(~placed)),
-            ("position without an attitude", np.count_nonzero(placed & ~turned)),
-        ):
-            if count:
-                dropped[cause] = int(count)
-        poses = Trajectory(t_ns[known], position[known], quaternion[known], dropped=dropped)
-        return in_world(poses, settings.world_from_source)
 
     def _doubt(self, name: str, track: PositionTrack) -> None:
         if len(track.t_ns) < 2:
@@ -856,36 +835,6 @@ class FlightPoses:
                 f"{name}: the horizontal position of {track.name} is {where} throughout: it had no fix, or"
                 " never moved"
             )
-        if track.accuracy_m:
-            horizontal, vertical = track.accuracy_m
-            self._note(
-                f"{name}: {track.name} states its own sigma as {horizontal:.3g} m across and {vertical:.3g} m"
-                " in height"
-            )
-
-
-def _positions_of(reader: TelemetryFormat, path: Path, choice: TelemetryChoice) -> Telemetry:
-    """Read a drone's own log; if angles of the camera are all that it holds, say what they are good for."""
-    try:
-        return reader.read_telemetry(path, choice)
-    except NoPositionsError as error:
-        entry = _entry_of_angles(reader, path)
-        if not entry:
-            raise
-        remedy = f"name another log of positions as pose, and {entry}"
-        raise DataError(error.source, error.problem, remedy, code="no-positions") from None
-
-
-def _entry_of_angles(reader: Format, path: Path) -> str:
-    """Return the manifest's entry for a log's angles without its positions; "" if it holds none."""
-    if not isinstance(reader, AttitudeFormat):
-        return ""
-    try:
-        knows_north = reader.read_attitudes(path).knows_north
-    except DataError:
-        return ""
-    heading = "" if knows_north else ", yaw_deg: 90"
-    return f"gimbal: {{file: {path.name}{heading}}}"
 
 
 def _refuse_heading(place: str, knows_north: bool, gimbal: GimbalSource) -> None:

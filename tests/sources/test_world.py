@@ -171,6 +171,30 @@ def test_a_map_and_an_actor_turn_with_the_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(actor[list(NAMES)].to_numpy(copy=True)[0], [6.0, 2.0, 4.0])
 
 
+def test_separate_topics_of_positions_and_attitudes_are_scaled_and_turned_upright(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, seconds=0.2, clean=True)
+    half = float(np.sqrt(0.5))
+    entries = []
+    for t in range(START_NS - 10**8, START_NS + 4 * 10**8, 10**8):
+        of = header(t, "map")
+        point = {"header": of, "point": {"x": 1.0, "y": 2.0, "z": 3.0}}
+        turned = {"header": of, "quaternion": {"x": half, "w": half}}
+        entries += [
+            Entry("/point", "geometry_msgs/msg/PointStamped", t, point),
+            Entry("/turned", "geometry_msgs/msg/QuaternionStamped", t, turned),
+        ]
+    write_log(tmp_path, "log", "mcap-cdr", entries)
+    camera = flight.settings["cameras"]["drone1"]
+    camera["pose"] = {"file": "log.mcap", "topic": "/point", "attitude": "/turned", "of": "body"}
+    camera["mount"] = {"looks": "forward", "translation": [0.0, 0.0, 0.1]}
+    flight.settings["world"] = {"up": "y", "scale": 2.0}
+    del flight.settings["truth"]
+    flight.save()
+    poses = pd.read_parquet(ingest(flight.manifest).folder / "cameras" / "drone1" / "poses.parquet")
+    # y is up: east is z, north is x. The body is turned by 90 deg about x: its z points to -y, down.
+    np.testing.assert_allclose(poses[list(NAMES)].to_numpy(copy=True)[0], [6.0, 2.0, 3.9], atol=1e-6)
+
+
 def subjects(folder: Path, names: tuple[str, ...]) -> SyntheticFlight:
     """Write a flight whose truth names the subject before each joint; the second stands 5 m away."""
     flight = write_flight(folder, cameras=2, seconds=0.2, clean=True)

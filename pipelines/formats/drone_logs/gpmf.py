@@ -42,7 +42,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.geometry.poses import conjugate, interpolate_points, multiply, rotate
-from pipelines.session.errors import DataError, NoPositionsError
+from pipelines.session.errors import DataError
 from pipelines.session.records import Attitudes, Height, Telemetry
 from pipelines.session.registries import TelemetryChoice
 
@@ -273,9 +273,8 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
         return at_ns, rows[:, :3], np.asarray(fixed), fit
     if (found := track.stream("GPS5", 3)) is None:
         known = ", ".join(sorted(set(track.rows) & set(_KNOWN))) or "none that is known"
-        raise NoPositionsError(
-            path, f"its telemetry holds no position (streams: {known})", "name another log of poses"
-        )
+        problem = f"its telemetry holds no position (streams: {known})"
+        raise DataError(path, problem, "name another log of poses", code="no-positions")
     at_ns, rows = found
     fixed = np.concatenate([each[:, 0] for each in track.rows["fixed"]]) >= _FIX_3D
     clock = track.stream("GPSU", 1)

@@ -18,7 +18,7 @@ from pipelines.geometry.poses import (
     interpolate_poses,
     multiply,
 )
-from pipelines.session.errors import DataError, NoPositionsError
+from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, Height, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice
 from pipelines.session.storage import code_of
@@ -58,7 +58,8 @@ def position_track(
     keep = kept_rows(t_ns, causes, found)
     if not keep.any():
         counts = ", ".join(f"{count} {cause}" for cause, count in found.items()) or "it is empty"
-        raise NoPositionsError(source, f"{name} holds no usable position ({counts})", "name another log")
+        problem = f"{name} holds no usable position ({counts})"
+        raise DataError(source, problem, "name another log", code="no-positions")
     for cause, count in found.items():
         dropped[cause] = dropped.get(cause, 0) + count
     return PositionTrack(
