@@ -60,7 +60,7 @@ def write_spotted_flight(folder: Path, frames: int) -> Path:
 def spot_detector(folder: Path) -> str:
     """Return the value of `--detector`: models that find the spots, and a person in every picture."""
     pose = heatmap_model(folder / "pose.onnx", bands=3)
-    box = np.array([(100.0, 60.0, 220.0, 180.0, 0.9)], np.float32)
+    box = np.array([[(100.0, 60.0, 220.0, 180.0, 0.9)]], np.float32)
     people = constant_model(folder / "people.onnx", (320, 320), {"dets": box})
     return f"onnx:{pose},people={people},mean=0/0/0,std=255/255/255,provider=cpu"
 
