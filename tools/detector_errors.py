@@ -20,16 +20,14 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.optimize import isotonic_regression
 
 from pipelines.detect import detect
 from pipelines.geometry.arrays import Float
 from pipelines.ingest import ingest
-from pipelines.keypoints import calibration
-from pipelines.keypoints.calibration import (
-    Calibration,
-    fit,
-    write_calibration,
-)
+from pipelines.keypoints.calibration import ANY_JOINT as ANY_GROUP
+from pipelines.keypoints.calibration import COLUMNS as CALIBRATED
+from pipelines.keypoints.calibration import file_of
 from pipelines.session.people import get_skeleton
 from pipelines.session.registries import find_detector
 from pipelines.session.stages import locked
@@ -48,6 +46,7 @@ LOOKS = (
 SECONDS, RATE_HZ = 12, 10
 COMMAND = "python tools/detector_errors.py --write"
 JOINTS = get_skeleton("coco17").joints
+MIN_KEYPOINTS = 20  # a knot of so many is known to about 0.1
 GOOD = 0.05  # of the person's height
 GROSS = 0.1  # of the person's height: beyond that a joint counts as missed
 SOMEBODY_ELSE = 0.5  # of the person's height: a detection further away is not the actor's
@@ -84,7 +83,7 @@ def main() -> None:
                 print(*row)
             if options.write:
                 write_table(name, by_tilt)
-                write_calibration(calibration.file_of(name), calibrated(by_tilt))
+                write_calibration(name, by_tilt)
 
 
 def scenario_text(tilt_deg: int, look: int) -> str:
@@ -162,18 +161,42 @@ def write_table(detector: str, by_tilt: dict[int, list[Sightings]]) -> None:
         writer.writerows(table_rows(by_tilt))
 
 
-def calibrated(by_tilt: dict[int, list[Sightings]]) -> Calibration:
-    """Fit the calibration of confidences over all tilts together."""
+def write_calibration(detector: str, by_tilt: dict[int, list[Sightings]]) -> None:
+    """Fit the probabilities of confidences over all tilts together, and write them by group of joints."""
     flights = [flight for own in by_tilt.values() for flight in own]
     share = np.concatenate([flight.error_px / flight.height_px[:, None] for flight in flights])
-    return fit(
-        np.concatenate([flight.confidence for flight in flights]),
-        share <= GOOD,
-        JOINTS,
-        groups=("eye", "ear", "wrist", "hip", "knee", "ankle"),
-        origin=COMMAND,
-        good=f"within {100 * GOOD:g} % of the person's height in the picture",
+    confidence = np.concatenate([flight.confidence for flight in flights])
+    with file_of(detector).open("w", encoding="utf-8", newline="") as file:
+        good = f"within {100 * GOOD:g} % of the person's height in the picture"
+        file.write(f"# made by: {COMMAND}\n# probability that a joint is {good}\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(CALIBRATED)
+        for group in (ANY_GROUP, "ankle", "ear", "eye", "hip", "knee", "wrist"):
+            of = [j for j, joint in enumerate(JOINTS) if group in (ANY_GROUP, joint.split("_")[-1])]
+            raw, near = confidence[:, of].ravel(), (share <= GOOD)[:, of].ravel()
+            found = np.isfinite(raw) & (raw > 0)
+            for level, probability, count in knots_of(raw[found], near[found].astype(np.float64)):
+                writer.writerow([group, f"{level:.6g}", f"{probability:.6g}", int(count)])
+
+
+def knots_of(confidence: Float, outcome: Float) -> Float:
+    """Compute knots [K, 3]: mean confidence, probability and count of each block of at least 20 keypoints.
+
+    Equal confidences are pooled first. Consecutive ones are pooled to at least 20, because small blocks at
+    either end would otherwise have probabilities of 0 and 1.
+    """
+    level, inverse = np.unique(confidence, return_inverse=True)
+    count = np.bincount(inverse).astype(np.float64)
+    good = np.bincount(inverse, weights=outcome)
+    begun = (np.cumsum(count) - count) // MIN_KEYPOINTS
+    bins = np.minimum(begun, max(count.sum() // MIN_KEYPOINTS - 1, 0)).astype(int)
+    _, bins = np.unique(bins, return_inverse=True)
+    total, middle, share = (
+        np.bincount(bins, weights=w).astype(np.float64) for w in (count, count * level, good)
     )
+    fitted = isotonic_regression(share / total, weights=total)
+    firsts, pooled = fitted.blocks[:-1], fitted.weights
+    return np.column_stack([np.add.reduceat(middle, firsts) / pooled, fitted.x[firsts], pooled])
 
 
 def table_rows(by_tilt: dict[int, list[Sightings]]) -> Iterator[tuple[str, ...]]:

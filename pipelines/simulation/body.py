@@ -39,9 +39,9 @@ from pipelines.simulation.body_outfits import (
     neutral_offsets,
     neutral_turns,
 )
+from pipelines.simulation.raster import TriangleSurface
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, BodyMotion, Rig
 from pipelines.simulation.scenario import Body
-from pipelines.simulation.surfaces import TriangleSurface
 
 _ASSET = Path(__file__).parent / "data" / "body.npz"
 # Transforms of so many frames take 5 MB, however long the motion.

@@ -16,7 +16,6 @@ import numpy as np
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import invert, transform
-from pipelines.session.errors import DataError
 from pipelines.session.people import mirrored
 from pipelines.simulation.scenario import DetectorErrors, ModelledDetector
 
@@ -69,14 +68,8 @@ class ErrorTable:
         """Return median error share, missed share and confidence, each [T, J].
 
         Linear between the measured tilts; beyond them as at the nearest.
-
-        Raises:
-            ValueError: a joint has no rows, and there are none for all others.
         """
-        missing = [name for name in joints if name not in self.rows and ANY_JOINT not in self.rows]
-        if missing:
-            raise ValueError(f"no errors were measured for {', '.join(missing)}")
-        tables = [self.rows.get(name, self.rows.get(ANY_JOINT, np.empty((0, 4)))) for name in joints]
+        tables = [self.rows.get(name, self.rows[ANY_JOINT]) for name in joints]
         values = np.empty((3, len(tilt_deg), len(joints)))
         for j, table in enumerate(tables):
             for k in range(3):
@@ -91,45 +84,12 @@ def errors_of(detector: str) -> Path:
 
 @lru_cache(maxsize=4)
 def read_errors(path: Path) -> ErrorTable:
-    """Read the measured errors: a CSV with `COLUMNS`; lines that begin with # give their source.
-
-    Raises:
-        DataError: no such file, other columns, something that is no number or out of range, a tilt twice.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(path, f"cannot be read: {error}", "make it again", code="damaged") from error
-    rows = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
-    if not rows or tuple(rows[0]) != COLUMNS:
-        raise DataError(
-            path,
-            "is no table of detector errors",
-            f"its header must be {','.join(COLUMNS)}",
-            code="wrong-kind",
-        )
+    """Read the measured errors: a CSV with `COLUMNS`; lines that begin with # give their source."""
+    lines = path.read_text(encoding="utf-8").splitlines()
     by_joint: dict[str, list[list[float]]] = {}
-    for row in rows[1:]:
-        by_joint.setdefault(row[1] if len(row) > 1 else "", []).append(_numbers(path, row))
-    tables = {joint: np.array(sorted(values)) for joint, values in by_joint.items()}
-    if not tables or any((np.diff(table[:, 0]) <= 0).any() for table in tables.values()):
-        raise DataError(
-            path, "has no rows, or a tilt twice for one joint", "give every tilt once", code="bad-value"
-        )
-    return ErrorTable(tables)
-
-
-def _numbers(path: Path, row: list[str]) -> list[float]:
-    """Parse tilt, error, missed share and confidence of one row."""
-    try:
-        tilt, _, error, missed, confidence = row
-        values = [float(text) for text in (tilt, error, missed, confidence)]
-    except ValueError:
-        values = [np.nan]
-    in_range = np.isfinite(values).all() and min(values[1:]) >= 0 and max(values[2:]) <= 1
-    if not in_range:
-        raise DataError(path, f"has a row {','.join(row)}", "give a tilt, a joint and three shares")
-    return values
+    for tilt, joint, *numbers in list(csv.reader(line for line in lines if not line.startswith("#")))[1:]:
+        by_joint.setdefault(joint, []).append([float(number) for number in (tilt, *numbers)])
+    return ErrorTable({joint: np.array(sorted(values)) for joint, values in by_joint.items()})
 
 
 # --- the detector --------------------------------------------------------------------------------------
@@ -207,9 +167,6 @@ def detect_keypoints(
     Returns:
         [T, J, 2] px, NaN for missed joints, and confidences [T, J] above 0 and at most 1; 0 for missed
         joints.
-
-    Raises:
-        ValueError: a joint without measured errors.
     """
     table = read_errors(errors_of(errors.detector)) if table is None else table
     median_share, measured_missed, mean_confidence = table.at(tilt_deg, joints)

@@ -29,10 +29,10 @@ from pipelines.simulation.flying import (
     sample_log,
 )
 from pipelines.simulation.motion_script import perform
+from pipelines.simulation.raster import TriangleSurface, hidden_by
 from pipelines.simulation.retarget import retarget
 from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Actor, Scenario
-from pipelines.simulation.surfaces import TriangleSurface, hidden_by
 from pipelines.simulation.world import World, build_world, raise_mounds
 
 Moving = Callable[[Float], BodyMotion]

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.compilation import cached, helper
 from pipelines.geometry.mounting import attitude_from_angles, body_from_camera
 from pipelines.geometry.noise import GaussMarkov, NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import (
@@ -274,8 +273,7 @@ class _Flight(NamedTuple):
             self.position[:, rows],
             self.velocity[:, rows],
             self.acceleration[:, rows],
-            self.limits.speed_mps,
-            self.limits.acceleration_mps2,
+            self.limits,
         )
 
     def paths(self, aim: Float) -> DronePaths:
@@ -315,10 +313,7 @@ def _leaning(acceleration: Float, velocity: Float, heading: Float) -> Float:
 
 def _followed(angle: Float, t_s: Float, lag_s: float, fastest_radps: float) -> Float:
     """Compute angles [N, T] of something that turns after `angle` and starts there."""
-    target = np.unwrap(angle, axis=1) if angle.size else angle
-    followed = target.copy()
-    _follow(t_s, target, lag_s, fastest_radps, followed)
-    return followed
+    return _follow(t_s, np.unwrap(angle, axis=1) if angle.size else angle, lag_s, fastest_radps)
 
 
 def _unit(vectors: Float) -> Float:
@@ -329,30 +324,32 @@ def _unit(vectors: Float) -> Float:
 # --- the integration -----------------------------------------------------------------------------------
 
 
-@helper
-def _steps(span_s: float) -> int:
-    """Return the number of equal steps of an interval; the margin is for rounding alone."""
-    return max(1, math.ceil(span_s / STEP_S - 1e-6))
+def _substeps(t_s: Float, k: int) -> tuple[int, float]:
+    """Return number and length (s) of the equal steps to the next moment; the margin is for rounding."""
+    span_s = float(t_s[k + 1] - t_s[k])
+    steps = max(1, math.ceil(span_s / STEP_S - 1e-6))
+    return steps, span_s / steps
 
 
-@helper
-def _shorten(vector: Float, longest: float) -> None:
-    """Limit the length of [3] to `longest`, in place; keep the direction."""
-    length = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    if length > longest:
-        vector *= longest / length
+def _length(vectors: Float) -> Float:
+    """Compute the lengths [N, 1] of vectors [N, 3]."""
+    x, y, z = vectors.T
+    return np.asarray(np.sqrt(x**2 + y**2 + z**2)[:, None])
 
 
-@helper
-def _approach(distance_m: float, braking_mps2: float) -> float:
+def _shortened(vectors: Float, longest: float) -> Float:
+    """Limit the lengths of vectors [N, 3] to `longest`; keep the directions."""
+    length = _length(vectors)
+    return np.where(length > longest, vectors * (longest / np.maximum(length, longest)), vectors)
+
+
+def _approach(distance_m: Float, braking_mps2: float) -> Float:
     """Compute the speed towards a slot: in proportion while near, such that it can stop while far."""
     near = braking_mps2 / POSITION_GAIN_PER_S**2
-    if distance_m <= near:
-        return POSITION_GAIN_PER_S * distance_m
-    return math.sqrt(2 * braking_mps2 * (distance_m - near / 2))
+    far = np.sqrt(np.maximum(2 * braking_mps2 * (distance_m - near / 2), 0.0))
+    return np.where(distance_m <= near, POSITION_GAIN_PER_S * distance_m, far)
 
 
-@cached
 def _track(
     t_s: Float,
     slot: Float,
@@ -360,49 +357,41 @@ def _track(
     position: Float,
     velocity: Float,
     acceleration: Float,
-    speed_limit: float,
-    acceleration_limit: float,
+    limits: Limits,
 ) -> None:
-    """Fly from the first row of the last three arrays [N, T, 3], and write their other rows."""
-    kept = _BRAKING_SHARE * acceleration_limit
-    for n in range(position.shape[0]):
-        at, moving, pushed = position[n, 0].copy(), velocity[n, 0].copy(), acceleration[n, 0].copy()
-        for k in range(len(t_s) - 1):
-            steps = _steps(t_s[k + 1] - t_s[k])
-            step_s = (t_s[k + 1] - t_s[k]) / steps
-            response = 1 - math.exp(-step_s / ATTITUDE_LAG_S)
-            for m in range(steps):
-                share = m / steps
-                missing = slot[n, k] + share * (slot[n, k + 1] - slot[n, k]) - at
-                distance = math.sqrt(missing[0] ** 2 + missing[1] ** 2 + missing[2] ** 2)
-                wanted = slot_velocity[n, k] + share * (slot_velocity[n, k + 1] - slot_velocity[n, k])
-                if distance > 0:
-                    wanted += missing * (_approach(distance, kept) / distance)
-                _shorten(wanted, speed_limit)
-                push = VELOCITY_GAIN_PER_S * (wanted - moving)
-                _shorten(push, acceleration_limit)
-                pushed += response * (push - pushed)
-                faster = moving + pushed * step_s
-                _shorten(faster, speed_limit)
-                at += (moving + faster) * (step_s / 2)
-                pushed = (faster - moving) / step_s
-                moving = faster
-            position[n, k + 1], velocity[n, k + 1], acceleration[n, k + 1] = at, moving, pushed
+    """Fly from the first row of the arrays [N, T, 3] of the motion, and write their other rows."""
+    kept = _BRAKING_SHARE * limits.acceleration_mps2
+    at, moving, pushed = position[:, 0], velocity[:, 0], acceleration[:, 0]
+    for k in range(len(t_s) - 1):
+        steps, step_s = _substeps(t_s, k)
+        response = 1 - math.exp(-step_s / ATTITUDE_LAG_S)
+        for m in range(steps):
+            share = m / steps
+            missing = slot[:, k] + share * (slot[:, k + 1] - slot[:, k]) - at
+            distance = _length(missing)
+            wanted = slot_velocity[:, k] + share * (slot_velocity[:, k + 1] - slot_velocity[:, k])
+            towards = np.divide(_approach(distance, kept), distance, where=distance > 0, out=0 * distance)
+            wanted = _shortened(wanted + missing * towards, limits.speed_mps)
+            push = _shortened(VELOCITY_GAIN_PER_S * (wanted - moving), limits.acceleration_mps2)
+            pushed = pushed + response * (push - pushed)
+            faster = _shortened(moving + pushed * step_s, limits.speed_mps)
+            at = at + (moving + faster) * (step_s / 2)
+            pushed = (faster - moving) / step_s
+            moving = faster
+        position[:, k + 1], velocity[:, k + 1], acceleration[:, k + 1] = at, moving, pushed
 
 
-@cached
-def _follow(t_s: Float, target: Float, lag_s: float, fastest_radps: float, angle: Float) -> None:
-    """Turn after angles [N, T] from the first row of `angle`, and write its other rows."""
-    for n in range(target.shape[0]):
-        now = angle[n, 0] if len(t_s) else 0.0
-        for k in range(len(t_s) - 1):
-            steps = _steps(t_s[k + 1] - t_s[k])
-            step_s = (t_s[k + 1] - t_s[k]) / steps
-            for m in range(steps):
-                wanted = target[n, k] + m / steps * (target[n, k + 1] - target[n, k])
-                rate = (wanted - now) / lag_s
-                now += min(max(rate, -fastest_radps), fastest_radps) * step_s
-            angle[n, k + 1] = now
+def _follow(t_s: Float, target: Float, lag_s: float, fastest_radps: float) -> Float:
+    """Turn after angles [N, T] and start there."""
+    angle = target.copy()
+    now = angle[:, 0] if len(t_s) else np.zeros(len(angle))
+    for k in range(len(t_s) - 1):
+        steps, step_s = _substeps(t_s, k)
+        for m in range(steps):
+            wanted = target[:, k] + m / steps * (target[:, k + 1] - target[:, k])
+            now = now + np.clip((wanted - now) / lag_s, -fastest_radps, fastest_radps) * step_s
+        angle[:, k + 1] = now
+    return angle
 
 
 # --- recorders -----------------------------------------------------------------------------------------

@@ -8,15 +8,89 @@ once.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bytes, Float, Float32, Int32
+from pipelines.geometry.arrays import Bool, Bytes, Float, Float32, Int32
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.compilation import cached
-from pipelines.simulation.surfaces import TriangleSurface
+
+
+@dataclass(frozen=True)
+class TriangleSurface:
+    """Triangles with a colour at each corner, seen from both sides.
+
+    `smooth` surfaces are shaded with normals averaged at their corners, others face by face. Where
+    `ground` is True the colour is multiplied by the renderer's ground texture at (x, y).
+    """
+
+    vertices: Float  # [V, 3] m, world
+    faces: NDArray[np.int32]  # [F, 3], counterclockwise seen from outside
+    colour: NDArray[np.float32]  # [V, 3] RGB reflectance, 0..1, linear
+    smooth: bool = True
+    ground: bool = False
+
+
+def joined(*surfaces: TriangleSurface) -> TriangleSurface:
+    """Join several surfaces of one kind to one.
+
+    Raises:
+        ValueError: they differ in `smooth` or `ground`, or there are none.
+    """
+    if len({(s.smooth, s.ground) for s in surfaces}) != 1:
+        raise ValueError("only surfaces of one kind can be joined")
+    first = np.cumsum([0, *(len(s.vertices) for s in surfaces[:-1])])
+    return TriangleSurface(
+        np.concatenate([s.vertices for s in surfaces]),
+        np.concatenate([s.faces + k for s, k in zip(surfaces, first, strict=True)]).astype(np.int32),
+        np.concatenate([s.colour for s in surfaces]),
+        surfaces[0].smooth,
+        surfaces[0].ground,
+    )
+
+
+def hidden_by(surface: TriangleSurface, eye: Float, targets: Float) -> Bool:
+    """Test if a surface, whose both sides hide, stands between an eye [3] and targets [N, 3] m, world.
+
+    Exact up to rounding, which counts where a line runs through the edge of a triangle. False for a target
+    with NaN.
+    """
+    out = np.empty(len(targets), dtype=np.bool_)
+    eye, targets = np.ascontiguousarray(eye, np.float64), np.ascontiguousarray(targets, np.float64)
+    _meets(np.ascontiguousarray(surface.vertices, np.float64), surface.faces, eye, targets, out)
+    return out
+
+
+@cached
+def _meets(vertices: Float, faces: NDArray[np.int32], eye: Float, targets: Float, out: Bool) -> None:
+    """Moeller and Trumbore 1997, "Fast, minimum storage ray/triangle intersection", between two points."""
+    for n in range(len(targets)):
+        wx, wy, wz = targets[n, 0] - eye[0], targets[n, 1] - eye[1], targets[n, 2] - eye[2]
+        out[n] = False
+        for f in range(len(faces)):
+            a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+            ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+            vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+            px, py, pz = wy * vz - wz * vy, wz * vx - wx * vz, wx * vy - wy * vx
+            volume = ux * px + uy * py + uz * pz
+            if volume == 0.0:  # the line runs within the triangle's plane
+                continue
+            sx, sy, sz = eye[0] - a[0], eye[1] - a[1], eye[2] - a[2]
+            first = (sx * px + sy * py + sz * pz) / volume
+            if not 0.0 <= first <= 1.0:
+                continue
+            qx, qy, qz = sy * uz - sz * uy, sz * ux - sx * uz, sx * uy - sy * ux
+            second = (wx * qx + wy * qy + wz * qz) / volume
+            if second < 0.0 or first + second > 1.0:
+                continue
+            along = (vx * qx + vy * qy + vz * qz) / volume
+            if 0.0 < along < 1.0:
+                out[n] = True
+                break
+
 
 SMOOTH, GROUND = 1, 2
 
@@ -62,24 +136,15 @@ def _single(surface: TriangleSurface) -> Mesh:
     )
 
 
-@cached
 def _corner_normals(vertices: Float, faces: Int32) -> Float32:
+    a, b, c = (vertices[corner] for corner in faces.T)
+    (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
+    across = np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
     sums = np.zeros_like(vertices)
-    for f in range(len(faces)):
-        a, b, c = faces[f]
-        ux, uy, uz = vertices[b] - vertices[a]
-        vx, vy, vz = vertices[c] - vertices[a]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        for k in (a, b, c):
-            sums[k, 0] += nx
-            sums[k, 1] += ny
-            sums[k, 2] += nz
-    normals = np.empty(vertices.shape, np.float32)
-    for i in range(len(sums)):
-        x, y, z = sums[i]
-        length = max(np.sqrt(x * x + y * y + z * z), 1e-30)
-        normals[i, 0], normals[i, 1], normals[i, 2] = x / length, y / length, z / length
-    return normals
+    np.add.at(sums, faces.ravel(), np.repeat(across, 3, axis=0))
+    x, y, z = sums.T
+    length = np.maximum(np.sqrt(x * x + y * y + z * z), 1e-30)
+    return np.asarray(sums / length[:, None], np.float32)
 
 
 _EMPTY = TriangleSurface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
@@ -205,17 +270,9 @@ def draw(triangles: Projected, chosen: Int32, shifts_px: Float, first_sample_row
                     seen[row, column + np.uint64(k)] = face
 
 
-@cached
 def _in_camera(vertices: Float, position: Float, world_from_camera: Float) -> Float:
-    points = np.empty_like(vertices)
-    for i in range(len(vertices)):
-        x = vertices[i, 0] - position[0]
-        y = vertices[i, 1] - position[1]
-        z = vertices[i, 2] - position[2]
-        for k in range(3):
-            points[i, k] = (
-                x * world_from_camera[0, k] + y * world_from_camera[1, k] + z * world_from_camera[2, k]
-            )
+    x, y, z = (vertices - position).T[..., None]
+    points: Float = x * world_from_camera[0] + y * world_from_camera[1] + z * world_from_camera[2]
     return points
 
 
@@ -475,18 +532,12 @@ def shadow_map(mesh: Mesh, region: Float, axes: Float, *, finest_m: float, most_
 
 def sunlight(maps: Sequence[ShadowMap], axes: Float, fragments: Fragments, count: int) -> Float32:
     """Compute the cosine of the sun's incidence times its share that reaches each fragment, [N]."""
-    sun = np.empty(count, np.float32)
-    _face_sun(fragments.normal, axes[2], sun)
+    x, y, z = fragments.normal[:count].T
+    towards = axes[2]
+    sun = np.asarray(np.maximum(x * towards[0] + y * towards[1] + z * towards[2], 0.0), np.float32)
     for each in maps:
         _cast(*each, axes, fragments.point, fragments.normal, sun)
     return sun
-
-
-@cached
-def _face_sun(normal: Float32, towards: Float, sun: Float32) -> None:
-    for i in range(len(sun)):
-        cosine = normal[i, 0] * towards[0] + normal[i, 1] * towards[1] + normal[i, 2] * towards[2]
-        sun[i] = max(cosine, 0.0)
 
 
 @cached
@@ -541,24 +592,9 @@ def _cast(
         sun[i] *= lit / 9.0
 
 
-@cached
 def _edges(height: Float32, step: float) -> Bytes:
     """Mark texels where heights within the 4 x 4 texels of a look-up differ by more than a step."""
-    rows, width = height.shape
-    lowest, highest = np.empty((rows, width), np.float32), np.empty((rows, width), np.float32)
-    for i in range(rows):
-        for j in range(width):
-            begin, end = max(j - 1, 0), min(j + 2, width - 1)
-            low, high = height[i, begin], height[i, begin]
-            for c in range(begin + 1, end + 1):
-                low, high = min(low, height[i, c]), max(high, height[i, c])
-            lowest[i, j], highest[i, j] = low, high
-    edge = np.empty((rows, width), np.uint8)
-    for i in range(rows):
-        begin, end = max(i - 1, 0), min(i + 2, rows - 1)
-        for j in range(width):
-            low, high = lowest[begin, j], highest[begin, j]
-            for r in range(begin + 1, end + 1):
-                low, high = min(low, lowest[r, j]), max(high, highest[r, j])
-            edge[i, j] = 1 if high > low + step else 0
-    return edge
+    import cv2
+
+    lowest, highest = (of(height, np.ones((4, 4), np.uint8), anchor=(1, 1)) for of in (cv2.erode, cv2.dilate))
+    return np.asarray(highest > np.asarray(lowest, np.float64) + step, np.uint8)

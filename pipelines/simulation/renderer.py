@@ -6,20 +6,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Bytes, Float, Float32
+from pipelines.geometry.arrays import Bytes, Float, Float32
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.compilation import cached
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.simulation.raster import (
-    CENTRES_PX,
     GROUND,
-    NOTHING,
     SHIFTS_PX,
     SUBROWS,
-    Band,
     CameraView,
     Mesh,
     ShadowMap,
+    TriangleSurface,
     bands,
     draw,
     empty_band,
@@ -33,7 +31,6 @@ from pipelines.simulation.raster import (
     sunlight,
 )
 from pipelines.simulation.shading import ground_texture, paint, shade
-from pipelines.simulation.surfaces import TriangleSurface
 
 # A cubic spline between rays so far apart is right to 1e-5 px.
 _KNOT_PX = 8
@@ -341,43 +338,6 @@ class Renderer:
             sun = sunlight(shadows, self._axes, fragments, count)
             shade(fragments, count, sun, sky, first_row, view, rows)
         return light[part.start - top : part.stop - top]
-
-    def silhouette(
-        self,
-        position: Float,
-        quaternion_xyzw: Float,
-        person: TriangleSurface,
-        others: Sequence[TriangleSurface] = (),
-    ) -> Bool:
-        """Return the pixels [H, W] at whose centres the camera sees the person, without distortion.
-
-        `others` are surfaces that may stand in front, besides the static ones; poses are those of
-        `picture`.
-        """
-        meshes = [mesh_of([person]), self._static, *(mesh_of([other]) for other in others)]
-        seen = self._at_centres(position, quaternion_xyzw, stacked(meshes)).source
-        mine: Bool = (seen != NOTHING) & (seen < len(person.faces))
-        return mine
-
-    def depth(
-        self, position: Float, quaternion_xyzw: Float, people: Sequence[TriangleSurface] = ()
-    ) -> Float32:
-        """Return the depth [H, W] m at pixels' centres, along the optical axis, without distortion.
-
-        It is infinite where no surface is seen; poses are those of `picture`.
-        """
-        mesh = stacked([self._static, *(mesh_of([person]) for person in people)])
-        nearness = self._at_centres(position, quaternion_xyzw, mesh).nearness
-        depth = np.full_like(nearness, np.inf)
-        return np.divide(np.float32(1), nearness, out=depth, where=nearness > 0)
-
-    def _at_centres(self, position: Float, quaternion_xyzw: Float, mesh: Mesh) -> Band:
-        rotation = matrix_from_quaternion(np.asarray(quaternion_xyzw, np.float64))
-        position = np.asarray(position, np.float64)
-        triangles = projected(mesh.vertices, mesh.faces, position, rotation, self._intrinsics)
-        band = empty_band(self._intrinsics.height, self._intrinsics.width)
-        draw(triangles, np.arange(len(triangles.source), dtype=np.int32), CENTRES_PX, 0, band)
-        return band
 
 
 def _land(static: Mesh) -> Float:

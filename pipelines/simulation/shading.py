@@ -51,23 +51,15 @@ def shade(
     )
 
 
-@cached
 def _fill_sky(share: Float32, first_row: int, turn: Float, pinhole: Float, light: Float32) -> None:
     """Fill in the sky: paler towards the horizon, and below it as at it; black where none is seen."""
-    width = light.shape[1]
-    for row in range(light.shape[0]):
-        down = (first_row + row - pinhole[3]) / pinhole[1]
-        for x in range(width):
-            seen = share[row * width + x]
-            if seen == 0.0:
-                light[row, x, 0] = light[row, x, 1] = light[row, x, 2] = 0.0
-                continue
-            right = (x - pinhole[2]) / pinhole[0]
-            dz = turn[2, 0] * right + turn[2, 1] * down + turn[2, 2]
-            sine = max(dz / np.sqrt(right * right + down * down + 1.0), 0.0)
-            low = (1.0 - sine) * (1.0 - sine) * (1.0 - sine)
-            for c in range(3):
-                light[row, x, c] = seen * (ZENITH_RGB[c] + low * (HORIZON_RGB[c] - ZENITH_RGB[c]))
+    rows, width, _ = light.shape
+    down = (first_row + np.arange(rows)[:, None] - pinhole[3]) / pinhole[1]
+    right = (np.arange(width) - pinhole[2]) / pinhole[0]
+    dz = turn[2, 0] * right + turn[2, 1] * down + turn[2, 2]
+    sine = np.maximum(dz / np.sqrt(right * right + down * down + 1.0), 0.0)
+    low = ((1.0 - sine) * (1.0 - sine) * (1.0 - sine))[..., None]
+    light[:] = share[: rows * width].reshape(rows, width, 1) * (ZENITH_RGB + low * (HORIZON_RGB - ZENITH_RGB))
 
 
 @cached

@@ -1,4 +1,14 @@
-"""The ground with its mounds, trees and walls: exact solids, their places, surfaces and map."""
+"""The ground with its mounds, trees and walls: exact solids, their places, surfaces and map.
+
+Shapes are rows of numbers, all in metres of the world:
+
+- mound: x, y, cos yaw, sin yaw, sigma along, sigma across, height
+- trunk, an upright capped cylinder: x, y, low z, high z, radius
+- crown, an ellipsoid: x, y, z, horizontal semi-axis, vertical semi-axis; crown k belongs to trunk k
+- slab, an upright box: x, y, cos yaw, sin yaw, half length, half thickness, low z, high z
+
+Solids are open sets: a point that only touches them is not hidden.
+"""
 
 import math
 from collections.abc import Sequence
@@ -8,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int32, Int64
+from pipelines.geometry.compilation import cached
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 from pipelines.simulation import scenario
-from pipelines.simulation import world_kernels as kernels
-from pipelines.simulation.surfaces import TriangleSurface, joined
+from pipelines.simulation.raster import TriangleSurface, joined
 
 
 @dataclass(frozen=True)
@@ -22,23 +32,14 @@ class MoundedGround:
     a and b are the distances from a mound's centre along its yawed axes, in its sigmas.
     """
 
-    mounds: Float  # [M, 7] as `kernels` explains
+    mounds: Float  # [M, 7]
 
     def height(self, xy: Float) -> Float:
         """Compute the ground's height, m, [...] at points [..., 2]; NaN at NaN where there are mounds."""
-        points = _rows(xy, 2)
+        points = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2)
         out = np.empty(len(points))
-        kernels.heights(self.mounds, points, out)
+        _heights(self.mounds, points, out)
         return out.reshape(np.shape(xy)[:-1])
-
-    def normal(self, xy: Float) -> Float:
-        """Compute unit normals of the ground [..., 3], pointing up, at points [..., 2]."""
-        points = _rows(xy, 2)
-        slope = np.zeros((len(points), 2))
-        kernels.gradients(self.mounds, points, slope)
-        upward = np.concatenate([-slope, np.ones((len(points), 1))], axis=1)
-        unit: Float = upward / np.sqrt((upward**2).sum(axis=1, keepdims=True))
-        return unit.reshape(*np.shape(xy)[:-1], 3)
 
     @property
     def slope(self) -> float:
@@ -64,6 +65,19 @@ class MoundedGround:
         return total
 
 
+@cached
+def _heights(mounds: Float, xy: Float, out: Float) -> None:
+    # Compiled for the exponential of the C library: NumPy's differs in the last digit between processors.
+    for n in range(len(xy)):
+        total = 0.0
+        for k in range(len(mounds)):
+            east, north = xy[n, 0] - mounds[k, 0], xy[n, 1] - mounds[k, 1]
+            along = (mounds[k, 2] * east + mounds[k, 3] * north) / mounds[k, 4]
+            across = (mounds[k, 2] * north - mounds[k, 3] * east) / mounds[k, 5]
+            total += mounds[k, 6] * math.exp(-0.5 * (along * along + across * across))
+        out[n] = total
+
+
 def raise_mounds(mounds: Sequence[scenario.Mound]) -> MoundedGround:
     """Return the ground that a scenario describes."""
     rows = [
@@ -77,11 +91,6 @@ def raise_mounds(mounds: Sequence[scenario.Mound]) -> MoundedGround:
         for m in mounds
     ]
     return MoundedGround(np.array(rows, dtype=np.float64).reshape(-1, 7))
-
-
-def _rows(points: Float, columns: int) -> Float:
-    """Return points as [N, columns] for the kernels."""
-    return np.ascontiguousarray(points, dtype=np.float64).reshape(-1, columns)
 
 
 # Beyond this the horizon is less than two pixels away for a drone at 5 m.
@@ -241,7 +250,7 @@ _MOST_BURIED_M = 50.0
 
 @dataclass(frozen=True)
 class Obstacles:
-    """Solids on the ground, as rows of numbers that `kernels` explains. Tree k has trunk and crown k."""
+    """Solids on the ground, as rows of numbers. Tree k has trunk and crown k."""
 
     trunks: Float  # [T, 5]
     crowns: Float  # [T, 5]
@@ -489,30 +498,18 @@ class World:
         """Compute the height of the ground [...], m, at points [..., 2]."""
         return self.terrain.height(xy)
 
-    def normal(self, xy: Float) -> Float:
-        """Compute unit normals [..., 3] of the ground, pointing up, at points [..., 2]."""
-        return self.terrain.normal(xy)
-
     def surfaces(self) -> list[TriangleSurface]:
         """Return the visible surfaces: the ground out to the horizon, then trunks, crowns and walls if any.
 
         The ground is within 2 cm of `height`, trunks within 4 % of their radius, walls exact. Crowns are
-        ragged: leaves end up to a fifth beyond or three tenths short of the ellipsoid of `solid` and
-        `hidden`. From any side, the two outlines share about nine tenths of their union.
+        ragged: leaves end up to a fifth beyond or three tenths short of the ellipsoid of `hidden`.
+        From any side, the two outlines share about nine tenths of their union.
         """
         return [
             ground_surface(self.ground, self.terrain),
             *tree_surfaces(self.obstacles, self.seed),
             *wall_surfaces(self.obstacles, self.seed),
         ]
-
-    def solid(self, points: Float) -> Bool:
-        """Test if points [..., 3] are below the ground or inside a trunk, crown or wall; False for NaN."""
-        rows = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
-        out = np.empty(len(rows), dtype=np.bool_)
-        solids = self.obstacles
-        kernels.inside(rows, self.terrain.mounds, solids.trunks, solids.crowns, solids.slabs, out)
-        return out.reshape(np.shape(points)[:-1])
 
     def hidden(self, eye: Float, target: Float) -> Bool:
         """Test if something solid stands between eyes and targets, [..., 3] each, broadcast.
@@ -522,29 +519,153 @@ class World:
         hidden, and from there everything is hidden; False for NaN.
         """
         eyes, targets = np.broadcast_arrays(eye, target)
-        starts, ends = (
-            np.ascontiguousarray(part, dtype=np.float64).reshape(-1, 3) for part in (eyes, targets)
-        )
-        out = np.empty(len(ends), dtype=np.bool_)
-        ground, solids = self.terrain, self.obstacles
-        kernels.hidden(
-            starts,
-            ends,
-            ground.mounds,
-            ground.slope,
-            ground.curvature,
-            solids.trunks,
-            solids.crowns,
-            solids.slabs,
-            out,
-        )
-        return out.reshape(eyes.shape[:-1])
+        # From the target: drones look down, so the way to them soon climbs faster than any mound.
+        start = targets.reshape(-1, 3)
+        way = eyes.reshape(-1, 3) - start
+        found = np.zeros(len(start), dtype=np.bool_)
+        left = np.flatnonzero(np.isfinite(way).all(axis=1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for meets in (self._meet_trees, self._meet_walls, self._meet_ground):
+                found[left] = meets(start[left], way[left])
+                left = left[~found[left]]
+        return found.reshape(eyes.shape[:-1])
+
+    def _meet_trees(self, start: Float, way: Float) -> Bool:
+        """Test if lines [N, 3] from a start meet a trunk or a crown."""
+        meet = np.zeros(len(start), dtype=np.bool_)
+        flat2 = (way[:, :2] ** 2).sum(axis=1)
+        for trunk, crown in zip(self.obstacles.trunks, self.obstacles.crowns, strict=True):
+            (low, high, thin), (middle, wide, upright) = trunk[2:], crown[2:]
+            away = start[:, :2] - trunk[:2]
+            toward = (away * way[:, :2]).sum(axis=1)
+            # Most trees are passed by: the nearest point of the line to the axis, seen from above.
+            nearest = np.where(flat2 > 0, np.clip(-toward / flat2, 0.0, 1.0), 0.0)
+            passed = away + nearest[:, None] * way[:, :2]
+            (rows,) = np.nonzero(((passed**2).sum(axis=1) < max(thin, wide) ** 2) & ~meet)
+            flat, along, off2 = flat2[rows], toward[rows], (away[rows] ** 2).sum(axis=1)
+            z, climb = (start[rows, 2] - middle) / upright, way[rows, 2] / upright
+            meet[rows] = _dips_below_zero(
+                flat / wide**2 + climb * climb,
+                along / wide**2 + z * climb,
+                off2 / wide**2 + z * z - 1,
+                0.0,
+                1.0,
+            )
+            first, last = _between(start[rows, 2], way[rows, 2], low, high, 0.0, 1.0)
+            meet[rows] |= (first < last) & _dips_below_zero(flat, along, off2 - thin**2, first, last)
+        return meet
+
+    def _meet_walls(self, start: Float, way: Float) -> Bool:
+        meet = np.zeros(len(start), dtype=np.bool_)
+        for x, y, cos, sin, length, thickness, low, high in self.obstacles.slabs:
+            east, north = start[:, 0] - x, start[:, 1] - y
+            first: Float | float = 0.0
+            last: Float | float = 1.0
+            for at, step, least, most in (
+                (cos * east + sin * north, cos * way[:, 0] + sin * way[:, 1], -length, length),
+                (cos * north - sin * east, cos * way[:, 1] - sin * way[:, 0], -thickness, thickness),
+                (start[:, 2], way[:, 2], low, high),
+            ):
+                first, last = _between(at, step, least, most, first, last)
+            meet |= first < last
+        return meet
+
+    def _meet_ground(self, start: Float, way: Float) -> Bool:
+        """March along lines in steps that the slope bounds, but no shorter than the curvature allows."""
+        length = np.hypot(way[:, 0], way[:, 1])
+        fall = self.terrain.slope * length - way[:, 2]
+        # Infinite over flat ground and for upright lines.
+        least = np.sqrt(np.divide(8 * GRAZE_M, self.terrain.curvature)) / length
+        end = start + way
+        meet: Bool = end[:, 2] - self.height(end[:, :2]) < -GRAZE_M
+        share, going = np.zeros(len(start)), np.flatnonzero(~meet)
+        while len(going):
+            at = start[going] + share[going, None] * way[going]
+            clearance = at[:, 2] - self.height(at[:, :2])
+            meet[going] = clearance < -GRAZE_M
+            share[going] += np.maximum((clearance + GRAZE_M) / fall[going], least[going])
+            going = going[~meet[going] & (fall[going] > 0) & (share[going] < 1)]
+        return meet
 
     def occupancy(self, resolution_m: float, height_m: float) -> Occupancy:
-        """Map the ground's square: 1 where a solid reaches into a voxel, else 0; see `map_world`."""
-        return map_world(
-            self.ground, self.terrain, self.obstacles, resolution_m=resolution_m, height_m=height_m
-        )
+        """Return voxels over the ground's square, from one below z = 0 up to a height: 1 occupied, 0 free.
+
+        A voxel is occupied if the inside of a solid and of the voxel have a point in common. The test is
+        exact for trunks, crowns and slabs. Over mounds it errs towards occupied, by at most 5 % of a voxel
+        unless a mound is narrower than a tenth of one. Voxels lie on multiples of `resolution_m`.
+        """
+        side, half, middle = resolution_m, self.ground.size_m / 2, np.array(self.ground.centre)
+        first = np.floor((middle - half) / side + _TOUCH_M).astype(np.int64)
+        end = np.ceil((middle + half) / side - _TOUCH_M).astype(np.int64)
+        low = np.array([*first, -1], dtype=np.int64)
+        shape = (*(end - first).tolist(), 1 + math.ceil(height_m / side - _TOUCH_M))
+        grid = _filled_ground(self.terrain, low, shape, side)
+        for trunk, crown in zip(self.obstacles.trunks, self.obstacles.crowns, strict=True):
+            _mark_tree(grid, low, side, trunk, crown)
+        for slab in self.obstacles.slabs:
+            _mark_slab(grid, low, side, slab)
+        return Occupancy(grid.astype(np.float32), low.astype(np.float64) * side, side)
+
+
+GRAZE_M = 1e-3
+"""Allowed depth of a line of sight in the ground, m; steps can overlook another such depth."""
+
+
+def _dips_below_zero(a: Float, b: Float, c: Float, first: Float | float, last: Float | float) -> Bool:
+    """Test if a t^2 + 2 b t + c, a >= 0, is negative somewhere in the open interval (first, last)."""
+    lowest = np.minimum(np.maximum(np.where(a > 0, -b / a, first), first), last)
+    return np.asarray((a * lowest + 2 * b) * lowest + c < 0)
+
+
+def _between(
+    start: Float, way: Float, low: float, high: float, first: Float | float, last: Float | float
+) -> tuple[Float, Float]:
+    """Return the part of (first, last) in which low < start + t way < high; empty when first >= last."""
+    sides = np.stack([(low - start) / way, (high - start) / way])
+    level, inside = way == 0, (low < start) & (start < high)
+    enter = np.where(level, np.where(inside, first, 1.0), np.maximum(first, sides.min(axis=0)))
+    leave = np.where(level, np.where(inside, last, 0.0), np.minimum(last, sides.max(axis=0)))
+    return enter, leave
+
+
+def _mark_tree(grid: Bool, low: Int64, side: float, trunk: Float, crown: Float) -> None:
+    """Set the voxels [X, Y, Z] that a tree reaches into; voxel 0 begins at `low` sides."""
+    radius, upright = crown[3:]
+    reach = max(trunk[4], radius)
+    lowest, highest = min(trunk[2], crown[2] - upright), max(trunk[3], crown[2] + upright)
+    spans = [(trunk[0] - reach, trunk[0] + reach), (trunk[1] - reach, trunk[1] + reach), (lowest, highest)]
+    voxels = tuple(_range(*span, side, low[k], grid.shape[k]) for k, span in enumerate(spans))
+    begin = [(low[k] + np.arange(part.start, part.stop)) * side for k, part in enumerate(voxels)]
+    # Scaling the axes keeps a box a box: its point nearest to the centre decides.
+    east, north, up = (
+        np.maximum(np.maximum(begin[k] - crown[k], crown[k] - begin[k] - side), 0.0) for k in range(3)
+    )
+    flat = (east[:, None] ** 2 + north**2)[..., None]
+    in_trunk = (begin[2] + _TOUCH_M < trunk[3]) & (begin[2] + side - _TOUCH_M > trunk[2])
+    grid[voxels] |= (flat / radius**2 + (up / upright) ** 2 < 1) | ((flat < trunk[4] ** 2) & in_trunk)
+
+
+def _mark_slab(grid: Bool, low: Int64, side: float, slab: Float) -> None:
+    """Set the voxels that a slab reaches into: from above, no axis of either separates the rectangles."""
+    x, y, cos, sin, length, thickness = slab[:6]
+    wide, deep = abs(cos) * length + abs(sin) * thickness, abs(sin) * length + abs(cos) * thickness
+    spans = [(x - wide, x + wide), (y - deep, y + deep), (slab[6], slab[7])]
+    voxels = tuple(_range(*span, side, low[k], grid.shape[k]) for k, span in enumerate(spans))
+    east, north = (
+        (low[k] + np.arange(part.start, part.stop)) * side + side / 2 - slab[k]
+        for k, part in enumerate(voxels[:2])
+    )
+    spread = side / 2 * (abs(cos) + abs(sin))  # of a voxel along the slab's axes
+    along = abs(cos * east[:, None] + sin * north) + _TOUCH_M < length + spread
+    across = abs(cos * north - sin * east[:, None]) + _TOUCH_M < thickness + spread
+    grid[voxels] |= (along & across)[..., None]
+
+
+def _range(low_m: float, high_m: float, side: float, first: int, count: int) -> slice:
+    """Return the voxels that an interval reaches into, cut to the grid."""
+    begin = math.floor((low_m + _TOUCH_M) / side) - first
+    end = math.ceil((high_m - _TOUCH_M) / side) - first
+    return slice(max(begin, 0), max(min(end, count), 0))
 
 
 def build_world(spec: scenario.WorldSettings, seed: int, *, keep_clear: Float) -> World:
@@ -568,42 +689,12 @@ def build_world(spec: scenario.WorldSettings, seed: int, *, keep_clear: Float) -
 _WOOD = 1
 
 
-# Level ground on the border between two voxels fills the lower one alone.
+# Voxels and solids that share a plane do not overlap for a rounding error.
 _TOUCH_M = 1e-9
 # The ground rises by at most this share of a voxel between two samples.
 _FINE_ENOUGH = 0.05
 # A voxel over a steep mound is sampled at no more places than this along a side.
 _MOST_SAMPLES = 16
-
-
-def map_world(
-    ground: scenario.GroundSquare,
-    terrain: MoundedGround,
-    obstacles: Obstacles,
-    *,
-    resolution_m: float,
-    height_m: float,
-) -> Occupancy:
-    """Return voxels over the ground's square: 1 occupied, 0 free.
-
-    They reach from one voxel below z = 0 up to `height_m`.
-
-    A voxel is occupied if the inside of a solid and of the voxel have a point in common. The test is exact
-    for trunks, crowns and slabs. Over mounds it errs towards occupied: a voxel counts as soon as the ground
-    could reach into it, by the sampled heights and the curvature. This is at most 5 % of a voxel too early,
-    unless a mound is narrower than a tenth of a voxel. Voxels lie on multiples of `resolution_m`.
-    """
-    half = ground.size_m / 2
-    middle = np.array(ground.centre)
-    first = np.floor((middle - half) / resolution_m + _TOUCH_M).astype(np.int64)
-    end = np.ceil((middle + half) / resolution_m - _TOUCH_M).astype(np.int64)
-    low = np.array([*first, -1], dtype=np.int64)
-    shape = (*(end - first).tolist(), 1 + math.ceil(height_m / resolution_m - _TOUCH_M))
-    grid = _filled_ground(terrain, low, shape, resolution_m)
-    kernels.mark_trees(grid, low, resolution_m, obstacles.trunks, obstacles.crowns)
-    kernels.mark_slabs(grid, low, resolution_m, obstacles.slabs)
-    origin = low.astype(np.float64) * resolution_m
-    return Occupancy(grid.astype(np.float32), origin, resolution_m)
 
 
 def _filled_ground(

@@ -128,15 +128,15 @@ def test_boxes_become_regions_with_the_aspect_of_the_pose_model(tmp_path: Path) 
     box, beside, car = (40, 30, 80, 130), (200, 30, 240, 130), (100, 100, 200, 150)
     pose, picture = heatmap_model(tmp_path / "pose.onnx", size=(96, 128)), np.zeros((720, 1280, 3), np.uint8)
     boxes = np.array([[(*beside, 0.6), (*box, 0.9), (*car, 0.95), (0, 0, 9, 9, 0.1)]], np.float32)
-    outputs = {"dets": boxes, "labels": np.array([[0, 0, 2, 0]], np.int64)}
-    finder = constant_model(tmp_path / "p.onnx", (320, 320), outputs)
+    labels = np.array([[0, 0, 2, 0]], np.int64)
+    finder = constant_model(tmp_path / "p.onnx", (320, 320), {"dets": boxes, "labels": labels})
     (first, score), (second, _) = load(pose, f"people={finder}").find_people(picture)
     assert score == pytest.approx(0.9)
     np.testing.assert_allclose(first.centre, (4 * 60 - 0.5, 4 * 80 - 0.5), atol=1e-3)
     np.testing.assert_allclose(second.centre, (4 * 220 - 0.5, 4 * 80 - 0.5), atol=1e-3)
     assert first.side == pytest.approx(1.25 * 4 * 100)  # 160 wide would do for 40: the height decides
-    outputs = {"dets": np.array([[(*car, 0.9)]], np.float32)}
-    wide = constant_model(tmp_path / "w.onnx", (320, 320), outputs)
+    boxes = np.array([[(*car, 0.9)]], np.float32)
+    wide = constant_model(tmp_path / "w.onnx", (320, 320), {"dets": boxes})
     ((region, _),) = load(pose, f"people={wide}").find_people(picture)
     assert region.side == pytest.approx(1.25 * 4 * 100 * 128 / 96)
 

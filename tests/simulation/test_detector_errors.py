@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float
-from pipelines.session.errors import DataError
 from pipelines.session.people import mirrored
 from pipelines.simulation.detector_errors import (
-    COLUMNS,
     HIDDEN_CONFIDENCE,
     HIDDEN_ERROR,
     HIDDEN_MISSED_SHARE,
@@ -73,11 +71,6 @@ def lengths(xy: Float) -> Float:
 # --- the table -----------------------------------------------------------------------------------------
 
 
-def write(path: Path, *rows: str) -> Path:
-    path.write_text("\n".join(["# from a test", ",".join(COLUMNS), *rows, ""]), encoding="utf-8")
-    return path
-
-
 @pytest.mark.parametrize("detector", MODELLED)
 def test_a_joint_is_found_worse_the_steeper_the_camera_looks(detector: str) -> None:
     """As in the seed: alike up to 30 degrees, worse above; of all joints together."""
@@ -88,23 +81,6 @@ def test_a_joint_is_found_worse_the_steeper_the_camera_looks(detector: str) -> N
     assert (np.diff(missed[1:, 0]) > 0).all()
     assert (np.diff(confidence[1:, 0]) < 0).all()
     assert error[1, 0] == pytest.approx(error[0, 0], rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("row", "complaint"),
-    [
-        ("0,nose,0.03,0.5", "has a row 0,nose,0.03,0.5:"),
-        ("0,nose,much,0.5,0.7", "has a row 0,nose,much"),
-        ("0,nose,0.03,1.5,0.7", "has a row 0,nose,0.03,1.5"),
-        ("0,nose,-0.03,0.5,0.7", "has a row 0,nose,-0.03"),
-        ("0,nose,nan,0.5,0.7", "has a row 0,nose,nan"),
-        ("0,*,0.01,0.5,0.7\n0,*,0.02,0.5,0.7", "a tilt twice"),
-        ("", "has no rows"),
-    ],
-)
-def test_a_bad_table_is_refused(tmp_path: Path, row: str, complaint: str) -> None:
-    with pytest.raises(DataError, match=complaint.replace("*", r"\*").rstrip(":")):
-        read_errors(write(tmp_path / "t.csv", row))
 
 
 # --- the view ------------------------------------------------------------------------------------------

@@ -15,8 +15,8 @@ from pipelines.simulation.flight import (
     keypoints_of,
     visible_joints,
 )
+from pipelines.simulation.raster import hidden_by
 from pipelines.simulation.scenario import Scenario
-from pipelines.simulation.surfaces import hidden_by
 
 STANDING: dict[str, Any] = {"motion": [{"stand": {"seconds": 1}}]}
 WALKING: dict[str, Any] = {"motion": [{"walk": {"distance_m": 6}}]}

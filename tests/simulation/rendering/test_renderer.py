@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
@@ -20,18 +16,14 @@ from pipelines.geometry.poses import (
     rotate,
     transform,
 )
-from pipelines.simulation.body import make_body
+from pipelines.simulation.raster import TriangleSurface, hidden_by
 from pipelines.simulation.renderer import EXPOSURE, STEP_S, ExposedMoment, Renderer, exposed_moments
-from pipelines.simulation.rig import BONES
-from pipelines.simulation.scenario import Body
-from pipelines.simulation.surfaces import TriangleSurface, hidden_by
 
 Pose = tuple[Float, Float]
 
 SUN = np.array([0.4, -0.3, 0.8])
 CAMERA = Intrinsics(160, 120, 150.0, 140.0, 82.3, 57.6)
 SEED = 3
-FLOAT32 = 2.0**-23
 
 
 def looking(position: tuple[float, float, float], at: tuple[float, float, float]) -> Pose:
@@ -101,87 +93,17 @@ def renderer(*static: TriangleSurface, intrinsics: Intrinsics = CAMERA) -> Rende
     return Renderer(static, intrinsics, sun=SUN, seed=SEED)
 
 
-coordinates = st.floats(-3.0, 3.0)
-
-
-@pytest.mark.slow  # compiles much
-@settings(max_examples=15)
-@given(st.integers(0, 2**32 - 1))
-def test_a_silhouette_is_the_pixels_whose_centres_project_into_a_triangle(seed: int) -> None:
-    """Every pixel, but for centres that lie within rounding of an edge."""
-    rng = np.random.default_rng(seed)
-    mesh = surface(rng.uniform(-1.2, 1.2, (12, 3)), rng.permutation(12).reshape(4, 3).astype(np.int32))
-    pose = looking((rng.uniform(2, 4), rng.uniform(-4, -2), rng.uniform(-2, 4)), (0.0, 0.0, 0.0))
-    corners = project(transform(invert(*pose), mesh.vertices), CAMERA)[mesh.faces]
-    x, y = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
-    inside, doubtful = np.zeros(x.shape, bool), np.zeros(x.shape, bool)
-    for corner in corners:
-        edges = np.roll(corner, -1, axis=0) - corner
-        sides = np.stack(
-            [
-                (e[0] * (y - p[1]) - e[1] * (x - p[0])) / np.hypot(*e)
-                for p, e in zip(corner, edges, strict=True)
-            ]
+def test_what_lies_behind_a_sphere_is_hidden() -> None:
+    """Lines that pass the middle within 0.99 of the radius meet the polyhedron, beyond 1 they do not."""
+    ball, eye = sphere(np.array([0.0, 0.0, 1.0]), 0.8), np.array([0.0, -6.0, 1.0])
+    turn = np.linspace(0, 2 * np.pi, 50)
+    for share, expected in ((0.3, True), (0.99, True), (1.001, False)):
+        sine = share * 0.8 / 6.0
+        along = np.stack(
+            [sine * np.cos(turn), np.full(50, np.sqrt(1 - sine**2)), sine * np.sin(turn)], axis=1
         )
-        inside |= (sides > 0).all(axis=0) | (sides < 0).all(axis=0)
-        doubtful |= (np.abs(sides) < 1e-6).any(axis=0)
-    silhouette = renderer().silhouette(*pose, mesh)
-    assert (silhouette == inside)[~doubtful].all()
-    assert doubtful.mean() < 0.01
-
-
-@settings(max_examples=20)
-@given(st.floats(0.5, 30.0), st.floats(-60.0, 60.0))
-def test_depth_of_a_plane(height: float, tilt_deg: float) -> None:
-    """Ground that also lies under and behind the camera, so that its triangles cross the near plane."""
-    pose = looking((0.3, -0.2, height), (0.3, 20.0, height - 20 * np.tan(np.radians(tilt_deg))))
-    depth = renderer(level(5000.0)).depth(*pose)
-    with np.errstate(divide="ignore"):
-        expected = -height / rays(pose)[..., 2]
-    hit = (expected > 0) & (expected < 4000)
-    # Nearness is kept and stepped along a row in single precision: its error is a few units of the
-    # largest nearness in the row, which is that of the row's nearest pixel.
-    nearest = np.where(hit, 1 / expected, 0).max(axis=1, keepdims=True)
-    tolerance = 4 * FLOAT32 * nearest * expected
-    assert (np.abs(depth / expected - 1) < np.maximum(tolerance, 4 * FLOAT32))[hit].all()
-    assert np.isinf(depth[expected < 0]).all()
-    assert hit.any() or tilt_deg < 0
-
-
-def test_the_nearer_one_hides_the_farther() -> None:
-    pose = looking((0.0, -6.0, 1.0), (0.0, 0.0, 1.0))
-    person = sphere(np.array([0.0, 0.0, 1.0]), 0.8)
-    alone = renderer().silhouette(*pose, person)
-    wall = rectangle(np.array([0.0, -2.0, 1.0]), np.array([3.0, 0.0, 0.0]), np.array([0.0, 0.0, 3.0]))
-    beyond = TriangleSurface(wall.vertices + np.array([0.0, 4.0, 0.0]), wall.faces, wall.colour)
-    half = TriangleSurface(wall.vertices + np.array([3.0, 0.0, 0.0]), wall.faces, wall.colour)
-    assert alone.any()
-    assert not renderer(wall).silhouette(*pose, person).any()
-    assert np.array_equal(renderer(beyond).silhouette(*pose, person), alone)
-    assert not renderer().silhouette(*pose, person, [wall]).any()
-    # The half wall begins at x = 0, which projects to cx.
-    left = np.arange(CAMERA.width) < CAMERA.cx
-    assert np.array_equal(renderer(half).silhouette(*pose, person), alone & left)
-    rest = renderer().silhouette(*pose, half, [person])
-    assert not (rest & renderer(half).silhouette(*pose, person)).any()
-
-
-def test_a_person_hides_what_lies_behind_the_nearest_surface() -> None:
-    """The rasteriser's depth buffer and the intersection of lines with triangles say the same."""
-    person = make_body(Body())
-    body = person.surface(person.rig.offset[0], np.tile([0.0, 0.0, 0.0, 1.0], (len(BONES), 1)))
-    pose = looking((2.5, 1.0, 2.4), (0.0, 0.0, 0.9))
-    depth = renderer().depth(*pose, [body])
-    seen = np.argwhere(np.isfinite(depth))[::25]
-    empty = np.argwhere(np.isinf(depth))[::400]
-    assert min(len(seen), len(empty)) > 40
-    row, column = seen.T
-    through = rays(pose)[row, column]
-    before, behind = (pose[0] + through * (depth[row, column] + by)[:, None] for by in (-0.003, 0.003))
-    assert hidden_by(body, pose[0], behind).all()
-    assert not hidden_by(body, pose[0], before).any()
-    beside = pose[0] + rays(pose)[empty[:, 0], empty[:, 1]] * 10.0
-    assert not hidden_by(body, pose[0], beside).any()
+        assert (hidden_by(ball, eye, eye + 12.0 * along) == expected).all()
+        assert not hidden_by(ball, eye, eye + 5.1 * along).any()
 
 
 def linear(picture: NDArray[np.uint8]) -> Float:
@@ -215,12 +137,12 @@ def test_the_shadow_of_a_box_falls_where_its_corners_throw_it(moves: bool) -> No
     reach = 0.09 + 2 * 0.08
     around = [reach * np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(16) * np.pi / 8]
     votes = np.mean([shaded(points + step) for step in around], axis=0)
-    beside = ~one.silhouette(*pose, cube)
-    beside[1:-1, 1:-1] &= ~np.any(
-        [np.roll(~beside, (i, j), (0, 1))[1:-1, 1:-1] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0
-    )
+    # Seen from 12 m above, the box covers what its top does at 10.5 m, and a pixel more.
+    way = points - pose[0]
+    near = pose[0] + way * ((12.0 - high[2]) / 12.0)
+    beside = ~((near > low - 0.1) & (near < high + 0.1))[..., :2].all(axis=-1)
     dark, bright = beside & (votes == 1), beside & (votes == 0)
-    assert dark.sum() > 50
+    assert dark.sum() > 30
     between = (np.median(light[dark]) + np.median(light[bright])) / 2
     assert np.median(light[bright]) > 2.5 * np.median(light[dark])
     assert (light[dark] < between).all()
@@ -263,17 +185,14 @@ def test_each_row_is_exposed_about_its_own_time(exposure_s: float, readout_s: fl
     assert variance.max() <= STEP_S**2 / 4 + 1e-15
 
 
-@pytest.mark.parametrize(("exposure_s", "readout_s", "bend"), [(0.0, 0.0, False), (0.004, 0.03, True)])
-def test_markers_lie_where_they_are_projected(exposure_s: float, readout_s: float, bend: bool) -> None:
+def test_markers_lie_where_they_are_projected() -> None:
     """Dark balls fall while the camera turns: each is filmed where it is when its own row is read.
 
     The centre of a ball's outline is 0.02 px from its centre's projection. Noise of 1.8 in steps of 8 bits
     over some 50 pixels of 150 steps moves the centre of gravity by 0.01 px. Light that is linear between
     moments of 1 ms is not off on average; within one the image moves by 0.3 px.
     """
-    lens = replace(LENS, readout_s=readout_s)
-    if not bend:
-        lens = replace(lens, model="none", distortion=())
+    lens = LENS
     places = np.array([[x, 8.0, z] for x in (-4.0, 0.1, 4.2) for z in (-2.4, 0.3, 2.7)])
     pose = looking((0.0, 0.0, 0.3), (0.0, 8.0, 0.2))
 
@@ -287,7 +206,7 @@ def test_markers_lie_where_they_are_projected(exposure_s: float, readout_s: floa
             *camera, [surface_of_all([sphere(c, 0.12, 24, 12) for c in centres])] if seen else []
         )
 
-    moments, weights = exposed_moments(lens.height, exposure_s=exposure_s, readout_s=readout_s)
+    moments, weights = exposed_moments(lens.height, exposure_s=0.004, readout_s=lens.readout_s)
     one = renderer(intrinsics=lens)
     with_balls, without = (
         linear(one.exposed([moment(t_s, seen) for t_s in moments], weights, 0)) for seen in (True, False)
@@ -308,7 +227,7 @@ def test_markers_lie_where_they_are_projected(exposure_s: float, readout_s: floa
         near = np.hypot(x - expected[0], y - expected[1]) < 7
         found = [(dark * near * axis).sum() / (dark * near).sum() for axis in (x, y)]
         np.testing.assert_allclose(found, expected, atol=0.1)
-    assert (moved > 2.0) == (readout_s > 0)
+    assert moved > 2.0
 
 
 def surface_of_all(parts: list[TriangleSurface]) -> TriangleSurface:

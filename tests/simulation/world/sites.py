@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.simulation import scenario
 from pipelines.simulation.world import World, build_world
 
@@ -33,3 +33,18 @@ def site(**parts: object) -> World:
 def everything() -> World:
     """Build two mounds that overlap, two trees, two walls."""
     return site(mounds=MOUNDS, trees=TREES, walls=WALLS)
+
+
+def solid(world: World, points: Float) -> Bool:
+    """Test if points [..., 3] are below the ground or inside of a trunk, crown or wall."""
+    x, y, z = np.moveaxis(np.asarray(points), -1, 0)
+    inside = z < world.height(np.stack([x, y], axis=-1))
+    for (east, north, low, high, radius), crown in zip(
+        world.obstacles.trunks, world.obstacles.crowns, strict=True
+    ):
+        inside = inside | (np.hypot(x - east, y - north) < radius) & (low < z) & (z < high)
+        inside |= (((points - crown[:3]) / crown[[3, 3, 4]]) ** 2).sum(axis=-1) < 1
+    for east, north, cos, sin, length, thickness, low, high in world.obstacles.slabs:
+        along, across = cos * (x - east) + sin * (y - north), cos * (y - north) - sin * (x - east)
+        inside |= (abs(along) < length) & (abs(across) < thickness) & (low < z) & (z < high)
+    return np.asarray(inside)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float
-from pipelines.simulation.surfaces import TriangleSurface
+from pipelines.simulation.raster import TriangleSurface
 from tests.simulation.world.sites import everything, site
 
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.simulation import scenario
-from pipelines.simulation.world import MoundedGround
 from tests.simulation.world.sites import MOUNDS, everything, site
 
 
@@ -36,32 +35,28 @@ def test_heights_are_those_of_the_formula() -> None:
     assert np.array_equal(site().height(xy), np.zeros((20, 20)))
 
 
-def second_derivatives(terrain: MoundedGround, xy: Float) -> Float:
-    """Compute the largest second derivative in any direction, [N].
-
-    It is the spectral norm of the Hessian, by differences of slopes.
-    """
-    step = 1e-4
-    normals = [terrain.normal(xy + sign * shift) for shift in step * np.eye(2) for sign in (1, -1)]
-    slopes = [-normal[..., :2] / normal[..., 2:] for normal in normals]
-    hessian = np.stack([(slopes[0] - slopes[1]), (slopes[2] - slopes[3])], axis=-1) / (2 * step)
-    norms: Float = np.linalg.norm(hessian, ord=2, axis=(-2, -1))
-    return norms
-
-
 def test_no_place_is_steeper_or_more_curved_than_stated() -> None:
-    terrain = everything().terrain
-    axis = np.linspace(-12, 12, 241)
+    terrain, step = everything().terrain, 1e-3
+    axis = np.linspace(-12, 12, 121)
     xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    normal = terrain.normal(xy)
-    steepest = (np.hypot(normal[:, 0], normal[:, 1]) / normal[:, 2]).max()
+    east, north = step * np.eye(2)
+
+    def height(*by: Float) -> Float:
+        return terrain.height(xy + sum(by, np.zeros(2)))
+
+    slopes = [(height(way) - height(-way)) / (2 * step) for way in (east, north)]
+    steepest = np.hypot(*slopes).max()
     # The bounds add up what the mounds reach at different places, so they are not met, but of their size.
     assert 0.6 * terrain.slope < steepest <= terrain.slope
-    curved = second_derivatives(terrain, xy)
+    (ee, nn) = ((height(way) + height(-way) - 2 * height()) / step**2 for way in (east, north))
+    en = (height(east, north) + height(-east, -north) - height(east, -north) - height(-east, north)) / (
+        4 * step**2
+    )
+    hessian = np.stack([np.stack([ee, en], axis=-1), np.stack([en, nn], axis=-1)], axis=-1)
+    curved = np.linalg.norm(hessian, ord=2, axis=(-2, -1))
     assert 0.6 * terrain.curvature < curved.max() <= terrain.curvature
-    rng = np.random.default_rng(2)
     for radius in (0.3, 2.0):
-        centre = rng.uniform(-10, 10, (40, 2))
+        centre = np.random.default_rng(2).uniform(-10, 10, (40, 2))
         bound = terrain.curvature_within(centre, radius)
         within = np.linalg.norm(xy - centre[:, None], axis=-1) <= radius
-        assert all(curved[near].max() <= limit + 1e-6 for near, limit in zip(within, bound, strict=True))
+        assert all(curved[near].max() <= limit + 1e-5 for near, limit in zip(within, bound, strict=True))
