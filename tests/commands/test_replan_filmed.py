@@ -20,7 +20,7 @@ from pipelines.session.storage import read_json
 from pipelines.session.tables import TRUTH, read_motion
 from pipelines.simulation.detector_errors import see
 from pipelines.simulation.renderer import Renderer
-from pipelines.simulation.surfaces import TriangleSurface
+from pipelines.simulation.raster import TriangleSurface
 from tests.commands.test_replan import compare, refused, session_of
 from tests.keypoints.spotted_flights import spot_detector
 from tests.synthetic.flights import write_flight
