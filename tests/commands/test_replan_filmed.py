@@ -19,8 +19,8 @@ from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json
 from pipelines.session.tables import TRUTH, read_motion
 from pipelines.simulation.detector_errors import see
-from pipelines.simulation.renderer import Renderer
 from pipelines.simulation.raster import TriangleSurface
+from pipelines.simulation.renderer import Renderer
 from tests.commands.test_replan import compare, refused, session_of
 from tests.keypoints.spotted_flights import spot_detector
 from tests.synthetic.flights import write_flight
