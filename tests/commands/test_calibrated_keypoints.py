@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import pipelines.export
 import pipelines.reporting.overlays
 from pipelines.export import export
 from pipelines.ingest import ingest
-from pipelines.keypoints.calibration import Calibration, write_calibration
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.report import report
 from pipelines.reporting.overlays import FilmedCamera, views_of
@@ -23,9 +21,9 @@ def test_keypoints_of_little_worth_are_used_and_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The calibrated confidence of wrists is always 0.1, below the least confidence; that of others is 0.9.
-    knots = {name: np.array([[0.5, worth, 100.0]]) for name, worth in (("*", 0.9), ("wrist", 0.1))}
     measured = tmp_path / "measured.csv"
-    write_calibration(measured, Calibration("a test", "near", knots))
+    head = "# made by: a test\n# probability that a joint is near\njoints,confidence,probability,count\n"
+    measured.write_text(f"{head}*,0.5,0.9,100\nwrist,0.5,0.1,100\n", encoding="utf-8")
     for place in ("pipelines.keypoints.calibration", "pipelines.reconstruct", "pipelines.attempt"):
         monkeypatch.setattr(f"{place}.measured_for", lambda _: measured)
     session = tmp_path / "flight.session"
