@@ -199,11 +199,12 @@ class AngleSample:
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicsSample:
-    """The intrinsics of a CameraInfo message."""
+    """The intrinsics of a CameraInfo message; None from a camera that is not calibrated (its K is 0)."""
 
     stamp_ns: int
     receive_ns: int
-    intrinsics: Intrinsics
+    intrinsics: Intrinsics | None
+    note: str = ""  # on what was assumed
 
 
 @dataclass(frozen=True, slots=True)

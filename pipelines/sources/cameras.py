@@ -323,7 +323,7 @@ class FlightCameras:
                 intrinsics = _with_size(intrinsics, size, path)
                 self._note(f"{name}: its calibration states no picture size; that of its pictures is taken")
         elif source.file:
-            intrinsics = self._logs.intrinsics(source.file, source.topic).intrinsics
+            intrinsics = self._logs.intrinsics(source.file, source.topic)
         else:
             intrinsics = _inline_intrinsics(source, place)
         if source.readout_s:

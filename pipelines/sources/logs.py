@@ -45,6 +45,7 @@ from pipelines.formats.logs.trajectories import (
     transforms_in,
 )
 from pipelines.geometry.arrays import Int64
+from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.clocks import ClockStep, find_steps, without_steps
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import LogSource, Manifest, MapSource
@@ -281,13 +282,14 @@ class FlightLogs:
             gathered = attitudes_of(samples, f"{source} {name}", stamps=stamps, order=order, units=units)
             return opened.at_world_times(gathered, name)
 
-    def intrinsics(self, log: str, topic: str | None) -> IntrinsicsSample:
-        """Return the first camera info of a topic.
+    def intrinsics(self, log: str, topic: str | None) -> Intrinsics:
+        """Return the intrinsics of a topic of camera infos; messages that are not calibrated are left out.
 
         Raises:
-            DataError: no such topic, or it is empty or its calibration changes during the flight.
+            DataError: no such topic, or none of it is calibrated, or its calibration changes in flight.
         """
-        first: IntrinsicsSample | None = None
+        found: dict[Intrinsics, str] = {}
+        count = 0
         with self.open(log) as opened:
             name, source = opened.choose("intrinsics", topic), opened.source
             for sample in all_samples(opened.recording.messages([name]), source):
@@ -295,19 +297,27 @@ class FlightLogs:
                     raise DataError(
                         source, f"{name} holds no camera info", "name another topic", code="no-intrinsics"
                     )
-                if first is not None and sample.intrinsics != first.intrinsics:
+                count += 1
+                if sample.intrinsics is not None:
+                    found.setdefault(sample.intrinsics, sample.note)
+                if len(found) > 1:
                     raise DataError(
                         source,
                         f"{name} changes during the flight (zoom?)",
                         "give one calibration in a file or inline",
                         code="no-intrinsics",
                     )
-                first = first or sample
-        if first is None:
+            for note in filter(None, found.values()):
+                opened.note(f"{source}: {note}")
+        if not found:
+            problem = f"{name}: the camera is not calibrated (K is 0 in {count} messages)"
             raise DataError(
-                source, f"{name} is empty", "name another topic, or give the intrinsics", code="empty"
+                source,
+                problem if count else f"{name} is empty",
+                "calibrate it, name another topic, or give a calibration file under `intrinsics`",
+                code="no-intrinsics" if count else "empty",
             )
-        return first
+        return next(iter(found))
 
     def frames(self, log: str, topic: str | None) -> Frames:
         """Read the times at which the pictures of a topic were taken, at world times.

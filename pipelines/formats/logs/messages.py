@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.camera_matrices import intrinsics
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
@@ -37,6 +38,7 @@ LATEST_NS = 2**62
 
 _FISHEYE_MODELS = {"equidistant", "fisheye", "kannala_brandt"}
 _RADTAN_MODELS = {"plumb_bob", "rational_polynomial", "radtan"}
+_NO_MODELS = {"", "none"}  # without distortion
 
 # Principal points of whole pictures lie nearer to their middle, as for calibrations without a size.
 _FAR_OFF_CENTRE = 0.2
@@ -210,27 +212,31 @@ def _vector_stamped(message: Message, _: Source) -> Iterator[Sample]:
 
 
 def _camera_info(message: Message, source: Source) -> Iterator[Sample]:
-    yield IntrinsicsSample(_stamp_ns(message), message.receive_ns, _lens(message, source))
-
-
-def _lens(message: Message, source: Source) -> Intrinsics:
-    value, topic = message.value, message.topic.name
+    value = message.value
     # ROS 1, and Foxglove outside ROS 2, write the matrices in capitals.
     stated_matrix, stated_distortion = (value.k, value.d) if hasattr(value, "k") else (value.K, value.D)
     matrix = np.asarray(stated_matrix, dtype=np.float64).reshape(3, 3)
     distortion = np.asarray(stated_distortion, dtype=np.float64).tolist()
-    if not matrix[0, 0] or not matrix[1, 1]:
-        raise DataError(
-            source,
-            f"topic {topic}: the camera is not calibrated (focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g})",
-            "calibrate it, or give a calibration file under `intrinsics`",
-        )
+    stamp_ns, lens, note = _stamp_ns(message), None, ""
+    if matrix[0, 0] and matrix[1, 1]:
+        lens, note = _lens(message, source, matrix, distortion)
+    yield IntrinsicsSample(stamp_ns, message.receive_ns, lens, note)
+
+
+def _lens(message: Message, source: Source, matrix: Float, distortion: list[float]) -> tuple[Intrinsics, str]:
+    """Return the intrinsics of the pictures beside a CameraInfo, and a note.
+
+    Some drivers state binning with a K that is of the binned pictures already. The principal point tells: it
+    is in the middle of the binned pictures, and undivided it is far off theirs, or the other way round.
+    """
+    value, topic = message.value, message.topic.name
     model = value.distortion_model.lower()
-    if model not in _FISHEYE_MODELS | _RADTAN_MODELS and (model or any(distortion)):
+    known = _FISHEYE_MODELS | _RADTAN_MODELS
+    if model not in known and (model not in _NO_MODELS or any(distortion)):
         raise DataError(
             source,
             f"topic {topic}: its distortion model {value.distortion_model!r} is none of"
-            f" {', '.join(sorted(_FISHEYE_MODELS | _RADTAN_MODELS))}",
+            f" {', '.join(sorted(known))}",
             "give a calibration file under `intrinsics`",
         )
     full = intrinsics(
@@ -244,14 +250,9 @@ def _lens(message: Message, source: Source) -> Intrinsics:
     binned = _of_the_picture(full, value)
     undivided = replace(full, width=binned.width, height=binned.height)
     if _off_centre(binned) > _FAR_OFF_CENTRE >= _off_centre(undivided):
-        raise DataError(
-            source,
-            f"topic {topic}: its K has its middle in that of the binned {binned.width} x {binned.height} px"
-            " already, so that its binning would divide it once more",
-            "give a calibration file under `intrinsics`",
-            code="bad-value",
-        )
-    return binned
+        size = f"{binned.width} x {binned.height} px"
+        return undivided, f"topic {topic}: its K is of the binned {size} already, by its principal point"
+    return binned, ""
 
 
 def _off_centre(lens: Intrinsics) -> float:
