@@ -227,8 +227,8 @@ Sample = PoseSample | AngleSample | IntrinsicsSample | PictureSample
 class VideoIndex:
     """Presentation times of the frames of a video. Frame k is the k-th in presentation order, from 0.
 
-    Every frame that the container lists has a row, even if it cannot be decoded. A damaged frame is
-    then missing and the others keep their numbers. Frames that the container lists but the file no longer
+    Every frame that the container lists has a row, from the first one that a decoder gives on. A damaged
+    frame is missing and the others keep their numbers. Frames that the container lists but the file no longer
     holds are counted in `dropped`.
     """
 
@@ -240,6 +240,7 @@ class VideoIndex:
     codec: str
     variable: bool  # True if k / rate_hz is further from pts_ns[k] than the container's clock explains
     dropped: dict[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()  # on what was assumed
 
     @property
     def count(self) -> int:

@@ -144,10 +144,12 @@ class FlightCameras:
         if video is not None and video.codec == UNTIMED:
             raise DataError(
                 self._manifest,
-                f"cameras.{name}: its pictures have no times in EXIF that rise from one to the next",
+                f"cameras.{name}: its pictures have no times of their own that rise from one to the next",
                 "write frame_times: {start: SECONDS, fps: 30}, or give a csv",
                 code="clock-unknown",
             )
+        for line in video.notes if video is not None else ():
+            self._note(f"{name}: {line}")
         if video is not None and video.codec == SHARED_SECONDS and camera.clock is None:
             self._note(
                 f"{name}: several of its pictures share a second in EXIF and are spread evenly over it: say"

@@ -22,8 +22,6 @@ SUBTITLE = "1\n00:00:00,000 --> 00:00:01,000\nHello\n"
     [
         ("empty.csv", b"", "empty"),
         ("a.mcap", b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 16384\n", "16384"),
-        ("a.h264", b"\0\0\0\x01\x67\x64\0\x1f" + bytes(20), "H.264"),
-        ("a.h265", b"\0\0\0\x01\x40\x01\x0c" + bytes(20), "H.265"),
         ("a.srt", SUBTITLE.encode("utf-16"), "subtitles"),
         ("a.csv", "Höhe,Länge\n1,2\n".encode("cp1252"), "not UTF-8"),
         ("a.kml", b'<?xml version="1.0"?>\n<kml xmlns="x">', "KML"),

@@ -54,6 +54,7 @@ def write_video(
     b_frames: int = 2,
     turned_deg: int = 0,
     draw: Callable[[int], Picture] = bar_code,
+    container_format: str | None = None,
 ) -> Path:
     """Write one frame for each stamp; the suffix of the path is the container, MP4 with its table in front.
 
@@ -66,9 +67,12 @@ def write_video(
         b_frames: number of consecutive frames that refer to later ones.
         turned_deg: counter-clockwise rotation that the container states.
         draw: makes the picture of a frame; all have the same size.
+        container_format: FFmpeg's name of it, where the suffix does not tell.
     """
     mp4 = path.suffix in {".mp4", ".mov"}
-    with av.open(str(path), "w", options={"movflags": "faststart"} if mp4 else {}) as container:
+    with av.open(
+        str(path), "w", format=container_format, options={"movflags": "faststart"} if mp4 else {}
+    ) as container:
         stream = container.add_stream(codec, rate=30)
         assert isinstance(stream, av.VideoStream)
         stream.height, stream.width = draw(0).shape[:2]

@@ -1,7 +1,9 @@
 """Reader of video files through FFmpeg's libraries: the exact time of every frame, and any frame exactly.
 
-Frames are identified by their presentation stamps alone. Counting decoded pictures fails if one is
-damaged, and index / rate fails if the rate varies. A seek may land after the wanted frame.
+Frames are numbered as a decoder gives them: from the first that it can decode, those of equal stamps each by
+itself. They are identified by their presentation stamps, because counting decoded pictures fails if one is
+damaged, and index / rate fails if the rate varies. A seek may land after the wanted frame. Raw streams have
+no stamps: their pictures are counted, and decoded from the beginning.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ from __future__ import annotations
 import bisect
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from itertools import chain
@@ -19,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from pipelines.formats.common.rows import describe_times
-from pipelines.formats.videos.picture_folder import FolderPictures
+from pipelines.formats.videos.picture_folder import UNTIMED, FolderPictures
 from pipelines.geometry.arrays import Float, Float32, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics, rescaled, undistort
 from pipelines.geometry.clocks import TrackedPoints
@@ -61,6 +63,13 @@ _MAGIC = {
     b"YUV4MPEG2 ": "yuv4mpegpipe",
     bytes.fromhex("060e2b34020501010d010201"): "mxf",
 }
+# Raw streams, by their first unit or by the ending of their names.
+_RAW = {
+    "h264": (re.compile(rb"\0\0\0?\x01[\x06\x09\x27\x47\x67]"), (".h264", ".264", ".avc")),
+    "hevc": (re.compile(rb"\0\0\0?\x01[\x40\x42\x44\x46\x4e]\x01"), (".h265", ".265", ".hevc")),
+    "mjpeg": (None, (".mjpeg", ".mjpg", ".mjp")),
+}
+_RAW_BEGINNING = re.compile(rb"\0\0\0?\x01|\xff\xd8\xff")
 
 
 class VideoContainer:
@@ -85,6 +94,7 @@ class VideoContainer:
             ".ivf",
         ),
         *(".mpg", ".mpeg", ".vob", ".wmv", ".asf", ".nut", ".y4m", ".mxf"),
+        *(suffix for _, suffixes in _RAW.values() for suffix in suffixes),
     )
 
     def recognises(self, path: Path) -> bool:
@@ -100,6 +110,10 @@ class VideoContainer:
     def describe(self, path: Path) -> dict[str, object]:
         """Describe frames, times, rate, gaps, picture size, codec, and losses."""
         index = self.index(path)
+        if index.codec == UNTIMED:
+            picture = f"{index.width} x {index.height} px"
+            dropped = {f"dropped: {cause}": count for cause, count in index.dropped.items()}
+            return {"frames": index.count, "times": "none: a raw stream", "picture": picture, **dropped}
         times = describe_times(index.pts_ns)
         return {
             "frames": index.count,
@@ -113,6 +127,7 @@ class VideoContainer:
             "turned_deg": index.rotation_deg,
             "codec": index.codec,
             **({"data_tracks": tracks} if (tracks := data_tracks(path)) else {}),
+            **({"notes": list(index.notes)} if index.notes else {}),
             **{f"dropped: {cause}": count for cause, count in index.dropped.items()},
         }
 
@@ -126,9 +141,9 @@ def index_video(path: Path) -> VideoIndex:
 
     The largest video stream is used. Cover pictures do not count, nor frames that an edit list hides or that
     VP8 and VP9 code for reference only. pts_ns[k] is the stamp of frame k less that of frame 0, rounded to a
-    nanosecond once. Counted in `dropped`: "cut off" (frames in the table after the end of the file; also the
-    last ones shown later than the first lost one, as their numbers are unknown), "no stamp", "duplicate
-    stamp".
+    nanosecond once; those of equal stamps are spread up to the next. Counted in `dropped`: "cut off" (frames
+    in the table after the end of the file; also the last ones shown later than the first lost one, as their
+    numbers are unknown), "no stamp", "before the first frame that can be decoded".
     """
     with VideoReader(path) as reader:
         return reader.index
@@ -225,6 +240,14 @@ class VideoReader:
         self._scan = _scan(path)
         self._reader: object = None  # the iteration of `frames` that moved the decoder last
         self._begin()
+        if (
+            self._next is not None
+            and self._next[0]
+            and (unseen := _frames_before_the_first(path, self._scan))
+        ):
+            self._scan = self._scan.without_first(unseen)
+            self.close()
+            self._begin()
         if self._next is None:
             self.close()
             count = len(self._scan.ticks)
@@ -302,7 +325,7 @@ class VideoReader:
     def _begin(self) -> None:
         """Open the file and decode from the beginning."""
         self._container, self._stream = open_container(self._path)
-        self._coming = _numbered(self._container, self._stream, self._scan.ticks, sought=False)
+        self._coming = _numbered(self._container, self._stream, self._scan, sought=False)
         self._next = next(self._coming, None)
 
     def _seek(self, number: int) -> None:
@@ -315,7 +338,7 @@ class VideoReader:
             self.close()
             self._begin()
             return
-        self._coming = _numbered(self._container, self._stream, self._scan.ticks, sought=True)
+        self._coming = _numbered(self._container, self._stream, self._scan, sought=True)
         self._next = next(self._coming, None)
 
     def _picture(self, frame: VideoFrame) -> Picture:
@@ -336,10 +359,17 @@ class VideoReader:
 
 @dataclass(frozen=True)
 class _Scan:
-    ticks: Int64  # [N] strictly increasing stamps of the container
+    ticks: Int64  # [N] stamps of the container, in order; numbers in a raw stream
     tick_s: Fraction
-    key_frames: list[int]  # sorted numbers
+    key_frames: list[int]  # sorted numbers, of stamps that no other frame has
     dropped: dict[str, int]
+    is_raw: bool = False
+
+    def without_first(self, count: int) -> _Scan:
+        """Leave out the first frames, which no decoder gives."""
+        keys = [key - count for key in self.key_frames if key >= count]
+        dropped = {**self.dropped, "before the first frame that can be decoded": count}
+        return replace(self, ticks=self.ticks[count:], key_frames=keys, dropped=dropped)
 
 
 class _CodedFrame(NamedTuple):
@@ -363,6 +393,12 @@ def _scan(path: Path) -> _Scan:
         # Only a complete table, like that of MP4, lists frames beyond the file's end.
         lost = {e.pos: e.timestamp for e in stream.index_entries if e.size > 0 and e.pos + e.size > size}
         tick_s, listed = Fraction(stream.time_base or 0), stream.frames
+        is_raw = container.format.name in _RAW
+    if is_raw:
+        # A decoder begins at the first key frame.
+        begin = next((k for k, packet in enumerate(stored) if packet.key), len(stored))
+        scan = _Scan(np.arange(len(stored), dtype=np.int64), Fraction(1), [], {}, is_raw)
+        return scan.without_first(begin) if begin else scan
     whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
     first_lost = min(lost.values(), default=0)
@@ -373,7 +409,7 @@ def _scan(path: Path) -> _Scan:
         if lost:
             problem = f"is cut off before its first frame ends ({len(lost)} are lost)"
         raise DataError(path, problem, "copy it from the camera again, or export it as MP4")
-    ticks = np.unique(np.array([pts for pts, _ in sure], dtype=np.int64))
+    ticks = np.sort(np.array([pts for pts, _ in sure], dtype=np.int64))
     furthest_s = max(abs(int(ticks[0])), abs(int(ticks[-1]))) * tick_s
     if tick_s <= 0 or furthest_s > _LATEST_S:
         raise DataError(path, f"stamps its frames up to {float(furthest_s):.3g} s", "its header is damaged")
@@ -386,12 +422,14 @@ def _scan(path: Path) -> _Scan:
     counts = {
         "cut off": len(lost) + len(stamped) - len(sure),
         "no stamp": len(whole) - len(stamped),
-        "duplicate stamp": len(sure) - len(ticks),
     }
+    once = np.ones(len(ticks), np.bool_)
+    once[1:] &= np.diff(ticks) > 0
+    once[:-1] &= np.diff(ticks) > 0
     return _Scan(
         ticks,
         tick_s,
-        np.flatnonzero(np.isin(ticks, [pts for pts, key in sure if key])).tolist(),
+        np.flatnonzero(np.isin(ticks, [pts for pts, key in sure if key]) & once).tolist(),
         {cause: count for cause, count in counts.items() if count},
     )
 
@@ -409,15 +447,24 @@ def _is_mirrored(frame: VideoFrame) -> bool:
 def _index(scan: _Scan, stream: VideoStream, first: VideoFrame) -> VideoIndex:
     turned = round(first.rotation / 90) % 4 * 90
     width, height = (first.width, first.height) if turned % 180 == 0 else (first.height, first.width)
+    pts_ns = _nanoseconds(scan.ticks, scan.tick_s, int(scan.ticks[0]))
+    notes: tuple[str, ...] = ()
+    starts = np.flatnonzero(np.diff(pts_ns, prepend=-1))  # of runs of equal stamps
+    if again := len(pts_ns) - len(starts):
+        step_ns = int(pts_ns[-1] - pts_ns[starts[-2]]) if len(starts) > 1 else 10**9
+        ends_ns = np.append(pts_ns[starts], pts_ns[-1] + step_ns)
+        pts_ns = np.interp(np.arange(len(pts_ns)), np.append(starts, len(pts_ns)), ends_ns).astype(np.int64)
+        notes = (f"{again} frames have the stamp of the frame before: spread up to the next stamp",)
     return VideoIndex(
-        pts_ns=_nanoseconds(scan.ticks, scan.tick_s, int(scan.ticks[0])),
+        pts_ns=pts_ns,
         start_ns=int(_nanoseconds(scan.ticks[:1], scan.tick_s)[0]),
         width=width,
         height=height,
         rotation_deg=turned,
-        codec=stream.codec_context.codec.canonical_name,
+        codec=UNTIMED if scan.is_raw else stream.codec_context.codec.canonical_name,
         variable=_is_variable(scan.ticks),
         dropped=scan.dropped,
+        notes=notes,
     )
 
 
@@ -441,16 +488,22 @@ def _is_variable(ticks: Int64) -> bool:
 # --- decoding -----------------------------------------------------------------------------------------
 
 
-def _numbered(
-    container: InputContainer, stream: VideoStream, ticks: Int64, *, sought: bool
-) -> Iterator[tuple[int, VideoFrame]]:
-    """Yield numbers and frames in the order of showing; undecodable frames are skipped."""
+def _frames_before_the_first(path: Path, scan: _Scan) -> int:
+    """Count the frames of the index before the first one that a decoder gives, damaged or not."""
+    container, stream = open_container(path)
+    with container:
+        first = next((frame.pts for frame in _decoded(container, stream, None)), None)
+    return 0 if first is None else int(np.searchsorted(scan.ticks, first))
+
+
+def _decoded(
+    container: InputContainer, stream: VideoStream, first: int | None, *, sought: bool = False
+) -> Iterator[VideoFrame]:
+    """Yield the frames from a stamp on, after a seek from that of the first key frame on."""
     from av.error import FFmpegError
 
-    first = None if sought else int(ticks[0])
-    last = -1
     for packet in chain(packets(container, stream), (None,)):
-        if first is None:
+        if sought and first is None:
             if packet is None or packet.pts is None or not packet.is_keyframe:
                 continue
             first = packet.pts
@@ -458,13 +511,25 @@ def _numbered(
             frames_ready = stream.decode(packet)  # packet None: the frames that the decoder still holds
         except FFmpegError:
             continue
-        for frame in frames_ready:
-            if frame.pts is None or frame.pts < first or frame.is_corrupt:
-                continue
-            number = int(np.searchsorted(ticks, frame.pts))
-            # Stamps of a cut-off end are not in the index.
-            if last < number < len(ticks) and ticks[number] == frame.pts:
-                last = number
+        yield from (
+            frame for frame in frames_ready if first is None or (frame.pts is not None and frame.pts >= first)
+        )
+
+
+def _numbered(
+    container: InputContainer, stream: VideoStream, scan: _Scan, *, sought: bool
+) -> Iterator[tuple[int, VideoFrame]]:
+    """Yield numbers and frames in the order of showing; undecodable frames are skipped."""
+    if scan.is_raw:
+        yield from zip(range(len(scan.ticks)), _decoded(container, stream, None), strict=False)
+        return
+    last = -1
+    for frame in _decoded(container, stream, None if sought else int(scan.ticks[0]), sought=sought):
+        number = max(int(np.searchsorted(scan.ticks, frame.pts or 0)), last + 1)
+        # Stamps of a cut-off end are not in the index.
+        if number < len(scan.ticks) and scan.ticks[number] == frame.pts:
+            last = number
+            if not frame.is_corrupt:
                 yield number, frame
 
 
@@ -553,6 +618,11 @@ def container_format(path: Path) -> str | None:
     for first, step in ((0, _PACKET_TS), (4, _PACKET_M2TS)):
         if head[first : first + 1] == b"G" == head[first + step : first + step + 1]:
             return "mpegts"
+    suffix = path.suffix.lower()
+    if _RAW_BEGINNING.match(head):
+        for kind, (beginning, suffixes) in _RAW.items():
+            if suffix in suffixes or (beginning is not None and beginning.match(head)):
+                return kind
     return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.videos import video
+from pipelines.formats.videos.picture_folder import UNTIMED
 from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames, index_video
 from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
@@ -258,6 +260,92 @@ def test_more_containers_that_ffmpeg_reads(tmp_path: Path, suffix: str, codec: s
     np.testing.assert_allclose(np.diff(index.pts_ns), 1e9 / 30, atol=1e6)
     assert [read_bar_code(picture) for _, picture in frames(path)] == list(range(index.count))
     assert index.count in {11, 12}  # a container may lose the length of its last picture
+
+
+def remuxed(path: Path, source: Path, pts_of: Callable[[int, int], int | None]) -> Path:
+    """Copy the coded frames of a video with other stamps; those without a stamp are left out."""
+    with av.open(str(source)) as read, av.open(str(path), "w") as written:
+        stream = written.add_stream_from_template(read.streams.video[0])
+        for number, packet in enumerate(p for p in read.demux(video=0) if p.size and p.pts is not None):
+            pts = pts_of(number, packet.pts or 0)
+            if pts is not None:
+                packet.pts, packet.dts, packet.stream = pts, (packet.dts or 0) - 50_000, stream
+                written.mux(packet)
+    return path
+
+
+@pytest.mark.parametrize("b_frames", [0, 2])
+@pytest.mark.parametrize("lost", [1, 5, 12, 17])
+def test_a_stream_that_begins_without_a_key_frame_is_numbered_as_decoders_do(
+    tmp_path: Path, lost: int, b_frames: int
+) -> None:
+    whole = write_video(tmp_path / "whole.ts", even_ticks(60), b_frames=b_frames)
+    path = remuxed(tmp_path / "v.ts", whole, lambda number, pts: pts if number >= lost else None)
+    pictures, _ = decoded_by_opencv(path)
+    with VideoReader(path) as reader:
+        assert reader.index.count == len(pictures) == 60 - 12 * -(-lost // 12)
+        shown = [read_bar_code(picture) for _, picture in reader.frames()]
+        assert shown == [read_bar_code(picture) for picture in pictures]
+        assert reader.missing == set()
+        assert reader.index.pts_ns[0] == 0
+        assert list(reader.index.dropped.values()) == [60 - lost - reader.index.count] if lost % 12 else True
+        tenth = reader.read(10)
+        assert tenth is not None
+        assert read_bar_code(tenth) == shown[10]
+
+
+@pytest.mark.parametrize("alike", [[5], [5, 6, 7], [3, 20, 39]])
+def test_frames_of_equal_stamps_keep_the_numbers_of_a_decoder(tmp_path: Path, alike: list[int]) -> None:
+    whole = write_video(tmp_path / "whole.ts", even_ticks(40), b_frames=0)
+    stamps: list[int] = []
+
+    def pts_of(number: int, pts: int) -> int:
+        stamps.append(stamps[-1] if number in alike else pts)
+        return stamps[-1]
+
+    path = remuxed(tmp_path / "v.ts", whole, pts_of)
+    with VideoReader(path) as reader:
+        assert reader.index.count == 40
+        assert [read_bar_code(picture) for _, picture in reader.frames()] == list(range(40))
+        for number in (38, *alike, 0, 30):
+            picture = reader.read(number)
+            assert picture is not None
+            assert read_bar_code(picture) == number
+        assert (np.diff(reader.index.pts_ns) > 0).all()
+        others = np.delete(np.arange(40), alike)
+        expected = (np.array(stamps) - stamps[0])[others] * 100_000 / 9
+        np.testing.assert_allclose(reader.index.pts_ns[others], expected, atol=1)
+        assert [str(len(alike)) in note for note in reader.index.notes] == [True]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec", "form", "b_frames"),
+    [
+        (".h264", "libx264", "h264", 0),
+        (".264", "libx264", "h264", 2),
+        (".raw", "libx264", "h264", 0),
+        (".h265", "libx265", "hevc", 0),
+        (".mjpeg", "mjpeg", "mjpeg", 0),
+        (".mjpg", "mjpeg", "mjpeg", 0),
+    ],
+)
+def test_raw_streams_are_numbered_and_have_no_times(
+    tmp_path: Path, suffix: str, codec: str, form: str, b_frames: int
+) -> None:
+    path = tmp_path / f"v{suffix}"
+    try:
+        write_video(path, even_ticks(30), codec=codec, b_frames=b_frames, container_format=form)
+    except (av.error.FFmpegError, ValueError) as error:
+        pytest.skip(f"this FFmpeg does not write {codec} ({error})")
+    assert recognise(path, VideoFormat, "video").name == "video"
+    with VideoReader(path) as reader:
+        assert (reader.index.count, reader.index.codec) == (30, UNTIMED)
+        assert [read_bar_code(picture) for _, picture in reader.frames()] == list(range(30))
+        for number in (17, 3, 29):
+            picture = reader.read(number)
+            assert picture is not None
+            assert read_bar_code(picture) == number
+    assert READER.describe(path)["frames"] == 30
 
 
 def test_a_display_matrix_that_mirrors_is_refused(tmp_path: Path) -> None:
