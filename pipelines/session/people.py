@@ -9,6 +9,7 @@ some of these joints at slightly different points; the differences are constant 
   mouth corners are `left_mouth` and `right_mouth`.
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -139,6 +140,30 @@ SKELETONS: dict[str, Skeleton] = {
     name: Skeleton(name, joints, bones_of(joints)) for name, joints in _JOINTS.items()
 }
 """Every skeleton by the name that `flight.yaml` uses; of two with equal counts the likelier comes first."""
+
+
+_ALSO_CALLED = {
+    **dict.fromkeys(("midhip", "chip", "hipcenter", "pelvis"), "hip"),
+    **{f"{way}footindex": f"{side}_big_toe" for side in ("left", "right") for way in (side, side[0])},
+}
+
+
+def _ways_to_write(joint: str) -> list[str]:
+    side, _, part = joint.partition("_")
+    part = part.replace("_", "")
+    if side not in {"left", "right"}:
+        return [joint.replace("_", "")]
+    return [f"{side}{part}", f"{side[0]}{part}", f"{part}{side}", f"{part}{side[0]}"]
+
+
+_CALLED = _ALSO_CALLED | {
+    way: joint for joints in _JOINTS.values() for joint in joints for way in _ways_to_write(joint)
+}
+
+
+def joint_called(name: str) -> str | None:
+    """Return the joint that a program calls so: RBigToe, right_big_toe and BigToe_R are right_big_toe."""
+    return _CALLED.get(re.sub(r"[^a-z0-9]", "", name.lower()))
 
 
 def get_skeleton(name: str) -> Skeleton:

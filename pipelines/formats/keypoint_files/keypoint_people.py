@@ -5,18 +5,22 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.common.files import read_head
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.people import SKELETONS, Skeleton, get_skeleton, skeleton_with
+from pipelines.session.people import SKELETONS, Skeleton, get_skeleton, joint_called, skeleton_with
 from pipelines.session.records import Detections
 from pipelines.session.storage import code_of
 
+# Tables of mice share a name or two with people, as nose and left_ear.
+LEAST_NAMED_JOINTS = 6
 # So many files show the format of a folder, and reading them takes no time.
 _SAMPLED_FILES = 8
 # Frame numbers below it, and their differences, fit int64.
@@ -166,14 +170,30 @@ def _digits(name: str) -> list[str]:
     return re.findall(r"[0-9]+", _SUFFIX.sub("", name))
 
 
+@dataclass(frozen=True)
 class KeypointFile:
-    """Reader of the people of a keypoint file or folder; each format gathers them from its own layout."""
+    """Reader of the people of a keypoint file or folder.
 
-    suffixes = (".json",)
+    Args:
+        is_known: recognises the content of a JSON file, whose lists are cut (`samples`), or the head of a
+            table.
+        gather: adds every person of `Gathering.path`; joint names and picture size too if the file states
+            them.
+        of_folders: a folder of such files, one for each picture, is read as well.
+    """
 
-    def gather(self, people: Gathering) -> None:
-        """Add every person of `people.path`; joint names and picture size too if the file states them."""
-        raise NotImplementedError
+    name: str
+    title: str
+    is_known: Callable[[object], bool]
+    gather: Callable[[Gathering], None]
+    suffixes: tuple[str, ...] = (".json",)
+    of_folders: bool = True
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if the content is known."""
+        if self.suffixes != (".json",):
+            return path.is_file() and self.is_known(read_head(path, self.suffixes))
+        return (self.of_folders or path.is_file()) and any(map(self.is_known, samples(path)))
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe frames, people, the skeleton (stated, or guessed from the keypoints), and confidences."""
@@ -246,6 +266,19 @@ class Gathering:
             raise DataError(self.path, problem, "give each camera a file or folder of its own")
         return frame
 
+    def frame_of_file(self, file: Path, stem: str | None = None) -> int | None:
+        """Return the frame of a file of one picture: 0 for a file alone without a number in its name.
+
+        A file of a folder without a number is counted, and has none.
+        """
+        stem = file.stem if stem is None else stem
+        if frame_number(stem, self.digits) is not None:
+            return self.frame_of(stem, str(file))
+        if file == self.path:
+            return self.frame_of(0, str(file))
+        self.dropped["file without a frame number"] += 1
+        return None
+
     def add(
         self, frame: int, rows: Float, where: str, *, rank: int | None = None, own_id: int | None = None
     ) -> None:
@@ -264,6 +297,31 @@ class Gathering:
         self._frame.append(frame)
         self._own_id.append(own_id)
         self._rows.append(rows)
+
+    def add_named(
+        self, frame: int, names: Sequence[str], points: Float, where: str, **ids: int | None
+    ) -> None:
+        """Add a person whose keypoints [K, 3] have names of the user's own; unknown ones are left out.
+
+        The skeleton is the smallest that has the most of them.
+        """
+        if self.joint_names is None:
+            joints = {joint_called(name) for name in names}
+            fit = max(SKELETONS.values(), key=lambda s: (len(joints & {*s.joints}), -len(s.joints)))
+            if len(joints & {*fit.joints}) < LEAST_NAMED_JOINTS:
+                problem = f"names its keypoints {', '.join(names[:6])}: they are no joints of people"
+                raise DataError(
+                    self.path, problem, "name them as left_shoulder, right_knee", code="unsupported"
+                )
+            self.joint_names = fit.joints
+        place = {joint: k for k, joint in enumerate(self.joint_names)}
+        rows = np.zeros((len(place), 3))
+        for name, point in zip(names, points, strict=True):
+            if (joint := joint_called(name)) in place:
+                rows[place[joint]] = point if np.isfinite(point[:2]).all() else 0.0
+            else:
+                self.dropped["keypoint of no known joint"] += 1
+        self.add(frame, rows, where, **ids)
 
     def keypoints(self) -> Float:
         """Return all people so far [M, K, 3]; DataError without people."""

@@ -1,23 +1,27 @@
-"""Keypoints as OpenPose, AlphaPose, MMPose and programs with COCO's results write them."""
+"""Keypoints as OpenPose, AlphaPose, COCO, MMPose, EasyMocap, Ultralytics, DeepLabCut and SLEAP write them.
+
+Each format is a line of a table: how its content is recognised, and how its people are gathered.
+"""
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.common.files import read_text
 from pipelines.formats.keypoint_files.keypoint_people import (
     Gathering,
     KeypointFile,
     changing_digits,
     first_entry,
-    frame_number,
     is_alphapose_entry,
     json_files,
     load_json,
     numbers,
     objects,
-    samples,
     triples,
     whole_number,
 )
@@ -25,53 +29,39 @@ from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS
 
-
-class OpenPose(KeypointFile):
-    """Reader of a folder of OpenPose JSON files, or of one of them."""
-
-    name = "openpose"
-    title = "OpenPose keypoints"
-
-    def recognises(self, path: Path) -> bool:
-        """Return True if a file, or some files across a folder, are objects with a list `people`."""
-        return any(_is_frame(sample) for sample in samples(path))
-
-    def gather(self, people: Gathering) -> None:
-        """Add every person, file by file; skip and count files that are no frames."""
-        if people.path.is_dir():
-            people.digits = changing_digits([_stem(file) for file in json_files(people.path)])
-        for file, content in people.contents():
-            _read_frame(file, content, people)
-        if people.count() == len(SKELETONS["body25"].joints):
-            people.joint_names = SKELETONS[_order_of_25(people.keypoints())].joints
+# --- OpenPose ------------------------------------------------------------------------------------------
 
 
 def _is_frame(content: object) -> bool:
     return isinstance(content, dict) and isinstance(content.get("people"), list)
 
 
-def _read_frame(file: Path, content: object, people: Gathering) -> None:
-    """Add the people of one file; count the file instead if it is no frame."""
-    name = _stem(file)
-    if frame_number(name, people.digits) is None:
-        people.dropped["file without a frame number"] += 1
-        return
-    if not isinstance(content, dict) or not _is_frame(content):
-        people.dropped["file without a list of people"] += 1
-        return
-    frame = people.frame_of(name, str(file))
-    for rank, (where, person) in enumerate(objects(content["people"], file, "people")):
-        if stated := person.get("pose_keypoints_2d") or person.get("pose_keypoints"):  # the latter until 2018
-            rows = triples(stated, where)
-            people.add(frame, rows, where, rank=rank, own_id=_openpose_track(person.get("person_id")))
+def _gather_openpose(people: Gathering) -> None:
+    """Add every person, file by file; skip and count files that are no frames."""
+    if people.path.is_dir():
+        people.digits = changing_digits([_stem(file) for file in json_files(people.path)])
+    for file, content in people.contents():
+        if not isinstance(content, dict) or not _is_frame(content):
+            people.dropped["file without a list of people"] += 1
+        elif (frame := people.frame_of_file(file, _stem(file))) is not None:
+            for rank, (where, person) in enumerate(objects(content["people"], file, "people")):
+                # The second name is that of versions until 2018.
+                if stated := person.get("pose_keypoints_2d") or person.get("pose_keypoints"):
+                    track = person.get("person_id")
+                    people.add(frame, triples(stated, where), where, rank=rank, own_id=_track(track))
+    if people.count() == len(SKELETONS["body25"].joints):
+        people.joint_names = SKELETONS[_order_of_25(people.keypoints())].joints
 
 
 def _stem(file: Path) -> str:
     return file.stem.removesuffix("_keypoints")
 
 
-def _openpose_track(person_id: object) -> int | None:
-    number = whole_number(person_id[0]) if isinstance(person_id, list) and person_id else None
+def _track(stated: object) -> int | None:
+    """Return a tracker's number, alone or in lists; None without one."""
+    while isinstance(stated, list) and stated:
+        stated = stated[0]
+    number = whole_number(stated)
     return number if number is not None and number >= 0 else None
 
 
@@ -89,101 +79,62 @@ def _order_of_25(keypoints: Float) -> str:
     return "body25" if midpoint else "body25b"
 
 
-OPENPOSE = OpenPose()
-
-
-class AlphaPose(KeypointFile):
-    """Reader of AlphaPose's `alphapose-results.json`, old and new, also in its formats `cmu` and `open`."""
-
-    name = "alphapose"
-    title = "AlphaPose keypoints"
-
-    def recognises(self, path: Path) -> bool:
-        """Return True for a list of results that name pictures, or have AlphaPose's `box` or `idx`."""
-        return path.is_file() and any(
-            is_alphapose_entry(first_entry(s)) or _is_by_picture(s) for s in samples(path)
-        )
-
-    def gather(self, people: Gathering) -> None:
-        """Add every person, with the tracker's id."""
-        content = load_json(people.path)
-        if isinstance(content, dict) and _is_by_picture(content):
-            people.digits = changing_digits(content)
-            for picture, shown in content.items():
-                frame = people.frame_of(picture, str(people.path))
-                key = next(key for key in _BY_PICTURE if key in shown)
-                for where, person in objects(shown[key], f"{people.path}, {picture}", key):
-                    people.add(frame, triples(person.get(_BY_PICTURE[key]), where), where)
-            return
-        if isinstance(content, list):
-            named = {entry.get("image_id") for entry in content if isinstance(entry, dict)}
-            people.digits = changing_digits([name for name in named if isinstance(name, str)])
-        for where, entry in objects(content, people.path, "results"):
-            frame = people.frame_of(entry.get("image_id"), where)
-            if "keypoints" not in entry:
-                raise DataError(where, "has no keypoints", "check the file's format")
-            people.add(
-                frame, triples(entry["keypoints"], where), where, own_id=_alphapose_track(entry.get("idx"))
-            )
-
+# --- AlphaPose, old and new, also in its formats `cmu` and `open` --------------------------------------
 
 # The list of people of a picture and the keypoints of each, in AlphaPose's formats `open` and `cmu`.
 _BY_PICTURE = {"people": "pose_keypoints_2d", "bodies": "joints"}
 
 
-def _is_by_picture(content: object) -> bool:
-    return (
+def _is_alphapose(content: object) -> bool:
+    return is_alphapose_entry(first_entry(content)) or (
         isinstance(content, dict)
         and bool(content)
         and all(isinstance(shown, dict) and _BY_PICTURE.keys() & shown.keys() for shown in content.values())
     )
 
 
-def _alphapose_track(idx: object) -> int | None:
-    while isinstance(idx, list) and idx:
-        idx = idx[0]
-    return whole_number(idx)
+def _gather_alphapose(people: Gathering) -> None:
+    """Add every person, with the tracker's id."""
+    content = load_json(people.path)
+    if isinstance(content, dict):
+        people.digits = changing_digits(content)
+        for picture, shown in content.items():
+            frame = people.frame_of(picture, str(people.path))
+            key = next(key for key in _BY_PICTURE if key in shown)
+            for where, person in objects(shown[key], f"{people.path}, {picture}", key):
+                people.add(frame, triples(person.get(_BY_PICTURE[key]), where), where)
+        return
+    if isinstance(content, list):
+        named = {entry.get("image_id") for entry in content if isinstance(entry, dict)}
+        people.digits = changing_digits([name for name in named if isinstance(name, str)])
+    for where, entry in objects(content, people.path, "results"):
+        frame = people.frame_of(entry.get("image_id"), where)
+        people.add(frame, triples(entry.get("keypoints"), where), where, own_id=_track(entry.get("idx")))
 
 
-ALPHAPOSE = AlphaPose()
+# --- COCO: results and annotations ---------------------------------------------------------------------
 
 
-class Coco(KeypointFile):
-    """Reader of COCO keypoint results and annotations."""
-
-    name = "coco"
-    title = "COCO keypoints"
-
-    def recognises(self, path: Path) -> bool:
-        """Return True for a COCO file, even with boxes only or an empty list; reading reports the fault."""
-        return path.is_file() and any(_is_annotations(s) or _is_results(s) for s in samples(path))
-
-    def gather(self, people: Gathering) -> None:
-        """Add every person; an annotation file also states the joint names and the picture size."""
-        content = load_json(people.path)
-        boxes = (
-            _add_annotations(content, people) if isinstance(content, dict) else _add_results(content, people)
-        )
-        if boxes and not len(people):
-            raise DataError(
-                people.path,
-                f"holds boxes only, no keypoints, in all of its {boxes} entries",
-                "run a keypoint detector",
-            )
-        people.dropped["entry without keypoints"] += boxes
-
-
-def _is_annotations(sample: object) -> bool:
-    return isinstance(sample, dict) and {"images", "annotations"} <= sample.keys()
-
-
-def _is_results(sample: object) -> bool:
-    entry = first_entry(sample)
-    return sample == [] or (
+def _is_coco(content: object) -> bool:
+    """Return True for a COCO file, even with boxes only or an empty list; reading reports the fault."""
+    if isinstance(content, dict):
+        return {"images", "annotations"} <= content.keys()
+    entry = first_entry(content)
+    return content == [] or (
         {"image_id", "category_id"} <= entry.keys()
         and ("keypoints" in entry or "bbox" in entry)
         and not is_alphapose_entry(entry)
     )
+
+
+def _gather_coco(people: Gathering) -> None:
+    """Add every person; an annotation file also states the joint names and the picture size."""
+    content = load_json(people.path)
+    boxes = _add_annotations(content, people) if isinstance(content, dict) else _add_results(content, people)
+    if boxes and not len(people):
+        problem = f"holds boxes only, no keypoints, in all of its {boxes} entries"
+        raise DataError(people.path, problem, "run a keypoint detector", code="no-keypoints")
+    people.dropped["entry without keypoints"] += boxes
 
 
 def _add_results(content: object, people: Gathering) -> int:
@@ -212,99 +163,226 @@ def _add_annotations(content: dict[str, object], people: Gathering) -> int:
             continue
         image_id = str(annotation.get("image_id"))
         if image_id not in frames:
-            raise DataError(
-                where, f"its image_id {image_id} is not among the images", "check the images list"
-            )
-        rows = _with_confidence(triples(annotation["keypoints"], where), where)
-        people.add(frames[image_id], rows, where, own_id=whole_number(annotation.get("track_id")))
-    people.joint_names = _coco_joint_names(content)
-    width, height = sizes.pop() if len(sizes) == 1 else (None, None)
-    people.image_size = (width, height) if width and height else None
+            problem = f"its image_id {image_id} is not among the images"
+            raise DataError(where, problem, "check the images list")
+        rows = triples(annotation["keypoints"], where)
+        if not np.isin(rows[:, 2], (0, 1, 2)).all():
+            problem = "its third values are not the visibilities 0, 1 and 2"
+            raise DataError(where, problem, "store it as COCO results", code="bad-value")
+        track = whole_number(annotation.get("track_id"))
+        people.add(frames[image_id], rows * [1, 1, 0.5], where, own_id=track)
+    names = first_entry(content.get("categories")).get("keypoints")
+    if isinstance(names, list):
+        people.joint_names = tuple(str(name).strip().lower().replace(" ", "_") for name in names)
+    if len(sizes) == 1:
+        people.image_size = _size(*sizes.pop())
     return boxes
 
 
-def _with_confidence(rows: Float, where: str) -> Float:
-    """Convert rows of x, y, visibility to x, y, confidence."""
-    visibility = rows[:, 2:]
-    if not np.isin(visibility, (0, 1, 2)).all():
-        raise DataError(
-            where, "its third values are not the visibilities 0, 1 and 2", "store it as COCO results"
-        )
-    return np.hstack([rows[:, :2], visibility / 2])
+def _size(width: object, height: object) -> tuple[int, int] | None:
+    sides = whole_number(width), whole_number(height)
+    return (sides[0], sides[1]) if sides[0] and sides[1] else None
 
 
-def _coco_joint_names(content: dict[str, object]) -> tuple[str, ...] | None:
-    """Return the first category's keypoint names in this program's spelling of joints; None without names."""
-    names = first_entry(content.get("categories")).get("keypoints")
-    if not isinstance(names, list):
-        return None
-    return tuple(str(name).strip().lower().replace(" ", "_") for name in names)
+# --- MMPose: a file of predictions, or a folder with one file for every picture ------------------------
 
 
-COCO = Coco()
-
-
-class MMPose(KeypointFile):
-    """Reader of a file of MMPose predictions, or of a folder with one file for every picture."""
-
-    name = "mmpose"
-    title = "MMPose keypoints"
-
-    def recognises(self, path: Path) -> bool:
-        """Return True if a file, or some files across a folder, hold MMPose's frames or people."""
-        return any(_is_prediction(sample) for sample in samples(path))
-
-    def gather(self, people: Gathering) -> None:
-        """Add every person, file by file; the last joint names that a file states count."""
-        for file, content in people.contents():
-            people.joint_names = _read_file(file, content, people) or people.joint_names
-
-
-def _is_prediction(sample: object) -> bool:
+def _is_mmpose(sample: object) -> bool:
     if isinstance(sample, dict):
         return "instance_info" in sample
     keys = first_entry(sample).keys()
     return {"frame_id", "instances"} <= keys or {"keypoints", "keypoint_scores"} <= keys
 
 
-def _read_file(file: Path, content: object, people: Gathering) -> tuple[str, ...] | None:
-    """Add the people of one file; return the joint names if it states them."""
-    names = None
-    if isinstance(content, dict):
-        names = _mmpose_joint_names(content.get("meta_info"))
-        content = content.get("instance_info")
-    if not isinstance(content, list):
-        people.dropped["file without predictions"] += 1
-    elif "instances" in first_entry(content):
-        for where, entry in objects(content, file, "frames"):
-            frame = people.frame_of(entry.get("frame_id"), where, file)
-            _add_people(frame, entry.get("instances"), where, people)
-    elif frame_number(file.stem) is None and file == people.path:  # the predictions of one picture
-        _add_people(people.frame_of(0, str(file)), content, str(file), people)
-    elif frame_number(file.stem) is None:
-        people.dropped["file without a frame number"] += 1
-    else:
-        _add_people(people.frame_of(file.stem, str(file)), content, str(file), people)
-    return names
+def _gather_mmpose(people: Gathering) -> None:
+    """Add every person, file by file; the last joint names that a file states count."""
+    for file, content in people.contents():
+        predictions = content
+        if isinstance(content, dict):
+            meta = content.get("meta_info")
+            by_id = meta.get("keypoint_id2name") if isinstance(meta, dict) else None
+            if isinstance(by_id, dict):
+                people.joint_names = tuple(str(by_id.get(str(index))) for index in range(len(by_id)))
+            predictions = content.get("instance_info")
+        if not isinstance(predictions, list):
+            people.dropped["file without predictions"] += 1
+        elif "instances" in first_entry(predictions):
+            for where, entry in objects(predictions, file, "frames"):
+                frame = people.frame_of(entry.get("frame_id"), where, file)
+                _add_instances(frame, entry.get("instances"), where, people)
+        elif (frame_of_file := people.frame_of_file(file)) is not None:
+            _add_instances(frame_of_file, predictions, str(file), people)
 
 
-def _add_people(frame: int, instances: object, where: str, people: Gathering) -> None:
+def _add_instances(frame: int, instances: object, where: str, people: Gathering) -> None:
     for rank, (who, person) in enumerate(objects(instances, where, "instances")):
         points = numbers(person.get("keypoints"), who)
         scores = numbers(person.get("keypoint_scores"), who)
         if points.ndim != 2 or points.shape[1] != 2 or scores.shape != points.shape[:1]:
             shapes = f"{list(points.shape)} and {list(scores.shape)}"
             problem = f"keypoints and keypoint_scores are of shape {shapes}, not [K, 2] and [K]"
-            raise DataError(who, problem, "save 2D predictions")
+            raise DataError(who, problem, "save 2D predictions", code="bad-value")
         people.add(frame, np.column_stack([points, scores]), who, rank=rank)
 
 
-def _mmpose_joint_names(meta: object) -> tuple[str, ...] | None:
-    """Return the joints in order, from the data set's `keypoint_id2name`; None without it."""
-    by_id = meta.get("keypoint_id2name") if isinstance(meta, dict) else None
-    if not isinstance(by_id, dict):
-        return None
-    return tuple(str(by_id.get(str(index))) for index in range(len(by_id)))
+# --- EasyMocap: annots/CAMERA/000000.json --------------------------------------------------------------
 
 
-MMPOSE = MMPose()
+def _is_easymocap(sample: object) -> bool:
+    return isinstance(sample, dict) and isinstance(sample.get("annots"), list) and "filename" in sample
+
+
+def _gather_easymocap(people: Gathering) -> None:
+    """Add every person, file by file, with the id that EasyMocap gave; faces and hands are not read."""
+    for file, content in people.contents():
+        if not isinstance(content, dict) or not _is_easymocap(content):
+            people.dropped["file without annotations"] += 1
+        elif (frame := people.frame_of_file(file)) is not None:
+            people.image_size = _size(content.get("width"), content.get("height"))
+            for rank, (where, person) in enumerate(objects(content["annots"], file, "annots")):
+                rows = numbers(person.get("keypoints"), where)
+                if rows.ndim != 2 or rows.shape[1] != 3:
+                    problem = f"keypoints are of shape {list(rows.shape)}, not [K, 3]"
+                    raise DataError(where, problem, "extract 2D keypoints", code="bad-value")
+                people.add(frame, rows, where, rank=rank, own_id=_track(person.get("personID")))
+
+
+# --- Ultralytics: results as JSON, one file a picture, or a list of pictures ---------------------------
+
+
+def _is_ultralytics(sample: object) -> bool:
+    content = sample[0] if isinstance(sample, list) and sample and isinstance(sample[0], list) else sample
+    entry = first_entry(content)
+    return "box" in entry and isinstance(entry.get("keypoints"), dict)
+
+
+def _gather_ultralytics(people: Gathering) -> None:
+    """Add every person; a list of lists holds the pictures from frame 0 on."""
+    for file, content in people.contents():
+        if isinstance(content, list) and content and all(isinstance(each, list) for each in content):
+            for number, picture in enumerate(content):
+                _add_results_of_yolo(people, people.frame_of(number, str(file)), picture, file)
+        elif (frame := people.frame_of_file(file)) is not None:
+            _add_results_of_yolo(people, frame, content, file)
+
+
+def _add_results_of_yolo(people: Gathering, frame: int, picture: object, file: Path) -> None:
+    """Add people with keypoints {x: [...], y: [...], visible: [...]}."""
+    for rank, (where, person) in enumerate(objects(picture, file, "results")):
+        stated = person.get("keypoints")
+        points: dict[str, object] = stated if isinstance(stated, dict) else {}
+        columns = [numbers(points.get(axis), where) for axis in "xy"]
+        columns.append(numbers(points.get("visible", [1.0] * columns[0].size), where))
+        if columns[0].ndim != 1 or len({column.shape for column in columns}) > 1:
+            problem = "keypoints are not equally many numbers x, y, visible"
+            raise DataError(where, problem, "save results of a pose model", code="bad-value")
+        track = _track(person.get("track_id"))
+        people.add(frame, np.stack(columns, axis=1), where, rank=rank, own_id=track)
+
+
+# --- DeepLabCut: a table below lines scorer, individuals, bodyparts, coords ----------------------------
+
+_DLC_LINES = ("scorer", "individuals", "bodyparts", "coords")
+
+
+def _is_deeplabcut(head: object) -> bool:
+    lines = str(head).split("\n", 4)
+    labels = [line.partition(",")[0].strip() for line in lines[:4]]
+    return labels[0] == "scorer" and {"bodyparts", "coords"} <= set(labels)
+
+
+def _gather_deeplabcut(people: Gathering) -> None:
+    """Add everybody of every row; its frame is its number, or that in the name of a labelled picture."""
+    rows = list(csv.reader(read_text(people.path).split("\n")))
+    count = next((k for k, row in enumerate(rows) if not row or row[0].strip() not in _DLC_LINES), len(rows))
+    head = {row[0].strip(): [cell.strip() for cell in row] for row in rows[:count]}
+    first = next((k for k, cell in enumerate(head["coords"]) if cell in {"x", "y"}), 0)
+    if not first or len({len(line) for line in head.values()}) > 1:
+        raise DataError(people.path, "has no columns x and y below `coords`", "export it again")
+    everybody = head.get("individuals", [""] * len(head["coords"]))
+    columns: dict[str, dict[str, dict[str, int]]] = {}
+    for k in range(first, len(head["coords"])):
+        of_person = columns.setdefault(everybody[k], {})
+        of_person.setdefault(head["bodyparts"][k], {})[head["coords"][k]] = k
+    parts = list(next(iter(columns.values())))
+    table = _cells(people, rows[count:], first, len(head["coords"]), count + 1)
+    for name, values in table:
+        frame = people.frame_of(name, str(people.path))
+        for rank, of_person in enumerate(columns.values()):
+            points = np.array(
+                [
+                    [values[at["x"] - first], values[at["y"] - first],
+                     values[at["likelihood"] - first] if "likelihood" in at else 1.0]
+                    for at in (of_person[part] for part in parts if part in of_person)
+                ]
+            )  # fmt: skip
+            if np.isfinite(points[:, :2]).any():
+                people.add_named(frame, parts, points, str(people.path), rank=rank, own_id=rank)
+
+
+def _cells(
+    people: Gathering, rows: Sequence[list[str]], first: int, width: int, line: int
+) -> list[tuple[object, list[float]]]:
+    """Return the name or number of each row, and its numbers; a last row that breaks off is counted."""
+    found: list[tuple[object, list[float]]] = []
+    for number, row in enumerate(rows, start=line):
+        if not any(row):
+            continue
+        try:
+            if len(row) != width:
+                raise ValueError(f"{len(row)} cells instead of {width}")
+            values = [float(cell) if cell.strip() else np.nan for cell in row[first:]]
+        except ValueError as error:
+            if number == line + len(rows) - 1:
+                people.dropped["truncated last line"] += 1
+                continue
+            raise DataError(people.path, f"line {number}: {error}", "export it again") from error
+        name = row[first - 1].strip()
+        found.append((int(name) if name.isdecimal() else name, values))
+    return found
+
+
+# --- SLEAP: analysis as CSV, a row for each person in a frame ------------------------------------------
+
+
+def _is_sleap(head: object) -> bool:
+    cells = str(head).partition("\n")[0].strip().split(",")
+    return "frame_idx" in cells and any(cell.endswith(".x") for cell in cells)
+
+
+def _gather_sleap(people: Gathering) -> None:
+    """Add every row: track, frame_idx, instance.score, then x, y and score of each node."""
+    rows = list(csv.reader(read_text(people.path).split("\n")))
+    head = {cell.strip(): k for k, cell in enumerate(rows[0])}
+    nodes = [cell.removesuffix(".x") for cell in head if cell.endswith(".x") and f"{cell[:-1]}y" in head]
+    tracks: dict[str, int] = {}
+    for number, row in enumerate(rows[1:], start=2):
+        if not any(row):
+            continue
+        where = f"{people.path}, line {number}"
+        try:
+            frame = people.frame_of(int(row[head["frame_idx"]]), where)
+            points = np.array(
+                [
+                    [float(row[head[f"{node}.{axis}"]] or "nan") if f"{node}.{axis}" in head else 1.0
+                     for axis in ("x", "y", "score")]
+                    for node in nodes
+                ]
+            )  # fmt: skip
+        except (ValueError, IndexError) as error:
+            raise DataError(where, f"is no row of numbers ({error})", "export it again") from error
+        track = row[head["track"]].strip() if "track" in head else ""
+        own_id = tracks.setdefault(track, len(tracks)) if track else None
+        people.add_named(frame, nodes, points, where, own_id=own_id)
+
+
+OPENPOSE = KeypointFile("openpose", "OpenPose keypoints", _is_frame, _gather_openpose)
+ALPHAPOSE = KeypointFile(
+    "alphapose", "AlphaPose keypoints", _is_alphapose, _gather_alphapose, of_folders=False
+)
+COCO = KeypointFile("coco", "COCO keypoints", _is_coco, _gather_coco, of_folders=False)
+MMPOSE = KeypointFile("mmpose", "MMPose keypoints", _is_mmpose, _gather_mmpose)
+EASYMOCAP = KeypointFile("easymocap_keypoints", "EasyMocap keypoints", _is_easymocap, _gather_easymocap)
+ULTRALYTICS = KeypointFile("ultralytics", "Ultralytics keypoints", _is_ultralytics, _gather_ultralytics)
+DEEPLABCUT = KeypointFile("deeplabcut", "DeepLabCut keypoints", _is_deeplabcut, _gather_deeplabcut, (".csv",))
+SLEAP = KeypointFile("sleap", "SLEAP keypoints", _is_sleap, _gather_sleap, (".csv",))

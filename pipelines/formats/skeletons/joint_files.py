@@ -26,7 +26,7 @@ from pipelines.formats.poses.trajectory_files import write_pose_csv
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.errors import DataError
-from pipelines.session.people import SKELETONS
+from pipelines.session.people import SKELETONS, joint_called
 from pipelines.session.progress import Progress
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording, Trajectory
 from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, pose_table, write_table
@@ -208,23 +208,12 @@ def _camel_case(joint: str) -> str:
 _MARKERS = {joint: _camel_case(joint) for skeleton in SKELETONS.values() for joint in skeleton.joints}
 
 
-_JOINTS = {
-    **{marker: joint for joint, marker in _MARKERS.items()},
-    **{joint.title().replace("_", ""): joint for joint in _MARKERS},  # RightBigToe
-    "CHip": "hip",
-    "MidHip": "hip",
-    "HipCenter": "hip",
-    "LFootIndex": "left_big_toe",
-    "RFootIndex": "right_big_toe",
-}
-
-
 def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
     """Return our names of known markers; if two markers mean one joint, only the first gets its name."""
     names: dict[str, None] = {}
     given = []
     for marker in markers:
-        joint = _JOINTS.get(marker, marker)
+        joint = joint_called(marker) or marker
         given.append(marker if joint in names else joint)
         names[given[-1]] = None
     return tuple(given)
