@@ -48,13 +48,15 @@ class CalibratedCamera:
     """One camera of a calibration file; either part may be absent from the file.
 
     Some calibrations do not state the size of their pictures. It is then that of which the principal point
-    is the middle, and `size_stated` is False: the pictures themselves decide.
+    is the middle, and `size_stated` is False: the pictures themselves decide. `note` says what else the file
+    states and is not used, or used otherwise.
     """
 
     intrinsics: Intrinsics | None
     position: Float | None = None  # [3] m, world_from_camera
     quaternion_xyzw: Float | None = None  # [4] unit, world_from_camera
     size_stated: bool = True
+    note: str = ""
 
 
 @dataclass(frozen=True)

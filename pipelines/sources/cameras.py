@@ -320,6 +320,8 @@ class FlightCameras:
                     path, "holds poses but no intrinsics", "name one with both", code="no-intrinsics"
                 )
             intrinsics = calibrated.intrinsics
+            if calibrated.note:
+                self._note(f"{name}: {calibrated.note}")
             if not calibrated.size_stated:
                 size = self._picture_size(camera, video, detections)
                 intrinsics = _with_size(intrinsics, size, path)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from pipelines.formats.calibrations import camera_matrices
+from pipelines.formats.calibrations import calibration_files
 from pipelines.formats.calibrations.camera_matrices import write_camera_info
 from pipelines.formats.logs import mcap_log
 from pipelines.formats.scenes.mcap_writing import Ros2Recording
@@ -113,7 +113,7 @@ def test_intrinsics_come_back_exactly(
 ) -> None:
     path = tmp_path_factory.mktemp("camera") / "camera.yaml"
     write_camera_info(path, "drone1", Intrinsics(640, 480, fx, fy, cx, cy, "radtan", tuple(distortion)))
-    (read,) = camera_matrices.CAMERA_INFO.read_calibration(path).values()
+    (read,) = calibration_files.CAMERA_INFO.read_calibration(path).values()
     assert read.intrinsics is not None
     full = read.intrinsics
     assert (full.width, full.height, full.fx, full.fy, full.cx, full.cy) == (640, 480, fx, fy, cx, cy)

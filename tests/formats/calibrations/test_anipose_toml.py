@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.calibrations import rigs
+from pipelines.formats.calibrations import calibration_files
 from pipelines.geometry.cameras import project
 from pipelines.session.errors import DataError
 from pipelines.session.registries import CalibrationFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
-READER: CalibrationFormat = rigs.ANIPOSE
+READER: CalibrationFormat = calibration_files.ANIPOSE
 POSE2SIM = "pose2sim_single/calibration/Calib_qualisys.toml"
 TODAY = "second/caliscope_4cam_camera_array.toml"
 
@@ -92,7 +92,6 @@ def test_uncalibrated_and_ignored_cameras_are_left_out() -> None:
     assert list(READER.read_calibration(path)) == ["cam_1", "cam_2", "cam_3", "cam_4"]
     summary = READER.describe(path)
     assert summary["cameras"] == 4
-    assert ["cam_0"] in summary.values()
 
 
 @pytest.mark.parametrize(

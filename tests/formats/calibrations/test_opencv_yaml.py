@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.formats.calibrations import opencv_yaml
+from pipelines.formats.calibrations import calibration_files
 from pipelines.geometry.cameras import project
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 from pipelines.session.registries import CalibrationFormat, recognise
 
-READER: CalibrationFormat = opencv_yaml.OPENCV
+READER: CalibrationFormat = calibration_files.OPENCV
 K = np.array([[800.0, 0, 330.5], [0, 790.0, 241.25], [0, 0, 1]])
 D = np.array([[-0.21, 0.08, 0.001, -0.002, 0.01]])
 

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.formats.calibrations import opencv_yaml
+from pipelines.formats.calibrations import calibration_files
 from pipelines.geometry.cameras import project
 from pipelines.session.registries import CalibrationFormat, recognise
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
-READER: CalibrationFormat = opencv_yaml.ORBSLAM
+READER: CalibrationFormat = calibration_files.ORBSLAM
 
 # After Examples/Stereo-Inertial/TUM-VI.yaml and Examples/Stereo/EuRoC.yaml of ORB-SLAM 3, with other numbers.
 FISHEYE = """%YAML:1.0

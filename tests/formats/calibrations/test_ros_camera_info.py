@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.formats.calibrations import camera_matrices
+from pipelines.formats.calibrations import calibration_files
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, CalibrationFormat
 from tests.real_data import real_data
 
-READER: CalibrationFormat = camera_matrices.CAMERA_INFO
+READER: CalibrationFormat = calibration_files.CAMERA_INFO
 MATRIX = np.array([[800.0, 0, 330.5], [0, 790.0, 241.25], [0, 0, 1]])
 POINTS = np.array([[0.1, 0.2, 2.0], [-0.5, 0.3, 2.5]])
 
