@@ -17,6 +17,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from pipelines.geometry.mounting import Looks, RelativeTo
+from pipelines.session.errors import DataError
+from pipelines.session.old_spellings import old_spellings
 from pipelines.session.source_options import option_names
 from pipelines.session.storage import refuse_camera_names, refuse_names_of_people
 from pipelines.session.yaml_files import (
@@ -554,5 +556,11 @@ def read_flight(path: Path) -> Manifest:
         newest=SCHEMA,
         shape="a mapping with `schema: 1` and `cameras:`",
         made="`mocap init FOLDER` drafts one",
+        refuse=_refuse_old_spellings,
     )
     return flight if flight.name else flight.model_copy(update={"name": path.stem})
+
+
+def _refuse_old_spellings(path: Path, stated: Mapping[object, object]) -> None:
+    if old := old_spellings(stated):
+        raise DataError(path, "; ".join(old), "docs/flight.md explains every key", code="old-spelling")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
@@ -105,6 +105,7 @@ def read_yaml_model(
     newest: int,
     shape: str,
     made: str = "",
+    refuse: Callable[[Path, Mapping[object, object]], None] | None = None,
 ) -> M:
     """Read and validate a file.
 
@@ -114,6 +115,7 @@ def read_yaml_model(
         newest: the newest version of the schema.
         shape: a description of the file's form, for the message if the file is no mapping.
         made: how one is made, for the message if the file is another one.
+        refuse: raises a DataError for a content that is worth a message of its own.
 
     Raises:
         DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
@@ -130,6 +132,8 @@ def read_yaml_model(
             "use a newer version of mocap",
             code="newer-schema",
         )
+    if refuse is not None:
+        refuse(path, raw)
     try:
         return model.model_validate(raw)
     except ValidationError as error:
