@@ -38,7 +38,7 @@ def init_command(
     PATHS are files and folders; folders are searched. Names (drone1.mp4, drone1_poses.tum, /drone1/odometry,
     a camera of a calibration) and times decide what belongs to which camera. What no file states, such as a
     frame rate, a clock or a mount, is assumed and marked with `assumed: true`, or named as missing. Read the
-    manifest before you ingest it.
+    manifest before you ingest it. Without any camera, the exit status is 1.
     """
     if bool(paths) == bool(example):
         raise click.UsageError("State the files of a flight, or --example NAME.")
@@ -68,6 +68,8 @@ def init_command(
     else:
         say(f"cameras: {', '.join(result.cameras) or 'none'}")
         say(f"written: {_from_here(result.path)}")
+    if not result.cameras:
+        raise SystemExit(1)
 
 
 def _write_example(name: str, output: Path | None, overwrite: bool, shown: Shown) -> None:

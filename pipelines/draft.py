@@ -34,6 +34,7 @@ from pipelines.formats.drone_logs.tlog import FORMAT as TLOG
 from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
 from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
+from pipelines.formats.logs.trajectories import poses_of
 from pipelines.formats.poses.trajectory_files import times_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
 from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
@@ -63,6 +64,7 @@ from pipelines.session.registries import (
     TelemetryFormat,
     TrajectoryFormat,
     VideoFormat,
+    recognise,
 )
 from pipelines.session.storage import as_data_error, drop_link
 from pipelines.session.unknown_files import EXPECTED, describe_unknown
@@ -503,19 +505,19 @@ def _drone_log(path: Path, place: NamePlace, format_: TelemetryFormat, instance:
 
 
 class _MotionComparison:
-    """Comparison of videos with drones' logs by their motion; each video is followed once."""
+    """Comparison of videos with poses by their motion; each video is followed once."""
 
     def __init__(self) -> None:
         self._followed: dict[Path, TrackedPoints] = {}
 
-    def __call__(self, film: FoundFilm, log: FlownPoses) -> MotionMatch | None:
-        """Return how well the poses in a log explain the motion in a video's pictures; None without poses.
+    def __call__(self, film: FoundFilm, found: Proposal) -> MotionMatch | None:
+        """Return how well poses explain the motion in a video's pictures; None without poses.
 
-        The lens is taken to have an ordinary angle of view. Without a gimbal, the camera is taken to look
-        forward and down by the angle that explains most.
+        The lens is taken to have an ordinary angle of view. The camera on a body without a gimbal is taken to
+        look forward and down by the angle that explains most.
         """
-        telemetry = log.telemetry
-        if telemetry is None or (track := telemetry.gimbal or telemetry.body) is None:
+        poses = _poses_in(found)
+        if poses is None:
             return None
         if film.path not in self._followed:
             index = index_video(film.path)
@@ -524,22 +526,47 @@ class _MotionComparison:
             lens = Intrinsics(index.width, index.height, focal_px, focal_px, *middle)
             watched_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
             self._followed[film.path] = followed_points(film.path, lens, watched_ns)
-        position = telemetry.position.values
-        if telemetry.position.on_earth:
-            position = _enu(position, Place(*position[0].tolist()))
-        moved = interpolate_points(telemetry.position.t_ns, position, track.t_ns, max_gap_ns=MAX_GAP_NS)
-        rows = np.isfinite(moved).all(axis=1)
-        if film.made_ns is not None and log.span and log.span.first_ns > NO_DATE_NS:
-            rows &= np.abs(track.t_ns - film.made_ns) <= 2 * film.length_ns + MADE_WITHIN_NS
-        found: list[MotionMatch] = []
-        for down_deg in (0.0,) if telemetry.gimbal else TRIED_DOWN_DEG:
-            turned = multiply(track.quaternion_xyzw[rows], body_from_camera("forward", down_deg))
+        t_ns, position, turned = poses
+        rows = np.isfinite(position).all(axis=1)
+        if film.made_ns is not None and found.span and found.span.first_ns > NO_DATE_NS:
+            rows &= np.abs(t_ns - film.made_ns) <= 2 * film.length_ns + MADE_WITHIN_NS
+        matches: list[MotionMatch] = []
+        for mount in (
+            [body_from_camera("forward", deg) for deg in TRIED_DOWN_DEG] if found.of_body else [None]
+        ):
             explained = explain_motion(
-                track.t_ns[rows], moved[rows], turned, self._followed[film.path], max_gap_ns=MAX_GAP_NS
+                t_ns[rows],
+                position[rows],
+                turned[rows] if mount is None else multiply(turned[rows], mount),
+                self._followed[film.path],
+                max_gap_ns=MAX_GAP_NS,
             )
             if explained is not None:
-                found.append(MotionMatch(*explained))
-        return max(found, key=lambda alike: float(np.nansum(alike.gain)), default=None)
+                matches.append(MotionMatch(*explained))
+        return max(matches, key=lambda alike: float(np.nansum(alike.gain)), default=None)
+
+
+def _poses_in(found: Proposal) -> tuple[Int64, Float, Float] | None:
+    """Read times, positions and rotations of a body, or of a camera; None for those of several topics."""
+    if isinstance(found, FlownPoses):
+        telemetry = found.telemetry
+        if telemetry is None or (track := telemetry.gimbal or telemetry.body) is None:
+            return None
+        position, turned = telemetry.position.values, track.quaternion_xyzw
+        if telemetry.position.on_earth:
+            position = _enu(position, Place(*position[0].tolist()))
+        if telemetry.gimbal is not None:
+            turned = multiply(turned, body_from_camera("forward"))
+        moved = interpolate_points(telemetry.position.t_ns, position, track.t_ns, max_gap_ns=MAX_GAP_NS)
+        return track.t_ns, moved, turned
+    poses = None
+    with suppress(DataError):
+        if not found.topic and "parent" not in found.settings:
+            poses = recognise(found.path, TrajectoryFormat, "trajectory").read_trajectory(found.path)
+        elif found.settings.keys() == {"file", "topic"}:
+            with recognise(found.path, LogFormat, "log").open_log([found.path]) as log:
+                poses = poses_of(log, found.topic, str(found.path), "header").trajectory
+    return None if poses is None else (poses.t_ns, poses.position, poses.quaternion_xyzw)
 
 
 def _enu(geodetic: Float, place: Place) -> Float:

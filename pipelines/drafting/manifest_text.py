@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from io import StringIO
 from pathlib import Path
@@ -128,6 +128,16 @@ class _ManifestWriter:
         self.missing: dict[str, list[str]] = {}
         self.assumed: dict[str, list[str]] = {}
 
+    def assume(self, camera: CameraDraft | None, key: str, what: str) -> str:
+        """Note that something is assumed; return the remark on it."""
+        self.assumed.setdefault(f"{key}: {what}", []).extend([camera.name] if camera else [])
+        return f"assumed: {what}"
+
+    def miss(self, camera: CameraDraft | None, key: str, what: str) -> str:
+        """Note that something is missing; return the remark on it."""
+        self.missing.setdefault(f"{key}: {what}", []).extend([camera.name] if camera else [])
+        return f"missing: {what}"
+
     def stated(self, settings: object) -> object:
         """Convert settings to the form in the manifest: relative paths, names of logs, a lone file bare."""
         if isinstance(settings, Path):
@@ -151,6 +161,15 @@ class _ManifestWriter:
         more = len(candidates) - len(lines)
         return [*lines, f"#   and {more} more"] if more else lines
 
+    def entry(
+        self, key: str, candidates: Sequence[Proposal], remarks: Sequence[str], settings: object = None
+    ) -> DraftedKey:
+        """Return the entry of the first candidate, a guess if a remark says so, with the others below it."""
+        stated = settings if isinstance(settings, dict) else _settings(candidates[0])
+        is_guess = any(remark.startswith("assumed") for remark in remarks)
+        value = self.guessed(stated) if is_guess else self.stated(stated)
+        return DraftedKey(value, [candidates[0].about, *remarks], self.others(key, candidates[1:]))
+
     # --- a camera --------------------------------------------------------------------------------------
 
     def camera(self, camera: CameraDraft) -> dict[str, DraftedKey]:
@@ -158,93 +177,69 @@ class _ManifestWriter:
         entries = {
             "video": self._video(camera),
             "keypoints": self._keypoints(camera),
-            "frame_times": self._frame_times(camera),
-            "clock": self._clock(camera),
+            **self._times(camera),
             "pose": self._pose(camera),
             "intrinsics": self._intrinsics(camera),
             **self._mount(camera),
         }
         return {key: entries[key] for key in CameraSources.model_fields if key in entries}
 
-    def _assume(self, camera: CameraDraft, key: str, what: str) -> None:
-        self.assumed.setdefault(f"{key}: {what}", []).append(camera.name)
-
-    def _miss(self, camera: CameraDraft, what: str) -> None:
-        self.missing.setdefault(what, []).append(camera.name)
-
-    def _entry(self, key: str, candidates: Sequence[Proposal], remarks: list[str], guess: bool) -> DraftedKey:
-        settings = _settings(candidates[0])
-        value = self.guessed(settings) if guess else self.stated(settings)
-        return DraftedKey(value, [candidates[0].about, *remarks], self.others(key, candidates[1:]))
-
     def _video(self, camera: CameraDraft) -> DraftedKey:
-        videos = camera.pictures["video"]
-        if videos:
-            if camera.paired:
-                self._assume(camera, "video", "of the same camera as the keypoints")
-            remarks = ["assumed: of the same camera as the keypoints"] if camera.paired else []
-            return self._entry("video", videos, remarks, camera.paired)
+        if videos := camera.pictures["video"]:
+            what = "of the same camera as the keypoints"
+            return self.entry("video", videos, [self.assume(camera, "video", what)] if camera.paired else [])
         if camera.pictures["keypoints"]:
             return DraftedKey()
-        self._miss(camera, "a video or keypoints")
-        return DraftedKey(
-            None, ["missing: a video, pictures of a log, or keypoints"], example=f"{camera.name}.mp4"
-        )
+        remark = self.miss(camera, "video", "a video, pictures of a log, or keypoints")
+        return DraftedKey(None, [remark], example=f"{camera.name}.mp4")
 
     def _keypoints(self, camera: CameraDraft) -> DraftedKey:
         listed = camera.pictures["keypoints"]
         if not listed:
             return DraftedKey()
-        first = listed[0]
-        remarks: list[str] = []
-        settings: dict[str, object] = {}
-        if isinstance(first, FoundFrames) and first.ambiguous:
-            settings["format"] = first.ambiguous
-            remarks.append("assumed: other formats recognise it too")
-            self._assume(camera, "keypoints", f"that they are {first.ambiguous}'s")
-        number = _first_frame(first, camera.film) if isinstance(first, FoundFrames) else 0
-        if number:
-            settings["first_frame"] = number
-            remarks.append(f"assumed: frame {number} of it is the first")
-            self._assume(camera, "keypoints", f"first_frame {number}")
-        entry = self._entry("keypoints", listed, remarks, False)
-        if settings:
-            entry.value = self.guessed({**first.settings, **settings})
-        return entry
+        first, remarks = listed[0], []
+        settings = dict(first.settings)
+        if isinstance(first, FoundFrames):
+            if first.ambiguous:
+                settings["format"] = first.ambiguous
+                what = f"that they are {first.ambiguous}'s, for other formats recognise them too"
+                remarks.append(self.assume(camera, "keypoints", what))
+            if number := _first_frame(first, camera.film):
+                settings["first_frame"] = number
+                remarks.append(self.assume(camera, "keypoints", f"first_frame {number}"))
+        return self.entry("keypoints", listed, remarks, settings)
 
-    # --- time ------------------------------------------------------------------------------------------
-
-    def _frame_times(self, camera: CameraDraft) -> DraftedKey:
+    def _times(self, camera: CameraDraft) -> dict[str, DraftedKey]:
+        """Return the times of the pictures, and the clock that they are by."""
         choice, film = camera.choices.get("frame_times"), camera.film
+        clock = DraftedKey(None, ["if its clock is off, or unsure"], example={"offset_s": 0, "sigma_s": 0.2})
         if choice:
-            return self._entry("frame_times", [choice.taken, *choice.others], [], False)
+            times = self.entry("frame_times", [choice.taken, *choice.others], [])
+            return {"frame_times": times, "clock": clock}
         if camera.logged_film is not None:
-            return DraftedKey()  # the log's own stamps
+            return {}  # the log's own stamps
         if film and film.clock == "none":
-            self._miss(camera, "frame_times: when its pictures were taken, for their EXIF does not say it")
-            why = "missing: their EXIF has no times that rise; or a file of times"
-            return DraftedKey(None, [why], example={"start": "SECONDS", "fps": ASSUMED_FPS})
+            remark = self.miss(camera, "frame_times", "the times of its pictures, which EXIF does not have")
+            times = DraftedKey(None, [remark], example={"start": "SECONDS", "fps": ASSUMED_FPS})
+            return {"frame_times": times, "clock": clock}
         if (known := _known_start(camera)) is not None:
             settings: dict[str, object] = {"start": (Decimal(known.start_ns) / 10**9).normalize()}
             if not known.sigma_s:
-                return DraftedKey(settings, [known.source])
-            self._assume(camera, "frame_times", f"start {known.source}, to {known.sigma_s:g} s")
-            return DraftedKey(self.guessed(settings), [f"assumed: {known.source}"])
+                return {"frame_times": DraftedKey(settings, [known.source]), "clock": clock}
+            remark = self.assume(camera, "frame_times", f"start {known.source}, to {known.sigma_s:g} s")
+            stated = DraftedKey({"offset_s": 0, "sigma_s": known.sigma_s}, [])
+            return {"frame_times": DraftedKey(self.guessed(settings), [remark]), "clock": stated}
         if not film and not camera.pictures["keypoints"]:
-            return DraftedKey()
+            return {"clock": clock}
         start, reason = self._start(camera)
         if film and start is None:
             why = "when the first frame was taken, if not at 0"
-            return DraftedKey(None, [why], example={"start": "SECONDS"})
-        settings = {} if start is None else {"start": start}
+            return {"frame_times": DraftedKey(None, [why], example={"start": "SECONDS"}), "clock": clock}
+        settings = ({} if start is None else {"start": start}) | ({} if film else {"fps": ASSUMED_FPS})
         assumed = [] if film else [f"fps {ASSUMED_FPS}"]
-        if not film:
-            settings["fps"] = ASSUMED_FPS
-        assumed.append("the first frame at 0 s" if start is None else "start, when the first frame was taken")
-        self._assume(camera, "frame_times", ", ".join(assumed))
-        return DraftedKey(
-            self.guessed(settings), [f"assumed: {', '.join(assumed)}{reason and f' ({reason})'}"]
-        )
+        assumed.append("the first frame at 0 s" if start is None else f"start, {reason}")
+        remark = self.assume(camera, "frame_times", ", ".join(assumed))
+        return {"frame_times": DraftedKey(self.guessed(settings), [remark]), "clock": clock}
 
     def _start(self, camera: CameraDraft) -> tuple[Decimal | None, str]:
         """Assume the first frame's time in seconds: the start of poses and truth; None for 0."""
@@ -262,49 +257,31 @@ class _ManifestWriter:
         first_ns = max(span.first_ns for span in spans.values())
         return Decimal(-(-first_ns // 10**6)) / 1000, f"when {' and '.join(spans)} begin"
 
-    def _clock(self, camera: CameraDraft) -> DraftedKey:
-        if camera.logged_film is not None:
-            return DraftedKey()
-        known = None if camera.choices.get("frame_times") else _known_start(camera)
-        if known is not None and known.sigma_s:
-            why = f"the start is known to {known.sigma_s:g} s"
-            return DraftedKey({"offset_s": 0, "sigma_s": known.sigma_s}, [why])
-        return DraftedKey(None, ["if its clock is off, or unsure"], example={"offset_s": 0, "sigma_s": 0.2})
-
     # --- poses -----------------------------------------------------------------------------------------
 
     def _pose(self, camera: CameraDraft) -> DraftedKey:
         choice = camera.choices.get("pose")
         if choice is None:
-            self._miss(camera, "pose: nothing of that name has poses")
-            remarks = [f"missing: nothing of that name has poses{self._loose(('pose', 'still'))}"]
-            return DraftedKey(None, remarks, example={"file": f"{camera.name}.tum"})
-        taken, remarks, guess = choice.taken, [], False
-
-        def assume(remark: str, what: str) -> None:
-            nonlocal guess
-            guess = True
-            remarks.append(remark)
-            self._assume(camera, "pose", what)
-
+            remark = self.miss(camera, "pose", "nothing of that name has poses")
+            others = self.others("pose", self.draft.free_poses)
+            return DraftedKey(None, [remark], others, example={"file": f"{camera.name}.tum"})
+        taken, remarks = choice.taken, []
         if not choice.named:
-            why = f"{'' if not choice.why else ' '}{choice.why}"
-            assume(f"assumed: they are its own{why}", f"that these poses are its own{why}")
+            remarks.append(self.assume(camera, "pose", f"that these poses are its own {choice.why}".rstrip()))
         if taken.is_true:
-            what = "what is called the truth, for there is nothing else"
-            assume("assumed: these poses, called the truth, for there are no others", what)
+            remarks.append(self.assume(camera, "pose", "what is called the truth, there is nothing else"))
         filmed = camera.logged_film.span if camera.logged_film else None
         if filmed and taken.span and filmed.overlap_ns(taken.span) < 0:
-            remarks.append(f"missing: it was filmed at other times, {filmed}")
-            self._miss(camera, "pose: there are no poses of the time when it filmed")
+            remarks.append(self.miss(camera, "pose", f"poses of the time when it filmed, {filmed}"))
         if isinstance(taken, FlownPoses):
             if taken.height == "stated":
-                self._miss(camera, "pose: altitude, for its log states no height")
-                remarks.append("missing: altitude: METRES above the take-off")
+                what = "altitude in METRES above the take-off, for its log states no height"
+                remarks.append(self.miss(camera, "pose", what))
             elif taken.states_altitude:
                 other = "absolute" if taken.height != "unknown" else "relative"
                 kind = "above the take-off" if other == "absolute" else "absolute, from a barometer"
-                assume(f"assumed: heights {kind} (altitude: {other} takes the other)", f"heights {kind}")
+                what = f"heights {kind} (altitude: {other} takes the other)"
+                remarks.append(self.assume(camera, "pose", what))
             if taken.step_ns > BRIDGED_NS:
                 step_s = taken.step_ns / 1e9
                 gap = f"ingest with --max-pose-gap {1.5 * step_s:.3g}"
@@ -312,35 +289,34 @@ class _ManifestWriter:
         elif taken.kind == "pose" and not taken.topic and "parent" not in taken.settings:
             remarks.append("if of the body, not the camera: add of: body, and a mount")
         if taken.ned_hint:
-            hint = f"{flow(taken.ned_hint)} sounds like north-east-down: then add axes: ned"
-            assume(hint, "axes enu, although a name sounds like ned")
-        return self._entry("pose", [taken, *choice.others], remarks, guess)
+            what = (
+                f"axes enu, although {flow(taken.ned_hint)} sounds like north-east-down: else add axes: ned"
+            )
+            remarks.append(self.assume(camera, "pose", what))
+        return self.entry("pose", [taken, *choice.others], remarks)
 
     def _mount(self, camera: CameraDraft) -> dict[str, DraftedKey]:
         """Return the mount or the gimbal of a camera whose poses are not its own."""
-        choice, gimbal = camera.choices.get("pose"), camera.choices.get("gimbal")
+        choice, gimbal, own = camera.choices.get("pose"), camera.choices.get("gimbal"), camera.angles
         if choice is None or choice.taken.kind == "still":
             return {}
         taken = choice.taken
-        lever = DraftedKey(
-            None,
-            ["the lever arm to the gimbal, m"],
-            example={"looks": "forward", "translation": [0, 0, 0]},
-        )
+        example = {"looks": "forward", "translation": [0, 0, 0]}
+        lever = DraftedKey(None, ["the lever arm to the gimbal, m"], example=example)
         if not (taken.of_body or taken.unturned):
             return {"mount": lever} if isinstance(taken, FlownPoses) or "preset" in taken.settings else {}
         if gimbal is not None:
-            why = "gimbal: relative_to, what its angles are relative to"
-            self._miss(camera, why)
-            example = {**dict(gimbal.taken.settings), "relative_to": "world"}
-            remarks = [gimbal.taken.about, "missing: relative_to, and order and units if not ypr and deg"]
-            entry = DraftedKey(None, remarks, self.others("gimbal", gimbal.others), self.stated(example))
-            return {"gimbal": entry, "mount": lever}
-        own = camera.angles
+            what = "relative_to, what its angles are relative to; order and units if not ypr and deg"
+            turned = self.stated({**gimbal.taken.settings, "relative_to": "world"})
+            remarks = [gimbal.taken.about, self.miss(camera, "gimbal", what)]
+            return {
+                "gimbal": DraftedKey(None, remarks, self.others("gimbal", gimbal.others), turned),
+                "mount": lever,
+            }
         if own is not None and own.knows_north:
             return {"gimbal": DraftedKey(self.stated(own.settings), [own.about]), "mount": lever}
         if own is not None:
-            heading = "yaw_deg is where its first picture looks, from north to east"
+            heading = "yaw_deg, where its first picture looks from north to east"
             turned = self.stated({**own.settings, "yaw_deg": 90})
             if taken.of_body:
                 remark = f"if it turned in a gimbal: {heading}"
@@ -348,45 +324,33 @@ class _ManifestWriter:
                     "mount": self._fixed_mount(camera),
                     "gimbal": DraftedKey(None, [remark], example=turned),
                 }
-            why = "gimbal: yaw_deg, the heading of its first picture, which a GoPro does not log"
-            self._miss(camera, why)
-            remarks = [f"missing: {heading} ({own.about})"]
-            return {"gimbal": DraftedKey(None, remarks, example=turned), "mount": lever}
+            remark = self.miss(camera, "gimbal", f"{heading}, which a GoPro does not log")
+            return {"gimbal": DraftedKey(None, [remark, own.about], example=turned), "mount": lever}
         if taken.unturned:
-            self._miss(camera, "gimbal: how the camera was turned, for its log does not say it")
-            remarks = ["missing: constant angles, from north to east and up, or a file and topic of angles"]
-            return {"gimbal": DraftedKey(None, remarks, example={"yaw_deg": 90, "pitch_deg": -30})}
+            what = "constant angles, from north to east and up, or a file and topic of angles"
+            fixed = {"yaw_deg": 90, "pitch_deg": -30}
+            return {"gimbal": DraftedKey(None, [self.miss(camera, "gimbal", what)], example=fixed)}
         return {"mount": self._fixed_mount(camera)}
 
     def _fixed_mount(self, camera: CameraDraft) -> DraftedKey:
-        self._assume(camera, "mount", "the camera looks forward, level, from the body's origin")
-        settings = {"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}
-        remark = "assumed: along the body's x axis, level, no lever arm (m)"
-        return DraftedKey(self.guessed(settings), [remark])
+        remark = self.assume(camera, "mount", "the camera looks forward, level, from the body's origin")
+        return DraftedKey(
+            self.guessed({"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}), [remark]
+        )
 
     def _intrinsics(self, camera: CameraDraft) -> DraftedKey:
         choice = camera.choices.get("intrinsics")
         if choice is None:
-            self._miss(camera, "intrinsics: nothing of that name has them")
-            remarks = [f"missing: nothing of that name has them{self._loose(('intrinsics',))}"]
+            remark = self.miss(camera, "intrinsics", "nothing of that name has them")
             numbers = {"width": 1920, "height": 1080, "fx": 1400, "fy": 1400, "cx": 959.5, "cy": 539.5}
-            return DraftedKey(None, remarks, example=numbers)
-        if not choice.named:
-            self._assume(camera, "intrinsics", "that one calibration holds for them")
-        remarks = [] if choice.named else ["assumed: it holds for this camera"]
-        if choice.taken.settings.get("camera") == camera.name:  # its own name need not be stated
-            taken = DraftedKey(self.stated({"file": choice.taken.path}), [choice.taken.about, *remarks])
-            taken.below = self.others("intrinsics", choice.others)
-            if not choice.named:
-                taken.value = self.guessed({"file": choice.taken.path})
-            return taken
-        return self._entry("intrinsics", [choice.taken, *choice.others], remarks, not choice.named)
-
-    def _loose(self, kinds: tuple[str, ...]) -> str:
-        """List found things of some kinds that are not used."""
-        unused = [c for c in self.draft.unused if isinstance(c, FoundLog) or c.kind in kinds]
-        paths = [flow(self._relative(each.path)) for each in unused[:MAX_LISTED]]
-        return f"; there is {', '.join(paths)}" if paths else ""
+            others = self.others("intrinsics", self.draft.free_intrinsics)
+            return DraftedKey(None, [remark], others, example=numbers)
+        what = "that one calibration holds for them"
+        remarks = [] if choice.named else [self.assume(camera, "intrinsics", what)]
+        settings = choice.taken.settings
+        if settings.get("camera") == camera.name:  # its own name need not be stated
+            settings = {"file": choice.taken.path}
+        return self.entry("intrinsics", [choice.taken, *choice.others], remarks, settings)
 
     # --- the flight ------------------------------------------------------------------------------------
 
@@ -405,55 +369,48 @@ class _ManifestWriter:
         """Return the logs that the rest of the manifest names."""
         poses = {c.choices["pose"].taken.path for c in self.draft.cameras if "pose" in c.choices}
         several = len(poses & set(self._log_names)) > 1
+        if several:
+            self.assume(None, "logs", "one clock and one origin for all; else say clock, world_from_source")
         entries = {}
         for name, log in self.draft.logs.items():
             paths = [self._relative(path) for path in log.parts]
-            settings: dict[str, object] = {
-                "file": paths[0] if len(paths) == 1 else paths,
-                "stamps": log.stamps,
-            }
+            settings: dict[str, object] = {"file": paths[0] if len(paths) == 1 else paths}
+            settings["stamps"] = log.stamps
             remarks = [f"{log.title}, {log.span}"]
             if log.stamps == "receive" or log.ahead_ns:
-                what = "stamps, for header stamps and those of receipt are of different clocks"
-                self.assumed[f"logs: {log.stamps} {what}"] = []
-                if abs(log.ahead_ns) < 10**9:
-                    remarks.append("receipt, as the header stamps of another log are of another clock")
-                else:
-                    side = "ahead of" if log.ahead_ns > 0 else "behind"
-                    apart = f"header stamps are {abs(log.ahead_ns) / 1e9:.3f} s {side} receipt"
-                    remarks.append(f"{apart}, assumed: {log.stamps}")
+                what = f"stamps {log.stamps}, for header stamps and those of receipt are of different clocks"
+                remarks.append(self.assume(None, "logs", what))
+            if abs(log.ahead_ns) >= 10**9:
+                side = "ahead of" if log.ahead_ns > 0 else "behind"
+                remarks.append(f"header stamps are {abs(log.ahead_ns) / 1e9:.3f} s {side} receipt")
             if several or log.ahead_ns or log.stamps == "receive":
                 settings["assumed"] = True
             entries[name] = DraftedKey(settings, remarks)
-        if several:
-            self.assumed["logs: one clock and one origin for all; else say clock and world_from_source"] = []
         return entries
 
     def actor(self) -> DraftedKey:
         """Return the source of the person's logged positions."""
         if not self.draft.actors:
             return DraftedKey()
-        taken, *others = self.draft.actors
-        self.assumed["actor: point hip, which point of the person the log follows"] = []
-        value = self.guessed({**taken.settings, "point": "hip"})
-        remarks = [taken.about, "assumed: point, one of hip, head, feet, centre"]
-        return DraftedKey(value, remarks, self.others("actor", others), blank=True)
+        taken = self.draft.actors[0]
+        remark = self.assume(None, "actor", "point hip, which the log follows; or head, feet, centre")
+        entry = self.entry("actor", self.draft.actors, [remark], {**taken.settings, "point": "hip"})
+        return replace(entry, blank=True)
 
     def map(self) -> DraftedKey:
         """Return the map: the first file, else a topic that lies where the poses do."""
         if not self.draft.maps:
             return DraftedKey()
-        taken, *others = self.draft.maps
-        remarks = [taken.about]
-        if "resolution_m" in taken.settings:
-            remarks.append("at a finer resolution_m it would be too large")
+        taken = self.draft.maps[0]
+        remarks = (
+            ["at a finer resolution_m it would be too large"] if "resolution_m" in taken.settings else []
+        )
         on_earth = any(c.choices["pose"].taken.by_gps for c in self.draft.cameras if "pose" in c.choices)
         if taken.frame == "projected" and on_earth:
-            remarks.append("missing: crs: EPSG:32632, that of its coordinates")
-            self.missing["map: crs, for its coordinates are those of a map projection"] = []
+            remarks.append(self.miss(None, "map", "crs of its coordinates, a map projection: EPSG:32632"))
         if taken.topic and taken.unturned:
             return DraftedKey(None, [], self.others("map", self.draft.maps), blank=True)
-        return DraftedKey(self.stated(taken.settings), remarks, self.others("map", others), blank=True)
+        return replace(self.entry("map", self.draft.maps, remarks), blank=True)
 
     def truth(self) -> DraftedKey:
         """Return the truth; joints only if they overlap with poses in time, because ingest refuses others."""
@@ -481,21 +438,12 @@ class _ManifestWriter:
         """List files that were recognised but are not used."""
         lines = ["", "# Recognised, but not used:"] if self.draft.unused else []
         for found in self.draft.unused:
+            about = found.about if isinstance(found, Proposal) else found.title
             if isinstance(found, FoundLog):
-                about = found.title
-                fixes = [t.topic for t in found.topics.values() if t.kind == "fixes"]
-                held = [
-                    " of ".join(str(v) for k, v in t.settings.items() if k in ("preset", "namespace"))
-                    or t.topic
-                    for t in found.topics.values()
-                    if t.span
-                ]
+                held = [t.topic or t.about for t in found.topics.values() if t.span]
                 about += f" with {', '.join(held[:MAX_LISTED])}" if held else " without poses or pictures"
-                if fixes:
-                    about += f"; if the person carried it: actor: {{file: FILE, topic: {fixes[0]}}}"
-            else:
-                about = found.about
-                about += "; if known to be true: truth: FILE" if found.kind == "joints" else ""
+            elif found.kind == "joints":
+                about += "; if known to be true: truth: FILE"
             lines.append(f"#   {flow(self._relative(found.path))}  ({one_line(about)})")
         return lines
 
@@ -562,7 +510,7 @@ def write_manifest(draft: FlightDraft, name: str, relative: Callable[[Path], str
         lines += [f"  {line}" for key, log in writer.logs().items() for line in log.lines(key, None)]
     lines += ["", "cameras:"] if draft.cameras else ["", "# cameras:  # missing: one for each drone"]
     if not draft.cameras:
-        writer.missing["cameras: nothing was found that has pictures, keypoints or poses of a drone"] = []
+        writer.miss(None, "cameras", "nothing was found that has pictures, keypoints or poses of a drone")
     for camera in draft.cameras:
         lines.append(f"  {flow(camera.name)}:")
         for key, entry in writer.camera(camera).items():

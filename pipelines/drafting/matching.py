@@ -59,14 +59,14 @@ MAP_TYPES = ("Octomap", "GridMap", "OccupancyGrid")
 
 @dataclass(frozen=True)
 class MotionMatch:
-    """Agreement of a video with a drone's log, by their motion."""
+    """Agreement of a video with poses, by their motion."""
 
     gain: Float  # [S] log-likelihood of each stretch of the video, over a camera that stands still
     start_ns: int  # of the video, on the log's clock
 
 
-Compare = Callable[[FoundFilm, FlownPoses], MotionMatch | None]
-"""Comparison of a video with a drone's log; None if one of them shows no motion."""
+Compare = Callable[[FoundFilm, Proposal], MotionMatch | None]
+"""Comparison of a video with poses; None if one of them shows no motion."""
 Distance = Callable[[FlownPoses, FlownPoses], float | None]
 """Median distance across (m) of the positions in two drones' logs; None if they share no time or place."""
 
@@ -126,6 +126,8 @@ class FlightDraft:
     joints: list[Proposal]  # true ones; the first is taken
     actors: list[Proposal]  # the first is taken
     maps: list[Proposal]  # the first is taken if it lies where the poses do, or is a file
+    free_poses: list[Proposal]  # of moving things, that no camera has
+    free_intrinsics: list[Proposal]
     unused: list[Proposal | FoundLog]
 
 
@@ -173,13 +175,13 @@ def match(
         film = camera.film
         own = [c for c in of.get("angles", []) if isinstance(c, FoundAngles) and film and c.path == film.path]
         camera.angles = own[0] if own else None
-    _pair_drones(cameras, moving, compare)
+    _pair_by_content(cameras, moving, compare)
     _prefer_attitudes(cameras, moving, distance)
     if any("pose" in c.choices and c.choices["pose"].taken.by_gps for c in cameras):
         actors += [c for c in of.get("fixes", []) if is_called(f"{c.topic} {c.place[-1]}", ACTOR)]
     maps = _maps(of.get("map", []), cameras)
-    mentioned = [c for camera in cameras for c in camera.mentioned()] + actors + maps + joints
-    used = {c.path for c in mentioned}
+    mentioned = [c for camera in cameras for c in camera.mentioned()]
+    used = {c.path for c in (*mentioned, *actors, *maps, *joints)}
     names: list[str] = []
     for log in logs:
         label = "_".join(word.text for word in log.label)
@@ -192,7 +194,9 @@ def match(
         joints,
         actors,
         maps,
-        sorted(unused.values(), key=lambda each: each.place),
+        free_poses=sorted((c for c in moving if c not in mentioned), key=lambda c: (c.place, c.rank)),
+        free_intrinsics=[c for c in of.get("intrinsics", []) if c not in mentioned],
+        unused=sorted(unused.values(), key=lambda each: each.place),
     )
 
 
@@ -305,14 +309,18 @@ def _are_two(one: Label, other: Label) -> bool:
 # --- what belongs to a camera ---------------------------------------------------------------------------
 
 
-def _pair_drones(cameras: Sequence[CameraDraft], moving: Sequence[Proposal], compare: Compare) -> None:
-    """Give videos without poses the drones' logs that no camera has: by time, else by motion."""
+def _pair_by_content(cameras: Sequence[CameraDraft], moving: Sequence[Proposal], compare: Compare) -> None:
+    """Give videos without poses those that no camera has: by time, else by motion."""
     taken = _taken(cameras)
-    free = [c for c in moving if isinstance(c, FlownPoses) and c not in taken]
+    likeliest: dict[object, Proposal] = {}  # of several topics of one drone
+    for candidate in moving:
+        if candidate not in taken:
+            key = candidate.path, candidate.labels[0], candidate.settings.get("instance")
+            likeliest[key] = min(likeliest.get(key, candidate), candidate, key=lambda each: each.rank)
     filmed = [(c, film) for c in cameras if "pose" not in c.choices and (film := c.film) is not None]
-    possible = {c.name: [log for log in free if _may_be_of(film, log)] for c, film in filmed}
+    possible = {c.name: [log for log in likeliest.values() if _may_be_of(film, log)] for c, film in filmed}
     uses = Counter(id(log) for logs in possible.values() for log in logs)
-    found: dict[str, tuple[FlownPoses, MotionMatch]] = {}
+    found: dict[str, tuple[Proposal, MotionMatch]] = {}
     for camera, film in filmed:
         logs = possible[camera.name]
         if len(logs) == 1 and uses[id(logs[0])] == 1:
@@ -396,8 +404,8 @@ def _share_time(log: Proposal, other: Proposal) -> bool:
 
 
 def _own_by_motion(
-    film: FoundFilm, logs: Sequence[FlownPoses], compare: Compare
-) -> tuple[FlownPoses, MotionMatch] | None:
+    film: FoundFilm, logs: Sequence[Proposal], compare: Compare
+) -> tuple[Proposal, MotionMatch] | None:
     """Return the log that explains a video's motion clearly, and clearly better than all others."""
     known = [(log, alike) for log in logs if (alike := compare(film, log)) is not None]
     for log, alike in known:

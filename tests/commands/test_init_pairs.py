@@ -16,6 +16,7 @@ from pipelines.draft import draft
 from pipelines.formats.poses.trajectory_files import TUM
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import matrix_from_quaternion
+from tests.commands.runner import mocap
 from tests.synthetic.drone_logs import (
     HOME,
     DroneTruth,
@@ -24,6 +25,8 @@ from tests.synthetic.drone_logs import (
     write_dataflash,
     write_ulog,
 )
+from tests.synthetic.logged_flights import header
+from tests.synthetic.logs import Entry, write_mcap
 from tests.synthetic.videos import even_ticks, write_video
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
@@ -68,14 +71,58 @@ def made_at(path: Path, t_ns: int) -> None:
     moved.replace(path)
 
 
+def write_topics(path: Path, names: list[str]) -> None:
+    """Write the poses of the sample's cameras as topics of one log."""
+    entries = []
+    for name in names:
+        flown = TUM.read_trajectory(SAMPLE / "truth" / f"{name}.tum")
+        for t, at, turned in zip(
+            flown.t_ns.tolist(), flown.position.tolist(), flown.quaternion_xyzw.tolist(), strict=True
+        ):
+            pose = {
+                "position": dict(zip("xyz", at, strict=True)),
+                "orientation": dict(zip("xyzw", turned, strict=True)),
+            }
+            stamped = {"header": header(t, "map"), "pose": pose}
+            entries.append(Entry(f"/{name}/camera_pose", "geometry_msgs/msg/PoseStamped", t, stamped))
+    write_mcap(path, sorted(entries, key=lambda entry: entry.stamp_ns))
+
+
+def test_recorders_names_leave_the_choice_between_topics_and_no_calibration(tmp_path: Path) -> None:
+    write_topics(tmp_path / "rec_2023_A.mcap", ["drone1", "drone2"])
+    for name in ("DJI_0007", "DJI_0008"):
+        write_video(tmp_path / f"{name}.MP4", even_ticks(60))
+    lens = "size = [64, 48]\nmatrix = [[90, 0, 31.5], [0, 90, 23.5], [0, 0, 1]]\ndistortions = [0, 0, 0, 0]\n"
+    for name in ("left", "right"):
+        still = f"[cam_{name}]\n{lens}rotation = [0, 0, 0]\ntranslation = [0, 0, 0]\n"
+        (tmp_path / f"cam_{name}.toml").write_text(still, encoding="utf-8")
+    result = draft([tmp_path])
+    assert result.cameras == ["DJI_0007", "DJI_0008"]
+    for line in ("/drone1/camera_pose", "/drone2/camera_pose"):
+        assert result.text.count(f"# or pose: {{file: rec_2023_A.mcap, topic: {line}, of: ") == 2
+    assert "pose: cam_" not in result.text
+    assert result.text.count("# or intrinsics: cam_left.toml") == 2
+
+
+def test_a_folder_without_a_camera_is_drafted_with_exit_status_1(tmp_path: Path) -> None:
+    (tmp_path / "site.xyz").write_text("0 0 0\n1 1 1\n", encoding="utf-8")
+    lens = "size = [64, 48]\nmatrix = [[90, 0, 31.5], [0, 90, 23.5], [0, 0, 1]]\ndistortions = [0, 0, 0, 0]\n"
+    (tmp_path / "lens.toml").write_text(f"[cam_0]\n{lens}", encoding="utf-8")
+    done = mocap("init", tmp_path)
+    assert done.returncode == 1
+    assert done.stdout.splitlines()[0] == "cameras: none"
+    assert "Traceback" not in done.stderr
+
+
 def test_videos_and_logs_of_one_flight_are_paired_by_motion(tmp_path: Path) -> None:
     shutil.copyfile(SAMPLE / "drone1.mp4", tmp_path / "north.mp4")
     shutil.copyfile(SAMPLE / "drone2.mp4", tmp_path / "lake.mp4")
-    write_ulog(tmp_path / "log_11_07.ulg", ulog_rows(drone_of_sample("drone2")))
+    write_topics(tmp_path / "rec_2023_A.mcap", ["drone2"])
     write_dataflash(tmp_path / "00000042.bin", drone_of_sample("drone1"))
     cameras = cameras_of(tmp_path)
     assert cameras["north"]["pose"] == {"file": "00000042.bin", "assumed": True}
-    assert cameras["lake"]["pose"] == {"file": "log_11_07.ulg", "assumed": True}
+    logged = {"file": "rec_2023_A", "topic": "/drone2/camera_pose", "of": "camera", "assumed": True}
+    assert cameras["lake"]["pose"] == logged
     true = YAML(typ="safe", pure=True).load((SAMPLE / "flight.yaml").read_text())["cameras"]
     for name, drone in (("north", "drone1"), ("lake", "drone2")):
         start_s = float(cameras[name]["frame_times"]["start"])
