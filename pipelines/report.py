@@ -7,15 +7,12 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines.geometry.arrays import Int64, Picture
-from pipelines.planning.loading import load_flight
-from pipelines.planning.scene import hidden_shares
 from pipelines.reporting.chart import MARK, refuse_foreign, write_figures
 from pipelines.reporting.comparison_page import draw_comparison, render_comparison
 from pipelines.reporting.content import (
@@ -28,7 +25,7 @@ from pipelines.reporting.content import (
 from pipelines.reporting.page import draw_session, render_page
 from pipelines.reporting.pictures import Video
 from pipelines.reporting.session_comparison import compare, labels_of
-from pipelines.reporting.studies import summarise_studies
+from pipelines.reporting.studies import draw_study, study_blocks
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
@@ -60,13 +57,11 @@ from pipelines.session.tables import (
     ACTOR,
     ANGLES,
     CAMERA_POSES,
-    COST_MAP,
     FRAMES,
     JOINT_ERRORS,
     KEYPOINTS,
     POSES,
     REPLAN,
-    SEEN,
     SKELETON,
     TRUTH,
     count_rows,
@@ -81,9 +76,9 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-REPORT = Stage("report", revision=15)
+REPORT = Stage("report", revision=16)
 # Figures of another revision are drawn again.
-_FIGURES_REVISION = 7
+_FIGURES_REVISION = 8
 
 
 @dataclass(frozen=True)
@@ -191,7 +186,7 @@ def compare_sessions(
             raise DataError(folder, "is stated twice", "state every session once", code="stated-twice")
     contents = {label: content_of(folder) for label, folder in zip(_labels(resolved), folders, strict=True)}
     page = output or resolved[0].parent / "comparison" / "index.html"
-    html, _ = render_comparison(contents)
+    html = render_comparison(contents)
     _refuse_foreign(page, overwrite)
     return Reported(page, skipped=not _write_if_changed(page, html))
 
@@ -259,14 +254,14 @@ def write_figures_of(
         return Reported(target, skipped=True)
     contents = {label: _load(*each) for label, each in sessions.items()}
     if others:
-        plates = draw_comparison(compare(contents))
+        figures = draw_comparison(compare(contents))
     else:
         with ExitStack() as stack:
             pictures, _ = _open_pictures(folder, description, stack)
             content = replace(contents[labels[0]], studies=tuple(studied))
-            plates = draw_session(content, partial(_read_frame, pictures))
+            figures = draw_session(content, partial(_read_frame, pictures))
     with whole_folder(target, key, mark=MARK, overwrite=True) as making:
-        write_figures(making.folder, plates, contents, key)
+        write_figures(making.folder, figures, contents, key)
         making.publish()
     return Reported(target, skipped=False)
 
@@ -284,7 +279,7 @@ def read_study(folder: Path) -> StudyContent:
     try:
         words = ["mocap", "study", *metrics["command"], "-o", folder.resolve().name]
         study = StudyContent(metrics, shlex.join(words), sha256_of(folder / "metrics.json"))
-        summarise_studies([study])
+        study_blocks(study, draw_study("study", metrics))
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise DataError(
             folder / "metrics.json", "is not the result of a study", remedy, code="wrong-kind"
@@ -364,12 +359,9 @@ def content_of(folder: Path) -> SessionContent:
     return _load(folder, read_description(folder), records)
 
 
-# A page is drawn from ten minutes at 30 Hz at most: more times change no figure.
-MAX_TIMES = 18_000
-# The table of a page holds twelve thousand times of one person with 33 joints at most, to save memory.
-MAX_ROWS = 400_000
-# Lines of sight are looked at in stretches of three minutes, so that long flights take no more memory.
-STRETCH_NS = 180_000_000_000
+# A page is drawn from six thousand times of one person with 33 joints, or as much of others: more change no
+# figure, and take memory.
+MAX_ROWS = 200_000
 
 
 class _Shown:
@@ -383,7 +375,7 @@ class _Shown:
     """
 
     def __init__(self, folder: Path, t_ns: Int64, rows: int, metrics: Mapping[str, object] | None) -> None:
-        self.every = max(-(-len(t_ns) // MAX_TIMES), -(-rows // MAX_ROWS), 1)
+        self.every = max(-(-max(rows, len(t_ns)) // MAX_ROWS), 1)
         self._folder = folder
         self._t_ns = t_ns[:: self.every]
         self._offset_ns = estimated_clocks(metrics or {})
@@ -475,43 +467,11 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         replan=_load_replan(folder, records["replan"], maps) if "replan" in records else None,
         refined=_by_camera(shown, "reconstruct/cameras.parquet", records.get("reconstruct")),
         true_poses=_by_camera(shown, "truth_poses.parquet", records["ingest"]),
-        hidden=_load_hidden(folder, description, records, maps),
         angles=_load_angles(shown, records.get("reconstruct")),
         joint_errors=_load_joint_errors(folder, records.get("reconstruct")),
         made_by=versions_of(folder),
         outdated=tuple(outdated(records, description.recorded)),
     )
-
-
-def _load_hidden(
-    folder: Path, description: Description, records: dict[str, StageRecord], maps: list[Occupancy]
-) -> dict[str, float]:
-    """Compute the share of the flight in which the map hides the actor; empty without a map or an actor."""
-    if not maps:
-        return {}
-    found: list[tuple[float, dict[str, float]]] = []
-    frames = [entry.frames for entry in description.cameras.values()]
-    first_ns, last_ns = min(of.first_t_ns for of in frames), max(of.last_t_ns for of in frames)
-    count = max(-(-(last_ns - first_ns) // STRETCH_NS), 1)
-    edges = np.linspace(first_ns, last_ns, count + 1).round().astype(np.int64).tolist()
-    for span_ns in pairwise(edges) if count > 1 else [None]:
-        try:
-            flight = load_flight(
-                folder, description, records.get("reconstruct"), pose_noise=None, span_ns=span_ns
-            )
-        except DataError:
-            continue
-        lasts_ns = float(np.ptp(flight.actor_t_ns))
-        found.append((lasts_ns, hidden_shares(flight, description, maps)))
-        return_unused()
-    if len(found) == 1:
-        return found[0][1]
-    shares: dict[str, float] = {}
-    for name in description.cameras:
-        own = [(lasts_ns, of[name]) for lasts_ns, of in found if name in of]
-        if own:
-            shares[name] = sum(weight * share for weight, share in own) / sum(weight for weight, _ in own)
-    return shares
 
 
 def _load_angles(shown: _Shown, record: StageRecord | None) -> pd.DataFrame | None:
@@ -545,15 +505,5 @@ def _load_replan(folder: Path, record: StageRecord, maps: list[Occupancy]) -> Re
             if f"replan/{arm}/trajectories.parquet" in record.outputs
         },
         actor=read_table(place / "actor.parquet", ACTOR),
-        cost_map=(
-            read_table(place / "cost_map.parquet", COST_MAP)
-            if "replan/cost_map.parquet" in record.outputs
-            else None
-        ),
         map=max(maps, key=lambda one: one.from_ns, default=None),
-        seen={
-            arm: read_table(place / arm / "seen.parquet", SEEN)
-            for arm in section(metrics, "arms")
-            if f"replan/{arm}/seen.parquet" in record.outputs
-        },
     )

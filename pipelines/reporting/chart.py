@@ -1,5 +1,6 @@
-"""Figures: their marks, words and numbers, in the page's style, as inline SVG and as files for a publication.
+"""Figures: panels of marks, drawn in the page's style as inline SVG and as files for a publication.
 
+A `Figure` is data. Its drawing, its description in words and its numbers as CSV all follow from its marks.
 The SVG takes its colours and fonts from the page: each colour of the palette is replaced by a CSS variable,
 so that one drawing serves light and dark mode and paper, and text stays text. The same figure gives the same
 bytes, and its ids carry a prefix of their own, so that the figures of one page do not clash.
@@ -12,7 +13,7 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,23 +21,21 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.reporting.content import SessionContent
-from pipelines.reporting.wording import cell_text, fixed
+from pipelines.reporting.wording import cell_text, fixed, listing, shortened, significant
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json, refuse_sessions, write_json
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
+    from matplotlib.figure import Figure as Drawing
     from matplotlib.typing import RcKeyType
 
 
 INK, MUTED, GRID, PAPER = "#22262a", "#666d74", "#dddcd6", "#fefdfb"
 SIDES = {"left": "#1f78b5", "right": "#c8561b", "": "#4a4f55"}
-"""Colours of the sides of the body, by the words of `motion.side_of`."""
+"""Colours of the sides of the body, by the words of `content.side_of`."""
 CAMERAS = ("#00785a", "#7d4fb5", "#8f7a00", "#9c2f4f", "#00808f", "#8c5a3c")
 """Colours of cameras, arms and sessions: neighbours differ in hue, none is the blue or orange of a side."""
 PEOPLE = ("#b0267a", "#3f48b8", "#a36f00", "#2a7d33", "#a8322b", "#4f6272")
@@ -66,6 +65,22 @@ PALETTE = {
 
 # CSS scales a figure as wide as the page to the window; the fonts are chosen for this width.
 WIDTH_IN = 9.0
+# A path of more points shows no more on a page 9 inches wide.
+MOST_POINTS = 600
+# A time axis shows no more stretches on a page 9 inches wide.
+MOST_BINS = 300
+# Coordinates beyond this are shown relative to a round number near them, or labels would be too long.
+FAR_FROM_ZERO_M = 10_000.0
+# One shade on the other still shows the lines below.
+SHADE_OPACITY = 0.17
+# More series are not told one by one in the description of a figure.
+MOST_SERIES_TOLD = 12
+
+TIME_LABEL = "time (s)"
+"""Label of an axis on which the page's viewer shows and takes moments."""
+
+Stroke = Literal["-"] | tuple[int, tuple[float, ...]]
+LINE_STYLES: tuple[Stroke, ...] = ("-", (0, (4.0, 1.5)), (0, (1.0, 1.2)))
 
 _PAGE_STYLE: dict[RcKeyType, Any] = {
     "svg.fonttype": "none",
@@ -78,6 +93,7 @@ _PAGE_STYLE: dict[RcKeyType, Any] = {
     "axes.linewidth": 0.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "axes.spines.left": False,
     "axes.formatter.useoffset": False,
     "axes.axisbelow": True,
     "axes.labelsize": 7.6,
@@ -86,7 +102,7 @@ _PAGE_STYLE: dict[RcKeyType, Any] = {
     "xtick.major.width": 0.5,
     "ytick.major.width": 0.5,
     "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
+    "ytick.major.size": 0.0,
     "xtick.labelsize": 7.2,
     "ytick.labelsize": 7.2,
     "grid.color": GRID,
@@ -100,12 +116,248 @@ _PAGE_STYLE: dict[RcKeyType, Any] = {
 }
 
 
+# --- marks ---
+
+
+@dataclass(frozen=True)
+class Line:
+    """A series [N], with the band around it where there is one; `legend` False leaves its name to the CSV."""
+
+    x: Float
+    y: Float
+    colour: str = INK
+    name: str = ""
+    low: Float | None = None
+    high: Float | None = None
+    style: Stroke = "-"
+    width: float = 1.1
+    legend: bool = True
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points [N], with the interval of each `along` an axis where there is one, and a line through them."""
+
+    x: Sequence[float] | Float
+    y: Sequence[float] | Float
+    colour: str = INK
+    name: str = ""
+    ends: Sequence[tuple[float, float] | None] = ()
+    along: Literal["x", "y"] = "x"
+    marker: str = "o"  # empty: the intervals alone
+    filled: bool = True
+    size: float = 4.0
+    joined: bool = False
+    legend: bool = True
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Horizontal bars [N]: rows from above, where they begin, and how long they are."""
+
+    rows: Sequence[float]
+    start: Sequence[float]
+    length: Sequence[float]
+    colour: str
+    name: str = ""
+    thickness: float = 0.72
+    legend: bool = True
+
+
+@dataclass(frozen=True)
+class Area:
+    """A stretch [bins] between two values, each of which holds for the whole of its bin."""
+
+    edges: Float  # [bins + 1]
+    low: Float
+    high: Float
+    colour: str
+    name: str = ""
+    legend: bool = True
+
+
+@dataclass(frozen=True)
+class Shades:
+    """Values [X, Y], shaded where they exceed each level, one shade on the other."""
+
+    x: Float
+    y: Float
+    values: Float
+    levels: Sequence[float]
+    name: str = ""
+    legend: bool = True
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """A hatched area with corners [K, 2]."""
+
+    corners: Float
+    name: str = ""
+    legend: bool = True
+
+
+@dataclass(frozen=True)
+class Note:
+    """Words at a place."""
+
+    x: float
+    y: float
+    words: str
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture that fills its panel."""
+
+    picture: Picture
+
+
+Mark = Line | Points | Bars | Area | Shades | Polygon | Note | Image
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One drawing of a figure: its marks, labels and spans."""
+
+    marks: Sequence[Mark]
+    x_label: str = ""
+    y_label: str = ""
+    rows: Mapping[float, str] | None = None  # labels of rows from above, by place
+    x_span: tuple[float | None, float | None] | None = None
+    y_span: tuple[float | None, float | None] | None = None
+    x_ticks: Mapping[float, str] | None = None
+    title: str = ""
+    grid: Literal["x", "y", "both"] | None = "y"
+    zero: bool = False  # draw a line at x = 0
+    equal: bool = False  # a metre is as long in both directions
+
+    @property
+    def what(self) -> str:
+        """Name of the panel in words and in the CSV."""
+        label = self.x_label if self.rows is not None else self.y_label
+        return ", ".join(part for part in (self.title, label.replace("\n", " ")) if part)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure: panels, row by row, with its title and caption."""
+
+    key: str
+    title: str
+    caption: str
+    panels: Sequence[Sequence[Panel]]
+    height_in: float
+    heights: Sequence[float] | None = None
+    widths: Sequence[float] | None = None
+    share_x: bool = True
+    share_y: bool = False
+    columns: int = 6  # of the legend
+    label: str = ""  # of the vertical axes of all
+    about: str = field(default="", repr=False)  # the description, where the marks say nothing
+
+    @property
+    def description(self) -> str:
+        """Picture in words, with its numbers, for readers who cannot see it."""
+        parts = [_in_words(panel) for row in self.panels for panel in row]
+        return self.about or " ".join(part for part in parts if part)
+
+    @cached_property
+    def csv(self) -> str:
+        """Numbers of all marks, with nine significant digits; empty cells are missing numbers.
+
+        No spreadsheet takes a text of it for a formula.
+        """
+        return as_csv([row for panels in self.panels for panel in panels for row in _rows_of(panel)])
+
+    @cached_property
+    def drawing(self) -> Drawing:
+        """Drawing by matplotlib."""
+        return _draw(self)
+
+    @cached_property
+    def svg(self) -> str:
+        """Figure as an `<svg>` element for the inside of a page."""
+        return _inline_svg(self)
+
+
+# --- numbers and words of the marks ---
+
+
+def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
+    """Write rows by column; columns in which no row has anything are left out."""
+    import pandas as pd
+
+    numbers = pd.DataFrame(rows).dropna(axis="columns", how="all")
+    texts = numbers.select_dtypes(exclude="number").map(cell_text)
+    written: str = numbers.assign(**texts).to_csv(index=False, float_format="%.9g", lineterminator="\n")
+    return written
+
+
+def _rows_of(panel: Panel) -> Iterator[dict[str, object]]:
+    """Yield the numbers of a panel: panel, series, row, x, y, low, high, value."""
+    for mark in panel.marks:
+        if isinstance(mark, Note | Image) or not mark.name:
+            continue
+        start: dict[str, object] = {"panel": panel.what, "series": mark.name}
+        if isinstance(mark, Bars):
+            for row, low, length in zip(mark.rows, mark.start, mark.length, strict=True):
+                in_row = (panel.rows or {}).get(round(row), "")
+                yield start | {"row": in_row, "x": length, "low": low, "high": low + length}
+        elif isinstance(mark, Area):
+            for low_x, high_x, low, high in zip(
+                mark.edges, mark.edges[1:], mark.low, mark.high, strict=False
+            ):
+                yield start | {"x": (low_x + high_x) / 2, "y": high - low}
+        elif isinstance(mark, Shades):
+            for (i, j), value in np.ndenumerate(mark.values):
+                yield start | {"x": mark.x[i], "y": mark.y[j], "value": value}
+        elif isinstance(mark, Polygon):
+            for x, y in mark.corners:
+                yield start | {"x": x, "y": y}
+        else:
+            ends: Any = mark.ends if isinstance(mark, Points) else ()
+            if isinstance(mark, Line) and mark.low is not None and mark.high is not None:
+                ends = zip(mark.low, mark.high, strict=True)
+            pairs = list(ends) or [None] * len(mark.x)
+            for x, y, pair in zip(mark.x, mark.y, pairs, strict=True):
+                label = None if panel.rows is None else panel.rows.get(round(y), "")
+                low, high = pair or (np.nan, np.nan)
+                place = {"x": x, "y": y} if label is None else {"row": label, "x": x}
+                yield start | place | {"low": low, "high": high}
+
+
+def _in_words(panel: Panel) -> str:
+    """Describe a panel: of each series the range and the median; of rows the value of each."""
+    told = []
+    for mark in panel.marks:
+        if panel.rows is not None and isinstance(mark, Bars | Points):
+            own = (
+                zip(mark.rows, mark.length, strict=True)
+                if isinstance(mark, Bars)
+                else zip(mark.y, mark.x, strict=True)
+            )
+            values = listing(
+                f"{panel.rows.get(round(row), '')} {significant(float(value))}" for row, value in own
+            )
+            told.append(f"{mark.name}: {values}" if mark.name else values)
+        elif isinstance(mark, Line | Points) and mark.name:
+            known = np.asarray(mark.y)[np.isfinite(mark.y)]
+            if known.size:
+                low, middle, high = (
+                    significant(float(v)) for v in (known.min(), np.median(known), known.max())
+                )
+                told.append(f"{mark.name} {low} to {high}, median {middle}")
+    left = f"; and {len(told) - MOST_SERIES_TOLD} more" if len(told) > MOST_SERIES_TOLD else ""
+    return f"{panel.what}: {'; '.join(told[:MOST_SERIES_TOLD])}{left}." if told else ""
+
+
+# --- drawing ---
+
+
 @contextmanager
 def page_style() -> Iterator[None]:
-    """Make figures in the page's style, independent of matplotlibrc.
-
-    Names in any script raise no warning.
-    """
+    """Make figures in the page's style, independent of matplotlibrc; names in any script raise no warning."""
     import matplotlib as mpl
 
     with mpl.rc_context(), warnings.catch_warnings():
@@ -116,46 +368,172 @@ def page_style() -> Iterator[None]:
         yield
 
 
+def _draw(figure: Figure) -> Drawing:
+    from matplotlib.figure import Figure as Drawing
+
+    rows, across = len(figure.panels), max(len(row) for row in figure.panels)
+    with page_style():
+        drawing = Drawing((WIDTH_IN, figure.height_in), layout="constrained")
+        grid = drawing.subplots(
+            rows,
+            across,
+            squeeze=False,
+            sharex=figure.share_x,
+            sharey=figure.share_y,
+            height_ratios=figure.heights,
+            width_ratios=figure.widths,
+        )
+        for own, panel_row in zip(grid, figure.panels, strict=True):
+            for axes, panel in zip(own, panel_row, strict=False):
+                _draw_panel(axes, panel)
+            for axes in own[len(panel_row) :]:
+                axes.set_axis_off()
+        if across == 1:
+            drawing.align_ylabels(list(grid[:, 0]))
+        entries: dict[str, Any] = {}
+        for axes in grid.flat:
+            for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
+                entries.setdefault(name, handle)
+        if entries:
+            count = min(len(entries), figure.columns)
+            drawing.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=count)
+        if figure.label:
+            drawing.supylabel(figure.label, fontsize=7.6, color=MUTED)
+    return drawing
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    if panel.zero:
+        axes.axvline(0, color=MUTED, linewidth=0.8)
+    for mark in panel.marks:
+        _draw_mark(axes, mark)
+    axes.set_xlabel(panel.x_label)
+    axes.set_ylabel(panel.y_label)
+    if panel.rows is not None:
+        axes.set_yticks(list(panel.rows), list(panel.rows.values()))
+        axes.set_ylim(max(panel.rows, default=0) + 0.5, -0.5)
+    if panel.x_ticks is not None:
+        axes.set_xticks(list(panel.x_ticks), list(panel.x_ticks.values()))
+    if panel.x_span is not None:
+        axes.set_xlim(*panel.x_span)
+    if panel.y_span is not None:
+        axes.set_ylim(*panel.y_span)
+    if panel.equal:
+        axes.set_aspect("equal", adjustable="box" if panel.x_span else "datalim")
+    if panel.title:
+        axes.set_title(panel.title, fontsize=7.2, color=MUTED, loc="left")
+    if panel.grid is not None:
+        axes.grid(visible=True, axis=panel.grid)
+
+
+def _draw_mark(axes: Axes, mark: Mark) -> None:
+    if isinstance(mark, Note):
+        axes.text(mark.x, mark.y, mark.words, fontsize=6.4, color=MUTED, ha="center", va="center", zorder=7)
+        return
+    if isinstance(mark, Image):
+        axes.imshow(mark.picture[..., ::-1], interpolation="antialiased")
+        axes.set(xticks=[], yticks=[])
+        axes.spines["bottom"].set_visible(False)
+        return
+    label = shortened(mark.name) if mark.name and mark.legend else None
+    if isinstance(mark, Line):
+        if mark.low is not None and mark.high is not None:
+            axes.fill_between(
+                mark.x, mark.low, mark.high, color=mark.colour, alpha=SHADE_OPACITY, linewidth=0
+            )
+        style: dict[str, Any] = {"color": mark.colour, "linestyle": mark.style, "linewidth": mark.width}
+        axes.plot(mark.x, mark.y, label=label, zorder=3, **style)
+    elif isinstance(mark, Points):
+        for x, y, ends in zip(mark.x, mark.y, mark.ends, strict=True) if len(mark.ends) else ():
+            if ends is not None:
+                place = (ends, (y, y)) if mark.along == "x" else ((x, x), ends)
+                axes.plot(*place, color=mark.colour if mark.marker else MUTED, linewidth=1.1, zorder=4)
+        if mark.marker:
+            face = mark.colour if mark.filled else PAPER
+            style = {
+                "color": mark.colour,
+                "markersize": mark.size,
+                "markerfacecolor": face,
+                "marker": mark.marker,
+            }
+            axes.plot(
+                mark.x, mark.y, linestyle="-" if mark.joined else "none", label=label, zorder=5, **style
+            )
+    elif isinstance(mark, Bars):
+        axes.barh(mark.rows, mark.length, mark.thickness, mark.start, color=mark.colour, label=label)
+    elif isinstance(mark, Area):
+        corners = np.repeat(mark.edges, 2)[1:-1]
+        low, high = np.repeat(mark.low, 2), np.repeat(mark.high, 2)
+        axes.fill_between(corners, low, high, color=mark.colour, linewidth=0, label=label)
+    elif isinstance(mark, Shades):
+        for k, level in enumerate(mark.levels):
+            opacity = 1 - (1 - SHADE_OPACITY) ** (k + 1)
+            axes.contourf(
+                mark.x,
+                mark.y,
+                mark.values.T,
+                levels=[level, np.inf],
+                colors=[MUTED],
+                alpha=SHADE_OPACITY,
+                zorder=1,
+            )
+            axes.fill(
+                [],
+                [],
+                color=MUTED,
+                alpha=opacity,
+                linewidth=0,
+                label=f"{mark.name} {level:g} m" if label else None,
+            )
+    else:
+        style = {
+            "facecolor": "none",
+            "edgecolor": STATUS_COLOURS["rejected"],
+            "hatch": "////",
+            "linewidth": 0.9,
+        }
+        axes.fill(*mark.corners.T, label=label, zorder=2, **style)
+
+
 @contextmanager
-def settled(figure: Figure, scale: float = 1.0) -> Iterator[None]:
-    """Lay a figure out at a scale of its size and hold that layout; call it within `page_style`.
+def _settled(drawing: Drawing, scale: float = 1.0) -> Iterator[None]:
+    """Lay a drawing out at a scale of its size and hold that layout; call it within `page_style`.
 
     The layout's solver leaves the last bits of coordinates open; rounded, the same figure gives the same
     bytes.
     """
-    size_in = figure.get_size_inches()
-    figure.set_size_inches(*(scale * size_in))
-    for axes in figure.axes:  # undo the positions of an earlier layout
+    size_in = drawing.get_size_inches()
+    drawing.set_size_inches(*(scale * size_in))
+    for axes in drawing.axes:  # undo the positions of an earlier layout
         if (place := axes.get_subplotspec()) is not None:
-            axes.set_position(place.get_position(figure))
+            axes.set_position(place.get_position(drawing))
         axes.set_in_layout(True)
-    figure.set_layout_engine("constrained")
-    figure.draw_without_rendering()
-    figure.set_layout_engine(None)  # not "none", a placeholder for which every savefig draws twice
-    for axes in figure.axes:
+    drawing.set_layout_engine("constrained")
+    drawing.draw_without_rendering()
+    drawing.set_layout_engine(None)  # not "none", a placeholder for which every savefig draws twice
+    for axes in drawing.axes:
         left, bottom, width, height = (round(float(edge), 5) for edge in axes.get_position(True).bounds)
         axes.set_position((left, bottom, width, height))
     try:
         yield
     finally:
-        figure.set_size_inches(*size_in)
+        drawing.set_size_inches(*size_in)
 
 
-def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
-    """Return the figure as an `<svg>` element for the inside of a page.
-
-    The key is the prefix of its ids; title and description are for readers who cannot see it.
-    """
+def _inline_svg(figure: Figure) -> str:
     buffer = io.StringIO()
-    with page_style(), settled(figure):
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-        times = _time_axes(figure)
+    with page_style(), _settled(figure.drawing):
+        figure.drawing.savefig(
+            buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None}
+        )
+        times = _time_axes(figure.drawing)
     drawing = buffer.getvalue()
     view = re.search(r'viewBox="([^"]+)"', drawing)
     if view is None:
         raise ValueError("matplotlib wrote an SVG without a viewBox")
     body = drawing[drawing.index("</metadata>") + len("</metadata>") :]
     body = re.sub(r"<defs>\s*<style[^>]*>[^<]*</style>\s*</defs>", "", body, count=1)
+    key = f"figure-{figure.key}"
     # Matplotlib's own ids are hashes of coordinates whose last bits the layout's solver leaves open.
     tags = "".join(re.findall(r"<[^<>]+>", body))
     found = dict.fromkeys(re.findall(r'(?:url\(#|href="#)([^")]+)', tags))
@@ -165,24 +543,25 @@ def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
     body = re.sub(r">\s+<", "><", body)
     return (
         f'<svg viewBox="{view.group(1)}"{times} role="img" aria-labelledby="{key}-title" '
-        f'aria-describedby="{key}-desc"><title id="{key}-title">{escape(title)}</title>'
-        f'<desc id="{key}-desc">{escape(description)}</desc>{body.strip()}'
+        f'aria-describedby="{key}-desc"><title id="{key}-title">{escape(figure.title)}</title>'
+        f'<desc id="{key}-desc">{escape(figure.description)}</desc>{body.strip()}'
     )
 
 
-TIME_LABEL = "time (s)"
-"""Label of an axis on which the page's viewer shows and takes moments."""
+def _time_axes(drawing: Drawing) -> str:
+    """Describe the time axes for the viewer: left and right edge in the drawing, the times there, its height.
 
-
-def _time_axes(figure: Figure) -> str:
-    """Describe the time axes for the viewer: left and right edge in the drawing, and the times there."""
-    width = 72 * figure.get_size_inches()[0]  # the unit of matplotlib's SVG is a point
-    found = [axes for axes in figure.axes if axes.get_xlabel() == TIME_LABEL]
-    parts = [
-        f"{width * axes.get_position().x0:.2f} {width * axes.get_position().x1:.2f} "
-        f"{axes.get_xlim()[0]:.4f} {axes.get_xlim()[1]:.4f}"
-        for axes in found
-    ]
+    A column of panels shares one axis of time, from the top of the first to the bottom of the last.
+    """
+    width, height = 72 * drawing.get_size_inches()  # the unit of matplotlib's SVG is a point
+    parts = []
+    for axes in drawing.axes:
+        if axes.get_xlabel() == TIME_LABEL:
+            place, (start, end) = axes.get_position(), axes.get_xlim()
+            column = [each.get_position().y1 for each in drawing.axes if each.get_position().x0 == place.x0]
+            edges = (width * place.x0, width * place.x1, start, end)
+            rows = (height * (1 - max(column)), height * (1 - place.y0))
+            parts.append(" ".join(f"{value:.4f}" for value in (*edges, *rows)))
     return f' data-time="{";".join(parts)}"' if parts else ""
 
 
@@ -195,98 +574,28 @@ def _page_tag(tag: str, referenced: Mapping[str, str]) -> str:
     tag = re.sub(r" font-family: [^;\"]+;?", "", tag)
     tag = re.sub(r' transform="rotate\(-0 [^"]*"', "", tag)
     tag = re.sub(r"\d+\.\d{3,}", lambda m: f"{float(m.group()):.2f}".rstrip("0").rstrip("."), tag)
-    tag = re.sub(r"#[0-9a-f]{6}\b", lambda m: _page_colour(m.group()), tag)
+    tag = re.sub(
+        r"#[0-9a-f]{6}\b", lambda m: f"var({PALETTE[m.group()]})" if m.group() in PALETTE else m.group(), tag
+    )
     return re.sub(r"\s*\n\s*", " ", tag)
 
 
-def _page_colour(colour: str) -> str:
-    return f"var({PALETTE[colour]})" if colour in PALETTE else colour
+# --- series ---
 
 
-# A path of more points shows no more on a page 9 inches wide.
-MOST_POINTS = 600
-# A time axis shows no more stretches on a page 9 inches wide.
-MOST_BINS = 300
-# Coordinates beyond this are shown relative to a round number near them, or labels would be too long.
-FAR_FROM_ZERO_M = 10_000.0
-# One shade on the other still shows the lines below.
-SHADE_OPACITY = 0.17
-
-LINE_STYLES: tuple[Literal["-"] | tuple[int, tuple[float, ...]], ...] = (
-    "-",
-    (0, (4.0, 1.5)),
-    (0, (1.0, 1.2)),
-)
-
-
-@dataclass(frozen=True)
-class Plate:
-    """A figure with its words, and the numbers that it draws."""
-
-    key: str
-    title: str
-    caption: str
-    description: str  # the picture in words, with its numbers, for readers who cannot see it
-    figure: Figure
-    numbers: Mapping[str, pd.DataFrame]  # by name; "" for those that need none
-
-    @cached_property
-    def svg(self) -> str:
-        """Figure as an `<svg>` element for the inside of a page."""
-        return inline_svg(self.figure, f"figure-{self.key}", self.title, self.description)
-
-    @cached_property
-    def csv(self) -> Mapping[str, str]:
-        """Numbers as CSV, by name, with nine significant digits; empty cells are missing numbers.
-
-        No spreadsheet takes a text of it for a formula.
-        """
-        return {name: _written(numbers) for name, numbers in self.numbers.items()}
-
-
-def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
-    """Write rows by column, of the same columns, as `Plate.csv` does."""
-    import pandas as pd
-
-    return _written(pd.DataFrame(rows))
-
-
-def _written(numbers: pd.DataFrame) -> str:
-    texts = numbers.select_dtypes(exclude="number").map(cell_text)
-    written: str = numbers.assign(**texts).to_csv(index=False, float_format="%.9g", lineterminator="\n")
-    return written
-
-
-def table(**columns: object) -> pd.DataFrame:
-    """Return numbers of a figure by columns of the same length; a single value holds for all rows."""
-    import pandas as pd
-
-    return pd.DataFrame(columns)
-
-
-def tabled(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> pd.DataFrame:
-    """Return numbers of a figure by rows."""
-    import pandas as pd
-
-    return pd.DataFrame(rows, columns=list(columns))
-
-
-def stacked(tables: list[pd.DataFrame]) -> pd.DataFrame:
-    """Stack tables of the same columns, one below the other."""
-    import pandas as pd
-
-    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-
-
-def colour_and_style(k: int) -> tuple[str, Any]:
+def colour_and_style(k: int) -> tuple[str, Stroke]:
     """Return the colour and the line style of camera, arm or session k."""
     return CAMERAS[k % len(CAMERAS)], LINE_STYLES[k // len(CAMERAS) % len(LINE_STYLES)]
 
 
-def way_m(path: Float) -> float:
-    """Compute the length of a path [T, 2 or 3] over ground, without its gaps."""
-    steps = np.sqrt((np.diff(path[:, :2], axis=0) ** 2).sum(axis=1))
-    return float(steps[np.isfinite(steps)].sum())
+def line_through(path: Float, colour: str, name: str = "", **style: Any) -> Line:
+    """Return the line through points [N, 2]."""
+    return Line(path[:, 0], path[:, 1], colour, name, **style)
+
+
+def points_at(path: Float, colour: str, name: str = "", **style: Any) -> Points:
+    """Return points [N, 2] as a mark."""
+    return Points(path[:, 0], path[:, 1], colour, name, **style)
 
 
 def stride_for(count: int, most: int = MOST_POINTS) -> int:
@@ -309,37 +618,6 @@ def near_zero(low: Float) -> Float:
 def axis_label(direction: str, origin_m: float) -> str:
     """Return `east (m)`, or with the subtracted number far from zero."""
     return f"{direction} (m)" if origin_m == 0 else f"{direction} of {fixed(origin_m, 0)} m (m)"
-
-
-def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
-    """Make an empty figure whose layout is solved when it is drawn; call it within `page_style`."""
-    from matplotlib.figure import Figure
-
-    return Figure((width_in, height_in), layout="constrained")
-
-
-def quiet(axes: Axes, grid: Literal["x", "y", "both"] | None = None) -> None:
-    """Make axes light: no frame on the left, a thin line below, and grid lines across the axes named."""
-    axes.spines["left"].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    if grid is not None:
-        axes.grid(visible=True, axis=grid)
-
-
-def shade(axes: Axes, x: Float, y: Float, values: Float, levels: Sequence[float]) -> None:
-    """Shade where values [X, Y] exceed each level, one shade on the other."""
-    for level in levels:
-        axes.contourf(x, y, values.T, levels=[level, np.inf], colors=[MUTED], alpha=SHADE_OPACITY, zorder=1)
-
-
-def shade_keys(labels: Sequence[str]) -> list[Patch]:
-    """Make the entries of a legend for the shades of as many levels."""
-    from matplotlib.patches import Patch
-
-    return [
-        Patch(color=MUTED, alpha=1 - (1 - SHADE_OPACITY) ** (k + 1), linewidth=0, label=label)
-        for k, label in enumerate(labels)
-    ]
 
 
 def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
@@ -371,170 +649,6 @@ def _by_bin(values: Float, seconds: Float, bins: Float) -> list[Float]:
     return [part[np.isfinite(part)] for part in inside]
 
 
-# --- figures of lines, bars and points -----------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Line:
-    """A series [N] with the band around it, where there is one."""
-
-    x: Float
-    y: Float
-    colour: str
-    name: str = ""  # for the legend; none without one
-    low: Float | None = None
-    high: Float | None = None
-    style: Literal["-"] | tuple[int, tuple[float, ...]] = "-"
-    width: float = 1.1
-    shade: float = 0.16  # opacity of the band
-
-
-@dataclass(frozen=True)
-class Bars:
-    """Horizontal bars [N]: rows from above, where they begin, and how long they are."""
-
-    rows: Sequence[float]
-    start: Sequence[float] | float
-    length: Sequence[float]
-    colour: str
-    name: str = ""
-    thickness: float = 0.72
-
-
-@dataclass(frozen=True)
-class RowPoints:
-    """Points [N] in rows from above, with the interval of each, where there is one; 0 rows are a legend."""
-
-    rows: Sequence[float]
-    x: Sequence[float]
-    ends: Sequence[tuple[float, float] | None]
-    colour: str
-    name: str = ""
-    width: float = 1.4
-    opacity: float = 1.0
-    marked: bool = True  # else the intervals alone
-
-
-@dataclass(frozen=True)
-class Stack:
-    """Shares [K, bins] over time, one on top of the other; each holds for the whole of its bin."""
-
-    edges: Float  # [bins + 1]
-    shares: Mapping[str, Float]  # by name
-    colours: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One drawing of a figure: its marks, labels and spans."""
-
-    marks: Sequence[Line | Bars | RowPoints | Stack]
-    x_label: str = ""
-    y_label: str = ""
-    rows: Mapping[float, str] | None = None  # labels of rows from above, by place
-    row_span: tuple[float, float] | None = None  # else half a row beyond the first and the last
-    x_span: tuple[float | None, float | None] | None = None
-    y_span: tuple[float | None, float | None] | None = None
-    title: str = ""
-    title_inside: bool = False
-    grid: Literal["x", "y", "both"] | None = "y"
-    zero: bool = False  # draw a line at x = 0
-
-
-def chart(
-    panels: Sequence[Sequence[Panel]],
-    height_in: float,
-    *,
-    width_in: float = WIDTH_IN,
-    heights: Sequence[float] | None = None,
-    widths: Sequence[float] | None = None,
-    share_x: bool = True,
-    share_y: bool = False,
-    legend: Literal["above", "inside", ""] = "above",
-    columns: int = 4,
-    label: str = "",
-) -> Figure:
-    """Draw panels, row by row; `label` is that of the vertical axes of all, `columns` are the legend's."""
-    rows, across = len(panels), max(len(row) for row in panels)
-    with page_style():
-        figure = new_figure(height_in, width_in)
-        grid = figure.subplots(
-            rows,
-            across,
-            squeeze=False,
-            sharex=share_x,
-            sharey=share_y,
-            height_ratios=heights,
-            width_ratios=widths,
-        )
-        for own, panel_row in zip(grid, panels, strict=True):
-            for axes, panel in zip(own, panel_row, strict=False):
-                _draw_panel(axes, panel)
-            for axes in own[len(panel_row) :]:
-                axes.set_axis_off()
-        if across == 1:
-            figure.align_ylabels(list(grid[:, 0]))
-        entries: dict[str, Any] = {}
-        for axes in grid.flat:
-            for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
-                entries.setdefault(name, handle)
-        if entries and legend == "above":
-            count = min(len(entries), columns)
-            figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=count)
-        elif entries and legend == "inside":
-            grid[0, 0].legend(loc="upper left", ncols=columns)
-        if label:
-            figure.supylabel(label, fontsize=7.6, color=MUTED)
-    return figure
-
-
-def _draw_panel(axes: Axes, panel: Panel) -> None:
-    if panel.zero:
-        axes.axvline(0, color=MUTED, linewidth=0.8)
-    for mark in panel.marks:
-        _draw_mark(axes, mark)
-    axes.set_xlabel(panel.x_label)
-    axes.set_ylabel(panel.y_label)
-    if panel.rows is not None:
-        axes.set_yticks(list(panel.rows), list(panel.rows.values()))
-        axes.set_ylim(*(panel.row_span or (max(panel.rows, default=0) + 0.5, -0.5)))
-    if panel.x_span is not None:
-        axes.set_xlim(*panel.x_span)
-    if panel.y_span is not None:
-        axes.set_ylim(*panel.y_span)
-    if panel.title and panel.title_inside:
-        words = axes.text(0.01, 0.97, panel.title, transform=axes.transAxes, va="top", fontsize=7)
-        words.set_in_layout(False)  # a long name takes no room from the curves
-    elif panel.title:
-        axes.set_title(panel.title, fontsize=7.2, color=MUTED, loc="left")
-    quiet(axes, panel.grid)
-
-
-def _draw_mark(axes: Axes, mark: Line | Bars | RowPoints | Stack) -> None:
-    if isinstance(mark, Line):
-        if mark.low is not None and mark.high is not None:
-            axes.fill_between(mark.x, mark.low, mark.high, color=mark.colour, alpha=mark.shade, linewidth=0)
-        style: dict[str, Any] = {"color": mark.colour, "linestyle": mark.style, "linewidth": mark.width}
-        axes.plot(mark.x, mark.y, label=mark.name or None, **style)
-    elif isinstance(mark, Bars):
-        label = mark.name or None
-        axes.barh(mark.rows, mark.length, mark.thickness, mark.start, color=mark.colour, label=label)
-    elif isinstance(mark, RowPoints):
-        for row, x, ends in zip(mark.rows, mark.x, mark.ends, strict=True):
-            if ends is not None:
-                axes.plot(ends, [row, row], color=mark.colour, linewidth=mark.width, alpha=mark.opacity)
-            if mark.marked:
-                axes.plot(x, row, "o", color=mark.colour, markersize=4)
-        if mark.name:
-            axes.plot([], [], "o-", color=mark.colour, markersize=4, label=mark.name)
-    else:
-        corners, base = np.repeat(mark.edges, 2)[1:-1], np.zeros(len(mark.edges) - 1)
-        for name, share in mark.shares.items():
-            low, high = np.repeat(base, 2), np.repeat(base + share, 2)
-            axes.fill_between(corners, low, high, color=mark.colours[name], linewidth=0, label=name)
-            base = base + share
-
-
 # --- files for a publication ---
 
 
@@ -556,27 +670,20 @@ _FILE_METADATA: dict[str, dict[str, Any]] = {
 
 
 def write_figures(
-    folder: Path, plates: Mapping[str, Plate], contents: Mapping[str, SessionContent], key: str
+    folder: Path, figures: Sequence[Figure], contents: Mapping[str, SessionContent], key: str
 ) -> None:
-    """Write `<figure>.png`, `.svg`, `.pdf` and `.csv` for every figure, and the mark.
-
-    The same plates give the same bytes. Numbers that have a name of their own go to `<figure>-<name>.csv`;
-    empty cells are missing numbers.
+    """Write `<figure>.png`, `.svg`, `.pdf` and `.csv` of every figure into an empty folder, and the mark.
 
     Args:
-        folder: an existing, empty folder.
         contents: the sessions that they are of, by label; the mark names their flights.
         key: equal for equal figures; it is stored in the mark.
     """
     listed = []
-    for plate in plates.values():
-        names = _write_drawing(folder, plate.key, plate.figure)
-        for what, numbers in plate.csv.items():
-            name = f"{plate.key}-{what}.csv" if what else f"{plate.key}.csv"
-            (folder / name).write_text(numbers, encoding="utf-8", newline="\n")
-            names.append(name)
-        words = {"title": plate.title, "caption": plate.caption, "description": plate.description}
-        listed.append({"figure": plate.key, **words, "files": names})
+    for figure in figures:
+        names = [*write_drawing(folder, figure.key, figure), f"{figure.key}.csv"]
+        (folder / names[-1]).write_text(figure.csv, encoding="utf-8", newline="\n")
+        words = {"title": figure.title, "caption": figure.caption, "description": figure.description}
+        listed.append({"figure": figure.key, **words, "files": names})
     sessions = {
         label: {"flight": content.session.flight, "simulated": content.session.simulated}
         for label, content in contents.items()
@@ -584,21 +691,22 @@ def write_figures(
     write_json(folder / MARK, {"schema": 1, "key": key, "sessions": sessions, "figures": listed})
 
 
-def _write_drawing(folder: Path, key: str, figure: Figure) -> list[str]:
+def write_drawing(folder: Path, name: str, figure: Figure) -> list[str]:
+    """Write a figure as PNG, SVG and PDF; equal figures give equal bytes. Return the names of the files."""
     import matplotlib as mpl
 
     names = []
     with page_style():
         mpl.rcParams.update(_FILE_STYLE)
-        with settled(figure, FILE_WIDTH_MM / 25.4 / WIDTH_IN):
+        with _settled(figure.drawing, FILE_WIDTH_MM / 25.4 / WIDTH_IN):
             for kind, metadata in _FILE_METADATA.items():
-                names.append(f"{key}.{kind}")
-                figure.savefig(folder / names[-1], dpi=FILE_DPI, metadata=metadata)
+                names.append(f"{name}.{kind}")
+                figure.drawing.savefig(folder / names[-1], dpi=FILE_DPI, metadata=metadata)
     return names
 
 
 def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
-    """Refuse to overwrite files that are not ours.
+    """Refuse to write figures over what is not ours.
 
     Args:
         folder: the folder for figures; its old contents are removed.
@@ -615,7 +723,11 @@ def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
         raise DataError(
             folder, "is a file, not a folder", "name another place with --figures", code="not-a-folder"
         )
-    foreign = sorted({path.name for path in folder.iterdir()} - _ours(folder))
+    ours = {MARK}
+    if (folder / MARK).is_file():
+        stated = read_json(folder / MARK, "remove it, or name another folder with --figures").get("figures")
+        ours |= {name for each in stated or () for name in each.get("files", ())}
+    foreign = sorted({path.name for path in folder.iterdir()} - ours)
     if foreign:
         raise DataError(
             folder,
@@ -623,12 +735,3 @@ def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
             "name another folder with --figures, or replace it with --overwrite",
             code="exists",
         )
-
-
-def _ours(folder: Path) -> set[str]:
-    """Return the names of the files that the mark in a folder lists."""
-    if not (folder / MARK).is_file():
-        return set()
-    stated = read_json(folder / MARK, "remove it, or name another folder with --figures").get("figures")
-    figures = stated if isinstance(stated, list) else []
-    return {MARK, *(name for each in figures if isinstance(each, dict) for name in each.get("files", ()))}

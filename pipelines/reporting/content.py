@@ -31,9 +31,7 @@ class ReplanContent:
     metrics: dict[str, object]  # replan/metrics.json
     arms: dict[str, pd.DataFrame]  # arm: tables.REPLAN
     actor: pd.DataFrame  # tables.ACTOR at the same times: the reference of the arms' scores
-    cost_map: pd.DataFrame | None = None  # tables.COST_MAP
     map: Occupancy | None = None  # the session's last map
-    seen: dict[str, pd.DataFrame] = field(default_factory=dict)  # arm: tables.SEEN, where a skeleton is known
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,6 @@ class SessionContent:
     replan: ReplanContent | None = None
     refined: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where refined
     true_poses: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where known
-    hidden: dict[str, float] = field(default_factory=dict)  # camera: share of moments, where a map is
     made_by: dict[str, dict[str, str]] = field(default_factory=dict)  # stage: program or library, and version
     outdated: tuple[str, ...] = ()  # stages whose inputs have changed since
     angles: pd.DataFrame | None = None  # tables.ANGLES, where the reconstruction has them

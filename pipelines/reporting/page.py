@@ -1,12 +1,17 @@
-"""The page of one session and the table of many flights, each as one self-contained file."""
+"""The pages: of one session, and the table of many flights, each as one self-contained file.
+
+A page is a list of sections, and a section is a list of blocks: texts, tables, figures, lists and what is
+folded away. One template shows them all.
+"""
+
+from __future__ import annotations
 
 import base64
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from importlib.resources import files
-from typing import Any
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -14,12 +19,12 @@ from markupsafe import Markup
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting import wording
 from pipelines.reporting.arms import Replan, draw_arms, summarise_replan
-from pipelines.reporting.chart import MOST_BINS, Plate
-from pipelines.reporting.content import SessionContent, as_reconstructed, number, section, text
+from pipelines.reporting.chart import MOST_BINS, Figure
+from pipelines.reporting.content import SessionContent, as_reconstructed, items, number, section, text
 from pipelines.reporting.figures import draw_all
 from pipelines.reporting.overlays import ReadFrame, collect_moments, residuals_over_time
 from pipelines.reporting.pictures import Video, draw_overlays, make_strips, panel_source, panel_width
-from pipelines.reporting.studies import draw_studies, summarise_studies
+from pipelines.reporting.studies import draw_study, study_blocks
 from pipelines.reporting.summary import (
     Summary,
     summarise,
@@ -29,75 +34,169 @@ from pipelines.reporting.summary import (
     tables_of_errors,
 )
 from pipelines.reporting.verdict import at_a_glance, give_verdict
-from pipelines.reporting.viewer import make_scene
-from pipelines.reporting.wording import environment
+from pipelines.reporting.viewer import ViewerScene, make_scene
+from pipelines.reporting.wording import Column, Table, environment
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Blocks that a click unfolds."""
+
+    title: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list: sentences, by how much they matter: `wrong`, `doubt` or `note`."""
+
+    sentences: Sequence[tuple[str, str]]
+
+
+Block = str | Table | Figure | Fold | Bullets
+"""Part of a section; a `Markup` is shown as it is, another text as a paragraph."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Part of a page; sections of another `tab` than the first one are shown when it is chosen."""
+
+    key: str
+    title: str
+    blocks: Sequence[Block]
+    lead: str = ""
+    tab: str = ""
+
+
+@dataclass(frozen=True)
+class Page:
+    """All that a page shows."""
+
+    generator: str  # of the page; it marks pages of ours, which may be overwritten
+    kicker: str
+    title: str
+    sections: Sequence[Section]
+    facts: Sequence[str] = ()
+    footer: str = ""
+    scene: ViewerScene | None = None
+    pictures: bool = field(default=False)  # whether the page holds any
+
+    def render(self) -> str:
+        """Return the complete HTML.
+
+        The same page gives the same bytes. All text is escaped. The page loads nothing; it runs the one
+        script of its 3D viewer if it has one, which its policy names by hash, and nothing else.
+        """
+        script = (files("pipelines.reporting") / "templates" / "viewer.js").read_text(encoding="utf-8")
+        rules = ["default-src 'none'", "style-src 'unsafe-inline'"]
+        if self.scene is not None:
+            digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+            rules.append(f"script-src 'sha256-{digest}'")
+        rules += ["img-src data:"] * self.pictures
+        sections = [section for section in self.sections if section.blocks or section.lead]
+        return (
+            environment()
+            .get_template("page.html.j2")
+            .render(
+                page=self,
+                sections=sections,
+                tabs=list(dict.fromkeys(section.tab for section in sections)),
+                policy="; ".join(rules),
+                script=Markup(script),  # noqa: S704 - our own file
+            )
+        )
+
+
+def _template(name: str, **context: object) -> Markup:
+    return Markup(environment().get_template(name).render(**context))  # noqa: S704 - escaped by the template
+
+
+# --- one session ---
 
 
 def render_page(content: SessionContent, read_frame: ReadFrame | None = None, video: Video = "none") -> str:
     """Render the complete HTML of a session's report.
 
-    The same content gives the same bytes: no dates of making, no paths of this machine.
-    All text from the session's files is escaped. The page loads nothing; it runs the one script of
-    its 3D viewer, which its policy names by hash, and nothing else. Without `read_frame`, which reads the
-    pictures behind the overlays, they are drawn on plain ground. `video` chooses how many pictures stand
-    beside the 3D view.
+    Args:
+        read_frame: reads the pictures behind the overlays; without it they are drawn on plain ground.
+        video: how many pictures stand beside the 3D view.
     """
     summary = summarise(content)
     replan = _replan(summary, content)
-    plates = _draw(summary, content, replan)
-    script = (files("pipelines.reporting") / "templates" / "viewer.js").read_text(encoding="utf-8")
-    overlays = _overlays(as_reconstructed(content), summary, read_frame)
-    strips = make_strips(as_reconstructed(content), summary, read_frame, video)
+    figures = {figure.key: figure for figure in _draw(summary, content, replan)}
+    measured = as_reconstructed(content)
+    strips = make_strips(measured, summary, read_frame, video)
+    scene = make_scene(summary, content.poses | content.refined, replan, strips)
+    overlays = _overlays(measured, summary, read_frame)
     started = wording.moment(summary.origin_ns)
-    return (
-        environment()
-        .get_template("page.html.j2")
-        .render(
-            name=content.name,
-            title=summary.description.flight or content.name,
-            summary=summary,
-            description=summary.description,
-            started=started,
-            method=text(summary.metrics, "method"),
-            verdict=give_verdict(content, summary),
-            glances=at_a_glance(summary),
-            key_figures=_key_figures(summary),
-            ingested=[table_of_cameras(content, summary, started), table_of_quality(content, summary)],
-            errors=tables_of_errors(summary),
-            joints=table_of_joints(summary),
-            plates=plates,
-            replan=replan,
-            studies=summarise_studies(content.studies),
-            scene=make_scene(summary, content.poses | content.refined, replan, strips),
-            refined=bool(content.refined),
-            made_by=_made_by(content),
-            every=content.every,
-            viewer_script=Markup(script),  # noqa: S704 - our own file
-            policy=_policy(script, pictures=bool(strips) or overlays is not None),
-            overlays=overlays,
-            # Our own drawing, in which every name was escaped when it was written.
-            drawings={key: Markup(plate.svg) for key, plate in plates.items()},  # noqa: S704
-            statuses=[word for word in STATUS if summary.counts.get(word)],
-            status_labels=wording.STATUS_LABELS,
-            status_reasons=wording.STATUS_REASONS,
-            stages=[_stage_note(stage, record) for stage, record in content.stages.items()],
-        )
-    )
+
+    def drawn(*keys: str) -> list[Block]:
+        return [figures[key] for key in keys if key in figures]
+
+    verdict = give_verdict(content, summary)
+    shown = [] if scene is None else [_template("viewer.html.j2", scene=scene, refined=bool(content.refined))]
+    statuses = [
+        ("note", f"{wording.STATUS_LABELS[word].capitalize()}: {wording.STATUS_REASONS[word]}.")
+        for word in STATUS
+        if summary.counts.get(word)
+    ]
+    joints: list[Block] = [table_of_joints(summary), Bullets(statuses)] if summary.motion is not None else []
+    tables: list[Block] = [
+        Fold("Every joint", [*joints, *drawn("joints", "sigmas")]),
+        Fold("What was ingested", [table_of_cameras(content, summary, started), *drawn("timeline")]),
+        Fold("How good the data of each camera is", [table_of_quality(content, summary)]),
+        Fold("Settings, versions and hashes", _how_made(content, summary)),
+    ]
+    if summary.motion is None:
+        del tables[0]
+    sections = [
+        Section("verdict", "Verdict", [_template("verdict.html.j2", verdict=verdict)]),
+        Section("motion", "The motion", shown),
+        Section("doubts", "What is doubtful", [Bullets(verdict.doubts)] if verdict.doubts else []),
+        Section(
+            "evidence",
+            "Evidence",
+            [
+                _template("glances.html.j2", figures=_key_figures(summary), glances=at_a_glance(summary)),
+                *([_template("overlays.html.j2", overlays=overlays)] if overlays is not None else []),
+                *drawn("time", "residuals", "top", "angles"),
+                *tables_of_errors(summary),
+            ],
+        ),
+        Section("tables", "Tables and methods", tables),
+        *(_replan_sections(replan, content, drawn("arms-top", "arms-time")) if replan is not None else []),
+        *(
+            Section(f"study-{k}", "Study", study_blocks(study, figures[f"study-{k}"]), tab="Studies")
+            for k, study in enumerate(content.studies, start=1)
+        ),
+    ]
+    simulated = ": a simulated flight" if summary.description.simulated else ""
+    return Page(
+        generator="mocap: a session",
+        kicker=f"Session report{simulated}",
+        title=summary.description.flight or content.name,
+        facts=_facts(content, summary, started),
+        sections=sections,
+        footer="World axes east, north, up in metres; pixels count from the centre of the top left one.",
+        scene=scene,
+        pictures=bool(strips) or overlays is not None,
+    ).render()
 
 
-def draw_session(content: SessionContent, read_frame: ReadFrame | None = None) -> dict[str, Plate]:
-    """Draw every figure of the page but the 3D viewer, by its key; the overlays have one for each moment."""
+def draw_session(content: SessionContent, read_frame: ReadFrame | None = None) -> list[Figure]:
+    """Draw every figure of the page but the 3D viewer; the overlays have one for each moment."""
     summary = summarise(content)
     moments = collect_moments(as_reconstructed(content), summary, read_frame)
-    return _draw(summary, content, _replan(summary, content)) | draw_overlays(moments)
+    return [*_draw(summary, content, _replan(summary, content)), *draw_overlays(moments)]
 
 
-def _draw(summary: Summary, content: SessionContent, replan: Replan | None) -> dict[str, Plate]:
-    of_arms = draw_arms(replan) if replan is not None else {}
+def _draw(summary: Summary, content: SessionContent, replan: Replan | None) -> list[Figure]:
     residuals = residuals_over_time(as_reconstructed(content), summary, MOST_BINS)
-    return (
-        draw_all(summary, content.poses, residuals, content.angles) | of_arms | draw_studies(content.studies)
-    )
+    return [
+        *draw_all(summary, content.poses, residuals, content.angles),
+        *(draw_arms(replan) if replan is not None else []),
+        *(draw_study(f"study-{k}", study.metrics) for k, study in enumerate(content.studies, start=1)),
+    ]
 
 
 def _replan(summary: Summary, content: SessionContent) -> Replan | None:
@@ -106,16 +205,33 @@ def _replan(summary: Summary, content: SessionContent) -> Replan | None:
     return summarise_replan(content.replan, summary.origin_ns, len(summary.cameras))
 
 
-def _policy(script: str, *, pictures: bool) -> str:
-    """Return the page's policy: its own styles, its own script, and pictures that it holds itself."""
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-    rules = ["default-src 'none'", "style-src 'unsafe-inline'", f"script-src 'sha256-{digest}'"]
-    return "; ".join(rules + ["img-src data:"] * pictures)
+def _replan_sections(replan: Replan, content: SessionContent, figures: Sequence[Block]) -> list[Section]:
+    warnings = items(content.stages.get("replan", {}), "warnings")
+    notes = [*(("doubt", str(each)) for each in warnings), *(("note", note) for note in replan.notes)]
+    lead = f"{replan.verdict[:1].upper()}{replan.verdict[1:]}"
+    blocks = [replan.setting, *figures, *replan.tables, Bullets(notes)]
+    return [Section("replan", "Planners compared", blocks, lead, tab="Planners")]
+
+
+def _facts(content: SessionContent, summary: Summary, started: str) -> list[str]:
+    title = summary.description.flight or content.name
+    facts = [content.name] if content.name != title else []
+    facts += [
+        started,
+        f"{wording.fixed(summary.duration_s)} s",
+        wording.plural(len(summary.cameras), "camera"),
+    ]
+    if summary.motion is not None:
+        facts.append(f"{len(summary.joints)} joints at {wording.whole(len(summary.motion.t_ns))} times")
+        if len(summary.people) > 1:
+            facts.append(f"{len(summary.people)} people")
+    method = text(summary.metrics, "method")
+    return [*facts, f"method {method}"] if method else facts
 
 
 def _overlays(
     content: SessionContent, summary: Summary, read_frame: ReadFrame | None
-) -> dict[str, Any] | None:
+) -> dict[str, object] | None:
     """Collect the moments, a drawing of every view, and facts about all of them; None without a view."""
     moments = collect_moments(content, summary, read_frame)
     views = {(m, view.camera): view for m, moment in enumerate(moments) for view in moment.views}
@@ -126,25 +242,20 @@ def _overlays(
         "moments": moments,
         "drawings": {key: panel_source(view, width_px) for key, view in views.items()},
         "pictures": sum(view.picture is not None for view in views.values()),
-        "rejected": any(view.rejected.any() for view in views.values()),
-        "unmeasured": any(view.unmeasured.any() for view in views.values()),
-        "others": any(len(view.others) for view in views.values()),  # people beside the skeleton's
+        "media": any(camera.entry.media for camera in summary.cameras),
         "refined": bool(content.refined),
     }
 
 
 def _key_figures(summary: Summary) -> list[tuple[str, str, str]]:
-    """Return at most five numbers that say how good a recording is: value, unit and label."""
+    """Return the numbers that say how good a recording is: value, unit and label."""
     if summary.share is None:
         frames = sum(camera.entry.frames.count for camera in summary.cameras)
-        return [
-            (wording.whole(len(summary.cameras)), "", "cameras"),
-            (wording.whole(frames), "", "frames"),
-        ]
+        return [(wording.whole(frames), "", "frames")]
     share, _, unit = wording.percent(summary.share).rpartition(wording.THIN)
     figures = [(share, unit, "of joint-frames measured")]
     for key, label in (
-        ("mpjpe_mm", "mean error (MPJPE)"),
+        ("mpjpe_mm", "mean error against truth (MPJPE)"),
         ("root_mpjpe_mm", "relative to the hips"),
         ("pa_mpjpe_mm", "after alignment (PA)"),
     ):
@@ -153,32 +264,36 @@ def _key_figures(summary: Summary) -> list[tuple[str, str, str]]:
             figures.append((wording.fixed(value), "mm", label))
     reprojection = number(section(summary.metrics, "reprojection_px"), "median")
     if reprojection is not None:
-        figures.append((wording.fixed(reprojection), "px", "median reprojection"))
+        figures.append((wording.fixed(reprojection), "px", "median reprojection error"))
+    if summary.sigma_mm is not None:
+        figures.append((wording.fixed(summary.sigma_mm), "mm", "stated σ per axis (median)"))
+    if summary.inside_95 is not None:
+        inside, _, unit = wording.percent(summary.inside_95).rpartition(wording.THIN)
+        figures.append((inside, unit, "of true positions inside the 95 % ellipsoids"))
     return figures
 
 
-def _made_by(content: SessionContent) -> list[tuple[str, str]]:
-    """Group the stages by the versions that made them: stages and versions."""
-    made: dict[str, list[str]] = {}
-    for stage in content.stages:
-        if made_by := content.made_by.get(stage):
-            versions = ", ".join(f"{name} {number}" for name, number in made_by.items())
-            made.setdefault(versions, []).append(stage)
-    return [(wording.listing(stages), versions) for versions, stages in made.items()]
-
-
-def _stage_note(stage: str, record: Mapping[str, object]) -> dict[str, object]:
-    """Return the settings and counts of one stage as rows."""
-    settings = section(record, "settings")
-    flight = section(settings, "flight")
-    settings.pop("flight", None)
-    return {
-        "name": stage,
-        "key": text(record, "key"),
-        "settings": wording.flattened(settings),
-        "flight": [row for row in wording.flattened(flight) if row[1] != "none"],
-        "counts": wording.flattened(section(record, "counts")),
-    }
+def _how_made(content: SessionContent, summary: Summary) -> list[Block]:
+    """List versions, settings and counts of each stage, and the hashes of the inputs."""
+    blocks: list[Block] = [
+        "The same inputs and settings give the same bytes. A key is the SHA-256 of all that decides a result."
+    ]
+    if content.every > 1:
+        blocks.append(
+            f"The flight is long: figures, pictures and the 3D view are drawn from one in {content.every} of"
+            " its times. Numbers of all its joint-frames are those of metrics.json."
+        )
+    used = text(section(summary.metrics, "method_used"), "summary")
+    blocks += [f"The method {text(summary.metrics, 'method')} {used}."] if used else []
+    for stage, record in content.stages.items():
+        versions = [f"{name} {of}" for name, of in content.made_by.get(stage, {}).items()]
+        rows = [("key", text(record, "key")), ("made by", ", ".join(versions))]
+        rows += wording.flattened(section(record, "settings")) + wording.flattened(section(record, "counts"))
+        kept = [row for row in rows if row[1] not in {"none", ""}]
+        columns = (Column(stage, text=True), Column("value", text=True))
+        blocks.append(Table(f"made-{stage}", "", columns, kept, "settings"))
+    columns = (Column("file", text=True), Column("SHA-256", text=True))
+    return [*blocks, Table("inputs", "", columns, list(summary.description.sources.items()), "settings")]
 
 
 # --- many flights ---
@@ -225,37 +340,60 @@ class FlightRow:
         """Columns of the planner arms that the flight has."""
         return [name for name in self.figures if name.startswith(_TILT)]
 
-    @property
-    def link(self) -> str | None:
-        """Address of its page."""
-        return None if self.report is None else quote(os.fsencode(self.report))
-
     def cells(self) -> list[object]:
         """Return the values of COLUMNS."""
         figures = [self.figures.get(name) for name in _FIGURES]
         return [self.flight, self.name, self.status, self.failed_stage, self.error, self.doubt, *figures]
 
+    def shown(self, arms: Sequence[str]) -> list[object]:
+        """Return the cells of its row on the page, with the tilt of some arms."""
+        name: str | Markup = self.name or self.flight
+        if self.report is not None:
+            name = Markup('<a href="{}">{}</a>').format(quote(os.fsencode(self.report)), name)
+        status = self.status + (f" in {self.failed_stage}" if self.failed_stage else "")
+        share, *errors, reprojection = (self.figures.get(figure) for figure in _FIGURES)
+        return [
+            (name, self.flight if self.name else ""),
+            status + (f", doubted ({self.doubt})" if self.doubt else ""),
+            wording.percent(share),
+            *(wording.fixed(error) for error in errors),
+            wording.fixed(reprojection, 2),
+            *(wording.fixed(self.figures.get(arm)) for arm in arms),
+            str(len(self.warnings)),
+        ]
+
 
 def render_flights(rows: Sequence[FlightRow]) -> str:
-    """Render the complete HTML of the summary; it loads nothing, and text from files is escaped."""
+    """Render the complete HTML of the summary of many flights."""
     arms = list(dict.fromkeys(name for row in rows for name in row.arms))
-    failed = sum(row.error is not None for row in rows)
-    return (
-        wording.environment()
-        .get_template("flights.html.j2")
-        .render(
-            rows=rows,
-            arms={name: name.removeprefix(_TILT) for name in arms},
-            failed=failed,
-            lead=_lead(len(rows), failed, sum(row.doubt is not None for row in rows)),
-            plural=wording.plural,
-        )
+    columns = [
+        Column("Flight", text=True),
+        Column("Status", text=True),
+        Column("Measured", "of joint-frames"),
+    ]
+    columns += [Column("MPJPE", "mm"), Column("PA-MPJPE", "mm"), Column("Reprojection", "median, px")]
+    columns += [Column("Tilt", f"deg, {arm.removeprefix(_TILT)}") for arm in arms]
+    table = Table(
+        "flights",
+        "Errors are against the truth where a flight has one. Tilt is the mean of each planner arm, simulated"
+        " but for that of flown.",
+        [*columns, Column("Warnings")],
+        [row.shown(arms) for row in rows],
     )
-
-
-def _lead(flights: int, failed: int, doubted: int) -> str:
-    of = f"of {wording.plural(flights, 'flight')}"
-    first = f"{doubted} {of} {'is' if doubted == 1 else 'are'} doubted. " if doubted else ""
-    if failed == 0:
-        return f"{first}{wording.plural(flights, 'flight')} went through all stages that were asked for."
-    return f"{first}{failed} {of} failed; the others went through."
+    failed = [("wrong", f"{row.flight}: {row.error}") for row in rows if row.error]
+    doubts = [("doubt", f"{row.name or row.flight}: {warning}") for row in rows for warning in row.warnings]
+    count = f"of {wording.plural(len(rows), 'flight')}"
+    doubted = sum(row.doubt is not None for row in rows)
+    lead = f"{doubted} {count} {'is' if doubted == 1 else 'are'} doubted. " if doubted else ""
+    lead += (
+        f"{len(failed)} {count} failed; the others went through."
+        if failed
+        else f"{wording.plural(len(rows), 'flight')} went through all stages that were asked for."
+    )
+    sections = [
+        Section("verdict", "Flights", [table], lead),
+        Section("failed", "What failed", [Bullets(failed)] if failed else []),
+        Section("doubts", "What is doubtful", [Bullets(doubts)] if doubts else []),
+    ]
+    title = wording.plural(len(rows), "flight")
+    return Page("mocap: many flights", "Many flights", title, sections).render()

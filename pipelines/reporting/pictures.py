@@ -11,23 +11,14 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.chart import (
-    INK,
-    WIDTH_IN,
-    Plate,
-    new_figure,
-    page_style,
-    quiet,
-    stacked,
-    table,
-)
+from pipelines.reporting.chart import INK, WIDTH_IN, Figure, Image, Mark, Panel, points_at
 from pipelines.reporting.content import MeasuredMotion, SessionContent, Strip, side_of
 from pipelines.reporting.overlays import (
     FilmedCamera,
@@ -41,9 +32,6 @@ from pipelines.reporting.overlays import (
 from pipelines.reporting.summary import Summary
 from pipelines.reporting.wording import listing, quantity, shortened
 from pipelines.session.people import bones_of
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Colour = tuple[int, int, int]
 
@@ -484,61 +472,32 @@ def panel_source(view: OverlayView, px: int) -> str:
     return f"data:image/webp;base64,{data}"
 
 
-def draw_overlays(moments: Sequence[OverlayMoment]) -> dict[str, Plate]:
-    """Draw a figure for every moment at which any camera has a frame, by its key."""
-    plates = [_moment(k, moment) for k, moment in enumerate(moments, start=1) if moment.views]
-    return {plate.key: plate for plate in plates}
+def draw_overlays(moments: Sequence[OverlayMoment]) -> list[Figure]:
+    """Draw a figure for every moment at which any camera has a frame."""
+    return [_moment(k, moment) for k, moment in enumerate(moments, start=1) if moment.views]
 
 
-def _moment(k: int, moment: OverlayMoment) -> Plate:
+def _moment(k: int, moment: OverlayMoment) -> Figure:
     columns = min(len(moment.views), MAX_PANELS_IN_ROW)
-    rows = -(-len(moment.views) // columns)
-    with page_style():
-        figure = new_figure(rows * (WIDTH_IN / columns + 0.2))
-        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for axes in panels[len(moment.views) :]:
-            axes.set_visible(False)
-        for axes, view in zip(panels, moment.views, strict=False):
-            axes.imshow(draw_panel(view, MAX_PANEL_PX)[..., ::-1], interpolation="antialiased")
-            axes.set_xticks([])
-            axes.set_yticks([])
-            quiet(axes)
-            axes.spines["bottom"].set_visible(False)
-            words = f"{shortened(view.camera)}, frame {view.frame}, {quantity(view.median_px, 'px')}"
-            axes.set_title(words, fontsize=7.2, color=INK, loc="left")
-    title = f"The skeleton in the pictures at {quantity(moment.t_s, 's', 2)}"
+    panels = []
+    for view in moment.views:
+        words = f"{shortened(view.camera)}, frame {view.frame}, {quantity(view.median_px, 'px')}"
+        marks: list[Mark] = [Image(draw_panel(view, MAX_PANEL_PX))]
+        for name, points in (("found", view.found), ("reprojected", view.reprojected)):
+            places = points[:, : view.found.shape[1]].reshape(-1, 2)
+            marks.append(points_at(places, INK, name, marker="", legend=False))
+        panels.append(Panel(marks, title=words, grid=None))
+    rows = [panels[first : first + columns] for first in range(0, len(panels), columns)]
     caption = (
         "Lines: the skeleton reprojected, left limbs in blue, right limbs in orange. Rings: what the "
         "detector found; crosses: found, but not reconstructed, in red where the views disagreed."
     )
-    if moment.worst and moment.error_mm is not None:
-        caption += (
-            f" The moment of the largest error of a joint: {quantity(moment.error_mm, 'mm', 0)} from truth."
-        )
-    elif moment.worst:
-        caption += " The moment with the largest reprojection error."
+    caption += " The worst of these moments." if moment.worst else ""
+    title = f"The skeleton in the pictures at {quantity(moment.t_s, 's', 2)}"
+    height = len(rows) * (WIDTH_IN / columns + 0.2)
     errors = listing(f"{view.camera} {quantity(view.median_px, 'px')}" for view in moment.views)
-    numbers = {"": stacked([_numbers_of_view(view) for view in moment.views])}
-    return Plate(f"overlay-{k}", title, caption, f"Median reprojection error: {errors}.", figure, numbers)
-
-
-def _numbers_of_view(view: OverlayView) -> pd.DataFrame:
-    """Tabulate every joint in the picture; empty where it was not found or not reconstructed."""
-    people, joints = view.found.shape[:2]
-    reprojected = view.reprojected[:, :joints].reshape(-1, 2)
-    found = view.found.reshape(-1, 2)
-    return table(
-        camera=view.camera,
-        frame=view.frame,
-        t_s=view.t_s,
-        person=np.repeat(np.arange(people), joints),
-        joint=list(view.joints[:joints]) * people,
-        found_x_px=found[:, 0],
-        found_y_px=found[:, 1],
-        reprojected_x_px=reprojected[:, 0],
-        reprojected_y_px=reprojected[:, 1],
-        rejected=view.rejected.ravel().astype(int),
-    )
+    about = f"Median reprojection error: {errors}."
+    return Figure(f"overlay-{k}", title, caption, rows, height, share_x=False, about=about)
 
 
 # --- strips for the viewer ---

@@ -32,7 +32,6 @@ from pipelines.reporting.wording import (
     joint_label,
     percent,
     quantity,
-    significant,
     whole,
 )
 from pipelines.session.camera_poses import logged_covariance
@@ -62,17 +61,10 @@ _KNOWN_MEASURES = (
     ("root_mpjpe_mm", "Root-relative MPJPE", "mm", 1, "the same with the hips laid on each other"),
     ("pa_mpjpe_mm", "PA-MPJPE", "mm", 1, "after the best shift, turn and scale of each frame"),
     ("pck150", "PCK at 150 mm", "%", 1, _PCK),
-    ("pck150_auc", "PCK area", "%", 1, "mean of PCK over all thresholds from 0 to 150 mm"),
     ("acceleration_error_mm_s2", "Acceleration error", "mm/s²", 0, "mean difference of accelerations"),
     ("jerk_m_s3", "Jerk", "m/s³", 0, "median length of the third derivative of the joints' motion"),
     ("bone_spread_mm", "Bone length spread", "mm", 1, "median over the bones of each one's spread"),
-    ("e_recon_m2", "E_recon", "m²", 3, "sum of squared distances over all joint-frames with truth"),
-    ("e_recon_terms", "E_recon, terms", "", 0, "joint-frames in that sum"),
-    ("e_recon_per_joint_frame_m2", "E_recon per joint-frame", "m²", 6, "the sum divided by its terms"),
-    ("root_frames_left_out", "Frames without root", "", 0, "left out of the root-relative error"),
-    ("pa_frames_left_out", "Frames not aligned", "", 0, "too few joints in common for PA-MPJPE"),
 )
-_STATED_ELSEWHERE = {"reconstructed_share", "reconstructed_share_of_truth", "joint_frames", "schema"}
 
 
 @dataclass(frozen=True)
@@ -117,6 +109,7 @@ class Summary:
     share: float | None
     counts: dict[str, int]
     inside_95: float | None
+    sigma_mm: float | None  # stated per axis, median
     joints: tuple[JointRow, ...]
     bones: tuple[Bone, ...]
     metrics: dict[str, object] = field(default_factory=dict)
@@ -172,6 +165,7 @@ def summarise(content: SessionContent) -> Summary:
         share=counts.get("ok", 0) / total if total else None,
         counts=counts,
         inside_95=share_inside_95(motion, truth) if motion is not None and truth is not None else None,
+        sigma_mm=finite_median(1000 * motion.sigma_m) if motion is not None else None,
         joints=tuple(_joint_rows(motion, error, content.joint_errors)) if motion is not None else (),
         bones=tuple(watched_bones(motion)) if motion is not None else (),
         metrics=metrics,
@@ -320,12 +314,6 @@ def _measures(summary: Summary) -> list[list[str]]:
         if value is not None:
             meaning = "distance in the picture from the keypoints, over all views"
             rows.append([f"Reprojection, {key}", quantity(value, "px", 2), meaning])
-    explained = {key for key, *_ in _KNOWN_MEASURES} | _STATED_ELSEWHERE
-    rows += [
-        [key, significant(number(summary.metrics, key)), ""]
-        for key in summary.metrics
-        if key not in explained and number(summary.metrics, key) is not None
-    ]
     return rows
 
 
@@ -427,14 +415,11 @@ def table_of_quality(content: SessionContent, summary: Summary) -> Table:
         Column("Clock", "σ"),
         Column("Person found", "of frames"),
         Column("Keypoints used", "of those found"),
-        Column("Hidden", "of moments"),
     )
     caption = (
         "How good the data of every camera is. Pose noise is per axis, measured as root mean square of logged"
         " less true poses; a clock’s offset is as stated, plus what was estimated."
     )
-    if content.hidden:
-        caption += " Hidden: the share of moments in which the map stands between camera and actor."
     rows = [_quality(content, summary, camera) for camera in summary.cameras]
     return Table("quality", caption, columns, rows, "quality")
 
@@ -453,7 +438,7 @@ def _quality(content: SessionContent, summary: Summary, camera: CameraRow) -> li
         ABSENT if unknown or poses is None or truth is None else _measured_noise(poses, truth, summary),
         offset,
         _clock_words(clock, number(section(summary.metrics, "clock_offset_sigmas_s"), camera.name)),
-        *(percent(share) for share in (*_detection(content, camera), content.hidden.get(camera.name))),
+        *(percent(share) for share in _detection(content, camera)),
     ]
 
 

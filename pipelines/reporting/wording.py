@@ -60,10 +60,6 @@ class Column:
     key: str = ""  # of the status whose colour stands beside the title
 
 
-Cell = str | tuple[str, str]
-"""A text, and below it a smaller one where there is one."""
-
-
 @dataclass(frozen=True)
 class Table:
     """A table of a page: the first column names the rows."""
@@ -71,7 +67,7 @@ class Table:
     key: str
     caption: str
     columns: Sequence[Column]
-    rows: Sequence[Sequence[object]]  # of `Cell`
+    rows: Sequence[Sequence[object]]  # a text, or a pair of it and a smaller one below
     kind: str = ""  # classes of the style sheet
 
 
@@ -188,14 +184,13 @@ def plain(value: object) -> str:
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
         return ", ".join(plain(v) for v in value) or "none"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key}: {plain(inner)}" for key, inner in value.items()) or "none"
     return str(value)
 
 
 def environment() -> Environment:
     """Make the templates' environment: all inputs are escaped, and a missing one is an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
 
     made = Environment(
         loader=PackageLoader("pipelines.reporting"),
@@ -209,6 +204,7 @@ def environment() -> Environment:
         fixed=fixed,
         whole=whole,
         percent=percent,
-        joint=joint_label,
+        kind_of=lambda it: type(it).__name__,
+        markup=Markup,
     )
     return made

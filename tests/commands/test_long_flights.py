@@ -220,9 +220,6 @@ def test_the_page_of_a_long_flight_is_drawn_from_some_of_its_times(
     session = ingested(flight)
     reconstruct(session, ReconstructSettings(method="robust"), workers=1)
     whole = content_of(session)
-    with monkeypatch.context() as patch:
-        patch.setattr(report, "MAX_TIMES", 20)
-        assert content_of(session).every == 3
     monkeypatch.setattr(report, "MAX_ROWS", 20 * 17)
     some = content_of(session)
     assert (whole.every, some.every) == (1, 3)
@@ -243,7 +240,7 @@ def test_the_page_of_a_long_flight_is_drawn_from_some_of_its_times(
         assert np.array_equal(found[0][0], found[1][0])
     succeeds("report", session)
     page = (session / "report" / "index.html").read_text(encoding="utf-8")
-    assert "drawn from one in 3 of its times" in page
+    assert "one in 3 of its times" in " ".join(page.split())
 
 
 def a_doubt() -> Doubt:

@@ -38,7 +38,9 @@ def test_a_study_is_on_the_page_until_it_is_made_again_without(
     folder = tmp_path / "two <b>drones"
     metrics = study(WORDS, None, folder).metrics
     drawn: list[str] = []
-    monkeypatch.setattr(stage, "write_figures", lambda _, plates, *__: drawn.extend(plates))
+    monkeypatch.setattr(
+        stage, "write_figures", lambda _, figures, *__: drawn.extend(each.key for each in figures)
+    )
     succeeds("report", session, "--study", folder, "--figures", tmp_path / "figures")
     assert "study-1" in drawn
     shown = page.read_text(encoding="utf-8")

@@ -78,13 +78,6 @@ def make_arm(arm: str) -> pd.DataFrame:
     return rows
 
 
-def make_cost_map() -> pd.DataFrame:
-    """Make a cost map of 1 - cos(yaw) at any time, 72 yaws, twice a second."""
-    t_ns, yaws = stamps()[::25], np.radians(np.arange(-175, 181, 5))
-    table = pd.DataFrame({"t_ns": np.repeat(t_ns, 72), "yaw_rad": np.tile(yaws, len(t_ns))})
-    return table.assign(cost=1 - np.cos(table["yaw_rad"]))
-
-
 def make_map() -> Occupancy:
     probability = np.full((80, 100, 20), 0.1, dtype=np.float32)
     probability[:, :, 0] = 0.9
@@ -99,7 +92,7 @@ def _estimate(mean: float, low: float, high: float) -> dict[str, object]:
 
 def make_scores(arm: str) -> dict[str, object]:
     return {
-        "tilt_deg": {"mean": 17.25, "max": 23.5, "near_obstacle": None},
+        "tilt_deg": {"mean": 17.25, "max": 23.5},
         "drones": len(DRONES),
         "range_m": {"mean": 10.0, "min": 9.25, "max": 10.75},
         "occluded_share": 0.125,
@@ -147,6 +140,7 @@ def make_comparison(*arms: str, verdict: str = "adaptive is better") -> ReplanCo
             for arm in arms
             if arm != arms[1]
         ],
+        "equal_ranges": [{"arms": list(arms), "best": None}],
         "verdict": verdict,
         "notes": [f"formations start at 45.0 deg, where {DRONES[0]} was"],
         "warnings": [],
@@ -157,6 +151,5 @@ def make_comparison(*arms: str, verdict: str = "adaptive is better") -> ReplanCo
         metrics=metrics,
         arms={arm: make_arm(arm) for arm in arms},
         actor=table[ACTOR.names],
-        cost_map=make_cost_map(),
         map=make_map(),
     )

@@ -11,13 +11,12 @@ import pandas as pd
 import pytest
 
 from pipelines.geometry.metrics import RESAMPLES, STRETCH_S
-from pipelines.reporting.comparison_page import judge, render_comparison
+from pipelines.reporting.comparison_page import draw_comparison, lead, render_comparison
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.session_comparison import compare, labels_of
-from pipelines.reporting.verdict import Verdict
 
 from .conftest import JOINTS, OFFSET_M, make_skeleton, make_truth
-from .reading import Outline, numbers, one, plain
+from .reading import Outline, numbers, plain
 from .test_page import HOSTILE, _named
 
 OFF_MM = 1000 * float(np.linalg.norm(OFFSET_M))
@@ -53,8 +52,8 @@ def _wandering(content: SessionContent, distance_mm: np.ndarray) -> SessionConte
     return replace(content, skeleton=skeleton, truth=truth, metrics={"method": "robust"})
 
 
-def _verdict(contents: dict[str, SessionContent]) -> Verdict:
-    return judge(compare(contents))
+def _lead(contents: dict[str, SessionContent]) -> str:
+    return lead(compare(contents))
 
 
 def test_the_same_motion_is_compared_moment_by_moment(content: SessionContent) -> None:
@@ -98,7 +97,6 @@ def test_other_times_are_compared_joint_by_joint(content: SessionContent) -> Non
     found = pair.differences["mpjpe"]
     assert found.estimate.value == pytest.approx(OFF_MM, abs=1e-6)
     assert (found.pairs, found.lower) == (len(JOINTS), 0)
-    assert numbers(_verdict({"a": content, "b": other}).certainty[0]) == [0, len(JOINTS)]
 
 
 @pytest.mark.parametrize("apart", [False, True])
@@ -122,21 +120,19 @@ def test_intervals_are_those_of_known_variances(content: SessionContent, apart: 
 
 
 def test_verdict_names_the_better_one_and_by_how_much(content: SessionContent) -> None:
-    lead = _verdict({"near": content, "far": _moved(content, 2)}).lead
-    assert lead.startswith("“near”")  # the better one is named first
-    # The errors of both in mm, their difference in mm and percent, and its 95 % interval.
-    assert numbers(lead) == [22.4, 44.7, 22.4, 50.0, 95, 22.4, 22.4]
-    # In the other order the sentence is the same.
-    assert _verdict({"far": _moved(content, 2), "near": content}).lead == lead
+    said = _lead({"near": content, "far": _moved(content, 2)})
+    assert said.startswith("“near”")  # the better one is named first
+    # The errors of both in mm, and the 95 % interval of their difference.
+    assert numbers(said) == [22.4, 44.7, 95, 22.4, 22.4]
+    assert _lead({"far": _moved(content, 2), "near": content}).startswith("“near”")
 
 
 def test_a_doubted_session_comes_before_who_is_better(content: SessionContent) -> None:
     doubt = {"code": "mount", "cameras": ["mast"], "what": "W1", "evidence": {}, "remedy": "R1"}
     doubted = replace(_moved(content, 2), metrics={**(content.metrics or {}), "doubts": [doubt]})
-    verdict = _verdict({"a": content, "b": doubted})
-    assert verdict.lead.startswith("“b”")
-    assert verdict.lead.index("W1") < verdict.lead.index("“a”")
-    assert one(verdict.doubts, "“b”", "W1", "mount")
+    said = _lead({"a": content, "b": doubted})
+    assert said.startswith("“b”")
+    assert said.index("W1") < said.index("“a”")
 
 
 def _three(content: SessionContent) -> dict[str, SessionContent]:
@@ -149,15 +145,15 @@ def _three(content: SessionContent) -> dict[str, SessionContent]:
 
 @pytest.fixture(scope="module")
 def page(content: SessionContent) -> str:
-    return render_comparison(_three(content))[0]
+    return render_comparison(_three(content))
 
 
 def test_three_sessions_are_set_against_the_first(content: SessionContent, page: str) -> None:
     outline = Outline(page)
-    lead = judge(compare(_three(content))).lead
-    assert "“c”" in lead
-    assert numbers(lead)[:2] == [3, 22.4]
-    assert plain(lead) in outline.text
+    said = _lead(_three(content))
+    assert "“c”" in said
+    assert numbers(said)[:2] == [3, 22.4]
+    assert plain(said) in outline.text
     assert "“b” less “a”" in outline.text
     assert "“c” less “a”" in outline.text
     assert outline.count("figure") == 3
@@ -167,18 +163,13 @@ def test_three_sessions_are_set_against_the_first(content: SessionContent, page:
     assert row[5:] == [f"{len(JOINTS)} of {len(JOINTS)}", "better"]
 
 
-def test_figures_and_tables_come_with_their_numbers(page: str) -> None:
+def test_figures_come_with_their_numbers(content: SessionContent, page: str) -> None:
     written = [unquote(link.split(",", 1)[1]) for link in Outline(page).links if link.startswith("data:")]
-    tables = [pd.read_csv(io.StringIO(text)) for text in written]
-    assert len(tables) == 5  # of three figures, the measures and the pairs
-    measures = next(
-        one for one in tables if list(one) == ["measure", "unit", "session", "value", "low", "high"]
-    )
-    of = measures[measures["measure"] == "mpjpe"].set_index("session")["value"]
-    pairs = next(one for one in tables if "first_mean" in one)
-    row = pairs[(pairs["measure"] == "mpjpe") & (pairs["other"] == "c")].iloc[0]
-    assert row["value"] == pytest.approx(of["c"] - of["a"])
-    assert (row["first_mean"], row["other_mean"]) == pytest.approx((of["a"], of["c"]))
+    figures = {figure.key: figure for figure in draw_comparison(compare(_three(content)))}
+    assert written == [figures[f"compare-{key}"].csv for key in ("differences", "time", "joints")]
+    table = pd.read_csv(io.StringIO(written[0]))
+    change = table[(table["series"] == "b") & table["row"].str.startswith("MPJPE")]["x"]
+    assert change.item() == pytest.approx(-100 / 3)
 
 
 def test_names_from_files_stay_text(content: SessionContent, page: str) -> None:
@@ -187,7 +178,7 @@ def test_names_from_files_stay_text(content: SessionContent, page: str) -> None:
     for name in HOSTILE:
         stages: dict[str, dict[str, object]] = {"reconstruct": {"key": name, "settings": {name: name}}}
         contents[name] = replace(_named(content, name), stages=stages)
-    outline = Outline(render_comparison(contents)[0])
+    outline = Outline(render_comparison(contents))
     # No kind of element or attribute that a page with harmless names does not have.
     assert set(outline.elements) <= set(Outline(page).elements)
     assert outline.scripts == []

@@ -22,7 +22,7 @@ def sessions(tmp_path: Path, content: SessionContent, monkeypatch: pytest.Monkey
         folder.mkdir()
     monkeypatch.setattr(pipelines.report, "content_of", lambda _: content)
     monkeypatch.setattr(
-        pipelines.report, "render_comparison", lambda contents: (f"{GENERATOR} {' '.join(contents)}", {})
+        pipelines.report, "render_comparison", lambda contents: f"{GENERATOR} {' '.join(contents)}"
     )
     return folders
 

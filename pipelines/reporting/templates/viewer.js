@@ -608,13 +608,12 @@
   /** The drawings with a time axis: each shows the moment, and a click or an arrow key chooses it. */
   const curves = Array.from(document.querySelectorAll(".drawing[data-time]"), (drawing) => {
     const svg = drawing.querySelector("svg");
-    const height = svg.viewBox.baseVal.height;
     const axes = svg.dataset.time.split(";").map((axis) => axis.split(" ").map(Number));
-    const lines = axes.map(() => {
+    const lines = axes.map(([, , , , top, bottom]) => {
       const line = document.createElementNS("http://www.w3.org/2000/svg", "line");
       line.setAttribute("class", "now");
-      line.setAttribute("y1", 0);
-      line.setAttribute("y2", height);
+      line.setAttribute("y1", top);
+      line.setAttribute("y2", bottom);
       return svg.appendChild(line);
     });
     const placeOf = ([left, right, from, to], t) => left + ((t - from) / (to - from)) * (right - left);
