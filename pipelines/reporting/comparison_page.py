@@ -72,7 +72,10 @@ def render_comparison(contents: Mapping[str, SessionContent]) -> str:
     tables = [_measures_table(comparison), *map(_pair_table, range(len(comparison.pairs)), comparison.pairs)]
     bars = [figures.pop("compare-joints")] if "compare-joints" in figures else []
     folded = [] if measure is None else [Fold("Every joint", [_joints_table(comparison, measure)])]
-    made: list[Block] = [_sessions_table(comparison), Fold("Settings that differ", [_settings_table(comparison)])]
+    made: list[Block] = [
+        _sessions_table(comparison),
+        Fold("Settings that differ", [_settings_table(comparison)]),
+    ]
     how = (
         "Sessions with the same motion at the same times are compared moment by moment, others by joint."
         f" Intervals come from {fixed(RESAMPLES, 0)} resampled flights, made of stretches of"
