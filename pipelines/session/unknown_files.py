@@ -101,6 +101,11 @@ _UNREAD = (
 )  # fmt: skip
 
 
+# DJI's binary records, by the drone's signatures (DatCon), by the app's prefix (dji-log-parser: place and length
+# of its details, version), or by their names, which count for binary content alone.
+_DJI_BINARY = re.compile(rb"(?s).{16}BUILD|.{242}DJI_LOG_V3|LOGH|.{3}\0{5}..[\x01-\x1e]")
+_DJI_NAME = re.compile(r"DJIFlightRecord_|FLY\d{3}\.dat$", re.IGNORECASE)
+
 _LFS_POINTER = re.compile(rb"version https://git-lfs\.github\.com/spec/v\d+\n[^\0]{0,400}?size (\d{1,18})")
 
 
@@ -153,6 +158,11 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
                 f"{_quoted(magic)} of {kind}",
                 _COPY,
             )
+    is_dji = path.suffix.lower() in {".txt", ".dat"} and _DJI_BINARY.match(head)
+    if is_dji or (_DJI_NAME.match(path.name) and _undecodable(head)):
+        ways = "Airdata, PhantomHelp, Flight Reader or dji-log-parser; DatCon or CsvView of the drone's own"
+        remedy = f"convert it to CSV ({ways}) and give that: pose: {{file: RECORD.csv}}"
+        return Likeness("is DJI's binary flight record, which mocap does not decode", remedy)
     for pattern, kind, remedy in _UNREAD:
         if pattern.match(head):
             return Likeness(f"is {kind}", remedy)

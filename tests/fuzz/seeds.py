@@ -146,7 +146,6 @@ SEEDS: dict[str, Writer] = {
     "colmap as text": _colmap("text"),
     "csv": _text("poses.csv", test_pose_csv.EUROC * 2),
     "dji": lambda folder: drone_logs.write_srt(folder / "a.SRT", _truth(folder)),
-    "dji_binary": _text("FLY022.DAT", bytes(16) + b"BUILD" + bytes(221) + b"DJI_LOG_V3" + bytes(100)),
     "dji_record": lambda folder: test_dji_records.airdata(folder / "a.csv"),
     "easymocap": test_opencv_yaml.write_easymocap,
     "flight": lambda folder: write_flight(folder, seconds=0.2),

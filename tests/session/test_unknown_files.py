@@ -33,6 +33,8 @@ SUBTITLE = "1\n00:00:00,000 --> 00:00:01,000\nHello\n"
         ("a.toml", b"[cam1]\nsize = [9, 9]\nmatrix = [[1, 0, 4], [0, 1, 4], [0, 0, 1]]\n", "distortions"),
         ("a.toml", b"[cam1]\nsize = [9, 9]\nignore = true\nmatrix = [[1]]\n", "ignore"),
         ("FLY012.DAT", b"\xff\x01" * 200, "DJI"),
+        ("a.DAT", bytes(16) + b"BUILD" + bytes(221) + b"DJI_LOG_V3" + bytes(100), "DJI"),
+        ("a.txt", b"\x18\x02\0\0\0\0\0\0\xb4\x01\x0e\0" + bytes(range(256)), "DJI"),
         ("DJIFlightRecord_2024-05-01_[10-00-00].txt", b"\xff\x01" * 9, "DJI"),
         ("a.srt", SUBTITLE.encode(), "subtitles"),
         ("a.mcap", b"\x89MCAQ0\r\n" + bytes(100), "MCAP"),

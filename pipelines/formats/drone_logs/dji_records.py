@@ -1,4 +1,4 @@
-"""DJI's flight records: as the CSV that log services export, and as the binary that a phone keeps.
+"""DJI's flight records as the CSV that log services export.
 
 The record is the only place where most consumer drones log their gimbal's angles. The CSV has the columns
 that the exporting service chose, in feet or metres, often in both. Known are those of Airdata
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import csv
 import re
-import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -27,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.files import first_bytes, read_head
+from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import describe_times
 from pipelines.formats.drone_logs.dji_subtitles import (
     DjiRows,
@@ -87,10 +86,6 @@ _MARK = re.compile(r"[.,](?=\d)")
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?")
 # Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_PREFIX = struct.Struct("<QHB")  # of a binary record: where its details lie, their length, and the version
-_BINARY_NAME = re.compile(r"DJIFlightRecord_|FLY\d{3}\.dat$", re.IGNORECASE)
-# DJI was at version 14 in 2025, and a larger number means another kind of file.
-_NEWEST_BINARY = 30
 
 
 class DjiRecordFormat:
@@ -143,50 +138,6 @@ class DjiRecordFormat:
         record = _read(path)
         found = attitudes_of_rows(path, record.rows)
         return replace(found, notes=tuple(f"{path}: {note}" for note in record.notes))
-
-
-class DjiBinaryFormat:
-    """Recogniser of DJI's binary records (.txt of the app, .DAT of the drone), which only DJI's keys open."""
-
-    name = "dji_binary"
-    title = "DJI flight record (binary)"
-    suffixes: tuple[str, ...] = (".txt", ".dat")
-
-    def recognises(self, path: Path) -> bool:
-        """Return True for the app's record by its prefix, the drone's by signatures, or either by its name.
-
-        The prefix is described in lvauvillier/dji-log-parser, the signatures in DatCon. A name counts for
-        binary content alone.
-        """
-        head = first_bytes(path, 256, suffixes=self.suffixes)
-        if _BINARY_NAME.match(path.name) and any(byte < 9 or byte >= 0xF8 for byte in head):  # never in UTF-8
-            return True
-        if path.suffix.lower() == ".dat":
-            return head[16:21] == b"BUILD" or head[242:252] == b"DJI_LOG_V3" or head.startswith(b"LOGH")
-        if len(head) < 100:
-            return False
-        details, length, version = _PREFIX.unpack_from(head)
-        size = path.stat().st_size
-        return 0 < version <= _NEWEST_BINARY and length > 0 and 12 <= details <= size and b"\0\0" in head[:8]
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Refuse it, with the way to a CSV."""
-        raise _binary(path)
-
-    def read_telemetry(self, path: Path, _choice: TelemetryChoice) -> Telemetry:
-        """Refuse it, with the way to a CSV."""
-        raise _binary(path)
-
-
-def _binary(path: Path) -> DataError:
-    ways = "Airdata, PhantomHelp or Flight Reader; dji-log-parser"
-    if path.suffix.lower() == ".dat":
-        ways = "DatCon or CsvView"
-    return DataError(
-        path,
-        "is DJI's binary flight record, which mocap does not decode",
-        f"convert it to CSV ({ways}) and give that: pose: {{file: RECORD.csv}}",
-    )
 
 
 # --- reading -------------------------------------------------------------------------------------------
@@ -478,4 +429,3 @@ def _since_epoch_ns(match: re.Match[str], day_first: bool) -> int:
 
 
 FORMAT = DjiRecordFormat()
-BINARY = DjiBinaryFormat()

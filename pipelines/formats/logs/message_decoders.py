@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import json
 import re
 from collections.abc import Callable
@@ -33,7 +31,6 @@ _DEFINITIONS = {
         OCTOMAP: "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n",
     },
 }
-_BASE64 = "base64"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
@@ -58,8 +55,8 @@ def decoder(schema: Schema) -> Decoder:
 
     ros1 and cdr: dataclasses of rosbags, numeric arrays as views into the message. Without a definition
     in the file, the types of ROS 1 Noetic or of the newest ROS 2 that rosbags knows are used. Messages of
-    a ROS 2 bag in compression mode `message` are decompressed. json: namespaces, with the binary fields
-    of the schema as bytes. protobuf: messages of the protobuf library.
+    a ROS 2 bag in compression mode `message` are decompressed. json: namespaces. protobuf: messages
+    of the protobuf library.
     """
     found = _decoder_or_reason(schema)
     if isinstance(found, str):
@@ -82,7 +79,7 @@ def _decoder(schema: Schema) -> Decoder:
     if schema.encoding in {"ros1", "cdr"}:
         return _ros_decoder(schema)
     if schema.encoding == "json":
-        return _json_decoder(schema)
+        return _decode_json
     if schema.encoding == "protobuf":
         return _protobuf_decoder(schema)
     raise ValueError(f"messages in encoding {schema.encoding or 'none'!r} are not read")
@@ -165,57 +162,15 @@ def _check_arrays(types: Typesdict) -> None:
                 raise ValueError(f"{name} has {description[1][1]} entries")
 
 
-def _json_decoder(schema: Schema) -> Decoder:
-    binary = _binary_fields(schema)
-
-    def decode(data: memoryview | bytes) -> Any:
-        try:
-            value = json.loads(bytes(data), object_hook=lambda fields: SimpleNamespace(**fields))
-        except RecursionError as error:
-            raise ValueError("JSON nested too deeply") from error
-        if not isinstance(value, SimpleNamespace):
-            raise ValueError("the message is no JSON object")
-        _decode_base64(value, binary)
-        return value
-
-    return decode
-
-
-def _binary_fields(schema: Schema) -> dict[str, Any]:
-    """Return the fields that hold base64: names to `_BASE64`, or to the fields of the objects below them."""
-    if not schema.definition and schema.type.startswith("foxglove."):
-        return {"data": _BASE64}
+def _decode_json(data: memoryview | bytes) -> Any:
+    """Decode a JSON object to a namespace; base64 stays text."""
     try:
-        definition = json.loads(schema.definition or b"{}")
-        return _binary_properties(definition) if isinstance(definition, dict) else {}
-    except (ValueError, RecursionError):
-        return {}
-
-
-def _binary_properties(definition: dict[str, Any]) -> dict[str, Any]:
-    fields: dict[str, Any] = {}
-    properties = definition.get("properties")
-    for name, field in properties.items() if isinstance(properties, dict) else ():
-        inner = field.get("items", field) if isinstance(field, dict) else None
-        if isinstance(inner, dict):
-            if inner.get("contentEncoding") == _BASE64:
-                fields[name] = _BASE64
-            elif below := _binary_properties(inner):
-                fields[name] = below
-    return fields
-
-
-def _decode_base64(value: SimpleNamespace, fields: dict[str, Any]) -> None:
-    for name, below in fields.items():
-        field = getattr(value, name, None)
-        if isinstance(field, str) and below == _BASE64:
-            try:
-                setattr(value, name, base64.b64decode(field, validate=True))
-            except binascii.Error as error:
-                raise ValueError(f"{name} is no base64") from error
-        for item in field if isinstance(field, list) else [field]:
-            if isinstance(item, SimpleNamespace) and isinstance(below, dict):
-                _decode_base64(item, below)
+        value = json.loads(bytes(data), object_hook=lambda fields: SimpleNamespace(**fields))
+    except RecursionError as error:
+        raise ValueError("JSON nested too deeply") from error
+    if not isinstance(value, SimpleNamespace):
+        raise ValueError("the message is no JSON object")
+    return value
 
 
 def _protobuf_decoder(schema: Schema) -> Decoder:

@@ -14,6 +14,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,10 +22,9 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
-from pipelines.formats.maps.voxel_grids import DEFAULT_RESOLUTION_M
+from pipelines.formats.maps.voxel_grids import VoxelSet
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.maps import check_resolution, check_size
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import install_command, need
 
@@ -56,61 +56,34 @@ class LasFormat:
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe version, points, box, classes and the coordinate reference system."""
-        header, box = _header(path), _Box()
+        header = _header(path)
+        boxes: list[Float] = []  # lowest, highest point
         with _plain(path, header) as plain:
-            dropped = _hand_over(plain, header, box.add)
+            usable, dropped = _hand_over(
+                plain, header, lambda points: boxes.append(np.stack([points.min(axis=0), points.max(axis=0)]))
+            )
         facts: dict[str, object] = {
             "version": f"{header.version.major}.{header.version.minor}",
             "point_format": int(header.point_format.id),
             "compressed": bool(header.are_points_compressed),
             "points": int(header.point_count),
             "crs": crs_of(header) or "not stated",
-            "finite_points": box.count,
+            "finite_points": usable,
             **{f"dropped: {cause}": count for cause, count in dropped.items()},
         }
-        if box.count:
-            facts["points_box_min_m"] = [round(v, 4) for v in box.low.tolist()]
-            facts["points_box_max_m"] = [round(v, 4) for v in box.high.tolist()]
+        if boxes:
+            low, high = np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]
+            facts["points_box_min_m"] = [round(v, 4) for v in low.tolist()]
+            facts["points_box_max_m"] = [round(v, 4) for v in high.tolist()]
         return facts
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
-        """Read points as voxels: occupied (1.0) with a point in it, else unknown; 0.2 m unless stated.
-
-        The file is read twice, first for the box of the points, so that memory grows with the voxels only.
-        """
-        side = check_resolution(path, DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
-        header, box = _header(path), _Box()
+        """Read points as voxels: occupied (1.0) with a point in it, else unknown; 0.2 m unless stated."""
+        header, voxels = _header(path), VoxelSet(path, resolution_m)
         with _plain(path, header) as plain:
-            dropped = _hand_over(plain, header, box.add)
-            if not box.count:
-                raise DataError(path, "holds no point that can be used", _COPY)
-            with np.errstate(over="ignore", invalid="ignore"):  # coordinates of a damaged scale
-                low = np.floor(box.low / side)
-                cells = np.nan_to_num(np.floor(box.high / side) - low + 1, nan=np.inf)
-                span = " x ".join(f"{v:.0f}" for v in box.high - box.low)
-            shape = np.clip(cells, 1, 2**40).astype(np.int64)  # more is refused
-            check_size(path, shape.tolist(), side, f"crop it (its box is {span} m)")
-            grid = np.full(shape.tolist(), np.nan, dtype=np.float32)
-
-            def fill(points: Float) -> None:
-                grid[*(np.floor(points / side) - low).astype(np.int64).T] = 1.0
-
-            _hand_over(plain, header, fill)
-        return Occupancy(grid, low * side, side, dropped=dropped, crs=crs_of(header))
-
-
-class _Box:
-    """Box of all points so far."""
-
-    def __init__(self) -> None:
-        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
-        self.count = 0
-
-    def add(self, points: Float) -> None:
-        if len(points):
-            self.low = np.minimum(self.low, points.min(axis=0))
-            self.high = np.maximum(self.high, points.max(axis=0))
-            self.count += len(points)
+            _, dropped = _hand_over(plain, header, voxels.add)
+        found = voxels.occupancy()
+        return replace(found, dropped=found.dropped | dropped, crs=crs_of(header))
 
 
 def _header(path: Path) -> Any:
@@ -177,11 +150,11 @@ def _decompress(path: Path, plain: Path) -> None:
             target.write_points(chunk)
 
 
-def _hand_over(plain: Path, header: Any, take: Callable[[Float], None]) -> dict[str, int]:
-    """Hand over the usable points [N, 3] of each chunk; return counts of the others by cause."""
+def _hand_over(plain: Path, header: Any, take: Callable[[Float], None]) -> tuple[int, dict[str, int]]:
+    """Hand over the usable points [N, 3] of each chunk; count them, and the others by cause."""
     laspy = need("laspy", "las")
     lost: Counter[str] = Counter()
-    read = 0
+    read = usable = 0
     with laspy.open(plain) as cloud:
         room = plain.stat().st_size - cloud.header.offset_to_point_data
         there = max(0, min(int(cloud.header.point_count), room // cloud.header.point_format.size))
@@ -194,11 +167,14 @@ def _hand_over(plain: Path, header: Any, take: Callable[[Float], None]) -> dict[
             hidden = np.asarray(chunk.withheld).astype(bool) & ~bad
             with np.errstate(over="ignore", invalid="ignore"):  # a damaged scale: the box is then refused
                 points = np.stack([np.asarray(chunk[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-            take(points[~bad & ~hidden])
+            points = points[~bad & ~hidden]
+            usable += len(points)
+            if len(points):
+                take(points)
             lost["points marked as noise"] += int(bad.sum())
             lost["points marked as withheld"] += int(hidden.sum())
     lost["points cut off"] = int(header.point_count) - read
-    return dict(+lost)
+    return usable, dict(+lost)
 
 
 def crs_of(header: Any) -> str | None:

@@ -16,7 +16,7 @@ from pipelines.geometry.arrays import Bytes, Float, Float32, Int64
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
 from pipelines.session.maps import (
-    MOST_VOXELS,
+    MapSizeError,
     check_resolution,
     check_size,
     describe_grid,
@@ -30,8 +30,10 @@ DEFAULT_RESOLUTION_M = 0.2
 
 # Three indices of so many bits fit an int64.
 _BITS = 20
-# A voxel's index fits its bits up to this many voxels from the world's origin.
+# A voxel's index fits its bits up to this many voxels from the first point.
 _REACH = 1 << (_BITS - 1)
+# A damaged number must not be the first point; coordinates of maps on Earth have fewer voxels.
+_FARTHEST = 1 << 40
 Pose = tuple[Float, Float]
 """Position [3] and quaternion [4] of one frame in another."""
 _UPSIDE_DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # its own inverse; NED to ENU and back
@@ -39,45 +41,43 @@ _UPSIDE_DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # its own inverse
 _SLAB_VALUES = 1 << 22
 
 
-def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) -> Occupancy:
-    """Make the voxels of points [N, 3] m; corners are whole multiples of the resolution (default 0.2 m).
-
-    Points that are not finite are left out and counted.
-    """
-    side = check_resolution(source, DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
-    finite, dropped = _finite(source, points)
-    low, shape = _box(finite, side)
-    check_size(source, shape.tolist(), side, f"crop stray points (its box is {_span(finite)} m)")
-    grid = np.full(shape.astype(np.int64).tolist(), np.nan, dtype=np.float32)
-    grid[*_indices(finite, low, side).T] = 1.0
-    return Occupancy(grid, low * side, side, dropped=dropped)
-
-
 class VoxelSet:
-    """Voxels of many clouds, each with the earliest time of a point in it."""
+    """Voxels of clouds, each with the earliest time of a point in it; corners are multiples of the side."""
 
-    def __init__(self, source: str, resolution_m: float | None) -> None:
+    def __init__(self, source: Path | str, resolution_m: float | None) -> None:
         self._source = source
         self._side = check_resolution(source, DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
+        self._first: Int64 | None = None  # the voxel from which the others are counted
         self._keys: Int64 = np.zeros(0, np.int64)  # sorted
         self._since_ns: Int64 = np.zeros(0, np.int64)
         self._low, self._high = np.full(3, _REACH, np.int64), np.full(3, -_REACH, np.int64)
         self.dropped: Counter[str] = Counter()
 
-    def add(self, points: Float, t_ns: int) -> None:
-        """Add the points [N, 3] of one time; those that are not finite or too far are counted."""
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def add(self, points: Float, t_ns: int = 0) -> None:
+        """Add the points [N, 3] of one time; those that are not finite or too far are counted.
+
+        Raises:
+            MapSizeError: their box has too many voxels.
+        """
         usable = np.isfinite(points).all(axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
             place = np.floor(points / self._side)
+            usable_here = place[usable & (np.abs(place) < _FARTHEST).all(axis=1)]
+            if self._first is None and len(usable_here):
+                self._first = usable_here[0].astype(np.int64)
+            place = place - (0 if self._first is None else self._first)
             near = usable & (np.abs(place) < _REACH).all(axis=1)
         self.dropped["points that are not finite"] += int((~usable).sum())
-        self.dropped[f"points beyond {_REACH * self._side:g} m"] += int((usable & ~near).sum())
+        self.dropped[f"points beyond {_REACH * self._side:g} m of the first"] += int((usable & ~near).sum())
         index = place[near].astype(np.int64)
         if not len(index):
             return
         self._low = np.minimum(self._low, index.min(axis=0))
         self._high = np.maximum(self._high, index.max(axis=0))
-        check_size(self._source, self.shape, self._side, "give a topic without stray points")
+        check_size(self._source, self.shape, self._side, "crop stray points")
         shifted = index + _REACH
         keys = np.unique((shifted[:, 0] << 2 * _BITS) | (shifted[:, 1] << _BITS) | shifted[:, 2])
         at = np.searchsorted(self._keys, keys)
@@ -99,35 +99,47 @@ class VoxelSet:
         """Times at which new voxels appeared, ascending; empty while there is no voxel."""
         return np.unique(self._since_ns)
 
-    def occupancy(self, at_ns: int) -> Occupancy:
-        """Return the map of all points up to a time, in the box of all voxels; it is valid from that time."""
+    def occupancy(self, at_ns: int = 0) -> Occupancy:
+        """Return the map of all points up to a time, in the box of all voxels; it is valid from that time.
+
+        Raises:
+            DataError: there is no point.
+        """
+        if self._first is None:
+            raise DataError(self._source, "holds no point that is finite", "export it again", code="empty")
         keys = self._keys[self._since_ns <= at_ns]
         mask = (1 << _BITS) - 1
         index = np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _REACH
         grid = np.full(self.shape, np.nan, dtype=np.float32)
         grid[*(index - self._low).T] = 1.0
-        return Occupancy(grid, self._low.astype(np.float64) * self._side, self._side, at_ns)
+        origin = (self._low + self._first).astype(np.float64) * self._side
+        return Occupancy(grid, origin, self._side, at_ns, dropped=dict(+self.dropped))
+
+
+def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) -> Occupancy:
+    """Make the voxels of points [N, 3] m, of 0.2 m by default; what cannot be used is counted."""
+    voxels = VoxelSet(source, resolution_m)
+    voxels.add(points)
+    return voxels.occupancy()
 
 
 def describe_points(source: Path | str, points: Float) -> dict[str, object]:
-    """Describe points, their box and centre, and their map at 0.2 m (without building it)."""
-    finite, dropped = _finite(source, points)
-    side = DEFAULT_RESOLUTION_M
-    low, shape = _box(finite, side)
-    summary: dict[str, object] = {
-        "points": len(points),
-        "finite_points": len(finite),
-        **{f"dropped: {cause}": count for cause, count in dropped.items()},
-        "points_box_min_m": _rounded(finite.min(axis=0)),
-        "points_box_max_m": _rounded(finite.max(axis=0)),
-        "centroid_m": _rounded(finite.mean(axis=0)),
-    }
-    if not math.prod(shape.tolist()) <= MOST_VOXELS:
-        return {**summary, "voxels": f"too many at {side:g} m: crop stray points or state resolution_m"}
-    sides = shape.astype(np.int64)
-    flat = np.ravel_multi_index(tuple(_indices(finite, low, side).T), tuple(sides.tolist()))
-    occupied = len(np.unique(flat))
-    return {**summary, **describe_grid(side, low * side, sides.tolist(), occupied=occupied, free=0)}
+    """Describe points, their box and centre, and their map at 0.2 m."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    facts: dict[str, object] = {"points": len(points), "finite_points": len(finite)}
+    if len(finite):
+        box = {"points_box_min_m": finite.min(axis=0), "points_box_max_m": finite.max(axis=0)}
+        box["centroid_m"] = finite.mean(axis=0)
+        facts |= {name: [round(v, 4) for v in at.tolist()] for name, at in box.items()}
+    try:
+        grid = occupancy_of(source, points, None)
+    except MapSizeError:
+        many = f"too many at {DEFAULT_RESOLUTION_M:g} m: crop stray points or state resolution_m"
+        return {**facts, "voxels": many}
+    facts |= {f"dropped: {cause}": count for cause, count in grid.dropped.items()}
+    occupied = int(np.count_nonzero(grid.probability == 1))
+    shape = grid.probability.shape
+    return facts | describe_grid(grid.resolution_m, grid.origin, shape, occupied=occupied, free=0)
 
 
 def packed_points(
@@ -183,34 +195,6 @@ def check_count(path: Path, stated: int, there: int) -> None:
             "copy it again or export it again",
             code="damaged",
         )
-
-
-def _finite(source: Path | str, points: Float) -> tuple[Float, dict[str, int]]:
-    usable = np.isfinite(points).all(axis=1)
-    if not usable.any():
-        raise DataError(source, f"none of its {len(points)} points is finite", "export it again")
-    lost = int((~usable).sum())
-    return (points[usable], {"not finite": lost}) if lost else (points, {})
-
-
-def _box(points: Float, side: float) -> tuple[Float, Float]:
-    """Return the lowest voxel, counted from the world's origin, and the number of voxels along each axis."""
-    with np.errstate(over="ignore", invalid="ignore"):  # huge coordinates: `check_size` refuses them
-        low, high = np.floor(points.min(axis=0) / side), np.floor(points.max(axis=0) / side)
-        return low, high - low + 1
-
-
-def _indices(points: Float, low: Float, side: float) -> Int64:
-    return (np.floor(points / side) - low).astype(np.int64)
-
-
-def _span(points: Float) -> str:
-    with np.errstate(over="ignore"):
-        return " x ".join(f"{side:.4g}" for side in points.max(axis=0) - points.min(axis=0))
-
-
-def _rounded(values: Float) -> list[float]:
-    return [round(v, 4) for v in values.tolist()]
 
 
 def placed(

@@ -6,18 +6,15 @@ The headings are those that these services document and that public readers of t
 from __future__ import annotations
 
 import csv
-import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pipelines.draft import draft
-from pipelines.formats.drone_logs.dji_records import BINARY, FORMAT, recordings_of
+from pipelines.formats.drone_logs.dji_records import FORMAT, recordings_of
 from pipelines.geometry.geodesy import Place, enu_from_geodetic
 from pipelines.geometry.poses import rotate
-from pipelines.session.errors import DataError
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import FORMATS, TelemetryChoice
 from tests.commands.runner import refused
@@ -239,22 +236,7 @@ def test_refusals(tmp_path: Path) -> None:
     assert not FORMAT.recognises(other)
 
 
-def test_binary_records_are_refused_with_the_way_to_a_csv(tmp_path: Path) -> None:
+def test_a_real_binary_record_is_refused_with_the_way_to_a_csv() -> None:
     real = real_data(f"{REAL}.txt")
-    assert [f.name for f in FORMATS.all() if f.recognises(real)] == ["dji_binary"]
+    assert [f.name for f in FORMATS.all() if f.recognises(real)] == []
     assert "dji-log-parser" in refused("info", real)
-    newest = tmp_path / "new.txt"  # version 14: the details stand first, and all records are encrypted
-    newest.write_bytes(struct.pack("<QHBB", 536, 436, 14, 0) + bytes(range(256)) * 4)
-    onboard = tmp_path / "FLY022.DAT"
-    onboard.write_bytes(bytes(16) + b"BUILD" + bytes(221) + b"DJI_LOG_V3" + bytes(100))
-    for path in (newest, onboard):
-        assert BINARY.recognises(path)
-        with refuses(path, "pose: {file: RECORD.csv}"):
-            BINARY.read_telemetry(path, TelemetryChoice())
-    text = tmp_path / "notes.txt"
-    text.write_text(
-        "what the team noted on the day of the flight, in plain words, for more than a line\n" * 3
-    )
-    assert not BINARY.recognises(text)
-    with pytest.raises(DataError):
-        draft([newest])

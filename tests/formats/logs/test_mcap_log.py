@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from pipelines.formats.logs.messages import bytes_of
 from pipelines.formats.logs.recordings import (
     DAMAGED,
     TAIL,
@@ -69,7 +70,7 @@ def test_foxglove_as_json(tmp_path: Path) -> None:
     with log_format(path).open_log([path]) as log:
         assert [(t.type, t.encoding) for t in log.topics] == [("foxglove.CompressedImage", "json")]
         (message,) = log.messages(["/c"])
-    assert (message.value.data, message.value.timestamp.nsec, message.receive_ns) == (data, 7, 9)
+    assert (bytes_of(message.value.data).tobytes(), message.value.timestamp.nsec, message.receive_ns) == (data, 7, 9)
 
 
 def test_foxglove_as_protobuf(tmp_path: Path) -> None:
