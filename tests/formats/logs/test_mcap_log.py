@@ -70,7 +70,11 @@ def test_foxglove_as_json(tmp_path: Path) -> None:
     with log_format(path).open_log([path]) as log:
         assert [(t.type, t.encoding) for t in log.topics] == [("foxglove.CompressedImage", "json")]
         (message,) = log.messages(["/c"])
-    assert (bytes_of(message.value.data).tobytes(), message.value.timestamp.nsec, message.receive_ns) == (data, 7, 9)
+    assert (bytes_of(message.value.data).tobytes(), message.value.timestamp.nsec, message.receive_ns) == (
+        data,
+        7,
+        9,
+    )
 
 
 def test_foxglove_as_protobuf(tmp_path: Path) -> None:
