@@ -101,8 +101,8 @@ _UNREAD = (
 )  # fmt: skip
 
 
-# DJI's binary records, by the drone's signatures (DatCon), by the app's prefix (dji-log-parser: place and length
-# of its details, version), or by their names, which count for binary content alone.
+# DJI's binary records, by the drone's signatures (DatCon), by the app's prefix (dji-log-parser: place and
+# length of its details, version), or by their names, which count for binary content alone.
 _DJI_BINARY = re.compile(rb"(?s).{16}BUILD|.{242}DJI_LOG_V3|LOGH|.{3}\0{5}..[\x01-\x1e]")
 _DJI_NAME = re.compile(r"DJIFlightRecord_|FLY\d{3}\.dat$", re.IGNORECASE)
 
