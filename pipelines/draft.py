@@ -35,7 +35,7 @@ from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
 from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
 from pipelines.formats.logs.trajectories import poses_of
-from pipelines.formats.poses.trajectory_files import times_of
+from pipelines.formats.poses import times_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
 from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
 from pipelines.formats.videos.video import created_ns, followed_points, index_video

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.formats.poses.trajectory_files import write_tum as write_trajectory
+from pipelines.formats.poses import write_tum as write_trajectory
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.ingest import ingest

@@ -13,7 +13,6 @@ from filelock import FileLock
 from rosbags.highlevel import AnyReader
 
 from pipelines.export import export, load_recording
-from pipelines.formats.poses import trajectory_files
 from pipelines.formats.skeletons import c3d, joint_files, trc
 from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.formats.skeletons.opensim_kinematics import write_sto
@@ -70,7 +69,6 @@ def test_files_written_in_parts_are_those_written_at_once(
     for module, name in (
         (trc, "_FRAMES_AT_ONCE"),
         (joint_files, "_TIMES_AT_ONCE"),
-        (trajectory_files, "_POSES_AT_ONCE"),
     ):
         monkeypatch.setattr(module, name, 5)
     export(filmed, ["trc", "csv", "tum"], parts)

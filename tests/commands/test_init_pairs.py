@@ -13,7 +13,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipelines.draft import draft
-from pipelines.formats.poses.trajectory_files import TUM
+from pipelines.formats.poses import TUM
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import matrix_from_quaternion
 from tests.commands.runner import mocap

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.formats.maps.point_files import PCD
-from pipelines.formats.poses.trajectory_files import write_tum as write_trajectory
+from pipelines.formats.poses import write_tum as write_trajectory
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.geodesy import Place, enu_from_geodetic, place_at
 from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector

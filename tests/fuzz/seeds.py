@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.poses import trajectory_files
+from pipelines.formats import poses as trajectory_files
 from pipelines.formats.scenes import mcap_writing
 from pipelines.formats.skeletons import bvh_writing, joint_files, trc
 from pipelines.session.registries import Export

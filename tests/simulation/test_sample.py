@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.formats.logs.mcap_log import FORMAT as MCAP
 from pipelines.formats.maps.octomap import FORMAT as OCTOMAP
-from pipelines.formats.poses.trajectory_files import TUM
+from pipelines.formats.poses import TUM
 from pipelines.formats.skeletons.joint_files import JOINTS_CSV
 from pipelines.formats.videos.video import FORMAT as VIDEO
 from pipelines.session.manifest import read_flight

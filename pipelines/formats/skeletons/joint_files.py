@@ -22,7 +22,7 @@ from pipelines.formats.common.rows import (
     parse_stamps,
     rows_below,
 )
-from pipelines.formats.poses.trajectory_files import write_pose_csv
+from pipelines.formats.poses import write_pose_csv
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.errors import DataError

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.poses import trajectory_files
+from pipelines.formats import poses as trajectory_files
 from pipelines.geometry.arrays import Float
 from pipelines.session.registries import TrajectoryFormat, recognise
 from tests.formats.refusals import refuses

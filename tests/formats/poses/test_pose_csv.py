@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from pipelines.formats.poses import trajectory_files
+from pipelines.formats import poses as trajectory_files
 from pipelines.formats.videos import frame_times
 from pipelines.session.records import Trajectory
 from pipelines.session.registries import TrajectoryFormat

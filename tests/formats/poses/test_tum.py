@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from pipelines.formats.poses import trajectory_files
+from pipelines.formats import poses as trajectory_files
 from pipelines.geometry.poses import rotate
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import Export, TrajectoryFormat, recognise

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 
-from pipelines.formats.poses import trajectory_files
+from pipelines.formats import poses as trajectory_files
 from pipelines.formats.skeletons import joint_files
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
