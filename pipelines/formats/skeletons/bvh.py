@@ -12,7 +12,6 @@ person who faces the file's +z, with the left hand towards +x, faces the world's
 towards +y.
 """
 
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -247,6 +246,8 @@ def _rest_places(bones: list[_FileBone]) -> Float:
 
 # --- from text to channels -----------------------------------------------------------------------------
 
+_CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz")
+
 
 def _read(path: Path) -> _BvhFile:
     text = read_text(path)
@@ -255,174 +256,101 @@ def _read(path: Path) -> _BvhFile:
         raise DataError(path, "is no BVH file", "its first word must be HIERARCHY", code="wrong-kind")
     if not marker:
         raise DataError(path, "ends before its line MOTION", _EXPORT_AGAIN, code="damaged")
-    bones = _bones(path, head.split("\n"))
-    channels = sum(len(bone.channels) for bone in bones)
-    first_line = head.count("\n") + 2
+    bones = _bones(path, head.replace("{", " { ").replace("}", " } ").split()[1:])
     lines = tail.split("\n", maxsplit=3) + [""] * 3
-    frames = _stated(path, lines[1], "Frames:", first_line + 1)
-    frame_time_s = _stated(path, lines[2], "Frame Time:", first_line + 2)
+    frames, frame_time_s = _stated(path, lines[1], "Frames:"), _stated(path, lines[2], "Frame Time:")
     if not 0 < frame_time_s <= _LONGEST_S:
-        raise DataError(path, f"line {first_line + 2}: a frame time of {frame_time_s:g} s", "correct it")
-    values = _numbers(path, lines[3], channels, frames, first_line + 3)
+        raise DataError(path, f"states a frame time of {frame_time_s:g} s", "correct it", code="bad-value")
+    values = _numbers(path, lines[3], sum(len(bone.channels) for bone in bones), head.count("\n") + 5)
+    if len(values) != frames:
+        problem = f"states {frames:g} frames but holds {len(values)}"
+        remedy = _EXPORT_AGAIN if len(values) < frames else "correct the line `Frames:`"
+        raise DataError(path, problem, remedy, code="damaged")
     return _BvhFile(bones, frame_time_s, values)
 
 
-def _bones(path: Path, lines: list[str]) -> list[_FileBone]:
+def _bones(path: Path, words: list[str]) -> list[_FileBone]:
     """Parse the hierarchy, parents first, in the order of the file."""
     bones: list[_FileBone] = []
-    names: set[str] = set()
-    open_blocks: list[int | None] = []  # bones, and None for an end site
-    coming: int | None = None
-    channels = 0
-    for number, line in enumerate(lines, start=1):
-        words = line.replace("{", " { ").replace("}", " } ").split()
-        while words:
-            word, rest = words[0].upper(), words[1:]
-            words = []
-            if word == "HIERARCHY":
-                words = rest
-            elif word in {"ROOT", "JOINT"}:
-                brace = rest.index("{") if "{" in rest else len(rest)
-                name, words = " ".join(rest[:brace]), rest[brace:]
-                above = open_blocks[-1] if open_blocks else None
-                if not name or (above is None) != (word == "ROOT") or (bones and word == "ROOT"):
-                    raise _bad_line(path, number, line)
-                if name in names:
-                    raise DataError(path, f"line {number}: a second bone is called {name}", "rename one")
-                if len(bones) >= _MOST_BONES:
-                    raise DataError(
-                        path, f"has more than {_MOST_BONES} bones", _EXPORT_AGAIN, code="too-large"
-                    )
-                names.add(name)
-                bones.append(_FileBone(name, -1 if above is None else above, np.zeros(3), [], channels))
-                coming = len(bones) - 1
-            elif word == "END" and rest and rest[0].upper() == "SITE":
-                coming, words = None, rest[1:]
-                words = words[words.index("{") :] if "{" in words else []
-            elif word == "{":
-                open_blocks.append(coming)
-                words = rest
-            elif word == "}" and open_blocks:
-                open_blocks.pop()
-                words = rest
-            elif word == "OFFSET" and open_blocks:
-                offset = _offset(path, rest[:3], number, line)
-                inner = open_blocks[-1]
-                if inner is not None:
+    above: list[int | None] = []  # the open blocks: bones, and None for an end site
+    coming = iter(words)
+    for word in coming:
+        match word.upper():
+            case "ROOT" | "JOINT" | "END" as kind:
+                name = " ".join(iter(lambda: next(coming, "{"), "{"))
+                if kind == "END":
+                    above.append(None)
+                    continue
+                if not name or bool(above) != (kind == "JOINT") or (above and above[-1] is None):
+                    raise _damaged(path, f"the bone {name[:40]!r} has no place there")
+                if name in {bone.name for bone in bones} or len(bones) == _MOST_BONES:
+                    raise _damaged(path, f"a second bone is called {name[:40]!r}, or there are too many")
+                first = bones[-1].first_channel + len(bones[-1].channels) if bones else 0
+                parent = above[-1] if above else None
+                bones.append(_FileBone(name, -1 if parent is None else parent, np.zeros(3), [], first))
+                above.append(len(bones) - 1)
+            case "}" if above:
+                above.pop()
+            case "OFFSET" if above and bones:
+                offset = _offset(path, [next(coming, "") for _ in range(3)])
+                if (inner := above[-1]) is not None:
                     bones[inner].offset = offset
-                elif len(open_blocks) > 1 and (above := open_blocks[-2]) is not None:
-                    bones[above].end = offset
-                words = rest[3:]
-            elif word == "CHANNELS" and open_blocks and (inner := open_blocks[-1]) is not None:
-                count = int(rest[0]) if rest and rest[0].isdecimal() else -1
-                named = [channel.lower() for channel in rest[1 : 1 + count]]
-                _check_channels(path, number, count, named)
-                if bones[inner].channels:
-                    raise _bad_line(path, number, line)
-                bones[inner].channels, bones[inner].first_channel = named, channels
-                channels += count
-                words = rest[1 + count :]
-            else:
-                raise _bad_line(path, number, line)
-    if open_blocks or not bones:
-        lack = f"lacks {len(open_blocks)} closing braces" if bones else "holds no bones"
-        raise DataError(path, f"its hierarchy {lack}", _EXPORT_AGAIN)
+                else:
+                    bones[-1].end = offset
+            case "CHANNELS" if above and above[-1] == len(bones) - 1 and not bones[-1].channels:
+                count = next(coming, "")
+                named = [next(coming, "").lower() for _ in range(int(count) if count.isdecimal() else 0)]
+                places = [channel for channel in named if channel.endswith("position")]
+                if not named or set(named) - {*_CHANNELS} or len(set(places)) < len(places):
+                    raise _damaged(path, f"CHANNELS {count} {' '.join(named)[:60]} make no sense")
+                bones[-1].channels = named
+            case _:
+                raise _damaged(path, f"{word[:60]!r} has no place in its hierarchy")
+    if above or not bones or any(bone.parent < 0 for bone in bones[1:]):
+        raise _damaged(path, "its hierarchy lacks a brace, a root or all bones")
     return bones
 
 
-def _check_channels(path: Path, number: int, count: int, named: list[str]) -> None:
-    unknown = [channel for channel in named if channel not in _CHANNELS]
-    twice = {channel for channel in named if channel.endswith("position") and named.count(channel) > 1}
-    if count < 0 or len(named) != count or unknown or twice:
-        what = f"{unknown[0]!r}" if unknown else f"{len(named)} channels"
-        raise DataError(
-            path,
-            f"line {number}: cannot make sense of {what} in CHANNELS",
-            f"a count, then that many of {', '.join(_CHANNELS)}",
-        )
+def _damaged(path: Path, problem: str) -> DataError:
+    return DataError(path, problem, _EXPORT_AGAIN, code="damaged")
 
 
-_CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz")
-
-
-def _offset(path: Path, words: list[str], number: int, line: str) -> Float:
+def _offset(path: Path, words: list[str]) -> Float:
     try:
         offset = np.array([float(word) for word in words])
-    except ValueError as error:
-        raise _bad_line(path, number, line) from error
-    if offset.shape != (3,) or not (np.abs(offset) < _LARGEST).all():
-        raise _bad_line(path, number, line)
+    except ValueError:
+        offset = np.full(3, np.nan)
+    if not (np.abs(offset) < _LARGEST).all():
+        raise _damaged(path, f"OFFSET {' '.join(words)[:60]} is no place")
     return offset
 
 
-def _bad_line(path: Path, number: int, line: str) -> DataError:
-    return DataError(path, f"line {number}: {line.strip()[:60]!r} has no place there", _EXPORT_AGAIN)
-
-
-def _stated(path: Path, line: str, key: str, number: int) -> float:
+def _stated(path: Path, line: str, key: str) -> float:
     """Return the number after `Frames:` or `Frame Time:`."""
-    words = line.split()
-    named = key.split()
-    if [word.lower() for word in words[: len(named)]] == [word.lower() for word in named]:
-        try:
-            return float(words[len(named)])
-        except (ValueError, IndexError):
-            pass
-    raise DataError(
-        path,
-        f"line {number} must be `{key}` and a number, it is {line.strip()[:60]!r}",
-        _EXPORT_AGAIN,
-        code="bad-value",
-    )
-
-
-def _numbers(path: Path, body: str, channels: int, frames: float, first_line: int) -> Float:
-    """Parse the frames [T, channels]: all at once, and line by line only to find a fault."""
+    words = line.lower().split(key.lower())
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # numpy's sign for text that is no number
-            values = np.fromstring(body, sep=" ")
-    except (DeprecationWarning, ValueError):
-        values = np.empty(0)
-    rows = sum(1 for line in body.split("\n") if line.strip())
-    if not channels or not rows or values.size != rows * channels or not (np.abs(values) < _LARGEST).all():
-        raise _first_bad_frame(path, body, channels, first_line)
-    if rows != frames:
-        last = first_line + body.rstrip().count("\n")
-        raise DataError(
-            path,
-            f"states {frames:g} frames but holds {rows}, the last on line {last}",
-            _EXPORT_AGAIN if rows < frames else "correct the line `Frames:`",
-        )
-    return values.reshape(rows, channels)
+        return float(words[1]) if len(words) == 2 and not words[0].strip() else float("none")
+    except ValueError:
+        problem = f"has {line.strip()[:60]!r} where `{key}` and a number belong"
+        raise DataError(path, problem, _EXPORT_AGAIN, code="bad-value") from None
 
 
-def _first_bad_frame(path: Path, body: str, channels: int, first_line: int) -> DataError:
+def _numbers(path: Path, body: str, channels: int, first_line: int) -> Float:
+    """Parse the frames [T, channels]."""
     if not channels or not body.strip():
-        return DataError(
-            path, "holds no frames" if channels else "has no channels", _EXPORT_AGAIN, code="empty"
-        )
-    lines = body.split("\n")
-    last = max(k for k, line in enumerate(lines) if line.strip())
-    for k, line in enumerate(lines):
-        words = line.split()
-        if words and len(words) != channels:
-            remedy = _EXPORT_AGAIN
-            if k == last:
-                remedy += ", or delete that line and lower the number behind `Frames:`"
-            return DataError(path, f"line {first_line + k} has {len(words)} of {channels} numbers", remedy)
-        for word in words:
+        raise DataError(path, "holds no frames or no channels", _EXPORT_AGAIN, code="empty")
+    rows: list[Float] = []
+    for number, line in enumerate(body.split("\n"), start=first_line):
+        if words := line.split():
             try:
-                usable = abs(float(word)) < _LARGEST
+                row = np.array(words, dtype=np.float64)
             except ValueError:
-                usable = False
-            if not usable:
-                return DataError(
-                    path,
-                    f"line {first_line + k}: {word[:40]!r} is no finite number below {_LARGEST:g}",
-                    _EXPORT_AGAIN,
-                )
-    return DataError(path, "holds numbers that cannot be read", _EXPORT_AGAIN, code="damaged")
+                row = np.full(channels, np.nan)
+            if len(row) != channels or not (np.abs(row) < _LARGEST).all():
+                problem = f"line {number} does not hold {channels} numbers below {_LARGEST:g}"
+                raise DataError(path, problem, _EXPORT_AGAIN, code="damaged")
+            rows.append(row)
+    return np.array(rows)
 
 
 FORMAT = BvhFormat()
