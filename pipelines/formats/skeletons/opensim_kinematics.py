@@ -83,10 +83,6 @@ _ACCURACY = 1e-5
 _ARMS = tuple(f"{name}_{side}" for side in "rl" for name in ("arm_flex", "arm_add", "arm_rot", "elbow_flex"))
 # Elbows begin bent by this angle (rad), because a straight one cannot choose its side.
 _FIRST_BEND = 0.6
-# An elbow nearer to the end of its range counts as straight.
-_STRAIGHT = np.radians(1.0)
-# Squared errors of equal fits differ by less.
-_CLEARLY_LESS = 0.9
 # More bend (rad) of one elbow must not make up for a straight other one.
 _BENT_ENOUGH = 1.0
 
@@ -221,8 +217,6 @@ def solve(
         model: the scaled model.
         weights: of markers by name, and of coordinates that are drawn to their default value; others do not
             take part.
-        motion: of all people.
-        person: the one to solve for.
     """
     named = [(k, marker_name(joint)) for k, joint in enumerate(motion.joints)]
     seen: Bool = np.asarray(np.isfinite(motion.position[:, person]).all(axis=-1).any(axis=0))
@@ -259,76 +253,43 @@ def solve(
     solver = library.InverseKinematicsSolver(model, reference, resting)
     solver.setAccuracy(_ACCURACY)
     turns = np.array([c.getMotionType() == library.Coordinate.Rotational for c in coordinates])
-    bent = _most_bent(motion, person, kept)
-
-    def followed(first: int) -> tuple[Float, Float]:
-        """Follow the pose from a time on, then from there back; coordinates [T, C] and errors [T, M] m."""
-        values, errors = np.empty((len(kept), len(coordinates))), np.full((len(kept), len(names)), np.nan)
-        for rows in (range(first, len(kept)), range(first - 1, -1, -1)):
-            if rows:
-                _assemble(solver, state, coordinates, names, float(since_s[bent]), float(since_s[first]))
-            for row in rows:
-                state.setTime(float(since_s[row]))
-                for name, value in zip(names, weight[kept[row]].tolist(), strict=True):
-                    solver.updateMarkerWeight(name, value)
-                solver.track(state)
-                values[row] = [coordinate.getValue(state) for coordinate in coordinates]
-                for column in np.flatnonzero(known[kept[row]]).tolist():
-                    errors[row, column] = solver.computeCurrentMarkerError(names[column])
-        return values, errors
-
-    values, errors = followed(0)
-    if bent > 0 and _is_arm_stuck(coordinates, values):
-        other = followed(bent)
-        if np.nanmean(other[1] ** 2) < _CLEARLY_LESS * np.nanmean(errors**2):
-            values, errors = other
+    first = _most_bent(motion, person, kept)
+    values, errors = np.empty((len(kept), len(coordinates))), np.full((len(kept), len(names)), np.nan)
+    for rows in (range(first, len(kept)), range(first - 1, -1, -1)):
+        state.setTime(float(since_s[first]))
+        _assemble(solver, state, coordinates, names)
+        for row in rows:
+            state.setTime(float(since_s[row]))
+            for name, value in zip(names, weight[kept[row]].tolist(), strict=True):
+                solver.updateMarkerWeight(name, value)
+            solver.track(state)
+            values[row] = [coordinate.getValue(state) for coordinate in coordinates]
+            for column in np.flatnonzero(known[kept[row]]).tolist():
+                errors[row, column] = solver.computeCurrentMarkerError(names[column])
     values[:, turns] = np.degrees(values[:, turns])
     return Kinematics(motion.t_ns[kept], tuple(c.getName() for c in coordinates), values, errors)
 
 
-def _assemble(
-    solver: Any,
-    state: Any,
-    coordinates: Sequence[Any],
-    names: Sequence[str],
-    bent_s: float,
-    first_s: float,
-) -> None:
-    """Place the model in its pose at a time."""
+def _assemble(solver: Any, state: Any, coordinates: Sequence[Any], names: Sequence[str]) -> None:
+    """Place the model in its pose at the state's time; of four ways to turn the arms the best is taken."""
     by_name = {coordinate.getName(): coordinate for coordinate in coordinates}
     for coordinate in coordinates:
         coordinate.setValue(state, coordinate.getDefaultValue(), False)
-    arms: dict[str, float] = {}
-    if set(_ARMS).issubset(by_name):
-        state.setTime(bent_s)
-        solver.assemble(state)
-        placed = {name: coordinate.getValue(state) for name, coordinate in by_name.items()}
-        found = []
-        for turns in product((0.0, np.pi), repeat=2):
-            begun = dict(
-                zip(_ARMS, (v for turn in turns for v in (0.0, 0.0, turn, _FIRST_BEND)), strict=True)
-            )
-            for name, value in (placed | begun).items():
-                by_name[name].setValue(state, value, False)
-            solver.assemble(state)
-            error = sum(solver.computeCurrentMarkerError(name) ** 2 for name in names)
-            found.append((error, [by_name[name].getValue(state) for name in _ARMS]))
-        arms = dict(zip(_ARMS, min(found)[1], strict=True))
-    state.setTime(first_s)
     solver.assemble(state)
-    for name, value in arms.items():
-        by_name[name].setValue(state, value, False)
-    if arms:
+    if not set(_ARMS).issubset(by_name):
+        return
+    placed = {name: coordinate.getValue(state) for name, coordinate in by_name.items()}
+    found: list[tuple[float, list[float]]] = []
+    for turns in product((0.0, np.pi), repeat=2):
+        angles = [value for turn in turns for value in (0.0, 0.0, turn, _FIRST_BEND)]
+        for name, value in {**placed, **dict(zip(_ARMS, angles, strict=True))}.items():
+            by_name[name].setValue(state, value, False)
         solver.assemble(state)
-
-
-def _is_arm_stuck(coordinates: Sequence[Any], values: Float) -> bool:
-    """Test if an elbow is at the end of its range at most of the times, as in an arm that is turned round."""
-    return any(
-        coordinate.getName().startswith("elbow_flex")
-        and np.median(values[:, column]) < coordinate.getRangeMin() + _STRAIGHT
-        for column, coordinate in enumerate(coordinates)
-    )
+        error = sum(solver.computeCurrentMarkerError(name) ** 2 for name in names)
+        found.append((error, [by_name[name].getValue(state) for name in by_name]))
+    for name, value in zip(by_name, min(found)[1], strict=True):
+        by_name[name].setValue(state, value, False)
+    solver.assemble(state)
 
 
 def _most_bent(motion: JointMotion, person: int, kept: Int64) -> int:
