@@ -331,12 +331,8 @@ def _refuse_foreign(folder: Path, overwrite: bool) -> None:
     except OSError as error:
         raise as_data_error(error, table) from error
     if not first.startswith(",".join(COLUMNS[:4])):
-        raise DataError(
-            table,
-            "is not the summary of a batch",
-            "choose another --output, or give --overwrite",
-            code="exists",
-        )
+        problem = "is not the summary of a batch"
+        raise DataError(table, problem, "choose another --output, or give --overwrite", code="exists")
 
 
 def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:

@@ -396,12 +396,8 @@ def _move(made: Mapping[Path, dict[str, Any]], target: Path, overwrite: bool) ->
         there = sha256_of(place) if place.is_file() else None
         own = there is not None and there == ours.get(path.name, {}).get("sha256")
         if place.exists() and there != facts["sha256"] and not own and not overwrite:
-            raise DataError(
-                place,
-                "exists and was not exported so",
-                "choose another --output, or add --overwrite",
-                code="exists",
-            )
+            problem = "exists and was not exported so"
+            raise DataError(place, problem, "choose another --output, or add --overwrite", code="exists")
         (unchanged if there == facts["sha256"] else written).append((path, place))
     for path, _ in written:
         sync(path)

@@ -387,12 +387,8 @@ def times_of(path: Path) -> Path:
     )
     found = next((place for place in places if place.is_file()), None)
     if found is None:
-        raise DataError(
-            path,
-            "is a KITTI trajectory without times",
-            "put KITTI's times.txt beside it, or save it as TUM",
-            code="clock-unknown",
-        )
+        remedy = "put KITTI's times.txt beside it, or save it as TUM"
+        raise DataError(path, "is a KITTI trajectory without times", remedy, code="clock-unknown")
     return found
 
 

@@ -430,20 +430,12 @@ def read_description(session: Path) -> Description:
     path = session / "session.json"
     document = read_json(path, "ingest the flight again with --force")
     if isinstance(document.get("schema"), int) and document["schema"] > SCHEMA:
-        raise DataError(
-            path,
-            f"has schema {document['schema']}, this version reads up to {SCHEMA}",
-            "update mocap",
-            code="newer-schema",
-        )
+        problem = f"has schema {document['schema']}, this version reads up to {SCHEMA}"
+        raise DataError(path, problem, "update mocap", code="newer-schema")
     try:
         return Description.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise DataError(
-            path,
-            f"is damaged ({place + ': ' if place else ''}{first['msg']})",
-            "ingest the flight again with --force",
-            code="damaged",
-        ) from None
+        problem = f"is damaged ({place + ': ' if place else ''}{first['msg']})"
+        raise DataError(path, problem, "ingest the flight again with --force", code="damaged") from None

@@ -56,11 +56,8 @@ def check_resolution(source: Path | str, resolution_m: float) -> float:
         DataError: not a number, or not within 0.1 mm and 10 km.
     """
     if not FINEST_M <= resolution_m <= COARSEST_M:
-        raise DataError(
-            source,
-            f"voxels of {resolution_m:g} m are no map",
-            f"the resolution must lie between {FINEST_M:g} and {COARSEST_M:g} m",
-        )
+        problem = f"voxels of {resolution_m:g} m are no map"
+        raise DataError(source, problem, f"the resolution must lie between {FINEST_M:g} and {COARSEST_M:g} m")
     return resolution_m
 
 
@@ -172,12 +169,8 @@ def each_map(session: Path) -> Iterator[Occupancy]:
         return
     maps = read_json(place / "index.json").get("maps")
     if not isinstance(maps, list):
-        raise DataError(
-            place / "index.json",
-            "holds no list of maps",
-            "ingest the flight again with --force",
-            code="wrong-kind",
-        )
+        remedy = "ingest the flight again with --force"
+        raise DataError(place / "index.json", "holds no list of maps", remedy, code="wrong-kind")
     for k in range(len(maps)):
         yield read_grid(place / f"{k}.npz")
 

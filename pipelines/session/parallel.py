@@ -128,12 +128,9 @@ def connected(scheduler: str, progress: Progress | None = None) -> Iterator[Any]
     try:
         client = distributed.Client(scheduler, timeout=SCHEDULER_ANSWER_TIMEOUT_S)
     except (OSError, ValueError, TypeError) as error:
-        raise DataError(
-            f"--scheduler {scheduler}",
-            "no Dask scheduler answers there",
-            "start one with `dask scheduler`, or leave it out to use this machine",
-            code="no-scheduler",
-        ) from error
+        problem = "no Dask scheduler answers there"
+        remedy = "start one with `dask scheduler`, or leave it out to use this machine"
+        raise DataError(f"--scheduler {scheduler}", problem, remedy, code="no-scheduler") from error
     with client:
         if progress is not None and not client.scheduler_info()["workers"]:
             progress.note(f"{scheduler} has no workers yet: waiting for them")
@@ -181,19 +178,13 @@ class SharedSession:
             DataError: the worker has another version of mocap, or finds no such session there.
         """
         if self.code != version("mocap-pipeline"):
-            raise DataError(
-                "--scheduler",
-                f"a Dask worker has mocap {version('mocap-pipeline')}, not {self.code}",
-                "install the same version on every machine",
-                code="wrong-worker",
-            )
+            problem = f"a Dask worker has mocap {version('mocap-pipeline')}, not {self.code}"
+            remedy = "install the same version on every machine"
+            raise DataError("--scheduler", problem, remedy, code="wrong-worker")
         if _key_of_ingest(Path(self.place)) != self.ingested:
-            raise DataError(
-                self.place,
-                "is not this session on a machine of the Dask cluster",
-                "every machine needs the same folders under the same paths",
-                code="wrong-worker",
-            )
+            problem = "is not this session on a machine of the Dask cluster"
+            remedy = "every machine needs the same folders under the same paths"
+            raise DataError(self.place, problem, remedy, code="wrong-worker")
         return Path(self.place)
 
 

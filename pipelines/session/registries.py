@@ -355,12 +355,8 @@ class Registry(Generic[T]):
             DataError: no such name; the message lists the existing ones.
         """
         if name not in self._entries:
-            raise DataError(
-                name,
-                f"no such {self.noun}",
-                f"there are {', '.join(self.names()) or 'none'}",
-                code="no-such-name",
-            )
+            remedy = f"there are {', '.join(self.names()) or 'none'}"
+            raise DataError(name, f"no such {self.noun}", remedy, code="no-such-name")
         loaded: T = self._entries[name].load()
         return loaded
 
@@ -465,12 +461,8 @@ def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: s
             return stated
         raise DataError(path, f"{name} is no format of a {noun}", "leave `format:` out", code="wrong-kind")
     if not path.exists():
-        raise DataError(
-            path,
-            "does not exist",
-            "check the path; paths are relative to the file that names them",
-            code="no-such-file",
-        )
+        remedy = "check the path; paths are relative to the file that names them"
+        raise DataError(path, "does not exist", remedy, code="no-such-file")
     refuse_special(path)
     candidates = [f for f in FORMATS.all() if isinstance(f, protocols)]
     matches = [f for f in candidates if f.recognises(path)]
@@ -481,12 +473,8 @@ def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: s
         if len(likely) == 1 and path.is_file():
             return likely[0]  # its reader says exactly what is wrong
         raise _unrecognised(path, noun, sorted(f.name for f in candidates))
-    raise DataError(
-        path,
-        f"could be {' or '.join(sorted(f.name for f in matches))}",
-        "say which with `format:`",
-        code="ambiguous",
-    )
+    problem = f"could be {' or '.join(sorted(f.name for f in matches))}"
+    raise DataError(path, problem, "say which with `format:`", code="ambiguous")
 
 
 def _unrecognised(path: Path, noun: str, known: list[str]) -> DataError:

@@ -151,12 +151,8 @@ def options_of(place: str, part: str, format_: Format, stated: Mapping[str, obje
     allowed = set(getattr(format_, "choices", found.model_fields if found is not TelemetryChoice else ()))
     if strange := [name for name in stated if name not in allowed]:
         takes = f"only {', '.join(sorted(allowed))}" if allowed else "none"
-        raise DataError(
-            place,
-            f"{', '.join(strange)}: no option of this file ({format_.title})",
-            f"leave it out; such a file takes {takes}",
-            code="wrong-option",
-        )
+        problem = f"{', '.join(strange)}: no option of this file ({format_.title})"
+        raise DataError(place, problem, f"leave it out; such a file takes {takes}", code="wrong-option")
     try:
         made = found.model_validate(dict(stated))
     except ValidationError as error:

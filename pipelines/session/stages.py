@@ -317,12 +317,8 @@ class Session:
                     path, f"is gone although `{command}` wrote it", f"run `{command}` again", code="changed"
                 )
             if sha256_of(path) != expected:
-                raise DataError(
-                    path,
-                    f"is not what `{command}` wrote (other SHA-256): it was changed since",
-                    f"run `{command}` again, which makes it anew",
-                    code="changed",
-                )
+                problem = f"is not what `{command}` wrote (other SHA-256): it was changed since"
+                raise DataError(path, problem, f"run `{command}` again, which makes it anew", code="changed")
         return record
 
     def ingested(self) -> StageRecord:
@@ -521,12 +517,8 @@ def names_of(paths: Sequence[Path]) -> list[str]:
         whole = path.resolve()
         name = whole.stem if whole.stem != "flight" else whole.parent.name
         if name in named:
-            raise DataError(
-                path,
-                f"would be called {name}, as {named[name]} is",
-                "leave --output out, or rename one of them",
-                code="exists",
-            )
+            problem = f"would be called {name}, as {named[name]} is"
+            raise DataError(path, problem, "leave --output out, or rename one of them", code="exists")
         named[name] = path
     return list(named)
 
@@ -542,12 +534,9 @@ def open_session(folder: Path) -> Session:
         for stage in STAGES:
             new, old = _new_folder(folder, stage), _old(folder, stage)
             if (new / "stage.json").exists() and old.exists() and not (new.is_symlink() or old.is_symlink()):
-                raise DataError(
-                    folder,
-                    f"was interrupted while `{COMMANDS[stage]}` published its result",
-                    f"run `{COMMANDS[stage]}` again, which completes it",
-                    code="not-a-session",
-                )
+                problem = f"was interrupted while `{COMMANDS[stage]}` published its result"
+                remedy = f"run `{COMMANDS[stage]}` again, which completes it"
+                raise DataError(folder, problem, remedy, code="not-a-session")
         _check_session(folder)
     except OSError as error:
         raise as_data_error(error, folder) from error
@@ -628,12 +617,9 @@ def _check_target(folder: Path, *, overwrite: bool) -> None:
         return
     foreign = sorted({path.name for path in folder.iterdir()} - _LEFT_BY_KILLED_INGEST)
     if foreign:
-        raise DataError(
-            folder,
-            f"is not a session and not empty ({len(foreign)} entries, the first {foreign[0]})",
-            "choose another place with --output, or write into it with --overwrite",
-            code="exists",
-        )
+        problem = f"is not a session and not empty ({len(foreign)} entries, the first {foreign[0]})"
+        remedy = "choose another place with --output, or write into it with --overwrite"
+        raise DataError(folder, problem, remedy, code="exists")
 
 
 def _refuse_newer_session(folder: Path) -> None:

@@ -122,12 +122,8 @@ def refuse_special(path: Path) -> None:
         DataError: it is a pipe, a socket or a device.
     """
     if is_special(path):
-        raise DataError(
-            path,
-            "is a pipe, a socket or a device",
-            "write what comes out of it to a file, and name that",
-            code="special-file",
-        )
+        remedy = "write what comes out of it to a file, and name that"
+        raise DataError(path, "is a pipe, a socket or a device", remedy, code="special-file")
 
 
 def text_encoding(content: bytes) -> str:
@@ -504,12 +500,8 @@ def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
     if not (target / mark).is_file():
         for parent in target.parents:
             if (parent / "session.json").is_file():
-                raise DataError(
-                    target,
-                    "is a part of a session",
-                    f"name another folder with {option}",
-                    code="not-a-session",
-                )
+                problem = "is a part of a session"
+                raise DataError(target, problem, f"name another folder with {option}", code="not-a-session")
 
 
 def is_made(target: Path, key: str, *, mark: str) -> bool:
@@ -532,12 +524,9 @@ def _check(target: Path, mark: str, overwrite: bool) -> None:
             target, "is a file, not a folder", "choose another place with --output", code="not-a-folder"
         )
     if entries := sorted(path.name for path in target.iterdir()):
-        raise DataError(
-            target,
-            f"holds something else ({len(entries)} entries, the first {entries[0]})",
-            "choose another place with --output, or replace it with --overwrite",
-            code="exists",
-        )
+        problem = f"holds something else ({len(entries)} entries, the first {entries[0]})"
+        remedy = "choose another place with --output, or replace it with --overwrite"
+        raise DataError(target, problem, remedy, code="exists")
 
 
 def _put_back(work: Path, target: Path) -> None:

@@ -294,12 +294,8 @@ def _frame_of(path: Path, table: pa.Table, schema: pa.Schema) -> pd.DataFrame:
     """Check the columns and numbers of a table that was read."""
     missing = [name for name in schema.names if name not in table.column_names]
     if missing:
-        raise DataError(
-            path,
-            f"lacks the columns {', '.join(missing)}",
-            "run the stage again with --force",
-            code="missing-column",
-        )
+        problem = f"lacks the columns {', '.join(missing)}"
+        raise DataError(path, problem, "run the stage again with --force", code="missing-column")
     frame: pd.DataFrame = table.to_pandas()
     _refuse_absurd_numbers(path, frame, schema.names)
     return frame

@@ -63,19 +63,12 @@ def url_of(place: Path | str) -> str | None:
         return None
     scheme, rest = found["scheme"].lower(), found["rest"].rstrip("/")
     if found["chained"] or "::" in rest or scheme not in SCHEMES:
-        raise DataError(
-            f"{scheme}://...",
-            f"is a kind of URL that mocap does not open (it opens {', '.join(SCHEMES)})",
-            "copy the file to this machine, and give its path",
-            code="url-refused",
-        )
+        problem = f"is a kind of URL that mocap does not open (it opens {', '.join(SCHEMES)})"
+        remedy = "copy the file to this machine, and give its path"
+        raise DataError(f"{scheme}://...", problem, remedy, code="url-refused")
     if "@" in unquote(rest.partition("/")[0]) or _SECRET.search(unquote(rest)):
-        raise DataError(
-            f"{scheme}://...",
-            "is a URL with credentials in it",
-            "leave them out of it, and set them where the store's own tools look for them",
-            code="url-with-secret",
-        )
+        remedy = "leave them out of it, and set them where the store's own tools look for them"
+        raise DataError(f"{scheme}://...", "is a URL with credentials in it", remedy, code="url-with-secret")
     return f"{scheme}:///{rest}" if scheme == "file" else f"{scheme}://{rest}"
 
 
@@ -214,12 +207,9 @@ def _make_room(folder: Path, size: int, url: str) -> None:
     while shutil.disk_usage(folder.parent).free < size + MIN_FREE_BYTES_BESIDE_SOURCES:
         if not notes:
             free = shutil.disk_usage(folder.parent).free
-            raise DataError(
-                url,
-                f"has {size / 1e9:.3g} GB, and the disk of {folder.parent} has {free / 1e9:.3g} GB free",
-                "free some space, or set XDG_CACHE_HOME to another disk",
-                code="disk-full",
-            )
+            problem = f"has {size / 1e9:.3g} GB, and the disk of {folder.parent} has {free / 1e9:.3g} GB free"
+            remedy = "free some space, or set XDG_CACHE_HOME to another disk"
+            raise DataError(url, problem, remedy, code="disk-full")
         oldest = notes.pop(0)
         remove_tree(oldest)
         remove_tree(oldest.with_suffix(""))
@@ -416,12 +406,9 @@ def _asked(url: str, call: Callable[[Any, str], T], *, missing: type[Exception] 
         chain = list(_chain(error))
         names = {type(each).__name__ for each in chain}
         if any(isinstance(each, _PrivateAddressError) for each in chain):
-            raise DataError(
-                url,
-                "leads to an address of this machine or of a private network",
-                "fetch the file yourself, and give its path",
-                code="url-refused",
-            ) from None
+            problem = "leads to an address of this machine or of a private network"
+            remedy = "fetch the file yourself, and give its path"
+            raise DataError(url, problem, remedy, code="url-refused") from None
         if isinstance(error, OSError) and error.errno in _FULL:
             raise
         if isinstance(error, FileNotFoundError | NotADirectoryError):
@@ -429,18 +416,12 @@ def _asked(url: str, call: Callable[[Any, str], T], *, missing: type[Exception] 
                 raise missing(url) from None
             raise DataError(url, "does not exist", "check the URL", code="no-such-file") from None
         if names & _REFUSED:
-            raise DataError(
-                url,
-                "the store refuses these credentials, or there are none",
-                "set them where the store's own tools look for them (of S3: AWS_PROFILE, ~/.aws)",
-                code="store-refused",
-            ) from None
-        raise DataError(
-            url,
-            f"the store does not answer as it should ({type(error).__name__})",
-            "check the network and the store's address, and run the command again, which continues",
-            code="store-unreachable",
-        ) from None
+            problem = "the store refuses these credentials, or there are none"
+            remedy = "set them where the store's own tools look for them (of S3: AWS_PROFILE, ~/.aws)"
+            raise DataError(url, problem, remedy, code="store-refused") from None
+        problem = f"the store does not answer as it should ({type(error).__name__})"
+        remedy = "check the network and the store's address, and run the command again, which continues"
+        raise DataError(url, problem, remedy, code="store-unreachable") from None
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:

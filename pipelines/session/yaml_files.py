@@ -126,12 +126,8 @@ def read_yaml_model(
     if not isinstance(raw, Mapping):
         raise DataError(path, f"is no {noun}", f"it must be {shape}{how}", code="wrong-kind")
     if isinstance(raw.get("schema"), int) and raw["schema"] > newest:
-        raise DataError(
-            path,
-            f"has schema {raw['schema']}, newer than {newest}",
-            "use a newer version of mocap",
-            code="newer-schema",
-        )
+        problem = f"has schema {raw['schema']}, newer than {newest}"
+        raise DataError(path, problem, "use a newer version of mocap", code="newer-schema")
     if refuse is not None:
         refuse(path, raw)
     try:

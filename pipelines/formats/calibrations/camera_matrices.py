@@ -46,17 +46,11 @@ def intrinsics(
         raise DataError(source, f"camera {camera} has no 3 x 3 matrix of numbers and size of two")
     skew, last = abs(matrix[0, 1]), matrix[2]
     if skew > 1e-6 * abs(matrix[0, 0]) or matrix[1, 0] != 0 or not np.array_equal(last, (0, 0, 1)):
-        raise DataError(
-            source,
-            f"camera {camera}: its matrix has skew {matrix[0, 1]:.4g} or is not fx 0 cx, 0 fy cy, 0 0 1",
-            "calibrate without skew",
-        )
+        problem = f"camera {camera}: its matrix has skew {matrix[0, 1]:.4g} or is not fx 0 cx, 0 fy cy, 0 0 1"
+        raise DataError(source, problem, "calibrate without skew")
     if any(distortion[_MOST_COEFFICIENTS:]):
-        raise DataError(
-            source,
-            f"camera {camera} has {len(distortion)} distortion coefficients (thin prism or tilt)",
-            f"calibrate with at most {_MOST_COEFFICIENTS}",
-        )
+        problem = f"camera {camera} has {len(distortion)} distortion coefficients (thin prism or tilt)"
+        raise DataError(source, problem, f"calibrate with at most {_MOST_COEFFICIENTS}")
     coefficients = tuple(float(value) for value in distortion[:_MOST_COEFFICIENTS])
     if fisheye:
         return build_intrinsics(source, camera, size, matrix, "fisheye", coefficients or (0.0,) * 4)

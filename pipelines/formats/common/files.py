@@ -96,12 +96,8 @@ def read_text(path: Path) -> str:
     try:
         return plain_text(path.read_bytes(), errors="strict")
     except OSError as error:
-        raise DataError(
-            path,
-            f"cannot be read ({error.strerror})",
-            "check the path and its permissions",
-            code=code_of(error),
-        ) from error
+        problem = f"cannot be read ({error.strerror})"
+        raise DataError(path, problem, "check the path and its permissions", code=code_of(error)) from error
     except UnicodeDecodeError as error:
         raise DataError(path, f"is not UTF-8 text (byte {error.start})", "save it as UTF-8") from error
 

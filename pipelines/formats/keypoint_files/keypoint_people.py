@@ -445,11 +445,8 @@ def _choose_skeleton(people: Gathering, stated: str | None) -> Skeleton:
         raise DataError(path, f"has {count} keypoints per person, as no known skeleton", f"there are {known}")
     found = candidates[:1] if names is None else [s for s in candidates if s.joints == names]
     if not found:
-        raise DataError(
-            path,
-            f"names its {count} keypoints {', '.join((names or ())[:4])}, ..., as no known skeleton",
-            f"state the skeleton if it is one of {known}",
-        )
+        problem = f"names its {count} keypoints {', '.join((names or ())[:4])}, ..., as no known skeleton"
+        raise DataError(path, problem, f"state the skeleton if it is one of {known}")
     return found[0]
 
 

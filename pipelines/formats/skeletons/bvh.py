@@ -124,12 +124,8 @@ def _likely_unit(path: Path, bones: list[_FileBone], axes: str) -> float:
     for metres in (*METRES.values(), _CMU_M):
         if _SMALLEST_M <= tall * metres <= _TALLEST_M:
             return metres
-    raise DataError(
-        path,
-        f"states no unit, and its rest pose of {tall:.3g} is an adult's in none",
-        "say truth: {file: FILE, unit: cm}",
-        code="unit-unknown",
-    )
+    problem = f"states no unit, and its rest pose of {tall:.3g} is an adult's in none"
+    raise DataError(path, problem, "say truth: {file: FILE, unit: cm}", code="unit-unknown")
 
 
 def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
@@ -140,12 +136,8 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
     position channels, it is put at their mean, if it is never further than 5 cm from it.
     """
     if unit not in METRES:
-        raise DataError(
-            path,
-            f"the unit {unit!r} is none of {', '.join(METRES)}",
-            "state one of them",
-            code="unit-unknown",
-        )
+        problem = f"the unit {unit!r} is none of {', '.join(METRES)}"
+        raise DataError(path, problem, "state one of them", code="unit-unknown")
     if axes not in AXES:
         raise DataError(
             path, f"the axes {axes!r} are none of {', '.join(AXES)}", "state one of them", code="axes-unknown"
@@ -225,11 +217,9 @@ def _fixed_place(path: Path, bone: _FileBone, place: Float) -> Float:
     middle: Float = place.mean(axis=0)
     stretch_m = float(np.abs(place - middle).max())
     if stretch_m > _MOST_STRETCH_M:
-        raise DataError(
-            path,
-            f"the bone {bone.name} moves by up to {stretch_m:.3g} m against its parent",
-            "state the unit that the file is in, or export it with bones of fixed lengths",
-        )
+        problem = f"the bone {bone.name} moves by up to {stretch_m:.3g} m against its parent"
+        remedy = "state the unit that the file is in, or export it with bones of fixed lengths"
+        raise DataError(path, problem, remedy)
     return place[0] if stretch_m == 0 else middle
 
 

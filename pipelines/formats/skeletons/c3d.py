@@ -124,12 +124,8 @@ def _check_layout(path: Path) -> None:
         frames = min(frames, struct.unpack(f"{order}H", stated[1])[0])
     needed = (start - 1) * _BLOCK + frames * (4 * points + analogs) * (4 if is_float else 2)
     if size < needed:
-        raise DataError(
-            path,
-            f"is no readable C3D (it holds {size} of the {needed} bytes of its header)",
-            _EXPORT_AGAIN,
-            code="damaged",
-        )
+        problem = f"is no readable C3D (it holds {size} of the {needed} bytes of its header)"
+        raise DataError(path, problem, _EXPORT_AGAIN, code="damaged")
     if not _is_chain(section, order):
         raise DataError(
             path, "is no readable C3D (its parameters are damaged)", _EXPORT_AGAIN, code="damaged"

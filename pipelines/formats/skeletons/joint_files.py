@@ -61,19 +61,11 @@ def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float
     y-up files (OpenSim, TRC) turn into world = (z, x, y), a rotation: x forward becomes y, y up becomes z.
     """
     if unit not in METRES:
-        raise DataError(
-            source,
-            f"the unit {unit!r} is none of {', '.join(METRES)}",
-            "state `unit: mm` or alike",
-            code="unit-unknown",
-        )
+        problem = f"the unit {unit!r} is none of {', '.join(METRES)}"
+        raise DataError(source, problem, "state `unit: mm` or alike", code="unit-unknown")
     if axes not in AXES:
-        raise DataError(
-            source,
-            f"the axes {axes!r} are none of {', '.join(AXES)}",
-            "state `axes: y-up` or z-up",
-            code="axes-unknown",
-        )
+        problem = f"the axes {axes!r} are none of {', '.join(AXES)}"
+        raise DataError(source, problem, "state `axes: y-up` or z-up", code="axes-unknown")
     seen = np.isfinite(position).all(axis=-1, keepdims=True)
     turned = position[..., [2, 0, 1]] if axes == "y-up" else position
     return np.where(seen, turned * METRES[unit], np.nan)
@@ -123,11 +115,8 @@ def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenM
     )
     frames = int(index[-1]) + 1
     if frames > min(_MOST_FRAMES, _MOST_EMPTY * len(t_ns)):
-        raise DataError(
-            source,
-            f"{len(t_ns)} times are scattered over {frames} frames",
-            "reconstruct it at a --rate, or export csv",
-        )
+        problem = f"{len(t_ns)} times are scattered over {frames} frames"
+        raise DataError(source, problem, "reconstruct it at a --rate, or export csv")
     step_ns = int(t_ns[-1] - t_ns[0]) / (frames - 1)
     even_ns = t_ns[0] + np.rint(np.arange(frames) * step_ns).astype(np.int64)
     off_ns = int(np.abs(t_ns - even_ns[index]).max())
@@ -286,12 +275,8 @@ class JointsCsvFormat:
         text = read_text(path)
         heading = _find_heading(text)
         if heading is None:
-            raise DataError(
-                path,
-                "has no header that names the time, joint and x y z",
-                "begin with t_ns,joint,x,y,z",
-                code="missing-column",
-            )
+            problem = "has no header that names the time, joint and x y z"
+            raise DataError(path, problem, "begin with t_ns,joint,x,y,z", code="missing-column")
         names = heading.names
         words = {name: column for name, column in names.items() if name in ("joint", "person")}
         table = rows_below(path, heading, text, words, {axis: names[axis] for axis in "xyz"})

@@ -165,11 +165,8 @@ def _set_of(motion: JointMotion) -> tuple[str, str]:
     for name, names in _SET_OF.items():
         if set(SKELETONS[name].joints) == set(motion.joints):
             return names
-    raise DataError(
-        "osim",
-        f"has no markers for a skeleton of {len(motion.joints)} joints",
-        f"there are {', '.join(_SET_OF)}",
-    )
+    problem = f"has no markers for a skeleton of {len(motion.joints)} joints"
+    raise DataError("osim", problem, f"there are {', '.join(_SET_OF)}")
 
 
 def scale_model(library: Any, model: Any, scaling: Any, motion: JointMotion, person: int) -> list[str]:

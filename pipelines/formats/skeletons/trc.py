@@ -87,12 +87,8 @@ def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
     """Return the header, the lines below it, and the line number of the first of those in the file."""
     lines = text.split("\n")
     if len(lines) < 5 or not lines[0].startswith("PathFileType") or not re.match(r"Frame\s*#", lines[3]):
-        raise DataError(
-            path,
-            "has no TRC header (five lines from PathFileType to X1 Y1 Z1)",
-            "export it again",
-            code="missing-column",
-        )
+        problem = "has no TRC header (five lines from PathFileType to X1 Y1 Z1)"
+        raise DataError(path, problem, "export it again", code="missing-column")
     markers = tuple(cell.strip() for cell in lines[3].split("\t")[2:] if cell.strip())
     columns = len(lines[4].split())
     if not markers or columns != 3 * len(markers):
@@ -123,12 +119,8 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
         if len(cells) == 3 * markers + 3 and not cells[-1].strip():
             cells.pop()  # many writers end their lines with a tab
         if len(cells) != 3 * markers + 2:
-            raise DataError(
-                path,
-                f"line {number} has {len(cells)} cells instead of {3 * markers + 2}",
-                "export it again",
-                code="bad-value",
-            )
+            problem = f"line {number} has {len(cells)} cells instead of {3 * markers + 2}"
+            raise DataError(path, problem, "export it again", code="bad-value")
         try:
             values.append([float(cell) if cell.strip() else np.nan for cell in cells[2:]])
         except ValueError as error:
