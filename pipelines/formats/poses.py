@@ -101,22 +101,14 @@ def clean_poses(
     covariance: Float | None = None,
     truncated: int = 0,
 ) -> Trajectory:
-    """Drop the rows that cannot be used, each counted under the first cause that applies.
+    """Drop the rows of [N] poses that cannot be used, each counted under the first cause that applies.
 
     - "truncated last line": rows that the reader already left out at the end (`truncated`);
-    - "not finite": a stamp or a number that is missing, NaN or infinite. A covariance that is blank
+    - "not finite": a stamp or a number that is missing, NaN or infinite. A covariance [6, 6] that is blank
       as a whole is unknown (all zero) and keeps its row;
     - "zero quaternion", "quaternion not unit" (off by more than NORM_TOLERANCE; others are normalised);
     - "absurd position": further from the origin than FARTHEST_M;
     - "duplicate stamp", "stamp out of order" as in `kept_rows`.
-
-    Args:
-        t_ns: [N] stamps.
-        readable: [N] True if the stamp could be read.
-        position: [N, 3] m.
-        quaternion_xyzw: [N, 4].
-        covariance: [N, 6, 6], if there is one.
-        truncated: number of rows left out before.
     """
     if covariance is not None:
         blank: Bool = np.asarray(np.isnan(covariance).all(axis=(1, 2)))

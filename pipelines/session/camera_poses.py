@@ -20,13 +20,7 @@ from pipelines.session.registries import noise_models, parsed_noise_models
 def poses_at(
     track: Trajectory, t_ns: Int64, between: Interpolation, *, static: bool = False
 ) -> tuple[Float, Float]:
-    """Interpolate world_from_camera at given times.
-
-    Args:
-        track: the logged or refined poses.
-        t_ns: [T].
-        between: the longest gap to bridge and the longest extrapolation.
-        static: True for a camera that stands still; its first pose holds all the time.
+    """Interpolate world_from_camera at [T] times; the first pose of a static camera holds all the time.
 
     Returns:
         Positions [T, 3] m and quaternions [T, 4] xyzw; NaN where there is no pose.
@@ -74,13 +68,9 @@ def stated_models(name: str, entry: CameraEntry, pose_noise: str | None) -> list
 def stated_noise(
     name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None = None
 ) -> StatedNoise:
-    """Compute the uncertainty of each pose of a camera's log, from models or else from its covariances.
+    """Compute the uncertainty of each logged pose, from models or else from its covariances.
 
-    Args:
-        trajectory: its N logged poses.
-
-    Raises:
-        DataError: a model is not known.
+    DataError if a model is not known.
     """
     models = stated_models(name, entry, pose_noise)
     if models is None:

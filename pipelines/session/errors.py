@@ -79,14 +79,7 @@ class MocapError(Exception):
 
 
 class DataError(MocapError):
-    """Input that cannot be used.
-
-    Args:
-        source: the file, folder or setting at fault.
-        problem: what is wrong with it, with the numbers involved.
-        remedy: what the user can do about it; empty only where the problem already says it.
-        code: the kind of the error, one of `CODES`; by default that of the class.
-    """
+    """Input that cannot be used: what is wrong with which file or setting, and what the user can do."""
 
     def __init__(
         self, source: Path | str, problem: str, remedy: str = "", *, code: str | None = None

@@ -70,16 +70,9 @@ class MapSizeError(DataError):
 
 
 def check_size(source: Path | str, shape: Sequence[float], resolution_m: float, remedy: str = "") -> None:
-    """Refuse a grid that would not fit, before anything is allocated for it.
+    """Refuse a grid that would not fit, before anything is allocated for it, with a MapSizeError.
 
-    Args:
-        source: for the message.
-        shape: voxels along each axis; floats where they come from unchecked coordinates.
-        resolution_m: side of a voxel.
-        remedy: what the user can do to make it smaller, beside a larger resolution.
-
-    Raises:
-        MapSizeError: more than `MOST_VOXELS`, or a shape that is not finite.
+    `remedy` says what makes it smaller, beside a larger resolution.
     """
     voxels = math.prod(float(side) for side in shape)
     if voxels <= MOST_VOXELS:
@@ -120,16 +113,7 @@ def describe_grid(
 
 
 def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> list[HeldMap]:
-    """Write `map/` into an existing folder (a session, or a stage that is being written).
-
-    The maps are taken one at a time, so that a log's many maps need not be in memory together.
-
-    Args:
-        occupancies: at least one, in the order of the times from which they hold.
-
-    Returns:
-        The entry of each map, in the same order.
-    """
+    """Write `map/` into an existing folder, one map in memory at a time; return the entry of each."""
     place = folder / "map"
     place.mkdir()
     index, held = [], []

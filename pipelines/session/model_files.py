@@ -183,11 +183,8 @@ class PackagedModels:
     def fetch(self, source: Path | None = None) -> None:
         """Put missing or damaged files into the cache; do nothing if all are in place.
 
-        Args:
-            source: the package, or a folder that holds the files at any depth; None downloads the package.
-
-        Raises:
-            DataError: no network, or a file is not the expected one. The cache stays unchanged.
+        `source` is the package, or a folder that holds the files at any depth; None downloads the package.
+        DataError if there is no network or a file is not the expected one; the cache stays unchanged.
         """
         wanted = [file for file in self.files if not self._is_good(file)]
         if wanted and source is not None:

@@ -33,18 +33,10 @@ R = TypeVar("R")
 def each_part(
     work: Callable[[T], R], parts: Sequence[T], *, workers: int = 1, executor: Executor | None = None
 ) -> Generator[tuple[int, R]]:
-    """Call a function with every part, and yield number and result in the order in which they end.
+    """Call a function of a module with every part; yield number and result in the order in which they end.
 
-    Closed early, the parts that are not done are cancelled.
-
-    Args:
-        work: a function of a module.
-        parts: its arguments.
-        workers: the number of processes of this machine; with one, this process works.
-        executor: works instead of processes.
-
-    Raises:
-        MocapError: the first error that a part raised, or a worker could not run it.
+    Closed early, the parts that are not done are cancelled. With one worker this process works; `executor`
+    works instead of processes. MocapError: the first that a part raised, or a worker could not run it.
     """
     workers = min(workers, len(parts))
     if executor is None and (workers < 2 or multiprocessing.current_process().daemon):
@@ -87,14 +79,7 @@ def _end_with_parent() -> None:
 
 
 def result_of(future: Future[T], what: Path | str) -> T:
-    """Return the result of a finished call.
-
-    Args:
-        what: the subject of the line if the workers are at fault.
-
-    Raises:
-        MocapError: the call raised it, or a worker could not run it.
-    """
+    """Return the result of a finished call; MocapError about `what` if the workers are at fault."""
     try:
         return future.result()
     except CancelledError as error:
@@ -112,14 +97,7 @@ def result_of(future: Future[T], what: Path | str) -> T:
 
 @contextmanager
 def connected(scheduler: str, progress: Progress | None = None) -> Iterator[Any]:
-    """Connect to the Dask cluster at an address, and yield the client.
-
-    Args:
-        progress: is told where the cluster has no workers yet.
-
-    Raises:
-        DataError: Dask is not installed, or no scheduler answers there.
-    """
+    """Connect to the Dask cluster at an address, and yield the client; DataError if nothing answers there."""
     distributed = need("distributed", "batch")
     for name in list(logging.root.manager.loggerDict):
         # A lost connection is one line, not a traceback.

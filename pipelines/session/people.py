@@ -183,13 +183,9 @@ def skeleton_with(count: int) -> tuple[Skeleton, ...]:
 
 
 def take_joints(values: Float, joints: tuple[str, ...], wanted: tuple[str, ...], axis: int = -2) -> Float:
-    """Select the entries of the `wanted` joints, in their order.
+    """Select the entries of the `wanted` joints along an axis of [..., J, ...], in their order.
 
-    Args:
-        values: any floats with one entry per joint along `axis` (positions [..., J, 3] by default).
-        joints: the J joints of `values`.
-        wanted: the joints to return; one that is absent from `joints` is NaN.
-        axis: the axis of the joints.
+    A joint that is absent from `joints` is NaN.
     """
     column = {joint: index for index, joint in enumerate(joints)}
     source = np.array([column.get(joint, -1) for joint in wanted], dtype=np.int64)
@@ -200,15 +196,9 @@ def take_joints(values: Float, joints: tuple[str, ...], wanted: tuple[str, ...],
 
 
 def with_derived(joints: tuple[str, ...], position: Float) -> tuple[tuple[str, ...], Float]:
-    """Append the joints of `DERIVED` that are absent and whose parents are there.
+    """Append the joints of `DERIVED` that are absent and whose parents are there, and their positions.
 
-    Args:
-        joints: the J joints of `position`.
-        position: [..., J, D] in any unit; NaN is missing.
-
-    Returns:
-        The joints with the derived ones at the end, and their positions. A derived joint is NaN where a
-        parent is.
+    `position` is [..., J, D]. A derived joint is NaN where a parent is.
     """
     for joint, parents in DERIVED:
         if joint in joints or not set(parents).issubset(joints):
@@ -236,30 +226,12 @@ class LoggedActor:
 
 
 def logged_actor(folder: Path, description: Description, span_ns: Span | None = None) -> LoggedActor | None:
-    """Load the actor of a session, the first of several; None where none was logged.
-
-    Args:
-        folder: the session.
-        description: its session.json.
-        span_ns: only what is known of these times.
-
-    Raises:
-        DataError: the table is damaged.
-    """
+    """Load the first logged person of a session, of some times; None where nobody was logged."""
     return next(iter(logged_people(folder, description, span_ns)), None)
 
 
 def logged_people(folder: Path, description: Description, span_ns: Span | None = None) -> list[LoggedActor]:
-    """Load all people of a session who were logged: person 0, 1, ... in this order.
-
-    Args:
-        folder: the session.
-        description: its session.json.
-        span_ns: only what is known of these times.
-
-    Raises:
-        DataError: the table is damaged.
-    """
+    """Load all people of a session who were logged: person 0, 1, ...; of some times if a span is stated."""
     entries = description.logged_people
     if not entries:
         return []

@@ -62,14 +62,8 @@ class Halt:
 def side_by_side(work: Callable[[T], R], parts: Iterable[T], *, workers: int, halt: Halt) -> list[R]:
     """Call `work` on every part in parallel and return the results in the order of the parts.
 
-    Threads are enough, because the long calculations release the interpreter lock. A single worker is the
-    calling thread, since starting one takes longer than small parts.
-
-    Args:
-        work: called with one part; it checks `halt` from time to time.
-        parts: the arguments of `work`.
-        halt: set when one part fails or the user interrupts; the exception is raised when all have stopped.
-            A single worker stops by the exception itself.
+    Threads are enough, because the long calculations release the interpreter lock. `work` checks `halt` from
+    time to time; it is set when one part fails or the user interrupts. A single worker is the calling thread.
     """
     if workers == 1:
         return [work(part) for part in parts]

@@ -443,17 +443,10 @@ def recognise(path: Path, protocol: type[F], noun: str, *, name: str | None = No
 
 
 def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: str | None = None) -> Format:
-    """Find the one registered format of some kinds that recognises a file.
+    """Find the one registered format of some kinds that recognises a file; the user may state its name.
 
-    Args:
-        path: an existing file or folder.
-        protocols: the kinds, of the runtime-checkable protocols above.
-        noun: the name of such a file in messages ("keypoint file", "camera trajectory").
-        name: the format that the user states.
-
-    Raises:
-        DataError: the path is missing, no format of the kinds knows it, several do, or the stated format is
-            of another kind.
+    DataError if the path is missing, no format of the kinds knows it, several do, or the stated format is of
+    another kind. `noun` names such a file in messages.
     """
     if name is not None:
         stated = FORMATS.get(name)
@@ -528,14 +521,7 @@ _OF_EXTRA = re.compile(r"(?P<requirement>[^;]+?)\s*;\s*extra == ['\"](?P<extra>[
 
 
 def need(module: str, extra: str) -> Any:
-    """Import an optional library.
-
-    Args:
-        extra: the extra of this package that lists it.
-
-    Raises:
-        DataError: it is not installed.
-    """
+    """Import an optional library, which an extra of this package lists; DataError if it is not installed."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's wrappers deprecate themselves

@@ -135,17 +135,9 @@ def option_names(part: str) -> list[str]:
 
 
 def options_of(place: str, part: str, format_: Format, stated: Mapping[str, object], wanted: type[O]) -> O:
-    """Validate the options beside a file.
+    """Validate the options beside a file by the model that its format has for a part of the manifest.
 
-    Args:
-        place: the part in messages ("flight.yaml: cameras.drone1.pose").
-        part: its name, `pose` for example.
-        format_: the format of the file.
-        stated: the options by name.
-        wanted: the model that is expected.
-
-    Raises:
-        DataError: the format takes no such option, or not with this value.
+    DataError if the format takes no such option, or not with this value; `place` names it in messages.
     """
     found = next((model for kind, model in _BY_KIND.get(part, ()) if isinstance(format_, kind)), NoOptions)
     allowed = set(getattr(format_, "choices", found.model_fields if found is not TelemetryChoice else ()))

@@ -300,11 +300,8 @@ class Session:
     def intact_record(self, stage: str) -> StageRecord | None:
         """Return the record of a stage after checking that all of its files are as the stage wrote them.
 
-        Stages that read the files of another stage use this: a file that was edited, truncated or replaced
-        since does not match the record. None if the stage was never finished.
-
-        Raises:
-            DataError: a file is gone or has another content; the record is damaged or of a later version.
+        None if the stage was never finished. DataError if a file is gone or has another content, or the
+        record is damaged or of a later version.
         """
         record = self.record(stage)
         if record is None:
@@ -364,13 +361,10 @@ class WritableSession(Session):
         """Begin a stage, or find it finished with the same settings and inputs, and undamaged.
 
         Args:
-            settings: everything that determines the result, with defaults filled in, of types that
-                `jsonable` accepts; no paths, no thread counts.
+            settings: everything that determines the result, with defaults filled in; no paths, no thread
+                counts.
             inputs: the SHA-256 of everything read, by a name that is the same on every machine.
             force: run it again, from the start.
-
-        Raises:
-            DataError: the stage was written by a later version.
         """
         key = key_of(stage, settings, inputs)
         before = usable_record(self.folder / stage.name / "stage.json")
@@ -402,11 +396,10 @@ class Run:
     """One run of a stage.
 
     Attributes:
-        folder: the folder in which the stage writes; it becomes the stage when published. The files that
-            ingest writes there become the session's own (session.json, cameras/, ...).
+        folder: where the stage writes; it becomes the stage, of ingest the session's own files, when
+            published.
         finished: True if nothing is to be done; `record` then describes the existing result.
-        replaces: settings that differ from those of the stage's earlier run: name to (before, now). A setting
-            that was or is absent is None.
+        replaces: settings that differ from the earlier run's: name to (before, now); absent ones are None.
     """
 
     def __init__(
@@ -504,13 +497,9 @@ def session_name(folder: Path) -> str:
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """Return a name for each flight or session, which does not depend on the others.
+    """Return the name of each flight or session: that of its file, or of the folder around a `flight.yaml`.
 
-    The name is that of the file without its ending. Most manifests are called `flight`; these get the name
-    of the folder around them.
-
-    Raises:
-        DataError: two have the same name.
+    DataError if two have the same name.
     """
     named: dict[str, Path] = {}
     for path in paths:
@@ -557,8 +546,7 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
 
     Args:
         create: allow a folder that does not exist yet (ingest); if the ingest fails, a new folder is removed.
-        overwrite: with `create`, write also into a folder with other files in it. Those stay, unless they
-            have the name of one of the session's own files.
+        overwrite: with `create`, write also into a folder with other files in it, which stay.
 
     Raises:
         DataError: not a session, or with `create` something else; of a later version; cannot be written.

@@ -134,12 +134,8 @@ def text_encoding(content: bytes) -> str:
 def plain_text(content: bytes, errors: str = "replace") -> str:
     r"""Decode UTF-8, or UTF-16 that begins with its mark, without the mark and with lines ending in "\n".
 
-    Args:
-        content: a file, or its beginning.
-        errors: `replace`, so that bytes which are no text become a sign that no number contains, or `strict`.
-
-    Raises:
-        UnicodeDecodeError: with `strict`, bytes that are no such text.
+    UnicodeDecodeError for bytes that are no such text, with `strict`; `replace` makes them signs that no
+    number contains.
     """
     return content.decode(text_encoding(content), errors).replace("\r\n", "\n").replace("\r", "\n")
 
@@ -341,15 +337,9 @@ _OF_SESSIONS = {"session.json": "a session", "stage.json": "a stage of a session
 
 @contextmanager
 def held(lock: Path, target: Path | str) -> Iterator[None]:
-    """Hold a lock of the kernel, which ends with the process, however that ends.
+    """Hold a lock of the kernel, which ends with the process; BusyError if another process has it.
 
-    Args:
-        lock: the file of the lock. The holder's process id is in a file of its own beside it, because some
-            versions of filelock empty the lock file.
-        target: the folder, or the URL, that is written meanwhile, for the message.
-
-    Raises:
-        BusyError: another process holds it.
+    The holder's process id is in a file of its own, because some versions of filelock empty the lock file.
     """
     holder = lock.with_name(f"{lock.name}.pid")
     drop_link(lock)
@@ -445,14 +435,8 @@ class Making:
 def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Iterator[Making]:
     """Make a folder. Parts are kept after an interrupt, and removed after success or a DataError.
 
-    Args:
-        key: equal for equal results.
-        mark: a file that every such folder has; a target without it holds something else.
-        overwrite: replace also a target that holds something else.
-
-    Raises:
-        DataError: the target is something else, or cannot be written.
-        BusyError: another process makes the same folder.
+    `key` is equal for equal results. A target without the file `mark` holds something else, and is replaced
+    only with `overwrite`, else a DataError. BusyError if another process makes the same folder.
     """
     target = target.absolute()
     _check(target, mark, overwrite)
@@ -479,15 +463,9 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
 
 
 def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
-    """Refuse to replace a session or a part of one, even with `overwrite`.
+    """Refuse, with a DataError, to replace a session or a part of one, even with `overwrite`.
 
-    Args:
-        target: the folder that would be replaced.
-        mark: as for `whole_folder`.
-        option: the option by which the user named the target.
-
-    Raises:
-        DataError: the target holds a session or a stage of one, at any depth, or lies in a session.
+    The target must not hold a session or a stage of one at any depth, nor lie in one.
     """
     target = target.absolute()
     if not target.is_dir():

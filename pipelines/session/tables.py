@@ -182,15 +182,9 @@ def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], p
 
 
 def read_table(path: Path, schema: pa.Schema, span_ns: Span | None = None) -> pd.DataFrame:
-    """Read a table and check that it holds the columns of `schema` (more are allowed and kept).
+    """Read a table with the columns of `schema` (more are kept), within a span, both ends included.
 
-    Args:
-        path: the file.
-        schema: the columns.
-        span_ns: only rows with times from the first to the second, both included; others take no memory.
-
-    Raises:
-        DataError: missing, not a Parquet file, truncated, columns are missing, or it holds absurd numbers.
+    DataError: missing, not a Parquet file, truncated, columns are missing, or it holds absurd numbers.
     """
     with _opened(path) as opened:
         batches = _batches_within(opened, span_ns)
@@ -235,17 +229,7 @@ def count_rows(path: Path) -> int:
 
 
 def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.DataFrame:
-    """Read the rows of a table that have one of these integers in a column; others take no memory.
-
-    Args:
-        path: the file.
-        schema: its columns.
-        name: one of them.
-        chosen: sorted.
-
-    Raises:
-        DataError: see `read_table`.
-    """
+    """Read the rows of a table that have one of these sorted integers in a column; others take no memory."""
     kept = []
     with _opened(path) as opened:
         for batch in _batches(opened):

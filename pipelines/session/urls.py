@@ -49,13 +49,10 @@ T = TypeVar("T")
 
 
 def url_of(place: Path | str) -> str | None:
-    """Return the URL that a place is; None for a place on this machine.
+    """Return the URL that a place is; None for a place on this machine, also for a path that exists.
 
-    A URL that has become a Path has lost one of its two slashes. A path that exists is no URL.
-
-    Raises:
-        DataError: the URL holds a secret, which results and messages would repeat, or is of a kind that is
-            not fetched.
+    A URL that has become a Path has lost one of its two slashes. DataError if the URL holds a secret, which
+    results and messages would repeat, or is of a kind that is not fetched.
     """
     text = str(place)
     found = _URL.fullmatch(text)
@@ -73,13 +70,9 @@ def url_of(place: Path | str) -> str | None:
 
 
 def located(base: Path, stated: str | Path) -> Path:
-    """Return the path of a file or folder that is stated by a path relative to `base`, or by URL.
+    """Return the path of a file or folder stated by a path relative to `base`, or by URL, which is fetched.
 
-    What is stated by URL is fetched if it is not in the cache. If `base` itself was fetched, the path is
-    relative to its URL.
-
-    Raises:
-        DataError: the store cannot be read, or holds no such thing.
+    If `base` itself was fetched, the path is relative to its URL. DataError if the store cannot be read.
     """
     url = source_url(base, stated)
     return origin_of(base) / stated if url is None else fetched(url)
@@ -138,13 +131,9 @@ def media_path(base: Path, stated: str, session: Path) -> str:
 
 
 def fetched(url: str, *, fresh: bool = False) -> Path:
-    """Return the copy of a file or folder of a store; fetch it if it is missing.
+    """Return the copy of a file or folder of a store; fetch it if it is missing or, if `fresh`, changed.
 
-    Args:
-        fresh: ask the store, and fetch what has changed there since.
-
-    Raises:
-        DataError: the store cannot be read, holds no such thing, or it does not fit on the disk.
+    DataError if the store cannot be read, holds no such thing, or it does not fit on the disk.
     """
     folder = _cache() / "sources" / _short(url)
     target, note = folder / url.rpartition("/")[2], folder.with_suffix(".json")
@@ -223,13 +212,8 @@ def session_here(place: Path | str, *, create: bool = False) -> Iterator[Path]:
     """Yield the folder of a session. One at a URL is copied here, and uploaded at the end if it has changed.
 
     After an error nothing is uploaded. What was made stays in the copy, and the same command continues.
-
-    Args:
-        create: allow a URL at which there is no session yet (ingest).
-
-    Raises:
-        DataError: the store cannot be used, or holds no session there.
-        BusyError: another process of this machine works on it, or somebody else has uploaded meanwhile.
+    `create` allows a URL at which there is no session yet. BusyError if another process of this machine works
+    on it, or somebody else has uploaded meanwhile.
     """
     url = url_of(place)
     if url is None:

@@ -33,14 +33,9 @@ def intrinsics(
     distortion: Sequence[float],
     fisheye: bool,
 ) -> Intrinsics:
-    """Build intrinsics from a camera matrix and OpenCV's coefficients, all in pixels.
+    """Build intrinsics from a size [2], a matrix [3, 3] without skew and OpenCV's coefficients, all in px.
 
-    Args:
-        camera: the camera's name, for messages.
-        size: width, height.
-        matrix: [3, 3], last row 0 0 1, without skew.
-        distortion: OpenCV's order; all zero, or none, is no distortion (unless fisheye: then equidistant).
-        fisheye: True if the coefficients are those of cv2.fisheye.
+    Coefficients that are all zero, or none, are no distortion (unless fisheye: then equidistant).
     """
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or len(size) != 2:
         raise DataError(source, f"camera {camera} has no 3 x 3 matrix of numbers and size of two")

@@ -64,16 +64,10 @@ def parse_table(
 ) -> TextTable:
     """Read delimited rows of `columns` cells; blank lines and lines that begin with # are skipped.
 
-    If the last line does not parse, its writing was probably interrupted: it is left out and counted in
-    `truncated`. Where commas do not separate cells and the first row has no dot but in a date, commas before
-    digits are decimal; if every one of them could also separate thousands, the table is refused.
-
-    Args:
-        body: its text below the header.
-        delimiter: one character.
-        text: columns to keep as text, name to index.
-        numbers: columns to read as numbers, name to index. Blank, "nan" and the like become NaN.
-        first_line: the number of the body's first line in the file, for messages.
+    A last line that does not parse is left out and counted in `truncated`. Where commas do not separate cells
+    and the first row has no dot but in a date, commas before digits are decimal; if every one of them could
+    also separate thousands, the table is refused. `text` and `numbers` map names to columns; blank and "nan"
+    are NaN.
     """
     import pyarrow as pa
 
@@ -178,11 +172,10 @@ def parse_stamps(
 ) -> tuple[Int64, Bool]:
     """Parse decimal stamps [N] as nanoseconds, rounded to the nearest (halves away from zero).
 
-    No float stands between: a float64 holds 1700000000.123456789 s only to 0.2 us. `unit` is SECONDS,
-    MILLISECONDS, MICROSECONDS or NANOSECONDS. The result is 0 where the second array is False, because the
-    text is no finite number that int64 nanoseconds can hold. If the file does not state its unit, stamps that
-    would lie after the year 2262 are read in the unit in which they do not (EuRoC's `#timestamp`: ns).
-    Dates with times by ISO 8601 are read whatever the unit; without a zone they are UTC.
+    No float stands between: a float64 holds 1700000000.123456789 s only to 0.2 us. The result is 0 where the
+    second array is False: the text is no finite number that int64 nanoseconds can hold. If the file does not
+    state its unit, stamps after the year 2262 are read in the unit in which they are not. Dates with times by
+    ISO 8601 are read whatever the unit; without a zone they are UTC.
     """
     import pyarrow as pa
     import pyarrow.compute as pc

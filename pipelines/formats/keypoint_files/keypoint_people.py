@@ -172,14 +172,10 @@ def _digits(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class KeypointFile:
-    """Reader of the people of a keypoint file or folder.
+    """Reader of the people of a keypoint file, or of a folder with one for each picture.
 
-    Args:
-        is_known: recognises the content of a JSON file, whose lists are cut (`samples`), or the head of a
-            table.
-        gather: adds every person of `Gathering.path`; joint names and picture size too if the file states
-            them.
-        of_folders: a folder of such files, one for each picture, is read as well.
+    `is_known` recognises the content of a JSON file, whose lists are cut (`samples`), or the head of a table.
+    `gather` adds every person of `Gathering.path`; joint names and picture size too if the file states them.
     """
 
     name: str

@@ -92,13 +92,9 @@ class Ros2Recording:
             self._file.close()
 
     def write(self, topic: str, type_: str, receive_ns: int, fields: Mapping[str, Any]) -> None:
-        """Add a message.
+        """Add a message of a type in the spelling of ROS 2 (nav_msgs/msg/Odometry), in the order of receipt.
 
-        Args:
-            topic: its topic, of one type throughout.
-            type_: in the spelling of ROS 2 (nav_msgs/msg/Odometry).
-            receive_ns: time of receipt; not before that of the messages written so far.
-            fields: all fields that are not zero; a stamp is a plain number of nanoseconds.
+        `fields` are all that are not zero; a stamp is a plain number of nanoseconds.
         """
         data = bytes(self._store.serialize_cdr(build(self._store, type_, fields), type_))
         number = self._sequence.get(topic, 0)

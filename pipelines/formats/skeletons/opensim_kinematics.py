@@ -209,11 +209,8 @@ def solve(
 ) -> Kinematics:
     """Run inverse kinematics over the times with enough markers.
 
-    Args:
-        library: OpenSim.
-        model: the scaled model.
-        weights: of markers by name, and of coordinates that are drawn to their default value; others do not
-            take part.
+    `weights` are those of markers by name, and of coordinates that are drawn to their default value; others
+    do not take part.
     """
     named = [(k, marker_name(joint)) for k, joint in enumerate(motion.joints)]
     seen: Bool = np.asarray(np.isfinite(motion.position[:, person]).all(axis=-1).any(axis=0))
