@@ -137,16 +137,8 @@ def _mcap_channels() -> Iterator[_Input]:
     yield "60,000 topics", _mcap(_STRING, topics)
     messages = b"".join(_message(k, k) for k in range(n))
     yield "60,000 topics with a message each", _mcap(_STRING, topics, messages)
-    one = b"".join(_channel(k, 1, "/topic") for k in range(n))
-    yield "60,000 channels of one topic", _mcap(_STRING, one, messages)
-    schemas = b"".join(
-        _schema(k + 1, f"a/msg/T{k}", b"float64 x\n") + _channel(k, k + 1, f"/t{k}") for k in range(n)
-    )
-    yield "60,000 types", _mcap(schemas, messages)
     inside = _STRING + topics + messages
     yield "60,000 topics in a chunk", _mcap(_chunk(inside, size=len(inside)))
-    other = b"".join(_channel(k, 0, f"/t{k}", "none" + str(k)) for k in range(n))
-    yield "60,000 unknown encodings", _mcap(other, messages)
 
 
 @_kind("MCAP: inflated chunks", "mcap", "a.mcap")
@@ -154,15 +146,11 @@ def _mcap_bombs() -> Iterator[_Input]:
     for name, press in (("zstd", zstd.compress), ("lz4", lz4.frame.compress)):
         large = press(bytes(1000 * MB))
         yield f"{name}, 1,000 MB of zeros", _mcap(_chunk(large, name, 1000 * MB))
-        yield f"{name}, states 100 bytes", _mcap(_chunk(large, name, 100))
         yield f"{name}, states 2^63", _mcap(_chunk(large, name, 2**63))
         body = _STRING + _channel(1, 1, "/a") + _message(1, 1, bytes(900 * MB))
         yield f"{name}, one message of 900 MB", _mcap(_chunk(press(body), name, len(body)))
         some = press(bytes(60 * MB))
         yield f"{name}, 400 times 60 MB", _mcap(*[_chunk(some, name, 60 * MB)] * 400)
-    messages = _STRING + _channel(1, 1, "/a") + _message(1, 1) * 1_500_000
-    pressed = zstd.compress(messages)
-    yield "zstd, 1,500,000 messages", _mcap(_chunk(pressed, "zstd", len(messages)))
 
 
 @_kind("MCAP: chunks and indices", "mcap", "a.mcap")
@@ -172,18 +160,8 @@ def _mcap_indices() -> Iterator[_Input]:
     rows = [(1, len(head))] * 1_000_000
     yield "300,000 empty chunks", _mcap(*[_chunk(b"")] * 300_000)
     yield ("1,000,000 rows for one message", _mcap(_chunk(body, size=len(body)), _index(1, rows)))
-    empty = _index(1, []) * 300_000
-    yield "300,000 empty indices", _mcap(_chunk(body, size=len(body)), empty)
-    far = _index(1, [(2**63 - 1, 2**63 - 1)])
-    yield "places of 2^63 - 1", _mcap(_chunk(body, size=len(body)), far)
-    late = _index(1, [(2**64 - 1, 0)])
-    yield "stamps of 2^64 - 1", _mcap(_chunk(body, size=len(body)), late)
     yield "500,000 unknown records", _mcap(head, _op(99, b"") * 500_000, _message(1, 1))
     yield "a record of 2^63 bytes", _mcap(head, struct.pack("<BQ", 5, 2**63), closed=False)
-    count = _op(11, struct.pack("<QHIIIIQQI", 2**64 - 1, 1, 1, 0, 0, 1, 0, 0, 0))
-    yield "2^64 - 1 messages stated", _mcap(head, _message(1, 1), count)
-    mixed = b"".join(_message(1, k) + _op(99, b"") for k in range(200_000))
-    yield "200,000 runs of one message", _mcap(head, mixed)
 
 
 @_kind("messages: definitions", "mcap", "a.mcap")
@@ -201,18 +179,9 @@ def _definitions() -> Iterator[_Input]:
     yield "2,000 types deep", log(deep)
     wide = "B0[10] x" + "".join(f"{rule}B{k}\nB{k + 1}[10] x" for k in range(12)) + f"{rule}B12\nfloat64 x"
     yield "arrays of arrays, 10^13 numbers", log(wide)
-    shared = _schema(1, "a/msg/A", f"{deep}\nfloat".encode()) + b"".join(
-        _channel(k, 1, f"/t{k}") for k in range(30_000)
-    )
-    yield "30,000 topics of one faulty type", _mcap(shared)
     yield "an array of 10^12", log("float64[1000000000000] x")
     yield "a type within itself", log("A x")
-    yield "two types within each other", log(f"B x{rule}B\nA x")
     yield "a sequence of 2^32 - 1", log("float64[] x", b"\xff\xff\xff\xff" + bytes(8))
-    yield "2^32 - 1 empty strings", log("string[] x", b"\xff\xff\xff\xff" + bytes(64))
-    empty = log(f"B[] x{rule}B\n", b"\xff\xff\xff\xff" + bytes(8))
-    yield "2^32 - 1 messages without fields", empty
-    yield "a name of 1 MB", log("float64 " + "x" * MB)
     bomb = _mcap(_STRING, _channel(1, 1, "/a"), _message(1, 1, zstd.compress(bytes(1000 * MB))))
     yield "a compressed message of 1,000 MB", bomb
 
@@ -289,17 +258,10 @@ def _bag_index(number: int, rows: bytes) -> bytes:
 def _bag_bombs() -> Iterator[_Input]:
     large = bz2.compress(bytes(1000 * MB))
     yield "bz2, 1,000 MB of zeros", _bag(_bag_chunk(large, "bz2", 1000 * MB))
-    yield "bz2, states 100 bytes", _bag(_bag_chunk(large, "bz2", 100))
-    yield "bz2, states 2^32 - 1", _bag(_bag_chunk(large, "bz2", 2**32 - 1))
     some = bz2.compress(bytes(60 * MB))
     yield "bz2, 100 times 60 MB", _bag(_bag_chunk(some, "bz2", 60 * MB) * 100)
-    large = lz4.frame.compress(bytes(1000 * MB))
-    yield "lz4, 1,000 MB of zeros", _bag(_bag_chunk(large, "lz4", 1000 * MB))
     frames = lz4.frame.compress(bytes(1000)) * 100_000
     yield "lz4, 100,000 frames", _bag(_bag_chunk(frames, "lz4", 100_000_000))
-    tail = bz2.compress(_bag_topic(0, "/a") + _bag_message(0) * 1_000_000)
-    size = len(_bag_topic(0, "/a") + _bag_message(0) * 1_000_000)
-    yield "bz2, 1,000,000 messages", _bag(_bag_chunk(tail, "bz2", size))
 
 
 @_kind("ROS 1: records", "ros1", "a.bag")
@@ -310,24 +272,16 @@ def _bag_records() -> Iterator[_Input]:
     small = bz2.compress(_bag_topic(0, "/a") + _bag_message(0))
     both = _bag_chunk(small, "bz2", len(_bag_topic(0, "/a") + _bag_message(0)))
     yield "50,000 chunks of a message", _bag(both * 50_000, chunks=50_000)
-    yield "9,000 chunks of a message", _bag(both * 9000, chunks=9000)
     topics = b"".join(_bag_topic(k, f"/t{k}") for k in range(60_000))
     yield "60,000 topics", _bag(topics)
-    messages = b"".join(_bag_message(k) for k in range(60_000))
-    yield "60,000 topics with a message each", _bag(topics, _bag_chunk(messages))
     content = _bag_topic(0, "/a") + _bag_message(0)
     place = struct.pack("<III", 0, 0, len(_bag_topic(0, "/a")))
     rows = _bag_index(0, place * 1_000_000)
     yield "1,000,000 rows for one message", _bag(_bag_chunk(content), rows, chunks=1)
-    empty = _bag_index(0, b"") * 300_000
-    yield "300,000 empty indices", _bag(_bag_chunk(content), empty, chunks=1)
     fields = struct.pack("<I", 2) + b"a="
     header = fields * (MB // 6)
     record = (struct.pack("<I", len(header)) + header + bytes(4)) * 20
     yield "headers of 170,000 fields", _bag(record)
-    topic = _bag_chunk(_bag_topic(0, "/a") * 100_000 + _bag_message(0))
-    first = _bag_index(0, bytes(12) * 1000)
-    yield "an index that points before 100,000 topics", _bag(topic, first, chunks=1)
 
 
 @_kind("ROS 2: databases", "ros2", "a.db3")
@@ -367,39 +321,6 @@ def _databases() -> Iterator[_Input]:
     yield "a view without end", database(topics, named, endless)
     zeros = "SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, zeroblob(999000000) AS data"
     yield "a view of 1 GB", database(topics, named, f"CREATE VIEW messages AS {zeros}")
-    no_topics = (
-        "CREATE VIEW topics AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS id"
-    )
-    yield (
-        "a view of topics without end",
-        database(
-            f"{no_topics}, '/t' || i AS name, 'a/msg/A' AS type, 'cdr' AS serialization_format FROM n", plain
-        ),
-    )
-    yield (
-        "1,000,000 messages",
-        database(
-            topics,
-            plain,
-            named,
-            "INSERT INTO messages "  # noqa: S608  # of constants
-            + many.replace("60000", "1000000")
-            + " SELECT i, 1, i, x'000100000100000000' FROM n",
-        ),
-    )
-    yield (
-        "texts in place of numbers",
-        database(topics, plain, named, "INSERT INTO messages VALUES (1, '1', 'x', 5), (2, 1, 1e308, NULL)"),
-    )
-    yield (
-        "stamps of 2^63 - 1",
-        database(
-            topics,
-            plain,
-            named,
-            "INSERT INTO messages VALUES (1, 1, 9223372036854775807, x'0001'), (2, 1, -5, x'00')",
-        ),
-    )
     generated = plain.replace("data BLOB", "data BLOB AS (zeroblob(900000000))")
     yield (
         "generated columns of 900 MB",
@@ -429,11 +350,8 @@ def _bag_folders() -> Iterator[_Input]:
         return f"rosbag2_bagfile_information:\n  message_count: 1\n  relative_file_paths:\n{listed}"
 
     log = _mcap(_STRING, _channel(1, 1, "/a"), _message(1, 1))
-    yield ("metadata of 10,000 files", bag(stated(f"{k}.mcap" for k in range(10_000)), a__mcap=log))
-    yield "one file named 2,000 times", bag(stated(["a.mcap"] * 2000), a__mcap=log)
     yield "metadata of aliases", bag(_laughs(), a__mcap=log)
     yield "metadata nested deep", bag("[" * 100_000, a__mcap=log)
-    yield "metadata of 15 MB", bag("a: [" + "1, " * 5_000_000 + "1]", a__mcap=log)
     bomb = zstd.compress(bytes(4000 * MB))
     yield "a zstd file of 4 GB", bag(stated(["a.db3.zstd"]), a__db3__zstd=bomb)
     nested = zstd.compress(zstd.compress(log))
@@ -459,8 +377,6 @@ _LENS = (
 def _yaml_calibrations() -> Iterator[_Input]:
     chain = "".join(f"cam{k}:\n{_LENS}" for k in range(10_000))
     yield "10,000 cameras", chain
-    yield ("5,000 cameras, under 1 MB", "".join(f"cam{k}:\n{_LENS}" for k in range(5000)))
-    yield "1,500 cameras", "".join(f"cam{k}:\n{_LENS}" for k in range(1500))
     aliases = f"cam0: &c\n{_LENS}" + "".join(f"cam{k}: *c\n" for k in range(1, 50_000))
     yield "50,000 cameras by aliases", aliases
     head = f"cam0:\n{_LENS}"
@@ -470,13 +386,6 @@ def _yaml_calibrations() -> Iterator[_Input]:
     ]
     yield "merges of merges", head + "\n".join(keys)
     yield "nested 100,000 deep", head + "a: " + "[" * 100_000
-    yield "blocks 700 deep", head + "".join(" " * k + "a:\n" for k in range(700))
-    yield "a scalar of 900 kB", head + "a: " + "9" * 900_000
-    yield "100,000 anchors", head + "".join(f"k{k}: &n{k} 1\n" for k in range(50_000))
-    yield "400,000 short items", head + "a: [" + "1," * 400_000 + "1]"
-    yield ("a date with 100,000 digits", head + "a: 2001-01-01 00:00:00." + "0" * 100_000)
-    yield "a sexagesimal number", head + "a: 1" + ":59" * 100_000
-    yield "an integer in base 2", head + "a: 0b" + "1" * 500_000
     tags = "".join(f"%TAG !t{k}! tag:x,{k}:\n" for k in range(20_000))
     yield "20,000 tags", tags + "---\n" + head
     yield "%50,000 questions", head + "? " * 50_000
@@ -498,13 +407,8 @@ def _yaml_flights() -> Iterator[_Input]:
         return json.dumps(raw)
 
     yield "10,000 cameras", flight(lambda text: cameras(text, 10_000))
-    yield "1,000 cameras", flight(lambda text: cameras(text, 1000))
-    yield "128 cameras", flight(lambda text: cameras(text, 128))
     yield "aliases of aliases", flight(lambda text: text + _laughs())
     yield "nested 100,000 deep", flight(lambda text: text + "a: " + "{a: " * 100_000)
-    yield ("30,000 unknown keys", flight(lambda text: text + "".join(f"key{k}: 1\n" for k in range(30_000))))
-    yield "a name of 900 kB", flight(lambda text: text + "name: " + "x" * 900_000)
-    yield "999 kB of blanks", flight(lambda text: text + " " * 900_000)
 
 
 @_kind("TOML, INI: calibrations", "anipose", "calib.toml")
@@ -514,9 +418,6 @@ def _toml() -> Iterator[_Input]:
 
     yield "10,000 cameras", cameras(10_000)
     yield "nested 100,000 deep", cameras(1) + "a = " + "[" * 100_000
-    yield "a key of 100,000 dots", cameras(1) + "a" + ".a" * 100_000 + " = 1\n"
-    yield "an integer of 500,000 digits", cameras(1) + "a = " + "9" * 500_000 + "\n"
-    yield ("40,000 tables", cameras(1) + "".join(f"[a.b.c{k}]\n" for k in range(40_000)))
     yield (
         "an INI of 200,000 keys",
         "camera_info",
@@ -555,7 +456,7 @@ def _frame_numbers() -> Iterator[_Input]:
 
         return write
 
-    for number in (5_000_000, 10**9, 10**15, 2**62 - 1):
+    for number in (5_000_000, 2**62 - 1):
         yield f"the only frame is {number:,}", "", "flight.yaml", flight([person(f"{number}.jpg")])
         both = [person("0.jpg"), person(f"{number}.jpg")]
         yield f"frames 0 and {number:,}", "", "flight.yaml", flight(both)
@@ -570,9 +471,6 @@ def _keypoint_json() -> Iterator[_Input]:
     text = json.dumps(person)
     yield "30,000 people in a frame", "[" + ",".join([text] * 30_000) + "]"
     yield "nested 1,000,000 deep", "[" * 1_000_000
-    yield ("an integer of 1,000,000 digits", f"[{text[:-1]}, {chr(34)}idx{chr(34)}: {'9' * 10**6}}}]")
-    long = json.dumps(person | {"keypoints": [1.0] * 3_000_000})
-    yield "1,000,000 keypoints in a person", f"[{long}]"
     yield "a key of 20 MB", "coco", "a.json", f'[{{"{"x" * 20 * MB}": 1}}]'
     yield "2,000,000 empty lists", "mmpose", "a.json", '{"instance_info": [' + "[]," * 2_000_000 + "[]]}"
     deep: object = 1.0
@@ -583,12 +481,6 @@ def _keypoint_json() -> Iterator[_Input]:
         "coco",
         "a.json",
         json.dumps([person | {"image_id": 1, "keypoints": deep}]),
-    )
-    yield (
-        "coordinates of 1e308",
-        "coco",
-        "a.json",
-        json.dumps([person | {"image_id": 1, "keypoints": [1e308] * 51}]),
     )
 
     def folder_of(files: int, content: str) -> Writer:
@@ -629,18 +521,12 @@ def _tables() -> Iterator[_Input]:
         separator = "," if name == "csv" else " "
         yield f"{name}: a line of 30 MB", name, entry, good + (f"1{separator}") * (15 * MB)
         yield f"{name}: a number of 1,000,000 digits", name, entry, good + "9" * 1_000_000 + good[1:]
-        yield f"{name}: 1e308", name, entry, good + good.splitlines()[-1].replace("0", "1e308") + "\n"
-        yield f"{name}: 10 MB of line ends", name, entry, good + "\n" * (10 * MB)
     yield "csv: 200,000 columns", "csv", "poses.csv", ",".join(f"c{k}" for k in range(200_000)) + "\n"
     yield "csv: an open quote over 20 MB", "csv", "poses.csv", 't_ns,x\n1,"' + "a\n" * (10 * MB)
     joints = "t_ns,person,joint,x,y,z\n"
     many = "".join(f"{k},0,joint{k},0,0,0\n" for k in range(20_000))
     yield "joints: 20,000 joints at 20,000 times", joints + many
-    people = "".join(f"{k},{k},nose,0,0,0\n" for k in range(20_000))
-    yield "joints: 20,000 people at 20,000 times", joints + people
-    yield ("joints: person 10^12", joints + f"1,{10**12},nose,0,0,0\n2,0,nose,0,0,0\n")
     yield "frame times: frame 10^15", "frame_times", "f.csv", f"frame,t_ns\n0,1\n{10**15},2\n"
-    yield "frame times: frame 5,000,000", "frame_times", "f.csv", "frame,t_ns\n0,1\n5000000,2\n"
     wide = ",".join(
         ["time(millisecond)", "datetime(utc)", "latitude", "longitude"] + [f"c{k}" for k in range(10**5)]
     )
@@ -656,24 +542,12 @@ def _bvh() -> Iterator[_Input]:
     n = 50_000
     deep = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\n" for k in range(n)) + "}\n" * (n + 1)
     yield "nested 50,000 deep", motion(root + deep, 3)
-    turned = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\nCHANNELS 1 Xrotation\n" for k in range(n)) + "}\n" * (
-        n + 1
-    )
-    yield "nested 50,000 deep with channels", motion(root + turned, 3 + n)
-    wide = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\n}}\n" for k in range(n)) + "}\n"
-    yield "50,000 bones side by side", motion(root + wide, 3)
     yield ("10^9 frames stated", motion(root + "}\n", 3).replace("Frames: 1", "Frames: 1000000000"))
-    yield "2,000,000 frames", motion(root + "}\n", 3, 2_000_000)
-    many = root.replace("CHANNELS 3 Xrotation Yrotation Zrotation", "CHANNELS 90000" + " Xrotation" * 90_000)
-    yield "90,000 channels of a bone", motion(many + "}\n", 90_000)
     yield (
         "an offset of 1e308",
         motion(root + "JOINT a\n{\nOFFSET 1e308 0 0\nJOINT b\n{\nOFFSET 1e308 1e308 0\n}\n}\n}\n", 3),
     )
     yield "one line of 500,000 braces", motion(root + "{" * 500_000 + "}" * 500_001, 3)
-    yield "a frame time of 1e300", motion(root + "}\n", 3, 3).replace("0.01", "1e300")
-    sites = "End Site\n{\nOFFSET 0 1 0\n}\n" * 100_000
-    yield "100,000 end sites", motion(root + sites + "}\n", 3)
 
 
 @_kind("skeletons: C3D, TRC, AMC", "trc", "a.trc")
@@ -682,14 +556,6 @@ def _skeletons() -> Iterator[_Input]:
     for markers in (10**9, 2**62):
         text = f"{head}60\t60\t1\t{markers}\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t0.0\t1\t2\t3\n"
         yield f"TRC: {markers:,} markers stated", text
-    names = "\t\t\t".join(f"m{k}" for k in range(20_000))
-    places = "\t".join(f"X{k}\tY{k}\tZ{k}" for k in range(20_000))
-    text = (
-        f"{head}60\t60\t1\t20000\tmm\nFrame#\tTime\t{names}\n\t\t{places}\n\n1\t0.0" + "\t1" * 60_000 + "\n"
-    )
-    yield "TRC: 20,000 markers", text
-    same = text.replace("m0\t", "m1\t")
-    yield "TRC: a marker twice", same
     rate = f"{head}1e-300\t1e308\t1\t1\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t1e308\t1\t2\t3\n"
     yield "TRC: a time of 1e308", rate
     c3d = bytearray(512 * 2)
@@ -703,9 +569,6 @@ def _skeletons() -> Iterator[_Input]:
     looped = bytearray(c3d)
     looped[516:524] = struct.pack("<bbBBhbb", 5, 1, 65, 65, 0, 0, 0)
     yield "C3D: a parameter that leads to itself", "c3d", "a.c3d", bytes(looped)
-    back = bytearray(c3d)
-    back[516:522] = struct.pack("<bbBBh", 2, 1, 65, 65, -2)
-    yield "C3D: a parameter that leads back", "c3d", "a.c3d", bytes(back)
     dimensions = bytearray(c3d)
     dimensions[516 : 516 + 20] = struct.pack(
         "<bbBBhbB7BB4B", 2, 1, 65, 65, 500, 4, 7, *[255] * 7, 0, 0, 0, 0, 0
@@ -757,15 +620,9 @@ def _parquet() -> Iterator[_Input]:
             table = table.append_column(f"c{k}", pa.nulls(len(table)))
         pq.write_table(table, path)
 
-    def text(path: Path) -> None:
-        table = pq.read_table(path)
-        named = pa.array(["x" * 1000 * MB] + [""] * (len(table) - 1))
-        pq.write_table(table.append_column("note", named), path, compression="zstd")
-
     for name, table in (("poses", _POSES), ("keypoints", _KEYPOINTS), ("joints", _SKELETON)):
         yield f"50,000,000 equal {name}", _session(table, repeated(50_000_000))
     yield "5,000 columns", _session(_POSES, wide)
-    yield "a text of 1,000 MB", _session(_POSES, text)
 
 
 @_kind("sessions: absurd numbers", "", "a.session")
@@ -781,13 +638,11 @@ def _sessions() -> Iterator[_Input]:
 
         return _session(table, change)
 
-    for value in (1e308, -1e308, float("inf")):
+    for value in (1e308,):
         yield f"a joint at {value:g} m", changed(_SKELETON, "x", value)
         yield f"a camera at {value:g} m", changed(_POSES, "x", value)
         yield f"a keypoint at {value:g} px", changed(_KEYPOINTS, "x", value)
     yield "a stamp of 2^62 ns", changed(_SKELETON, "t_ns", 2**62)
-    yield "a pose at 2^62 ns", changed(_POSES, "t_ns", 2**62)
-    yield "frame 2^62", changed(_KEYPOINTS, "frame", 2**31 - 1)
 
 
 # --- maps ----------------------------------------
@@ -802,13 +657,8 @@ def _clouds() -> Iterator[_Input]:
     yield "PCD: 10^12 points", pcd.format(n=10**12, data="binary").encode() + bytes(120)
     lzf = struct.pack("<II", 3 * 4_000_000, 264 * 4_000_000) + b"\xe0\xff\x00" * 4_000_000
     yield ("PCD: LZF to 1 GB", pcd.format(n=88_000_000, data="binary_compressed").encode() + lzf)
-    short = struct.pack("<II", 12, 2**32 - 1) + bytes(12)
-    yield ("PCD: LZF to 2^32 - 1", pcd.format(n=357_913_941, data="binary_compressed").encode() + short)
     count = pcd.replace("COUNT 1 1 1", "COUNT 1 1 1000000000000")
     yield "PCD: a count of 10^12", count.format(n=1, data="ascii") + "1 2 3\n"
-    fields = pcd.replace("x y z", "x y z" + " a" * 5000).replace("4 4 4", "4" + " 4" * 5002)
-    fields = fields.replace("F F F", "F" + " F" * 5002).replace("1 1 1", "1" + " 1" * 5002)
-    yield ("PCD: 5,003 fields", fields.format(n=1000, data="ascii") + ("1 " * 5003 + "\n") * 1000)
     far = "\n".join(["0 0 0", "1e308 0 0", "-1e308 1e308 1e38"])
     yield "PCD: points at 1e308", pcd.format(n=3, data="ascii") + far
     box = "\n".join(["0 0 0", "9000 9000 9000"])
@@ -822,11 +672,6 @@ def _clouds() -> Iterator[_Input]:
     )
     lists = ply.format(kind="binary_little_endian", n=1) + "property list uint uint a\nend_header\n"
     yield "PLY: a list of 2^32 - 1", "ply", "a.ply", lists.encode() + bytes(12) + b"\xff" * 4
-    before = "ply\nformat ascii 1.0\nelement face 1000000000\nproperty float a\nelement vertex 1\n"
-    rest = "property float x\nproperty float y\nproperty float z\nend_header\n0\n"
-    yield "PLY: 10^9 faces before", "ply", "a.ply", before + rest
-    many = "".join(f"element e{k} 1\nproperty float a\n" for k in range(1500))
-    yield "PLY: 1,500 elements", "ply", "a.ply", ply.format(kind="ascii", n=1) + many + "end_header\n0 0 0\n"
     las = bytearray(227 + 40)
     las[:4] = b"LASF"
     las[24:26] = b"\1\2"
@@ -834,14 +679,6 @@ def _clouds() -> Iterator[_Input]:
     struct.pack_into("<BHI", las, 104, 0, 20, 2**32 - 1)
     struct.pack_into("<dddddd", las, 131, 1e-3, 1e-3, 1e-3, 0, 0, 0)
     yield "LAS: 2^32 - 1 records and points", "las", "a.las", bytes(las)
-    none = bytearray(las)
-    struct.pack_into("<I", none, 100, 0)
-    struct.pack_into("<BHI", none, 104, 0, 0, 2**32 - 1)
-    yield "LAS: points of no length", "las", "a.las", bytes(none)
-    packed = bytearray(las)
-    struct.pack_into("<I", packed, 100, 0)
-    packed[104] = 128
-    yield "LAZ: 2^32 - 1 points", "las", "a.laz", bytes(packed)
 
 
 @_kind("maps: grids", "ros_map", "map.yaml")
@@ -862,16 +699,8 @@ def _grids() -> Iterator[_Input]:
 
     yield "npz: 1,000 MB of zeros", "npz", "site.npz", npz("(250, 1000, 1000)", bytes(1000 * 10**6))
     yield "npz: 2^60 voxels stated", "npz", "site.npz", npz(f"({2**20}, {2**20}, {2**20})")
-    yield "npz: 60 dimensions", "npz", "site.npz", npz("(" + "1, " * 60 + ")", bytes(4))
     yield "npz: objects", "npz", "site.npz", npz("(1, 1, 1)", b"cos\nsystem\n(S'true'\ntR.", "|O")
     yield "npz: a header nested deep", "npz", "site.npz", npz("(" * 3000 + ")" * 3000)
-    text = BytesIO()
-    with zipfile.ZipFile(text, "w", zipfile.ZIP_DEFLATED) as archive:
-        for k in range(60_000):
-            archive.writestr(f"a{k}", "")
-        archive.writestr("origin.npy", "")
-        archive.writestr("probability.npy", "")
-    yield "npz: 60,000 members", "npz", "site.npz", text.getvalue()
 
     def ros(about: str, name: str, picture: bytes) -> Writer:
         def write(folder: Path) -> None:
@@ -883,10 +712,7 @@ def _grids() -> Iterator[_Input]:
     about = "resolution: {r}\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
     usual = about.format(r=0.05)
     yield ("map.yaml: 2^31 pixels wide", ros(usual, "a.pgm", b"P5\n2147483647 2147483647\n255\n\0"))
-    yield "map.yaml: PNG of 10^9 pixels", ros(usual, "a.png", _png(31_000, 31_000))
-    yield ("map.yaml: PNG of 400,000,000 pixels", ros(usual, "a.png", _png(20_000, 20_000)))
     yield ("map.yaml: voxels of 1e-300 m", ros(about.format(r=1e-300), "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"))
-    yield ("map.yaml: voxels of 1e300 m", ros(about.format(r=1e300), "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"))
     yield "map.yaml: the picture is a device", ros(usual, "/dev/zero", b"")
     turned = usual.replace("[0, 0, 0]", "[1e308, -1e308, 0.7]")
     yield ("map.yaml: an origin of 1e308", ros(turned, "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"))
@@ -909,7 +735,7 @@ def _png(width: int, height: int) -> bytes:
 def _octomaps() -> Iterator[_Input]:
     tree = test_octomap.at([7] * 13, [3.5, None, -2.0, [3.5, None] * 4, *[None] * 4])
     good = test_octomap.file_of(tree)
-    for resolution in ("1e-300", "1e300", "nan", "0", "-0.1"):
+    for resolution in ("1e-300", "nan"):
         changed = b"\n".join(
             b"res " + resolution.encode() if line.startswith(b"res ") else line for line in good.split(b"\n")
         )
@@ -917,13 +743,6 @@ def _octomaps() -> Iterator[_Input]:
     head, _, _ = good.partition(b"data\n")
     full = struct.pack("<H", 0xFFFF)
     yield "only inner nodes", head + b"data\n" + full * 2_000_000
-    corners = b"\n".join(
-        b"size 999999999999" if line.startswith(b"size ") else line for line in good.split(b"\n")
-    )
-    yield "a size of 10^12", corners
-    yield "the whole world in eight leaves", head + b"data\n" + struct.pack("<H", 0xAAAA)
-    ends = test_octomap.file_of([3.5, None, None, None, None, None, None, test_octomap.at([7] * 15, 3.5)])
-    yield "an octant and a voxel", ends
 
 
 # --- calibrations in binary, pictures, videos ----------------------------------------
@@ -945,18 +764,7 @@ def _colmap() -> Iterator[_Input]:
     image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1)
     yield "2^64 - 1 cameras", model(struct.pack("<Q", 2**64 - 1) + camera[8:])
     yield ("2^64 - 1 images", model(camera, struct.pack("<Q", 2**64 - 1) + image + b"a\0" + bytes(8)))
-    yield (
-        "2^60 points of an image",
-        model(camera, struct.pack("<Q", 1) + image + b"a\0" + struct.pack("<Q", 2**60)),
-    )
     yield ("a name without an end", model(camera, struct.pack("<Q", 1) + image + b"a" * (20 * MB)))
-    many = struct.pack("<Q", 200_000) + b"".join(
-        struct.pack("<I7dI", k, 1, 0, 0, 0, 0, 0, 0, 1) + f"{k}.jpg".encode() + b"\0" + bytes(8)
-        for k in range(200_000)
-    )
-    yield "200,000 images", model(camera, many)
-    wide = struct.pack("<QIiQQddd", 1, 1, 0, 2**63, 2**63, 1e308, 1e308, 1e308)
-    yield ("pictures of 2^63 pixels", model(wide, struct.pack("<Q", 1) + image + b"a\0" + bytes(8)))
 
 
 @_kind("pictures", "pictures", "film")
@@ -971,11 +779,8 @@ def _pictures() -> Iterator[_Input]:
 
     large = _png(30_000, 30_000)
     yield "PNG of 900,000,000 pixels", film(lambda _: large)
-    medium = _png(12_000, 12_000)
-    yield "PNG of 144,000,000 pixels", film(lambda _: medium)
     small = _png(16, 16)
     yield "10,000 pictures", film(lambda _: small, 10_000)
-    yield "another size each", film(lambda k: _png(16 + k, 16), 50)
     first = _png(16, 16)
     lied = bytearray(first)
     struct.pack_into(">II", lied, 16, 2**31 - 1, 2**31 - 1)
@@ -990,8 +795,6 @@ def _pictures() -> Iterator[_Input]:
     yield "EXIF that leads to itself", "picture_tags", "film", film(lambda _: jpeg(looped), suffix="jpg")
     counted = struct.pack("<H", 1) + struct.pack("<HHII", 0x0132, 2, 2**32 - 1, 0) + bytes(4)
     yield "EXIF of 2^32 - 1 letters", "picture_tags", "film", film(lambda _: jpeg(counted), suffix="jpg")
-    many = struct.pack("<H", 5000) + struct.pack("<HHII", 0x0132, 2, 60_000, 0) * 5000
-    yield "EXIF of 5,000 tags", "picture_tags", "film", film(lambda _: jpeg(many), suffix="jpg")
 
 
 def _box(kind: bytes, content: bytes) -> bytes:
@@ -1032,8 +835,6 @@ def _boxes() -> Iterator[_Input]:
         nested = struct.pack(">I", 8 + len(nested)) + b"moov" + nested if len(nested) < 60_000 else nested
     yield "boxes nested deep", deep + nested
     yield "200,000 empty boxes", deep + _box(b"free", b"") * 200_000
-    tracks = _box(b"moov", _box(b"trak", b"") * 50_000)
-    yield "50,000 empty tracks", deep + tracks
     yield "a box of no length", deep + bytes(4) + b"moov" + bytes(100)
 
 
@@ -1057,17 +858,11 @@ def _ulogs() -> Iterator[_Input]:
     yield "arrays of arrays", log("t12:float a;", *nested)
     yield "a type within itself", log("a:a x;")
     yield "a chain of 5,000 types", log(*(f"t{k}:t{k + 1} a;" for k in range(5000)))
-    yield ("60,000 formats", log(*(f"t{k}:uint64_t timestamp;float x;" for k in range(60_000))))
     topic = log("a:uint64_t timestamp;float x;")
     subscribed = b"".join(drone_logs.ulog_record("A", struct.pack("<BH", 0, k) + b"a") for k in range(60_000))
     yield "60,000 subscriptions", topic + subscribed
     rows = drone_logs.ulog_record("D", struct.pack("<HQf", 0, 1, 2.0)) * 1_000_000
     yield "1,000,000 equal rows", topic + drone_logs.ulog_record("A", bytes(3) + b"a") + rows
-    yield "300,000 dropouts", topic + drone_logs.ulog_record("O", bytes(2)) * 300_000
-    info = drone_logs.ulog_record("M", b"\0" + b"\x06char[2]aab"[:9] + b"xx")
-    yield "100,000 pieces of information", topic + info * 100_000
-    parameter = drone_logs.ulog_record("P", b"\x09float ABC" + struct.pack("<f", 1e38))
-    yield "300,000 parameters", topic + parameter * 300_000
     yield "an array of 999,999,999", log("a:uint64_t timestamp;float[999999999] x;")
 
 
@@ -1084,30 +879,16 @@ def _telemetry() -> Iterator[_Input]:
         "<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"
     )
     yield "ArduPilot: 200,000 definitions", "ardupilot", "a.bin", own + dataflash(200_000, b"")
-    yield "ArduPilot: 9,000 definitions", "ardupilot", "a.bin", own + dataflash(9000, b"")
-    yield (
-        "ArduPilot: messages of no length",
-        "ardupilot",
-        "a.bin",
-        own
-        + b"\xa3\x95\x80"
-        + struct.pack("<BB4s16s64s", 1, 0, b"GPS", b"QBIHBcLLefffB", b"TimeUS")
-        + b"\xa3\x95\x01" * 100_000,
-    )
-    yield "ArduPilot: 20 MB of marks", "ardupilot", "a.bin", own + b"\xa3\x95" * (10 * MB)
     packet = struct.pack(">Q", 1_700_000_000_000_000) + b"\xfe\x00\x00\x01\x01\x00\x00\x00"
     yield "MAVLink: 1,000,000 empty packets", "tlog", "a.tlog", packet * 1_000_000
     yield "MAVLink: 20 MB of marks", "tlog", "a.tlog", packet + b"\xfe" * (20 * MB)
-    yield "MAVLink: 20 MB of version 2 marks", "tlog", "a.tlog", packet + b"\xfd\x00" * (10 * MB)
     place = "[latitude: 1.0] [longitude: 2.0] [rel_alt: 1.0 abs_alt: 2.0]"
     cue = "{k}\n00:00:00,{a:03d} --> 00:00:00,{b:03d}\n" + place + "\n\n"
     cues = "".join(cue.format(k=k, a=k % 1000, b=k % 1000 + 1) for k in range(200_000))
     yield "SRT: 200,000 cues that go back", cues
     one = cue.format(k=1, a=0, b=33)
-    yield ("SRT: an hour of 20 digits", one.replace("00:00:00,033", "9" * 20 + ":00:00,033") + one)
     yield ("SRT: 1,000,000 brackets", one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[" * 1_000_000)
     yield "SRT: a latitude of 1e308", (one + one).replace("1.0]", "1e308]")
-    yield ("SRT: 500,000 pairs in a cue", one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[a: 1] " * 500_000)
 
 
 @_kind("telemetry in videos", "gopro", "a.mp4")

@@ -4,12 +4,10 @@ A trace is recorded while a command runs in this process. The whole folder is co
 each call that renames, removes, makes or syncs something, so that what libraries in C write is seen as well.
 From a trace follow the states of the disk that a loss of power may leave after each of its steps:
 
+- Changes of entries of folders reach the disk in their order, as a journal keeps them. Those before the last
+  sync of a file or folder are there; of the others, any number of the first.
 - Of a file, what was there at its last sync is there, or what was written since. That may also be cut
   anywhere, be zeros, or be missing.
-- Of a folder, the entries are there as of its last sync. Each change since then has reached the disk or has
-  not, independently of all others, except of those of the same name. A rename is done wholly or not at all.
-
-That is less than journaling file systems promise, which keep the order of changes.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.stages import STAGES, locked
 from tests.commands.runner import mocap, succeeds
 from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
-from tests.kills.killing import SCENARIO, SMALL_STUDY, kept
+from tests.kills.killing import SCENARIO, kept
 from tests.synthetic.flights import write_flight
 
 Key = tuple[int, str]  # node of a folder, and a name in it
@@ -48,18 +46,6 @@ class Entry:
     gone: Key | None
     come: Key | None
     is_folder: bool
-
-    @property
-    def keys(self) -> set[Key]:
-        """The entries that it changes."""
-        return {key for key in (self.gone, self.come) if key is not None}
-
-    @property
-    def moved(self) -> tuple[int, int] | None:
-        """The two folders of a rename from one into another; None for other changes."""
-        if self.gone is None or self.come is None or self.gone[0] == self.come[0]:
-            return None
-        return self.gone[0], self.come[0]
 
 
 @dataclass(frozen=True)
@@ -214,123 +200,41 @@ class Recorder:
 # --- what may be left ----------------------------------------------------------------------------------
 
 
-def losses(
-    trace: Trace, choice: np.random.Generator, *, moments: int, each: int
-) -> Iterator[tuple[int, Disk]]:
+def losses(trace: Trace, choice: np.random.Generator, *, moments: int) -> Iterator[tuple[int, Disk]]:
     """Yield states that a loss of power after some steps may leave, with the number of steps before it.
 
-    Nothing unsynced is left; all entries, without content and with any; all but one of the changes of
-    entries; one alone of them; those before a moment, as a journal leaves them; any of them. The same state
-    is yielded once for one number of steps.
+    The same state is yielded once for one number of steps.
 
     Args:
         trace: all steps.
-        choice: chooses what is left of unsynced files, and changes.
+        choice: chooses what is left of unsynced files, and how many changes of entries.
         moments: the most moments; the last step is always one of them.
-        each: the most changes that are left out, or made, alone.
     """
     last = len(trace.steps)
     counts = trace.first + choice.permutation(last - trace.first)[: moments - 1]
     for count in sorted({*counts.tolist(), last}):
         steps = trace.steps[:count]
-        entries = [k for k, step in enumerate(steps) if isinstance(step, Entry)]
-        certain = _certain(steps, entries)
-        open_ = [k for k in entries if k not in certain]
-        alone = choice.permutation(open_)[:each].tolist()
-        subsets = [set(), set(open_), set(open_), *({k} for k in alone), *(set(open_) - {k} for k in alone)]
-        subsets.append(set(open_[: int(choice.integers(len(open_) + 1))]))
-        subsets.append({k for k in open_ if choice.random() < 0.5})
+        certain = max((k for k, step in enumerate(steps) if isinstance(step, Synced)), default=0)
+        written = {certain, count, int(choice.integers(certain, count + 1))}
         seen = set()
-        for number, subset in enumerate(subsets):
-            done = _done(steps, entries, certain, subset)
-            disk = Disk(done, _left(steps, None if number < 2 else choice))
+        states = [(end, choice if number else None) for number, end in enumerate(sorted(written))]
+        for end, torn in [*states, (count, choice)]:
+            disk = Disk(_entries_after(steps[:end]), _left(steps, torn))
             mark = hash((frozenset(disk.entries.items()), frozenset(disk.contents.items())))
             if mark not in seen:
                 seen.add(mark)
                 yield count, disk
 
 
-def _certain(steps: Sequence[Step], entries: Sequence[int]) -> set[int]:
-    """Return the changes of entries that syncs have brought to the disk, with all that these need.
-
-    A change of an entry needs the earlier changes of the same entry. A rename out of a folder that is there
-    needs the making of the folder into which it leads.
-    """
-    synced: dict[int, int] = {}
-    for k, step in enumerate(steps):
-        if isinstance(step, Synced):
-            synced[step.node] = k
-    made = _makings(steps, entries)
-    certain: set[int] = set()
-    needed = {k for k in entries if any(synced.get(parent, -1) > k for parent, _ in _entry(steps, k).keys)}
-    while needed - certain:
-        certain |= needed
-        keys: set[Key] = set()
-        for k in reversed(entries):
-            if k in certain or _entry(steps, k).keys & keys:
-                certain.add(k)
-                keys |= _entry(steps, k).keys
-        uncertain = {node for node, (k, _) in made.items() if k not in certain}
-        needed = {
-            made[node][0]
-            for k in certain
-            if (move := _entry(steps, k).moved) and not _floating(move[0], uncertain, made)
-            for node in _floating(move[1], uncertain, made)
-        }
-    return certain
-
-
-def _done(
-    steps: Sequence[Step], entries: Sequence[int], certain: set[int], chosen: set[int]
-) -> dict[Key, int]:
-    """Return the entries after the certain and the chosen changes, without chosen ones that need others."""
-    made = _makings(steps, entries)
+def _entries_after(steps: Sequence[Step]) -> dict[Key, int]:
     found: dict[Key, int] = {}
-    missing: set[Key] = set()
-    nowhere: set[int] = set()  # folders whose making is missing
-    for k in entries:
-        step = _entry(steps, k)
-        lost = (
-            step.moved is not None
-            and bool(_floating(step.moved[1], nowhere, made))
-            and not _floating(step.moved[0], nowhere, made)
-        )
-        if k not in certain and (k not in chosen or step.keys & missing or lost):
-            missing |= step.keys
-            if step.gone is None:
-                nowhere.add(step.node)
-            continue
-        if step.gone is not None:
-            found.pop(step.gone, None)
-        if step.come is not None:
-            found[step.come] = step.node
+    for step in steps:
+        if isinstance(step, Entry):
+            if step.gone is not None:
+                found.pop(step.gone, None)
+            if step.come is not None:
+                found[step.come] = step.node
     return found
-
-
-def _entry(steps: Sequence[Step], k: int) -> Entry:
-    step = steps[k]
-    assert isinstance(step, Entry)
-    return step
-
-
-def _makings(steps: Sequence[Step], entries: Sequence[int]) -> dict[int, tuple[int, int]]:
-    """Return for every node the step that made it, and the node of the folder in which."""
-    made = {}
-    for k in entries:
-        step = _entry(steps, k)
-        if step.gone is None and step.come is not None:
-            made[step.node] = k, step.come[0]
-    return made
-
-
-def _floating(node: int, missing: set[int], made: Mapping[int, tuple[int, int]]) -> list[int]:
-    """Return which of the missing folders a folder was made in, itself among them."""
-    above = []
-    while node != ROOT:
-        if node in missing:
-            above.append(node)
-        node = made[node][1]
-    return above
 
 
 def _left(steps: Sequence[Step], choice: np.random.Generator | None) -> dict[int, bytes]:
@@ -400,13 +304,13 @@ def cases_on(folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Ca
             yield place, make(name, place)
 
 
-def replay(folder: Path, case: Case, *, moments: int, each: int, again: int, seed: int) -> Lost:
+def replay(folder: Path, case: Case, *, moments: int, again: int, seed: int) -> Lost:
     """Record a command, and look at states that a loss of power may leave.
 
     Args:
         folder: holds everything that the command reads and writes.
         case: the command.
-        moments: see `losses`, and so `each`.
+        moments: see `losses`.
         again: states in which the command is given again, chosen at random.
         seed: seed of the moments, of what is left of unsynced files, and of the choice.
     """
@@ -419,7 +323,7 @@ def replay(folder: Path, case: Case, *, moments: int, each: int, again: int, see
     assert done.returncode == 0, done.stderr
     expected, after = case.files(), case.version()
     assert before != after
-    states = list(losses(trace, choice, moments=moments, each=each))
+    states = list(losses(trace, choice, moments=moments))
     chosen = set(choice.permutation(len(states))[:again].tolist())
     troubles, steps = [], len(trace.steps) - trace.first
     for number, (count, disk) in enumerate(states):
@@ -496,11 +400,6 @@ def _of_session(
     return Case(name, arguments, version, files, before)
 
 
-def _ingest(name: str, place: Path) -> Case:
-    session, manifest = place / "flown.session", write_flight(place, seconds=0.3).manifest
-    return _of_session(name, session, ["ingest", manifest, "-o", session])
-
-
 def _ingest_again(name: str, place: Path) -> Case:
     session, flight = place / "flown.session", write_flight(place, seconds=0.3)
 
@@ -533,19 +432,6 @@ def _detect(name: str, place: Path) -> Case:
     return replace(made, whole=False)
 
 
-def _report(name: str, place: Path) -> Case:
-    session = _ingested(place)
-    succeeds("reconstruct", session, "--method", "robust")
-    before = partial(succeeds, "report", session, "--video", "none")
-    return _of_session(name, session, ["report", session], before)
-
-
-def _replan(name: str, place: Path) -> Case:
-    session = _ingested(place, 1.5)
-    succeeds("reconstruct", session, "--method", "robust")
-    return _of_session(name, session, ["replan-compare", session])
-
-
 def _export(name: str, place: Path) -> Case:
     session, target = _ingested(place), place / "exported"
     succeeds("reconstruct", session, "--method", "robust")
@@ -567,22 +453,12 @@ def _simulate(name: str, place: Path) -> Case:
     return Case(name, ["simulate", scenario, "-o", target], partial(_made, target), files, before)
 
 
-def _study(name: str, place: Path) -> Case:
-    target = place / "studied"
-    files = partial(_files_beside, target)
-    return Case(name, ["study", *SMALL_STUDY, "-o", target], partial(_made, target), files)
-
-
 _CASES: Mapping[str, Callable[[str, Path], Case]] = {
-    "ingest": _ingest,
     "ingest again": _ingest_again,
     "reconstruct": _reconstruct,
     "detect": _detect,
-    "replan-compare": _replan,
-    "report": _report,
     "export": _export,
     "simulate": _simulate,
-    "study": _study,
 }
 
 
@@ -591,7 +467,7 @@ def print_replays(names: Sequence[str], *, moments: int, seed: int) -> int:
     found = []
     with tempfile.TemporaryDirectory() as place:
         for folder, case in cases_on(Path(place), names):
-            lost = replay(folder, case, moments=moments, each=2, again=moments // 2, seed=seed)
+            lost = replay(folder, case, moments=moments, again=moments // 2, seed=seed)
             found.append(lost)
             print(  # noqa: T201
                 f"{lost.case}: {lost.states} states after {lost.steps} steps, {lost.run_again} of them run"
