@@ -42,7 +42,7 @@ test: setup
 QUICK := session drafting geometry planning $(addprefix formats/,calibrations common keypoint_files poses skeletons)
 
 check: lint
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" $(addprefix tests/,$(QUICK))
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not slow and not long" $(addprefix tests/,$(QUICK))
 
 lint: setup
 	$(BIN)/ruff format --check .
@@ -70,6 +70,7 @@ fuzz: setup
 	$(BIN)/python -m tests.fuzz --crafted
 	$(BIN)/python -m tests.kills --kills 50
 	$(BIN)/python -m tests.kills --power
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m long
 
 # The wheel in an empty environment.
 wheel:

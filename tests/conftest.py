@@ -1,6 +1,6 @@
 """Settings and fixtures of all tests.
 
-Hypothesis has no deadlines here, and uses the same examples every time, except with the profile `explore`:
+Hypothesis has no deadlines here, and uses the same few examples every time, but for the profile `explore`:
 
 HYPOTHESIS_PROFILE=explore make test
 """
@@ -18,7 +18,7 @@ from hypothesis import settings
 import pipelines  # noqa: F401  # before numpy, as commands do: linear algebra on one thread
 
 # A shared machine is sometimes slow, so only the tests about time check times.
-settings.register_profile("repeatable", deadline=None, derandomize=True)
+settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=30)
 settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 

@@ -80,6 +80,15 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     made.close()
 
 
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """Start a scheduler with a worker in a thread of this process; return its address."""
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as made:
+        yield str(made.scheduler_address)
+
+
 def flights_and_single_runs(folder: Path, detector: str) -> tuple[list[Path], list[dict[str, str]]]:
     """Write a flight with keypoints and one with videos, and return the results of single runs on copies.
 
@@ -102,7 +111,7 @@ def flights_and_single_runs(folder: Path, detector: str) -> tuple[list[Path], li
 
 
 def test_blocks_of_a_flight_make_the_same_bytes_here_on_processes_and_on_a_cluster(
-    tmp_path: Path, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (detection, follow):
         monkeypatch.setattr(module, "BLOCK", 10)
@@ -123,7 +132,7 @@ def test_blocks_of_a_flight_make_the_same_bytes_here_on_processes_and_on_a_clust
 
     expected = found(here)
     assert found(processes, workers=2) == expected
-    with connected(cluster.address) as client:
+    with connected(scheduler) as client:
         executor = client.get_executor(pure=False)
         assert found(there, executor=executor) == expected
         with locked(apart) as session:  # backgrounds without keypoints
@@ -132,7 +141,7 @@ def test_blocks_of_a_flight_make_the_same_bytes_here_on_processes_and_on_a_clust
 
 
 def test_segments_of_a_long_flight_on_a_cluster_make_the_bytes_of_one_process(
-    tmp_path: Path, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in {"LENGTH_S": 1.0, "OVERLAP_S": 0.5, "_BLENDED_NS": 300_000_000}.items():
         monkeypatch.setattr(segments, name, value)
@@ -142,12 +151,12 @@ def test_segments_of_a_long_flight_on_a_cluster_make_the_bytes_of_one_process(
     shutil.copytree(here, there)
     settings = ReconstructSettings(method="robust")
     assert len(reconstruct(here, settings, workers=1).metrics["segments"]) == 2
-    with connected(cluster.address) as client:
+    with connected(scheduler) as client:
         reconstruct(there, settings, executor=client.get_executor(pure=False))
     assert content(there / "reconstruct") == content(here / "reconstruct")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_cluster_makes_the_bytes_of_single_runs_and_a_killed_worker_loses_nothing(
     tmp_path: Path, cluster: Cluster
 ) -> None:

@@ -40,7 +40,7 @@ FIRST_MM = 150.0
 """People of 67 px: keypoints of BlazePose are off by some 3 px of 26 mm, points of two views by more."""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_arms_are_filmed_and_a_detector_looks_at_them(tmp_path: Path) -> None:
     session = session_of(tmp_path, SHORT)
     done = compare(session, *SMALL, "--json")

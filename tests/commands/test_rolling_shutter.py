@@ -29,7 +29,7 @@ drones:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_detections_count_at_the_time_of_their_rows(tmp_path: Path) -> None:
     """A readout that is not stated moves exact keypoints by 52 mm, twice the detector's own error.
 

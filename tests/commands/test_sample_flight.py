@@ -20,15 +20,18 @@ SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
 LEGS = ("left_knee", "right_knee", "left_ankle", "right_ankle")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("detector", "most_mm", "advised"), [("blazepose", 45, 1), ("blazepose-heavy", 36, 0)]
+    ("detector", "most_mm", "advised"),
+    [
+        pytest.param("blazepose", 45, 1, marks=pytest.mark.slow),
+        pytest.param("blazepose-heavy", 36, 0, marks=pytest.mark.long),
+    ],
 )
 def test_the_detector_and_true_poses_give_the_skeleton(
     tmp_path: Path, detector: str, most_mm: float, advised: int
 ) -> None:
     """Allow 45 or 36 mm at 95 %: half of it is the detector's different definition of hips and shoulders."""
-    session, said = reconstructed(tmp_path, detector, "--pictures", "::6")
+    session, said = reconstructed(tmp_path, detector, "--pictures", "::12")
     metrics: dict[str, Any] = read_json(session / "reconstruct" / "metrics.json")
     assert metrics["mpjpe_mm"] < most_mm
     assert metrics["reconstructed_share"] > 0.95
@@ -45,7 +48,7 @@ def test_the_detector_and_true_poses_give_the_skeleton(
     assert page.count(f">{detector}, ") == 2  # in the row of each camera
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_leg_is_taken_for_the_other(tmp_path: Path) -> None:
     """Check that no leg is swapped, as BlazePose does in 8 of drone1's first 110 pictures from the side.
 

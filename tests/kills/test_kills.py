@@ -14,7 +14,7 @@ from tests.synthetic.flights import write_flight
 SEED, KILLS = 7, 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_and_run_again_the_bytes_are_those_of_an_undisturbed_run(tmp_path: Path) -> None:
     manifest = write_flight(tmp_path, seconds=0.5).manifest
     ingested, session = tmp_path / "a.session", tmp_path / "b.session"
