@@ -42,8 +42,7 @@ from benchmarks import detectors, gimbals, people
 from benchmarks.corpus.drawn import DrawnFlight, Given, Poses, kept_in_place_of_pictures
 from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, flights
 from benchmarks.results import fixed, keep, markdown_table
-from pipelines.detect import detect
-from pipelines.follow import Following
+from pipelines.detect import Following, detect
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.joint_angles import ANGLES, joint_angles
 from pipelines.geometry.metrics import measure
@@ -267,7 +266,7 @@ def measure_draw(
         )
         with (
             kept_in_place_of_pictures(flight, first.detector),
-            patch("pipelines.attempt.find_clocks", find_once),
+            patch("pipelines.reconstruct.find_clocks", find_once),
         ):
             with locked(session) as writable:
                 detect(writable, detector=first.detector)
@@ -279,7 +278,7 @@ def measure_draw(
                 settings = ReconstructSettings(**method, people=1, detector=first.detector)
                 began_s = time.process_time()
                 try:
-                    with nullcontext() if timed else patch("pipelines.attempt.doubts_of", _no_doubts):
+                    with nullcontext() if timed else patch("pipelines.reconstruct.doubts_of", _no_doubts):
                         reconstruct(session, settings)
                 except DataError as error:
                     yield case, Outcome(error=str(error))

@@ -28,8 +28,7 @@ from benchmarks.corpus.drawn import DrawnFlight, Given, kept_in_place_of_picture
 from benchmarks.corpus.stored import DETECTORS, HALVES, Flight, Half, flights
 from benchmarks.results import fixed, keep, markdown_table
 from pipelines.check import check
-from pipelines.detect import detect
-from pipelines.follow import Following
+from pipelines.detect import Following, detect
 from pipelines.ingest import ingest
 from pipelines.session.description import Doubt
 from pipelines.session.stages import locked
@@ -89,7 +88,7 @@ def tried(own: Described, mistake: Mistake, right: float) -> Verdict | None:
     named = first is not None and first["code"] in mistake.codes
     after, why = None, ""
     if first is not None and named and with_remedy(manifest, first["remedy"]):
-        with patch("pipelines.attempt.doubts_of", lambda *_, **__: []):  # only the error is looked at
+        with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):  # only the error is looked at
             after, _, why = measured(manifest, compared)
     mended = after is not None and after <= 1.1 * right
     counts = error is None or error > 1.2 * right

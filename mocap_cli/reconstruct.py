@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from pipelines.reconstruct import Reconstructed, ReconstructSettings
 
 GONE = {
+    "--strict": "`mocap check SESSION --strict` does it",
     "--refine-cameras": "--method auto does it",
     "--pixel-noise": "it is estimated from the keypoints",
     "--min-confidence": "keypoints below 0.3 are not used",
@@ -154,17 +155,15 @@ _settings_options = grouped(
     type=click.IntRange(1, 256),
     default=lambda: os.cpu_count() or 1,
     show_default="all cores",
-    help="Threads, or processes for the segments of a long flight; the result does not depend on them.",
+    help="Threads and processes; the result does not depend on them.",
 )
 @scheduler_option("Give the pictures, and a long flight, to the Dask cluster there, in parts.")
-@click.option("--strict", is_flag=True, help="Refuse a flight with a doubt (see `mocap check`).")
 @force_option
 @output_options
 def reconstruct_command(
     session: Path,
     output: Path | None,
     settings: ReconstructSettings,
-    strict: bool,
     workers: int,
     scheduler: str | None,
     force: bool,
@@ -184,7 +183,6 @@ def reconstruct_command(
         result = reconstruct(
             session,
             settings,
-            strict=strict,
             workers=workers,
             executor=client and client.get_executor(pure=False),
             force=force,

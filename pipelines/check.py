@@ -3,32 +3,32 @@
 A flight that was not ingested yet is read into a temporary session. Where no keypoints are known, the
 detector looks at a few seconds in the middle of the flight, in a temporary copy: a check changes no session.
 The backgrounds of these pictures are followed, too: only they tell that all cameras' clocks are alike wrong.
-A long flight is checked in the segments in which it would be reconstructed: a doubt is the flight's if half
-of them have it, and a warning otherwise.
 """
 
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from pipelines.attempt import chosen_detections, find_people
-from pipelines.detect import DETECT, cameras_to_detect, detect
-from pipelines.follow import BACKGROUND, Following, cameras_to_follow
+from pipelines.detect import (
+    BACKGROUND,
+    DETECT,
+    Following,
+    cameras_to_detect,
+    cameras_to_follow,
+    detect,
+)
 from pipelines.ingest import ingest
+from pipelines.reconstruct import chosen_detections, find_people
 from pipelines.reconstruction.background_tracks import Followed, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
-from pipelines.reconstruction.loading import common_joints, load_cameras, load_time_base
+from pipelines.reconstruction.loading import load_cameras
 from pipelines.reconstruction.observations import Camera
-from pipelines.reconstruction.segments import divided, doubts_of_flight
 from pipelines.session.description import Description, Doubt, read_description
-from pipelines.session.errors import NoViewsError
-from pipelines.session.memory import return_freed_arrays, return_unused
+from pipelines.session.memory import return_freed_arrays
 from pipelines.session.people import logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Session, StageRecord, WritableSession, copy_session, locked, open_session
-from pipelines.session.tables import Span
 
 LOOK_S = 8.0
 """Seconds in the middle of a flight that the detector looks at."""
@@ -91,24 +91,8 @@ def _checked(
     folder = session.folder
     description = read_description(folder)
     detected, pictures = _detected(session, description, detector, workers, progress)
-    _, t_ns = load_time_base(folder, description, detected, None)
-    keypoints = len(description.cameras) * len(common_joints(folder, description, detected))
-    segments = divided(t_ns, keypoints)
-    looked_at = partial(_doubts, session, description, detected, pose_noise)
-    if len(segments) < 2:
-        return Checked(looked_at(None), list(description.warnings), pictures)
-    found = []
-    for segment in segments:
-        try:
-            found.append(looked_at(segment.span_ns))
-        except NoViewsError as error:  # too few cameras have pictures there
-            nothing = error
-        return_unused()
-    if not found:
-        raise nothing
-    often, seldom = doubts_of_flight([[doubt.as_json() for doubt in doubts] for doubts in found])
-    warnings = [f"{count} of {len(found)} segments: {doubt.as_warning()}" for doubt, count, _ in seldom]
-    return Checked(often, [*description.warnings, *warnings], pictures)
+    doubts = _doubts(session, description, detected, pose_noise)
+    return Checked(doubts, list(description.warnings), pictures)
 
 
 def _doubts(
@@ -116,9 +100,8 @@ def _doubts(
     description: Description,
     detected: StageRecord | None,
     pose_noise: str | None,
-    span_ns: Span | None,
 ) -> list[Doubt]:
-    """Doubt what cannot be right in a span of time, or in all the time."""
+    """Doubt what cannot be right."""
     folder = session.folder
     cameras, _ = load_cameras(
         folder,
@@ -126,9 +109,8 @@ def _doubts(
         detected,
         min_confidence=MIN_CONFIDENCE,
         pose_noise=pose_noise,
-        span_ns=span_ns,
     )
-    actors = logged_people(folder, description, span_ns)
+    actors = logged_people(folder, description)
     found, association, _ = find_people(cameras, description.pose_interpolation, actors)
     return doubts_of(
         folder,

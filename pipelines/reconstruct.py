@@ -1,53 +1,141 @@
 """Stage `reconstruct`: compute a skeleton, its status and its errors from keypoints in moving cameras.
 
-Detect people in the pictures and follow backgrounds where that was not done; reconstruct the flight at once
-(`attempt`) or, if it is long, segment by segment (`segmented`); doubt what cannot be right; store.
+Detect people in the pictures and follow backgrounds where that was not done; find clocks; correct cameras by
+background and ground; associate people; triangulate; estimate jointly; measure the errors; doubt what cannot
+be right; store. Nothing is filled or smoothed without an option for it: a joint that could not be measured is
+NaN with a status that gives the reason.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from pipelines.attempt import (
-    Attempt,
-    ReconstructionOutcome,
-    ReconstructSettings,
-    Source,
-    counts_of,
-    reconstruct_once,
-    refuse_doubted,
-    unused_cameras,
-    write_attempt,
+from pipelines.detect import Following, cameras_to_follow, detect, hints_from, hints_of
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.noise import PoseErrors
+from pipelines.geometry.triangulation import STATUS, Method, Triangulation, Views
+from pipelines.keypoints.association import Association, associate
+from pipelines.keypoints.calibration import measured_for, read_calibration
+from pipelines.keypoints.no_people import Ground, Surroundings, level_of
+from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
+from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras
+from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
+from pipelines.reconstruction.clocks import (
+    MIN_SIGMAS_TO_MOVE,
+    OFFSET_TO_FIND_S,
+    QUESTIONED_SIGMA_S,
+    FoundClocks,
+    is_wrong,
 )
-from pipelines.detect import detect, hints_from, hints_of
-from pipelines.follow import Following, cameras_to_follow
-from pipelines.geometry.triangulation import STATUS
-from pipelines.keypoints.calibration import measured_for
-from pipelines.reconstruction.finishing import smoother
-from pipelines.reconstruction.loading import common_joints, load_time_base
-from pipelines.reconstruction.results import gait_of, write_figures
-from pipelines.reconstruction.segments import divided
-from pipelines.reconstruction.solving import noise_text
+from pipelines.reconstruction.doubts.diagnosis import doubts_of, doubts_of_clocks
+from pipelines.reconstruction.doubts.scene import GroundOfMap
+from pipelines.reconstruction.doubts.turning import common_offset
+from pipelines.reconstruction.finishing import finish, smoother
+from pipelines.reconstruction.ground import bind_positions
+from pipelines.reconstruction.loading import (
+    is_time_unknown,
+    load_cameras,
+    load_clock_sigma,
+    load_pose_errors,
+    load_truth,
+    source_of_pose_noise,
+    with_reference,
+)
+from pipelines.reconstruction.observations import (
+    Camera,
+    Candidates,
+    Observations,
+    candidates,
+    observe,
+    on_sides,
+    readout_of,
+    time_base,
+)
+from pipelines.reconstruction.refining import (
+    RefinedFlight,
+    RobustFlight,
+    doubted_people,
+    find_clocks,
+    find_wrong_clocks,
+    refine_flight,
+    shifted,
+)
+from pipelines.reconstruction.results import (
+    angles_parts,
+    assess,
+    camera_poses_table,
+    gait_of,
+    method_used,
+    of_people,
+    people_warnings,
+    skeleton_parts,
+    write_figures,
+)
+from pipelines.reconstruction.solving import (
+    are_calibrated,
+    noise_text,
+    ray_sigma,
+    refused_people,
+    solver_for,
+    views_with_noise,
+)
 from pipelines.reconstruction.trials import PoseDisturbance, disturbed, summary_of_trials
-from pipelines.segmented import by_segments, stated_segments
-from pipelines.session.description import Description, Doubt, assumptions_as_warnings, read_description
+from pipelines.session.description import (
+    Description,
+    Doubt,
+    Interpolation,
+    assumptions_as_warnings,
+    read_description,
+)
 from pipelines.session.errors import DataError
+from pipelines.session.maps import each_map
 from pipelines.session.memory import Waiting, return_freed_arrays
+from pipelines.session.people import LoggedActor, logged_people, true_joints_at
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.stages import Run, Stage, StageRecord, WritableSession, locked
+from pipelines.session.records import JointMotion
+from pipelines.session.stages import Stage, StageRecord, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of
+from pipelines.session.tables import ANGLES, CAMERA_POSES, GAIT, SKELETON, join_tables, write_table
 
-__all__ = ["RECONSTRUCT", "ReconstructSettings", "Reconstructed", "reconstruct"]
+if TYPE_CHECKING:
+    import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=28)
+RECONSTRUCT = Stage("reconstruct", revision=29)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
+# Detectors place joints in sharp pictures of this size to about three pixels.
+PIXEL_SIGMA_PX = 3.0
+
+
+@dataclass(frozen=True)
+class ReconstructSettings:
+    """Settings that determine the result, in addition to the session itself."""
+
+    method: Method | Literal["refined", "auto"] = "auto"
+    rate_hz: float | None = None
+    people: int | Literal["auto"] | None = None  # None: `auto` if several were logged by name, else 1
+    min_confidence: float = 0.3
+    pose_noise: str | None = None
+    detector: str = "blazepose"  # for cameras with pictures and without keypoints
+    every: int = 1  # of their pictures
+    start_s: float | None = None  # since the flight's first picture: span of pictures for the detector
+    end_s: float | None = None
+    fill_s: float | None = None  # the longest gap that is filled
+    smooth: str | None = None  # as `finishing.smoother` reads it
+    refine_cameras: Literal["background"] | None = None  # before the triangulation; `auto` does it unasked
+    disturb_poses: str | None = None  # errors added to the logged poses, as `PoseDisturbance.parse` reads it
+
+    @property
+    def asks_background(self) -> bool:
+        """True if moving cameras with pictures have their poses corrected by their backgrounds."""
+        return self.method == "auto" or self.refine_cameras == "background"
 
 
 @dataclass(frozen=True)
@@ -64,7 +152,6 @@ def reconstruct(
     folder: Path,
     settings: ReconstructSettings | None = None,
     *,
-    strict: bool = False,
     workers: int = 1,
     executor: Executor | None = None,
     force: bool = False,
@@ -75,16 +162,16 @@ def reconstruct(
     Args:
         folder: the session.
         settings: the settings that determine the result.
-        strict: refuse a flight that is doubted.
         workers: the number of processes and threads; the result does not depend on it.
-        executor: works on the pictures and segments instead; neither does the result depend on that.
+        executor: works on the pictures and on windows of a long flight instead; neither does the result
+            depend on that.
         force: run it again even if nothing changed, and the detection too.
         progress: receives the progress.
 
     Raises:
-        DataError: the session cannot be used, one of its tables or the pictures were changed, nothing could
-            be reconstructed (the message gives the counts of the reasons, and the mistake that explains
-            them), or the flight is doubted and `strict`.
+        DataError: the session cannot be used, one of its tables or the pictures were changed, or nothing
+            could be reconstructed (the message gives the counts of the reasons, and the mistake that explains
+            them).
         BusyError: another process writes the session.
     """
     settings = settings or ReconstructSettings()
@@ -103,78 +190,62 @@ def reconstruct(
         if following is not None:
             background, left_out = _finished(following, settings, workers, executor, progress)
         measured = measured_for(detected.settings["detector"]) if detected else None
-        base, t_ns = load_time_base(folder, description, detected, settings.rate_hz)
-        keypoints = len(description.cameras) * len(common_joints(folder, description, detected))
-        segments = divided(t_ns, keypoints) if disturbance is None else []
         run = session.begin(
             RECONSTRUCT,
-            settings=_stated(settings, detected) | stated_segments(segments),
+            # The detector's name is that of the detection, without the paths of model files.
+            settings=asdict(settings) | {"detector": detected.settings["detector"] if detected else None},
             inputs=_inputs(ingested, detected, background, measured),
             force=force,
         )
         if run.finished:
             metrics = read_json(folder / "reconstruct" / "metrics.json")
-            refuse_doubted(folder, metrics["doubts"], strict=strict)
             return Reconstructed(folder, run.record, metrics, skipped=True)
 
-        source = Source(folder, description, settings, detected, background is not None, left_out)
-        if len(segments) > 1:
-            outcome = by_segments(run, source, segments, base, workers, executor, strict, progress)
-        else:
-            outcome = _at_once(run.folder, source, disturbance, workers, strict, progress)
-        record = run.publish(
-            counts=outcome.counts,
-            warnings=[
-                *(doubt.as_warning() for doubt in outcome.doubts),
-                *assumptions_as_warnings(description.assumptions),
-                *_hint_warnings(description, ingested, detected),
-                *outcome.warnings,
-            ],
-        )
-        _note_replaced(run, progress)
-    return Reconstructed(folder, record, outcome.metrics, skipped=False)
-
-
-def _at_once(
-    place: Path,
-    source: Source,
-    disturbance: PoseDisturbance | None,
-    workers: int,
-    strict: bool,
-    progress: Progress,
-) -> ReconstructionOutcome:
-    """Reconstruct a flight as a whole, with so many trials of pose errors, and write it into a folder."""
-    folder, settings = source.folder, source.settings
-    trials = 1 if disturbance is None else disturbance.trials
-    progress.start("Reconstructing", 1 + 3 * trials)
-    loaded = source.load(Waiting(place))
-    cameras, warnings = loaded.cameras, list(loaded.warnings)
-    progress.advance()
-    attempts = (
-        reconstruct_once(
-            loaded.flight,
-            disturbed(cameras, disturbance.models, disturbance.seed, trial) if disturbance else cameras,
+        trials = 1 if disturbance is None else disturbance.trials
+        progress.start("Reconstructing", 1 + 3 * trials)
+        flight = load_flight(
+            folder,
+            description,
             settings,
-            workers,
-            progress,
+            detected,
+            left_out if background is None else None,
+            Waiting(run.folder),
+            workers=workers,
+            executor=executor,
         )
-        for trial in range(trials)
-    )
-    stored = next(attempts)
-    doubts = source.doubts(loaded, stored)
-    _refuse_nothing(folder, stored, doubts)
-    gait, walks = gait_of(stored.observations, stored.result)
-    metrics = stored.metrics | {"gait": walks, "doubts": [doubt.as_json() for doubt in doubts]}
-    refuse_doubted(folder, metrics["doubts"], strict=strict)
-    if disturbance is not None:
-        every = [metrics, *(attempt.metrics for attempt in attempts)]
-        metrics = metrics | {"trials": summary_of_trials(every, disturbance.text, disturbance.seed)}
-        warnings.append(_disturbance_warning(disturbance))
-    metrics = jsonable(metrics)
-    write_attempt(place, stored, gait)
-    metrics = write_figures(place, metrics)
-    warnings += [*stored.warnings, *unused_cameras(cameras, stored.result)]
-    return ReconstructionOutcome(metrics, doubts, counts_of(metrics, stored, loaded.swaps), warnings)
+        progress.advance()
+        attempts = (
+            reconstruct_once(
+                flight,
+                disturbed(flight.cameras, disturbance.models, disturbance.seed, trial)
+                if disturbance
+                else flight.cameras,
+                progress,
+            )
+            for trial in range(trials)
+        )
+        stored = next(attempts)
+        doubts = _doubts(flight, stored)
+        _refuse_nothing(folder, stored, doubts)
+        gait, walks = gait_of(stored.observations, stored.result)
+        metrics = stored.metrics | {"gait": walks, "doubts": [doubt.as_json() for doubt in doubts]}
+        warnings = [
+            *(doubt.as_warning() for doubt in doubts),
+            *assumptions_as_warnings(description.assumptions),
+            *_hint_warnings(description, ingested, detected),
+            *flight.warnings,
+        ]
+        if disturbance is not None:
+            every = [metrics, *(attempt.metrics for attempt in attempts)]
+            metrics |= {"trials": summary_of_trials(every, disturbance.text, disturbance.seed)}
+            warnings.append(_disturbance_warning(disturbance))
+        _write_tables(run.folder, stored, gait)
+        metrics = write_figures(run.folder, jsonable(metrics))
+        warnings += [*stored.warnings, *_unused_cameras(flight.cameras, stored.result)]
+        record = run.publish(counts=_counts(metrics, stored, flight.swaps), warnings=warnings)
+        for name, (before, now) in run.replaces.items():
+            progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
+    return Reconstructed(folder, record, metrics, skipped=False)
 
 
 def _detected(
@@ -210,11 +281,6 @@ def _detected(
     if detected is None and settings.every > 1:
         progress.note("every camera came with keypoints: --pictures says nothing about them")
     return detected
-
-
-def _stated(settings: ReconstructSettings, detected: StageRecord | None) -> dict[str, object]:
-    """Return the settings; the detector's name is that of the detection, without the paths of model files."""
-    return asdict(settings) | {"detector": detected.settings["detector"] if detected else None}
 
 
 def _inputs(
@@ -258,12 +324,6 @@ def _disturbance_warning(disturbance: PoseDisturbance) -> str:
     )
 
 
-def _note_replaced(run: Run, progress: Progress) -> None:
-    """Report the changed settings of a replaced reconstruction."""
-    for name, (before, now) in run.replaces.items():
-        progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
-
-
 def _following(
     session: WritableSession, description: Description, settings: ReconstructSettings, force: bool
 ) -> tuple[Following | None, str | None]:
@@ -274,9 +334,7 @@ def _following(
         span_s = (settings.start_s, settings.end_s)
         return Following(session, every=settings.every, span_s=span_s, force=force), None
     except DataError as error:
-        if settings.refine_cameras is not None:
-            raise
-        return None, f"{Path(error.source).name} {error.problem}"
+        return None, _reason(error, settings)
 
 
 def _finished(
@@ -290,9 +348,14 @@ def _finished(
     try:
         return following.finish(workers=workers, executor=executor, progress=progress), None
     except DataError as error:
-        if settings.refine_cameras is not None:
-            raise
-        return None, f"{Path(error.source).name} {error.problem}"
+        return None, _reason(error, settings)
+
+
+def _reason(error: DataError, settings: ReconstructSettings) -> str:
+    """Return why `auto` goes without backgrounds; raise the error where somebody asked for them."""
+    if settings.refine_cameras is not None:
+        raise error
+    return f"{Path(error.source).name} {error.problem}"
 
 
 def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> None:
@@ -310,3 +373,525 @@ def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> 
         *(remedies or ["check calibration, clocks and poses, or state another pose noise with --pose-noise"]),
         code="nothing-reconstructed",
     )
+
+
+def _write_tables(folder: Path, attempt: Attempt, gait: pd.DataFrame) -> None:
+    """Write skeleton, angles, gait, and the poses of cameras that are not those of the log."""
+    observations, views, result = attempt.observations, attempt.views, attempt.result
+    join_tables(folder / "skeleton.parquet", skeleton_parts(observations, result), SKELETON)
+    join_tables(folder / "angles.parquet", angles_parts(observations, views, result), ANGLES)
+    write_table(folder / "gait.parquet", gait, GAIT)
+    if attempt.poses is not None:
+        write_table(folder / "cameras.parquet", attempt.poses, CAMERA_POSES)
+
+
+def _counts(metrics: Mapping[str, Any], attempt: Attempt, swaps: Mapping[str, object]) -> dict[str, object]:
+    """Count joints by status, undone swaps, filled and smoothed joints, and events of the association."""
+    events = ("views", "ambiguous", "switches", "refused", "resumed")
+    return {
+        **metrics["status_counts"],
+        "no_people": metrics["people"]["no_people"],
+        "association": {name: getattr(attempt.association, name).tolist() for name in events},
+        "left_right_swaps": {"undone_over_time": swaps, "between_views": attempt.between_views},
+        "filled": metrics["filled"],
+        "smoothing": metrics["smoothing"],
+    }
+
+
+def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
+    """Doubt what cannot be right in what was reconstructed."""
+    cameras = flight.cameras
+    if attempt.clocks is not None:
+        cameras = shifted(cameras, attempt.clocks.offset_s)
+    doubts = doubts_of(
+        flight.folder,
+        flight.description,
+        cameras,
+        chosen=chosen_detections(cameras, attempt.found, attempt.association),
+        followed=flight.followed,
+        pose_noise=flight.settings.pose_noise,
+    )
+    return [*doubts_of_clocks(flight.description, attempt.metrics.get("clocks_moved", {})), *doubts]
+
+
+def _unused_cameras(cameras: Sequence[Camera], result: Triangulation) -> list[str]:
+    """Write a warning for cameras without inliers: wrong place, wrong time, or another person."""
+    used = np.atleast_1d(result.inlier.any(axis=0))
+    return [
+        f"{camera.name}: none of its views was used"
+        for camera, any_used in zip(cameras, used, strict=True)
+        if not any_used
+    ]
+
+
+# --- the flight ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LoadedFlight:
+    """Data that all trials share."""
+
+    folder: Path
+    description: Description
+    settings: ReconstructSettings
+    cameras: list[Camera]
+    followed: Mapping[str, Followed | str]  # the backgrounds of the cameras that are refined by them
+    stills: Mapping[str, Stills]  # some pictures of cameras that are bound to each other by the ground
+    actors: list[LoggedActor]
+    ground: Ground | None
+    truth: JointMotion | None
+    warnings: list[str]
+    swaps: dict[str, dict[str, int]]  # of left and right that were undone over time, by camera
+    waiting: Waiting  # for large arrays of long flights
+    workers: int
+    executor: Executor | None
+
+    @property
+    def between(self) -> Interpolation:
+        """Rules for interpolating between logged poses."""
+        return self.description.pose_interpolation
+
+    def errors(self, cameras: Sequence[Camera]) -> list[PoseErrors | None]:
+        """Load the errors of each camera's log that were stated; None where nobody did."""
+        noise = self.settings.pose_noise
+        stated = [load_pose_errors(self.description, [camera], noise) for camera in cameras]
+        return [None if of is None else of[0] for of in stated]
+
+
+def load_flight(
+    folder: Path,
+    description: Description,
+    settings: ReconstructSettings,
+    detected: StageRecord | None,
+    left_out: str | None,
+    waiting: Waiting,
+    *,
+    workers: int,
+    executor: Executor | None,
+) -> LoadedFlight:
+    """Load cameras, logged people, backgrounds, ground and truth of a session.
+
+    Args:
+        left_out: the reason why no backgrounds were followed.
+
+    Raises:
+        DataError: see `load_cameras`; a table or map of the session is damaged.
+    """
+    measured = measured_for(detected.settings["detector"]) if detected else None
+    cameras, warnings = load_cameras(
+        folder,
+        description,
+        detected,
+        min_confidence=settings.min_confidence,
+        pose_noise=settings.pose_noise,
+        calibrated=read_calibration(measured).probabilities if measured else None,
+    )
+    cameras, swaps = _without_swaps(cameras)
+    cameras = waiting.put(cameras)
+    followed: dict[str, Followed | str] = {}
+    if settings.asks_background and cameras_to_follow(description):
+        for camera in cameras:
+            tracks = None if left_out or camera.static else load_tracks(folder, camera)
+            reason = "it stands still" if camera.static else left_out or "it came without pictures"
+            followed[camera.name] = tracks or reason
+    stills = {camera.name: load_stills(folder, camera) for camera in cameras if settings.method == "auto"}
+    actors = logged_people(folder, description)
+    return LoadedFlight(
+        folder,
+        description,
+        settings,
+        cameras,
+        followed,
+        {name: own for name, own in stills.items() if own is not None},
+        actors,
+        _ground(folder, description, actors),
+        waiting.put(load_truth(folder, description, cameras[0].detections.joints)),
+        warnings,
+        swaps,
+        waiting,
+        workers,
+        executor,
+    )
+
+
+def _ground(folder: Path, description: Description, actors: Sequence[LoggedActor]) -> Ground | None:
+    """Return the ground of the last map, else the level of the logged actor; None without either."""
+    if description.map is not None:
+        last = deque(each_map(folder), maxlen=1)
+        return GroundOfMap.of(last[0]).about if last else None
+    return level_of(actors[0].hips) if actors else None
+
+
+def _without_swaps(cameras: list[Camera]) -> tuple[list[Camera], dict[str, dict[str, int]]]:
+    """Undo left-right swaps over time, from the motion of joints in each camera; return also counts."""
+    mended, counts = [], {}
+    for camera in cameras:
+        detections, counts[camera.name] = undo_swaps_of_tracks(camera.detections, camera.frame_t_ns)
+        mended.append(replace(camera, detections=detections))
+    return mended, counts
+
+
+# --- the recipe ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Result of one reconstruction of the flight (one trial)."""
+
+    clocks: FoundClocks | None  # those that were found, of all cameras; None where all are held
+    observations: Observations
+    views: Views
+    result: Triangulation
+    found: Candidates
+    association: Association
+    between_views: dict[str, int]  # counts of left-right swaps, see `swaps_across_views`
+    metrics: dict[str, Any]
+    poses: pd.DataFrame | None  # of every picture, if they are not those of the log
+    warnings: list[str]
+
+
+def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Progress) -> Attempt:
+    """Find clocks, correct cameras by background and ground, triangulate, refine, and measure the errors.
+
+    Raises:
+        NoViewsError: no two cameras see anything at the same times.
+    """
+    description, settings = flight.description, flight.settings
+    clocks, clock_sigma_s, made = clocks_of(flight, cameras)
+    if clocks is not None:
+        cameras = shifted(cameras, clocks.offset_s)
+    logged = cameras
+    background: dict[str, Any] = {"background": None}
+    warnings: list[str] = []
+    if flight.followed:
+        errors = flight.errors(cameras)
+        cameras, background["background"], warnings = refine_cameras(
+            cameras, flight.followed, errors, between=flight.between
+        )
+        cameras = flight.waiting.put(cameras)
+    binding = None
+    if len(flight.stills) > 1:
+        binding = bind_positions(cameras, flight.followed, flight.stills, between=flight.between)
+        cameras, background["ground"] = binding.cameras, binding.entry
+    if made is None or cameras is not logged:
+        made = _triangulated(flight, cameras)
+    seen, views, solve = made.seen, made.views, made.solve
+    observations = seen.observations
+    progress.advance()
+    doubted = _doubted(made)
+    result = refused_people(made.result, observations, seen.anybody)
+    progress.advance()
+    refined = None
+    calibrated = settings.method == "auto" and are_calibrated(cameras, observations)
+    if settings.method in ("refined", "auto") and not calibrated:
+        refined = refine_flight(_robust_flight(flight, cameras, replace(made, result=result), clock_sigma_s))
+        observations, views = refined.observations, refined.views
+        result = refused_people(refined.result, observations, seen.anybody)
+        if refined.cameras is None:  # refinement rejected: fall back to `robust`, with its own loss
+            solve = solver_for("robust", cameras, observations, pixel_sigma=PIXEL_SIGMA_PX)
+            result = refused_people(solve(views), observations, seen.anybody)
+    if binding is not None:
+        result = replace(result, covariance=result.covariance + binding.common)
+    result, finished = finish(
+        observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)
+    )
+    flight.waiting.release()
+    truth = None if flight.truth is None else true_joints_at(flight.truth, observations.t_ns)
+    names = [camera.name for camera in cameras]
+    metrics = assess(
+        observations, views, result, cameras=names, method=settings.method, truth=truth, solve=solve
+    )
+    people = _people_seen(description, names, seen.association, doubted)
+    unseen = [description.names_of_people(k + 1)[k] for k in seen.association.unseen]
+    metrics |= of_people(people["names"], observations, result, truth)
+    readout = {
+        camera.name: readout_of(camera, seen.found, c, seen.association.choice[:, c])
+        for c, camera in enumerate(cameras)
+        if camera.intrinsics.readout_s
+    }
+    parts = background | (refined.metrics if refined else {}) | _clock_metrics(names, clocks, refined)
+    known = source_of_pose_noise(description, logged, settings.pose_noise)
+    progress.advance()
+    return Attempt(
+        clocks,
+        observations,
+        views,
+        result,
+        seen.found,
+        seen.association,
+        seen.between_views,
+        metrics
+        | finished
+        | {"people": people}
+        | ({"readout": readout} if readout else {})
+        | parts
+        | {"method_used": method_used(parts, cameras, known, settings.method)},
+        _poses_stored(cameras, refined, background["background"], flight.between),
+        [
+            *warnings,
+            *(refined.warnings if refined else []),
+            *seen.association.reasons,
+            *(f"nobody is seen near the log of {name}" for name in unseen),
+            *people_warnings(people),
+            *(
+                f"{name}: {counts['without_motion']} keypoints stand at the picture's time instead of their"
+                " row's: no neighbouring picture shows the person"
+                for name, counts in readout.items()
+                if counts["without_motion"]
+            ),
+        ],
+    )
+
+
+def clocks_of(
+    flight: LoadedFlight, cameras: list[Camera]
+) -> tuple[FoundClocks | None, Float, _Triangulated | None]:
+    """Estimate unknown clock offsets, and question stated ones.
+
+    Returns:
+        The clocks, None where all are held; their prior standard deviations [C], s, for later steps; and what
+        was triangulated with clocks that all were held.
+
+    A camera that turns has its clock from its background. The others are compared with these by the rays of
+    people, or with each other. An offset that all cameras share hardly changes these rays: if no camera's
+    start is stated and no background shows a clock by itself, it is estimated from all backgrounds together.
+    """
+    description, settings = flight.description, flight.settings
+    prior_s, stated = load_clock_sigma(description, cameras)
+    if settings.method == "refined":  # it finds the clocks of which the manifest says that they are off
+        return None, np.where(stated, with_reference(description, cameras, prior_s), 0.0), None
+    none, clocks, known = np.zeros(len(cameras)), None, np.zeros(len(cameras), dtype=np.bool_)
+    exact = (prior_s == 0) & (settings.method == "auto")
+    questioned_s = np.where(exact, QUESTIONED_SIGMA_S, prior_s)
+    if flight.followed and questioned_s.any():
+        offset_s, sigma_s = clocks_of_backgrounds(
+            cameras,
+            flight.followed,
+            flight.errors(cameras),
+            questioned_s,
+            exact,
+            between=flight.between,
+        )
+        wrong = exact & is_wrong(np.nan_to_num(offset_s), np.nan_to_num(sigma_s))
+        held = exact & ~wrong
+        known = np.isfinite(offset_s) & ~(held & (MIN_SIGMAS_TO_MOVE * sigma_s > OFFSET_TO_FIND_S))
+        moved = known & ~held
+        if moved.any():
+            by = {cameras[c].name: "background" for c in np.flatnonzero(wrong)}
+            offset_s, sigma_s = np.where(moved, [offset_s, sigma_s], 0.0)
+            clocks = FoundClocks(offset_s, sigma_s, none, wrong=by)
+            cameras, prior_s = shifted(cameras, clocks.offset_s), np.where(known, 0.0, prior_s)
+    prior_s = with_reference(description, cameras, prior_s)
+    made = None
+    if (exact & ~known).any():
+        made = _triangulated(flight, cameras)
+        robust = _robust_flight(flight, cameras, made, prior_s)
+        late = find_wrong_clocks(robust, exact & ~known, prior_s == 0, description.clock_reference)
+        if late.wrong:
+            cameras, made = shifted(cameras, late.offset_s), None
+            clocks = late if clocks is None else clocks.with_others(late)
+    if prior_s.any():
+        made = made or _triangulated(flight, cameras)
+        found = find_clocks(_robust_flight(flight, cameras, made, prior_s), stated)
+        cameras, prior_s = shifted(cameras, found.offset_s), found.prior_s
+        clocks = found if clocks is None else clocks.with_others(found)
+    unknown = not known.any() and is_time_unknown(description, cameras)
+    if settings.method == "auto" and unknown:
+        late_of_all = common_offset(cameras, flight.followed, flight.between)
+        if late_of_all is not None:
+            clocks = clocks or FoundClocks(none, none, none)
+            offset_s = clocks.offset_s + late_of_all.late_s
+            clocks = replace(clocks, offset_s=offset_s, common_sigma_s=late_of_all.sigma_s)
+    return clocks, prior_s, None if clocks is not None else made
+
+
+@dataclass(frozen=True)
+class _Triangulated:
+    """Observations, and what the method, or what it starts from, makes of them."""
+
+    seen: _Seen
+    views: Views
+    result: Triangulation
+    solve: Callable[[Views], Triangulation]
+
+
+def _triangulated(flight: LoadedFlight, cameras: list[Camera]) -> _Triangulated:
+    """Observe and triangulate by the method, or by what it starts from."""
+    seen = flight.waiting.put(_observe(flight, cameras))
+    flight.waiting.release()
+    views = views_with_noise(cameras, seen.observations, pixel_sigma=PIXEL_SIGMA_PX)
+    solve = solver_for(flight.settings.method, cameras, seen.observations, pixel_sigma=PIXEL_SIGMA_PX)
+    return _Triangulated(seen, views, flight.waiting.put(solve(views)), solve)
+
+
+def _doubted(made: _Triangulated) -> list[str]:
+    """Say of each person why they must not determine cameras and clocks; "" for those who do."""
+    seen = made.seen
+    return doubted_people(seen.observations, made.views, made.result, seen.association.doubts, PIXEL_SIGMA_PX)
+
+
+def _robust_flight(
+    flight: LoadedFlight, cameras: list[Camera], made: _Triangulated, clock_sigma_s: Float
+) -> RobustFlight:
+    """Collect what the refinement starts from."""
+    seen = made.seen
+    return RobustFlight(
+        cameras,
+        seen.found,
+        seen.association.choice,
+        seen.observations,
+        seen.sides,
+        made.views,
+        made.result,
+        prior=load_pose_errors(flight.description, cameras, flight.settings.pose_noise),
+        measured=any(camera.errors is not None for camera in cameras),
+        clock_sigma_s=clock_sigma_s,
+        pixel_sigma=PIXEL_SIGMA_PX,
+        between=flight.between,
+        workers=flight.workers,
+        executor=flight.executor,
+        trusted=np.array([not doubt for doubt in _doubted(made)]),
+        waiting=flight.waiting,
+    )
+
+
+def _clock_metrics(
+    names: Sequence[str], clocks: FoundClocks | None, refined: RefinedFlight | None
+) -> dict[str, Any]:
+    """Collect the clock offsets of all steps and their standard deviations; empty without unknown clocks."""
+    if clocks is None:
+        return {}
+    offset_s, sigma_s = clocks.offset_s, clocks.sigma_s
+    if refined is not None and refined.cameras is not None:
+        later, sigmas = (
+            np.array([refined.metrics[part][name] for name in names])
+            for part in ("clock_offsets_s", "clock_offset_sigmas_s")
+        )
+        offset_s = offset_s + later
+        sigma_s = sigmas if sigmas.any() else sigma_s  # else they were held
+    return replace(clocks, offset_s=offset_s, sigma_s=sigma_s).as_metrics(names)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """All detections, and their association with people."""
+
+    found: Candidates
+    association: Association
+    observations: Observations  # at the skeleton's times, on these sides
+    sides: Int64  # [T, P, J, C], see `on_sides`
+    between_views: dict[str, int]  # counts of left-right swaps, see `swaps_across_views`
+    anybody: Bool  # [T] True if any person was detected
+
+
+def _observe(flight: LoadedFlight, cameras: list[Camera]) -> _Seen:
+    """Associate people, interpolate their keypoints to common times, and correct left-right swaps."""
+    between, people = flight.between, flight.settings.people
+    found, association, sigma = find_people(
+        cameras,
+        between,
+        flight.actors,
+        people=people if isinstance(people, int) else None,
+        scene=Surroundings(flight.ground, np.array([camera.field for camera in cameras])),
+    )
+    base = time_base(cameras, flight.settings.rate_hz)
+    observations = observe(cameras, found, association.choice, base, between)
+    nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
+    anybody = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
+    sides, between_views = _agreeing_sides(observations, sigma[nearest])
+    rays, confidence = on_sides(observations.rays, observations.confidence, sides)
+    observations = replace(observations, rays=rays, confidence=confidence)
+    return _Seen(found, association, observations, sides, between_views, anybody)
+
+
+def find_people(
+    cameras: list[Camera],
+    between: Interpolation,
+    actors: Sequence[LoggedActor],
+    *,
+    people: int | None = 1,
+    scene: Surroundings | None = None,
+) -> tuple[Candidates, Association, Float]:
+    """Collect all detections at common times, and associate them with people; those logged come first.
+
+    With a scene, things that are no people by the ground and by the other cameras are left out.
+
+    The last result is the uncertainty of rays, see `ray_sigma`.
+    """
+    found = candidates(cameras, between)
+    sigma = ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=PIXEL_SIGMA_PX)
+    association = associate(
+        (found.t_ns - found.t_ns[0]) / 1e9,
+        found.rays,
+        found.confidence,
+        found.position,
+        found.rotation,
+        sigma,
+        actors=np.stack([actor.hips_at(found.t_ns) for actor in actors], axis=1) if actors else None,
+        people=people,
+        scene=scene,
+    )
+    return found, association, sigma
+
+
+def chosen_detections(cameras: Sequence[Camera], found: Candidates, association: Association) -> list[Int64]:
+    """Return for every picture [F] of each camera which of its detections the actor is; -1 for none."""
+    chosen = []
+    for index, camera in enumerate(cameras):
+        of_frame = np.full(len(camera.frame_t_ns), -1, dtype=np.int64)
+        frame, choice = found.frame[:, index], association.choice[:, index, 0]
+        used = (frame >= 0) & (choice >= 0)
+        of_frame[frame[used]] = choice[used]
+        chosen.append(of_frame)
+    return chosen
+
+
+def _people_seen(
+    description: Description, cameras: Sequence[str], association: Association, doubted: Sequence[str]
+) -> dict[str, Any]:
+    """Count people seen at once, times with more people than requested, and unused detections."""
+    asked = association.choice.shape[2]
+    names = description.names_of_people(asked)
+    return {
+        "asked": asked,
+        "phantoms": association.phantoms,
+        "names": names,
+        "doubted": {name: cause for name, cause in zip(names, doubted, strict=True) if cause},
+        "seen_at_once": int(association.people.max(initial=0)),
+        "times": len(association.people),
+        "times_with_more": int((association.people > asked).sum()),
+        "detections_not_used": dict(zip(cameras, association.unused.tolist(), strict=True)),
+        "no_people": {
+            cause: {name: count for name, count in zip(cameras, of.tolist(), strict=True) if count}
+            for cause, of in association.no_people.items()
+        },
+    }
+
+
+def _poses_stored(
+    cameras: list[Camera],
+    refined: RefinedFlight | None,
+    background: Mapping[str, Any] | None,
+    between: Interpolation,
+) -> pd.DataFrame | None:
+    """Make a table of the poses of all pictures, for the cameras whose poses are not those of the log."""
+    if refined is not None and refined.cameras is not None:
+        return refined.cameras
+    corrected = [camera for camera in cameras if background is not None and background[camera.name]["used"]]
+    return camera_poses_table(corrected, between) if corrected else None
+
+
+def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, dict[str, int]]:
+    """Find the sides [T, P, J, C] on which most cameras agree; see `swaps_across_views`."""
+    sides = np.empty(observations.confidence.shape, dtype=np.int64)
+    total: Counter[str] = Counter()
+    for person in range(observations.rays.shape[1]):
+        sides[:, person], counts = swaps_across_views(
+            observations.rays[:, person],
+            observations.position,
+            observations.rotation,
+            sigma,
+            observations.joints,
+        )
+        total.update(counts)
+    return sides, dict(sorted(total.items()))

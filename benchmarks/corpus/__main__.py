@@ -25,8 +25,7 @@ from benchmarks.corpus.stored import (
     write_backgrounds,
     write_keypoints,
 )
-from pipelines.detect import detect
-from pipelines.follow import Following
+from pipelines.detect import Following, detect
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import tracks_path
 from pipelines.session.stages import StageRecord, locked

@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.corpus.stored import RECORDED, Flight, read_backgrounds, read_keypoints
 from pipelines.detect import Block as DetectorBlock
-from pipelines.follow import FollowedBlock
+from pipelines.detect import FollowedBlock
 from pipelines.formats.calibrations.camera_matrices import write_camera_info
 from pipelines.formats.maps.octomap import write_octomap
 from pipelines.formats.scenes.mcap_writing import Ros2Recording
@@ -252,6 +252,6 @@ def kept_in_place_of_pictures(flight: Flight, detector: str) -> Iterator[None]:
     with (
         patch("pipelines.detect._produce", detect),
         patch("pipelines.detect.hashes_of_models", lambda _: {}),
-        patch("pipelines.follow.follow_block", follow),
+        patch("pipelines.detect.follow_block", follow),
     ):
         yield

@@ -15,7 +15,7 @@ import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -331,6 +331,14 @@ class PoseErrors:
     """True if white errors have the logged covariance of each pose; `white` is then its level."""
     assumed: bool = False
     """True if nobody knows the level of the constant errors, and `processes` have a wide one."""
+
+    def later(self, elapsed_s: float) -> PoseErrors:
+        """Return the same errors some seconds after the start, when a drift has a size already."""
+        processes = (
+            replace(each, sigma0=float(np.hypot(each.sigma0, each.rate * np.sqrt(elapsed_s))))
+            for each in self.processes
+        )
+        return replace(self, processes=tuple(processes))
 
     def white_with_stray(self, knot_s: float) -> Float:
         """Compute the standard deviation [2] (m, rad) of white errors, with slow errors between knots."""

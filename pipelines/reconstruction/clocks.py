@@ -91,11 +91,6 @@ class FoundClocks:
     common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
     wrong: Mapping[str, str] = field(default_factory=dict)  # evidence against each stated clock that is moved
 
-    @property
-    def moves(self) -> bool:
-        """True if the estimate moves a clock, or could."""
-        return bool(self.offset_s.any() or self.sigma_s.any())
-
     def with_others(self, found: FoundClocks) -> FoundClocks:
         """Add the offsets that keypoints show for cameras that are already shifted by these.
 
@@ -104,15 +99,6 @@ class FoundClocks:
         sigma_s = np.where(self.sigma_s > 0, self.sigma_s, found.sigma_s)
         wrong = {**found.wrong, **self.wrong}
         return replace(found, offset_s=self.offset_s + found.offset_s, sigma_s=sigma_s, wrong=wrong)
-
-    def of(self, names: Sequence[str], chosen: Sequence[int]) -> FoundClocks:
-        """Take the clocks of some of the cameras, by their numbers."""
-        kept = {names[number] for number in chosen}
-        wrong = {name: by for name, by in self.wrong.items() if name in kept}
-        rows = np.array(chosen, dtype=np.int64)
-        return FoundClocks(
-            self.offset_s[rows], self.sigma_s[rows], self.prior_s[rows], self.common_sigma_s, wrong
-        )
 
     def as_metrics(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
         """Return what metrics.json says of the clocks of all cameras."""
@@ -138,47 +124,6 @@ def is_wrong(offset_s: Float, sigma_s: Float) -> Bool:
     """Test if the evidence against stated clocks is strong, and their offsets are large enough to matter."""
     least_s = np.maximum(MIN_SIGMAS_TO_MOVE * sigma_s, MIN_OFFSET_TO_MOVE_S)
     return np.asarray(np.abs(offset_s) > least_s)
-
-
-def agreed_clocks(names: Sequence[str], found: Sequence[Mapping[str, Mapping[str, Any]]]) -> FoundClocks:
-    """Agree on the clocks that some segments found.
-
-    Where the backgrounds of some segments determine clocks, the other segments do not count: they compare
-    clocks with a reference that may be late itself. For clocks that no background determines, and for stated
-    ones, most segments decide whether a clock is held. Of the offsets that were found, the median is taken,
-    with the median of their standard deviations: an offset that the whole flight shares is hardly surer.
-
-    Args:
-        names: of all C cameras.
-        found: of each segment `offset_s`, `sigma_s`, `prior_s`, and `wrong` for a stated clock by camera, and
-            `common_sigma_s` of "".
-    """
-    offset_s, sigma_s, prior_s = np.zeros((3, len(names)))
-    wrong: dict[str, str] = {}
-    found = [each for each in found if any(map(_is_by_background, each.values()))] or found
-    for c, name in enumerate(names):
-        own = [each[name] for each in found if name in each]
-        moved = [each for each in own if each["prior_s"] > 0]
-        by_background = list(filter(_is_by_background, own))
-        against = [each for each in own if each.get("wrong")]
-        if against or all("wrong" in each for each in own):
-            own = against if 2 * len(against) > len(own) else []
-            if own:
-                wrong[name] = str(own[0]["wrong"])
-        elif by_background:
-            own = by_background
-        elif 2 * len(moved) > len(own):
-            prior_s[c] = max(each["prior_s"] for each in moved)
-            own = moved
-        if own:
-            offset_s[c] = np.median([each["offset_s"] for each in own])
-            sigma_s[c] = np.median([each["sigma_s"] for each in own])
-    common_s = float(np.median([each[""]["common_sigma_s"] for each in found])) if found else 0.0
-    return FoundClocks(offset_s, sigma_s, prior_s, common_s, wrong)
-
-
-def _is_by_background(clock: Mapping[str, Any]) -> bool:
-    return bool(clock.get("prior_s") == 0 and clock["sigma_s"] > 0 and "wrong" not in clock)
 
 
 def initial_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sigma_s: Float) -> Float:

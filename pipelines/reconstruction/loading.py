@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.noise import (
     UNKNOWN_SIGMA,
     NoiseModel,
@@ -18,31 +18,27 @@ from pipelines.geometry.noise import (
     errors_of_level,
     pose_errors,
 )
-from pipelines.reconstruction.background_tracks import rows_to_follow
 from pipelines.reconstruction.log_stretches import Mended, mend, said_stretches
-from pipelines.reconstruction.observations import Camera, regular_times
+from pipelines.reconstruction.observations import Camera
 from pipelines.session.camera_poses import stated_models, stated_noise
-from pipelines.session.description import CameraEntry, Description, Interpolation
-from pipelines.session.errors import DataError, NoViewsError
-from pipelines.session.records import JointMotion, Trajectory
+from pipelines.session.description import Description
+from pipelines.session.errors import DataError
+from pipelines.session.records import JointMotion
 from pipelines.session.stages import StageRecord
 from pipelines.session.tables import (
     FRAMES,
     KEYPOINTS,
-    LATEST_NS,
     POSES,
     TRUTH,
-    Span,
     detections_from,
     most_confident,
-    read_first,
     read_motion,
     read_table,
     trajectory_from,
 )
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 # More people in one picture are errors of the detector, and memory grows with their number.
 _MOST_PEOPLE = 12
@@ -83,7 +79,6 @@ def load_cameras(
     min_confidence: float,
     pose_noise: str | None,
     calibrated: Calibrated | None = None,
-    span_ns: Span | None = None,
 ) -> tuple[list[Camera], list[str]]:
     """Load every camera with keypoints; also return warnings.
 
@@ -95,7 +90,6 @@ def load_cameras(
         pose_noise: pose noise that replaces the flight's own, None to keep that.
         calibrated: function from the detector's raw confidences [N] of joints [N] to probabilities. Without
             it raw confidences are used; those of imported keypoints are never calibrated.
-        span_ns: only pictures of these times, and poses about them; cameras without any are left out.
 
     Raises:
         DataError: fewer than two cameras have keypoints, or they share no joint.
@@ -110,80 +104,10 @@ def load_cameras(
     cameras = []
     for name, source in sources.items():
         entry = description.cameras[name]
-        frames = _frames(folder, name, source, span_ns)
-        if not len(frames):
-            continue
-        camera = _load_camera(
-            folder, name, description, source, frames, joints, min_confidence, calibrated, span_ns, warnings
-        )
+        camera = _load_camera(folder, name, description, source, joints, min_confidence, calibrated, warnings)
         noise = stated_noise(name, entry, camera.trajectory, pose_noise)
         cameras.append(replace(camera, sigma=noise.sigma, covariance=noise.covariance))
-    if len(cameras) < 2:
-        raise NoViewsError(
-            folder, "has pictures of one camera or none", "a skeleton needs two cameras at least"
-        )
     return cameras, warnings
-
-
-def load_time_base(
-    folder: Path, description: Description, detected: StageRecord | None, rate_hz: float | None
-) -> tuple[str, Int64]:
-    """Choose the times of the skeleton as `observations.time_base` does, without loading keypoints.
-
-    Returns:
-        The camera whose pictures they are (the first, with a rate), and the times.
-    """
-    sources = _keypoints(folder, description, detected)
-    stamps = {
-        name: _frames(folder, name, source, None)["t_ns"].to_numpy(np.int64)
-        for name, source in sources.items()
-    }
-    stamps = {name: t_ns for name, t_ns in stamps.items() if len(t_ns)}
-    if not stamps:
-        return "", np.empty(0, np.int64)
-    name = max(stamps, key=lambda each: len(stamps[each]))
-    if rate_hz is None:
-        return name, stamps[name]
-    first, last = (
-        min(int(t_ns[0]) for t_ns in stamps.values()),
-        max(int(t_ns[-1]) for t_ns in stamps.values()),
-    )
-    return name, regular_times(first, last, rate_hz)
-
-
-def _frames(folder: Path, name: str, source: _Keypoints, span_ns: Span | None) -> pd.DataFrame:
-    """Load the frames of a camera that were looked at; within a span, from one that is followed."""
-    frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES).iloc[source.looked_at]
-    if span_ns is None:
-        return frames
-    t_ns = frames["t_ns"].to_numpy(np.int64)
-    first, stop = np.searchsorted(t_ns, (span_ns[0], span_ns[1] + 1)).tolist()
-    followed = rows_to_follow(t_ns)
-    step = int(followed[1]) if len(followed) > 1 else 1
-    return frames.iloc[first - first % step : stop].copy()
-
-
-def _logged(path: Path, entry: CameraEntry, between: Interpolation, span_ns: Span | None) -> Trajectory:
-    """Load the poses of a log; within a span, those about it and the first, with which a drift begins."""
-    if span_ns is None or entry.poses.static:
-        return trajectory_from(read_table(path, POSES))
-    import pandas as pd
-
-    reach_ns = between.max_gap_ns + between.max_extrapolation_ns
-    about = (max(span_ns[0] - reach_ns, -LATEST_NS), min(span_ns[1] + reach_ns, LATEST_NS))
-    first, within = read_first(path, POSES), read_table(path, POSES, about)
-    if len(within) and len(first) and first["t_ns"].iloc[0] < within["t_ns"].iloc[0]:
-        within = pd.concat([first, within], ignore_index=True)
-    return trajectory_from(within if len(within) else first)
-
-
-def common_joints(folder: Path, description: Description, detected: StageRecord | None) -> tuple[str, ...]:
-    """List the joints of the skeleton.
-
-    Raises:
-        DataError: the cameras share no joint.
-    """
-    return _common_joints(folder, _keypoints(folder, description, detected))
 
 
 def _common_joints(folder: Path, sources: Mapping[str, _Keypoints]) -> tuple[str, ...]:
@@ -202,22 +126,17 @@ def _load_camera(
     name: str,
     description: Description,
     source: _Keypoints,
-    frames: pd.DataFrame,
     joints: tuple[str, ...],
     min_confidence: float,
     calibrated: Calibrated | None,
-    span_ns: Span | None,
     warnings: list[str],
 ) -> Camera:
     entry = description.cameras[name]
-    trajectory = _logged(
-        folder / "cameras" / name / "poses.parquet", entry, description.pose_interpolation, span_ns
-    )
+    frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES).iloc[source.looked_at]
+    trajectory = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
     mended = Mended(trajectory, None, 0, 0, 0, 0.0) if entry.poses.static else mend(trajectory)
     warnings += said_stretches(name, mended)
-    if span_ns is not None:
-        span_ns = int(frames["t_ns"].iloc[0]), int(frames["t_ns"].iloc[-1])
-    keypoints = read_table(source.table, KEYPOINTS, span_ns)
+    keypoints = read_table(source.table, KEYPOINTS)
     confident = keypoints[keypoints["confidence"] >= min_confidence]
     if calibrated is not None and entry.keypoints is None:
         raw, joint = confident["confidence"].to_numpy(np.float64), confident["joint"].to_numpy(str)
@@ -283,13 +202,8 @@ def _prior_of(models: Sequence[NoiseModel], camera: Camera) -> PoseErrors:
     A drift begins with the log, and has a size already in the first picture.
     """
     try:
-        errors = pose_errors(models)
         elapsed_s = max(float(camera.frame_t_ns[0] - camera.trajectory.t_ns[0]) / 1e9, 0.0)
-        processes = (
-            replace(process, sigma0=float(np.hypot(process.sigma0, process.rate * np.sqrt(elapsed_s))))
-            for process in errors.processes
-        )
-        return replace(errors, processes=tuple(processes))
+        return pose_errors(models).later(elapsed_s)
     except ValueError:
         level = np.array(UNKNOWN_SIGMA) if camera.sigma is None else np.median(camera.sigma, axis=0)
         return errors_of_level(level)
@@ -335,11 +249,6 @@ def is_time_unknown(description: Description, cameras: Sequence[Camera]) -> bool
     return all(clock.prior_sigma_s > 0 and clock.sigma_s == 0 and clock.start != "stated" for clock in clocks)
 
 
-def load_truth(
-    folder: Path, description: Description, joints: tuple[str, ...], span_ns: Span | None = None
-) -> JointMotion | None:
-    """Load the true joints, NaN for joints without truth; None if the session has no truth (in the span)."""
-    if not description.has_true_joints:
-        return None
-    motion = read_motion(folder / "truth.parquet", TRUTH, joints, span_ns)
-    return motion if len(motion.t_ns) or span_ns is None else None
+def load_truth(folder: Path, description: Description, joints: tuple[str, ...]) -> JointMotion | None:
+    """Load the true joints, NaN for joints without truth; None if the session has no truth."""
+    return read_motion(folder / "truth.parquet", TRUTH, joints) if description.has_true_joints else None

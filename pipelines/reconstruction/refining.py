@@ -7,7 +7,9 @@ are inliers and which joints are reconstructed. Positions and covariances are th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,6 +47,7 @@ from pipelines.reconstruction.refinement.problem import Sighting
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
 from pipelines.reconstruction.results import poses_table
 from pipelines.reconstruction.solving import pictures_of
+from pipelines.reconstruction.windows import Window, refine_in_windows, spread, windows_of
 from pipelines.session.description import Interpolation
 from pipelines.session.memory import Waiting
 from pipelines.session.people import bones_of
@@ -54,6 +57,8 @@ if TYPE_CHECKING:
 
 # The search for clock offsets uses at most so many times of the skeleton; more find no other offset.
 _SEARCHED = 300
+# In a long flight it uses more: means over `LASTING_S` need some times.
+_LONGEST_SEARCH_STEP_S = 0.5
 # Clocks are moved at most so often; offsets of 0.2 s took one to five times.
 _MOST_SHIFTS = 6
 # A clock is determined if its posterior sigma is below this share of its prior sigma.
@@ -84,10 +89,18 @@ class RobustFlight:
     clock_sigma_s: Float  # [C] prior standard deviation of each clock offset, 0 for a known clock
     pixel_sigma: float  # px, of a good keypoint
     between: Interpolation  # rules for interpolating between logged poses
-    threads: int  # see `refine`
+    workers: int  # see `refine_in_windows`
+    executor: Executor | None  # works on the windows instead
     trusted: Bool  # [P] people who determine cameras and clocks; the others are triangulated afterwards
     only_limbs: bool = False  # other joints are not refined
     waiting: Waiting | None = None  # where the arrays wait meanwhile
+
+    @cached_property
+    def windows(self) -> list[Window]:
+        """Windows of the flight; some of them to find clocks."""
+        _, people, joints, cameras = self.observations.confidence.shape
+        windows = windows_of(self.t_s, people * joints * cameras)
+        return spread(windows) if self.only_limbs else windows
 
     @property
     def limbs(self) -> Bool:
@@ -249,7 +262,8 @@ def _initial_clock_offsets_s(flight: RobustFlight) -> Float:
 def _views_at(flight: RobustFlight, moved: Bool) -> tuple[Callable[[float], Views], int]:
     """Return a function from a shift (s) of some clocks [C] to views at every k-th time, and k."""
     times = len(flight.observations.t_ns)
-    every = -(-times // _SEARCHED)
+    step_s = float(np.median(np.diff(flight.t_s))) if times > 1 else 1.0
+    every = max(min(-(-times // _SEARCHED), int(_LONGEST_SEARCH_STEP_S / step_s)), 1)
 
     def views_at(shift_s: float) -> Views:
         observed, views = _observe_with_offsets(flight, np.where(moved, shift_s, 0.0), every)
@@ -265,9 +279,14 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
     A picture is joined to the three times nearest to its stamp, which is not accurate for large offsets.
     Also, estimated levels of pose noise absorb part of a large offset. So the stamps are shifted by the
     estimated offsets, and the refinement is repeated until the remaining correction is small, or smaller than
-    its standard deviation.
+    its standard deviation. The clocks of a long flight are found in some of its windows.
     """
     started = _triangulate_with_offsets(flight, offset_s) if offset_s.any() else flight.result
+    if len(flight.windows) > 1 and flight.clock_sigma_s.any() and not flight.only_limbs:
+        settled, offset_s = _settle_clocks(replace(flight, only_limbs=True), offset_s)
+        held = replace(flight, clock_sigma_s=np.zeros_like(offset_s))
+        refined = _refine_with_offsets(held, offset_s, _triangulate_with_offsets(flight, offset_s))
+        return replace(refined, clock_sigma_s=settled.clock_sigma_s), offset_s
     for _ in range(1 + _MOST_SHIFTS):
         refined = _refine_with_offsets(flight, offset_s, started)
         offset_s = offset_s + refined.clock_offset_s
@@ -287,15 +306,17 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
     sightings = [_sighting(flight, c, camera) for c, camera in enumerate(cameras)]
     if flight.waiting is not None:
         flight.waiting.release()
-    return refine(
+    return refine_in_windows(
         flight.t_s,
         sightings,
         start.reshape(-1, people * joints, 3),
         rigid_pairs(flight.observations.joints, people),
         flight.prior,
         flight.clock_sigma_s,
+        windows=flight.windows,
         contested=not flight.measured,
-        threads=flight.threads,
+        workers=flight.workers,
+        executor=flight.executor,
     )
 
 

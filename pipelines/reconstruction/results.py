@@ -56,32 +56,6 @@ _UNMEASURED = dict.fromkeys(
 """Placeholder for errors without truth."""
 
 
-def of_times(
-    observations: Observations, views: Views, result: Triangulation, rows: slice
-) -> tuple[Observations, Views, Triangulation]:
-    """Return what belongs to some of the times, which are rows of `observations`."""
-    each = observations.confidence[0, ..., 0].size
-    start, stop, _ = rows.indices(len(observations.t_ns))
-    joint_frames = slice(start * each, stop * each)
-    some = ("t_ns", "rays", "confidence", "position", "rotation", "pose_sigma", "pose_covariance")
-    of_all = {name: getattr(observations, name) for name in some}
-    return (
-        replace(observations, **{name: value[rows] for name, value in of_all.items() if value is not None}),
-        replace(
-            views,
-            rays=views.rays[joint_frames],
-            weight=views.weight[joint_frames],
-            pose_index=views.pose_index[joint_frames] - start,
-            position=views.position[rows],
-            rotation=views.rotation[rows],
-            pose_sigma=views.pose_sigma[rows],
-        ),
-        replace(
-            result, **{field.name: getattr(result, field.name)[joint_frames] for field in fields(result)}
-        ),
-    )
-
-
 def assess(
     observations: Observations,
     views: Views,
@@ -284,6 +258,58 @@ def _leave_one_out(
     return figures
 
 
+# --- people --------------------------------------------------------------------------------------------
+
+_NO_BODY = {
+    "ground": "not on the ground",
+    "size": "not of a person's size",
+    "misfit": "seen at different places by different cameras",
+    "residual": "its views disagree more than those of the first person",
+    "same": "a second image of a person",
+    "bystander": "beyond the cameras and never in all of their pictures, a bystander",
+}
+_LEFT_OUT = {
+    "ground": "detections left out, because nobody of their size could stand on the ground there: {}",
+    "alone": "detections left out, because no other camera sees them although one shows every place"
+    " where they could stand: {}",
+    "kept": "nobody of their size could stand on the ground there, but this holds for the camera's most"
+    " confident person, too: the detections are kept, and the poses or the ground may be wrong: {}",
+}
+
+
+def people_warnings(people: Mapping[str, Any]) -> list[str]:
+    """Write warnings on things that are no people, unused detections, and more people than requested.
+
+    Args:
+        people: the counts that metrics.json has of people.
+    """
+    warnings = [
+        _LEFT_OUT[cause].format(", ".join(f"{name} {count}" for name, count in of.items()))
+        for cause, of in people["no_people"].items()
+        if of
+    ]
+    causes = ", ".join(f"{count} {_NO_BODY[cause]}" for cause, count in people["phantoms"].items())
+    if causes:
+        warnings.append(f"bodies that --persons auto left out: {causes}")
+    warnings += [
+        f"{name} may be nobody, or mixed up with others ({_NO_BODY[cause]}): cameras and clocks are corrected"
+        f" without {name}"
+        for name, cause in people["doubted"].items()
+    ]
+    unused = [f"{name} {count}" for name, count in people["detections_not_used"].items() if count]
+    if unused:
+        line = f"detections that belong to nobody reconstructed: {', '.join(unused)}"
+        if people["times_with_more"]:
+            line += (
+                f"; two cameras or more detect up to {people['seen_at_once']} at once, and more than"
+                f" {people['asked']} at {people['times_with_more']} of {people['times']} times: if these are"
+                f" people (detectors also take trees for them), --persons {people['seen_at_once']}"
+                " reconstructs them"
+            )
+        warnings.append(line)
+    return warnings
+
+
 # --- parts of the method -------------------------------------------------------------------------------
 
 
@@ -400,25 +426,33 @@ def _bones_table(bones: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame([{"bone": name, **of} for name, of in bones.items()], columns=BONES.names)
 
 
-def skeleton_table(observations: Observations, result: Triangulation) -> pd.DataFrame:
-    """Build the rows of `tables.SKELETON`: every joint of every person at every time."""
+# Tables are larger than their arrays, and are made of so many times at once.
+_TIMES_AT_ONCE = 8192
+
+
+def skeleton_parts(observations: Observations, result: Triangulation) -> Iterator[pd.DataFrame]:
+    """Yield the rows of `tables.SKELETON` in parts: every joint of every person at every time."""
     import pandas as pd
 
     times, people, joints, _ = observations.confidence.shape
-    used = np.where(result.inlier, result.residual_px, np.nan)
-    table = pd.DataFrame(
-        {
-            "t_ns": np.repeat(observations.t_ns, people * joints),
-            "person": np.tile(np.repeat(np.arange(people), joints), times),
-            "joint": np.tile(np.array(observations.joints, dtype=object), times * people),
-        }
-    )
-    table[["x", "y", "z"]] = result.points
-    table[list(POINT_COVARIANCE_COLUMNS)] = result.covariance[:, *np.triu_indices(3)]
-    table["views"] = result.views
-    table["reprojection_px"] = _row_mean(used)
-    table["status"] = np.array(STATUS, dtype=object)[result.status]
-    return table
+    names = np.array(observations.joints, dtype=object)
+    for start in range(0, times, _TIMES_AT_ONCE):
+        t_ns = observations.t_ns[start : start + _TIMES_AT_ONCE]
+        rows = slice(start * people * joints, (start + len(t_ns)) * people * joints)
+        table = pd.DataFrame(
+            {
+                "t_ns": np.repeat(t_ns, people * joints),
+                "person": np.tile(np.repeat(np.arange(people), joints), len(t_ns)),
+                "joint": np.tile(names, len(t_ns) * people),
+            }
+        )
+        table[["x", "y", "z"]] = result.points[rows]
+        table[list(POINT_COVARIANCE_COLUMNS)] = result.covariance[rows][:, *np.triu_indices(3)]
+        table["views"] = result.views[rows]
+        used = np.where(result.inlier[rows], result.residual_px[rows], np.nan)
+        table["reprojection_px"] = _row_mean(used)
+        table["status"] = np.array(STATUS, dtype=object)[result.status[rows]]
+        yield table
 
 
 _CORRELATED = {
@@ -435,8 +469,6 @@ It is below 1 because a detector misplaces a limb or the trunk as a whole, and l
 trunk take part. For the ankle it contains the offset of heel and toe from the sole. Chosen on the flights for
 tuning: about 97 % of the errors are inside two standard deviations (`python -m benchmarks.accuracy corpus`).
 """
-# Tables of angles are larger than the skeleton's arrays, and are made of so many times at once.
-_TIMES_AT_ONCE = 8192
 
 
 def angles_parts(observations: Observations, views: Views, result: Triangulation) -> Iterator[pd.DataFrame]:

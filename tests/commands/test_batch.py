@@ -21,13 +21,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pipelines import batch, follow
+from pipelines import batch
 from pipelines import detect as detection
 from pipelines.batch import BatchSettings, Job, Outcome, run_flight
-from pipelines.detect import detect
-from pipelines.follow import Following
+from pipelines.detect import Following, detect
 from pipelines.reconstruct import ReconstructSettings, reconstruct
-from pipelines.reconstruction import segments
+from pipelines.reconstruction import windows
 from pipelines.report import Reported
 from pipelines.reporting.page import FlightRow, render_flights
 from pipelines.session.errors import BusyError
@@ -113,9 +112,9 @@ def flights_and_single_runs(folder: Path, detector: str) -> tuple[list[Path], li
 def test_blocks_of_a_flight_make_the_same_bytes_here_on_processes_and_on_a_cluster(
     tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (detection, follow):
-        monkeypatch.setattr(module, "BLOCK", 10)
-        monkeypatch.setattr(module, "MIN_PICTURES_FOR_PROCESSES", 0)
+    monkeypatch.setattr(detection, "BLOCK", 10)
+    monkeypatch.setattr(detection, "MIN_PICTURES_FOR_PROCESSES", 0)
+    monkeypatch.setattr(detection, "MIN_FOLLOWED_FOR_PROCESSES", 0)
     manifest = write_spotted_flight(tmp_path, 25)
     here, processes, there, apart = (tmp_path / f"{name}.session" for name in "abcd")
     succeeds("ingest", manifest, "-o", here)
@@ -140,17 +139,17 @@ def test_blocks_of_a_flight_make_the_same_bytes_here_on_processes_and_on_a_clust
     assert content(apart / "background") == content(here / "background")
 
 
-def test_segments_of_a_long_flight_on_a_cluster_make_the_bytes_of_one_process(
+def test_windows_of_a_long_flight_on_a_cluster_make_the_bytes_of_one_process(
     tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, value in {"LENGTH_S": 1.0, "OVERLAP_S": 0.5, "_BLENDED_NS": 300_000_000}.items():
-        monkeypatch.setattr(segments, name, value)
+    for name, value in {"MAX_WINDOW_S": 1.0, "OVERLAP_S": 0.5, "BLENDED_S": 0.3}.items():
+        monkeypatch.setattr(windows, name, value)
     manifest = write_flight(tmp_path, seconds=1.8).manifest
     here, there = tmp_path / "here.session", tmp_path / "there.session"
     succeeds("ingest", manifest, "-o", here)
     shutil.copytree(here, there)
-    settings = ReconstructSettings(method="robust")
-    assert len(reconstruct(here, settings, workers=1).metrics["segments"]) == 2
+    settings = ReconstructSettings(method="refined")
+    reconstruct(here, settings, workers=1)
     with connected(scheduler) as client:
         reconstruct(there, settings, executor=client.get_executor(pure=False))
     assert content(there / "reconstruct") == content(here / "reconstruct")

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines import detect, follow
+from pipelines import detect
 from pipelines.export import export, load_recording
 from pipelines.film import film
 from pipelines.formats.videos.video import VideoReader
@@ -144,8 +144,7 @@ class Meddler(Silent):
 def test_nothing_is_kept_of_a_video_that_is_exchanged_while_it_is_looked_at(
     flight: Path, steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (detect, follow):
-        monkeypatch.setattr(module, "BLOCK", FRAMES // 2)
+    monkeypatch.setattr(detect, "BLOCK", FRAMES // 2)
     session, video = flight / "flight.session", flight / ("left.mp4" if steps < FRAMES else "right.mp4")
     settings = ReconstructSettings(detector=spot_detector(flight))
     reconstruct(session, settings)

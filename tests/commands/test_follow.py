@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines import follow
-from pipelines.follow import Following
+from pipelines import detect
+from pipelines.detect import Following
 from pipelines.geometry.arrays import Picture
 from pipelines.reconstruct import reconstruct
 from pipelines.reconstruction.background_tracks import load_stills, load_tracks
@@ -72,7 +72,7 @@ def test_auto_goes_on_without_a_video_that_is_exchanged_while_it_is_followed(
     session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing of it is kept: with the right video, the result is that of a flight where nothing happened."""
-    monkeypatch.setattr(follow, "BLOCK", 15)
+    monkeypatch.setattr(detect, "BLOCK", 15)
     reconstruct(session)
     expected = content(session)
     video = session.parent / "drone1.mp4"
@@ -88,7 +88,7 @@ def test_auto_goes_on_without_a_video_that_is_exchanged_while_it_is_followed(
 
 def test_blocks_share_a_picture_and_no_points(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Follow in blocks of 15 pictures: points move as the texture does, to some tenths of a pixel."""
-    monkeypatch.setattr(follow, "BLOCK", 15)
+    monkeypatch.setattr(detect, "BLOCK", 15)
     with locked(session) as writable:
         record = Following(writable).finish(workers=2)
     assert record.counts["cameras"]["drone1"]["pictures"] == FRAMES
