@@ -69,6 +69,7 @@ class ClockFit:
     residual_s: float  # scatter of the events about the line: 1.4826 times their median deviation
     events: int  # that were compared
     rejected: int  # of them, further than six times the scatter from the line
+    steps_s: tuple[float, ...] = ()  # of the other clock, taken out so that its last readings count
 
     def other_ns(self, t_ns: Int64) -> Int64:
         """Convert times of this clock to readings of the other; exact integers except for the drift."""

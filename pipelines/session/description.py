@@ -154,6 +154,7 @@ class LogClockEntry(Entry):
     residual_s: float  # scatter of the fixes
     events: int
     rejected: int
+    steps_s: tuple[float, ...] = ()  # of the receiver's time, taken out so that its last times count
 
 
 class OriginEntry(Entry):

@@ -206,7 +206,7 @@ def write_dataflash(
         log += [dataflash("ORGN", BOOT_NS // 1000, 1, 0, 0, 0), dataflash("ORGN", BOOT_NS // 1000, 0, *place)]
     for row, stamp_ns in enumerate(truth.t_ns.tolist()):
         since_ns = stamp_ns - int(truth.t_ns[0])
-        us = (BOOT_NS + since_ns - round(since_ns * drift_ppm * 1e-6)) // 1000
+        us = int(truth.boot_us[row]) - round(since_ns * drift_ppm * 1e-9)
         week, ms = divmod(stamp_ns // 1_000_000 + GPS_LEAP_S * 1000 - 315_964_800_000, 7 * 86_400_000)
         lat, lng = round(truth.latitude_deg[row] * 1e7), round(truth.longitude_deg[row] * 1e7)
         alt_cm = round(truth.altitude_m[row] * 100)
@@ -282,7 +282,7 @@ def write_tlog(
         messages: list[tuple[str, tuple[Any, ...]]] = [
             (
                 "SYSTEM_TIME",
-                ((int(truth.t_ns[0]) // 1000 + (ms * 1000 - int(truth.boot_us[0]))) * gps_time, ms),
+                ((int(truth.t_ns[row]) // 1000 + ms * 1000 - us) * gps_time, ms),
             ),
             ("GLOBAL_POSITION_INT", (ms, lat, lon, alt, round(up * 1000), 0, 0, 0, 0)),
             ("LOCAL_POSITION_NED", (ms, north, east, -up, 0, 0, 0)),

@@ -19,9 +19,12 @@ from numpy.typing import NDArray
 
 from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
+    Boots,
     attitude_track,
     damaged,
     describe_fit,
+    find_boots,
+    fit_gps_time,
     fixes_track,
     of_angles,
     on_gps_time,
@@ -33,7 +36,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     world_from_heading,
 )
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import RelativeTo, attitude_in_enu
 from pipelines.session.errors import DataError
@@ -86,8 +89,10 @@ class _MessageRows:
 
     name: str
     raw: NDArray[np.void]  # [N] a field for each column
+    places: Int64  # [N] in the file
     scales: Mapping[str, float]
     lost: int  # number of messages cut off at the end
+    boots: Boots | None = None
 
     def __len__(self) -> int:
         return len(self.raw)
@@ -116,15 +121,17 @@ class _MessageRows:
         return next((unit for unit in units if unit[0] in self), None)
 
     def t_ns(self) -> Int64:
-        """Return stamps [N] since boot; 0 without a time."""
+        """Return stamps [N] since the first boot; 0 without a time."""
         field, unit_ns = self.clock or ("", 0)
-        return self.integers(field) * unit_ns if field else np.zeros(len(self), np.int64)
+        boot_ns = self.integers(field) * unit_ns if field else np.zeros(len(self), np.int64)
+        return boot_ns if self.boots is None else self.boots.going_on(boot_ns, self.places)
 
     def of(self, instance: int, *columns: str) -> _MessageRows:
         """Keep the rows of one instance, by the first of `columns` that exists; all rows if none does."""
         for column in columns:
             if column in self:
-                return replace(self, raw=self.raw[self.integers(column) == instance])
+                which = self.integers(column) == instance
+                return replace(self, raw=self.raw[which], places=self.places[which])
         return self
 
 
@@ -153,6 +160,8 @@ class ArduPilotFormat:
             facts["gps_fixes"] = int(np.count_nonzero(gps.numbers("Status") >= _3D_FIX))
         if (fit := _gps_time(log)) is not None:
             facts["gps_time"] = describe_fit(fit)
+        if log.boots is not None and len(log.boots.places):
+            facts["restarts"] = len(log.boots.places)
         if lost := sum(rows.lost for rows in timed):
             facts["dropped: cut off"] = lost
         facts["topics"] = [f"{name} {count}" for name, count in sorted(log.counts.items())]
@@ -166,7 +175,7 @@ class ArduPilotFormat:
         """
         log = _DataFlash(path)
         dropped: dict[str, int] = {}
-        notes: list[str] = []
+        notes = [] if log.boots is None else log.boots.notes()
         fit = on_gps_time(path, _gps_time(log), choice.time, notes)
         body = _body(log, dropped)
         position = _position(log, choice, dropped, notes)
@@ -183,7 +192,8 @@ class ArduPilotFormat:
                 gps_ns = week * _WEEK_NS + ms * 1_000_000 + _GPS_EPOCH_NS
                 return np.unique(gps_ns - _leap_ns(gps_ns))
             if rows is not None:
-                return pictures_on_gps_time(path, rows.t_ns(), _gps_time(log), choice)
+                t_ns = rows.t_ns()
+                return pictures_on_gps_time(path, t_ns[t_ns > 0], _gps_time(log), choice)
         raise DataError(
             path, "holds no CAM or TRIG message", "take the times of frames otherwise", code="wrong-kind"
         )
@@ -287,15 +297,21 @@ def _mount(
 
 def _gps_time(log: _DataFlash) -> ClockFit | None:
     """Fit UTC to the time since boot, by the first receiver; None if it gives no time."""
-    rows = log.first(["GPS"], 0, "I")
+    boot_ns, utc_ns, _ = _utc(log.first(["GPS"], 0, "I"))
+    return fit_gps_time(boot_ns, utc_ns) if len(utc_ns) else None
+
+
+def _utc(rows: _MessageRows | None) -> tuple[Int64, Int64, Int64]:
+    """Return times since boot, UTC, and places in the file [N] of a receiver's 3D fixes."""
     names = (("GWk", "GMS"), ("Week", "TimeMS"))  # today's, and those until 2014
     stated = next((pair for pair in names if rows is not None and all(name in rows for name in pair)), None)
     if rows is None or stated is None:
-        return None
+        none = np.zeros(0, np.int64)
+        return none, none, none
     week, ms = (rows.integers(name) for name in stated)
     known = (rows.numbers("Status") >= _3D_FIX) & (week > 0)
     gps_ns = week[known] * _WEEK_NS + ms[known] * 1_000_000 + _GPS_EPOCH_NS
-    return fit_clock(rows.t_ns()[known], gps_ns - _leap_ns(gps_ns))
+    return rows.t_ns()[known], gps_ns - _leap_ns(gps_ns), rows.places[known]
 
 
 def _leap_ns(gps_ns: Int64) -> Int64:
@@ -323,6 +339,11 @@ class _DataFlash:
             name: np.asarray(reader.offsets[f.type], np.int64) for name, f in self._formats.items()
         }
         self.counts = {name: len(places) for name, places in self._places.items() if len(places)}
+        self.boots: Boots | None = None
+        frequent = self.first(["ATT", "GPS", "POS"])
+        if frequent is not None:
+            clock = _utc(self.first(["GPS"], 0, "I"))
+            self.boots = find_boots(frequent.t_ns(), frequent.places, *clock)
 
     def first(self, names: Sequence[str], instance: int = 0, *columns: str) -> _MessageRows | None:
         """Return the messages of the first of `names` that has any of the instance; None without any."""
@@ -352,7 +373,7 @@ class _DataFlash:
             else np.zeros(0, layout)
         )
         scales = {column: _LETTERS[c][1] for column, c in zip(columns, letters, strict=True)}
-        return _MessageRows(name, raw, scales, int(np.count_nonzero(~whole)))
+        return _MessageRows(name, raw, places[whole], scales, int(np.count_nonzero(~whole)), self.boots)
 
 
 def _index(path: Path) -> Any:

@@ -32,6 +32,7 @@ from pipelines.formats.common.rows import NORM_TOLERANCE
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     describe_fit,
+    fit_gps_time,
     of_angles,
     on_gps_time,
     on_one_clock,
@@ -39,7 +40,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     turned_as_stated,
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.geometry.poses import conjugate, interpolate_points, multiply, rotate
 from pipelines.session.errors import DataError
@@ -139,7 +140,7 @@ class GoProFormat:
         if (flown := track.stream("GLPI", 4)) is not None:
             rows = flown[1]
             system = track.stream("SYST", 2)
-            fit = fit_clock(_ns(system[1][:, 0]), _ns(system[1][:, 1])) if system is not None else None
+            fit = fit_gps_time(_ns(system[1][:, 0]), _ns(system[1][:, 1])) if system is not None else None
             position = position_track(
                 path, "GLPI", _ns(rows[:, 0]), rows[:, 1:4], dropped, on_earth=True, height="sea level"
             )
@@ -269,7 +270,7 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
         at_ns, rows = found
         fixed = rows[:, 8] >= _FIX_3D
         utc_ns = (rows[:, 5] + _DAYS_TO_2000).astype(np.int64) * 86_400_000_000_000 + _ns(rows[:, 6])
-        fit = fit_clock(at_ns[fixed], utc_ns[fixed]) if fixed.any() else None
+        fit = fit_gps_time(at_ns[fixed], utc_ns[fixed]) if fixed.any() else None
         return at_ns, rows[:, :3], np.asarray(fixed), fit
     if (found := track.stream("GPS5", 3)) is None:
         known = ", ".join(sorted(set(track.rows) & set(_KNOWN))) or "none that is known"
@@ -278,7 +279,7 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
     at_ns, rows = found
     fixed = np.concatenate([each[:, 0] for each in track.rows["fixed"]]) >= _FIX_3D
     clock = track.stream("GPSU", 1)
-    fit = fit_clock(clock[0], _ns(clock[1][:, 0])) if clock is not None else None
+    fit = fit_gps_time(clock[0], _ns(clock[1][:, 0])) if clock is not None else None
     return at_ns, rows[:, :3], np.asarray(fixed), fit
 
 

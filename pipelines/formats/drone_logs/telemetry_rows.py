@@ -1,7 +1,7 @@
 """Cleaning of telemetry rows into tracks: one set of rules for every drone's log."""
 
 from collections.abc import Iterable, Mapping, MutableMapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -10,7 +10,7 @@ import numpy as np
 
 from pipelines.formats.common.rows import NORM_TOLERANCE, kept_rows
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.clocks import ClockFit
+from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place, enu_from_geodetic, place_at
 from pipelines.geometry.mounting import RelativeTo, attitude_from_angles, attitude_in_enu, level_heading
 from pipelines.geometry.poses import (
@@ -27,6 +27,14 @@ from pipelines.session.storage import code_of
 _UNEVEN_S = 0.5
 # Receivers on drones report at least once a second.
 _HELD_NS = 1_000_000_000
+# The time since boot goes back by more only if the autopilot was restarted; a second link is late by less.
+_RESTART_NS = 1_000_000_000
+# The medians of so many messages before and after a restart or a step say how large it is.
+_AROUND = 20
+# A step of GPS time stays for this many fixes.
+_LEAST_FIXES = 5
+# Beside such a step, fixes come with smaller differences in delay.
+_STEADY_NS = 200_000_000
 # Fewer intervals between changes do not show if they are regular.
 _LEAST_REFRESHES = 4
 
@@ -203,6 +211,89 @@ def on_one_clock(
     )
 
 
+@dataclass(frozen=True)
+class Boots:
+    """Parts of a log between restarts of the autopilot, at which its time since boot falls."""
+
+    places: Int64  # [B - 1] of the first frequent message of each later part, as bytes or by another clock
+    before: Int64  # [B - 1] of the last one before it
+    before_ns: Int64  # [B - 1] its time since boot
+    shifts_ns: Int64  # [B] by which the times of each part go on in those of the first
+    known: Bool  # [B] False where no other clock tells the shift
+
+    def parts(self, boot_ns: Int64, places: Int64) -> Int64:
+        """Return the part of each message [N]; between two frequent messages, by its time since boot."""
+        part = np.searchsorted(self.places, places, side="right")
+        for k, (last, first, last_ns) in enumerate(
+            zip(self.before, self.places, self.before_ns, strict=True), start=1
+        ):
+            part[(places > last) & (places < first) & (boot_ns < last_ns - _RESTART_NS // 2)] = k
+        return part
+
+    def going_on(self, boot_ns: Int64, places: Int64) -> Int64:
+        """Return the times [N] of messages since the first boot; 0 where they are not known."""
+        part = self.parts(boot_ns, places)
+        return np.where(self.known[part], boot_ns + self.shifts_ns[part], 0)
+
+    def notes(self) -> list[str]:
+        """Describe the restarts, in one line or none."""
+        if not len(self.places):
+            return []
+        lost = int(np.count_nonzero(~self.known))
+        told = f"the autopilot was restarted {len(self.places)} times; its times go on by another clock"
+        return [f"{told}, but for {lost} parts, of which no clock tells when they began" if lost else told]
+
+
+def find_boots(
+    boot_ns: Int64, places: Int64, clock_boot_ns: Int64, clock_ns: Int64, clock_places: Int64
+) -> Boots:
+    """Find the restarts of an autopilot.
+
+    Args:
+        boot_ns: [N] times since boot of frequent messages, in the order of the log.
+        places: [N] where they are.
+        clock_boot_ns: [M] the same of messages that also state the time of another clock.
+        clock_ns: [M] that time.
+        clock_places: [M] where they are.
+    """
+    starts = []
+    for k in (np.flatnonzero(np.diff(boot_ns) < -_RESTART_NS) + 1).tolist():
+        before, after = boot_ns[max(0, k - _AROUND) : k], boot_ns[k : k + _AROUND]
+        if (np.diff(before) >= 0).all() and (np.diff(after) >= 0).all() and after.max() < before.max():
+            starts.append(k)
+    firsts = np.array(starts, np.intp)
+    count = len(starts) + 1
+    shifts_ns, known = np.zeros(count, np.int64), np.ones(count, np.bool_)
+    found = Boots(places[firsts], places[firsts - 1], boot_ns[firsts - 1], shifts_ns, known)
+    part = found.parts(clock_boot_ns, clock_places)
+    lead_ns = clock_ns - clock_boot_ns
+    for k in range(1, count):
+        before, after = lead_ns[part == k - 1][-_AROUND:], lead_ns[part == k][:_AROUND]
+        known[k] = known[k - 1] and len(before) > 0 and len(after) > 0
+        if known[k]:
+            middle_ns = int(before[0])  # differences are exact as float64, times are not
+            shift_ns = float(np.median(after - middle_ns) - np.median(before - middle_ns))
+            shifts_ns[k] = shifts_ns[k - 1] + round(shift_ns)
+    return found
+
+
+def fit_gps_time(boot_ns: Int64, utc_ns: Int64) -> ClockFit | None:
+    """Fit UTC by a receiver to the time since boot, without steps of whole seconds.
+
+    A receiver learns of leap seconds in flight. So its last times count, and earlier ones are moved.
+    """
+    lead_ns = utc_ns - boot_ns
+    leaps_s = np.rint(np.diff(lead_ns) / 1e9).astype(np.int64)
+    mended, steps_s = utc_ns.copy(), []
+    for k in np.flatnonzero(leaps_s).tolist():
+        sides = lead_ns[: k + 1][-_LEAST_FIXES:], lead_ns[k + 1 :][:_LEAST_FIXES] - leaps_s[k] * 1_000_000_000
+        if min(map(len, sides)) == _LEAST_FIXES and np.ptp(np.concatenate(sides)) < _STEADY_NS:
+            mended[: k + 1] += leaps_s[k] * 1_000_000_000
+            steps_s.append(float(leaps_s[k]))
+    fit = fit_clock(boot_ns, mended)
+    return fit and replace(fit, steps_s=tuple(steps_s))
+
+
 def on_gps_time(
     source: Path, fit: ClockFit | None, wanted: Literal["gps", "boot"] | None, notes: list[str]
 ) -> ClockFit | None:
@@ -263,7 +354,9 @@ def damaged(path: Path, error: Exception) -> DataError:
 
 def describe_fit(fit: ClockFit) -> str:
     """Describe clock offset and drift between a log's own clock and GPS time, in words."""
-    return (
+    steps = ", ".join(f"{step_s:+g} s" for step_s in fit.steps_s)
+    stepped = f"GPS time steps by {steps}: the last times count (else clock.offset_s); " if steps else ""
+    return stepped + (
         f"GPS time is {fit.offset_ns / 1e9:.3f} s ahead of its clock, drifting {fit.drift_ppm:.1f} ppm"
         f" (+- {min(fit.drift_sigma_ppm, 1e6):.2g}; {fit.events} fixes, scatter"
         f" {fit.residual_s * 1e3:.1f} ms)"

@@ -13,7 +13,7 @@ import mmap
 import re
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,8 +22,11 @@ import numpy as np
 
 from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
+    Boots,
     damaged,
     describe_fit,
+    find_boots,
+    fit_gps_time,
     of_angles,
     on_gps_time,
     pictures_on_gps_time,
@@ -43,10 +46,6 @@ _MARKS = re.compile(rb"[\xfd\xfe]")
 _MOST_WRONG = (
     200_000  # marks without a packet, and ten for each packet: 25 MB of chance in a log full of damage
 )
-# The time since boot goes back by more only if the vehicle was restarted; a second link is late by less.
-_RESTART_MS = 1000
-# The medians of so many messages before and after a restart say how long it took.
-_AROUND_RESTART = 20
 _SIGNED, _SIGNATURE = 1, 13  # flag in a packet of MAVLink 2, and the bytes of its signature
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 # Larger stamps do not fit int64 in nanoseconds.
@@ -102,8 +101,10 @@ class TlogFormat:
         for system in log.vehicles()[:1]:
             if (fit := log.gps_time(system)) is not None:
                 facts["gps_time"] = describe_fit(fit)
-            if restarts := log.restarts(system):
-                facts["restarts"] = [f"at {at_s:.1f} s" for _, at_s in restarts]
+            if len(restarts := log.boots(system).places):
+                facts["restarts"] = [
+                    f"at {(place - log.first_us) / 1e6:.1f} s" for place in restarts.tolist()
+                ]
         facts["packets_missing"] = log.lost
         facts |= {f"dropped: {cause}": count for cause, count in log.dropped.items()}
         facts["topics"] = [f"{name} {count}" for name, count in sorted(log.named().items())]
@@ -122,11 +123,7 @@ class TlogFormat:
         log = _read(path)
         system = _vehicle(path, log, choice.instance, _POSITIONS)
         notes = [f"took vehicle {system}"] if len(log.vehicles()) > 1 else []
-        notes += [
-            f"the vehicle was restarted at {at_s:.1f} s: the {count} attitudes after it, and all else,"
-            " go on by GPS time, or by the station's clock"
-            for count, at_s in log.restarts(system)
-        ]
+        notes += log.boots(system).notes()
         fit, station = log.gps_time(system), None
         if fit is None and choice.time is None:
             fit = station = log.station_time(system)
@@ -298,6 +295,7 @@ class _Packets:
     payloads: dict[tuple[int, int], bytearray] = field(default_factory=dict)  # by system and message
     stamps_us: dict[tuple[int, int], array[int]] = field(default_factory=dict)
     dropped: dict[str, int] = field(default_factory=dict)
+    _boots: dict[int, Boots] = field(default_factory=dict)  # by system
 
     def named(self) -> dict[str, int]:
         """Count the messages by name."""
@@ -317,38 +315,39 @@ class _Packets:
         rows = list(kind.unpacker.iter_unpack(bytes(self.payloads.get((system, message), b""))))
         columns = zip(*rows, strict=True) if rows else ((),) * len(names)
         found = {name: np.array(column) for name, column in zip(names, columns, strict=True)}
-        if rows and "time_boot_ms" in found:
-            stamps_ms = np.array(self.stamps_us[system, message], dtype=np.int64) // 1000
-            shifts_ms = self._shifts_by_utc(system)
-            found["time_boot_ms"], _ = _on_first_boot(found["time_boot_ms"], stamps_ms, shifts_ms)
+        if rows and "time_boot_ms" in found and self.boots(system).places.size:
+            boot_ns = found["time_boot_ms"].astype(np.int64) * 1_000_000
+            stamps_us = np.array(self.stamps_us[system, message], dtype=np.int64)
+            found["time_boot_ms"] = self.boots(system).going_on(boot_ns, stamps_us) // 1_000_000
         return found
 
-    def _shifts_by_utc(self, system: int) -> list[int]:
-        """Return the time since boot that each restart took back, ms, by SYSTEM_TIME; empty without UTC."""
-        unpacker = self.dialect.mavlink_map[_SYSTEM_TIME].unpacker
-        rows = list(unpacker.iter_unpack(bytes(self.payloads.get((system, _SYSTEM_TIME), b""))))
-        unix_us, boot_ms = np.array(rows, dtype=np.uint64).astype(np.int64).reshape(-1, 2).T
-        if (unix_us < _UNIX_US).any():
-            return []
-        going_on, starts = _on_first_boot(boot_ms, unix_us // 1000)
-        added_ms = going_on - boot_ms
-        return [int(added_ms[k] - added_ms[k - 1]) for k in starts]
-
-    def restarts(self, system: int) -> list[tuple[int, float]]:
-        """Return the restarts of a vehicle: attitudes after each, and its time from the log's start in s."""
-        stamps_us = np.array(self.stamps_us.get((system, _ATTITUDE), []), dtype=np.int64)
-        kind = self.dialect.mavlink_map[_ATTITUDE]
-        payload = bytes(self.payloads.get((system, _ATTITUDE), b""))
-        boot_ms = np.array([row[0] for row in kind.unpacker.iter_unpack(payload)], dtype=np.int64)
-        _, starts = _on_first_boot(boot_ms, stamps_us // 1000)
-        return [(len(stamps_us) - k, float(stamps_us[k] - self.first_us) / 1e6) for k in starts]
+    def boots(self, system: int) -> Boots:
+        """Find the restarts of a vehicle; places are stamps of the station, us."""
+        if system not in self._boots:
+            none = np.zeros(0, np.int64)
+            self._boots[system] = find_boots(none, none, none, none, none)
+            frequent = next(
+                (m for m in (_ATTITUDE, _GLOBAL_POSITION, _LOCAL_POSITION) if (system, m) in self.stamps_us),
+                None,
+            )
+            if frequent is not None:
+                boot_ns = _boot_us(self.columns(system, frequent)) * 1000
+                stamps_us = np.array(self.stamps_us[system, frequent], dtype=np.int64)
+                utc = self.columns(system, _SYSTEM_TIME)
+                utc_us = utc["time_unix_usec"].astype(np.int64)
+                utc_places = np.array(self.stamps_us.get((system, _SYSTEM_TIME), ()), dtype=np.int64)
+                found = find_boots(boot_ns, stamps_us, _boot_us(utc) * 1000, utc_us * 1000, utc_places)
+                if (utc_us < _UNIX_US).any() or not found.known.all():
+                    found = find_boots(boot_ns, stamps_us, boot_ns, stamps_us * 1000, stamps_us)
+                self._boots[system] = found
+        return self._boots[system]
 
     def gps_time(self, system: int) -> ClockFit | None:
         """Fit UTC to the time since boot; None if the vehicle does not know it."""
         columns = self.columns(system, _SYSTEM_TIME)
         unix_us = columns["time_unix_usec"].astype(np.int64)
         known = unix_us > _UNIX_US
-        return fit_clock(_boot_us(columns)[known] * 1000, unix_us[known] * 1000)
+        return fit_gps_time(_boot_us(columns)[known] * 1000, unix_us[known] * 1000)
 
     def station_time(self, system: int) -> ClockFit | None:
         """Fit the station's clock to the time since boot."""
@@ -357,29 +356,6 @@ class _Packets:
                 boot_us = _boot_us(self.columns(system, message))
                 return fit_clock(boot_us * 1000, np.array(stamps_us, dtype=np.int64) * 1000)
         return None
-
-
-def _on_first_boot(
-    boot_ms: Int64, stamps_ms: Int64, shifts_ms: Sequence[int] = ()
-) -> tuple[Int64, list[int]]:
-    """Let the times since boot [N] go on after each restart; list the restarts.
-
-    How long each took is stated (`shifts_ms`, if as many are found), else by another clock (`stamps_ms`).
-    """
-    going_on = boot_ms.astype(np.int64)
-    starts = []
-    for k in (np.flatnonzero(np.diff(going_on) < -_RESTART_MS) + 1).tolist():
-        before, after = slice(max(0, k - _AROUND_RESTART), k), slice(k, k + _AROUND_RESTART)
-        is_later = stamps_ms[k] >= stamps_ms[k - 1] and boot_ms[after].max() < boot_ms[before].max()
-        if is_later and (np.diff(boot_ms[before]) >= 0).all() and (np.diff(boot_ms[after]) >= 0).all():
-            lead_ms = stamps_ms - going_on
-            going_on[k:] += round(float(np.median(lead_ms[after]) - np.median(lead_ms[before])))
-            starts.append(k)
-    if len(shifts_ms) == len(starts):
-        going_on = boot_ms.astype(np.int64)
-        for k, shift_ms in zip(starts, shifts_ms, strict=True):
-            going_on[k:] += shift_ms
-    return going_on, starts
 
 
 def _read(path: Path) -> _Packets:

@@ -22,6 +22,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     damaged,
     describe_fit,
+    fit_gps_time,
     fixes_track,
     of_angles,
     on_gps_time,
@@ -33,7 +34,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     world_from_heading,
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
@@ -346,7 +347,7 @@ def _gps_time(topics: Sequence[UlogTopic]) -> ClockFit | None:
             utc_ns = np.asarray(topic.columns["time_utc_usec"]).astype(np.int64) * 1000
             known = utc_ns > 0
             published = np.asarray(topic.columns["timestamp"]).astype(np.int64) * 1000
-            return fit_clock(published[known], utc_ns[known])
+            return fit_gps_time(published[known], utc_ns[known])
     return None
 
 
