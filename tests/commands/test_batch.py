@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -27,8 +27,7 @@ from pipelines.batch import BatchSettings, Job, Outcome, run_flight
 from pipelines.detect import Following, detect
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.reconstruction import windows
-from pipelines.report import Reported
-from pipelines.reporting.page import FlightRow, render_flights
+from pipelines.reporting.page import FlightRow
 from pipelines.session.errors import BusyError
 from pipelines.session.parallel import connected
 from pipelines.session.registries import install_command
@@ -217,24 +216,6 @@ def test_all_stages_of_a_flight_are_those_of_the_commands(tmp_path: Path) -> Non
     assert run_flight(Job(flight.manifest, session, BatchSettings(), force=False)).unchanged
 
 
-def test_workers_that_are_left_over_split_the_videos_of_the_flights_there_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given: list[Job] = []
-
-    def taken(jobs: Sequence[Job], *_: object) -> list[tuple[int, Outcome]]:
-        given.extend(jobs)
-        return [(k, Outcome()) for k in range(len(jobs))]
-
-    monkeypatch.setattr(batch, "_outcomes", taken)
-    flights = [tmp_path / f"{name}.yaml" for name in "ab"]
-    for workers, for_each in ((1, 1), (2, 1), (3, 1), (4, 2), (9, 4)):
-        batch.batch(flights, tmp_path / "out", workers=workers)
-        assert [job.workers for job in given[-2:]] == [for_each, for_each]
-    batch.batch(flights, tmp_path / "out", scheduler="tcp://somewhere:1")
-    assert [job.workers for job in given[-2:]] == [1, 1]
-
-
 def test_a_session_at_a_url_is_uploaded_when_its_flight_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,25 +230,6 @@ def test_a_session_at_a_url_is_uploaded_when_its_flight_is_done(
     failed = run_flight(replace(job, session=Path("s3://me:pw@bucket/x.session")))
     assert failed.failed_stage == "ingest"
     assert "pw" not in str(failed.error)
-
-
-def test_flight_that_fails_late_gets_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flight = write_flight(tmp_path, seconds=0.4)  # too short for planners
-    session = tmp_path / "flight.session"
-    reported: list[Path] = []
-
-    def write_no_page(folder: Path, *, force: bool) -> Reported:
-        reported.append(folder)
-        return Reported(folder, skipped=False)
-
-    monkeypatch.setattr(batch, "report", write_no_page)  # a real one takes seconds
-    settings = BatchSettings(stages=("ingest", "replan-compare", "report"))
-    outcome = run_flight(Job(flight.manifest, session, settings, force=False))
-    assert outcome.failed_stage == "replan-compare"
-    assert reported == [session]
-    flight.manifest.unlink()
-    assert run_flight(Job(flight.manifest, session, settings, force=False)).failed_stage == "ingest"
-    assert reported == [session], "a session of before is not the flight's"
 
 
 def test_session_that_is_held_for_a_moment_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -337,25 +299,3 @@ def test_what_a_batch_cannot_start_with(tmp_path: Path, monkeypatch: pytest.Monk
     )
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert install_command("batch") in refused("batch", tmp_path / "a" / "*.yaml")
-
-
-def test_doubted_flights_come_first(tmp_path: Path) -> None:
-    right = FlightRow("a.yaml", "a", None, None, {}, (), None)
-    rows = [right, replace(right, flight="b.yaml", doubt="mount")]
-    lead = re.search(r'class="lead">([^<]*)', render_flights(rows))
-    assert lead is not None
-    assert lead[1].startswith("1 of 2 ")
-    usual = re.search(r'class="lead">([^<]*)', render_flights([right, right]))
-    assert usual is not None
-    assert lead[1].endswith(usual[1])
-    batch._store(tmp_path, rows, [Outcome(), Outcome(doubt="mount")])
-    assert pd.read_csv(tmp_path / "summary.csv")["doubt"].fillna("").tolist() == ["", "mount"]
-
-
-def test_page_escapes_what_stands_in_files() -> None:
-    evil = '<script>alert("x")</script>'
-    row = FlightRow(evil, evil, "ingest", evil, {"tilt_deg_<b>": 1.0}, (evil,), f"{evil}#/index.html")
-    page = render_flights([row])
-    assert "<script" not in page
-    assert 'href="%3Cscript' in page
-    assert "%23/index.html" in page

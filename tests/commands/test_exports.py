@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -140,15 +139,6 @@ def test_seconds_count_from_the_first_picture_or_the_epoch(filmed: Path, tmp_pat
     assert first["epoch"][0] == START_NS
     assert "csv" in refused("export", filmed, "--to", "trc,csv", "--time", "zero", "-o", out)
     assert "zero, epoch" in refused("export", filmed, "--to", "trc", "--time", "noon", "-o", out)
-
-
-def test_pictures_that_are_gone_cost_pictures_only(filmed: Path, tmp_path: Path) -> None:
-    shutil.copytree(filmed, tmp_path / "flight.session")  # without the videos beside it
-    result = export(tmp_path / "flight.session", ["mcap"], tmp_path / "out")
-    with AnyReader(result.written) as reader:
-        topics = {connection.topic for connection in reader.connections}
-    assert {"/skeleton", "/drone1/camera_info"} <= topics
-    assert "/drone1/image/video" not in topics
 
 
 def test_c3d_is_truth(tmp_path: Path) -> None:

@@ -17,13 +17,11 @@ from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.poses import conjugate, rotate
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
-from pipelines.reporting.pictures import GREY as BLANK
 from pipelines.reporting.pictures import SIDES
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json, write_json
 from tests.commands.runner import as_if_written
 from tests.synthetic.flights import LENS, START_NS, SyntheticFlight, film_at, write_flight
-from tests.synthetic.logged_flights import write_logged_flight
 
 GREY = 150  # of the flight's own pictures
 FRAMES = 12
@@ -180,28 +178,6 @@ def test_an_angle_is_written_beside_its_joint(filmed: tuple[SyntheticFlight, Pat
     for wrong in ("overlay:left_nose", "trc:left_knee"):
         with pytest.raises(DataError):
             export(session, [wrong])
-
-
-def test_undecoded_pictures_are_grey_and_counted(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = VideoReader.read
-    monkeypatch.setattr(
-        VideoReader, "read", lambda self, number: None if number in {0, 4} else read(self, number)
-    )
-    notes = Notes()
-    export(session, ["overlay"], session.with_name("out"), progress=notes)
-    assert any(note.startswith(f"drone1: 2 of {FRAMES}") for note in notes.kept)
-    monkeypatch.undo()
-    with VideoReader(session.with_name("out") / "drone1.overlay.mp4") as reader:
-        corner = [picture[-50:, -50:].mean() for _, picture in reader.frames()]
-    assert [level < (BLANK + GREY) / 2 for level in corner] == [k in {0, 4} for k in range(FRAMES)]
-
-
-def test_odd_pictures_of_a_log(tmp_path: Path) -> None:
-    flight = write_logged_flight(tmp_path, "ros2-mcap", picture_size=(1279, 719))
-    for video in export(session_of(flight), ["overlay"]).written:
-        index = index_video(video)
-        assert (index.width, index.height, index.count) == (1280, 720, len(flight.t_ns))
-        assert np.abs(index.pts_ns - (flight.t_ns - flight.t_ns[0])).max() <= 12_000
 
 
 def test_pictures_that_are_gone_or_others_and_no_skeleton(session: Path) -> None:

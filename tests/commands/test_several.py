@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.session.stages import names_of
 from tests.commands.runner import content, mocap, refused, succeeds
 from tests.synthetic.flights import write_flight
 
@@ -67,11 +66,6 @@ def test_output_of_several_is_a_folder_around_them(folder: Path, tmp_path: Path)
     assert f"{tmp_path}/one.session: " in refused("ingest", *flights, "-o", tmp_path / "one.session")
     assert content(tmp_path / "one.session") == before
     assert refused("ingest", folder / "*.yml").startswith(f"mocap: {folder}/*.yml: ")
-
-
-def test_what_sessions_of_several_are_called() -> None:
-    assert names_of([Path("/a/flight.yaml"), Path("/b/tuesday.yaml")]) == ["a", "tuesday"]
-    assert names_of([Path("/a/flight.session"), Path("/b/c.session")]) == ["a", "c"]
 
 
 def test_info_says_what_each_of_several_is(folder: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ast
-import json
-import os
 import unicodedata
 from pathlib import Path
 
@@ -53,27 +51,6 @@ def test_usage_errors_are_clicks_own_otherwise() -> None:
     assert wrong.returncode == 2
     assert " reconstruct [OPTIONS] SESSION" in wrong.stderr.splitlines()[0]
     assert "'--persons': '0' " in wrong.stderr
-
-
-@pytest.mark.parametrize("evil", EVIL)
-def test_info_of_an_evil_file(tmp_path: Path, evil: str) -> None:
-    path = tmp_path / f"true{evil}joints.csv"
-    joint = evil.strip("\r\n")
-    path.write_text(f"t_ns,joint,x,y,z\n0,no{joint}se,1,2,3\n", encoding="utf-8", newline="")
-    printed = succeeds("info", path)
-    assert not steering(printed)
-    assert not any(line.startswith("mocap: ") for line in printed.splitlines())
-    assert "joints.csv: 3D joints" in printed
-    told = succeeds("info", path, "--json")
-    assert not steering(told)
-    assert json.loads(told)["path"] == str(path)  # nothing of the name is lost there
-
-
-def test_a_name_that_is_no_text(tmp_path: Path) -> None:
-    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.csv"))
-    path.write_text("t_ns,joint,x,y,z\n0,nose,1,2,3\n", encoding="utf-8")
-    assert "/?.csv: 3D joints" in succeeds("info", path)
-    assert json.loads(succeeds("info", path, "--json"))["path"] == str(path)
 
 
 def test_every_command_that_names_files(tmp_path: Path) -> None:

@@ -77,21 +77,6 @@ def test_equal_maps_are_equal_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-def test_a_session_without_a_map_has_none(tmp_path: Path) -> None:
-    assert maps.load_maps(tmp_path) == []
-
-
-@pytest.mark.parametrize(
-    ("index", "problem"),
-    [("{}", "no list of maps"), ("[", "is damaged"), ('{"maps": [{}, {}]}', r"1\.npz: No such file")],
-)
-def test_damaged_sessions_are_refused(tmp_path: Path, index: str, problem: str) -> None:
-    maps.store_map(tmp_path, [occupancy()])
-    (tmp_path / "map/index.json").write_text(index)
-    with pytest.raises(DataError, match=problem):
-        maps.load_maps(tmp_path)
-
-
 def archive(path: Path, **members: bytes | NDArray[Any] | list[Any] | float) -> Path:
     """Write an npz of arrays, or of bytes in place of an array; None leaves one out."""
     content: dict[str, Any] = {"origin": [0.0, 0, 0], "resolution_m": 0.2, **members}
@@ -156,14 +141,6 @@ def test_unusable_grids_are_one_clear_line(tmp_path: Path, members: dict[str, An
         with pytest.raises(DataError, match=problem) as caught:
             read(path)
         assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\5\6" + b"\0" * 30, b"\0" * 100])
-def test_what_is_no_zip_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "bad.npz"
-    path.write_bytes(content)
-    with pytest.raises(DataError):
-        maps.read_grid(path)
 
 
 def test_arrays_of_other_scripts_are_read(tmp_path: Path) -> None:

@@ -52,13 +52,6 @@ def test_a_file_goes_with_the_last_array_in_it(tmp_path: Path) -> None:
     assert not files.exists() or str(tmp_path) not in files.read_text()
 
 
-def test_values_without_arrays_stay_what_they_are(tmp_path: Path) -> None:
-    waiting = Waiting(tmp_path)
-    assert waiting.put(None) is None
-    assert waiting.put(("a", 1)) == ("a", 1)
-    waiting.release()
-
-
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say it there")
 def test_waiting_arrays_take_no_memory_until_they_are_used(tmp_path: Path) -> None:
     """Compare 64 MB in use and waiting; a quarter of that is left for everything else."""

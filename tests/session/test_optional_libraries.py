@@ -44,10 +44,6 @@ def calls() -> list[tuple[str, str]]:
     return sorted(set(found))
 
 
-def test_the_program_asks_for_optional_libraries() -> None:
-    assert {extra for _, extra in calls()} == EXTRAS.keys() - {"dev", "docs"}
-
-
 @pytest.mark.parametrize(("module", "extra"), calls())
 def test_the_hint_installs_the_library_that_is_imported(module: str, extra: str) -> None:
     command, *requirements = shlex.split(install_command(extra).removeprefix("pip "))

@@ -73,8 +73,3 @@ def test_regular_samples_of_which_some_are_missing_are_never_bridged(seed: int, 
     kept[[0, -1]] = True
     at_ns = every[:-1] + 5 * MS
     np.testing.assert_array_equal(known_at(every[kept], at_ns), kept[:-1] & kept[1:])
-
-
-def test_a_single_sample_is_known_at_its_own_time_alone() -> None:
-    t_ns = np.array([10 * MS])
-    np.testing.assert_array_equal(known_at(t_ns, np.array([9, 10, 11]) * MS), [False, True, False])

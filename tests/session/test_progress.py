@@ -9,10 +9,6 @@ import pytest
 from pipelines.session.progress import Halt, side_by_side
 
 
-def test_results_come_in_the_order_of_the_parts() -> None:
-    assert side_by_side(lambda k: k * k, range(20), workers=4, halt=Halt()) == [k * k for k in range(20)]
-
-
 def test_a_failure_ends_the_others() -> None:
     halt, together = Halt(), Barrier(2, timeout=10)
     stopped: list[int] = []

@@ -7,36 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.session.errors import DataError
 from pipelines.session.people import (
     DERIVED,
     SKELETONS,
-    bones_of,
     get_skeleton,
     mirrored,
-    skeleton_with,
     take_joints,
     with_derived,
 )
 
 NAMES = st.sampled_from(sorted(SKELETONS))
-
-
-@pytest.mark.parametrize(
-    ("name", "count"),
-    [
-        ("coco17", 17),
-        ("halpe26", 26),
-        ("body25", 25),
-        ("body25b", 25),
-        ("blazepose33", 33),
-        ("coco23", 23),
-        ("coco18", 18),
-    ],
-)
-def test_every_skeleton_has_its_detectors_number_of_distinct_joints(name: str, count: int) -> None:
-    joints = get_skeleton(name).joints
-    assert len(joints) == len(set(joints)) == count
 
 
 # Joints by number as the detectors' own documentation gives them, a few of each group.
@@ -62,19 +42,6 @@ def test_joints_have_the_detectors_numbers(name: str) -> None:
     assert [joints[int(number)] for number in words[::2]] == words[1::2]
 
 
-def test_an_unknown_skeleton_is_refused_with_those_there_are() -> None:
-    with pytest.raises(DataError) as caught:
-        get_skeleton("coco19")
-    assert caught.value.source == "coco19"
-    assert caught.value.remedy.endswith(", ".join(SKELETONS))
-
-
-def test_skeletons_by_count() -> None:
-    assert [s.name for s in skeleton_with(25)] == ["body25", "body25b"]
-    assert [s.name for s in skeleton_with(33)] == ["blazepose33"]
-    assert skeleton_with(19) == ()
-
-
 @pytest.mark.parametrize("name", sorted(SKELETONS))
 def test_bones_are_symmetric_and_join_joints_that_are_there(name: str) -> None:
     skeleton = get_skeleton(name)
@@ -85,19 +52,6 @@ def test_bones_are_symmetric_and_join_joints_that_are_there(name: str) -> None:
     assert {frozenset(("left_hip", "left_knee")), frozenset(("right_elbow", "right_wrist"))} <= bones
 
 
-@given(NAMES)
-def test_mirroring_twice_changes_nothing_and_stays_in_the_skeleton(name: str) -> None:
-    joints = get_skeleton(name).joints
-    assert [mirrored(mirrored(joint)) for joint in joints] == list(joints)
-    assert {mirrored(joint) for joint in joints} == set(joints)
-    assert mirrored("nose") == "nose"
-
-
-def test_bones_of_some_joints() -> None:
-    joints = ("left_hip", "left_knee", "right_ankle", "left_ankle")
-    assert bones_of(joints) == (("left_hip", "left_knee"), ("left_knee", "left_ankle"))
-
-
 @given(NAMES, NAMES, st.integers(0, 2**32 - 1))
 def test_taking_joints_there_and_back_keeps_the_shared_ones(one: str, other: str, seed: int) -> None:
     a, b = get_skeleton(one).joints, get_skeleton(other).joints
@@ -106,12 +60,6 @@ def test_taking_joints_there_and_back_keeps_the_shared_ones(one: str, other: str
     shared = np.isin(a, b)
     np.testing.assert_array_equal(back[:, shared], values[:, shared])
     assert np.isnan(back[:, ~shared]).all()
-
-
-def test_taking_joints_along_another_axis() -> None:
-    confidence = np.array([[0.1, 0.2], [0.3, 0.4]])
-    taken = take_joints(confidence, ("nose", "neck"), ("neck", "hip", "nose"), axis=-1)
-    np.testing.assert_array_equal(taken, [[0.2, np.nan, 0.1], [0.4, np.nan, 0.3]])
 
 
 def test_neck_and_hip_are_the_midpoints_of_their_parents() -> None:
@@ -125,12 +73,3 @@ def test_neck_and_hip_are_the_midpoints_of_their_parents() -> None:
     np.testing.assert_array_equal(derived[0, 18], (position[0, 11] + position[0, 12]) / 2)
     assert np.isnan(derived[1, 18]).all()
     assert [joint for joint, _ in DERIVED] == ["neck", "hip"]
-
-
-def test_joints_that_are_there_or_lack_a_parent_are_not_derived() -> None:
-    body25 = get_skeleton("body25").joints
-    measured = np.ones((1, 25, 3))
-    joints, position = with_derived(body25, measured)
-    assert joints == body25
-    assert position is measured
-    assert with_derived(("nose", "left_hip"), np.zeros((2, 3)))[0] == ("nose", "left_hip")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import itertools
 import json
 import os
@@ -24,7 +23,6 @@ from pipelines.session.stages import (
     SCHEMA,
     Run,
     Stage,
-    key_of,
     locked,
     open_session,
     versions_of,
@@ -291,12 +289,6 @@ def test_a_copy_kept_by_the_user_stays(tmp_path: Path) -> None:
     assert (folder / "reconstruct.old" / "skeleton").read_text() == kept
 
 
-def test_the_key_is_the_hash_of_all_that_decides() -> None:
-    text = '{"inputs":{"flight":"ab"},"revision":3,"settings":{"a":[1,null],"b":0.1},"stage":"detect"}'
-    key = key_of(Stage("detect", 3), {"b": 0.1, "a": (1, None)}, {"flight": "ab"})
-    assert key == hashlib.sha256(text.encode()).hexdigest()
-
-
 def test_an_unchanged_stage_is_skipped_and_a_forced_one_redone_to_the_same_bytes(tmp_path: Path) -> None:
     folder = tmp_path / "a.session"
     work(folder)
@@ -313,22 +305,6 @@ def test_an_unchanged_stage_is_skipped_and_a_forced_one_redone_to_the_same_bytes
         "ingest",
         *["reconstruct"] * 2,
     ]
-
-
-def test_what_a_changed_setting_replaces_is_told(tmp_path: Path) -> None:
-    folder = tmp_path / "a.session"
-    work(folder)
-    assert reconstruct(folder, "robust").replaces == {}
-    assert reconstruct(folder, "dlt").replaces == {"method": ("robust", "dlt")}
-
-
-def test_a_changed_input_is_no_finished_stage(tmp_path: Path) -> None:
-    folder = tmp_path / "a.session"
-    work(folder)
-    ingest(folder, "old", OLD)
-    again = reconstruct(folder, "robust")
-    assert not again.finished
-    assert again.replaces == {}
 
 
 def flip(path: Path) -> None:
@@ -376,16 +352,6 @@ def test_a_stage_whose_files_changed_is_not_read(
         session.intact_record(stage)
 
 
-def test_a_record_that_lacks_something_is_one_line(tmp_path: Path) -> None:
-    folder = tmp_path / "a.session"
-    work(folder)
-    path = folder / "reconstruct" / "stage.json"
-    kept = {name: value for name, value in read_json(path).items() if name not in {"key", "outputs"}}
-    write_json(path, kept)
-    with refused("damaged", path, "key, outputs"):
-        open_session(folder).record("reconstruct")
-
-
 def test_an_interrupted_stage_keeps_its_finished_chunks(tmp_path: Path) -> None:
     folder = tmp_path / "a.session"
     work(folder)
@@ -418,16 +384,6 @@ def test_an_interrupted_stage_keeps_its_finished_chunks(tmp_path: Path) -> None:
     attempt(interrupt=False)
     assert produced == ["first", "second", "first", "second", "second"]
     assert not (folder / ".partial").exists(), "neither these chunks nor those of other settings"
-
-
-def test_force_starts_over(tmp_path: Path) -> None:
-    folder = tmp_path / "a.session"
-    work(folder)
-    with locked(folder) as session:
-        session.begin(RECONSTRUCT, settings={}, inputs={}).chunk("first", produce_part("stale"))
-    with locked(folder) as session:
-        run = session.begin(RECONSTRUCT, settings={}, inputs={}, force=True)
-        assert (run.chunk("first", produce_part("fresh")) / "part").read_text() == "fresh"
 
 
 def fail_to_ingest(folder: Path) -> None:
@@ -477,22 +433,6 @@ def assert_record_of(folder: Path, flight: str) -> None:
     assert record.settings == {"flight": flight}
 
 
-def test_a_file_and_a_place_below_a_file_are_no_targets(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with refused("not-a-folder", tmp_path / "file", "--output"):
-        ingest(tmp_path / "file", "new", NEW)
-    with refused("not-a-folder"):
-        ingest(tmp_path / "file" / "a.session", "new", NEW)
-
-
-@pytest.mark.parametrize("opening", [open_session, lambda folder: reconstruct(folder, "dlt")])
-def test_what_is_no_session_is_told_to_become_one(tmp_path: Path, opening: Callable[[Path], object]) -> None:
-    for folder in (tmp_path, tmp_path / "nothing"):
-        with refused("not-a-session", folder, COMMANDS["ingest"]):
-            opening(folder)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_newer_schemas_are_refused_and_left_alone(tmp_path: Path) -> None:
     folder = tmp_path / "a.session"
     work(folder)
@@ -510,29 +450,3 @@ def test_newer_schemas_are_refused_and_left_alone(tmp_path: Path) -> None:
                 opening(folder)
         assert contents(folder) == before
         path.write_bytes(kept)
-
-
-@pytest.mark.parametrize("schema", [None, "1", [1]])
-def test_a_session_without_a_schema_number_is_damaged(tmp_path: Path, schema: object) -> None:
-    folder = tmp_path / "a.session"
-    work(folder)
-    write_json(folder / "session.json", {"schema": schema})
-    with refused("damaged", folder / "session.json"):
-        open_session(folder)
-    ingest(folder, "new", NEW)
-    open_session(folder)
-
-
-def test_ingest_publishes_only_what_it_owns(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"\bnotes\.txt$"):
-        ingest(tmp_path / "a.session", "new", {"notes.txt": ""})
-    with pytest.raises(ValueError, match=r"^no-such "):
-        Stage("no-such", 1)
-
-
-def test_the_record_of_an_unpublished_stage_cannot_be_asked_for(tmp_path: Path) -> None:
-    work(tmp_path / "a.session")
-    with locked(tmp_path / "a.session") as session:
-        run = session.begin(RECONSTRUCT, settings={}, inputs={})
-        with pytest.raises(RuntimeError, match=r"^reconstruct "):
-            _ = run.record

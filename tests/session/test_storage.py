@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
-import json
 import math
 import os
 from pathlib import Path
@@ -17,14 +15,10 @@ from hypothesis import strategies as st
 
 from pipelines.session.errors import DataError
 from pipelines.session.storage import (
-    as_data_error,
-    canonical_json,
     file_stamp,
     jsonable,
     read_json,
-    remove_tree,
     sha256_of,
-    sync_tree,
     write_json,
 )
 
@@ -48,21 +42,6 @@ def test_what_is_json_already_survives_unchanged(
     assert list(read_json(path)) == list(document), "objects keep their order"
 
 
-@given(DOCUMENTS, st.randoms())
-def test_canonical_json_ignores_the_order_of_keys(document: dict[str, Any], random: Any) -> None:
-    names = list(document)
-    random.shuffle(names)
-    assert canonical_json({name: document[name] for name in names}) == canonical_json(document)
-    assert json.loads(canonical_json(document)) == document
-
-
-@given(st.lists(st.floats(allow_infinity=False) | st.just(math.nan), min_size=1))
-def test_numpy_writes_what_lists_write(numbers: list[float]) -> None:
-    expected = [None if math.isnan(number) else number for number in numbers]
-    assert jsonable(np.array(numbers)) == expected
-    assert jsonable(tuple(np.float64(number) for number in numbers)) == expected
-
-
 def test_numpy_scalars_become_plain_ones() -> None:
     plain = jsonable(
         {"flag": np.bool_(True), "count": np.int64(2**62), "share": np.float32(0.5), "name": np.str_("a")}
@@ -71,29 +50,10 @@ def test_numpy_scalars_become_plain_ones() -> None:
     assert [type(value) for value in plain.values()] == [bool, int, float, str]
 
 
-@pytest.mark.parametrize(
-    "value", [math.inf, -math.inf, np.float64(np.inf), {"deep": [np.array([1.0, np.inf])]}]
-)
-def test_infinity_is_neither_a_number_nor_missing(value: object) -> None:
-    with pytest.raises(ValueError, match=r"^-?inf\b"):
-        jsonable(value)
-
-
-@pytest.mark.parametrize("value", [Path("flight.yaml"), {1: "one"}, {"set": {1}}, 1j, b"bytes"])
-def test_what_json_does_not_know_is_refused(value: object) -> None:
-    with pytest.raises(TypeError):
-        jsonable(value)
-
-
 def test_names_that_are_not_utf8_can_be_written(tmp_path: Path) -> None:
     name = os.fsdecode(b"caf\xe9.mp4")
     write_json(tmp_path / "a.json", jsonable({name: name}))
     assert read_json(tmp_path / "a.json") == {"caf?.mp4": "caf?.mp4"}
-
-
-def test_json_is_readable_and_ends_with_a_newline(tmp_path: Path) -> None:
-    write_json(tmp_path / "a.json", {"name": "Hügel", "n": [1]})
-    assert (tmp_path / "a.json").read_bytes() == '{\n  "name": "Hügel",\n  "n": [\n    1\n  ]\n}\n'.encode()
 
 
 def test_nan_is_never_written_and_the_old_file_stays(tmp_path: Path) -> None:
@@ -128,17 +88,6 @@ def test_damaged_json_is_one_line(tmp_path: Path, content: bytes) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_missing_json_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"a\.json: " + os.strerror(errno.ENOENT)):
-        read_json(tmp_path / "a.json")
-
-
-def test_hash_of_a_file_is_its_sha256(tmp_path: Path) -> None:
-    content = b"keypoints" * 100_000
-    (tmp_path / "a").write_bytes(content)
-    assert sha256_of(tmp_path / "a") == hashlib.sha256(content).hexdigest()
-
-
 def test_hash_of_a_folder_sees_names_contents_and_nothing_else(tmp_path: Path) -> None:
     def folder(name: str, files: dict[str, bytes]) -> Path:
         for file, content in files.items():
@@ -160,35 +109,6 @@ def test_hash_of_a_folder_sees_names_contents_and_nothing_else(tmp_path: Path) -
     ]
     hashes = [sha256_of(folder(f"changed{k}", other)) for k, other in enumerate(changed)]
     assert len({reference, *hashes}) == 1 + len(changed)
-
-
-def test_hash_of_nothing_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="gone: " + os.strerror(errno.ENOENT)):
-        sha256_of(tmp_path / "gone")
-
-
-def test_removing_takes_files_folders_links_and_nothing(tmp_path: Path) -> None:
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    (kept / "file").touch()
-    (tmp_path / "link").symlink_to(kept)
-    (tmp_path / "folder" / "inner").mkdir(parents=True)
-    (tmp_path / "folder" / "inner" / "file").touch()
-    sync_tree(tmp_path / "folder")
-    for name in ("link", "folder", "nothing"):
-        remove_tree(tmp_path / name)
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "kept"]
-
-
-def test_errors_of_the_system_name_the_file_and_the_remedy() -> None:
-    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "skeleton.parquet")
-    error = as_data_error(full, Path("a.session"))
-    assert (error.source, error.problem) == ("skeleton.parquet", os.strerror(errno.ENOSPC))
-    assert "space" in error.remedy
-    # pyarrow gives a text alone
-    error = as_data_error(OSError("unwritable"), Path("a.session"))
-    assert (error.source, error.problem) == (Path("a.session"), "unwritable")
-    assert error.remedy
 
 
 def test_the_stamp_of_a_file_tells_sizes_and_times_of_change(tmp_path: Path) -> None:

@@ -29,15 +29,6 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_it_appears_and_nothing_else_is_left(tmp_path: Path) -> None:
-    make(tmp_path / "flight")
-    assert names(tmp_path) == ["flight"]
-    assert names(tmp_path / "flight") == ["copy", MARK]
-    assert is_made(tmp_path / "flight", "k", mark=MARK)
-    assert not is_made(tmp_path / "flight", "other", mark=MARK)
-    assert not is_made(tmp_path / "nothing", "k", mark=MARK)
-
-
 def test_finished_parts_outlive_an_interrupt_but_not_other_settings(tmp_path: Path) -> None:
     target, made = tmp_path / "flight", list[str]()
 

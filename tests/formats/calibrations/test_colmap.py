@@ -97,18 +97,6 @@ def test_a_real_model() -> None:
     assert (lens.width, lens.height, lens.fx, lens.cx, lens.model) == (1919, 1079, 1847.53, 959.0, "none")
 
 
-def test_images_that_share_a_name_keep_their_folder(tmp_path: Path) -> None:
-    images = {"cam1/000.jpg": 1, "cam2/000.jpg": 1, "cam2/001.jpg": 1}
-    model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, images).write_binary(str(tmp_path))
-    assert list(READER.read_calibration(tmp_path)) == ["001", "cam1/000", "cam2/000"]
-
-
-def test_an_unsupported_model_is_refused_by_name(tmp_path: Path) -> None:
-    model({1: ("FOV", [700.0, 700, 320, 240, 0.9])}, {"a.jpg": 1}).write_binary(str(tmp_path))
-    with refuses(tmp_path, "FOV", "SIMPLE_PINHOLE"):
-        READER.read_calibration(tmp_path)
-
-
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
 def test_a_binary_model_that_is_cut_off_or_states_wrong_counts_is_refused(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
@@ -149,14 +137,4 @@ def write(folder: Path, cameras: str = CAMERAS, images: str = IMAGES) -> Path:
 )
 def test_faulty_text_is_refused(tmp_path: Path, cameras: str, images: str) -> None:
     with refuses(write(tmp_path, cameras, images)):
-        READER.read_calibration(tmp_path)
-
-
-def test_a_folder_without_a_whole_model(tmp_path: Path) -> None:
-    assert not READER.recognises(tmp_path)
-    assert not READER.recognises(tmp_path / "absent")
-    (tmp_path / "cameras.txt").write_text(CAMERAS)
-    (tmp_path / "images.bin").write_bytes(b"")
-    assert not READER.recognises(tmp_path)
-    with refuses(tmp_path, "points3D"):
         READER.read_calibration(tmp_path)

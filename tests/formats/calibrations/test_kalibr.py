@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from pipelines.formats.calibrations import calibration_files
-from pipelines.geometry.cameras import project
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, CalibrationFormat
 from tests.commands.runner import mocap
@@ -52,25 +49,6 @@ def test_a_real_chain() -> None:
     assert lens.distortion[3] == -0.010717188529046507
     assert cameras["cam0"].position is None, "T_cam_imu is no pose in the world"
     assert "752 x 480 px" in str(READER.describe(path)["cam0"])
-
-
-@pytest.mark.parametrize("model", ["radtan", "equidistant", "none"])
-def test_it_projects_as_opencv_does(tmp_path: Path, model: str) -> None:
-    coefficients = np.zeros(4) if model == "none" else np.array([-0.28, 0.07, 0.0002, -0.0003])
-    stated = None if model == "none" else str(coefficients.tolist())
-    path = chain(tmp_path / "c.yaml", distortion_model=model, distortion_coeffs=stated)
-    assert READER.recognises(path)
-    lens = READER.read_calibration(path)["cam0"].intrinsics
-    assert lens is not None
-    points = np.array([[0.1, 0.2, 2.0], [-0.5, 0.3, 2.5]])
-    matrix = np.array([[460.0, 0, 366.25], [0, 458.5, 248.5], [0, 0, 1]])
-    if model == "equidistant":
-        expected = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)[
-            0
-        ]
-    else:
-        expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, coefficients)[0]
-    np.testing.assert_allclose(project(points, lens), expected.reshape(-1, 2), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -57,17 +57,6 @@ def test_it_projects_as_opencv_does(tmp_path: Path, suffix: str) -> None:
     assert "640 x 480 px" in str(READER.describe(path)["camera"])
 
 
-@pytest.mark.parametrize("flag", [{"fisheye_model": 1}, {"distortion_model": "equidistant"}])
-def test_fisheye(tmp_path: Path, flag: dict[str, object]) -> None:
-    coefficients = np.array([[0.05], [-0.01], [0.002], [0.0]])
-    camera = only(store(tmp_path / "c.yml", distortion_coefficients=coefficients, **flag))
-    assert camera.intrinsics is not None
-    assert camera.intrinsics.model == "fisheye"
-    points = np.array([[[0.7, 0.2, 1.0]], [[-0.5, 1.3, 1.5]]])
-    expected, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)
-    np.testing.assert_allclose(project(points[:, 0], camera.intrinsics), expected[:, 0], rtol=0, atol=1e-9)
-
-
 @pytest.mark.parametrize("as_vector", [True, False])
 def test_pose(tmp_path: Path, as_vector: bool) -> None:
     rvec, tvec = np.array([[0.3], [-0.8], [1.1]]), np.array([[0.5], [-1.5], [4.0]])
@@ -76,16 +65,6 @@ def test_pose(tmp_path: Path, as_vector: bool) -> None:
     camera = only(store(tmp_path / "c.yml", **given))
     assert camera.position is not None
     np.testing.assert_allclose(camera.position, (-matrix.T @ tvec).ravel(), atol=1e-12)
-
-
-def test_without_a_size_the_pictures_decide(tmp_path: Path) -> None:
-    """The size is then that of which the principal point is the middle: 2 * 330.5 + 1, 2 * 241.25 + 1."""
-    camera = only(store(tmp_path / "c.yml", image_width=None, image_height=None))
-    assert not camera.size_stated
-    assert camera.intrinsics is not None
-    assert (camera.intrinsics.width, camera.intrinsics.height) == (662, 484)
-    assert camera.intrinsics.fx == 800.0
-    assert only(store(tmp_path / "d.yml")).size_stated
 
 
 @pytest.mark.parametrize(

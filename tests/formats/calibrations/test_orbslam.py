@@ -69,16 +69,6 @@ def test_the_real_file_projects_as_opencv_does() -> None:
     np.testing.assert_allclose(project(points, lens), expected[:, 0], rtol=0, atol=1e-9)
 
 
-def test_two_fisheyes(tmp_path: Path) -> None:
-    cameras = READER.read_calibration(write(tmp_path, FISHEYE))
-    assert list(cameras) == ["Camera1", "Camera2"]
-    first, second = (camera.intrinsics for camera in cameras.values())
-    assert first is not None
-    assert second is not None
-    assert (first.model, first.distortion) == ("fisheye", (0.0034, 0.0007, -0.002, 0.0002))
-    assert (second.fx, second.width, second.height) == (191.5, 512, 510)
-
-
 def test_without_a_size_the_pictures_decide(tmp_path: Path) -> None:
     text = "\n".join(line for line in FISHEYE.splitlines() if "width" not in line and "height" not in line)
     first = READER.read_calibration(write(tmp_path, text))["Camera1"]

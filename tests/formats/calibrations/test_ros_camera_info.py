@@ -98,26 +98,6 @@ def test_both_forms_project_as_opencv_does(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "cells", "expected"),
-    [
-        ("equidistant", 4, "fisheye"),
-        ("fisheye", 4, "fisheye"),
-        ("plumb_bob", 4, "radtan"),
-        ("rational_polynomial", 8, "radtan"),
-        ("''", 5, "radtan"),
-        ("plumb_bob", 0, "none"),
-    ],
-)
-def test_models(tmp_path: Path, model: str, cells: int, expected: str) -> None:
-    data = [0.01 * (k + 1) for k in range(cells)]
-    block = f"{{rows: 1, cols: {cells}, data: {data}}}"
-    path = stored(tmp_path / "c.yaml", distortion_model=model, distortion_coefficients=block)
-    lens = only(path, "left")
-    assert lens.model == expected
-    assert list(lens.distortion) == data
-
-
-@pytest.mark.parametrize(
     ("keys", "problem"),
     [
         ({"distortion_model": "ftheta"}, "distortion model 'ftheta'"),

@@ -4,37 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipelines.formats.common.rows import (
-    MILLISECONDS,
     NANOSECONDS,
     SECONDS,
-    format_seconds,
     parse_stamps,
     parse_table,
-    stamp_column,
 )
 from tests.formats.refusals import refuses
 
 # An epoch stamp in float64 seconds has no room for nanoseconds (its step is 0.2 us).
-STAMPS = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=30)
 
 
 def test_a_stamp_that_no_float_can_hold_survives() -> None:
     t_ns, readable = parse_stamps("log", ["1700000000.123456789"])
     assert t_ns.tolist() == [1700000000123456789]
     assert readable.all()
-
-
-@given(STAMPS)
-def test_formatted_stamps_read_back_exactly(stamps: list[int]) -> None:
-    t_ns, readable = parse_stamps("log", format_seconds(np.array(stamps)))
-    assert readable.all()
-    assert t_ns.tolist() == stamps
 
 
 @pytest.mark.parametrize(
@@ -48,22 +34,6 @@ def test_formatted_stamps_read_back_exactly(stamps: list[int]) -> None:
 def test_epoch_stamps_that_are_not_seconds_are_refused(stamp: str, word: str) -> None:
     with refuses("log", word):
         parse_stamps("log", [stamp, stamp])
-
-
-@pytest.mark.parametrize(
-    ("header", "expected"),
-    [
-        ("t_ns,x", (0, NANOSECONDS)),
-        ("x,Time", (1, SECONDS)),
-        ("#timestamp [ns],x", (0, NANOSECONDS)),
-        ("Timestamp (ms),x", (0, MILLISECONDS)),
-        ("t,t_ns", (1, NANOSECONDS)),
-        ("time_of_day,x", None),
-        ("time [h],x", None),
-    ],
-)
-def test_time_columns(header: str, expected: tuple[int, int] | None) -> None:
-    assert stamp_column(header.split(",")) == expected
 
 
 @pytest.mark.parametrize(

@@ -82,17 +82,6 @@ def test_annotations_give_visibility_size_and_frames(tmp_path: Path) -> None:
     assert found.confidence[0, :4].tolist() == [0, 0, 0.5, 1]
 
 
-def test_joint_names_of_the_file_are_heeded(tmp_path: Path) -> None:
-    animal = [{"name": "dog", "keypoints": [f"paw_{n}" for n in range(17)]}]
-    path = written(tmp_path, dataset(categories=animal))
-    with refuses(path, 17, "paw_0, paw_1, paw_2, paw_3, ..."):
-        FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-    assert len(FORMAT.read_keypoints(path, skeleton="coco17", first_frame=0).frame) == 1
-    spaced = [{"keypoints": [joint.replace("_", " ").title() for joint in get_skeleton("coco17").joints]}]
-    path = written(tmp_path, dataset(categories=spaced))
-    assert FORMAT.read_keypoints(path, skeleton=None, first_frame=0).joints == get_skeleton("coco17").joints
-
-
 @pytest.mark.parametrize(
     "content",
     [

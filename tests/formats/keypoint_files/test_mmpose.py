@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pipelines.formats.keypoint_files.result_files import MMPOSE as FORMAT
-from pipelines.session.errors import DataError
 from pipelines.session.people import get_skeleton
 from pipelines.session.registries import FORMATS, KeypointFormat, recognise
 from tests.formats.refusals import refuses
@@ -63,39 +62,6 @@ def test_a_demo_counts_from_one_and_names_its_joints(tmp_path: Path) -> None:
     path = written(tmp_path / "other.json", content | {"meta_info": other})
     with refuses(path, 26, "h36m_0"):
         FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-
-
-def test_a_folder_of_pictures(tmp_path: Path) -> None:
-    folder = tmp_path / "predictions"
-    written(folder / "img_0003.json", [])
-    written(folder / "img_0004.json", [instance()])
-    written(folder / "img_0005.json", {"meta_info": {}, "instance_info": [instance(), instance(30.0)]})
-    (folder / "img_0006.json").write_text("[{")
-    written(folder / "settings.json", {})
-    assert recognise(folder, KeypointFormat, KIND).name == "mmpose"
-    found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=3)
-    assert found.frames_listed.tolist() == [0, 1, 2]
-    assert found.frame.tolist() == [1, 2, 2]
-    assert list(found.dropped.values()) == [1, 1]
-    described = FORMAT.describe(folder)
-    assert described["people per frame, at most"] == 2
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        [],
-        video([{"keypoints": [[1, 2, 3]], "keypoint_scores": [1]}]),
-        video([{"keypoints": [[1, 2], [1]], "keypoint_scores": [1, 1]}]),
-        video([{"keypoints": [[1, 2]]}]),
-        [{"frame_id": "x", "instances": []}],
-        video([instance(count=134)]),
-    ],
-)
-def test_bad_content_is_one_clear_line(tmp_path: Path, content: object) -> None:
-    with pytest.raises(DataError) as caught:
-        FORMAT.read_keypoints(written(tmp_path / "walk.json", content), skeleton=None, first_frame=0)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_real_picture_is_frame_0() -> None:

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipelines.formats.keypoint_files.result_files import OPENPOSE as FORMAT
 from pipelines.session.people import take_joints
@@ -83,14 +81,6 @@ def test_places_frames_and_missing_joints(tmp_path: Path) -> None:
     assert list(found.dropped.values()) == [1]
 
 
-def test_tracks_are_used_where_openpose_gives_them(tmp_path: Path) -> None:
-    frame_file(tmp_path / "a", "cam.0001.json", person(track=4), person(track=2))
-    found = FORMAT.read_keypoints(tmp_path / "a", skeleton=None, first_frame=0)
-    assert found.person.tolist() == [2, 4]
-    frame_file(tmp_path / "b", "cam.0001.json", person(track=0), person(50.0, track=0))
-    assert FORMAT.read_keypoints(tmp_path / "b", skeleton=None, first_frame=0).person.tolist() == [0, 1]
-
-
 def test_damaged_files_among_many_are_left_out_and_counted(tmp_path: Path) -> None:
     folder = tmp_path / "a"
     for frame in range(4):
@@ -131,22 +121,6 @@ def test_bad_folders_are_one_clear_line(tmp_path: Path) -> None:
         read("mixed")
     with refuses(tmp_path / "absent"):
         read("absent")
-
-
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(st.lists(st.lists(st.booleans(), max_size=3), min_size=1, max_size=6))
-def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, seen: list[list[bool]]) -> None:
-    """Write each frame as a list of places, each filled by a person or by {}."""
-    seen = [*seen, [True]]
-    folder = tmp_path_factory.mktemp("frames")
-    for frame, places in enumerate(seen):
-        people = [person(x=100.0 * frame + place) if there else {} for place, there in enumerate(places)]
-        frame_file(folder, f"cam.{frame}.json", *people)
-    expected = [(f, p) for f, places in enumerate(seen) for p, there in enumerate(places) if there]
-    found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=0)
-    assert list(zip(found.frame.tolist(), found.person.tolist(), strict=True)) == expected
-    assert found.xy[:, 0, 0].tolist() == [100.0 * frame + place for frame, place in expected]
-    assert found.frames_listed.tolist() == list(range(len(seen)))
 
 
 @pytest.mark.parametrize("name", ["{:06d}_cam2", "{:06d}_rtmpose-m_256x192", "cam2_{:012d}_keypoints"])

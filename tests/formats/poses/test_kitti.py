@@ -49,15 +49,6 @@ def test_poses_stand_upright_and_have_their_times(tmp_path: Path, times: str) ->
     np.testing.assert_allclose(down, np.tile([0, 0, -1], (5, 1)), atol=1e-9)
 
 
-def test_rows_that_are_no_rotation_are_dropped_and_counted(tmp_path: Path) -> None:
-    rows = matrices()
-    rows[2, 0, 0] = 3.0
-    rows[3, 0, 3] = np.inf
-    poses = READER.read_trajectory(write(tmp_path, rows))
-    assert len(poses.t_ns) == 3
-    assert sum(poses.dropped.values()) == 2
-
-
 def test_too_few_times_or_none_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path)
     (tmp_path / "times.txt").write_text("0.0\n0.1\n")

@@ -12,7 +12,7 @@ from hypothesis import given
 
 from pipelines.formats import poses as trajectory_files
 from pipelines.geometry.poses import rotate
-from pipelines.session.records import JointMotion, Recording, Trajectory
+from pipelines.session.records import Trajectory
 from pipelines.session.registries import Export, TrajectoryFormat, recognise
 from tests.formats.exported import flown, recording
 from tests.formats.trajectories import trajectories
@@ -43,16 +43,6 @@ def test_values_and_exact_stamps(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses.quaternion_xyzw[0], [0, 0, 0.6, 0.8], atol=1e-16)
     assert poses.dropped == {}
     assert poses.covariance is None
-
-
-@pytest.mark.parametrize("separator", [" ", "\t", ",", ", ", "   ", " \t "])
-def test_separators_comments_blank_lines_and_line_ends(tmp_path: Path, separator: str) -> None:
-    row = "1.5 1 2 3 0 0 0 1".replace(" ", separator)
-    path = write(tmp_path, f"\ufeff# ground truth\r\n# timestamp tx ty tz qx qy qz qw\r\n\r\n  {row} \r\n")
-    assert READER.recognises(path)
-    poses = READER.read_trajectory(path)
-    assert poses.t_ns.tolist() == [1_500_000_000]
-    assert poses.position.tolist() == [[1, 2, 3]]
 
 
 @pytest.mark.parametrize(
@@ -109,14 +99,6 @@ def test_rows_are_dropped_by_cause(tmp_path: Path) -> None:
     assert poses.position[1, 2] == 0, "of two rows with one stamp the first is kept"
 
 
-@pytest.mark.parametrize("tail", ["3 0.1 0.", "3 0.1 0.2 0.3 0 0 0 -", "3"])
-def test_a_last_line_that_broke_off_is_dropped(tmp_path: Path, tail: str) -> None:
-    path = write(tmp_path, rows(f"1 0 0 0 {IDENTITY}", f"2 0 0 0 {IDENTITY}") + tail)
-    poses = READER.read_trajectory(path)
-    assert poses.t_ns.tolist() == [10**9, 2 * 10**9]
-    assert list(poses.dropped.values()) == [1]
-
-
 def test_recognises_by_content(tmp_path: Path) -> None:
     assert READER.recognises(write(tmp_path, f"1 0 0 0 {IDENTITY}\n", "a.txt"))
     assert READER.recognises(write(tmp_path, "1,0,0,0,0,0,0,1\n", "b.csv"))
@@ -167,12 +149,6 @@ def test_cameras_and_joints_as_evo_reads_them(tmp_path: Path, monkeypatch: pytes
     read = file_interface.read_tum_trajectory_file(str(paths["left_wrist"]))
     np.testing.assert_array_equal(read.positions_xyz, np.delete(wrist, 7, axis=0))
     assert (read.orientations_quat_wxyz == [1, 0, 0, 0]).all()
-
-
-def test_each_person_gets_tracks_of_its_own(tmp_path: Path) -> None:
-    motion = JointMotion(np.array([0]), ("nose",), np.ones((1, 2, 1, 3)))
-    paths = WRITER.write(Recording("x", motion, {}), tmp_path)
-    assert [path.name for path in paths] == ["x_person0_nose.tum", "x_person1_nose.tum"]
 
 
 def test_vins_writes_w_first(tmp_path: Path) -> None:

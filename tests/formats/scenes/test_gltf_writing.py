@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from pipelines.formats.scenes.gltf_writing import EXPORT
 from pipelines.geometry.arrays import Float
@@ -76,21 +75,3 @@ def test_cameras_look_along_their_negative_z(tmp_path: Path) -> None:
             rotate(turn, np.array([0.0, 1.0, 0.0])), [[0, 1, 0]] * len(turn), atol=1e-6
         )
     assert document["cameras"]
-
-
-def test_trimesh_reads_the_scene(tmp_path: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    path, document, buffer = written(tmp_path, motion=walking(10))
-    scene = trimesh.load(path)
-    shown = [node for node in document["nodes"] if "mesh" in node]
-    assert len(scene.graph.nodes_geometry) == len(shown)
-    joints = np.array([animated(document, buffer, name, "translation")[0] for name in walking(1).joints])
-    # The bars end at joints, so that nothing reaches further than a joint's radius.
-    np.testing.assert_allclose(scene.bounds, [joints.min(axis=0), joints.max(axis=0)], rtol=0, atol=0.05)
-
-
-def test_the_same_recording_gives_the_same_bytes(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-    first, second = (written(tmp_path / name)[0].read_bytes() for name in ("a", "b"))
-    assert first == second

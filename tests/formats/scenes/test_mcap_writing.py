@@ -19,8 +19,6 @@ from tests.formats.exported import (
     LENS,
     LOOKING_NORTH,
     SIGMA_M,
-    START_NS,
-    VOXEL_M,
     flown,
     recording,
     stamps,
@@ -148,17 +146,3 @@ def test_pictures_come_with_the_lens_of_their_size(log: Path) -> None:
     assert [shown.shape for shown in decoded] == [(540, 960, 3)] * 4
     for shown, level in zip(decoded, range(40, 100, 15), strict=True):
         assert np.abs(shown.astype(int) - level).max() < 15 / 2  # half a step: it is no other picture
-
-
-def test_the_map_is_its_surface(log: Path) -> None:
-    ((stamp, cloud),) = messages(log, "/map")
-    assert stamp == START_NS
-    points = np.frombuffer(bytes(cloud.data), "<f4").reshape(-1, 3)
-    assert len(points) == cloud.width == 26
-    np.testing.assert_allclose(points.min(axis=0), np.array([10, 20, 0]) + 1.5 * VOXEL_M)
-    assert [field.name for field in cloud.fields] == ["x", "y", "z"]
-
-
-def test_the_same_recording_gives_the_same_bytes(log: Path, tmp_path: Path) -> None:
-    (again,) = WRITER.write(recording(), tmp_path)
-    assert again.read_bytes() == log.read_bytes()

@@ -15,7 +15,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
 from pipelines.session.registries import ExportWithChoices, JointFormat, need
-from tests.formats.exported import SIGMA_M, Listener, recording, stamps, walking, without
+from tests.formats.exported import SIGMA_M, recording, stamps, walking, without
 from tests.formats.refusals import refuses
 
 READER: JointFormat = c3d.FORMAT
@@ -131,18 +131,6 @@ def test_damaged_parameters_are_refused_before_ezc3d_sees_them(tmp_path: Path, n
     (tmp_path / "a.c3d").write_bytes(damaged)
     with refuses(tmp_path / "a.c3d", "parameters"):
         read(tmp_path / "a.c3d")
-
-
-def test_pauses_are_frames_without_points_and_counted(tmp_path: Path) -> None:
-    walked, listener = recording(progress=Listener()), Listener()
-    assert walked.motion is not None
-    kept = np.r_[0:20, 40:60]
-    motion = JointMotion(walked.motion.t_ns[kept], walked.motion.joints, walked.motion.position[kept])
-    (path,) = WRITER.write(replace(walked, motion=motion, progress=listener), tmp_path)
-    back = read(path)
-    assert len(back.t_ns) == 60
-    assert np.isnan(back.position[20:40]).all()
-    assert any("20" in note for note in listener.notes)
 
 
 def test_a_header_that_counts_too_many_frames_is_outvoted_by_point_frames(tmp_path: Path) -> None:

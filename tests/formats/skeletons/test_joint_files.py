@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.formats.common.exporting import thinned
 from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session.records import JointMotion
 from tests.formats.exported import START_NS, Listener
@@ -51,10 +50,3 @@ def beside(t_ns: np.ndarray, frame: int) -> bool:
     at = (t_ns[0] + t_ns[-1] * 0) + round(frame * 200_000_000 / 6)
     after = int(np.searchsorted(t_ns, at))
     return bool(t_ns[after] != at) and 3 in (after - 1, after)
-
-
-def test_thinning_keeps_the_first_of_every_period() -> None:
-    t_ns = START_NS + np.rint(np.arange(31) * 1e9 / 30).astype(np.int64)
-    assert thinned(t_ns, 10.0).tolist() == list(range(0, 31, 3))
-    assert thinned(t_ns, 1000.0).tolist() == list(range(31))
-    assert not len(thinned(t_ns, 0.0))

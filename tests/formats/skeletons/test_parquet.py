@@ -9,10 +9,8 @@ import pandas as pd
 import pytest
 
 from pipelines.formats.skeletons import joint_files
-from pipelines.session.records import Recording
 from pipelines.session.registries import Export
 from tests.formats.exported import flown, recording
-from tests.formats.refusals import refuses
 
 WRITER: Export = joint_files.PARQUET_EXPORT
 
@@ -31,15 +29,3 @@ def test_tables_by_name_time_and_joint(tmp_path: Path) -> None:
     assert set(table["status"]) == {"ok"}
     assert table["cyy"].iloc[0] == pytest.approx(0.02**2)
     np.testing.assert_array_equal(pd.read_parquet(camera)["x"], flown().position[:, 0])
-
-
-def test_the_same_bytes_again(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-    first, second = (WRITER.write(recording(), tmp_path / name)[0] for name in ("a", "b"))
-    assert first.read_bytes() == second.read_bytes()
-
-
-def test_nothing_to_export(tmp_path: Path) -> None:
-    with refuses("x", "reconstruct"):
-        WRITER.write(Recording("x", None, {}), tmp_path)

@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
 
 from pipelines.formats.skeletons import trc
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import Export, JointFormat
-from tests.formats.motions import motions
 from tests.real_data import real_data
 
 READER: JointFormat = trc.FORMAT
@@ -74,14 +72,6 @@ def test_real_files(relative: str) -> None:
     assert 1.4 < height["head"] < 1.9
 
 
-def test_the_header_of_a_real_file_may_count_wrong() -> None:
-    """Read a file of Pose2Sim's filter, which states one row too many: the rows themselves are counted."""
-    path = real_data("pose2sim_single/pose-3d/single_0-99_filt_butterworth.trc")
-    summary = READER.describe(path)
-    assert summary["header: NumFrames"] == "100"
-    assert summary["rows"] == 99
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -96,19 +86,6 @@ def test_the_header_of_a_real_file_may_count_wrong() -> None:
 def test_faulty_content_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(DataError):
         read(write(tmp_path, text))
-
-
-@given(motion=motions(people=1))
-def test_writing_and_reading_gives_the_same(
-    tmp_path_factory: pytest.TempPathFactory, motion: JointMotion
-) -> None:
-    path = tmp_path_factory.mktemp("trc") / "a.trc"
-    trc.write_joints(path, motion, 0)
-    back = read(path)
-    assert back.joints == motion.joints
-    np.testing.assert_array_equal(back.t_ns, motion.t_ns)
-    # Seven decimals of a metre are written.
-    np.testing.assert_allclose(back.position, motion.position, rtol=0, atol=0.5001e-7)
 
 
 def test_export_is_what_opensim_expects(tmp_path: Path) -> None:
@@ -148,53 +125,6 @@ def opensim() -> Any:
 
 
 _FIRST, _MIDDLE, _LAST, _FRAMES = (slice(None), 0), (slice(None), 1), (slice(None), 2), slice(1, 3)
-
-
-@pytest.mark.parametrize(
-    "gaps",
-    [
-        pytest.param([], id="none"),
-        pytest.param([(2, 0)], id="first"),
-        pytest.param([(2, 1)], id="middle"),
-        pytest.param([(2, 2)], id="last"),
-        pytest.param([(2, 1), (2, 2)], id="last two"),
-        pytest.param([_FRAMES], id="all, for two frames"),
-        pytest.param([0], id="all, in the first frame"),
-        pytest.param([4], id="all, in the last frame"),
-        pytest.param([_FIRST], id="first, always"),
-        pytest.param([_MIDDLE], id="middle, always"),
-        pytest.param([_LAST], id="last, always"),
-        pytest.param([slice(None)], id="all, always"),
-    ],
-)
-@pytest.mark.parametrize("unit", ["m", "mm"])
-def test_opensim_and_we_read_every_pattern_of_gaps(tmp_path: Path, gaps: list[Any], unit: str) -> None:
-    library = opensim()
-    position = np.random.default_rng(0).uniform(-5, 5, (5, 3, 3))
-    for where in gaps:
-        position[where] = np.nan
-    t_ns = 1_700_000_000_000_000_000 + np.arange(5) * 33_333_333
-    motion = JointMotion(t_ns, ("left_hip", "right_hip", "nose"), position[:, None])
-    path = tmp_path / "gaps.trc"
-    trc.write_joints(path, motion, 0, unit=unit)
-
-    table = library.TimeSeriesTableVec3(str(path))
-    assert list(table.getColumnLabels()) == ["LHip", "RHip", "Nose"]
-    assert table.getTableMetaDataString("Units") == unit
-    np.testing.assert_allclose(list(table.getIndependentColumn()), t_ns / 1e9, rtol=0, atol=1e-6)
-    rows = [table.getRowAtIndex(row) for row in range(table.getNumRows())]
-    cells = np.array([[[row[k][axis] for axis in range(3)] for k in range(3)] for row in rows])
-    # OpenSim's x, y (up), z are the world's y, z (up), x. Seven decimals of a metre are written.
-    turned = position[..., [1, 2, 0]]
-    np.testing.assert_allclose(cells / {"m": 1, "mm": 1000}[unit], turned, rtol=0, atol=0.5001e-7)
-    # The older reader, which OpenSim's scaling and inverse kinematics use for marker files.
-    frames = library.MarkerData(str(path))
-    assert (frames.getNumFrames(), frames.getNumMarkers()) == (5, 3)
-    older = [
-        [[frames.getFrame(row).getMarker(k)[axis] for axis in range(3)] for k in range(3)] for row in range(5)
-    ]
-    np.testing.assert_array_equal(np.isnan(older), np.isnan(turned))
-    np.testing.assert_array_equal(np.isnan(read(path).position[:, 0]), np.isnan(position))
 
 
 def test_spellings_of_other_programs(tmp_path: Path) -> None:
