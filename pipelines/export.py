@@ -40,12 +40,22 @@ from pipelines.session.storage import (
     working_folder,
     write_json,
 )
-from pipelines.session.tables import ANGLES, FRAMES, POSES, SKELETON, read_motion, read_table, trajectory_from
+from pipelines.session.tables import (
+    ANGLES,
+    FRAMES,
+    GAIT,
+    POSES,
+    SKELETON,
+    read_motion,
+    read_table,
+    trajectory_from,
+)
 from pipelines.session.urls import is_there
 from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 PICTURES_HZ = 2.0
 """Default number of pictures of a camera in a recording per second."""
@@ -191,9 +201,8 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         lenses={name: camera.intrinsics.intrinsics() for name, camera in description.cameras.items()},
         maps=lambda: each_map(folder) if description.map else iter(()),
         pictures=_pictures(folder, description, record, pictures_hz),
-        angles=lambda: (
-            None if record is None else read_table(folder / "reconstruct" / "angles.parquet", ANGLES)
-        ),
+        angles=lambda: _reconstructed(folder, record, "angles", ANGLES),
+        gait=lambda: _reconstructed(folder, record, "gait", GAIT),
         doubts=lambda: [doubt.as_warning() for doubt in _doubts(folder, description, record)],
         zero_ns=description.start_ns,
         people=() if motion is None else tuple(description.names_of_people(motion.position.shape[1])),
@@ -202,6 +211,14 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         return recording
     drawn = _Overlays(folder, description, record)
     return replace(recording, overlays=partial(drawn.stills, rate_hz=pictures_hz), film=drawn.film)
+
+
+def _reconstructed(
+    folder: Path, record: StageRecord | None, name: str, schema: pa.Schema
+) -> pd.DataFrame | None:
+    """Return a table of the reconstruction; None if there is none."""
+    place = f"reconstruct/{name}.parquet"
+    return None if record is None or place not in record.outputs else read_table(folder / place, schema)
 
 
 def _doubts(folder: Path, description: Description, record: StageRecord | None) -> list[Doubt]:

@@ -136,6 +136,8 @@ class Recording:
     """World times of all pictures of a camera, and these with skeleton and named angles; None without any."""
     angles: Callable[[], pd.DataFrame | None] = field(default=lambda: None)
     """Rows of `tables.ANGLES`, sorted by time, then person; None without a reconstruction."""
+    gait: Callable[[], pd.DataFrame | None] = field(default=lambda: None)
+    """Rows of `tables.GAIT`; None without a reconstruction."""
     doubts: Callable[[], Sequence[str]] = tuple
     """Sentences on what contradicts itself in the flight."""
     unit: str | None = None  # of lengths, if the user chooses one that the export has

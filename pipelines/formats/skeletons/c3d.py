@@ -10,12 +10,14 @@ LAST_T_NS, as text because C3D's numbers are too short. Other files begin at the
 number.
 """
 
+from __future__ import annotations
+
 import math
 import re
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,6 +40,9 @@ from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import need
 from pipelines.session.storage import as_data_error
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 # A C3D is divided into blocks of this many bytes.
 _BLOCK = 512
 # This is the second byte of every C3D.
@@ -51,6 +56,10 @@ _LONGEST_TEXT = 255
 _MOST_RESIDUAL = 255
 # A larger number of the first frame is damage of the header.
 _MOST_FIRST_FRAME = 1_000_000_000
+# Dimensions of a parameter are stored in one byte.
+_MOST_EVENTS = 255
+# Names in gait laboratories' programs.
+_EVENTS = {"heel_strike": "Foot Strike", "toe_off": "Foot Off"}
 _SCREEN_UP = {"+Z": "z-up", "+Y": "y-up"}
 _EXPORT_AGAIN = "export it again"
 
@@ -286,13 +295,29 @@ class C3dExport:
             recording.progress.note(
                 f"c3d: {even.empty} frames lie in pauses of the skeleton and hold no points"
             )
+        gait = recording.gait()
         for person, path in files.items():
-            write_joints(path, even, person, unit=recording.unit or "mm", axes=recording.axes or "z-up")
+            events = None if gait is None else gait[gait["person"] == person]
+            if events is not None and len(events) > _MOST_EVENTS:
+                left_out = len(events) - _MOST_EVENTS
+                recording.progress.note(
+                    f"c3d: {left_out} gait events of {path.stem} do not fit, the last ones"
+                )
+            choice = {"unit": recording.unit or "mm", "axes": recording.axes or "z-up"}
+            write_joints(path, even, person, events=events, **choice)
         return sorted(files.values())
 
 
-def write_joints(path: Path, even: EvenMotion, person: int, *, unit: str, axes: str) -> None:
-    """Write one person's joints; the module explains the residuals."""
+def write_joints(
+    path: Path,
+    even: EvenMotion,
+    person: int,
+    *,
+    unit: str,
+    axes: str,
+    events: pd.DataFrame | None = None,
+) -> None:
+    """Write one person's joints, and rows of `tables.GAIT` as events; the module explains the residuals."""
     ezc3d = need("ezc3d", "c3d")
     motion = even.motion
     position = motion.position[:, person]
@@ -322,7 +347,18 @@ def write_joints(path: Path, even: EvenMotion, person: int, *, unit: str, axes: 
     file.add_parameter("MANUFACTURER", "SOFTWARE", ["mocap"])
     file.add_parameter("MOCAP", "FIRST_T_NS", [str(int(motion.t_ns[0]))])
     file.add_parameter("MOCAP", "LAST_T_NS", [str(int(motion.t_ns[-1]))])
+    if events is not None and len(events):
+        _add_events(file, events[:_MOST_EVENTS], int(motion.t_ns[0]))
     file.write(str(path))
+
+
+def _add_events(file: Any, events: pd.DataFrame, first_ns: int) -> None:
+    """Add the group EVENT (The C3D File Format, 2021): minutes and seconds since the first frame."""
+    since_s = (events["t_ns"].to_numpy(np.int64) - first_ns) / 1e9
+    file.add_parameter("EVENT", "USED", [len(events)])
+    file.add_parameter("EVENT", "CONTEXTS", events["side"].str.capitalize().tolist())
+    file.add_parameter("EVENT", "LABELS", [_EVENTS[event] for event in events["event"]])
+    file.add_parameter("EVENT", "TIMES", np.array(np.divmod(since_s, 60.0)))
 
 
 def _residuals(motion: JointMotion, person: int, missing: Any, step: float) -> Float:

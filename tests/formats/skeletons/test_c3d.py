@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from pipelines.formats.skeletons import c3d
@@ -15,7 +16,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
 from pipelines.session.registries import ExportWithChoices, JointFormat, need
-from tests.formats.exported import SIGMA_M, recording, stamps, walking, without
+from tests.formats.exported import SIGMA_M, START_NS, recording, stamps, walking, without
 from tests.formats.refusals import refuses
 
 READER: JointFormat = c3d.FORMAT
@@ -150,3 +151,19 @@ def test_counts_of_a_trial_may_be_a_table() -> None:
     for stated in ([70_000 & 0xFFFF, 1], [[70_000 & 0xFFFF], [1]]):
         contents = {"parameters": {"TRIAL": {"ACTUAL_END_FIELD": {"value": np.array(stated)}}}}
         assert c3d._words(contents, "ACTUAL_END_FIELD") == 70_000
+
+
+def test_gait_events_are_read_by_ezc3d(tmp_path: Path) -> None:
+    walked = recording(60)
+    rows = {
+        "t_ns": START_NS + np.array([250, 900, 65_500]) * 1_000_000,
+        "person": [0, 0, 0],
+        "side": ["left", "right", "left"],
+        "event": ["heel_strike", "toe_off", "heel_strike"],
+    }
+    (path,) = WRITER.write(replace(walked, gait=lambda: pd.DataFrame(rows)), tmp_path)
+    events = need("ezc3d", "c3d").c3d(str(path))["parameters"]["EVENT"]
+    assert events["USED"]["value"].tolist() == [3]
+    assert events["CONTEXTS"]["value"] == ["Left", "Right", "Left"]
+    assert events["LABELS"]["value"] == ["Foot Strike", "Foot Off", "Foot Strike"]
+    np.testing.assert_allclose(events["TIMES"]["value"], [[0, 0, 1], [0.25, 0.9, 5.5]], atol=1e-6)
