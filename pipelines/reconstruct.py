@@ -352,8 +352,8 @@ def _finished(
 
 
 def _reason(error: DataError, settings: ReconstructSettings) -> str:
-    """Return why `auto` goes without backgrounds; raise the error where somebody asked for them."""
-    if settings.refine_cameras is not None:
+    """Return why `auto` goes without backgrounds; raise it where they were asked for, or pictures changed."""
+    if settings.refine_cameras is not None or error.code == "changed":
         raise error
     return f"{Path(error.source).name} {error.problem}"
 

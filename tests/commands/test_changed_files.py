@@ -189,6 +189,15 @@ def test_every_command_that_reads_pictures_refuses_others(
     assert "written" in succeeds("export", session, "--to", "csv", "-o", tmp_path / "csv")
 
 
+def test_reconstruct_refuses_another_video_beside_imported_keypoints(filmed: Path, tmp_path: Path) -> None:
+    session = copied(filmed, tmp_path)
+    before = content(session)
+    exchange(session)
+    line = refused("reconstruct", session, "--force", code="changed")
+    assert str(session.parent / "drone1.mp4") in line
+    assert content(session) == before
+
+
 def test_a_source_that_is_written_while_it_is_ingested_is_refused(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=0.4)
     log = tmp_path / "drone2.tum"
