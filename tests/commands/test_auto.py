@@ -24,7 +24,7 @@ def reconstructed(session: Path, *options: str) -> tuple[dict[str, Any], bytes]:
 
 
 def test_without_pictures_it_is_the_refinement(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=3, seconds=1.5, pose_noise=NOISE)
+    flight = write_flight(tmp_path, cameras=3, seconds=1.5, fps=15, pose_noise=NOISE)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
     unasked, skeleton = reconstructed(session)
@@ -82,7 +82,7 @@ def test_every_method_is_served_by_the_clocks_that_were_found(tmp_path: Path, me
 
 @pytest.mark.parametrize(
     ("cameras", "late_s", "within_s"),
-    [(3, {"drone1": 0.12}, 0.005), (3, {"drone2": -0.05}, 0.005), (2, {"drone2": 0.2}, 0.02), (3, {}, 0.0)],
+    [(3, {"drone2": -0.05}, 0.005), (2, {"drone2": 0.2}, 0.02), (3, {}, 0.0)],
 )
 def test_a_stated_clock_that_is_wrong_is_moved_and_doubted(
     tmp_path: Path, cameras: int, late_s: dict[str, float], within_s: float
