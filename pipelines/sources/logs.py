@@ -30,7 +30,7 @@ from pipelines.formats.logs.pictures import (
     picture_stamps,
     read_triggers,
 )
-from pipelines.formats.logs.presets import FIXES, pairs_of
+from pipelines.formats.logs.presets import FIXES, axes_of_topic, pairs_of
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.formats.logs.trajectories import (
     COMMAND_TYPES,
@@ -48,7 +48,7 @@ from pipelines.geometry.arrays import Int64
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.clocks import ClockStep, find_steps, without_steps
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import LogSource, Manifest, MapSource
+from pipelines.session.manifest import Axes, LogSource, Manifest, MapSource
 from pipelines.session.records import IntrinsicsSample, Message, Occupancy, PictureSample, Trajectory
 from pipelines.session.registries import Log, LogFormat, recognise
 from pipelines.session.source_options import LoggedMap
@@ -247,6 +247,17 @@ class FlightLogs:
                 name = opened.choose("poses", topic)
                 gathered = poses_of(recording, name, source, stamps)
             return opened.at_world_times(gathered, name)
+
+    def axes(self, log: str, topic: str | None, parent: str | None) -> Axes | None:
+        """Return the axes that the manifest states for a log, else those that its program is known to use."""
+        if (stated := self.settings(log).axes) is not None:
+            return stated
+        with self.open(log) as opened:
+            there = [known.name for known in opened.recording.topics if kind_of(known) == "poses"]
+            name = topic or (there[0] if len(there) == 1 and parent is None else None)
+            if (axes := axes_of_topic(name, parent)) is not None:
+                self._note(f"{opened.source}: {name or parent} is AirSim's, in {axes.upper()}")
+            return axes
 
     def triggers(self, log: str, topic: str | None) -> Frames | None:
         """Read trigger times of pictures from a topic, at world times; None if it is no topic of triggers."""

@@ -194,7 +194,8 @@ class FlightPoses:
                 pose.file, pose.topic, options.parent, options.child, max_gap_ns=self._max_gap_ns
             )
             logged = as_stated(logged, pose, options)
-            turned = self._turned(camera, logged, pose.axes, settings.axes)
+            axes = pose.axes or self._logs.axes(pose.file, pose.topic, options.parent)
+            turned = self._turned(camera, logged, axes)
             return path, in_world(turned, settings.world_from_source)
         filed = as_stated(self._filed_trajectory(pose), pose, self._files.options("pose", pose, FiledPose))
         return path, self._turned(camera, filed, pose.axes)

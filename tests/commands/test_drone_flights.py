@@ -147,6 +147,42 @@ def _tlog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"file": f"{name}.tlog"}
 
 
+def _airsim(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    """Write odometry as AirSim's node does: position in NED, and the rotation of an FRD body in it."""
+    ned_from_enu, frd_from_flu = (0.5**0.5, 0.5**0.5, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    turned = multiply(multiply(np.array(ned_from_enu), truth.body), np.array(frd_from_flu))
+    entries = []
+    for row, t in enumerate(truth.t_ns.tolist()):
+        east, north, up = truth.enu[row].tolist()
+        pose = {
+            "position": {"x": north, "y": east, "z": -up},
+            "orientation": dict(zip("xyzw", turned[row].tolist(), strict=True)),
+        }
+        fields = {"header": header(t, "drone_1"), "child_frame_id": "odom_local_ned", "pose": {"pose": pose}}
+        entries.append(Entry("/airsim_node/drone_1/odom_local_ned", "nav_msgs/msg/Odometry", t, fields))
+    write_log(folder, name, "ros1", entries)
+    return {"file": f"{name}.bag", "of": "body"}
+
+
+def test_odometry_of_airsims_node_is_ned(tmp_path: Path) -> None:
+    flight = with_poses(tmp_path, _airsim)
+    for k, name in enumerate(flight.cameras):
+        truth = drone_of(flight, k)
+        yaw, pitch, _ = truth.gimbal_ypr_deg[0].tolist()
+        camera = flight.settings["cameras"][name]
+        camera["gimbal"] = {"yaw_deg": yaw, "pitch_deg": pitch}
+        camera["mount"] = ON_GIMBAL
+    flight.settings["world"].pop("origin")
+    flight.save()
+    ingest(flight.manifest)
+    assert len([line for line in session_of(flight)["warnings"] if "AirSim" in line]) == 2
+    for k, name in enumerate(flight.cameras):
+        found = poses_of(flight, name)[["x", "y", "z"]].to_numpy()
+        truth = drone_of(flight, k)
+        expected = truth.enu + rotate(truth.body, LEVER_ARM)
+        np.testing.assert_allclose(found, expected[: len(found)], atol=1e-6)
+
+
 def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
     return {
         "header": header(int(truth.t_ns[row]), "/gps"),

@@ -14,6 +14,7 @@ the nose.
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -52,6 +53,7 @@ FIXES = (
 )
 """Types of positions on Earth."""
 
+_AIRSIM = re.compile(r"(^|/)airsim_node/[^/]+/odom_local_ned$")
 # A message that names more topics is not read.
 _MOST_NAMED = 8
 # NavSatFix and GPSFix say by this status that there is no fix.
@@ -126,6 +128,15 @@ class _TopicRows:
 
     def values(self) -> Float:
         return np.frombuffer(self.numbers, dtype=np.float64).reshape(len(self.header_ns), -1)
+
+
+def axes_of_topic(topic: str | None, parent: str | None) -> Axes | None:
+    """Return the axes that a known program gives its poses, by the name of the topic or of their frame.
+
+    AirSim's node for ROS publishes /airsim_node/VEHICLE/odom_local_ned and frames below world_ned: NED and
+    FRD (microsoft.github.io/AirSim/airsim_ros_pkgs).
+    """
+    return "ned" if _AIRSIM.search(topic or "") or (parent or "").strip("/") == "world_ned" else None
 
 
 def namespaces(names: Sequence[str]) -> list[tuple[Preset, str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import shutil
+import sqlite3
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +21,7 @@ from pipelines.formats.logs.recordings import (
     UNCLOSED,
     UNDEFINED,
 )
+from pipelines.session.errors import DataError
 from tests.formats.log_entries import (
     PICTURE,
     POSE,
@@ -29,7 +31,7 @@ from tests.formats.log_entries import (
     log_format,
     positions,
 )
-from tests.synthetic.logs import Entry, McapCompression, cut, write_mcap
+from tests.synthetic.logs import Entry, McapCompression, cut, write_log, write_mcap
 
 FLIGHT = entries()
 ALL = [(e.topic, e.stamp_ns) for e in FLIGHT]
@@ -233,3 +235,29 @@ def test_split_files_are_one_recording(tmp_path: Path) -> None:
     with log_format(paths[0]).open_log(paths) as log:
         stamps = [m.receive_ns for m in log.messages([POSE, PICTURE])]
     assert stamps == sorted(e.stamp_ns for e in FLIGHT if e.topic in {POSE, PICTURE})
+
+
+@pytest.mark.parametrize("kind", [6, 7, 9, 11])
+@pytest.mark.parametrize("container", ["mcap", "ros2-sqlite3"])
+def test_version_2_of_cdr_is_refused(tmp_path: Path, kind: int, container: str) -> None:
+    path, topic = tmp_path / "a.mcap", POSE
+    if container == "mcap":
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+            channel = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channel, 1, bytes([0, kind, 0, 0, 1, 0, 0, 0, 0]), 1)
+            writer.finish()
+    else:
+        path = write_log(tmp_path, "a", "ros2-sqlite3", FLIGHT)
+        (file,) = path.glob("*.db3")
+        database = sqlite3.connect(file)
+        with database:
+            rows = database.execute("SELECT id, data FROM messages").fetchall()
+            changed = [(bytes([0, kind]) + data[2:], id_) for id_, data in rows]
+            database.executemany("UPDATE messages SET data = ? WHERE id = ?", changed)
+        database.close()
+    with log_format(path).open_log([path]) as log, pytest.raises(DataError) as caught:
+        list(log.messages([topic]))
+    assert caught.value.code == "unsupported"
