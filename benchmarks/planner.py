@@ -98,17 +98,15 @@ def worlds(options: argparse.Namespace) -> Lines:
 # --- predicted and measured errors -----------------------------------------------------------------------
 
 NEAREST_M = 8.0
-FLOWN: Mapping[str, tuple[str, Mapping[str, Any], bool]] = {
-    "fixed": ("fixed", {}, False),
-    "adaptive": ("adaptive", {}, False),
-    "joint, 10 m only": ("joint", {"ranges_m": (10.0,)}, False),
-    "adaptive, 8 m": ("adaptive", {"radius_m": NEAREST_M}, False),
-    "joint": ("joint", {}, False),
-    "joint, from 8 m": ("joint", {"radius_m": NEAREST_M}, False),
-    "adaptive, 8 m, way known": ("adaptive", {"radius_m": NEAREST_M}, True),
-    "joint, from 8 m, way known": ("joint", {"radius_m": NEAREST_M}, True),
+FLOWN: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "fixed": ("fixed", {}),
+    "adaptive": ("adaptive", {}),
+    "joint, 10 m only": ("joint", {"ranges_m": (10.0,)}),
+    "adaptive, 8 m": ("adaptive", {"radius_m": NEAREST_M}),
+    "joint": ("joint", {}),
+    "joint, from 8 m": ("joint", {"radius_m": NEAREST_M}),
 }
-"""Arms by their names in the table: the planner's arm, changes of its settings, and if it knows the way."""
+"""Arms by their names in the table: the planner's arm, and changes of its settings."""
 _NOISE = White(position_m=0.02, rotation_deg=0.2)
 _EVERY = 2  # tracking steps from picture to picture
 
@@ -138,7 +136,7 @@ def predict(seed: int) -> dict[str, Predicted]:
     start = Start(world.drones, world.yaw_rad)
     rows = slice(None, None, _EVERY)
     found = {}
-    for arm, (name, changes, knows) in FLOWN.items():
+    for arm, (name, changes) in FLOWN.items():
         config = PlannerConfig(tuning=PlannerTuning(errors=errors), **changes)
         done = replay(
             PLANNER_ARMS.get(name),
@@ -147,7 +145,6 @@ def predict(seed: int) -> dict[str, Predicted]:
             [field],
             start,
             config=config,
-            foresight=knows,
         )
         joints, place, actor = done.actor[rows, None] + posture, done.position[:, rows], done.actor[rows]
         measured = measure(
@@ -188,12 +185,10 @@ def _by_second(values: Float, second: Float) -> Float:
 
 
 def prediction(options: argparse.Namespace) -> Lines:
-    """Compare predicted with measured errors, and each arm with the best of those that know the way."""
+    """Compare predicted with measured errors."""
     first = options.first or 1000
     with ProcessPoolExecutor(options.workers) as pool:
         found = list(pool.map(predict, range(first, first + (options.count or 20))))
-    knowing = [arm for arm, (_, _, knows) in FLOWN.items() if knows]
-    least = [min(float(np.nanmean(world[arm].measured)) for arm in knowing) for world in found]
     rows = []
     for arm in FLOWN:
         own = [world[arm] for world in found]
@@ -204,13 +199,12 @@ def prediction(options: argparse.Namespace) -> Lines:
                 *(fixed(float(measured.mean()), 1),),
                 fixed(float(np.mean([np.nanmean(one.predicted) for one in own])), 1),
                 fixed(100 * float(np.mean([one.hidden for one in own])), 2),
-                fixed(float(np.mean(measured / least)), 3),
             ]
         )
     means = np.array(
         [[np.nanmean(one.predicted), np.nanmean(one.measured)] for w in found for one in w.values()]
     )
-    header = ["arm", "range m", "measured mm", "predicted mm", "hidden %", "over the best that knows the way"]
+    header = ["arm", "range m", "measured mm", "predicted mm", "hidden %"]
     return [
         *markdown_table(header, rows),
         "",

@@ -43,12 +43,12 @@ _settings_options = grouped(
         multiple=True,
         metavar="PLANNER.yaml|KEY=VALUE",
         help="Settings (docs/planner.md) of a file, or one of them: radius_m=8, tilt_deg=20, horizon_s=7,"
-        " yaw_deg=45, yaw_frame=heading, mode=plan-only, ...; repeat it for several, the last one counts.",
+        " yaw_deg=45, yaw_frame=heading, ...; repeat it for several, the last one counts.",
     ),
     click.option(
         "--trials",
         type=click.IntRange(1, 10_000),
-        default=20,
+        default=100,
         show_default=True,
         help="Draws of detector and pose noise for the reconstruction error.",
     ),
@@ -135,29 +135,23 @@ def replan_compare_command(
 
 
 def _print(metrics: dict[str, Any]) -> None:
-    groups = metrics["equal_ranges"]
-    arms = {name: metrics["arms"][name] for group in groups for name in group["arms"]}  # near ones first
-    rows = [
-        {
-            "arm": name,
-            "drones": arm["drones"],
-            "range m": arm["range_m"]["mean"],
-            "tilt deg": arm["tilt_deg"]["mean"],
-            "max": arm["tilt_deg"]["max"],
-            "near obstacle": arm["tilt_deg"]["near_obstacle"],
-            "hidden %": 100 * arm["occluded_share"],
-            "blind s": arm["blind_s"],
-            "path m": arm["path_m"],
-            "energy kJ": arm["energy_kj"],
-            "clearance m": arm["min_clearance_m"],
-            "separation m": arm["min_separation_m"],
-            "actor m": arm["min_actor_distance_m"],
-            **_errors(arm["reconstruction_error"]),
-            "violations": sum(arm["limit_violations"].values()),
-        }
-        for name, arm in arms.items()
-    ]
-    _print_rows(rows)
+    arms = {name: metrics["arms"][name] for group in metrics["equal_ranges"] for name in group["arms"]}
+    _print_rows(
+        [
+            {
+                "arm": name,
+                "drones": arm["drones"],
+                "range m": arm["range_m"]["mean"],
+                "tilt deg": arm["tilt_deg"]["mean"],
+                "max": arm["tilt_deg"]["max"],
+                "hidden %": 100 * arm["occluded_share"],
+                "path m": arm["path_m"],
+                **_errors(arm["reconstruction_error"]),
+                "violations": sum(arm["limit_violations"].values()),
+            }
+            for name, arm in arms.items()  # near ones first
+        ]
+    )
     _print_rows(
         [
             {
@@ -173,9 +167,9 @@ def _print(metrics: dict[str, Any]) -> None:
         ]
     )
     say(metrics["verdict"])
-    for group in groups if len(groups) > 1 else ():
+    for group in metrics["equal_ranges"] if len(metrics["equal_ranges"]) > 1 else ():
         if group["best"] is not None:
-            say(f"of equal range ({', '.join(group['arms'])}): best is {group['best']['arm']}")
+            say(f"of equal range ({', '.join(group['arms'])}): {' and '.join(group['best']['arms'])}")
 
 
 def _print_rows(rows: list[dict[str, object]]) -> None:
@@ -185,13 +179,19 @@ def _print_rows(rows: list[dict[str, object]]) -> None:
 
 def _errors(stated: dict[str, Any]) -> dict[str, object]:
     share, error, coverage = (stated.get(key) or {} for key in ("pck150", "mpjpe_mm", "coverage"))
-    interval = error.get("interval")
-    ends = f" [{interval[0]:.1f}, {interval[1]:.1f}]" if interval else ""
     return {
-        "PCK150 %": _percent(share.get("mean")),
-        "MPJPE mm": f"{error['mean']:.1f}{ends}" if error else None,
+        "PCK150 %": _with_interval(share, 100),
+        "MPJPE mm": _with_interval(error, 1),
         "covered %": _percent(coverage.get("mean")),
     }
+
+
+def _with_interval(stated: dict[str, Any], scale: float) -> str | None:
+    if not stated:
+        return None
+    low, high = stated["interval"] or (None, None)
+    ends = "" if low is None or high is None else f" [{scale * low:.1f}, {scale * high:.1f}]"
+    return f"{scale * stated['mean']:.1f}{ends}"
 
 
 def _print_filmed(metrics: dict[str, Any]) -> None:

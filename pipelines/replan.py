@@ -27,7 +27,6 @@ from pipelines.planning.arm_flights import (
     fly_arm,
     logged_arm,
     measure_arm,
-    seen_joints,
     trajectories,
 )
 from pipelines.planning.arms import PLANNER_ARMS
@@ -45,9 +44,7 @@ from pipelines.session.stages import Stage, StageRecord, WritableSession, key_of
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import (
     ACTOR,
-    COST_MAP,
     REPLAN,
-    SEEN,
     TRUTH,
     motion_table,
     read_table,
@@ -68,7 +65,7 @@ from pipelines.simulation.scenario import DetectorErrors
 if TYPE_CHECKING:
     import pandas as pd
 
-REPLAN_STAGE = Stage("replan", revision=6)
+REPLAN_STAGE = Stage("replan", revision=7)
 
 # The detector's errors were measured by the size of a person of this height in the picture.
 PERSON_HEIGHT_M = 1.75
@@ -164,7 +161,6 @@ def replan(
         keypoints = f"modelled after {errors.detector}"
         metrics = jsonable({"name": name} | compare(scene, results) | {"keypoints": keypoints})
         write_table(run.folder / "actor.parquet", _actor_table(scene), ACTOR)
-        write_table(run.folder / "cost_map.parquet", _cost_table(scene), COST_MAP)
         write_json(run.folder / "metrics.json", metrics)
         kept, lost = _keep_by_name(
             session, run.folder, name, {"settings": jsonable(stated), "inputs": inputs}
@@ -174,7 +170,6 @@ def replan(
             "moments": len(scene.t_ns),
             "pictures": len(scene.t_ns[scene.pictures]),
             "joint_frames": {name: result.joint_frames for name, result in results.items()},
-            "local_plans": {name: result.flight.separation for name, result in results.items()},
             "safety": {name: result.flight.safety for name, result in results.items()},
         }
         record = run.publish(counts=counts, warnings=metrics["warnings"])
@@ -350,7 +345,6 @@ def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder
     np.save(folder / "known.npy", flown.known)
     np.save(folder / "aim.npy", flown.aim)
     facts: dict[str, object] = {
-        "separation": flown.separation,
         "safety": flown.safety,
         "seen_share": None,
         "joint_frames": 0,
@@ -361,7 +355,6 @@ def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder
         by_person = measured.first.reshape(len(pictures), len(scene.people), -1, 3)
         first = JointMotion(pictures, joints, by_person)
         write_table(folder / "skeleton.parquet", motion_table(first), TRUTH)
-        write_table(folder / "seen.parquet", seen_joints(scene, flown, measured), SEEN)
         facts |= {"seen_share": measured.seen_share, "joint_frames": measured.joint_frames}
     write_json(folder / "facts.json", facts)
     write_json(folder / "times.json", _percentiles({"central": flown.central_s, "local": flown.local_s}))
@@ -377,7 +370,6 @@ def read_result(folder: Path) -> ArmResult:
             table,
             np.load(folder / "aim.npy"),
             np.load(folder / "known.npy"),
-            facts["separation"],
             facts["safety"],
         ),
         error_m=np.load(errors, mmap_mode="r") if errors.exists() else None,  # large in long flights
@@ -412,16 +404,3 @@ def _actor_table(scene: ReplayScene) -> pd.DataFrame:
     table = pd.DataFrame({"t_ns": scene.t_ns, "person": 0})
     table[["x", "y", "z"]] = scene.actor
     return table
-
-
-def _cost_table(scene: ReplayScene) -> pd.DataFrame:
-    import pandas as pd
-
-    t_ns, yaws, cost = scene.cost_map()
-    return pd.DataFrame(
-        {
-            "t_ns": np.repeat(t_ns, len(yaws)),
-            "yaw_rad": np.tile(yaws, len(t_ns)),
-            "cost": cost.ravel(),
-        }
-    )

@@ -24,7 +24,7 @@ from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.keypoints.hints import project_actor
 from pipelines.keypoints.tracking import FollowedPeople
-from pipelines.planning.comparison import capped_mm, mean_of_trials, measure_alone
+from pipelines.planning.comparison import SMALLEST_DIFFERENCE_MM, capped_mm, compare, mean_of_trials
 from pipelines.planning.config import SETTINGS, PlannerConfig, planner_config
 from pipelines.planning.loading import load_flight
 from pipelines.planning.scene import ReplanSettings, ReplayScene, build_scene
@@ -286,7 +286,7 @@ def _study_walk(
         ]
         parts = _parts(work, making, workers, halt)
         rows = [row for part in parts for row in read_json(part / "rows.json")["rows"]]
-        cells = estimates(rows, settings.axis, seed=settings.seed)
+        cells = estimates(rows, settings.axis)
         if not any(cell["metrics"]["mpjpe_mm"] for cell in cells):
             raise DataError(
                 "study",
@@ -494,10 +494,11 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
                 if result.error_m is None:
                     raise _no_skeleton(place)
                 capped.append(capped_mm(result.error_m, result.joint_frames))
-                scores = measure_alone(scene, _arm_of(cell), result)
+                arm = _arm_of(cell)
+                scores = compare(scene, {arm: result})["arms"][arm]
                 rows.append(_figures(scene, cell, scores, capped[-1]))
                 progress.advance()
-            best = _mark_tradeoff(rows, capped, settings.seed)
+            best = _mark_tradeoff(rows, capped)
             metrics = {
                 "kind": "session",
                 "varied": list(varied),
@@ -605,7 +606,7 @@ def _figures(
 ) -> Row:
     """Return the figures of one combination; way and energy are those of all drones together."""
     errors = scores["reconstruction_error"]
-    estimate = mean_of_trials(capped, scene.settings.seed)
+    estimate = mean_of_trials(capped)
     low, high = estimate["interval"] if estimate is not None and estimate["interval"] else (None, None)
     mpjpe, share, covered = (errors[key] for key in ("mpjpe_mm", "pck150", "coverage"))
     return {
@@ -635,8 +636,8 @@ def _figures(
     }
 
 
-def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any], seed: int) -> dict[str, Any]:
-    """Mark the best combination and the trade-off; return the best and those that noise does not tell apart.
+def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any]) -> dict[str, Any]:
+    """Mark the best combination and the trade-off; return the best and those that are alike.
 
     Combinations that violate a limit are left out, unless all do. The trade-off is between the error, the way
     of all drones and the range asked for: nothing on it is beaten or equalled in all three by another.
@@ -656,8 +657,10 @@ def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any], seed: int)
         rows[k]["tradeoff"] = not beaten
     alike = []
     for k in kept:
-        found = mean_of_trials(capped[k] - capped[best], seed)
-        if k != best and found is not None and found["interval"] and found["interval"][0] <= 0.0:
+        found = mean_of_trials(capped[k] - capped[best])
+        if k == best or found is None:
+            continue
+        if found["mean"] < SMALLEST_DIFFERENCE_MM or (found["interval"] and found["interval"][0] <= 0.0):
             alike.append(k)
     return {"cell": best, "alike": alike}
 
@@ -670,7 +673,7 @@ def _verdict(rows: Sequence[dict[str, Any]], best: dict[str, Any]) -> str:
         f" {own['path_m']:.0f} m and {own['energy_kj']:.0f} kJ of all drones (simulated)"
     ]
     if best["alike"]:
-        words.append(f"Noise does not tell apart {'; '.join(_named(rows[k]) for k in best['alike'])}")
+        words.append(f"No difference worth flying to {'; '.join(_named(rows[k]) for k in best['alike'])}")
     least = min((row for row in rows if row["tradeoff"]), key=lambda row: float(row["path_m"]))
     if least is not own:
         words.append(f"Shortest is {_named(least)}: {least['path_m']:.0f} m, {least['capped_mm']:.1f} mm")

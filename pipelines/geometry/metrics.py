@@ -466,11 +466,10 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
 
 # --- confidence intervals ----------------------------------------------------------------------------------
 
-# Intervals of means by the bootstrap. Trials are independent: as many are drawn from them with replacement
-# as there are (Efron & Tibshirani 1993, 13.3). In a flight neighbours correlate: the flight is treated as a
-# circle, and stretches of a fixed length are drawn from it (circular block bootstrap, Politis & Romano
-# 1992). The interval holds the middle 95 % of the means of many draws. Errors that are the same throughout
-# are not in it: it is valid for this flight, not for the next.
+# Trials are independent: the interval of their mean is Student's, which holds for few of them, too. In a
+# flight neighbours correlate: the flight is treated as a circle, and stretches of a fixed length are drawn
+# from it (circular block bootstrap, Politis & Romano 1992). The interval holds the middle 95 % of the means
+# of many draws. Errors that are the same throughout are not in it: it is valid for this flight alone.
 
 # Papers of the field state intervals of 95 %.
 LEVEL = 0.95
@@ -502,7 +501,7 @@ def stretch_samples(t_ns: Int64) -> int:
 def intervals(
     series: Mapping[str, Series], t_ns: Int64 | None, *, seed: int = 0
 ) -> dict[str, tuple[float, float] | None]:
-    """Compute the interval of every figure, with the same draws for all of them.
+    """Compute the interval of every figure, of a flight with the same draws for all of them.
 
     Args:
         series: by name, [T] each; nothing may be NaN.
@@ -511,19 +510,33 @@ def intervals(
     Returns:
         By name; None with fewer than ten samples or two trials, or if a draw has no data for the figure.
     """
+    if t_ns is None:
+        return {name: _of_trials(*each) for name, each in series.items()}
     return {name: interval_of(values) for name, values in resampled(series, t_ns, seed=seed).items()}
 
 
-def resampled(series: Mapping[str, Series], t_ns: Int64 | None, *, seed: int = 0) -> dict[str, Float]:
-    """Compute every figure of every draw, [RESAMPLES], with the same draws for all figures.
+def _of_trials(sums: Float, weights: Float) -> tuple[float, float] | None:
+    """Compute Student's interval of a ratio of totals over trials [K], to first order; None for one."""
+    if len(sums) < _MIN_TRIALS or not weights.sum() > 0:
+        return None
+    from scipy.special import stdtrit
+
+    ratio = float(sums.sum() / weights.sum())
+    error = float((sums - ratio * weights).std(ddof=1) / weights.mean() / math.sqrt(len(sums)))
+    reach = float(stdtrit(len(sums) - 1, 0.5 + LEVEL / 2)) * error
+    return ratio - reach, ratio + reach
+
+
+def resampled(series: Mapping[str, Series], t_ns: Int64, *, seed: int = 0) -> dict[str, Float]:
+    """Compute every figure of every draw of a flight, [RESAMPLES], with the same draws for all figures.
 
     The arguments are those of `intervals`. A value is NaN if a draw has no data for the figure. All values
-    are NaN with fewer than ten samples or two trials.
+    are NaN with fewer than ten samples.
     """
     count = len(next(iter(series.values()))[0]) if series else 0
-    if count < (_MIN_TRIALS if t_ns is None else _MIN_SAMPLES):
+    if count < _MIN_SAMPLES:
         return {name: np.full(RESAMPLES, np.nan) for name in series}
-    length = 1 if t_ns is None else stretch_samples(t_ns)
+    length = stretch_samples(t_ns)
     first = np.random.default_rng([seed, count]).integers(count, size=(RESAMPLES, math.ceil(count / length)))
     found = {}
     for name, (sums, weights) in series.items():

@@ -36,8 +36,6 @@ PLANNED = "planned"
 """Name of the other arm that is no planner: the commands of the planner on board, as logged."""
 LOGGED = (FLOWN, PLANNED)
 
-# Pictures of a person who walks differ from second to second.
-LOOK_PERIOD_S = 1.0
 # The same standard deviation of a good keypoint is the first guess of `mocap reconstruct`.
 PIXEL_SIGMA_PX = 3.0
 # Keypoints below this confidence are left out, as in `mocap reconstruct`.
@@ -58,8 +56,7 @@ class ArmFlight:
     slots: Float  # [N, T, 3] commanded yaw (rad, continuous), tilt (rad), range (m); NaN for `flown`
     aim: Float  # [N, T, P] shares of people in the place that each camera films
     known: Bool  # [N, T] False where a log has a gap and the position goes straight on
-    separation: dict[str, int]  # local plans by `Separation`; empty for logged arms
-    safety: dict[str, int]  # local plannings by `guard.FlownMotion`; likewise
+    safety: dict[str, int]  # local plannings by `guard.FlownMotion`; empty for logged arms
     central_s: Sequence[float] = ()  # measured planning times, different from run to run
     local_s: Sequence[float] = ()
 
@@ -74,14 +71,14 @@ def logged_arm(scene: ReplayScene, name: str) -> ArmFlight:
         position, quaternion, known = scene.flown
         names = tuple(camera.name for camera in scene.flight.cameras)
         slots = np.full_like(position, np.nan)
-        return ArmFlight(names, position, quaternion, slots, _on_the_middle(scene, known), known, {}, {})
+        return ArmFlight(names, position, quaternion, slots, _on_the_middle(scene, known), known, {})
     position, known = planned_positions(scene.flight, scene.t_ns)
     estimates = _estimates(scene)
     slots = slot_of(position - estimates)
     slots[..., YAW] = np.unwrap(slots[..., YAW], axis=1)
     aim = _on_the_middle(scene, known)
     return ArmFlight(
-        tuple(scene.flight.planned), position, look_at(position, estimates), slots, aim, known, {}, {}
+        tuple(scene.flight.planned), position, look_at(position, estimates), slots, aim, known, {}
     )
 
 
@@ -124,8 +121,8 @@ def _estimates(scene: ReplayScene) -> Float:
     return found
 
 
-def fly_arm(scene: ReplayScene, arm: Arm, *, foresight: bool = False) -> ArmFlight:
-    """Fly a scene again; with `foresight` the arm knows the actor's whole way, which bounds its forecast."""
+def fly_arm(scene: ReplayScene, arm: Arm) -> ArmFlight:
+    """Fly a scene again with an arm's planner."""
     done = replay(
         arm,
         scene.flight.actor_t_ns,
@@ -133,9 +130,7 @@ def fly_arm(scene: ReplayScene, arm: Arm, *, foresight: bool = False) -> ArmFlig
         scene.fields,
         Start(scene.drones, scene.yaw_rad, scene.heading_rad),
         config=scene.config,
-        mode=scene.settings.mode,
         seed=scene.settings.seed,
-        foresight=foresight,
         weights=scene.flight.weights,
     )
     return ArmFlight(
@@ -145,7 +140,6 @@ def fly_arm(scene: ReplayScene, arm: Arm, *, foresight: bool = False) -> ArmFlig
         slots=done.slots,
         aim=done.aim,
         known=np.ones(done.position.shape[:2], dtype=np.bool_),
-        separation=done.separation,
         safety=done.safety,
         central_s=done.times.central_s,
         local_s=done.times.local_s,
@@ -212,39 +206,11 @@ def trajectories(scene: ReplayScene, flown: ArmFlight) -> pd.DataFrame:
     return table
 
 
-def seen_joints(scene: ReplayScene, flown: ArmFlight, measured: MeasuredJoints) -> pd.DataFrame:
-    """Return the rows of `tables.SEEN`: the first person's joints once a second, as seen by each camera."""
-    import pandas as pd
-
-    if scene.joints is None or scene.flight.skeleton is None:
-        raise ValueError("the scene has no skeleton")
-    t_s, t_ns = scene.t_s[scene.pictures], scene.t_ns[scene.pictures]
-    looks = np.unique(np.searchsorted(t_s, np.arange(0.0, t_s[-1] + 1e-9, LOOK_PERIOD_S) - 1e-9))
-    first = slice(len(scene.flight.skeleton.joints))
-    pixels, free = (values[:, looks, first].swapaxes(0, 1) for values in (measured.pixels, measured.free))
-    status = np.where(np.isnan(pixels[..., 0]), "outside", np.where(free, "seen", "hidden"))  # [K, N, J]
-    logged = flown.known[:, scene.pictures][:, looks].T
-    known = np.isfinite(scene.joints[looks, first, 0])[:, None] & logged[..., None]
-    time, camera, joint = np.nonzero(known)
-    return pd.DataFrame(
-        {
-            "t_ns": t_ns[looks][time],
-            "camera": np.array(flown.names, dtype=object)[camera],
-            "joint": np.array(scene.flight.skeleton.joints, dtype=object)[joint],
-            "x": pixels[known][:, 0],
-            "y": pixels[known][:, 1],
-            "status": status[known],
-        }
-    )
-
-
-def flight_from(
-    table: pd.DataFrame, aim: Float, known: Bool, separation: dict[str, int], safety: dict[str, int]
-) -> ArmFlight:
+def flight_from(table: pd.DataFrame, aim: Float, known: Bool, safety: dict[str, int]) -> ArmFlight:
     """Rebuild the flight that `trajectories` stored."""
     names, position, quaternion = poses_from(table)
     slots = _dense(table, _SLOT, len(names))
-    return ArmFlight(names, position, quaternion, slots, aim, known, separation, safety)
+    return ArmFlight(names, position, quaternion, slots, aim, known, safety)
 
 
 def poses_from(table: pd.DataFrame) -> tuple[tuple[str, ...], Float, Float]:
@@ -310,8 +276,6 @@ class MeasuredJoints:
     first: Float  # [T, J, 3] the measured joints of the first trial
     seen_share: float  # of known joints and cameras: in the picture and not hidden
     joint_frames: int  # with a truth
-    pixels: Float  # [N, T, J, 2] px of the joints in the pictures; NaN outside, or where unknown
-    free: Bool  # [N, T, J] True where nothing stands between camera and joint
 
 
 def measure(
@@ -378,7 +342,7 @@ def measure(
     seen = np.isfinite(pixels[..., 0]) & free
     total = cameras * int(known.sum())
     seen_share = float((seen & known).sum() / total) if total else 0.0
-    return MeasuredJoints(error, first, seen_share, int(known.sum()), pixels, free)
+    return MeasuredJoints(error, first, seen_share, int(known.sum()))
 
 
 def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:
@@ -390,8 +354,6 @@ def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:
         first=np.concatenate([person.first for person in people], axis=1),
         seen_share=seen / sum(frames) if sum(frames) else 0.0,
         joint_frames=sum(frames),
-        pixels=np.concatenate([person.pixels for person in people], axis=2),
-        free=np.concatenate([person.free for person in people], axis=2),
     )
 
 

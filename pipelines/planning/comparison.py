@@ -6,6 +6,7 @@ stretches of the flight for figures that depend on the flight's course.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -21,28 +22,32 @@ from pipelines.planning.scores import coverage as viewed
 
 REFERENCE = "fixed"
 """Arm that the others are compared with; the first arm where it is missing."""
-# Smaller differences of the largest tilt are not worth a sentence.
-SAME_TILT_DEG = 2.0
-# Smaller differences of the measured share are not worth a sentence.
-SAME_COVERAGE_PERCENT = 1.0
+# Nobody changes a planner for less than half a centimetre of error.
+SMALLEST_DIFFERENCE_MM = 5.0
+# Nobody changes a planner for less than one joint in a hundred within 150 mm.
+SMALLEST_DIFFERENCE_POINTS = 1.0
+# Intervals from fewer draws of noise are wide, and their coverage depends on how errors are distributed.
+FEW_TRIALS = 20
 # Errors of arms whose mean ranges differ by more are not compared at equal range.
 SAME_RANGE_M = 0.3
 # The field counts a joint as right within this distance (PCK at 150 mm).
 PCK_M = 0.15
 
+# The figures that decide, how many of their units are a smallest difference, and the sign of better.
+_DECISIVE = {"pck150": (SMALLEST_DIFFERENCE_POINTS / 100, 1), "mpjpe_mm": (SMALLEST_DIFFERENCE_MM, -1)}
 
 MeanWithInterval = dict[str, Any]
 """`mean`, and `interval`: the ends that hold it with `LEVEL` probability; None where there is none."""
 
 
-def mean_of_trials(values: Float, seed: int) -> MeanWithInterval | None:
+def mean_of_trials(values: Float) -> MeanWithInterval | None:
     """Compute the mean of a figure over trials [K]; None without any, no interval for a single one."""
-    return _mean(values, None, seed)
+    return _mean(values, None, 0)
 
 
-def mean_over_time(values: Float, counted: Bool, t_ns: Int64, seed: int) -> MeanWithInterval | None:
-    """Compute the mean of [T] or [N, T] over the moments [T] that count, resampled in stretches."""
-    return _mean(np.atleast_2d(values).mean(axis=0)[counted], t_ns[counted], seed)
+def mean_over_time(values: Float, t_ns: Int64, seed: int) -> MeanWithInterval | None:
+    """Compute the mean of [T] values over a flight, resampled in stretches."""
+    return _mean(values, t_ns, seed)
 
 
 def _mean(values: Float, t_ns: Int64 | None, seed: int) -> MeanWithInterval | None:
@@ -119,21 +124,21 @@ def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, A
     """
     errors = {name: result.error_m for name, result in results.items() if result.error_m is not None}
     shared = common_frames(errors) if errors else None
-    arms = {name: _scores(scene, name, result, shared) for name, result in results.items()}
+    seen = {name: seen_people(scene, result.flight) for name, result in results.items()}
+    arms = {name: _scores(scene, name, result, seen[name], shared) for name, result in results.items()}
     reference = REFERENCE if REFERENCE in results else next(iter(results))
     differences = [
-        {"arm": name, "against": reference, **_difference(scene, result, results[reference], shared)}
-        for name, result in results.items()
+        {"arm": name, "against": reference, **_difference(scene, results, seen, (name, reference), shared)}
+        for name in results
         if name != reference
     ]
-    best = _best(scene, results, arms, shared)
     alike = equal_ranges({name: arm["range_m"]["mean"] for name, arm in arms.items()})
-    settings, flight = scene.settings, scene.flight
+    best = _best(results, arms, list(arms), shared)
     broken = [line for name, arm in arms.items() if (line := broken_limits(name, arm, scene.config))]
+    settings, flight = scene.settings, scene.flight
     return {
         "schema": 1,
         "simulated": True,  # replays are, and every reconstruction error
-        "mode": settings.mode,
         "drones": scene.drones,
         "yaw_deg": float(np.degrees(scene.yaw_rad)),
         "duration_s": float(scene.t_s[-1]),
@@ -143,65 +148,67 @@ def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, A
         "pose_noise_from": flight.noise_source,
         "maps": len(scene.fields),
         "zones": [asdict(zone) for zone in scene.config.zones],
-        "near_obstacle_share": float(scene.near.mean()),
         "trials": settings.trials,
         "seed": settings.seed,
         "intervals": {"level": LEVEL, "errors_over": "trials", "flights_over_stretches_of_s": STRETCH_S},
+        "smallest_difference": {"mm": SMALLEST_DIFFERENCE_MM, "points": SMALLEST_DIFFERENCE_POINTS},
         "arms": arms,
         "differences": differences,
         "best": best,
-        "equal_ranges": [
-            {
-                "arms": names,
-                "best": _best(scene, {name: results[name] for name in names}, arms, shared)
-                if len(alike) > 1
-                else best,
-            }
-            for names in alike
-        ],
-        "verdict": _verdict(arms, differences, broken, best),
+        "equal_ranges": [{"arms": names, "best": _best(results, arms, names, shared)} for names in alike],
+        "verdict": ". ".join([*broken, verdict(best, list(arms))]),
         "notes": list(scene.notes),
-        "warnings": [*broken, *_unequal(arms), *scene.warnings, *_warnings(results)],
+        "warnings": [*broken, *_unequal(arms), *scene.warnings, *_warnings(scene, results)],
     }
 
 
-def measure_alone(scene: ReplayScene, name: str, result: ArmResult) -> dict[str, Any]:
-    """Score one arm as in metrics.json; `mpjpe_mm` is that of all joint-frames that it measured."""
-    return _scores(scene, name, result, None if result.error_m is None else np.isfinite(result.error_m))
-
-
-def _scores(scene: ReplayScene, name: str, result: ArmResult, shared: Bool | None) -> dict[str, Any]:
+def _scores(
+    scene: ReplayScene, name: str, result: ArmResult, seen: Bool, shared: Bool | None
+) -> dict[str, Any]:
     flown = result.flight
-    seen = seen_people(scene, flown)
     found = score(
         scene.t_s,
         flown.position,
         aimed_at(scene, flown),
         scene.maps,
         scene.config,
-        near=scene.near,
         people=scene.people,
         seen=seen,
     )
-    own, common, covered = _errors(scene, result, shared)
+    figures = _errors(result.error_m, result.joint_frames, shared)
     return {
         **found,
-        "mpjpe_mm": None if common is None else common["mean"],
+        "mpjpe_mm": figures["mpjpe_mm"] and figures["mpjpe_mm"]["mean"],
         "simulated": name not in LOGGED,
         "drones": len(flown.position),
-        "local_plans": flown.separation or None,
         "safety": flown.safety or None,
         "reconstruction_error": {
             "simulated": True,
-            "mpjpe_mm": common,
-            "mpjpe_of_all_it_measured_mm": own,
-            "coverage": covered,
-            "pck150": _pck(scene, result),
+            **figures,
+            "mpjpe_of_all_it_measured_mm": _own_error(result),
             "seen_share": result.seen_share,
             "joint_frames": result.joint_frames,
         },
         **_by_person(scene, result, seen, shared),
     }
+
+
+def _errors(
+    error_m: Float32 | None, joint_frames: int, shared: Bool | None
+) -> dict[str, MeanWithInterval | None]:
+    """Compute the errors of common joint-frames, the share that was measured, and the share within 150 mm."""
+    if error_m is None or shared is None:
+        return dict.fromkeys(("mpjpe_mm", "coverage", "pck150"))
+    return {
+        "mpjpe_mm": mean_of_trials(mpjpe_mm(error_m, shared & np.isfinite(error_m))),
+        "coverage": mean_of_trials(coverage(error_m, joint_frames)),
+        "pck150": mean_of_trials(pck(error_m, joint_frames)),
+    }
+
+
+def _own_error(result: ArmResult) -> MeanWithInterval | None:
+    error_m = result.error_m
+    return None if error_m is None else mean_of_trials(mpjpe_mm(error_m, np.isfinite(error_m)))
 
 
 def _by_person(scene: ReplayScene, result: ArmResult, seen: Bool, shared: Bool | None) -> dict[str, Any]:
@@ -221,87 +228,74 @@ def _by_person(scene: ReplayScene, result: ArmResult, seen: Bool, shared: Bool |
         return over_all
     by_person: dict[str, Any] = {}
     for p, name in enumerate(scene.flight.people):
-        figures = by_person[name] = {
+        by_person[name] = {
             "weight": float(scene.flight.weights[p]),
             "occluded_share": float(1.0 - seen[p].mean()),
             "blind_s": blind_s(scene.t_s, seen[p : p + 1]),
             "view_quality": each[p],
         }
-        if result.error_m is None or shared is None or scene.joints is None:
-            continue
-        joints = result.error_m.shape[2] // len(people)
-        own = slice(p * joints, (p + 1) * joints)
-        error, frames = result.error_m[:, :, own], int(np.isfinite(scene.joints[:, own, 0]).sum())
-        seed = scene.settings.seed
-        figures |= {
-            "mpjpe_mm": mean_of_trials(mpjpe_mm(error, shared[:, :, own]), seed),
-            "coverage": mean_of_trials(coverage(error, frames), seed),
-            "pck150": mean_of_trials(pck(error, frames), seed),
-        }
+        if result.error_m is not None and shared is not None and scene.joints is not None:
+            joints = result.error_m.shape[2] // len(people)
+            own = slice(p * joints, (p + 1) * joints)
+            frames = int(np.isfinite(scene.joints[:, own, 0]).sum())
+            by_person[name] |= _errors(result.error_m[:, :, own], frames, shared[:, :, own])
     return over_all | {"by_person": by_person}
 
 
-def _errors(
-    scene: ReplayScene, result: ArmResult, shared: Bool | None
-) -> tuple[MeanWithInterval | None, MeanWithInterval | None, MeanWithInterval | None]:
-    """Return the mean error of all measured joint-frames and of the common ones, and the coverage."""
-    error, seed = result.error_m, scene.settings.seed
-    if error is None or shared is None:
-        return None, None, None
-    measured = np.isfinite(error)
-    own, common = (mean_of_trials(mpjpe_mm(error, rows), seed) for rows in (measured, shared & measured))
-    return own, common, mean_of_trials(coverage(error, result.joint_frames), seed)
-
-
-def _pck(scene: ReplayScene, result: ArmResult) -> MeanWithInterval | None:
-    if result.error_m is None:
-        return None
-    return mean_of_trials(pck(result.error_m, result.joint_frames), scene.settings.seed)
-
-
-def _difference(scene: ReplayScene, one: ArmResult, other: ArmResult, shared: Bool | None) -> dict[str, Any]:
-    """Compute one minus the other, with intervals."""
-    tilt_deg, hidden = (
-        of(scene, one.flight).mean(axis=0) - of(scene, other.flight).mean(axis=0)
-        for of in (_tilt_deg, _hidden)
+def _difference(
+    scene: ReplayScene,
+    results: Mapping[str, ArmResult],
+    seen: Mapping[str, Bool],
+    names: tuple[str, str],
+    shared: Bool | None,
+) -> dict[str, Any]:
+    """Compute one arm minus the other, with intervals."""
+    one, other = (results[name] for name in names)
+    tilts, hidden = (
+        [_tilt_deg(scene, each.flight).mean(axis=0) for each in (one, other)],
+        [1.0 - seen[name].mean(axis=(0, 1)) for name in names],
     )
-    always = np.ones(len(scene.t_ns), dtype=np.bool_)
     seed = scene.settings.seed
-    error = cover = right = None
-    over_flights: dict[str, object] = {"mpjpe_mm": None, "pck150": None}
-    if one.error_m is not None and other.error_m is not None and shared is not None:
-        both = shared & np.isfinite(one.error_m) & np.isfinite(other.error_m)  # one may have measured none
-        error = mean_of_trials(mpjpe_mm(one.error_m, both) - mpjpe_mm(other.error_m, both), seed)
-        cover = mean_of_trials(
-            coverage(one.error_m, one.joint_frames) - coverage(other.error_m, other.joint_frames), seed
-        )
-        right = mean_of_trials(
-            pck(one.error_m, one.joint_frames) - pck(other.error_m, other.joint_frames), seed
-        )
-        over_flights = _over_flights(scene, one.error_m, other.error_m, both)
     return {
-        "tilt_deg": mean_over_time(tilt_deg, always, scene.t_ns, seed),
-        "tilt_near_obstacle_deg": mean_over_time(tilt_deg, scene.near, scene.t_ns, seed),
-        "occluded_share": mean_over_time(hidden, always, scene.t_ns, seed),
-        "mpjpe_mm": error,
-        "coverage": cover,
-        "pck150": right,
-        "interval_over_flights": over_flights,
+        "tilt_deg": mean_over_time(tilts[0] - tilts[1], scene.t_ns, seed),
+        "occluded_share": mean_over_time(hidden[0] - hidden[1], scene.t_ns, seed),
+        **_error_difference(one, other, shared),
+        "interval_over_flights": _over_flights(scene, one, other, shared),
         "simulated": True,
     }
 
 
-def _over_flights(scene: ReplayScene, one: Float32, other: Float32, both: Bool) -> dict[str, object]:
+def _error_difference(
+    one: ArmResult, other: ArmResult, shared: Bool | None
+) -> dict[str, MeanWithInterval | None]:
+    """Compute the errors of one arm minus those of the other, trials paired."""
+    a, b, frames = one.error_m, other.error_m, (one.joint_frames, other.joint_frames)
+    if a is None or b is None or shared is None:
+        return dict.fromkeys(("mpjpe_mm", "coverage", "pck150"))
+    both = shared & np.isfinite(a) & np.isfinite(b)  # one may have measured none
+    return {
+        "mpjpe_mm": mean_of_trials(mpjpe_mm(a, both) - mpjpe_mm(b, both)),
+        "coverage": mean_of_trials(coverage(a, frames[0]) - coverage(b, frames[1])),
+        "pck150": mean_of_trials(pck(a, frames[0]) - pck(b, frames[1])),
+    }
+
+
+def _over_flights(
+    scene: ReplayScene, one: ArmResult, other: ArmResult, shared: Bool | None
+) -> dict[str, object]:
     """Compute the intervals of the differences over stretches of the flight, noise averaged over trials."""
-    t_ns = scene.t_ns[scene.pictures]
-    known = np.zeros(one.shape[1]) if scene.joints is None else np.isfinite(scene.joints[..., 0]).sum(axis=1)
-    right = ((one <= PCK_M).sum(axis=2, dtype=np.float64) - (other <= PCK_M).sum(axis=2)).mean(axis=0)
-    further = np.where(both, one - other, 0.0).sum(axis=2, dtype=np.float64).mean(axis=0)
+    a, b = one.error_m, other.error_m
+    if a is None or b is None or shared is None or scene.joints is None:
+        return {"mpjpe_mm": None, "pck150": None}
+    both = shared & np.isfinite(a) & np.isfinite(b)
+    known = np.isfinite(scene.joints[..., 0]).sum(axis=1)
+    right = ((a <= PCK_M).sum(axis=2, dtype=np.float64) - (b <= PCK_M).sum(axis=2)).mean(axis=0)
+    further = np.where(both, a - b, 0.0).sum(axis=2, dtype=np.float64).mean(axis=0)
     series = {
         "mpjpe_mm": (1e3 * further, both.sum(axis=2).mean(axis=0)),
         "pck150": (right, known.astype(np.float64)),
     }
-    found = intervals(series, t_ns, seed=scene.settings.seed)
+    found = intervals(series, scene.t_ns[scene.pictures], seed=scene.settings.seed)
     return {name: None if ends is None else list(ends) for name, ends in found.items()}
 
 
@@ -310,92 +304,91 @@ def _tilt_deg(scene: ReplayScene, flown: ArmFlight) -> Float:
     return tilt_deg
 
 
-def _hidden(scene: ReplayScene, flown: ArmFlight) -> Float:
-    hidden: Float = 1.0 - seen_people(scene, flown).mean(axis=0)
-    return hidden
+# --- the verdict ---
+
+
+def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]:
+    """Judge by each decisive figure if one arm is better (1) or worse (-1) than another, or neither (0).
+
+    A difference counts if noise does not explain it and if it has a practical size.
+    """
+    found = []
+    for name, (smallest, better) in _DECISIVE.items():
+        change = difference[name]
+        counts = change is not None and told_apart(change) and abs(change["mean"]) >= smallest
+        found.append(better * int(np.sign(change["mean"])) if counts and change is not None else 0)
+    return found
+
+
+def told_apart(found: MeanWithInterval) -> bool:
+    """Test if an interval over trials excludes zero; without an interval any difference counts."""
+    ends = found["interval"]
+    return bool(found["mean"]) and (ends is None or not ends[0] <= 0.0 <= ends[1])
 
 
 def _best(
-    scene: ReplayScene,
     results: Mapping[str, ArmResult],
     arms: Mapping[str, Mapping[str, Any]],
+    names: Sequence[str],
     shared: Bool | None,
 ) -> dict[str, Any] | None:
-    """Name the best arm, the runner-up, and their difference; None if fewer than two measured anything."""
-    measured = [
-        name
-        for name, arm in arms.items()
-        if name in results and (arm["reconstruction_error"]["pck150"] or {}).get("mean")
-    ]
+    """Find the arms that no other one beats; None if fewer than two of these measured anything.
+
+    One arm beats another if it is better in one figure and worse in none. Arms that violate a limit are left
+    out, unless all do.
+    """
+
+    def right(name: str) -> float:
+        return float((arms[name]["reconstruction_error"]["pck150"] or {}).get("mean") or 0.0)
+
+    measured = sorted((name for name in names if right(name)), key=right, reverse=True)
     kept = [name for name in measured if not sum(arms[name]["limit_violations"].values())] or measured
     if len(kept) < 2:
         return None
-
-    def right(name: str) -> float:
-        return float(arms[name]["reconstruction_error"]["pck150"]["mean"])
-
-    def less(one: str, other: str) -> dict[str, Any]:
-        return _difference(scene, results[one], results[other], shared)
-
-    leader = max(kept, key=right)
-    close = [name for name in kept if name == leader or not _told_apart(less(leader, name)["pck150"])]
-    by_error = [name for name in close if arms[name]["mpjpe_mm"] is not None]
-    best = min(by_error, key=lambda name: float(arms[name]["mpjpe_mm"])) if by_error else leader
-    against = {name: less(best, name) for name in kept if name != best}
-    alike = [
-        name
-        for name in close
-        if name != best and not any(_told_apart(against[name][key]) for key in ("pck150", "mpjpe_mm"))
-    ]
-    others = [name for name in against if name not in alike] or list(against)
-    runner_up = max(others, key=right)
+    change = {
+        pair: _error_difference(results[pair[0]], results[pair[1]], shared) for pair in permutations(kept, 2)
+    }
+    judged = {pair: worth_flying(found) for pair, found in change.items()}
+    beaten = {other for (_, other), signs in judged.items() if max(signs) > 0 and min(signs) >= 0}
+    unbeaten = [name for name in kept if name not in beaten] or kept
+    rest = [name for name in kept if name not in unbeaten]
+    first, second = unbeaten[0], (unbeaten[1:] or rest)[0]
+    disagreeing = next((pair for pair in permutations(unbeaten, 2) if judged[pair] == [1, -1]), None)
+    first, second = disagreeing or (first, second)
     return {
-        "arm": best,
-        "alike": alike,
-        "runner_up": runner_up,
+        "arms": unbeaten,
+        "disagree": disagreeing is not None,
         "left_out": [name for name in measured if name not in kept],
-        "difference": {"arm": best, "against": runner_up, **against[runner_up]},
+        "difference": {"arm": first, "against": second, **change[first, second]},
     }
 
 
-def _told_apart(found: Mapping[str, Any] | None) -> bool:
-    """Test if an interval over trials excludes zero; without an interval any difference counts."""
-    if found is None or not found["mean"]:
-        return False
-    ends = found["interval"]
-    return ends is None or not ends[0] <= 0.0 <= ends[1]
-
-
-def _about_best(best: Mapping[str, Any], arms: Mapping[str, Mapping[str, Any]]) -> str:
-    """Name the best arm with its difference to the runner-up and both intervals."""
-    name, other, difference = best["arm"], best["runner_up"], best["difference"]
-    share = 100 * arms[name]["reconstruction_error"]["pck150"]["mean"]
-    own = f"{share:.1f} % of all joints within {1e3 * PCK_M:.0f} mm"
-    words = [
-        f"{100 * difference['pck150']['mean']:+.1f} points of % against {other}"
-        f" ({_two_intervals(difference, 'pck150', 100.0)})"
-    ]
-    if difference["mpjpe_mm"] is not None:
-        words.append(
-            f"{difference['mpjpe_mm']['mean']:+.1f} mm where both measured"
-            f" ({_two_intervals(difference, 'mpjpe_mm', 1.0)})"
+def verdict(best: Mapping[str, Any] | None, names: Sequence[str]) -> str:
+    """Say in one sentence which arm is better and by how much, that none is, or that the figures disagree."""
+    if best is None:
+        return f"{' and '.join(names)}: there is nothing to compare"
+    difference = best["difference"]
+    arm, other = difference["arm"], difference["against"]
+    points = _with_interval(difference["pck150"], 100.0, "points of joints within 150 mm")
+    figures = f"{points}, {_with_interval(difference['mpjpe_mm'], 1.0, 'mm of mean error')} (simulated)"
+    left = f"; {' and '.join(best['left_out'])} left out for broken limits" if best["left_out"] else ""
+    if best["disagree"]:
+        said = (
+            f"the figures disagree: {arm} has more joints right, {other} is more accurate; {arm} less {other}"
         )
-    if best["alike"]:
-        first = f"best are {' and '.join([name, *best['alike']])}, which the noise does not tell apart: {own}"
+    elif len(best["arms"]) == 1:
+        said = f"{arm} is better than {other}"
     else:
-        first = f"best is {name}: {own}"
-    left = best["left_out"]
-    dropped = f"; {' and '.join(left)} left out for broken limits" if left else ""
-    return f"{first}, {', '.join(words)}, simulated{dropped}"
+        said = f"no difference worth flying between {' and '.join(best['arms'])}; {arm} less {other}"
+    return f"{said}: {figures}{left}"
 
 
-def _two_intervals(difference: Mapping[str, Any], key: str, scale: float) -> str:
-    """Format the interval over draws of noise and that over stretches of the flight."""
-    over = {"noise": difference[key]["interval"], "flight": difference["interval_over_flights"][key]}
-    parts = [
-        f"{name} [{scale * ends[0]:+.1f}, {scale * ends[1]:+.1f}]" for name, ends in over.items() if ends
-    ]
-    return ", ".join(parts) or "a single draw"
+def _with_interval(found: MeanWithInterval | None, scale: float, unit: str) -> str:
+    if found is None:
+        return f"unknown {unit}"
+    ends = found["interval"]
+    interval = f" [{scale * ends[0]:+.1f}, {scale * ends[1]:+.1f}]" if ends else " in a single draw"
+    return f"{scale * found['mean']:+.1f}{interval} {unit}"
 
 
 def equal_ranges(range_m: Mapping[str, float]) -> list[list[str]]:
@@ -426,25 +419,13 @@ def _unequal(arms: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return found
 
 
-def _verdict(
-    arms: Mapping[str, Mapping[str, Any]],
-    differences: Sequence[Mapping[str, Any]],
-    broken: Sequence[str],
-    best: Mapping[str, Any] | None,
-) -> str:
-    """Name the violated limits and the best arm, and then compare the arms."""
-    if differences:
-        wanted = next((each for each in differences if each["arm"] == "adaptive"), differences[0])
-        conclusion = verdict(wanted["arm"], wanted["against"], arms, wanted)
-    else:
-        conclusion = f"{next(iter(arms))} flew alone: there is nothing to compare it with"
-    named = [] if best is None else [_about_best(best, arms)]
-    unequal = [f"{said[0].upper()}{said[1:]}" for said in _unequal(arms)]
-    return ". ".join([*broken, *named, conclusion, *unequal])
-
-
-def _warnings(results: Mapping[str, ArmResult]) -> list[str]:
+def _warnings(scene: ReplayScene, results: Mapping[str, ArmResult]) -> list[str]:
     warnings = []
+    if scene.settings.trials < FEW_TRIALS and scene.flight.skeleton is not None:
+        warnings.append(
+            f"{scene.settings.trials} draws of noise are few: take --trials {FEW_TRIALS} or more, or do not"
+            " trust the intervals"
+        )
     for name, result in results.items():
         gap_share = float(1.0 - result.flight.known.mean())
         if gap_share > 0:
@@ -455,18 +436,6 @@ def _warnings(results: Mapping[str, ArmResult]) -> list[str]:
         if result.error_m is not None and not np.isfinite(result.error_m).any():
             warnings.append(f"{name}: not a single joint could be measured from its cameras")
     return warnings
-
-
-def verdict(
-    arm: str, against: str, arms: Mapping[str, Mapping[str, Any]], difference: Mapping[str, Any]
-) -> str:
-    """Compare an arm with another in one sentence: tilt, reconstruction error, coverage.
-
-    `arms` and `difference` (of the two, arm minus against) are those of metrics.json.
-    """
-    return (
-        f"{_about_tilt(arm, against, arms)}; {_about_error(difference)}{_about_coverage(arm, against, arms)}"
-    )
 
 
 def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) -> str | None:
@@ -482,49 +451,9 @@ def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) ->
         "jerk": f"has a jerk of more than {config.jerk_mps3:g} m/s^3",
     }
     counts = scores["limit_violations"]
-    violations = [f"{words} ({_times(counts[kind])})" for kind, words in kinds.items() if counts.get(kind)]
+    violations = [
+        f"{words} ({'once' if counts[kind] == 1 else f'{counts[kind]} times'})"
+        for kind, words in kinds.items()
+        if counts.get(kind)
+    ]
     return f"{arm} {', '.join(violations)}" if violations else None
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
-
-
-def _about_tilt(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
-    own, other = (arms[name]["tilt_deg"]["max"] for name in (arm, against))
-    if abs(own - other) < SAME_TILT_DEG:
-        return f"{arm} and {against} tilt alike, up to {own:.0f} and {other:.0f} deg"
-    if own < other:
-        return f"{arm} keeps the tilt at {own:.0f} deg where {against} climbs to {other:.0f}"
-    return f"{arm} climbs to a tilt of {own:.0f} deg where {against} keeps it at {other:.0f}"
-
-
-def _about_coverage(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
-    """Say which arm measured more joints; empty if they are alike."""
-    found = [arms[name]["reconstruction_error"]["coverage"] for name in (arm, against)]
-    if None in found:
-        return ""
-    own, other = (100 * each["mean"] for each in found)
-    if abs(own - other) < SAME_COVERAGE_PERCENT:
-        return ""
-    return f", and it measures {own:.0f} % of the joints where {against} measures {other:.0f} %"
-
-
-def _about_error(difference: Mapping[str, Any]) -> str:
-    found = difference["mpjpe_mm"]
-    if found is None:
-        return "its reconstruction error could not be compared"
-    mean, interval = found["mean"], found["interval"]
-    if interval is None:
-        return f"its reconstruction error differs by {mean:+.0f} mm in the only trial (simulated)"
-    low, high = interval
-    if low <= 0 <= high:
-        return (
-            "no difference in reconstruction error was found"
-            f" ({mean:+.1f} mm [{low:+.1f}, {high:+.1f}], simulated)"
-        )
-    nearest, farthest = sorted((abs(low), abs(high)))
-    which = "smaller" if mean < 0 else "larger"
-    return (
-        f"its reconstruction error is {abs(mean):.1f} mm [{nearest:.1f}, {farthest:.1f}] {which} (simulated)"
-    )

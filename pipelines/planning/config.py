@@ -16,7 +16,6 @@ MOST_DRONES = 16
 # A smaller polygon is a line or a point after rounding, and bars nothing.
 MIN_ZONE_AREA_M2 = 1e-6
 
-Mode = Literal["plan-only", "closed-loop"]  # of a replay
 Positive = Annotated[float, Field(gt=0, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, strict=True)]
 

@@ -27,12 +27,6 @@ class Forecast(NamedTuple):
     people: Float | None = None  # [P, T, 3] metres, world; None: the actor alone
     weight: Float | None = None  # [P]; None: all alike
 
-    def each(self, every: int) -> Forecast:
-        """Return every so many knots, at least the last one."""
-        rows = slice(every - 1, None, every) if len(self.position) >= every else slice(-1, None)
-        people = None if self.people is None else self.people[:, rows]
-        return Forecast(self.position[rows], self.heading_rad[rows], people, self.weight)
-
 
 class ActorFilter:
     """Position and velocity of the actor from the measurements so far, and nothing later.
@@ -106,30 +100,6 @@ class ActorFilter:
         Q = self._q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
         state = np.stack([self._state[0] + dt * self._state[1], self._state[1]])
         return state, np.einsum("ij,jk,lk->il", F, self._covariance, F) + Q
-
-
-class Foresight(ActorFilter):
-    """Knowledge of the actor's whole way, which nobody can have: it bounds what a better forecast could gain.
-
-    Beyond the last position the actor walks on at the mean velocity of the last second.
-
-    Args:
-        t_s: [A] ascending, at least two.
-        position: [A, 3] metres, world; finite.
-    """
-
-    def __init__(self, t_s: Float, position: Float) -> None:
-        super().__init__(q=1.0, sigma_m=1.0)
-        before = min(int(np.searchsorted(t_s, t_s[-1] - 1.0)), len(t_s) - 2)
-        self._last_mps = (position[-1] - position[before]) / (t_s[-1] - t_s[before])
-        self._times_s, self._way = t_s, position
-
-    def forecast(self, t_s: Float) -> Float:
-        """Return the positions [T, 3] at times [T], past or future."""
-        times_s, way = self._times_s, self._way
-        known = np.stack([np.interp(t_s, times_s, way[:, axis]) for axis in range(3)], axis=-1)
-        where: Float = known + np.maximum(t_s - times_s[-1], 0.0)[:, None] * self._last_mps
-        return where
 
 
 class PeopleFilter:

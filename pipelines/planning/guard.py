@@ -90,12 +90,10 @@ class Guard:
 
     Args:
         position: [N, 3] m, the drones at rest.
-        exactly: drones are exactly where plans are (`plan-only`). Then the accelerations and jerks are those
-            of the plans, and are not limited.
     """
 
-    def __init__(self, position: Float, config: PlannerConfig, *, exactly: bool = False) -> None:
-        self._config, self._flying, self._exactly = config, flying_of(config), exactly
+    def __init__(self, position: Float, config: PlannerConfig) -> None:
+        self._config, self._flying = config, flying_of(config)
         self._ticks = math.ceil(config.tuning.tracking_hz / config.tuning.local_hz - 1e-9)
         rows = self._ticks + stopping_ticks(self._flying) + 1
         self._ticks_ahead = min(round(ACTOR_AHEAD_S * config.tuning.tracking_hz), rows - 1)
@@ -182,9 +180,8 @@ class Guard:
         here, field = self._states[drone, self._age[drone]], around.field
 
         def follow(kind: FlownMotion, followed: DronePlan) -> _Motion:
-            exactly = self._exactly and followed is plan
-            states, stopped = self._rolled_out(t_s, here, followed, self._ticks, exactly)
-            ahead, _ = self._rolled_out(t_s, here, followed, self._ticks_ahead, exactly, stops=False)
+            states, stopped = self._rolled_out(t_s, here, followed, self._ticks)
+            ahead, _ = self._rolled_out(t_s, here, followed, self._ticks_ahead, stops=False)
             return self._measured(kind, followed, states, stopped, ahead, around)
 
         place, wanted_m = here[POSITION], wanted_clearance_m(self._config, field.grid)
@@ -207,16 +204,14 @@ class Guard:
         yield self._measured(FlownMotion.BRAKED, braked, committed, len(committed) - 1, committed, around)
 
     def _rolled_out(
-        self, t_s: float, here: Float, plan: DronePlan, ticks: int, exactly: bool, *, stops: bool = True
+        self, t_s: float, here: Float, plan: DronePlan, ticks: int, *, stops: bool = True
     ) -> tuple[Float, int]:
         """Return states [K + 1, 4, 3] of a drone that follows a plan and stops, and the row of the stop."""
         stopping = self._states.shape[1] - self._ticks if stops else 1
         states = np.empty((ticks + stopping, 4, 3))
         states[0] = here
         after_s = t_s - plan.start_s
-        stopped = roll_out(
-            plan.path, plan.velocity, plan.step_s, after_s, ticks, exactly, self._flying, states
-        )
+        stopped = roll_out(plan.path, plan.velocity, plan.step_s, after_s, ticks, self._flying, states)
         return states, stopped
 
     def _ways_out(self, here: Float, around: _Around) -> list[tuple[FlownMotion, Float]]:

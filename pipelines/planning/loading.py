@@ -24,7 +24,6 @@ from pipelines.session.tables import (
     POSES,
     SKELETON,
     TRUTH,
-    Span,
     read_motion,
     read_table,
     trajectory_from,
@@ -105,27 +104,25 @@ def load_flight(
     reconstructed: StageRecord | None,
     *,
     pose_noise: str | None,
-    span_ns: Span | None = None,
 ) -> LoggedFlight:
     """Read the flight, cut to the time in which the actor and all moving cameras are known.
 
     Args:
         reconstructed: the record of stage `reconstruct`, None where that has not run.
         pose_noise: errors of the poses, in place of those stated in the session.
-        span_ns: only what was recorded between these times; None for all.
 
     Raises:
         DataError: the actor's position is unknown, or not known while the cameras flew; an unknown noise
             model.
     """
     warnings: list[str] = []
-    skeleton, skeleton_source = _skeleton(folder, description, reconstructed, span_ns)
-    t_ns, actor, source = _actor(folder, description, reconstructed, warnings, span_ns)
+    skeleton, skeleton_source = _skeleton(folder, description, reconstructed)
+    t_ns, actor, source = _actor(folder, description, reconstructed, warnings)
     people = actor.shape[1]
     logged = description.logged_people if source == "log" else []
     if skeleton is not None:
         skeleton = _of_people(skeleton, t_ns, actor, logged=bool(logged))
-    cameras, poses_source, noise_source = _cameras(folder, description, pose_noise, span_ns)
+    cameras, poses_source, noise_source = _cameras(folder, description, pose_noise)
     if noise_source == "nobody":
         warnings.append("nobody states the noise of the cameras' poses: taken as exact; state --pose-noise")
     hips = _hips(skeleton) if skeleton is not None and skeleton_source == "truth" else None
@@ -205,18 +202,18 @@ def planned_positions(flight: LoggedFlight, t_ns: Int64) -> tuple[Float, Bool]:
 
 
 def _skeleton(
-    folder: Path, description: Description, reconstructed: StageRecord | None, span_ns: Span | None
+    folder: Path, description: Description, reconstructed: StageRecord | None
 ) -> tuple[JointMotion | None, Source | None]:
     """Return the true skeleton, or else the reconstructed one."""
     if description.truth is not None and description.has_true_joints:
         joints = tuple(description.truth.joints)
-        return read_motion(folder / "truth.parquet", TRUTH, joints, span_ns), "truth"
-    return (None, None) if reconstructed is None else (_reconstruction(folder, span_ns), "reconstruction")
+        return read_motion(folder / "truth.parquet", TRUTH, joints), "truth"
+    return (None, None) if reconstructed is None else (_reconstruction(folder), "reconstruction")
 
 
-def _reconstruction(folder: Path, span_ns: Span | None) -> JointMotion:
+def _reconstruction(folder: Path) -> JointMotion:
     """Read the reconstructed skeleton; joints that are not `ok` are NaN."""
-    motion = read_motion(folder / "reconstruct" / "skeleton.parquet", SKELETON, span_ns=span_ns)
+    motion = read_motion(folder / "reconstruct" / "skeleton.parquet", SKELETON)
     if motion.status is not None:
         motion.position[motion.status != "ok"] = np.nan
     return motion
@@ -263,10 +260,9 @@ def _actor(
     description: Description,
     reconstructed: StageRecord | None,
     warnings: list[str],
-    span_ns: Span | None,
 ) -> tuple[Int64, Float, Source]:
     """Return the planners' input, [A] and [A, P, 3]: the logs of the people, or the reconstructed hips."""
-    logged = logged_people(folder, description, span_ns)
+    logged = logged_people(folder, description)
     warnings.extend(
         f"the {entry.point} of {entry.name or 'the actor'} were logged: hips taken"
         f" {entry.hip_above_m:+.2f} m above"
@@ -286,7 +282,7 @@ def _actor(
             "run `mocap reconstruct`, or name the actor's topic under `actor:` in flight.yaml",
             code="no-actor",
         )
-    found = _reconstruction(folder, span_ns)
+    found = _reconstruction(folder)
     middle = _hips_of(found)
     if middle is None or not np.isfinite(middle[:, 0]).any():
         raise DataError(
@@ -331,15 +327,12 @@ def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.in
 
 
 def _cameras(
-    folder: Path, description: Description, pose_noise: str | None, span_ns: Span | None
+    folder: Path, description: Description, pose_noise: str | None
 ) -> tuple[tuple[SessionCamera, ...], Source, str]:
-    true_poses = _true_poses(folder, description, span_ns)
+    true_poses = _true_poses(folder, description)
     cameras, stating = [], set()
     for name, entry in description.cameras.items():
-        own_ns = None if entry.poses.static else span_ns
-        logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES, own_ns))
-        if not len(logged.t_ns):
-            raise DataError(folder, f"{name} has no poses in this span", code="no-poses")
+        logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
         noise, stated_by = _noise(name, entry, logged, pose_noise)
         stating.add(stated_by)
         cameras.append(
@@ -354,12 +347,12 @@ def _cameras(
     return tuple(cameras), "truth" if true_poses else "log", _said_by(stating)
 
 
-def _true_poses(folder: Path, description: Description, span_ns: Span | None) -> dict[str, Trajectory]:
+def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]:
     """Return the true poses of all cameras, if all of them are known."""
     moving = {name for name, entry in description.cameras.items() if not entry.poses.static}
     if description.truth is None or not moving or not moving <= set(description.truth.cameras):
         return {}
-    table = read_table(folder / "truth_poses.parquet", CAMERA_POSES, span_ns)
+    table = read_table(folder / "truth_poses.parquet", CAMERA_POSES)
     return {name: trajectory_from(table[table["camera"] == name]) for name in sorted(moving)}
 
 

@@ -18,7 +18,6 @@ threads and no fastmath: the same numbers give the same bytes.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -43,10 +42,6 @@ MAX_ETA = 1e4
 MIN_ETA = 0.2
 # A plan that ends farther off the slot may be in a local minimum.
 ASTRAY_M = 3.0
-# Each round of projection goes 5 % farther; after ten there is no room.
-MAX_PROJECTION_ROUNDS = 10
-# The ways between projected waypoints need this much more than the least distance.
-PROJECTION_MARGIN_M = 0.1
 
 
 class Weights(NamedTuple):
@@ -328,23 +323,13 @@ def _descend(
     return path, cost, iterations
 
 
-class Separation(StrEnum):
-    """Action taken to keep the distance to the other drones' plans."""
-
-    KEPT = "kept"
-    PROJECTED = "projected"  # waypoints were pushed apart
-    REJECTED = "rejected"  # projection failed: the previous plan goes on
-    BROKEN = "broken"  # the previous plan fails as well; the plan with the largest distance is flown
-
-
 @dataclass(frozen=True)
 class LocalPlan:
     """Result of the local planner."""
 
     plan: DronePlan
-    cost: float  # of the optimised path, before any projection
+    cost: float
     evaluations: int
-    separation: Separation
 
 
 class LocalPlanner:
@@ -388,11 +373,8 @@ class LocalPlanner:
             evaluations += other[2]
             if other[1] < cost:
                 path, cost = other[:2]
-        old = None if previous is None else np.concatenate([position[None], guess])
-        kept, separation = _keep_apart(path[2:], waypoints, old, field, config.separation_m)
-        return LocalPlan(
-            DronePlan(t_s, kept, velocity.copy(), config.tuning.waypoint_s), cost, evaluations, separation
-        )
+        plan = DronePlan(t_s, path[2:].copy(), velocity.copy(), config.tuning.waypoint_s)
+        return LocalPlan(plan, cost, evaluations)
 
     def _descended(
         self,
@@ -446,33 +428,6 @@ class LocalPlanner:
         return self._weights[side]
 
 
-def closest_approach(path: Float, others: Float) -> float:
-    """Compute the least distance in metres of a path to others [M, N + 1, 3], straight between waypoints.
-
-    `path` is [N + 1, 3]. The distance is inf without other drones.
-    """
-    return _closest_approach(np.ascontiguousarray(path), np.ascontiguousarray(others))
-
-
-@cached
-def _closest_approach(path: Float, others: Float) -> float:
-    least = math.inf
-    start, way = np.empty(3), np.empty(3)
-    for other in range(others.shape[0]):
-        for k in range(path.shape[0] - 1):
-            square, along, apart = 0.0, 0.0, 0.0
-            for axis in range(3):
-                start[axis] = path[k, axis] - others[other, k, axis]
-                way[axis] = path[k + 1, axis] - others[other, k + 1, axis] - start[axis]
-                square += way[axis] * way[axis]
-                along += start[axis] * way[axis]
-            u = min(max(-along / max(square, 1e-12), 0.0), 1.0)
-            for axis in range(3):
-                apart += (start[axis] + u * way[axis]) ** 2
-            least = min(least, math.sqrt(apart))
-    return least
-
-
 def _with_start(position: Float, velocity: Float, waypoints: Float, step_s: float) -> Float:
     """Return [N + 3, 3]: past and present positions at the drone's velocity, and the waypoints."""
     back = np.array([-2.0, -1.0, 0.0])[:, None] * step_s
@@ -481,51 +436,3 @@ def _with_start(position: Float, velocity: Float, waypoints: Float, step_s: floa
 
 def _nobody(times: Float) -> Float:
     return np.empty((0, len(times) + 1, 3))
-
-
-def _keep_apart(
-    path: Float, others: Float, old: Float | None, field: DistanceField, least_m: float
-) -> tuple[Float, Separation]:
-    """Return the path [N + 1, 3], pushed away from the others' [M, N + 1, 3] if need be, or the old one."""
-    if closest_approach(path, others) >= least_m:
-        return path, Separation.KEPT
-    pushed = _pushed_apart(path, others, least_m + PROJECTION_MARGIN_M)
-    free = field.sample(pushed[1:])[0].min() > min(0.0, field.sample(path[1:])[0].min())
-    if free and closest_approach(pushed, others) >= least_m:
-        return pushed, Separation.PROJECTED
-    if old is not None and closest_approach(old, others) >= least_m:
-        return old, Separation.REJECTED
-    choices = [path] + ([pushed] if free else []) + ([] if old is None else [old])
-    return max(choices, key=lambda choice: closest_approach(choice, others)), Separation.BROKEN
-
-
-def _pushed_apart(path: Float, others: Float, least_m: float) -> Float:
-    """Move waypoints aside until no way between them comes nearer to the others. The start stays."""
-    pushed = path.copy()
-    for round_ in range(MAX_PROJECTION_ROUNDS):
-        if closest_approach(pushed, others) >= least_m:
-            break
-        wanted_m = least_m * (1.0 + 0.05 * round_)
-        for other in others:
-            apart = pushed - other
-            aside = _way_aside(apart)
-            along = np.sum(apart * aside, axis=1)
-            short = wanted_m**2 - np.sum(apart**2, axis=1)
-            way = np.where(short > 0.0, np.sqrt(np.maximum(along**2 + short, 0.0)) - along, 0.0)
-            # The neighbours go along: the ways between them must keep the distance too.
-            way = np.maximum(way, np.maximum(np.append(way[1:], 0.0), np.append(0.0, way[:-1])))
-            pushed[1:] += way[1:, None] * aside
-    return pushed
-
-
-def _way_aside(apart: Float) -> Float:
-    """Return the unit vector [3] from the other drone to this one where [N + 1, 3] is nearest to zero."""
-    start, way = apart[:-1], np.diff(apart, axis=0)
-    u = np.clip(-np.sum(start * way, axis=1) / np.maximum(np.sum(way**2, axis=1), 1e-12), 0.0, 1.0)
-    nearest = start + u[:, None] * way
-    k = int(np.argmin(np.sum(nearest**2, axis=1)))
-    aside = nearest[k]
-    if np.sum(aside**2) < 1e-6:  # straight through each other: push to the left of the way, or east
-        aside = np.array([-way[k, 1], way[k, 0], 0.0])
-    length = float(np.sqrt(np.sum(aside**2)))
-    return aside / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])

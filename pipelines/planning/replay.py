@@ -1,10 +1,9 @@
 """Replay of an arm: its planner in flight (`Pilot`), offline, against the logged actor and the maps.
 
-Equal arguments give equal replays, but for the measured times. No measurement or map is used before its time,
-unless `foresight` asks for a bound.
+Equal arguments give equal replays, but for the measured times. No measurement or map is used before its
+time.
 """
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,9 +15,9 @@ import numpy as np
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm, RollingOut
-from pipelines.planning.config import MOST_DRONES, Mode, PlannerConfig
+from pipelines.planning.config import MOST_DRONES, PlannerConfig
 from pipelines.planning.distance_field import DistanceField, open_space, zone_edges
-from pipelines.planning.forecast import ActorFilter, Forecast, Foresight, PeopleFilter, YawZero, positions_at
+from pipelines.planning.forecast import ActorFilter, Forecast, PeopleFilter, YawZero, positions_at
 from pipelines.planning.formation import (
     TILT,
     YAW,
@@ -29,7 +28,7 @@ from pipelines.planning.formation import (
     turned,
 )
 from pipelines.planning.guard import FlownMotion, Guard
-from pipelines.planning.local import LocalPlanner, Separation
+from pipelines.planning.local import LocalPlanner
 from pipelines.planning.tracking import DronePlan, tracking_times
 
 # Times are sums of periods: what is due this much early is due.
@@ -64,7 +63,6 @@ class Replay:
     actor: Float  # [T, 3] the log, interpolated; of several people the weighted middle
     estimate: Float  # [N, T, 3] the planner's estimate of whom each camera films
     aim: Float  # [N, T, P] shares of people in the place that each camera films
-    separation: dict[str, int]  # local plans by `Separation`
     safety: dict[str, int]  # local plannings by `guard.FlownMotion`
     times: PlanningTimes
 
@@ -101,7 +99,6 @@ class Pilot:
         config: PlannerConfig,
         start: Start,
         *,
-        actor: PeopleFilter | None = None,
         weights: Sequence[float] = (1.0,),
         clock: Callable[[], float] = perf_counter,
     ) -> None:
@@ -117,7 +114,7 @@ class Pilot:
         self._weight = np.array(weights, dtype=np.float64)
         self._by_weight = np.tile(self._weight / self._weight.sum(), (start.drones, 1))
         people = [ActorFilter(q=config.actor_q, sigma_m=config.tuning.actor_sigma_m) for _ in weights]
-        self._filter = actor or PeopleFilter(people, self._weight)
+        self._filter = PeopleFilter(people, self._weight)
         slots = formation_slots(
             np.array([yaw_rad]), start.drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
         )
@@ -127,7 +124,6 @@ class Pilot:
         self.guard: Guard | None = None
         """Filter of the local plans: it decides which motion is flown. Set by a replay; None otherwise."""
         self.times = PlanningTimes([], [])
-        self.separation: Counter[Separation] = Counter()
 
     def measure(self, t_s: float, position: Float, person: int = 0) -> None:
         """Take in the position [3] of the actor or of one of several people: the hips' middle, m, world.
@@ -245,7 +241,6 @@ class Pilot:
             self._plans[i] = (
                 made.plan if self.guard is None else self.guard.admit(i, t_s, made.plan, self._filter, field)
             )
-            self.separation[made.separation] += 1
 
 
 def replay(
@@ -256,9 +251,7 @@ def replay(
     start: Start,
     *,
     config: PlannerConfig,
-    mode: Mode = "closed-loop",
     seed: int = 0,
-    foresight: bool = False,
     weights: Sequence[float] = (1.0,),
     clock: Callable[[], float] = perf_counter,
 ) -> Replay:
@@ -276,9 +269,6 @@ def replay(
         fields: the maps by the time from which they hold; before the first one nothing is known.
         start: the formation at the start.
         config: weights and rates, the same for all arms of a comparison.
-        mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones exactly
-            on their local plans.
-        foresight: forecasts are the log itself (`forecast.Foresight`); such a flight uses later measurements.
         weights: of the people.
         clock: seconds, to measure planning times.
 
@@ -303,17 +293,11 @@ def replay(
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
 
     weight = np.array(weights, dtype=np.float64)
-    foreseen = None
-    if foresight:
-        ways = [Foresight(log_s[own], measured[own, p]) for p, own in enumerate(known.T)]
-        foreseen = PeopleFilter(ways, weight)
-    pilot = Pilot(arm, config, start, actor=foreseen, weights=weights, clock=clock)
+    pilot = Pilot(arm, config, start, weights=weights, clock=clock)
     for row, person in np.argwhere(known[: first + 1]):
         pilot.measure(log_s[row], noisy[row, person], person)
     first_slots, first_estimate = pilot.wanted(np.zeros(1))
-    guard = pilot.guard = Guard(
-        first_estimate[:, 0] + slot_offsets(first_slots[0]), config, exactly=mode == "plan-only"
-    )
+    guard = pilot.guard = Guard(first_estimate[:, 0] + slot_offsets(first_slots[0]), config)
     shape = (start.drones, len(replay_ns), 3)
     position, velocity, slots, estimate = (np.empty(shape) for _ in range(4))
     aim = np.empty((*shape[:2], len(weight)))
@@ -341,7 +325,6 @@ def replay(
         actor=np.tensordot(weight / weight.sum(), positions_at(t_ns, measured, replay_ns), 1),
         estimate=estimate,
         aim=aim,
-        separation={kind.value: pilot.separation[kind] for kind in Separation},
         safety={kind.value: guard.counts[kind] for kind in FlownMotion},
         times=pilot.times,
     )

@@ -4,39 +4,30 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import sum_sigma
 from pipelines.geometry.poses import rates
-from pipelines.planning.config import ErrorModel, Mode, PlannerConfig, PlannerTuning, planner_config
+from pipelines.planning.config import ErrorModel, PlannerConfig, planner_config
 from pipelines.planning.distance_field import (
-    OCCUPIED,
     DistanceField,
-    Grid,
     MapsInTurn,
     Unknown,
     distance_field,
     in_turn,
-    looked,
-    visible,
     zone_edges,
 )
 from pipelines.planning.forecast import first_heading
 from pipelines.planning.formation import (
     YAW,
-    cost_map,
-    costs_of_slots,
     formation_slots,
     slot_of,
     slot_offsets,
-    yaw_set,
 )
 from pipelines.planning.loading import LoggedFlight, Source, flown_poses, points_at
-from pipelines.planning.scores import near_obstacle
 from pipelines.planning.tracking import tracking_times
 from pipelines.session.description import Description
 from pipelines.session.errors import DataError
@@ -46,14 +37,8 @@ from pipelines.session.records import Occupancy
 MOST_DRONES = 8
 # The detector's errors are modelled for 30 Hz, and 25 divide the 50 of the tracking.
 PICTURES_HZ = 25.0
-# The report's cost map has a column every half second.
-COST_MAP_HZ = 2.0
-# The report's cost map has a row every 5 deg.
-COST_MAP_YAWS = 72
 # Errors of poses change slowly along a flight, so that the mean over 200 moments is that of all.
 NOISE_LOOKS = 200
-# A share of moments is exact to a second in a hundred at this rate.
-HIDDEN_LOOKS_HZ = 10.0
 
 
 @dataclass(frozen=True)
@@ -65,27 +50,20 @@ class ReplanSettings:
     )
     drones: int | None = None  # the number of cameras, 2 to 8
     yaw_deg: float | None = None  # of the first camera at the start, from the zero of yaws
-    mode: Mode = "closed-loop"
-    trials: int = 20
+    trials: int = 100
     seed: int = 0
     pose_noise: str | None = None
     planner: PlannerConfig = field(default_factory=PlannerConfig)
 
 
 def replan_settings(values: Mapping[str, object], source: Path | str, **others: Any) -> ReplanSettings:
-    """Make settings of a mapping, as from YAML: those of the planner, `yaw_deg` and `mode`.
+    """Make settings of a mapping, as from YAML: those of the planner, and `yaw_deg`.
 
     Raises:
         DataError: a setting is unknown or out of range.
     """
     planner = dict(values)
     own: dict[str, Any] = {}
-    if "mode" in planner:
-        own["mode"] = planner.pop("mode")
-        if own["mode"] not in get_args(Mode):
-            raise DataError(
-                source, f"mode: {own['mode']!r} is none of {', '.join(get_args(Mode))}", code="bad-value"
-            )
     if "yaw_deg" in planner:
         yaw_deg = own["yaw_deg"] = planner.pop("yaw_deg")
         if isinstance(yaw_deg, bool) or not isinstance(yaw_deg, int | float) or not abs(yaw_deg) <= 360:
@@ -156,16 +134,6 @@ class ReplayScene:
         return slice(None, None, max(round(self.config.tuning.tracking_hz / PICTURES_HZ), 1))
 
     @cached_property
-    def near(self) -> Bool:
-        """True [T] while an obstacle is near a slot of the formation of the start: the same for all arms."""
-        slots = self._first_slots()
-        return looked(
-            self.maps,
-            lambda field, rows: near_obstacle(self.t_s[rows], slots[:, rows], self.actor[rows], field),
-            axis=0,
-        )
-
-    @cached_property
     def joints(self) -> Float | None:
         """Joints [K, P J, 3] of all people at the times of the pictures; None where no skeleton is known."""
         skeleton, t_ns = self.flight.skeleton, self.t_ns[self.pictures]
@@ -183,22 +151,6 @@ class ReplayScene:
         (_, first), *_ = self.maps_at(self.t_ns[:1])
         clearance_m = first.barring(zone_edges(self.config.zones)).sample(self._first_slots()[:, 0])[0]
         return int((clearance_m < self.config.drone_radius_m).sum())
-
-    def cost_map(self) -> tuple[Int64, Float, Float]:
-        """Compute times [M], yaws [D] of the first camera, and the formation's cost [M, D] there."""
-        rows = slice(None, None, max(round(self.config.tuning.tracking_hz / COST_MAP_HZ), 1))
-        yaws = yaw_set(COST_MAP_YAWS, self.yaw_rad)
-        slots = formation_slots(
-            yaws, self.drones, tilt_rad=self.config.tilt_rad, range_m=self.config.radius_m
-        )
-        t_ns, actor, offsets = self.t_ns[rows], self.actor[rows], slot_offsets(slots)
-        zones = zone_edges(self.config.zones)
-
-        def cost(field: DistanceField, part: slice) -> Float:
-            costs = costs_of_slots(field.barring(zones), actor[part], offsets, self.config)
-            return cost_map(costs, self.config)
-
-        return t_ns, yaws, looked(self.maps_at(t_ns), cost, axis=0)
 
 
 def build_scene(
@@ -320,40 +272,3 @@ def _doubts(scene: ReplayScene) -> list[str]:
     if scene.flight.skeleton is None:
         doubts.append("no skeleton to look at, so no reconstruction error: run `mocap reconstruct` first")
     return doubts
-
-
-def hidden_shares(
-    flight: LoggedFlight, description: Description, maps: Sequence[Occupancy]
-) -> dict[str, float]:
-    """Compute for each camera the share of moments in which an occupied voxel hid the actor from it.
-
-    Of several people it is the mean. Ten moments a second, while the camera's pose is known; true poses and
-    hips where they are known. Each map counts from its own time on; unknown voxels are free. The end of the
-    sight line next to the actor is left out (the default `sight_start_m`): maps contain the actor. So are
-    cameras that never have a pose.
-    """
-    start_m = PlannerTuning().sight_start_m
-    first_ns, last_ns = int(flight.actor_t_ns[0]), int(flight.actor_t_ns[-1])
-    count = max(2, round((last_ns - first_ns) / 1e9 * HIDDEN_LOOKS_HZ) + 1)
-    t_ns = np.linspace(first_ns, last_ns, count).round().astype(np.int64)
-    people, _ = flight.scored_actor(t_ns)
-    position, _, known = flown_poses(flight, description, t_ns)
-    hidden = np.zeros(known.shape)
-    for occupancy in sorted(maps, key=lambda one: one.from_ns):
-        (later,) = np.nonzero(t_ns >= occupancy.from_ns)  # a later map replaces an earlier one
-        field = _occupied_only(occupancy)
-        free = visible(field, position[:, later], people[:, None, later], start_m=start_m)  # [P, C, T]
-        hidden[:, later] = 1.0 - free.mean(axis=0)
-    return {
-        camera.name: float(hidden[c, known[c]].mean())
-        for c, camera in enumerate(flight.cameras)
-        if known[c].any()
-    }
-
-
-def _occupied_only(occupancy: Occupancy) -> DistanceField:
-    """Return a field that has only the occupied voxels, no distances: sight lines need no more."""
-    with np.errstate(invalid="ignore"):
-        occupied: NDArray[np.bool_] = occupancy.probability >= OCCUPIED
-    sign = np.where(occupied, np.float32(-1), np.float32(1))
-    return DistanceField(Grid(sign, np.array(occupancy.origin, dtype=np.float64), occupancy.resolution_m))

@@ -21,14 +21,10 @@ from pipelines.planning.formation import RANGE, TILT, YAW, slot_of, wrapped
 
 Scores = dict[str, object]
 
-# Higher things within 15 m of a slot can hide the actor or be in a drone's way soon.
-NEAR_OBSTACLE_M = 15.0
 # Plans change at 5 Hz, so that means over 0.1 s show every change of acceleration.
 MOTION_HZ = 10.0
 # Drones fly at their limits; differences of rounded positions exceed these by less than a millionth.
 LIMIT_ROUNDING = 1.0 + 1e-6
-# An actor who runs moves 1 m between two looks for obstacles near the slots.
-LOOKS_PER_S = 5.0
 # A point needs two views.
 MIN_VIEWS = 2
 # The person of Hughes et al. 2024 is a hexagonal prism with a lid.
@@ -181,7 +177,6 @@ def score(
     maps: DistanceField | MapsInTurn,
     config: PlannerConfig,
     *,
-    near: Bool | None = None,
     people: Float | None = None,
     seen: Bool | None = None,
 ) -> Scores:
@@ -193,14 +188,13 @@ def score(
         actor: [T, 3] metres, world; finite. Or [N, T, 3], whom each camera films.
         maps: the distance field, or the map of each moment.
         config: limits, no-fly zones, `sight_start_m` and the ray model.
-        near: [T] True while an obstacle is near (see `near_obstacle`); the same for all arms of a comparison.
         people: [P, T, 3] metres, world, if there are several. Shares and errors are means over them, and
             distances to the actor are those to the nearest of them.
         seen: [P, N, T] who is seen from which camera; by default sight lines to the actor that are free.
 
     Returns:
         JSON-able: degrees and metres by name; None where there is nothing to count (no pair of drones,
-        no obstacle at all, never near one). `limit_violations` counts episodes per drone (per pair for
+        no obstacle at all). `limit_violations` counts episodes per drone (per pair for
         separation): in an obstacle (`collision`), within `drone_radius_m` of one (`clearance`), within
         `actor_distance_m` of the actor (`actor`), in a no-fly zone (`zone`), and beyond
         the other limits of the configuration. `path_m` is the mean length of a drone's way, `energy_kj` the
@@ -232,11 +226,7 @@ def score(
         **{name: _episodes(motion[name] > limit * LIMIT_ROUNDING) for name, limit in limits.items()},
     }
     return {
-        "tilt_deg": {
-            "mean": float(tilt_deg.mean()),
-            "max": float(tilt_deg.max()),
-            "near_obstacle": None if near is None or not near.any() else float(tilt_deg[:, near].mean()),
-        },
+        "tilt_deg": {"mean": float(tilt_deg.mean()), "max": float(tilt_deg.max())},
         "range_m": _spread(slots[..., RANGE]),
         "yaw_separation_deg": _spread(np.degrees(np.abs(turned))) if pairs else None,
         "occluded_share": float(1.0 - seen.mean()),
@@ -377,35 +367,6 @@ def errors_of_views(position: Float, people: Float, seen: Bool, config: PlannerC
             axis=1
         )
     )
-
-
-def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: DistanceField) -> Bool:
-    """Find the times [T] when something higher than the actor's hips is within 15 m (level) of a slot.
-
-    The ground is always near. Obstacles for a drone at a low tilt rise above the actor. `t_s` [T] ascends,
-    `slot_position` is [N, T, 3] and `actor` [T, 3] m, world. Tested five times a second, and constant until
-    the next test.
-    """
-    grid = field.grid
-    occupied = grid.distance_m < 0.0
-    levels = np.arange(1, occupied.shape[2] + 1)
-    top_m = grid.origin[2] + grid.resolution_m * (occupied * levels).max(axis=2)
-    top_m[~occupied.any(axis=2)] = -np.inf  # the map may begin above the actor
-    wanted = np.minimum(np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / LOOKS_PER_S), t_s[-1])
-    looks = np.unique(np.searchsorted(t_s, wanted))
-    found = np.zeros(len(looks), dtype=np.bool_)
-    centres = [grid.origin[a] + grid.resolution_m * (np.arange(top_m.shape[a]) + 0.5) for a in range(2)]
-    for k, look in enumerate(looks):
-        for x, y, _ in slot_position[:, look]:
-            part = tuple(
-                slice(*np.searchsorted(c, [v - NEAR_OBSTACLE_M, v + NEAR_OBSTACLE_M]))
-                for c, v in zip(centres, (x, y), strict=True)
-            )
-            east, north = centres[0][part[0]], centres[1][part[1]]
-            square = (east[:, None] - x) ** 2 + (north[None] - y) ** 2
-            found[k] |= ((top_m[part] > actor[look, 2]) & (square <= NEAR_OBSTACLE_M**2)).any()
-    latest = np.searchsorted(looks, np.arange(len(t_s)), side="right") - 1
-    return found[latest]
 
 
 def _motion(t_s: Float, position: Float) -> dict[str, Float]:

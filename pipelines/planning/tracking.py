@@ -154,7 +154,6 @@ def roll_out(
     step_s: float,
     after_s: float,
     ticks: int,
-    exactly: bool,
     flying: Flying,
     states: Float,
 ) -> int:
@@ -165,7 +164,6 @@ def roll_out(
         start_velocity: [3] m/s.
         after_s: time from the start of the plan to the drone's first state.
         ticks: number of periods for which the plan is followed.
-        exactly: be exactly on the plan, without the limits, in place of tracking it.
         flying: gains, limits and period.
         states: [K + 1, 4, 3]; the first is the drone's state, the others are written.
 
@@ -179,12 +177,7 @@ def roll_out(
         state, following = states[k], states[k + 1]
         following[:] = state
         if k < ticks:
-            now_s = after_s + (k + 1 if exactly else k) * flying.period_s
-            _reference(path, start_velocity, step_s, now_s, x, v, a)
-            if exactly:
-                following[POSITION], following[VELOCITY], following[ACCELERATION] = x, v, a
-                _shorten(following[ACCELERATION], flying.acceleration_mps2)
-                continue
+            _reference(path, start_velocity, step_s, after_s + k * flying.period_s, x, v, a)
             for axis in range(3):
                 error = x[axis] - state[POSITION, axis]
                 following[INTEGRAL, axis] += error * flying.period_s

@@ -295,7 +295,7 @@ def _setting(metrics: Mapping[str, object]) -> str:
     }
     error = filmed.get(skeleton, f"simulated in {trials} of the skeleton of {skeleton}")
     return (
-        f"{plural(drones, 'drone')} over {fixed(number(metrics, 'duration_s'))} s, {text(metrics, 'mode')}."
+        f"{plural(drones, 'drone')} over {fixed(number(metrics, 'duration_s'))} s."
         f" Reconstruction error: {error}, each picture for itself, so that it is larger than the estimate's."
     )
 

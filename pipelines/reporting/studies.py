@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.metrics import interval_of, resampled
+from pipelines.geometry.metrics import intervals
 from pipelines.reporting.chart import CAMERAS, LEVELS, Figure, Mark, Note, Panel, Points, write_drawing
 from pipelines.reporting.content import StudyContent
 from pipelines.reporting.wording import Column, Table, fixed, plural, quantity
@@ -75,7 +75,7 @@ _SHOWN = (METRICS["mpjpe_mm"], METRICS["reconstructed_share"])  # tables on a se
 _BEST = ("auto", "robust", "midpoint", "dlt")  # the sentence is about the first one available
 
 
-def estimates(rows: Sequence[Row], axis: str, *, seed: int) -> list[dict[str, Any]]:
+def estimates(rows: Sequence[Row], axis: str) -> list[dict[str, Any]]:
     """Compute the means over trials of every condition and method.
 
     Intervals are those of `geometry.metrics` over trials.
@@ -102,8 +102,8 @@ def estimates(rows: Sequence[Row], axis: str, *, seed: int) -> list[dict[str, An
         made.append(
             {
                 **dict(zip(_CONDITION, condition, strict=True)),
-                "metrics": {name: _mean(own, name, seed) for name in own[0] if _is_measured(name)},
-                "ratio": _ratio(own, others, seed),
+                "metrics": {name: _mean(own, name) for name in own[0] if _is_measured(name)},
+                "ratio": _ratio(own, others),
                 "per_joint": _per_joint(own),
             }
         )
@@ -114,15 +114,12 @@ def _is_measured(name: str) -> bool:
     return name not in {*_CONDITION, "trial", "per_joint"}
 
 
-def _mean(rows: Sequence[Row], name: str, seed: int) -> dict[str, Any] | None:
+def _mean(rows: Sequence[Row], name: str) -> dict[str, Any] | None:
     values = np.array([row[name] for row in rows if row[name] is not None], dtype=np.float64)
-    if not values.size:
-        return None
-    drawn = resampled({name: (values, np.ones(len(values)))}, None, seed=seed)[name]
-    return _estimate(float(values.mean()), drawn, len(values))
+    return _estimate(values, np.ones(len(values))) if values.size else None
 
 
-def _ratio(rows: Sequence[Row], others: Sequence[Row], seed: int) -> dict[str, Any] | None:
+def _ratio(rows: Sequence[Row], others: Sequence[Row]) -> dict[str, Any] | None:
     """Compute the mean error as a multiple of another condition's; trials share random numbers in both."""
     pairs = np.array(
         [
@@ -134,15 +131,14 @@ def _ratio(rows: Sequence[Row], others: Sequence[Row], seed: int) -> dict[str, A
     ).reshape(-1, 2)
     if not len(pairs) or pairs[:, 1].min() < _NOTHING_MM:
         return None
-    own, other = pairs.mean(axis=0)
-    drawn = resampled({"": (pairs[:, 0], pairs[:, 1])}, None, seed=seed)[""]
-    return _estimate(float(own / other), drawn, len(pairs))
+    return _estimate(pairs[:, 0], pairs[:, 1])
 
 
-def _estimate(mean: float, drawn: Float, trials: int) -> dict[str, Any]:
-    # Trials without chance (exact poses, pictures filmed once) have no interval.
-    ends = interval_of(drawn) if drawn.min() < drawn.max() else None
-    return {"mean": mean, "interval": None if ends is None else list(ends), "trials": trials}
+def _estimate(sums: Float, weights: Float) -> dict[str, Any]:
+    """Compute a ratio over trials; without chance (exact poses, pictures filmed once) it has no interval."""
+    ends = intervals({"": (sums, weights)}, None)[""]
+    interval = list(ends) if ends is not None and ends[0] < ends[1] else None
+    return {"mean": float(sums.sum() / weights.sum()), "interval": interval, "trials": len(sums)}
 
 
 def _per_joint(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:

@@ -112,12 +112,6 @@ REPLAN = pa.schema(
 """replan/<arm>/trajectories.parquet: the pose (world_from_camera), the commanded
 slot (yaw continuous, NaN for the flown trajectories), the tilt above the actor, `visible` (True if nothing
 blocks the sight line), and the predicted error of all cameras together (NaN where not determined)."""
-SEEN = pa.schema([_T_NS, _CAMERA, _JOINT, *_XY, _STATUS])
-"""replan/<arm>/seen.parquet: once a second, the position of each known joint in the arm's pictures (exact px,
-NaN outside) and its status: `seen`, `hidden` by the surroundings, or `outside` the picture."""
-COST_MAP = pa.schema([_T_NS, ("yaw_rad", pa.float64()), ("cost", pa.float64())])
-"""replan/cost_map.parquet: the cost of a formation at a time, by the yaw of its first camera."""
-
 
 def write_table(path: Path, frame: pd.DataFrame, schema: pa.Schema) -> None:
     """Write a table with exactly the columns of `schema`; NaN stays NaN."""

@@ -127,17 +127,16 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(mound: 
     assert arms["flown"]["min_clearance_m"] < 0
     against_fixed = next(each for each in metrics["differences"] if each["arm"] == "adaptive")
     assert against_fixed["against"] == "fixed"
-    assert against_fixed["tilt_near_obstacle_deg"]["mean"] < -5
-    assert against_fixed["tilt_near_obstacle_deg"]["interval"][1] < 0
+    assert against_fixed["tilt_deg"]["interval"][1] < 0
     assert against_fixed["mpjpe_mm"]["interval"][1] < 0
     # The ring goes through the mound: it is no candidate. PCK counts what was not measured as wrong.
     best = metrics["best"]
-    assert (best["arm"], best["runner_up"], best["left_out"]) == ("adaptive", "fixed", ["flown"])
+    assert (best["arms"], best["disagree"], best["left_out"]) == (["adaptive"], False, ["flown"])
     pck = {name: arms[name]["reconstruction_error"]["pck150"]["mean"] for name in arms}
     assert best["difference"]["pck150"]["mean"] == pytest.approx(pck["adaptive"] - pck["fixed"])
     assert all(share <= arms[name]["reconstruction_error"]["coverage"]["mean"] for name, share in pck.items())
-    low, high = best["difference"]["interval_over_flights"]["mpjpe_mm"]
-    assert low < best["difference"]["mpjpe_mm"]["mean"] < high
+    low, high = against_fixed["interval_over_flights"]["mpjpe_mm"]
+    assert low < against_fixed["mpjpe_mm"]["mean"] < high
     # The sentence and the table are about the same joints.
     in_the_table = arms["adaptive"]["mpjpe_mm"] - arms["fixed"]["mpjpe_mm"]
     assert against_fixed["mpjpe_mm"]["mean"] == pytest.approx(in_the_table)
@@ -146,14 +145,13 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(mound: 
     assert metrics["warnings"][0] == first
     assert arms["flown"]["limit_violations"]["collision"] > 0
     assert first.startswith("flown ")
-    tilts = [f"{arms[name]['tilt_deg']['max']:.0f}" for name in ("adaptive", "fixed")]
-    assert re.search(r"^best is adaptive: .*\badaptive .*\b{}\b.*\bfixed\b.*\b{}\b".format(*tilts), then)
-    assert f"{-against_fixed['mpjpe_mm']['mean']:.1f} mm" in then
+    assert then.startswith("adaptive is better than fixed: ")
+    assert f"{against_fixed['mpjpe_mm']['mean']:+.1f} [" in then
     assert "(simulated)" in then
     for name in ("adaptive", "fixed"):
         violations = arms[name]["limit_violations"]
         assert set(violations.values()) == {0}
-        assert sum(arms[name]["safety"].values()) == sum(arms[name]["local_plans"].values()) > 0
+        assert sum(arms[name]["safety"].values()) > 0
 
 
 def test_what_is_stored(mound: Path) -> None:
@@ -164,7 +162,7 @@ def test_what_is_stored(mound: Path) -> None:
     assert metrics["actor"] == {"planned_with": "log", "scored_against": "truth"}
     for name, arm in metrics["arms"].items():
         assert set(arm) >= DESIGN_KEYS
-        assert set(arm["tilt_deg"]) == {"mean", "max", "near_obstacle"}
+        assert set(arm["tilt_deg"]) == {"mean", "max"}
         assert arm["simulated"] is (name != "flown")
         error = arm["reconstruction_error"]
         assert error["simulated"] is True
@@ -181,17 +179,6 @@ def test_what_is_stored(mound: Path) -> None:
         assert 1 - table["visible"].mean() == pytest.approx(arm["occluded_share"])
         skeleton = pd.read_parquet(folder / name / "skeleton.parquet")
         assert {"t_ns", "joint", "x", "y", "z"} <= set(skeleton.columns)
-        seen = pd.read_parquet(folder / name / "seen.parquet")
-        assert len(seen) == 2 * 17 * seen["t_ns"].nunique()
-        assert seen["t_ns"].nunique() in (26, 27)  # once a second, the first moment among them
-        assert seen["x"].isna().equals(seen["status"] == "outside")
-        # The ring goes through the mound; adaptive hides nobody, and looks at the middle of the hips.
-        assert (seen["status"] == "hidden").any() == (arm["occluded_share"] > 0)
-        if name == "adaptive":
-            hips = seen[seen["joint"].isin(["left_hip", "right_hip"])].groupby("t_ns")[["x", "y"]].mean()
-            assert np.abs(hips.to_numpy() - [639.5, 359.5]).max() < 60  # 0.6 m at 8 m, of 763 px
-    costs = pd.read_parquet(folder / "cost_map.parquet")
-    assert costs["cost"].max() > 0
     planning = json.loads((mound / "run.json").read_text())["runs"][-1]["planning"]
     assert planning["adaptive"]["local_ms"]["calls"] > 200
     assert "central_ms" not in (folder / "stage.json").read_text()
@@ -282,7 +269,7 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     assert arm["range_m"]["mean"] == pytest.approx(6, abs=0.3)
     assert arm["tilt_deg"]["mean"] == pytest.approx(30, abs=3)
     assert metrics["differences"] == []
-    assert metrics["verdict"].startswith("fixed ")
+    assert metrics["verdict"].startswith("fixed")
     stated = json.loads((calm / "replan" / "stage.json").read_text())["settings"]
     assert (stated["planner.horizon_s"], stated["planner.ranges_m"]) == (7.0, [6.0, 9.0])
     table = pd.read_parquet(calm / "replan" / "fixed" / "trajectories.parquet")
@@ -355,7 +342,6 @@ def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:
     metrics = compared(session, "--trials", "1", "--config", "radius_m=2.5", "--config", "tilt_deg=10")
     for arm in ("adaptive", "fixed"):
         assert metrics["arms"][arm]["min_clearance_m"] is not None
-        assert metrics["arms"][arm]["tilt_deg"]["near_obstacle"] is not None
 
 
 BAD = {

@@ -124,8 +124,6 @@ def test_an_arm_is_compared(outside: Path, session: Path) -> None:
         "fixed,opposite",
         "--trials",
         "1",
-        "--config",
-        "mode=plan-only",
         "-q",
     )
     arms = {

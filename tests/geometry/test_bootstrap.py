@@ -65,13 +65,22 @@ def test_nothing_to_draw_from_has_no_interval() -> None:
     assert intervals({"a": (rare, rare)}, stamps()) == {"a": None}
 
 
-def test_trials_are_drawn_one_by_one() -> None:
+@pytest.mark.parametrize(("trials", "low", "high"), [(3, 0.92, 0.98), (100, 0.93, 0.97)])
+def test_the_interval_of_trials_holds_the_mean_as_often_as_it_says(
+    trials: int, low: float, high: float
+) -> None:
+    """Skewed errors, as those of joints: 1,000 draws know a share of 95 % to 0.7 %."""
+    values = np.random.default_rng(5).gamma(8.0, 1.0, (1000, trials))
+    found = [intervals({"x": (own, np.ones(trials))}, None)["x"] for own in values]
+    assert low < np.mean([ends is not None and ends[0] <= 8.0 <= ends[1] for ends in found]) < high
+
+
+def test_trials_pair_sums_with_weights() -> None:
     values = np.random.default_rng(5).normal(5, 2, 400)
-    found = intervals({"x": (values, np.ones(400)), "twice": (2 * values, np.ones(400))}, None)
+    found = intervals({"x": (values, np.ones(400)), "ratio": (3 * values, values)}, None)
     assert found["x"] is not None
-    # The spread of 400 values is known to 3.5 %, the ends of 2000 draws to 4 % of half a width.
     assert np.diff(found["x"]) == pytest.approx(NORMAL_95 * 2 / np.sqrt(400), rel=0.15)
-    assert found["twice"] == pytest.approx(2 * np.array(found["x"]))  # the same draws
+    assert found["ratio"] == pytest.approx((3.0, 3.0))
     assert intervals({"x": (values[:1], ONE[:1])}, None) == {"x": None}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,28 +12,12 @@ from pipelines.planning.comparison import (
     common_frames,
     coverage,
     equal_ranges,
-    mean_of_trials,
     mean_over_time,
     mpjpe_mm,
     pck,
+    verdict,
+    worth_flying,
 )
-
-
-def test_the_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:
-    """400 draws: the standard error of the mean is sd/20; 2000 resamples give its ends to some per cent.
-
-    The 2.5 % quantile of the resampled means is known to 1.96 sd' sqrt(p (1 - p) / 2000) / (p's density),
-    0.06 standard errors; 0.25 is four times that.
-    """
-    values = np.random.default_rng(3).normal(5.0, 2.0, 400)
-    estimate = mean_of_trials(values, seed=0)
-    assert estimate is not None
-    assert estimate["interval"] is not None
-    standard_error = values.std() / 20
-    assert estimate["mean"] == pytest.approx(values.mean())
-    expected = values.mean() + 1.96 * standard_error * np.array([-1, 1])
-    assert estimate["interval"] == pytest.approx(tuple(expected), abs=0.25 * standard_error)
-    assert mean_of_trials(values, seed=0) == estimate
 
 
 def test_a_finer_time_makes_a_mean_no_surer() -> None:
@@ -44,7 +30,7 @@ def test_a_finer_time_makes_a_mean_no_surer() -> None:
     for rate_hz in (2, 50):
         t_s = np.arange(0, 500, 1 / rate_hz)
         values = held[(t_s // 5).astype(np.int64)]
-        estimate = mean_over_time(values, np.ones(len(t_s), dtype=bool), nanoseconds(t_s), seed=0)
+        estimate = mean_over_time(values, nanoseconds(t_s), seed=0)
         assert estimate is not None
         assert estimate["interval"] is not None
         width = estimate["interval"][1] - estimate["interval"][0]
@@ -81,3 +67,42 @@ def test_arms_of_equal_range_are_grouped_from_near_to_far() -> None:
         ["e"],
     ]
     assert equal_ranges({}) == []
+
+
+def change(points: float, mm: float, *, half: float = 0.1) -> dict[str, Any]:
+    """Return a difference in points of joints within 150 mm and in mm, with narrow intervals."""
+    return {
+        "pck150": {"mean": points / 100, "interval": [(points - half) / 100, (points + half) / 100]},
+        "mpjpe_mm": {"mean": mm, "interval": [mm - half, mm + half]},
+    }
+
+
+@pytest.mark.parametrize(
+    ("difference", "judged"),
+    [
+        (change(3.0, -8.0), [1, 1]),
+        (change(0.2, -8.0), [0, 1]),  # 0.2 points decide nothing
+        (change(3.0, 4.0), [1, 0]),  # nor do 4 mm
+        (change(3.0, 8.0), [1, -1]),
+        (change(3.0, -8.0, half=9.0), [0, 0]),  # noise
+        (change(0.0, 0.0), [0, 0]),  # the same arm twice
+    ],
+)
+def test_a_difference_counts_by_its_practical_size(difference: dict[str, Any], judged: list[int]) -> None:
+    assert worth_flying(difference) == judged
+
+
+@pytest.mark.parametrize(
+    ("arms", "disagree", "words"),
+    [
+        (["a"], False, "a is better than b"),
+        (["a", "b"], False, "no difference"),
+        (["a", "b"], True, "disagree"),
+    ],
+)
+def test_the_verdict_names_both_figures(arms: list[str], disagree: bool, words: str) -> None:
+    difference = {"arm": "a", "against": "b", **change(6.5, -9.3)}
+    said = verdict({"arms": arms, "disagree": disagree, "left_out": [], "difference": difference}, ["a", "b"])
+    assert words in said
+    assert "+6.5 [+6.4, +6.6]" in said
+    assert "-9.3 [-9.4, -9.2]" in said

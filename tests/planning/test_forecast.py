@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.planning.forecast import ActorFilter, Foresight
+from pipelines.planning.forecast import ActorFilter
 
 
 def test_a_steady_walk_is_forecast_exactly() -> None:
@@ -39,13 +39,3 @@ def test_errors_are_as_large_as_stated() -> None:
         error = truth - np.stack([position, velocity])
         total += float((error * np.linalg.solve(covariance, error)).sum())
     assert total / 1200 == pytest.approx(2.0, abs=5 * 0.058)
-
-
-def test_foresight_knows_the_way_and_goes_on_straight() -> None:
-    t_s = np.arange(0.0, 3.1, 0.1)
-    way = np.stack([np.sin(t_s), 0.5 * t_s, 0 * t_s + 1.0], axis=1)
-    actor = Foresight(t_s, way)
-    actor.measure(0.0, way[0])
-    assert actor.forecast(t_s[[3, 17]] + 0.05) == pytest.approx((way[[3, 17]] + way[[4, 18]]) / 2)
-    beyond = actor.forecast(np.array([5.0]))[0]
-    assert beyond == pytest.approx(way[-1] + 2.0 * (way[-1] - way[-11]))

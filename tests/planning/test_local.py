@@ -10,7 +10,7 @@ import pytest
 from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import DistanceField, distance_field, open_space
-from pipelines.planning.local import TERMS, LocalPlanner, Separation, closest_approach
+from pipelines.planning.local import TERMS, LocalPlanner
 from pipelines.planning.tracking import DronePlan
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import bare_ground, mound
@@ -172,57 +172,3 @@ def test_who_stands_inside_the_mound_gets_out_if_speed_has_a_floor(
 
 def straight(start: Float, end: Float, start_s: float = 0.0) -> DronePlan:
     return DronePlan(start_s, np.linspace(start, end, 21), (end - start) / 10.0, 0.5)
-
-
-def test_closest_approach_sees_between_the_waypoints() -> None:
-    """Two pass each other at 90 degrees, both at the crossing at 0.75 s, between two waypoints."""
-    path = np.array([[-1.5, 0, 0], [-0.5, 0, 0], [0.5, 0, 0], [1.5, 0, 0]])
-    other = path[:, [1, 0, 2]] + [0, 0, 0.25]
-    assert closest_approach(path, other[None]) == pytest.approx(0.25)
-    assert np.linalg.norm(path - other, axis=1).min() > 0.7
-    assert closest_approach(path, np.empty((0, 4, 3))) == np.inf
-
-
-def test_plans_that_would_meet_are_kept_apart() -> None:
-    """Head on along the same line, so strongly wanted that the soft term alone gives way."""
-    config = PlannerConfig(l_form=20.0, tuning=PlannerTuning(l_sep=0.5))
-    planner = LocalPlanner(config)
-    a, b = np.array([-10.0, 0, 4]), np.array([10.0, 0.1, 4])
-    other = straight(b, a)
-    made = planner.plan(
-        0.0,
-        a,
-        np.array([2.0, 0, 0]),
-        slots=straight(a, b).path[1:],
-        actor=straight(a, b).path[1:] + np.array([0, 30, 0]),
-        others=[other],
-        field=open_space(),
-        previous=None,
-    )
-    assert made.separation is Separation.PROJECTED
-    assert closest_approach(made.plan.path, other.path[None]) >= config.separation_m
-
-
-def test_where_pushing_does_not_help_the_plan_before_goes_on() -> None:
-    """Another drone is beside the way; on the other side there is rock."""
-    occupied = np.ones((60, 24, 60), dtype=np.float32)
-    occupied[:, 11:13] = 0  # a gap 1 m wide along y = 0
-    field = distance_field(Occupancy(occupied, np.array([-15.0, -6.0, -15.0]), 0.5))
-    config = PlannerConfig(l_form=20.0, tuning=PlannerTuning(l_sep=0.0, eps_obs_m=0.3))
-    here, still = np.zeros(3), np.zeros(3)
-    slots = np.linspace([0.5, 0, 0], [10, 0, 0], 20)
-    beside = np.tile([5.0, 1.0, 0.0], (21, 1))  # in the rock: 2 m to the side would be enough
-    waiting = DronePlan(-0.2, np.zeros((21, 3)), still, 0.5)
-    made = LocalPlanner(config).plan(
-        0.0,
-        here,
-        still,
-        slots=slots,
-        actor=slots + np.array([0, 0, 9]),
-        others=[DronePlan(0.0, beside, still, 0.5)],
-        field=field,
-        previous=waiting,
-    )
-    assert made.separation is Separation.REJECTED
-    assert closest_approach(made.plan.path, beside[None]) >= config.separation_m
-    assert field.sample(made.plan.path)[0].min() > 0

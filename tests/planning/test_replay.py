@@ -14,7 +14,7 @@ from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.formation import FormationPath
 from pipelines.planning.replay import Replay, Start, replay
-from pipelines.planning.scores import near_obstacle, score
+from pipelines.planning.scores import score
 from tests.planning.worlds import bare_ground, high_wall, mound, trees, walker, wall
 
 CONFIG = PlannerConfig()
@@ -28,7 +28,6 @@ def fly(
     config: PlannerConfig = CONFIG,
     drones: int = 2,
     yaw_deg: float = 45.0,
-    closed: bool = True,
 ) -> Replay:
     return replay(
         arm,
@@ -36,7 +35,6 @@ def fly(
         [field],
         Start(drones, np.radians(yaw_deg)),
         config=config,
-        mode="closed-loop" if closed else "plan-only",
     )
 
 
@@ -56,10 +54,7 @@ def test_the_adaptive_formation_goes_round_the_mound_and_the_fixed_one_over_it()
     assert tilt_deg(adaptive).max() < 20
     assert np.ptp(fixed.formation_yaw_rad) == 0
     assert np.abs(np.degrees(adaptive.formation_yaw_rad[-1]) - 45) > 80
-    near = near_obstacle(fixed.t_s, fixed.position, fixed.actor, field)
-    assert 0 < near.mean() <= 1
-    means = [tilt_deg(result)[:, near].mean() for result in (fixed, adaptive)]
-    assert means[0] - means[1] > 5
+    assert tilt_deg(fixed).mean() - tilt_deg(adaptive).mean() > 5
     for result in (fixed, adaptive):
         assert field.sample(result.position)[0].min() > 1
         assert np.linalg.norm(result.position[0] - result.position[1], axis=-1).min() > 3
@@ -161,4 +156,3 @@ def test_the_rates_of_planning() -> None:
     result = fly(FIXED, bare_ground(), seconds=4.1, drones=3)
     assert len(result.times.central_s) == 41
     assert len(result.times.local_s) == 3 * 21
-    assert sum(result.separation.values()) == 3 * 21

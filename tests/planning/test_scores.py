@@ -9,8 +9,8 @@ from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import open_space
 from pipelines.planning.formation import formation_slots, slot_offsets
-from pipelines.planning.scores import near_obstacle, predicted_errors, propulsion_w, score
-from tests.planning.worlds import bare_ground, wall
+from pipelines.planning.scores import predicted_errors, propulsion_w, score
+from tests.planning.worlds import wall
 
 CONFIG = PlannerConfig()
 T_S = np.arange(0, 20.001, 0.02)
@@ -26,7 +26,7 @@ def ring(drones: int, tilt_deg: float, *, rate_rad_per_s: float = 0.0) -> tuple[
 def test_a_still_formation_in_the_open() -> None:
     position, actor = ring(2, 30.0)
     figures = score(T_S, position, actor, open_space(), CONFIG)
-    assert figures["tilt_deg"] == pytest.approx({"mean": 30, "max": 30, "near_obstacle": None})
+    assert figures["tilt_deg"] == pytest.approx({"mean": 30, "max": 30})
     assert figures["range_m"] == pytest.approx({"mean": 10, "min": 10, "max": 10})
     assert figures["yaw_separation_deg"] == pytest.approx({"mean": 90, "min": 90, "max": 90})
     assert figures["occluded_share"] == 0
@@ -92,26 +92,11 @@ def test_what_the_wall_hides_and_who_flies_into_it() -> None:
     behind = (T_S >= 5) & (T_S < 10)
     position[1, behind] = [5.0, 8.0, 1.0]
     position[1, ~behind] = [5.0, -10.0, 1.0]
-    figures = score(T_S, position, actor, wall(), CONFIG, near=behind)
+    figures = score(T_S, position, actor, wall(), CONFIG)
     assert figures["occluded_share"] == pytest.approx(0.5 * behind.mean())
     assert figures["undetermined_share"] == pytest.approx(behind.mean())
     assert figures["blind_s"] == pytest.approx(5.0, abs=0.05)
     assert figures["min_clearance_m"] == pytest.approx(-1.0, abs=0.5)  # the wall covers y = 6.5 to 9.5
     assert isinstance(figures["limit_violations"], dict)
     assert figures["limit_violations"]["collision"] == figures["limit_violations"]["clearance"] == 1
-    assert figures["tilt_deg"] == pytest.approx({"mean": 0, "max": 0, "near_obstacle": 0}, abs=1e-9)
-
-
-def test_near_is_what_stands_above_the_actor_within_fifteen_metres() -> None:
-    """The wall's near face is y = 6.5; a slot that comes from the south is near from y = -8.5 on.
-
-    Looks are 0.2 s apart, 0.2 m at 1 m/s, and columns count by their centres, 0.25 m behind the face.
-    """
-    slot = np.stack([0 * T_S + 12, T_S - 20, 0 * T_S + 3], axis=1)[None]
-    actor = np.tile([12.0, -25.0, 1.0], (len(T_S), 1))
-    near = near_obstacle(T_S, slot, actor, wall())
-    first = slot[0, np.argmax(near), 1]
-    assert -8.26 <= first <= -8.25 + 0.2 + 0.01
-    assert near[np.argmax(near) :].all()
-    assert not near_obstacle(T_S, slot, actor, bare_ground()).any()
-    assert not near_obstacle(T_S, slot, actor + np.array([0, 0, 6.0]), wall()).any()
+    assert figures["tilt_deg"] == pytest.approx({"mean": 0, "max": 0}, abs=1e-9)

@@ -43,7 +43,7 @@ def track(plan: DronePlan, start: Float, flying: Flying, seconds: float) -> Floa
     ticks = round(seconds / flying.period_s)
     states = np.zeros((ticks + 1, 4, 3))
     states[0] = start
-    roll_out(plan.path, plan.velocity, plan.step_s, 0.0, ticks, False, flying, states)
+    roll_out(plan.path, plan.velocity, plan.step_s, 0.0, ticks, flying, states)
     return states
 
 
@@ -99,7 +99,7 @@ def test_limits_are_kept_whatever_a_plan_asks_for_and_every_motion_ends_at_rest(
     states[0, VELOCITY] = direction * 0.95 * flying.speed_mps / np.sqrt(3)
     states[0, ACCELERATION] = push * flying.acceleration_mps2 / np.sqrt(3)
     path = np.random.default_rng(seed).normal(0, spread_m, (21, 3))
-    last = roll_out(path, states[0, VELOCITY].copy(), 0.5, 0.0, ticks, False, flying, states)
+    last = roll_out(path, states[0, VELOCITY].copy(), 0.5, 0.0, ticks, flying, states)
     speed, acceleration = (np.linalg.norm(states[:, row], axis=1) for row in (VELOCITY, ACCELERATION))
     jerk = np.linalg.norm(np.diff(states[:, ACCELERATION], axis=0), axis=1) / flying.period_s
     within = 1 + 1e-9

@@ -119,7 +119,6 @@ def make_comparison(*arms: str, verdict: str = "adaptive is better") -> ReplanCo
     arms = arms or ("adaptive", "fixed", "flown")
     metrics: dict[str, Any] = {
         "schema": 1,
-        "mode": "closed-loop",
         "drones": 2,
         "yaw_deg": 45.0,
         "duration_s": 10.0,
