@@ -113,6 +113,7 @@ REPLAN = pa.schema(
 slot (yaw continuous, NaN for the flown trajectories), the tilt above the actor, `visible` (True if nothing
 blocks the sight line), and the predicted error of all cameras together (NaN where not determined)."""
 
+
 def write_table(path: Path, frame: pd.DataFrame, schema: pa.Schema) -> None:
     """Write a table with exactly the columns of `schema`; NaN stays NaN."""
     import pyarrow.parquet as pq
