@@ -241,7 +241,7 @@ def refinement() -> Iterator[Row]:
         prior, clocks = [pose_errors(())] * len(views), np.zeros(len(views))
         for _ in range(2):  # the first compiles
             started = time.process_time()
-            result = refine(flight.t_s, views, flight.start, BONES, prior, clocks, threads=1)
+            result = refine(flight.t_s, views, flight.start, BONES, prior, clocks)
             took_s = time.process_time() - started
         errors = [mean_mm(each, flight.truth) for each in (result.position, flight.start)]
         speed = f"{2250 * 17 / took_s / 1e3:.1f} k joint-frames/s"

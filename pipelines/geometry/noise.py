@@ -276,7 +276,7 @@ USUAL_CONSTANT, USUAL_COUNT = (0.1, math.radians(0.3)), 3.0
 """Usual level (m, rad) of constant errors that nobody stated, and how many numbers that is worth."""
 
 SURVEYED_M = 0.01
-"""Usual position error (m, per axis) of a camera that was surveyed: see `background_adjustment.adjust`."""
+"""Usual position error (m, per axis) of a camera that was surveyed: see `background.adjust`."""
 
 EXACT = 1e-5
 """Constant error (m and rad) that stands for none, so that the equations stay well posed."""

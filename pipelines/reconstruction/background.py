@@ -1,30 +1,64 @@
-"""Poses of moving cameras corrected by the static background.
+"""Poses of moving cameras corrected by points of the static background.
 
 Each camera's background is followed through its pictures once (`background_tracks`). Then its poses are
-adjusted (`background_adjustment`) and replace the logged poses in all later steps. Where the background says
-nothing, or contradicts the log, the logged poses stay, with the reason in one line.
+adjusted and replace the logged poses in all later steps. Where the background says nothing, or contradicts
+the log, the logged poses stay, with the reason in one line.
+
+One estimate serves far and near points, hovering and flying cameras. A point is a direction and an inverse
+depth, which may be 0, so it needs no parallax. A camera that only turns gets the changing part of its
+attitudes from directions, and their constant part stays at the log's. Where a camera flies, an attitude error
+also changes the motion of the background against the logged path. That determines the constant part too,
+except about a straight path. The position of the whole path is never determined.
+
+Unknowns are the error of every logged pose and, as its prior, the constant, slow and white errors of the log.
+Points are eliminated (Schur complement). A point is followed for about a second and then counts as another
+one, so that the normal matrix has a band: the work grows linearly with the pictures. Cauchy's loss handles
+points off the background and lost tracks.
+
+Levels of errors that nobody stated are estimated by MacKay's rule, as in `refinement.estimate`. A constant
+error is always possible, and one draw of it says little of its level. The position's stays wide; those of a
+rotation that the pictures show and of a lever arm count beside usual ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import row_delay_s, undistort
-from pipelines.geometry.noise import EXACT, ROTATION, PoseErrors, Process
-from pipelines.geometry.poses import quaternion_from_matrix, velocities
-from pipelines.reconstruction.background_adjustment import (
-    Adjusted,
-    Background,
-    PosePrior,
-    SeenPoints,
-    adjust,
-    clock_offset,
+from pipelines.geometry.noise import (
+    EXACT,
+    ROTATION,
+    SHIFT_IN_CAMERA,
+    SHIFT_IN_WORLD,
+    SURVEYED_M,
+    UNKNOWN_SIGMA,
+    USUAL_CONSTANT,
+    USUAL_COUNT,
+    PoseErrors,
+    Process,
+)
+from pipelines.geometry.poses import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    rotation_vector_from_quaternion,
+    velocities,
+)
+from pipelines.reconstruction.background_kernels import (
+    BackgroundPoints,
+    BackgroundSightings,
+    PosePriorArrays,
+    add_ties,
+    eliminate_points,
+    inverse_in_band,
+    move_points,
 )
 from pipelines.reconstruction.background_tracks import Followed, Tracks
 from pipelines.reconstruction.doubts.turning import common_offset
@@ -32,10 +66,860 @@ from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Trajectory
 
-# --- tuning ---
+STRETCH = 1500
+"""Pictures adjusted together: memory stays bounded, and so many poses average their white errors."""
 
+# Neighbouring stretches share a tenth of their pictures on each side, over which one hands over to the next.
+_REACH = 10
+# Followed points err by 0.15 px, but neighbouring pictures and points share their errors.
+_PIXEL_SIGMA = 1.0
+# A sighting this many standard deviations off counts half.
+_LOSS = 1.0
+# Losses that come before it: where logged poses are many pixels off, a narrow one rejects all sightings
+# (graduated non-convexity: Blake and Zisserman 1987; Yang et al. 2020).
+_WIDE = (30.0, 5.0)
+# Two sightings of a point determine its direction and depth and test nothing.
+_FEWEST_SIGHTINGS = 3
+_LONGEST_S, _LONGEST = 1.0, (12, 30)  # sightings of a point: time, and at least and at most these pictures
+# So many points in a picture show relative attitudes to 0.003 deg; more only take time.
+_POINTS = 120
+# Fewer points bind a picture to the one before too loosely for its attitude.
+_FEWEST_SHARED = 8
+# A background that loses more of the pictures than this share leaves too much to the log.
+_MOST_UNBOUND = 0.2
+_KINDS = (slice(0, 3), slice(3, 6))  # of the six numbers of an error: position, rotation
+# Points far from where they begin are where cameras see them after so many steps.
+_SETTLE_ROUNDS = 8
+_INVERSE_DEPTH = np.array([0.0, 0.01])  # mean (1/m) and precision (m^2) of the prior: farther than 1 m
+# A static background moves against itself by less.
+_WORST_PX = 2.0
+_ROUNDS, _CONVERGED = 8, (3e-4, 3e-5)  # m, rad: a tenth of what their posteriors leave
+# Poses that are farther from the log than this contradict it.
+_SIGMAS = 4.0
+# Slow errors are linear between knots this far apart; what they do in between counts as white.
+_KNOT_S = 0.2
+# Slow errors are counted over this time in the level of all errors.
+_SLOW_S = 10.0
+_UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1] / 10)
+"""Start of estimated levels. White positions that are free by more confuse far and near points at first."""
+
+_UNKNOWN_ARM_M, _USUAL_ARM_M = 0.05, 0.03  # constant shift in the camera: a lever arm that is wrong
+# Mounts and compasses of usual drones are off by this angle for good.
+_USUAL_TURN = float(np.radians(0.15))
+# The level of the constant rotation halves its distance to the fixed point in each of these steps.
+_LEVEL_STEPS = 20
+# So many draws of the posterior are enough for its levels.
+_DRAWS = 32
+# Levels have settled after so many rounds.
+_LEVEL_ROUNDS = 6
+# MacKay's rule leaps where pictures determine a smaller share of a level's errors.
+_LEAST_DETERMINED = 0.3
+_LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
+# Fewer pictures do not tell a camera that stands from one that flies.
+_FEWEST_STANDING = 8
+# The log of a camera that stands moves by less than this many standard deviations of all errors.
+_SIGMAS_STANDING = 2.0
+# A log that changes by less is that of a surveyed position, or frozen.
+_NEVER_MOVES_M = 1e-6
+# A camera that only turns leaves residuals of half this size, in the median.
+_STANDS_PX = 0.3
+# A free path that saves less misfit (px^2) than this fits noise, not parallax.
+_STANDS = 0.03
+# Slow errors of a camera that stands are read off its log over this time.
+_SLOW_LAG_S = 1.0
+# So many pictures show the clock; more only take time.
+_CLOCK_PICTURES = 600
+# Some seconds show an offset of 50 ms by ten standard deviations where a camera turns.
+_QUICK_CLOCK_PICTURES = 150
+# Stamps are moved at most so often.
+_CLOCK_ROUNDS = 8
+# An offset has settled when the next change is at most this share of its standard deviation.
+_SETTLED = 0.5
+# What is left of the offset in each round has this prior standard deviation.
+_ANY_CLOCK_S = 0.5
+# Rays of people show a clock better than a background that is less sure than this.
+_MOST_CLOCK_SIGMA_S = 0.03
+_LEAST_TURNING = UNKNOWN_SIGMA[1]  # rms: followed points drift by as much as a hovering camera turns
+# The speed of turning is computed over this time before and after a picture.
+_RATE_S = 0.1
+# Poses of a camera that stands are averaged to at most so many, which bounds the time to solve for its
+# place.
+_MOST_MEANS = 200
+# Slow errors whose variance is a smaller share of the constant one are counted to it.
+_SMALL = 0.02
 # Few pictures show a clock roughly. A stated one within so many standard deviations needs no closer look.
 SIGMAS_TO_LOOK_CLOSER = 3.0
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Standard deviations per axis of logged pose errors."""
+
+    white: tuple[float, float]  # m, rad: new in every pose
+    constant: tuple[float, float, float]  # m in the world, rad, m in the camera
+    slow: tuple[Process, Process]  # shift in the world and rotation
+    estimated: bool = False  # the levels of white and slow errors are only the start of an estimate
+    clock_s: float = 0.0  # of the offset of the pictures' clock, 0 for a known one
+
+    @classmethod
+    def of(cls, errors: PoseErrors | None) -> PosePrior:
+        """Build the prior from stated pose errors; None for unknown ones."""
+        if errors is None:
+            slow = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]), _unknown(ROTATION, _UNKNOWN_RATE[1])
+            return cls(_UNKNOWN_WHITE, (*UNKNOWN_SIGMA, _UNKNOWN_ARM_M), slow, estimated=True)
+        constant = dict.fromkeys((SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA), 0.0)
+        changing: dict[int, list[Process]] = {SHIFT_IN_WORLD: [], ROTATION: []}
+        for process in errors.processes:
+            if process.constant:
+                constant[process.number] = float(np.hypot(constant[process.number], process.sigma0))
+            else:
+                changing[ROTATION if process.number == ROTATION else SHIFT_IN_WORLD].append(process)
+        whole = (constant[SHIFT_IN_WORLD], constant[ROTATION], constant[SHIFT_IN_CAMERA])
+        slow = (_sum(SHIFT_IN_WORLD, changing[SHIFT_IN_WORLD]), _sum(ROTATION, changing[ROTATION]))
+        return cls(errors.white, whole, slow)
+
+    @property
+    def level(self) -> Float:
+        """Standard deviation of all parts together [2] (m, rad), slow ones over some seconds."""
+        slow = [process.sigma0**2 + process.rate**2 * _SLOW_S for process in self.slow]
+        constant = np.square([np.hypot(self.constant[0], self.constant[2]), self.constant[1]])
+        level: Float = np.sqrt(np.square(self.white) + constant + slow)
+        return level
+
+    def covariance(self, times: int) -> Float:
+        """Return the covariance [times, 6, 6] of the logged poses."""
+        return np.tile(np.diag(np.repeat(self.level**2, 3)), (times, 1, 1))
+
+
+def _unknown(number: int, rate: float) -> Process:
+    """Build the process of slow errors that nobody stated, from their rate (m or rad per sqrt(s)).
+
+    It is stationary: a random walk from zero would take the first pose of the log as exact.
+    """
+    return Process(number, rate * float(np.sqrt(_SLOW_S / 2)), correlation_s=_SLOW_S)
+
+
+def _rate(process: Process) -> float:
+    """Compute the rate of a process over short times."""
+    return float(np.sqrt(process.rate**2 + 2 * process.sigma0**2 / process.correlation_s))
+
+
+def _sum(number: int, processes: Sequence[Process]) -> Process:
+    """Build one process for the sum of several; that of different kinds is a random walk."""
+    if len(processes) == 1:
+        return replace(processes[0], number=number)
+    sigma2 = sum(process.sigma0**2 for process in processes)
+    rate2 = sum(_rate(process) ** 2 for process in processes)
+    return Process(number, max(float(np.sqrt(sigma2)), EXACT), float(np.sqrt(rate2)))
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Poses after adjustment of T pictures."""
+
+    position: Float  # [T, 3] m
+    rotation: Float  # [T, 3, 3] world_from_camera
+    covariance: Float  # [T, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2)
+    left: PoseErrors | None  # errors that remain; None where refused
+    prior: PosePrior  # with levels as estimated
+    points: int  # that were used
+    reprojection_px: float  # median; NaN where there is no solution
+    refused: str | None  # reason why the logged poses stay, in one line
+    stands: bool = False  # a camera that only turns explains its pictures as well as a free path
+    frozen: bool = False  # its logged position never changes, and its pictures do not fit that
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """K sightings of points of the background in the pictures of a camera."""
+
+    picture: Int64  # [K] row of the pictures
+    point: Int64  # [K]
+    rays: Float  # [K, 2] undistorted normalised image coordinates
+
+    def between(self, first: int, stop: int) -> SeenPoints:
+        """Return those in pictures from `first` to before `stop`."""
+        mine = (self.picture >= first) & (self.picture < stop)
+        return SeenPoints(self.picture[mine], self.point[mine], self.rays[mine])
+
+
+@dataclass(frozen=True)
+class Background:
+    """Background of one camera with T pictures."""
+
+    between: Callable[[int, int], SeenPoints]  # in pictures from the first number to before the second
+    focal_px: float
+    t_s: Float  # [T]
+    loosened: Float | None = None  # [T, 2] m, rad: what logged poses in bad stretches err by besides
+
+
+def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
+    """Refine the poses of one camera by its background.
+
+    Args:
+        seen: the background.
+        position: [T, 3] m, logged; NaN without a pose.
+        rotation: [T, 3, 3] logged world_from_camera.
+        prior: standard deviations of the log's errors.
+
+    Returns:
+        Adjusted poses, in stretches that overlap. If one is refused, all logged poses stay and `refused`
+        gives the reason. Pictures without a pose stay without one.
+
+    Where nobody stated the noise, a position that never changes was surveyed, to `SURVEYED_M`, if pictures
+    fit a camera that only turns. Otherwise the log may be `frozen`.
+    """
+    posed = position[np.isfinite(position[:, 0])]
+    if not prior.estimated or not len(posed) or np.ptp(posed, axis=0).max() >= _NEVER_MOVES_M:
+        return _adjust(seen, position, rotation, prior)
+    surveyed = replace(prior, constant=(SURVEYED_M, prior.constant[1], 0.0))  # nor has it a lever arm
+    found = _adjust(seen, position, rotation, surveyed)
+    if found.refused is None and found.stands and found.reprojection_px < _STANDS_PX:
+        return found
+    return replace(_adjust(seen, position, rotation, prior), frozen=bool(np.isfinite(found.reprojection_px)))
+
+
+def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
+    posed = np.flatnonzero(np.isfinite(position[:, 0]))
+
+    def refused(reason: str, reprojection_px: float = np.nan) -> Adjusted:
+        stays = prior.covariance(len(position))
+        return Adjusted(position, rotation, stays, None, prior, 0, reprojection_px, reason)
+
+    if not len(posed):
+        return refused("none of its pictures has a pose")
+    errors, covariance = np.zeros((len(position), 6)), prior.covariance(len(position))
+    covariance[posed] = 0.0
+    unbound, points, results = 0, 0, []
+    for rows, weight in _overlapping(np.array_split(posed, -(-len(posed) // STRETCH))):
+        stretch = _Stretch.of(seen, rows, position, rotation)
+        unbound += stretch.unbound
+        if len(posed) < 2 or unbound > _MOST_UNBOUND * (len(posed) - 1):
+            return refused(
+                f"{unbound} of {len(posed)} pictures share fewer than {_FEWEST_SHARED} points of the"
+                " background with the one before"
+            )
+        found = stretch.solve_with_levels(prior)
+        if found is None:
+            return refused("the adjustment did not converge")
+        points += len(stretch.points.inverse_depth)
+        errors[rows] += weight[:, None] * found.errors
+        # The covariance of a mean is at most the mean of covariances, whatever the correlation.
+        covariance[rows] += weight[:, None, None] * found.covariance
+        results.append(found)
+    covariance[posed[:, None], range(3), range(3)] += prior.constant[0] ** 2
+    pixels = float(np.median(np.concatenate([found.missed for found in results])))
+    if pixels > _WORST_PX:
+        return refused(f"the background moves by {pixels:.1f} px against itself", pixels)
+    surprise = max(found.surprise(prior.level) for found in results)
+    if surprise > _SIGMAS:
+        return refused(f"its poses would be {surprise:.0f} standard deviations from the log", pixels)
+    left = [_remaining(of.draws, float(np.median(np.diff(seen.t_s))), prior.constant[0]) for of in results]
+    return Adjusted(
+        *_without(errors, position, rotation),
+        covariance,
+        # Stretches are alike: the one in the middle speaks for all.
+        replace(left[len(left) // 2], assumed=prior.estimated),
+        results[len(results) // 2].prior,
+        points,
+        pixels,
+        None,
+        all(found.stands for found in results),
+    )
+
+
+def _overlapping(parts: Sequence[Int64]) -> Iterator[tuple[Int64, Float]]:
+    """Lengthen parts of a sequence on both sides, with weights that add up to 1 at each place."""
+    rows = np.concatenate(parts)
+    bounds = np.cumsum([0, *(len(part) for part in parts)])
+    reach = min(STRETCH // _REACH, min(len(part) for part in parts) // 2)
+    share = (np.arange(2 * reach) + 0.5) / max(2 * reach, 1)
+    rise = share**2 * (3 - 2 * share)
+    for begin, end in pairwise(bounds.tolist()):
+        longer = rows[max(begin - reach, 0) : end + reach]
+        weight = np.ones(len(longer))
+        if begin > 0:
+            weight[: 2 * reach] = rise
+        if end < len(rows):
+            weight[len(weight) - 2 * reach :] = 1 - rise
+        yield longer, weight
+
+
+def clock_offset(
+    seen: Background,
+    poses_at: Callable[[float], tuple[Float, Float]],
+    prior: PosePrior,
+    *,
+    quick: bool = False,
+) -> tuple[float, float] | None:
+    """Find by how much pictures were taken later than their stamps: the log turns as the background then.
+
+    Args:
+        seen: the background.
+        poses_at: function that returns the logged poses, as for `adjust`, this many seconds after the stamps.
+        prior: standard deviations of the log's errors.
+        quick: look at few pictures once; larger offsets are not exact then.
+
+    Returns:
+        Offset and its standard deviation, s, by the background alone. None if the camera turns too little in
+        the middle of the flight or its turning does not determine the offset, if there are too few poses or
+        the adjustment fails, or if no offset was found at which the next one is the same.
+    """
+    offset_s, before_s, levels = 0.0, 0.0, replace(prior, clock_s=_ANY_CLOCK_S)
+    for again in range(_CLOCK_ROUNDS):
+        position, rotation = poses_at(offset_s)
+        posed = np.flatnonzero(np.isfinite(position[:, 0]))
+        pictures = _QUICK_CLOCK_PICTURES if quick else _CLOCK_PICTURES
+        skipped = max(len(posed) - pictures, 0) // 2
+        rows = posed[skipped : skipped + pictures]
+        if len(rows) < 2:
+            return None
+        stretch = _Stretch.of(seen, rows, position, rotation)
+        solved = stretch._solved(levels, level_rounds=1 if again or quick else _LEVEL_ROUNDS)
+        if solved is None or solved.clock is None:
+            return None
+        levels = solved.prior
+        _, turned = _without(solved.errors, position[rows], rotation[rows])
+        away = rotation_vector_from_quaternion(quaternion_from_matrix(turned[:1].swapaxes(1, 2) @ turned))
+        if np.sqrt(np.var(away, axis=0).sum()) < _LEAST_TURNING:
+            return None
+        late_s, sigma_s = solved.clock
+        if quick:
+            return late_s, sigma_s
+        offset_s += late_s if late_s * before_s >= 0 else late_s / 2  # steps that swing to and fro
+        before_s = late_s
+        if abs(late_s) <= _SETTLED * sigma_s:
+            return (offset_s, sigma_s) if sigma_s <= _MOST_CLOCK_SIGMA_S else None
+    return None
+
+
+def _without(errors: Float, position: Float, rotation: Float) -> tuple[Float, Float]:
+    """Remove errors [T, 6] from logged poses: (p - e, R exp(-w))."""
+    back = matrix_from_quaternion(quaternion_from_rotation_vector(-errors[:, 3:]))
+    return position - errors[:, :3], rotation @ back
+
+
+def _sigma_of_constants(prior: PosePrior) -> Float:
+    """Collect the standard deviations [9] of constant errors; [10] with an unknown clock.
+
+    A shift of the whole path causes no residual: the path stays where the log has it.
+    """
+    sigma = np.repeat([0.0, *prior.constant[1:]], 3)
+    return np.append(sigma, prior.clock_s) if prior.clock_s > 0 else sigma
+
+
+def _remaining(draws: Float, period_s: float, shift: float) -> PoseErrors:
+    """Describe errors [M, T, 6] drawn from the posterior as white, constant and slow ones.
+
+    The shift of the whole path, of this standard deviation (m), is not in the draws.
+
+    Differences of neighbours that are not explained by those of pictures two apart are white. The mean over
+    the flight is constant. The rest is a Gauss-Markov process with the lag at which it has lost 1 / e.
+    """
+    white, processes = [0.0, 0.0], []
+    for kind, number in enumerate((SHIFT_IN_WORLD, ROTATION)):
+        part = draws[..., _KINDS[kind]]
+        whole, constant = float(np.mean(part**2)), float(np.mean(part.mean(axis=1) ** 2))
+        near, next_ = (_structure(part, lag) for lag in (1, 2))
+        fresh = min(max(2 * near - next_, 0.0), near)
+        slow = max(whole - constant - fresh, 0.0)
+        constant += 0.0 if kind else shift**2
+        white[kind] = max(float(np.sqrt(fresh)), EXACT)
+        if slow > _SMALL * min(constant, USUAL_CONSTANT[kind] ** 2):
+            lags = np.unique(np.geomspace(1, max(part.shape[1] // 2, 1), 24).astype(np.int64))
+            grown = np.array([_structure(part, int(lag)) for lag in lags]) - fresh
+            reached = np.flatnonzero(grown >= (1 - np.exp(-1)) * slow)
+            lag = lags[reached[0]] if len(reached) else lags[-1]
+            processes.append(Process(number, float(np.sqrt(slow)), correlation_s=float(lag * period_s)))
+        else:
+            constant += slow
+        processes.append(Process(number, max(float(np.sqrt(constant)), EXACT)))
+    return PoseErrors((white[0], white[1]), tuple(processes))
+
+
+def _structure(errors: Float, lag: int) -> float:
+    """Compute half of the mean square of differences over a number of pictures."""
+    return float(np.mean((errors[:, lag:] - errors[:, :-lag]) ** 2)) / 2 if errors.shape[1] > lag else 0.0
+
+
+@dataclass(frozen=True)
+class _SolvedStretch:
+    """Result of one stretch of T pictures."""
+
+    errors: Float  # [T, 6] of the logged poses
+    covariance: Float  # [T, 6, 6] of them
+    draws: Float  # [M, T, 6] of what the errors may be more, from the posterior
+    missed: Float  # [K] residuals, px
+    prior: PosePrior
+    clock: tuple[float, float] | None  # its offset and standard deviation (s), if it was unknown
+    loosened: Float  # [T, 2] m, rad
+    stands: bool = False
+
+    def surprise(self, level: Float) -> float:
+        """Compute the largest rms error of the axes, in standard deviations of the log's [2]."""
+        sigma = np.repeat(np.hypot(level, self.loosened), 3, axis=1)
+        return float(np.sqrt(np.mean((self.errors / sigma) ** 2, axis=0)).max())
+
+
+@dataclass(frozen=True)
+class _StretchState:
+    """Estimates of the unknowns."""
+
+    errors: Float  # [T, 6]
+    knots: Float  # [N, 6] slow errors
+    constant: Float  # [9]: shift in the world, rotation, shift in the camera; [10] with an unknown clock (s)
+
+
+@dataclass(frozen=True)
+class _Factored:
+    """Normal equations of the last step, factored: of pictures and knots, and of the constant errors."""
+
+    band: Float  # [width, n] Cholesky factor, in columns from the diagonal down
+    border: Float  # [n, 9 or 10] inverse of the band's matrix times the constant errors' columns
+    corner: Float  # [9, 9] or [10, 10] covariance of the constant errors
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """Pictures that are adjusted together, and the points seen in them."""
+
+    rows: Int64  # [T] of the camera's pictures
+    position: Float  # [T, 3]
+    rotation: Float  # [T, 3, 3]
+    seen: BackgroundSightings
+    points: BackgroundPoints
+    place: Int64  # [T] first unknown of each picture
+    knot_place: Int64  # [N]
+    knot_t_s: Float  # [N]
+    knot: Int64  # [T] the knot before each picture
+    share: Float  # [T] of the knot after it
+    loosened: Float  # [T, 2] m, rad
+    focal_px: float
+    unbound: int  # pictures that share too few points with the one before
+
+    @classmethod
+    def of(cls, whole: Background, rows: Int64, position: Float, rotation: Float) -> _Stretch:
+        """Build a stretch of some pictures."""
+        seen = whole.between(int(rows[0]), int(rows[-1]) + 1)
+        t_s = whole.t_s[rows]
+        period_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 1.0
+        longest = int(np.clip(round(_LONGEST_S / max(period_s, 1e-3)), *_LONGEST))
+        row_of = np.full(len(position), -1)
+        row_of[rows] = np.arange(len(rows))
+        mine = row_of[seen.picture] >= 0
+        picture, point, rays = row_of[seen.picture[mine]], seen.point[mine], seen.rays[mine]
+        order = np.lexsort((picture, point))
+        picture, point, rays = picture[order], point[order], rays[order]
+        kept, first = _pieces(picture, point, longest)
+        picture, rays = picture[kept], rays[kept]
+        steps = (t_s[-1] - t_s[0]) / _KNOT_S if len(t_s) else 0.0
+        knot_t_s = np.linspace(t_s[0], t_s[-1], max(int(np.ceil(steps)), 1) + 1)
+        knot = np.clip(np.searchsorted(knot_t_s, t_s, side="right") - 1, 0, len(knot_t_s) - 2)
+        share = (t_s - knot_t_s[knot]) / np.maximum(knot_t_s[knot + 1] - knot_t_s[knot], 1e-9)
+        place, knot_place = _places(t_s, knot_t_s)
+        middle = picture[(first[:-1] + first[1:]) // 2] if len(first) > 1 else first[:0]
+        return cls(
+            rows,
+            position[rows],
+            rotation[rows],
+            BackgroundSightings(first, picture, rays, _PIXEL_SIGMA / whole.focal_px),
+            _far_points(first, picture, rays, position[rows][middle], rotation[rows]),
+            place,
+            knot_place,
+            knot_t_s,
+            knot,
+            share,
+            np.zeros((len(rows), 2)) if whole.loosened is None else whole.loosened[rows],
+            whole.focal_px,
+            int((_shared(first, picture, len(rows)) < _FEWEST_SHARED).sum()),
+        )
+
+    def solve_with_levels(self, prior: PosePrior) -> _SolvedStretch | None:
+        """Solve, with levels of errors estimated if they are unknown; None without convergence.
+
+        A camera that stands sees no parallax, whatever its log says. Inverse depths near 0 fit that with any
+        path, and the small errors of followed points then choose one. So a log that hardly moves is compared
+        with a camera that does not move at all.
+        """
+        stands = self._standing(prior)
+        free = self._solved(prior)
+        if stands is None or (free is not None and _misfit(stands) > _misfit(free) + _STANDS):
+            return free
+        return stands
+
+    def _standing(self, prior: PosePrior) -> _SolvedStretch | None:
+        """Solve for a camera that only turns; None if its log moves more than its errors do."""
+        t_s = self._times_s()
+        away = self.position - self.position.mean(axis=0)
+        if len(t_s) < _FEWEST_STANDING or np.sqrt(np.mean(away**2)) > _SIGMAS_STANDING * prior.level[0]:
+            return None
+        if prior.estimated:
+            white, rate = _levels_of_standing(t_s, self.position)
+            prior = _with_position_levels(prior, white, _unknown(SHIFT_IN_WORLD, rate))
+            arm = min(prior.constant[2], _USUAL_ARM_M)
+            prior = replace(prior, constant=(*prior.constant[:2], arm))
+        place, variance = _place_of_standing(t_s, self.position, prior)
+        variance += prior.constant[2] ** 2  # nothing moves that could tell it from a shift of the place
+        origin = np.tile(place, (len(self.points.origin), 1))
+        still = replace(
+            self,
+            position=np.tile(place, (len(t_s), 1)),
+            points=BackgroundPoints(origin, *(array.copy() for array in self.points[1:])),
+        )
+        tight = replace(prior, constant=(*prior.constant[:2], 0.0))
+        tight = _with_position_levels(tight, EXACT, _unknown(SHIFT_IN_WORLD, EXACT))
+        found = still._solved(tight, positions_known=True)
+        if found is None:
+            return None
+        errors, covariance, draws = found.errors.copy(), found.covariance.copy(), found.draws.copy()
+        errors[:, :3] += self.position - place
+        covariance[:, range(3), range(3)] += variance
+        rng = np.random.default_rng(0)
+        draws[..., :3] += np.sqrt(variance) * rng.standard_normal((len(draws), 1, 3))
+        levels = _with_position_levels(found.prior, prior.white[0], prior.slow[0])
+        return replace(found, errors=errors, covariance=covariance, draws=draws, prior=levels, stands=True)
+
+    def _times_s(self) -> Float:
+        """Return the times of the pictures [T], from the knots about them."""
+        step = self.knot_t_s[self.knot + 1] - self.knot_t_s[self.knot]
+        return np.asarray(self.knot_t_s[self.knot] + self.share * step)
+
+    def _solved(
+        self, prior: PosePrior, *, positions_known: bool = False, level_rounds: int = _LEVEL_ROUNDS
+    ) -> _SolvedStretch | None:
+        constant = np.zeros(len(_sigma_of_constants(prior)))
+        state = _StretchState(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), constant)
+        for loss in _WIDE:
+            settle = _SETTLE_ROUNDS if loss == _WIDE[0] else 0
+            found = self._solve(state, prior, rounds=2, loss=loss, settle=settle)
+            if found is None:
+                return None
+            state = found[0]
+        for _ in range(level_rounds if prior.estimated else 0):
+            found = self._solve(state, prior, rounds=2)
+            if found is None:
+                return None
+            state, factored, _ = found
+            levels = self._estimated(state, self._draws(factored, 8), prior)
+            if positions_known:
+                levels = _with_position_levels(levels, prior.white[0], prior.slow[0])
+            prior = with_constant_levels(levels, state.constant[3:9], factored.corner[3:9, 3:9])
+        found = self._solve(state, prior, rounds=_ROUNDS)
+        if found is None:
+            return None
+        state, factored, missed = found
+        errors = self._draws(factored, _DRAWS)[0]
+        late = float(state.constant[-1]), float(np.sqrt(factored.corner[-1, -1]))
+        clock = late if prior.clock_s > 0 else None
+        missed *= _PIXEL_SIGMA
+        covariance = self._covariance(factored)
+        return _SolvedStretch(state.errors, covariance, errors, missed, prior, clock, self.loosened)
+
+    def _solve(
+        self, state: _StretchState, prior: PosePrior, rounds: int, loss: float = _LOSS, settle: int = 0
+    ) -> tuple[_StretchState, _Factored, Float] | None:
+        """Make Gauss-Newton steps; return the estimate, the last equations, and residuals [K] in sigmas."""
+        from scipy.linalg.lapack import dpbtrf, dpbtrs
+
+        ties = self._ties(prior)
+        steady = 1 / np.maximum(_sigma_of_constants(prior), EXACT) ** 2
+        kept = np.zeros((len(self.points.inverse_depth), 12))
+        missed = np.full(len(self.seen.picture), np.nan)
+        size = int(max(self.place[-1], self.knot_place[-1])) + 6
+        for _ in range(rounds):
+            at, turn = _without(state.errors, self.position, self.rotation)
+            band, force = np.zeros((size, self._width())), np.zeros(size)
+            border = np.zeros((size, len(steady)))
+            corner, pull = np.diag(steady), -steady * state.constant
+            eliminate_points(
+                self.seen,
+                self.points,
+                at,
+                turn,
+                loss,
+                _INVERSE_DEPTH,
+                settle,
+                self.place,
+                band,
+                force,
+                missed,
+                kept,
+            )
+            settle = 0
+            add_ties(ties, self._design(turn, prior), *_parts(state), band, force, border, corner, pull)
+            factor, failed = dpbtrf(band.T, lower=1, overwrite_ab=1)
+            if failed:
+                return None
+            both = dpbtrs(factor, np.concatenate([border, force[:, None]], axis=1), lower=1)[0]
+            covariance = np.linalg.inv(corner - border.T @ both[:, :-1])
+            shift = covariance @ (pull - border.T @ both[:, -1])
+            step = both[:, -1] - both[:, :-1] @ shift
+            if not (np.isfinite(step).all() and (np.diagonal(covariance) > 0).all()):
+                return None
+            move_points(self.seen, self.points, at, turn, loss, kept, self.place, step)
+            state = _StretchState(
+                state.errors + step[self.place[:, None] + np.arange(6)],
+                state.knots + step[self.knot_place[:, None] + np.arange(6)],
+                state.constant + shift,
+            )
+            if (np.abs(step).reshape(-1, 2, 3).max(axis=(0, 2)) < _CONVERGED).all():
+                break
+        return state, _Factored(factor, both[:, :-1], covariance), missed[np.isfinite(missed)]
+
+    def _design(self, rotation: Float, prior: PosePrior) -> Float:
+        """Compute the derivatives [T, 6, 9 or 10] of the errors by the constant ones.
+
+        A picture that was taken later than its stamp shows a camera that has turned farther than the log's.
+        The position tells nothing of a clock: the background does not show where the whole path lies.
+
+        Args:
+            rotation: [T, 3, 3] as estimated.
+            prior: of the errors.
+        """
+        design = np.zeros((len(rotation), 6, len(_sigma_of_constants(prior))))
+        design[:, :3, :3] = design[:, 3:, 3:6] = np.eye(3)
+        design[:, :3, 6:9] = self.rotation
+        if prior.clock_s > 0:
+            t_s = self._times_s()
+            reach = max(1, round(_RATE_S / float(np.median(np.diff(t_s)))))
+            before = np.maximum(np.arange(len(t_s)) - reach, 0)
+            after = np.minimum(np.arange(len(t_s)) + reach, len(t_s) - 1)
+            turn = np.swapaxes(rotation[before], 1, 2) @ rotation[after]
+            vector = rotation_vector_from_quaternion(quaternion_from_matrix(turn))
+            design[:, 3:, 9] = -vector / (t_s[after] - t_s[before])[:, None]
+        return design
+
+    def _ties(self, prior: PosePrior) -> PosePriorArrays:
+        """Build the prior of errors about slow and constant ones, and of slow ones over time."""
+        steps = np.diff(self.knot_t_s)
+        variance = np.square(prior.white)
+        if not prior.estimated:  # an estimated level already holds what slow errors do between knots
+            variance += [process.stray(float(steps.max(initial=0.0))) for process in prior.slow]
+        white = 1 / np.repeat(np.maximum(variance + self.loosened**2, EXACT**2), 3, axis=1)
+        left, added = np.empty((len(steps), 6)), np.empty((len(steps), 6))
+        for k, step in enumerate(steps):
+            both = [process.step(float(step)) for process in prior.slow]
+            left[k] = np.repeat([one[0] for one in both], 3)
+            added[k] = 1 / np.maximum(np.repeat([one[1] for one in both], 3), EXACT**2)
+        start = 1 / np.maximum(np.repeat([process.sigma0 for process in prior.slow], 3), EXACT) ** 2
+        return PosePriorArrays(self.place, self.knot_place, self.knot, self.share, white, start, left, added)
+
+    def _width(self) -> int:
+        """Compute the width of the band: the farthest pair of unknowns that meet in an equation."""
+        last = self.seen.picture[self.seen.first[1:] - 1]
+        first = self.seen.picture[self.seen.first[:-1]]
+        widest = (self.place[last] - self.place[first]).max(initial=0)
+        widest = max(widest, np.diff(self.knot_place).max(initial=0))
+        before = np.abs(self.place - self.knot_place[self.knot]).max()
+        after = np.abs(self.place - self.knot_place[self.knot + 1]).max()
+        return int(max(widest, before, after)) + 6
+
+    def _draws(self, factored: _Factored, count: int) -> tuple[Float, Float, Float]:
+        """Draw deviations of errors [M, T, 6], knots [M, N, 6] and constants [M, 9 or 10] (posterior)."""
+        from scipy.linalg.lapack import dtbtrs
+
+        rng = np.random.default_rng(0)
+        free = rng.standard_normal((factored.band.shape[1], count))
+        free = dtbtrs(factored.band, free, uplo="L", trans="T")[0]
+        values, vectors = np.linalg.eigh(factored.corner)
+        constant = rng.standard_normal((count, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+        free -= factored.border @ constant.T
+        errors, knots = (
+            np.moveaxis(free[place[:, None] + np.arange(6)], 2, 0) for place in (self.place, self.knot_place)
+        )
+        return errors, knots, constant
+
+    def _covariance(self, factored: _Factored) -> Float:
+        """Compute the posterior covariance [T, 6, 6] of each picture's error."""
+        inverse = inverse_in_band(np.ascontiguousarray(factored.band.T))
+        row, column = np.tril_indices(6)
+        own = np.zeros((len(self.rows), 6, 6))
+        own[:, row, column] = inverse[self.place[:, None] + column, row - column]
+        own[:, column, row] = own[:, row, column]
+        border = factored.border[self.place[:, None] + np.arange(6)]
+        return np.asarray(own + border @ factored.corner @ np.swapaxes(border, 1, 2))
+
+    def _estimated(
+        self, state: _StretchState, draws: tuple[Float, Float, Float], prior: PosePrior
+    ) -> PosePrior:
+        """Estimate the levels of white and slow errors again by MacKay's rule."""
+        design = self._design(_without(state.errors, self.position, self.rotation)[1], prior)
+        usual = ~(self.loosened > 0).any(axis=1)
+        fresh = self._fresh(state, design)[usual]
+        spread = np.stack(
+            [self._fresh(_StretchState(*draw), design)[usual] for draw in zip(*draws, strict=True)]
+        )
+        white = [
+            _level(fresh[:, of], spread[..., of], sigma, least)
+            for of, sigma, least in zip(_KINDS, prior.white, _LEAST_WHITE, strict=True)
+        ]
+        scale = 1 / np.sqrt(np.diff(self.knot_t_s))[:, None]
+        steps, spread = np.diff(state.knots, axis=0) * scale, np.diff(draws[1], axis=1) * scale
+        rate = [
+            _level(steps[:, of], spread[..., of], _rate(process), least)
+            for of, process, least in zip(_KINDS, prior.slow, _LEAST_RATE, strict=True)
+        ]
+        slow = _unknown(SHIFT_IN_WORLD, rate[0]), _unknown(ROTATION, rate[1])
+        return replace(prior, white=(white[0], white[1]), slow=slow)
+
+    def _fresh(self, state: _StretchState, design: Float) -> Float:
+        """Compute the white part [T, 6] of the errors."""
+        share = self.share[:, None]
+        slow = (1 - share) * state.knots[self.knot] + share * state.knots[self.knot + 1]
+        return np.asarray(state.errors - slow - design @ state.constant)
+
+
+def with_constant_levels(prior: PosePrior, found: Float, covariance: Float) -> PosePrior:
+    """Estimate the levels of the constant rotation and of the lever arm, three numbers of each.
+
+    They say little, so a usual level counts as `USUAL_COUNT` more (inverse gamma prior; expectation
+    maximisation). What is known well stays what it is. What rests on a drifting path gives way: a rotation to
+    the log, an arm to none. A rotation of which the pictures say little keeps its wide level. An arm's never
+    grows: a large one that pictures hardly show would bend the path.
+
+    Args:
+        prior: levels with which the constants were found.
+        found: [6] posterior mean: rotation (rad), shift in the camera (m).
+        covariance: [6, 6], posterior.
+    """
+    place, turn, arm = prior.constant
+    if 1 - np.trace(covariance[:3, :3]) / (3 * turn**2) >= _LEAST_DETERMINED:
+        turn = _constant_level(found[:3], covariance[:3, :3], turn, _USUAL_TURN)
+    if arm > 0:  # a camera that stands has none
+        arm = min(arm, _constant_level(found[3:], covariance[3:, 3:], arm, _USUAL_ARM_M))
+    return replace(prior, constant=(place, turn, arm))
+
+
+def _constant_level(found: Float, covariance: Float, level: float, usual: float) -> float:
+    precision = np.linalg.inv(covariance)
+    pull, of_data = precision @ found, precision - np.eye(3) / level**2
+    variance = level**2
+    for _ in range(_LEVEL_STEPS):
+        posterior = np.linalg.inv(of_data + np.eye(3) / variance)
+        squares = np.sum((posterior @ pull) ** 2) + np.trace(posterior)
+        variance = (USUAL_COUNT * usual**2 + squares) / (USUAL_COUNT + 3)
+    return float(np.sqrt(variance))
+
+
+def _parts(state: _StretchState) -> tuple[Float, Float, Float]:
+    return state.errors, state.knots, state.constant
+
+
+def _level(estimates: Float, draws: Float, sigma: float, least: float) -> float:
+    """Estimate a standard deviation: squares of estimates over the number that the data determine.
+
+    Where the data determine little, the step is that of expectation maximisation (Dempster et al. 1977):
+    it has the same fixed point, and is smaller.
+    """
+    determined = 1 - np.mean(draws**2) / sigma**2
+    if determined < _LEAST_DETERMINED:
+        variance = np.mean(estimates**2) + np.mean(draws**2)
+    else:
+        variance = np.mean(estimates**2) / determined
+    return max(float(np.sqrt(np.clip(variance, 0.04 * sigma**2, 6.0 * sigma**2))), least)
+
+
+# --- cameras that stand ---------------------------------------------------------------------------------
+
+
+def _misfit(solved: _SolvedStretch) -> float:
+    """Compute what a solution leaves of a sighting (px^2 if it is small), by Cauchy's loss."""
+    return float(np.mean(np.log1p((solved.missed / _PIXEL_SIGMA) ** 2)))
+
+
+def _with_position_levels(prior: PosePrior, white: float, slow: Process) -> PosePrior:
+    return replace(prior, white=(white, prior.white[1]), slow=(slow, prior.slow[1]))
+
+
+def _levels_of_standing(t_s: Float, position: Float) -> tuple[float, float]:
+    """Read the level (m) of white errors and the rate of slow ones (m per sqrt(s)) off a log that stands.
+
+    Differences of neighbours are white errors, and what they grow by over a longer time is slow.
+    """
+    period_s = float(np.median(np.diff(t_s)))
+    lag = int(np.clip(round(_SLOW_LAG_S / period_s), 2, len(t_s) // 2))
+    near, far = (float(np.mean((position[k:] - position[:-k]) ** 2)) for k in (1, lag))
+    rate2 = max(far - near, 0.0) / ((lag - 1) * period_s)
+    white = float(np.sqrt(max(near - rate2 * period_s, 0.0) / 2))
+    return max(white, _LEAST_WHITE[0]), max(float(np.sqrt(rate2)), _LEAST_RATE[0])
+
+
+def _place_of_standing(t_s: Float, position: Float, prior: PosePrior) -> tuple[Float, float]:
+    """Estimate the place [3] of a camera that stands, and its variance per axis by white and slow errors.
+
+    Each pose of the log is weighted by the covariance of these errors over time (generalised least squares).
+    """
+    parts = np.array_split(np.arange(len(t_s)), min(len(t_s), _MOST_MEANS))
+    at_s = np.array([t_s[part].mean() for part in parts])
+    means = np.array([position[part].mean(axis=0) for part in parts])
+    slow = prior.slow[0]
+    covariance = np.diag([prior.white[0] ** 2 / len(part) + EXACT**2 for part in parts])
+    covariance += slow.rate**2 * np.minimum(at_s[:, None], at_s)
+    covariance += slow.sigma0**2 * np.exp(-np.abs(at_s[:, None] - at_s) / slow.correlation_s)
+    weight = np.linalg.solve(covariance, np.ones(len(parts)))
+    variance = 1 / float(weight.sum())
+    return np.asarray(variance * weight @ means), variance
+
+
+# --- points ---------------------------------------------------------------------------------------------
+
+
+def _pieces(picture: Int64, point: Int64, longest: int) -> tuple[Bool, Int64]:
+    """Cut tracks, sorted by point and picture, into pieces; choose as many as are needed in a picture.
+
+    Returns:
+        The sightings [K] that are used, and the first of each piece among these and their number [N + 1].
+    """
+    if not len(picture):
+        return np.zeros(0, dtype=np.bool_), np.zeros(1, dtype=np.int64)
+    begins = np.append(True, (np.diff(point) != 0) | (np.diff(picture) != 1))
+    start = np.maximum.accumulate(np.where(begins, np.arange(len(point)), 0))
+    # Tracks that begin together are cut at different times.
+    phase = (longest * ((0.6180339887498949 * point) % 1.0)).astype(np.int64)
+    part = (np.arange(len(point)) - start + phase) // longest
+    begins[1:] |= np.diff(part) != 0
+    piece = np.cumsum(begins) - 1
+    length = np.bincount(piece)
+    long = length >= _FEWEST_SIGHTINGS
+    mean = length[long].sum() / max(len(np.unique(picture)), 1)
+    chosen = long & ((0.7548776662466927 * np.arange(len(length))) % 1.0 < _POINTS / max(mean, 1.0))
+    first = np.concatenate([[0], np.cumsum(length[chosen])])
+    return np.asarray(chosen[piece]), first.astype(np.int64)
+
+
+def _shared(first: Int64, picture: Int64, pictures: int) -> Int64:
+    """Count the points [T - 1] that are seen in each picture and in the one after it."""
+    ends = np.zeros(len(picture), dtype=np.bool_)
+    ends[first[1:] - 1] = True
+    return np.bincount(picture[~ends], minlength=pictures)[: pictures - 1]
+
+
+def _far_points(
+    first: Int64, picture: Int64, rays: Float, origin: Float, rotation: Float
+) -> BackgroundPoints:
+    """Place each piece's point far away, in the mean direction of its rays."""
+    ray = np.einsum("kij,kj->ki", rotation[picture], np.append(rays, np.ones((len(rays), 1)), axis=1))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    if not len(origin):
+        return BackgroundPoints(origin, origin.copy(), np.zeros(0), np.zeros((0, 2, 3)))
+    direction = np.add.reduceat(ray, first[:-1], axis=0)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    least = np.eye(3)[np.abs(direction).argmin(axis=1)]
+    side = np.cross(direction, least)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    across = np.stack([side, np.cross(direction, side)], axis=1)
+    return BackgroundPoints(np.ascontiguousarray(origin), direction, np.full(len(origin), 0.05), across)
+
+
+def _places(t_s: Float, knot_t_s: Float) -> tuple[Int64, Int64]:
+    """Give every picture and knot six unknowns in the order of time; return the first of each."""
+    order = np.argsort(np.concatenate([t_s, knot_t_s]), kind="stable")
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = 6 * np.arange(len(order))
+    return place[: len(t_s)], place[len(t_s) :]
+
+
+# --- cameras of a flight --------------------------------------------------------------------------------
 
 
 def refine_cameras(
@@ -143,11 +1027,10 @@ def background_of(camera: Camera, followed: Followed) -> Background:
         for tracks in followed.between(first, stop):
             rays = _rays(tracks, camera, t_ns)  # of whole parts: velocities need the neighbours
             parts.append(SeenPoints(tracks.picture, tracks.point, rays).between(first, stop))
-        return SeenPoints(
-            np.concatenate([part.picture for part in parts]),
-            np.concatenate([part.point for part in parts]),
-            np.concatenate([part.rays for part in parts]),
+        picture, point, rays = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("picture", "point", "rays")
         )
+        return SeenPoints(picture, point, rays)
 
     loosened = None if camera.loosened is None else camera.loosened_at(t_ns)
     return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9, loosened)

@@ -101,55 +101,45 @@ def _factor3(a: Float) -> None:
             a[i, j] /= a[j, j]
 
 
-@cached
-def settle_points(
+@helper
+def _point_equations(
+    n: int,
     seen: BackgroundSightings,
     points: BackgroundPoints,
     place: Float,
     turned: Float,
     loss: float,
     prior: Float,
-    rounds: int,
+    normal: Float,
+    pull: Float,
 ) -> None:
-    """Move every point to where the cameras see it, their poses held.
-
-    Args:
-        seen: the sightings.
-        points: changed in place.
-        place: [T, 3] m.
-        turned: [T, 3, 3] world_from_camera.
-        loss: standard deviations at which a sighting counts half.
-        prior: [2] mean and precision of the inverse depth (1/m, m^2).
-        rounds: Gauss-Newton steps.
-    """
-    for n in range(len(seen.first) - 1):
-        for _ in range(rounds):
-            normal, force = np.zeros((3, 3)), np.zeros(3)
-            normal[2, 2] = prior[1]
-            force[2] = prior[1] * (prior[0] - points.inverse_depth[n])
-            for s in range(seen.first[n], seen.first[n + 1]):
-                t = seen.picture[s]
-                _, by_point, residual, front = _sighting(
-                    place[t],
-                    turned[t],
-                    points.origin[n],
-                    points.direction[n],
-                    points.inverse_depth[n],
-                    points.across[n],
-                    seen.rays[s],
-                )
-                if not front:
-                    continue
-                missed = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2
-                weight = 1 / (1 + missed / loss**2) / seen.sigma**2
-                for i in range(3):
-                    for a in range(2):
-                        force[i] += weight * by_point[a, i] * residual[a]
-                        for k in range(3):
-                            normal[i, k] += weight * by_point[a, i] * by_point[a, k]
-            _hold(normal)
-            _factor3(normal)
-            _move(points, n, _solve3(normal, force))
+    """Compute the Cholesky factor [3, 3] of a point's own equations, and their right side [3]."""
+    normal[:] = 0.0
+    pull[:] = 0.0
+    normal[2, 2] = prior[1]
+    pull[2] = prior[1] * (prior[0] - points.inverse_depth[n])
+    for s in range(seen.first[n], seen.first[n + 1]):
+        t = seen.picture[s]
+        _, by_point, residual, front = _sighting(
+            place[t],
+            turned[t],
+            points.origin[n],
+            points.direction[n],
+            points.inverse_depth[n],
+            points.across[n],
+            seen.rays[s],
+        )
+        if not front:
+            continue
+        missed = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2
+        weight = 1 / (1 + missed / loss**2) / seen.sigma**2
+        for i in range(3):
+            for a in range(2):
+                pull[i] += weight * by_point[a, i] * residual[a]
+                for k in range(3):
+                    normal[i, k] += weight * by_point[a, i] * by_point[a, k]
+    _hold(normal)
+    _factor3(normal)
 
 
 @helper
@@ -183,6 +173,7 @@ def eliminate_points(
     turned: Float,
     loss: float,
     prior: Float,
+    settle: int,
     offset: Int64,
     band: Float,
     force: Float,
@@ -196,8 +187,9 @@ def eliminate_points(
         points: where they are.
         place: [T, 3] m.
         turned: [T, 3, 3] world_from_camera.
-        loss: as in `settle_points`.
-        prior: as in `settle_points`.
+        loss: standard deviations at which a sighting counts half.
+        prior: [2] mean and precision of the inverse depth (1/m, m^2).
+        settle: times that a point is moved before to where the cameras see it, their poses held.
         offset: [T] first of each picture's six unknowns.
         band: [n, width] is added to.
         force: [n] is added to.
@@ -211,8 +203,10 @@ def eliminate_points(
     for n in range(len(seen.first) - 1):
         start, stop = seen.first[n], seen.first[n + 1]
         normal, pull = np.zeros((3, 3)), np.zeros(3)
-        normal[2, 2] = prior[1]
-        pull[2] = prior[1] * (prior[0] - points.inverse_depth[n])
+        for _ in range(settle):
+            _point_equations(n, seen, points, place, turned, loss, prior, normal, pull)
+            _move(points, n, _solve3(normal, pull))
+        _point_equations(n, seen, points, place, turned, loss, prior, normal, pull)
         for s in range(start, stop):
             t = seen.picture[s]
             mixed = half[s - start]
@@ -234,10 +228,6 @@ def eliminate_points(
             weight = 1 / (1 + square / loss**2) / seen.sigma**2
             at = offset[t]
             for a in range(2):
-                for i in range(3):
-                    pull[i] += weight * by_point[a, i] * residual[a]
-                    for k in range(3):
-                        normal[i, k] += weight * by_point[a, i] * by_point[a, k]
                 for i in range(6):
                     share = weight * by_pose[a, i]
                     force[at + i] += share * residual[a]
@@ -245,8 +235,6 @@ def eliminate_points(
                         mixed[i, k] += share * by_point[a, k]
                     for k in range(i + 1):
                         band[at + k, i - k] += share * by_pose[a, k]
-        _hold(normal)
-        _factor3(normal)
         # Whitened: mixed F^-T, and F^-1 pull.
         for i in range(3):
             for k in range(i):
@@ -403,51 +391,6 @@ def add_ties(
             _tie(band, old, new, -kept * w)
             force[new] -= w * left
             force[old] += kept * w * left
-
-
-@cached
-def factorise(band: Float) -> bool:
-    """Replace a banded matrix by its lower Cholesky factor; return False if it is not positive definite."""
-    count, width = band.shape
-    for j in range(count):
-        own = band[j]
-        for k in range(max(0, j - width + 1), j):
-            left = band[k]
-            away = j - k
-            share = left[away]
-            if share != 0.0:
-                for i in range(width - away):
-                    own[i] -= share * left[away + i]
-        if not own[0] > 0:
-            return False
-        pivot = math.sqrt(own[0])
-        for i in range(width):
-            own[i] /= pivot
-    return True
-
-
-@cached
-def solve_lower(band: Float, sides: Float) -> None:
-    """Replace right sides [n, m] by F^-1 of them, F the factor."""
-    count, width = band.shape
-    for j in range(count):
-        for m in range(sides.shape[1]):
-            sides[j, m] /= band[j, 0]
-        for i in range(1, min(width, count - j)):
-            for m in range(sides.shape[1]):
-                sides[j + i, m] -= band[j, i] * sides[j, m]
-
-
-@cached
-def solve_upper(band: Float, sides: Float) -> None:
-    """Replace right sides [n, m] by F^-T of them, F the factor."""
-    count, width = band.shape
-    for j in range(count - 1, -1, -1):
-        for i in range(1, min(width, count - j)):
-            for m in range(sides.shape[1]):
-                sides[j, m] -= band[j, i] * sides[j + i, m]
-        for m in range(sides.shape[1]):
-            sides[j, m] /= band[j, 0]
 
 
 @cached

@@ -170,7 +170,6 @@ class Observations:
     position: Float  # [T, C, 3]
     rotation: Float  # [T, C, 3, 3]
     pose_sigma: Float | None  # [T, C, 2]; None if no camera has known pose noise
-    pose_covariance: Float | None = None  # [T, C, 6, 6]; None if no camera's log has covariances
 
 
 def time_base(cameras: list[Camera], rate_hz: float | None) -> Int64:
@@ -251,7 +250,6 @@ def observe(
         position=position,
         rotation=rotation,
         pose_sigma=pose_sigma,
-        pose_covariance=_all_covariances(cameras, pose_sigma, t_ns),
     )
 
 
@@ -286,18 +284,6 @@ def _all_sigmas(cameras: list[Camera], sigmas: list[Float | None]) -> Float:
         ],
         axis=1,
     )
-
-
-def _all_covariances(cameras: list[Camera], sigma: Float | None, t_ns: Int64) -> Float | None:
-    """Build the pose covariances [T, C, 6, 6]: from the log, else from `sigma`; None if no log has any."""
-    if sigma is None or all(camera.covariance is None for camera in cameras):
-        return None
-    every = np.repeat(sigma**2, 3, axis=2)[..., None] * np.eye(6)
-    for c, camera in enumerate(cameras):
-        own = camera.covariance_at(t_ns)
-        if own is not None:
-            every[:, c] = own
-    return every
 
 
 def _timeline(cameras: list[Camera]) -> Int64:

@@ -43,8 +43,8 @@ from pipelines.reconstruction.observations import (
     on_sides,
     sightings_of,
 )
-from pipelines.reconstruction.refinement.problem import Sighting
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
+from pipelines.reconstruction.refinement.system import Sighting
 from pipelines.reconstruction.results import poses_table
 from pipelines.reconstruction.solving import pictures_of
 from pipelines.reconstruction.windows import Window, refine_in_windows, spread, windows_of
@@ -314,7 +314,7 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
         flight.prior,
         flight.clock_sigma_s,
         windows=flight.windows,
-        contested=not flight.measured,
+        measured=flight.measured,
         workers=flight.workers,
         executor=flight.executor,
     )

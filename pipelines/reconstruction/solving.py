@@ -1,16 +1,10 @@
-"""Solvers of joint-frames: their noise, the choice between them, and how they scale covariances and weights.
+"""Solvers of joint-frames: their noise, the choice between them, and how they weigh inliers.
 
-Covariances are wider where nothing is known of the poses' errors. Inliers are weighted again in two ways:
-
-- By the full logged 6x6 pose covariances. Triangulation uses one standard deviation for a position and one
-  for a rotation; its gates and its choice of views need no more. Logs contain more: satellite positioning
-  errs more upwards, a compass more than a level, and a lever arm correlates position and rotation. With each
-  view's own 2x2 covariance the inliers are weighted again: a few Gauss-Newton steps on the reprojection.
-- By a heavy-tailed loss, for static, calibrated cameras. Noisy poses move all joints of a view together and
-  by a normal amount: least squares is right for them, and weighting views by their own residuals costs 11 %
-  at five cameras. With calibrated poses and no stated noise, a view that disagrees shows a wrong joint, and
-  the size of its residual has no meaning: its weight should fall with its residual
-  (docs/estimate.md).
+Covariances are wider where nothing is known of the poses' errors. For static, calibrated cameras inliers
+get a heavy-tailed loss. Noisy poses move all joints of a view together and by a normal amount: least squares
+is right for them, and weighting views by their own residuals costs 11 % at five cameras. With calibrated
+poses and no stated noise, a view that disagrees shows a wrong joint, and the size of its residual has no
+meaning: its weight should fall with its residual.
 """
 
 from __future__ import annotations
@@ -24,7 +18,6 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import UNKNOWN_SIGMA
-from pipelines.geometry.poses import cross_matrix
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -101,7 +94,7 @@ def solver_for(
     """Choose the solver from views to points; for `refined` and `auto`, the solver of their start.
 
     For calibrated cameras, `robust` has its own loss. For poses with errors, it has a gate that knows the
-    common error of a picture's joints, and weights from logged covariances. Its covariances are wider than
+    common error of a picture's joints. Its covariances are wider than
     residuals say where nothing is known of the poses' errors.
     """
     if method in ("robust", "auto") and are_calibrated(cameras, observations):
@@ -112,10 +105,6 @@ def solver_for(
     in_pictures = partial(triangulate_pictures, picture=picture, pixel_sigma=of_detector)
     if observations.pose_sigma is None:
         return partial(triangulate_widened, solve=in_pictures)
-    if observations.pose_covariance is not None:
-        in_pictures = partial(
-            triangulate_weighted, solve=in_pictures, pose_covariance=observations.pose_covariance
-        )
     return in_pictures
 
 
@@ -160,73 +149,6 @@ def triangulate_widened(views: Views, *, solve: Callable[[Views], Triangulation]
     """Triangulate, and widen covariances by `_UNKNOWN_POSES`."""
     found = solve(views)
     return replace(found, covariance=_UNKNOWN_POSES * found.covariance)
-
-
-# --- full pose covariances -----------------------------------------------------------------------------
-
-# The last of so many steps moves the median joint by less than a thousandth of its standard deviation.
-_REFITS = 4
-# So many joint-frames are fitted at once, which bounds the memory.
-_REFITTED = 8192
-
-
-def triangulate_weighted(
-    views: Views, *, solve: Callable[[Views], Triangulation], pose_covariance: Float
-) -> Triangulation:
-    """Triangulate with `robust`, then weigh its inliers by their poses' full covariances.
-
-    Args:
-        views: the views; `pose_sigma` holds the level of the same covariances.
-        solve: `robust` with the options for these views.
-        pose_covariance: [F, C, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2).
-    """
-    first = solve(views)
-    points, covariance = first.points.copy(), first.covariance.copy()
-    (ok,) = np.nonzero(first.status == STATUS.index("ok"))
-    for start in range(0, len(ok), _REFITTED):
-        rows = ok[start : start + _REFITTED]
-        refit = _refit(views, first, pose_covariance, rows)
-        good = np.isfinite(refit[0]).all(axis=1) & np.isfinite(refit[1]).all(axis=(1, 2))
-        points[rows[good]], covariance[rows[good]] = refit[0][good], refit[1][good]
-    measured = np.isfinite(points[:, 0])
-    residual_px = np.where(measured[:, None], reprojection_px(views, points), first.residual_px)
-    return replace(first, points=points, covariance=covariance, residual_px=residual_px)
-
-
-def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int64) -> tuple[Float, Float]:
-    """Refit these joint-frames: points [N, 3] and covariances [N, 3, 3]."""
-    pose = views.pose_index[rows]
-    rotation, centre = views.rotation[pose], views.position[pose]
-    inlier = first.inlier[rows]
-    weight = np.where(inlier, views.weight[rows], 1.0)
-    pixel = (views.pixel_sigma / views.focal / weight) ** 2
-    seen = np.where(inlier[..., None], views.rays[rows], 0.0)
-    covariance = pose_covariance[pose]
-    points = first.points[rows].copy()
-    normal = np.empty((len(rows), 3, 3))
-    for _ in range(_REFITS):
-        away = np.einsum("ncji,ncj->nci", rotation, points[:, None] - centre)
-        away[~inlier] = [0.0, 0.0, 1.0]
-        u, v, z = np.moveaxis(away, -1, 0)
-        u, v = u / z, v / z
-        project = np.zeros((*u.shape, 2, 3))
-        project[..., 0, 0] = project[..., 1, 1] = 1 / z
-        project[..., 0, 2], project[..., 1, 2] = -u / z, -v / z
-        by_point = np.einsum("ncij,nckj->ncik", project, rotation)
-        # A camera that stands e further, and is turned by w about its axes, sees the point at
-        # exp(-w) R' (X - p - e): by e as by -X, by w as by the cross product with the point.
-        by_turn = project @ cross_matrix(away)
-        by_pose = np.concatenate([-by_point, by_turn], axis=-1)
-        spread = by_pose @ covariance @ np.swapaxes(by_pose, -1, -2)
-        spread[..., 0, 0] += pixel
-        spread[..., 1, 1] += pixel
-        information = np.where(inlier[..., None, None], np.linalg.inv(spread), 0.0)
-        residual = seen - np.stack([u, v], axis=-1)
-        weighted = np.swapaxes(by_point, -1, -2) @ information
-        normal = (weighted @ by_point).sum(axis=1)
-        right = np.einsum("ncij,ncj->ni", weighted, residual)
-        points = points + np.linalg.solve(normal, right[..., None])[..., 0]
-    return points, np.asarray(np.linalg.inv(normal), dtype=np.float64)
 
 
 # --- heavy-tailed loss ---------------------------------------------------------------------------------

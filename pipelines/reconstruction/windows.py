@@ -16,8 +16,8 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.noise import PoseErrors
-from pipelines.reconstruction.refinement.problem import Sighting
 from pipelines.reconstruction.refinement.refine import Refined, refine
+from pipelines.reconstruction.refinement.system import Sighting
 from pipelines.session.memory import available_bytes
 from pipelines.session.parallel import each_part
 
@@ -88,8 +88,7 @@ class _Order:
     bones: Int64
     prior: list[PoseErrors] | None
     clock_sigma_s: Float
-    contested: bool
-    threads: int
+    measured: bool
 
     def within(self, window: Window) -> _Order:
         """Take the data of a window."""
@@ -115,7 +114,7 @@ def refine_in_windows(
     clock_sigma_s: Float,
     *,
     windows: Sequence[Window],
-    contested: bool = True,
+    measured: bool = False,
     workers: int = 1,
     executor: Executor | None = None,
 ) -> Refined:
@@ -126,11 +125,11 @@ def refine_in_windows(
 
     Args:
         windows: those of `windows_of`, or some of them.
-        workers: the number of processes (as far as memory allows), or threads for a single window.
+        workers: the number of processes, as far as memory allows.
         executor: works on the windows instead.
     """
     levels = None if prior is None else list(prior)
-    whole = _Order(t_s, tuple(sightings), start, bones, levels, clock_sigma_s, contested, workers)
+    whole = _Order(t_s, tuple(sightings), start, bones, levels, clock_sigma_s, measured)
     if len(windows) == 1 and windows[0].stop - windows[0].first == len(t_s):
         return _refine(whole)
     if executor is None:
@@ -153,8 +152,7 @@ def _refine(order: _Order) -> Refined:
         order.bones,
         order.prior,
         order.clock_sigma_s,
-        contested=order.contested,
-        threads=order.threads,
+        measured=order.measured,
     )
 
 

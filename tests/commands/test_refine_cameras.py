@@ -20,7 +20,7 @@ from pipelines.geometry.poses import (
     quaternion_from_matrix,
     rotation_vector_from_quaternion,
 )
-from pipelines.reconstruction.background_adjustment import Background, PosePrior, SeenPoints, adjust
+from pipelines.reconstruction.background import Background, PosePrior, SeenPoints, adjust
 from pipelines.reconstruction.background_tracks import follow, off_people
 from pipelines.session.description import read_description
 from pipelines.session.registries import noise_models

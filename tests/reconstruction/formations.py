@@ -11,7 +11,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import NoiseModel, disturb
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.geometry.triangulation import Views, estimate_noise, triangulate_pictures
-from pipelines.reconstruction.refinement.problem import Sighting
+from pipelines.reconstruction.refinement.system import Sighting
 from pipelines.session.people import bones_of
 from pipelines.simulation.flying import orbit
 from tests.synthetic.walk import COCO17, route, walk

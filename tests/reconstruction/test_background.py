@@ -31,21 +31,20 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
 )
-from pipelines.reconstruction import background_adjustment
-from pipelines.reconstruction.background import refine_cameras
-from pipelines.reconstruction.background_adjustment import (
+from pipelines.reconstruction import background
+from pipelines.reconstruction.background import (
     Adjusted,
     Background,
     PosePrior,
     SeenPoints,
     adjust,
+    refine_cameras,
     with_constant_levels,
 )
 from pipelines.reconstruction.background_kernels import (
     BackgroundPoints,
     BackgroundSightings,
     eliminate_points,
-    settle_points,
 )
 from pipelines.reconstruction.background_tracks import Followed, Tracks, follow, off_people
 from pipelines.reconstruction.observations import Camera
@@ -454,26 +453,12 @@ def test_points_that_move_against_each_other_are_refused() -> None:
     assert "px" in found.refused
 
 
-@pytest.mark.parametrize("pictures", [41, 60, 83])
-def test_a_few_pictures_more_than_a_stretch_cost_nothing(
-    pictures: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(background_adjustment, "STRETCH", 40)
-    rng = np.random.default_rng(6)
-    position, rotation = flown(pictures, 0.3 * pictures)
-    picture, point, xy = sighted(position, rotation, rng)
-    at, turned = logged(position, rotation, rng)
-    found = adjusted(picture, point, xy, (at, turned))
-    assert found.refused is None
-    assert np.median(turns_deg(found.rotation, rotation)) < np.median(turns_deg(turned, rotation))
-
-
 def test_poses_do_not_jump_where_a_stretch_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compare with stretches that do not overlap: each takes the path where its own log's errors are 0.
 
     Handed over in 30 pictures, that difference is 1.5 / 30 of it from one picture to the next, at most.
     """
-    monkeypatch.setattr(background_adjustment, "STRETCH", 150)
+    monkeypatch.setattr(background, "STRETCH", 150)
     rng = np.random.default_rng(9)
     position, rotation = flown(300, 12.0)
     picture, point, xy = sighted(position, rotation, rng)
@@ -484,7 +469,7 @@ def test_poses_do_not_jump_where_a_stretch_ends(monkeypatch: pytest.MonkeyPatch)
     logs = at, matrix_from_quaternion(quaternion)
     prior = PosePrior.of(pose_errors(models))
     smooth = adjusted(picture, point, xy, logs, prior)
-    monkeypatch.setattr(background_adjustment, "_REACH", 1000)
+    monkeypatch.setattr(background, "_REACH", 1000)
     apart = adjusted(picture, point, xy, logs, prior)
     assert smooth.refused is None
     steps, jumps = (np.linalg.norm(np.diff(of.position - position, axis=0), axis=1) for of in (smooth, apart))
@@ -512,11 +497,10 @@ def test_a_point_behind_all_of_its_pictures_spoils_nothing() -> None:
     seen = BackgroundSightings(np.array([0, 3]), np.arange(3), rays, 1e-3)
     points = BackgroundPoints(np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.full(1, 0.05), sides)
     place, turned, prior = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)), np.array([0.0, 0.01])
-    settle_points(seen, points, place, turned, 1.0, prior, 8)
+    band, force, missed, kept = np.zeros((18, 18)), np.zeros(18), np.zeros(3), np.zeros((1, 12))
+    eliminate_points(seen, points, place, turned, 1.0, prior, 8, 6 * np.arange(3), band, force, missed, kept)
     np.testing.assert_array_equal(points.direction, [[0.0, 0.0, -1.0]])
     assert np.isfinite(points.inverse_depth).all()
-    band, force, missed, kept = np.zeros((18, 18)), np.zeros(18), np.zeros(3), np.zeros((1, 12))
-    eliminate_points(seen, points, place, turned, 1.0, prior, 6 * np.arange(3), band, force, missed, kept)
     assert not band.any()
     assert not force.any()
     assert np.isnan(missed).all()

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.noise import pose_errors
-from pipelines.reconstruction.refinement.problem import Sighting
 from pipelines.reconstruction.refinement.refine import Refined, refine
+from pipelines.reconstruction.refinement.system import Sighting
 from tests.reconstruction.formations import BONES, FOCAL_PX, formation
 
 PRIOR_S = 0.2

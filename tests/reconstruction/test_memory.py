@@ -9,7 +9,7 @@ from pipelines.geometry.noise import GaussMarkov, pose_errors
 from pipelines.reconstruction.refinement import elimination
 from pipelines.reconstruction.refinement.elimination import covariances
 from pipelines.reconstruction.refinement.estimate import initial_state, solve
-from pipelines.reconstruction.refinement.problem import Knowledge, build
+from pipelines.reconstruction.refinement.system import Knowledge, build
 from tests.reconstruction.formations import BONES, formation
 
 CAMERAS, JOINTS = 3, 17
@@ -41,11 +41,10 @@ def test_an_hour_of_three_cameras_is_estimated_in_a_gigabyte(monkeypatch: pytest
     """Measure what a time of the skeleton adds; an hour has 108,000 times.
 
     Numbers of 8 bytes for each: 17 joints have 51 coordinates in the start, the state, a step and a state
-    that is tried, and 153 of covariances, in halves and as a whole. Each of 51 image points has 3, again in
-    the half of the flight that runs backwards, and one more divided by its noise. Each of three pictures has
-    38, again in that half, and 6 of its white error in every state. That is 1,100 numbers, 8.8 kB; fronts add
-    0.7 kB. The rest of 1.5 GB is for the program, 0.25 GB, and for its other arrays, which wait in files
-    meanwhile.
+    that is tried, and 153 of covariances. Each of 51 image points has 3, and one more divided by its noise.
+    Each of three pictures has 38, and 6 of its white error in every state. That is some 800 numbers, 6.5 kB;
+    fronts add 0.7 kB. The rest of 1.5 GB is for the program, 0.25 GB, and for its other arrays, which wait in
+    files meanwhile.
     """
     usual, shorter = elimination._SEGMENT, 64
     monkeypatch.setattr(elimination, "_SEGMENT", shorter)  # the factors of a segment are a constant

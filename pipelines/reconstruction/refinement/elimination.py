@@ -4,48 +4,60 @@ The normal equations are banded in time with a border. A second difference coupl
 couples three times and two knots, and the shared unknowns are coupled with everything. So joints and knots
 are eliminated in the order of time by one small dense front (Duff & Reid 1983, multifrontal; equal to a
 forward filter in information form). A backward pass solves for them and computes the covariances of fronts
-(Takahashi's recursion; in time, the smoother of Rauch, Tung & Striebel 1965). Two fronts start from both
-ends of the flight and meet in the middle. The solution is exact, without windows. Factors of a long flight do
-not fit into memory: the fronts at every `_SEGMENT` times are kept, and a segment is factorised again when the
-backward pass reaches it.
+(Takahashi's recursion; in time, the smoother of Rauch, Tung & Striebel 1965). The solution is exact, without
+windows. Factors of a long flight do not fit into memory: the fronts at every `_SEGMENT` times are kept, and a
+segment is factorised again when the backward pass reaches it.
+
+A front [N, N] holds the normal equations of the live unknowns, lower triangle: joints at three times (3 n),
+knots before and after (2 c), unknowns shared by all times. Eliminated unknowns x depend on the rest z of the
+front as x = R' (y - W' z), with R the inverse of the Cholesky factor of their own block and W = B R'.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
-from pipelines.reconstruction.refinement import kernels, sweeps
-from pipelines.reconstruction.refinement.kernels import State
-from pipelines.reconstruction.refinement.sweeps import Factors, Moments
-from pipelines.reconstruction.refinement.system import Half, System, halved
-from pipelines.session.progress import Halt, side_by_side
-
-Part = TypeVar("Part")
-Result = TypeVar("Result")
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.compilation import cached, helper
+from pipelines.reconstruction.refinement import kernels
+from pipelines.reconstruction.refinement.kernels import (
+    NUMBERS,
+    WHITE,
+    Equations,
+    Linearised,
+    Posterior,
+    State,
+    add_bones,
+    add_motion,
+    assemble,
+    linearised,
+    posterior_of_picture,
+)
+from pipelines.reconstruction.refinement.system import System
 
 # Factors of so many times of the skeleton are computed again together.
 _SEGMENT = 256
-# Where a half's factors take more bytes, segments are factorised twice.
-_KEPT_BYTES = 40e6
-# Keeping a smaller share of the factors saves no time.
-_WORTH = 0.1
+# Where the factors take more bytes, segments are factorised twice.
+_KEPT_BYTES = 80e6
 # Bone lengths with this precision (1 / m^2) do not move.
 _HELD = 1e10
+# An unseen joint is within this distance of its start.
+_ANYWHERE_M = 100.0
 
 
 @dataclass
 class Eliminated:
-    """Equations of a state after the elimination of all unknowns that are not alive where the halves meet."""
+    """Equations of a state after the elimination of all unknowns but those alive at the end."""
 
     state: State
-    swept: tuple[_Swept, _Swept]
-    lower: Float  # Cholesky factor of the remaining equations where the halves meet
-    gradient: Float  # of the same, in the order of the first half
+    fronts: list[_Front]  # at the start of every segment, to recompute its factors
+    factors: dict[int, Factors]  # of the segments whose factors are kept
+    lower: Float  # Cholesky factor of the remaining equations
+    gradient: Float  # of the same
     log_determinant: float  # half the log determinant of all equations, white errors included
 
 
@@ -55,39 +67,50 @@ def eliminate(system: System, state: State) -> Eliminated:
     Raises:
         LinAlgError: the equations are singular.
     """
-    swept = _on_both(
-        halved(system), lambda half, halt: _sweep(half, half.state(state), halt), system.problem.threads
-    )
-    lower, gradient = _meet(swept)
-    half_log = float(np.log(np.diagonal(lower)).sum()) + swept[0].log_determinant + swept[1].log_determinant
-    return Eliminated(state, swept, lower, gradient, half_log)
+    from scipy.linalg.lapack import dpotrf
+
+    n, front = 3 * system.problem.joints, _begin(system, state)
+    fronts, kept = [], {}
+    half_log, segments = 0.0, _segments(system)
+    kept_times = _KEPT_BYTES / (8 * n * system.size)
+    for index, (first, last) in enumerate(segments):
+        fronts.append(front.packed())
+        factors, part = _eliminate(system, state, front, first, last)
+        half_log += part
+        if last < kept_times or index == len(segments) - 1:
+            kept[index] = factors
+    alive = np.concatenate([np.arange(2 * n), np.arange(3 * n, system.size)])
+    lower, failed = dpotrf(front.matrix[np.ix_(alive, alive)], lower=1, clean=1)
+    if failed:
+        raise np.linalg.LinAlgError("the equations of what all times share are singular")
+    half_log += float(np.log(np.diagonal(lower)).sum())
+    return Eliminated(state, fronts, kept, lower, front.gradient[alive], half_log)
 
 
 def step(system: System, at: Eliminated) -> State:
     """Compute the Gauss-Newton step."""
     from scipy.linalg.lapack import dpotrs
 
-    last = dpotrs(at.lower, -at.gradient, lower=1)[0]
-    return _solve_back(system, at, last)
+    state, n, count = at.state, 3 * system.problem.joints, system.layout.entries.knot_count
+    alive = dpotrs(at.lower, -at.gradient, lower=1)[0]
+    position, knots = np.zeros((len(system.problem.t_s), n)), np.zeros_like(state.knots)
+    position[-2:] = alive[: 2 * n].reshape(2, n)
+    shared = np.ascontiguousarray(alive[2 * n + 2 * count :])
+    interval = int(system.of_time[-1])
+    if count:
+        knots[interval : interval + 2] = alive[2 * n : 2 * n + 2 * count].reshape(2, count)
+    for first, last, factors in _factors_backwards(system, at):
+        interval = backwards(first, last, system.of_time, interval, factors, position, knots, shared)
+    moved = State(position.reshape(state.position.shape), knots, shared, np.zeros_like(state.white))
+    kernels.whiten(system.equations(state), moved)
+    return moved
 
 
 def covariances(system: System, at: Eliminated) -> Float:
     """Compute the posterior covariance [T, J, 3, 3] of every joint at every time."""
-    shape = (system.problem.joints, 3, 3)
-    whole = _last_covariance(at)
-    every = np.empty((len(system.problem.t_s), *shape))
-
-    def of_half(swept: _Swept, halt: Halt) -> None:
-        covariance = np.zeros((len(swept.half.t_s), *shape))
-        _visit_back(swept, swept.state, whole, covariance, 0, halt)
-        # The times of the meeting are the first half's.
-        if swept.half.turned:
-            every[len(every) - len(covariance) + 2 :] = covariance[-3::-1]
-        else:
-            every[: len(covariance)] = covariance
-
-    _on_both(at.swept, of_half, system.problem.threads)
-    return every
+    covariance = np.zeros((*at.state.position.shape, 3))
+    _visit(system, at.state, at, covariance, 0)
+    return covariance
 
 
 def moments(system: System, state: State, at: Eliminated, *, every: int) -> Moments:
@@ -95,12 +118,7 @@ def moments(system: System, state: State, at: Eliminated, *, every: int) -> Mome
 
     Covariances are those of the eliminated state, squares those of `state`, one step further.
     """
-    whole = _last_covariance(at)
-
-    def of_half(swept: _Swept, halt: Halt) -> Moments:
-        return _visit_back(swept, swept.half.state(state), whole, np.zeros((0, 1, 3, 3)), every, halt)
-
-    return _added(*_on_both(at.swept, of_half, system.problem.threads))
+    return _visit(system, state, at, np.zeros((0, 1, 3, 3)), every)
 
 
 def shared_covariance(system: System, at: Eliminated) -> Float:
@@ -110,111 +128,35 @@ def shared_covariance(system: System, at: Eliminated) -> Float:
     return whole[begins:, begins:]
 
 
-def samples(system: System, at: Eliminated, count: int, rng: np.random.Generator) -> Iterator[Float]:
-    """Draw samples [T, J, 3] of the joints' errors from the posterior, with mean 0."""
-    from scipy.linalg.lapack import dtrtrs
-
-    for _ in range(count):
-        last = dtrtrs(at.lower, rng.standard_normal(len(at.lower)), lower=1, trans=1)[0]
-        yield _solve_back(system, at, last, rng).position
-
-
-# --- forwards ------------------------------------------------------------------------------------------
-
-
 @dataclass
 class _Front:
     """Normal equations of the live unknowns: joints at three times, knots around them, shared unknowns."""
 
-    matrix: Float  # [N, N] lower triangle
+    matrix: Float  # [N, N] lower triangle; [N (N + 1) / 2] if packed, in half the memory
     gradient: Float  # [N]
     interval: int
 
-    def packed(self) -> _Packed:
-        return _Packed(self.matrix[np.tril_indices(len(self.matrix))], self.gradient.copy(), self.interval)
-
-
-@dataclass
-class _Packed:
-    """Front in half the memory."""
-
-    lower: Float  # [N (N + 1) / 2]
-    gradient: Float  # [N]
-    interval: int
+    def packed(self) -> _Front:
+        rows = np.tril_indices(len(self.matrix))
+        return _Front(self.matrix[rows], self.gradient.copy(), self.interval)
 
     def unpacked(self) -> _Front:
         size = len(self.gradient)
         matrix = np.zeros((size, size))
-        matrix[np.tril_indices(size)] = self.lower
+        matrix[np.tril_indices(size)] = self.matrix
         return _Front(matrix, self.gradient.copy(), self.interval)
 
 
-@dataclass
-class _Swept:
-    """Half of the flight after its elimination."""
-
-    half: Half
-    state: State  # its part
-    fronts: list[_Packed]  # at the start of every segment, to recompute its factors
-    factors: dict[int, Factors]  # of the segments whose factors are kept
-    rest: _Front
-    log_determinant: float
+def _segments(system: System) -> list[tuple[int, int]]:
+    """List the segments [first, last) of the eliminated times."""
+    count = len(system.problem.t_s) - 2
+    return [(first, min(first + _SEGMENT, count)) for first in range(0, count, _SEGMENT)]
 
 
-def _segments(half: Half) -> list[tuple[int, int]]:
-    """List the segments [first, last) of a half; one empty segment without times, for its knots."""
-    return [(first, min(first + _SEGMENT, half.count)) for first in range(0, max(half.count, 1), _SEGMENT)]
-
-
-def _on_both(
-    both: tuple[Part, Part], work: Callable[[Part, Halt], Result], threads: int
-) -> tuple[Result, Result]:
-    """Run the same work on both halves, in parallel if two threads are allowed."""
-    halt = Halt()
-    first, second = side_by_side(lambda part: work(part, halt), both, workers=min(threads, 2), halt=halt)
-    return first, second
-
-
-def _sweep(half: Half, state: State, halt: Halt) -> _Swept:
-    system = half.system
-    front = _begin(half, state)
-    fronts, kept = [], {}
-    log_determinant = 0.0
-    bytes_per_time = 8 * 3 * system.problem.joints * system.size
-    kept_times = _KEPT_BYTES / bytes_per_time
-    if kept_times < _WORTH * half.count:
-        kept_times = 0.0
-    for index, (first, last) in enumerate(_segments(half)):
-        halt.check()
-        fronts.append(front.packed())
-        factors, part = _eliminate(half, state, front, first, last)
-        log_determinant += part
-        if last < kept_times or last == half.count:
-            kept[index] = factors
-    return _Swept(half, state, fronts, kept, front, log_determinant)
-
-
-def _begin(half: Half, state: State) -> _Front:
-    """Create the first front: the first knots, tied; in the first half also the priors at the start."""
-    system = half.system
-    front = _Front(np.zeros((system.size, system.size)), np.zeros(system.size), 0)
-    if not half.turned:
-        _add_priors(system, state, front)
-    if system.layout.entries.knot_count:
-        sweeps.begin(
-            front.matrix,
-            front.gradient,
-            3 * system.problem.joints,
-            system.layout.entries.knot_count,
-            state.knots,
-            half.ties,
-        )
-    return front
-
-
-def _add_priors(system: System, state: State, front: _Front) -> None:
-    """Add the priors of slow errors at the first knot and of shared unknowns."""
+def _begin(system: System, state: State) -> _Front:
+    """Create the first front: the priors of slow errors at the first knot and of shared unknowns."""
     layout, n3 = system.layout, 9 * system.problem.joints
+    front = _Front(np.zeros((system.size, system.size)), np.zeros(system.size), 0)
     for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
         value = state.knots[0] if at_knots else state.shared
         offset = n3 if at_knots else n3 + 2 * layout.entries.knot_count
@@ -229,14 +171,37 @@ def _add_priors(system: System, state: State, front: _Front) -> None:
     for place in range(n3 + 2 * layout.entries.knot_count + layout.bone_column, system.size):
         # A length without data keeps its value.
         front.matrix[place, place] += _HELD if system.held else 1e-6
+    return front
 
 
-def _eliminate(half: Half, state: State, front: _Front, first: int, last: int) -> tuple[Factors, float]:
+def _sweep(system: System, state: State) -> Sweep:
+    """Collect the arguments of the compiled functions."""
+    t_s = system.problem.t_s
+    before, after = np.diff(t_s)[:-1], np.diff(t_s)[1:]
+    return Sweep(
+        equations=system.equations(state),
+        starts=np.searchsorted(system.pictures.first, np.arange(len(t_s) - 1)),
+        of_time=system.of_time,
+        curvature=np.stack(
+            [2 / (before * (before + after)), -2 / (before * after), 2 / (after * (before + after))], axis=1
+        ),
+        spread=system.usual_step_s / (0.5 * (before + after)),
+        precision=system.inverse_acceleration,
+        hold=1 / _ANYWHERE_M**2,
+        bones=system.problem.bones,
+        bone_sigma=system.knowledge.bone_sigma_m,
+        grown=system.grown(state),
+        knot_t_s=system.problem.knot_t_s,
+        tie_kept=system.tie_kept,
+        tie_variance=system.tie_variance,
+    )
+
+
+def _eliminate(system: System, state: State, front: _Front, first: int, last: int) -> tuple[Factors, float]:
     """Eliminate the knots and joints of times from `first` to before `last`; change the front in place."""
-    system = half.system
     n, c = 3 * system.problem.joints, system.layout.entries.knot_count
     times, size = last - first, system.size
-    knots = int(half.of_time[last]) - front.interval if c else 0
+    knots = int(system.of_time[last]) - front.interval if c else 0
     factors = Factors(
         front.interval,
         np.zeros((times, n, n)),
@@ -247,132 +212,613 @@ def _eliminate(half: Half, state: State, front: _Front, first: int, last: int) -
         np.zeros((knots, c)),
     )
     try:
-        front.interval, log_determinant = sweeps.forwards(
-            first, last, half.sweep(state), front.matrix, front.gradient, front.interval, factors
+        front.interval, log_determinant = forwards(
+            first, last, _sweep(system, state), front.matrix, front.gradient, front.interval, factors
         )
     except np.linalg.LinAlgError as error:
         raise np.linalg.LinAlgError("the equations of the refinement are singular") from error
     return factors, log_determinant
 
 
-# --- where the halves meet -------------------------------------------------------------------------------
-
-
-def _meet(swept: tuple[_Swept, _Swept]) -> tuple[Float, Float]:
-    """Compute the Cholesky factor and gradient of the unknowns alive in both halves, in the first's order."""
-    from scipy.linalg.lapack import dpotrf
-
-    system = swept[0].half.system
-    n = 3 * system.problem.joints
-    alive = np.concatenate([np.arange(2 * n), np.arange(3 * n, system.size)])
-    matrix, gradient = np.zeros((len(alive), len(alive))), np.zeros(len(alive))
-    for each in swept:
-        place = each.half.met()
-        lower = np.tril(each.rest.matrix[np.ix_(alive, alive)])
-        matrix[np.ix_(place, place)] += lower + np.tril(lower, -1).T
-        gradient[place] += each.rest.gradient[alive]
-    factor: Float
-    factor, failed = dpotrf(matrix, lower=1, clean=1)
-    if failed:
-        raise np.linalg.LinAlgError("the equations of what all times share are singular")
-    return factor, gradient
-
-
 def _last_covariance(at: Eliminated) -> Float:
-    """Compute the covariance of the unknowns alive where the halves meet, in the order of the first half."""
+    """Compute the covariance of the unknowns alive at the end."""
     from scipy.linalg.lapack import dpotri
 
     inverse, _ = dpotri(at.lower, lower=1)
     return np.ascontiguousarray(np.tril(inverse) + np.tril(inverse, -1).T)
 
 
-# --- backwards -----------------------------------------------------------------------------------------
-
-
-def _factors_backwards(swept: _Swept, halt: Halt) -> Iterator[tuple[int, int, Factors]]:
-    segments = _segments(swept.half)
-    for index in range(len(segments) - 1, -1, -1):
-        halt.check()
-        factors = swept.factors.get(index)
+def _factors_backwards(system: System, at: Eliminated) -> Iterator[tuple[int, int, Factors]]:
+    for index, segment in reversed(list(enumerate(_segments(system)))):
+        factors = at.factors.get(index)
         if factors is None:
-            factors, _ = _eliminate(swept.half, swept.state, swept.fronts[index].unpacked(), *segments[index])
-        yield *segments[index], factors
+            factors, _ = _eliminate(system, at.state, at.fronts[index].unpacked(), *segment)
+        yield *segment, factors
 
 
-def _solve_back(
-    system: System, at: Eliminated, last_solution: Float, rng: np.random.Generator | None = None
-) -> State:
-    """Solve for the unknowns of all times from those of the meeting; with `rng`, draw a sample about 0."""
-    layout, state = system.layout, at.state
-    # Draws come from one source, so in order.
-    threads = 1 if rng is not None else system.problem.threads
-    (position, knots), (turned_position, turned_knots) = _on_both(
-        at.swept, lambda swept, halt: _follow_back(swept, last_solution, rng, halt), threads
-    )
-    position = np.concatenate([position, turned_position[-3::-1]])
-    first_of_second = at.swept[0].rest.interval + 2
-    knots[first_of_second:] = turned_knots[::-1][first_of_second:]
-    shared = np.ascontiguousarray(last_solution[len(last_solution) - layout.shared_count :])
-    moved = State(position.reshape(state.position.shape), knots, shared, np.zeros_like(state.white))
-    if rng is None:
-        kernels.whiten(system.equations(state, system.problem.t_s, system.pictures), moved)
-    return moved
-
-
-def _follow_back(
-    swept: _Swept, last_solution: Float, rng: np.random.Generator | None, halt: Halt
-) -> tuple[Float, Float]:
-    """Solve for the joints [T, n] of a half and for the knots [K, c]; knots of the other half stay 0."""
-    half, state = swept.half, swept.state
-    n, count = 3 * half.system.problem.joints, half.system.layout.entries.knot_count
-    alive = last_solution[half.met()]
-    position, knots = np.zeros((len(half.t_s), n)), np.zeros_like(state.knots)
-    position[-2:] = alive[: 2 * n].reshape(2, n)
-    shared = np.ascontiguousarray(alive[2 * n + 2 * count :])
-    interval = swept.rest.interval
-    if count:
-        knots[interval : interval + 2] = alive[2 * n : 2 * n + 2 * count].reshape(2, count)
-    for first, last, factors in _factors_backwards(swept, halt):
-        used = factors
-        if rng is not None:
-            used = factors._replace(
-                solved=rng.standard_normal(factors.solved.shape),
-                knot_solved=rng.standard_normal(factors.knot_solved.shape),
-            )
-        interval = sweeps.backwards(first, last, half.of_time, interval, used, position, knots, shared)
-    return position, knots
-
-
-def _visit_back(
-    swept: _Swept, state: State, last_covariance: Float, covariance: Float, every: int, halt: Halt
-) -> Moments:
-    """Compute the moments of a half, linearised at `state`; fill `covariance` unless it is empty."""
-    half = swept.half
-    problem, layout, sweep = half.system.problem, half.system.layout, half.sweep(state)
-    joints, knot_count, place = problem.joints, layout.entries.knot_count, half.met()
-    others = np.ascontiguousarray(last_covariance[np.ix_(place, place)])
+def _visit(system: System, state: State, at: Eliminated, covariance: Float, every: int) -> Moments:
+    """Compute the moments, linearised at `state`; fill `covariance` unless it is empty."""
+    problem, layout = system.problem, system.layout
+    joints, knot_count = problem.joints, layout.entries.knot_count
     found = Moments(
         np.zeros((2, joints, joints)),
         np.zeros(len(problem.bones)),
         np.zeros((joints, 2)),
         np.zeros((2, 3)),
         np.zeros((knot_count, 3)),
-        np.zeros((0 if half.turned else knot_count + layout.shared_count, 2)),
-        half.count,
+        np.zeros((knot_count + layout.shared_count, 2)),
+        len(problem.t_s) - 2,
     )
-    interval = swept.rest.interval
-    if knot_count and every and not half.turned:
-        sweeps.last_walk(others, 3 * joints, knot_count, state.knots, half.knot_t_s, interval, found.walked)
-    for first, last, factors in _factors_backwards(swept, halt):
-        others, interval = sweeps.visit(
-            first, last, sweep, others, interval, factors, every, covariance, found
-        )
+    others, interval, sweep = _last_covariance(at), int(system.of_time[-1]), _sweep(system, state)
+    for first, last, factors in _factors_backwards(system, at):
+        others, interval = visit(first, last, sweep, others, interval, factors, every, covariance, found)
     return found
 
 
-def _added(first: Moments, second: Moments) -> Moments:
-    """Add the moments of both halves; `starting` is the first half's."""
-    sums = {
-        name: getattr(first, name) + getattr(second, name) for name in Moments._fields if name != "starting"
-    }
-    return first._replace(**sums)
+# --- compiled --------------------------------------------------------------------------------------------
+
+# Products of fewer rows are too small to be fast.
+_STRIP = 48
+
+
+class Sweep(NamedTuple):
+    """Flight of T times with the priors of its motion."""
+
+    equations: Equations
+    starts: Int64  # [T - 1] index of the first picture of each time
+    of_time: Int64  # [T - 1] the knot before each eliminated time, and the last but one
+    curvature: Float  # [T - 2, 3] weights of three positions for their acceleration
+    spread: Float  # [T - 2] its variance relative to the usual
+    precision: Float  # [J, J] of an acceleration
+    hold: float  # added to the diagonal of joints, so that unseen ones stay near their start
+    bones: Int64  # [B, 2]
+    bone_sigma: Float  # [B] m
+    grown: float  # size of the body over that for which the priors hold
+    knot_t_s: Float  # [K]
+    tie_kept: Float  # [K - 1, c] share of a slow error that is left at the next knot
+    tie_variance: Float  # [K - 1, c] added variance
+
+
+class Factors(NamedTuple):
+    """Factors of a stretch's elimination: rows of its times, and of its knots from the first interval."""
+
+    first_interval: int
+    inverse: Float  # [., n, n] R
+    across: Float  # [., m, n] W
+    solved: Float  # [., n] y
+    knot_inverse: Float  # [., c, c]
+    knot_across: Float  # [., m', c]
+    knot_solved: Float  # [., c]
+
+
+class Moments(NamedTuple):
+    """Posterior mean squares and variances of the quantities whose standard deviations are the levels."""
+
+    acceleration: Float  # [2, J, J] sums of mean squares and of variances over the times
+    bones: Float  # [B] sums of mean squares
+    image: Float  # [J, 2] weighted squares of residuals, and their degrees of freedom after the fit
+    white: Float  # [2, 3] of position, rotation: sums of mean squares, count, sum of determined shares
+    walked: Float  # [c, 3] of the changes between knots per s: sums of mean squares, count, variances
+    starting: Float  # [c + shared, 2] mean squares and variances at the first time
+    times: int
+
+
+@helper
+def copy_block(source: Float, row: int, column: int, out: Float) -> None:
+    """Copy part of a matrix; an assignment to a slice would take seconds longer to compile."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = source[row + i, column + j]
+
+
+@helper
+def lower_square(rows: Float) -> Float:
+    """Compute the lower triangle of W W', in strips; values above it are undefined."""
+    size = len(rows)
+    square = np.empty((size, size))
+    for begin in range(0, size, _STRIP):
+        end = min(begin + _STRIP, size)
+        strip = np.dot(rows[begin:end], rows[:end].T)
+        for i in range(end - begin):
+            for j in range(end):
+                square[begin + i, j] = strip[i, j]
+    return square
+
+
+@helper
+def eliminate_block(
+    own: Float, beside: Float, gradient: Float, inverse: Float, across: Float, y: Float
+) -> tuple[Float, float]:
+    """Compute R = L^-1, W = B R', y = -R g in place; return W W' (lower) and half log det of `own`."""
+    n = len(own)
+    lower = np.linalg.cholesky(own)
+    half = 0.0
+    for i in range(n):
+        half += np.log(lower[i, i])
+        for j in range(i + 1):
+            inverse[i, j] = 0.0
+        for j in range(i + 1, n):
+            inverse[i, j] = 0.0
+        for k in range(i):
+            scale = lower[i, k]
+            for j in range(k + 1):
+                inverse[i, j] -= scale * inverse[k, j]
+        for j in range(i):
+            inverse[i, j] /= lower[i, i]
+        inverse[i, i] = 1.0 / lower[i, i]
+    for i in range(n):
+        total = 0.0
+        for j in range(i + 1):
+            total -= inverse[i, j] * gradient[j]
+        y[i] = total
+    np.dot(beside, inverse.T, across)
+    return lower_square(across), half
+
+
+@cached
+def forwards(
+    first: int, last: int, sweep: Sweep, front: Float, gradient: Float, interval: int, factors: Factors
+) -> tuple[int, float]:
+    """Eliminate joints and knots of the times from `first` to before `last`; change the front in place.
+
+    Writes the factors. Returns the interval of the time `last`, in which the front ends, and half the log
+    determinant of all eliminated unknowns, white errors included.
+    """
+    position, shared = sweep.equations.state.position, sweep.equations.state.shared
+    knots, bones = sweep.equations.state.knots, sweep.bones
+    starts, of_time, grown = sweep.starts, sweep.of_time, sweep.grown
+    inverse, across, solved = factors.inverse, factors.across, factors.solved
+    J = position.shape[1]
+    n, c = 3 * J, sweep.equations.entries.knot_count
+    size = len(gradient)
+    s = size - 3 * n - 2 * c
+    lengths = shared[len(shared) - len(bones) :]
+    length_offset = size - len(bones)
+    half = 0.0
+    if c and first == 0:
+        tie_knots(front, gradient, n, c, knots, 0, sweep)
+    own, beside = np.empty((n, n)), np.empty((size - n, n))
+    knot_own, knot_beside = np.empty((c, c)), np.empty((2 * n + c + s, c))
+    for time in range(first, last + 1):
+        while c and interval < of_time[time]:
+            k = interval - factors.first_interval
+            half += eliminate_knot(
+                front, gradient, n, c, knot_own, knot_beside, factors.knot_inverse[k],
+                factors.knot_across[k], factors.knot_solved[k],
+            )  # fmt: skip
+            interval += 1
+            tie_knots(front, gradient, n, c, knots, interval, sweep)
+        if time == last:
+            break
+        half += assemble(starts[time], starts[time + 1], sweep.equations, front, gradient)
+        add_motion(
+            position[time : time + 3], sweep.curvature[time], sweep.precision,
+            1.0 / (sweep.spread[time] * grown**2), sweep.hold, lengths, length_offset, front, gradient,
+        )  # fmt: skip
+        # All bones of a time at once with the first of its three, and those of the last times.
+        for offset in range(1 if time < len(position) - 3 else 3):
+            add_bones(
+                position[time + offset], bones, lengths, sweep.bone_sigma, grown, n * offset, length_offset,
+                front, gradient,
+            )  # fmt: skip
+        copy_block(front, 0, 0, own)
+        copy_block(front, n, 0, beside)
+        row = time - first
+        w = across[row]
+        less, part = eliminate_block(own, beside, gradient[:n], inverse[row], w, solved[row])
+        half += part
+        # The joints at the next two times move up; those of a third enter without any information.
+        for i in range(2 * n):
+            down = 0.0
+            for a in range(n):
+                down += w[i, a] * solved[row, a]
+            gradient[i] = gradient[n + i] + down
+            for j in range(i + 1):
+                front[i, j] = front[n + i, n + j] - less[i, j]
+        for i in range(2 * n, 3 * n):
+            gradient[i] = 0.0
+            for j in range(i + 1):
+                front[i, j] = 0.0
+        for i in range(3 * n, size):
+            down = 0.0
+            for a in range(n):
+                down += w[i - n, a] * solved[row, a]
+            gradient[i] += down
+            for j in range(2 * n):
+                front[i, j] = front[i, n + j] - less[i - n, j]
+            for j in range(2 * n, 3 * n):
+                front[i, j] = 0.0
+            for j in range(3 * n, i + 1):
+                front[i, j] -= less[i - n, j - n]
+    return interval, half
+
+
+@helper
+def eliminate_knot(
+    front: Float,
+    gradient: Float,
+    n: int,
+    c: int,
+    own: Float,
+    beside: Float,
+    inverse: Float,
+    across: Float,
+    solved: Float,
+) -> float:
+    """Eliminate the knot before; the knot after takes its place, and the next enters without information."""
+    size = len(gradient)
+    before, after = 3 * n, 3 * n + c
+    copy_block(front, before, before, own)
+    for i in range(c):
+        for j in range(2 * n):
+            beside[j, i] = front[before + i, j]
+        for j in range(after, size):
+            beside[2 * n + j - after, i] = front[j, before + i]
+    less, half = eliminate_block(own, beside, gradient[before:after], inverse, across, solved)
+    for i in range(2 * n):
+        for a in range(c):
+            gradient[i] += across[i, a] * solved[a]
+        for j in range(i + 1):
+            front[i, j] -= less[i, j]
+    for i in range(after, size):
+        row = 2 * n + i - after
+        down = 0.0
+        for a in range(c):
+            down += across[row, a] * solved[a]
+        gradient[i] += down
+        for j in range(2 * n):
+            front[i, j] -= less[row, j]
+        for j in range(after, i + 1):
+            front[i, j] -= less[row, 2 * n + j - after]
+    for i in range(c):
+        gradient[before + i] = gradient[after + i]
+        gradient[after + i] = 0.0
+        for j in range(3 * n):
+            front[before + i, j] = front[after + i, j]
+            front[after + i, j] = 0.0
+        for j in range(i + 1):
+            front[before + i, before + j] = front[after + i, after + j]
+        for j in range(c):
+            front[after + i, before + j] = 0.0
+        for j in range(i + 1):
+            front[after + i, after + j] = 0.0
+    for i in range(after + c, size):
+        for j in range(c):
+            front[i, before + j] = front[i, after + j]
+            front[i, after + j] = 0.0
+    return half
+
+
+@helper
+def tie_knots(
+    front: Float, gradient: Float, n: int, c: int, knots: Float, interval: int, sweep: Sweep
+) -> None:
+    """Add the prior of the change between the knot before and the knot after."""
+    before, after = 3 * n, 3 * n + c
+    for i in range(c):
+        kept, q = sweep.tie_kept[interval, i], sweep.tie_variance[interval, i]
+        change = knots[interval + 1, i] - kept * knots[interval, i]
+        front[before + i, before + i] += kept * kept / q
+        front[after + i, after + i] += 1 / q
+        front[after + i, before + i] -= kept / q
+        gradient[before + i] -= kept * change / q
+        gradient[after + i] += change / q
+
+
+@cached
+def backwards(
+    first: int,
+    last: int,
+    of_time: Int64,
+    interval: int,
+    factors: Factors,
+    position: Float,
+    knots: Float,
+    shared: Float,
+) -> int:
+    """Solve for joints [T, n] and knots [K, c] of a stretch from its end, in place; return the interval."""
+    inverse, across, solved = factors.inverse, factors.across, factors.solved
+    n, c = position.shape[1], knots.shape[1]
+    s = len(shared)
+    z, zk = np.empty(2 * n + 2 * c + s), np.empty(2 * n + c + s)
+    for i in range(s):
+        z[2 * n + 2 * c + i] = shared[i]
+        zk[2 * n + c + i] = shared[i]
+    rest_n, rest_c = np.empty(n), np.empty(c)
+    for time in range(last - 1, first - 2, -1):
+        # Solve knots eliminated after this time first; at the end, those before the stretch.
+        while c and interval > (of_time[time] if time >= first else factors.first_interval):
+            interval -= 1
+            follow_knot(time, interval, zk, rest_c, factors, position, knots)
+        if time < first:
+            break
+        row = time - first
+        for i in range(n):
+            z[i] = position[time + 1, i]
+            z[n + i] = position[time + 2, i]
+            rest_n[i] = solved[row, i]
+        for i in range(c):
+            z[2 * n + i] = knots[interval, i]
+            z[2 * n + c + i] = knots[interval + 1, i]
+        for j in range(len(z)):
+            for i in range(n):
+                rest_n[i] -= across[row, j, i] * z[j]
+        for i in range(n):
+            position[time, i] = 0.0
+        for j in range(n):
+            for i in range(j + 1):
+                position[time, i] += inverse[row, j, i] * rest_n[j]
+    return interval
+
+
+@helper
+def follow_knot(
+    time: int, interval: int, z: Float, rest: Float, factors: Factors, position: Float, knots: Float
+) -> None:
+    """Solve for a knot from the next knot and the joints at `time` + 1 and `time` + 2."""
+    n, c = position.shape[1], knots.shape[1]
+    row = interval - factors.first_interval
+    inverse, across, solved = factors.knot_inverse, factors.knot_across, factors.knot_solved
+    for i in range(n):
+        z[i] = position[time + 1, i]
+        z[n + i] = position[time + 2, i]
+    for i in range(c):
+        z[2 * n + i] = knots[interval + 1, i]
+        rest[i] = solved[row, i]
+    for j in range(len(z)):
+        for i in range(c):
+            rest[i] -= across[row, j, i] * z[j]
+    for i in range(c):
+        knots[interval, i] = 0.0
+    for j in range(c):
+        for i in range(j + 1):
+            knots[interval, i] += inverse[row, j, i] * rest[j]
+
+
+# --- covariances ---------------------------------------------------------------------------------------
+
+
+@helper
+def join(inverse: Float, across: Float, others: Float) -> tuple[Float, Float]:
+    """Compute the covariance of eliminated unknowns, and (negated) with the others, from the others'."""
+    gain = np.dot(across, inverse)  # [m, n]; x depends on the others by its negative, transposed
+    cross = np.dot(others, gain)  # [m, n], negative
+    own, more = np.dot(inverse.T, inverse), np.dot(gain.T, cross)
+    # Symmetrise, because asymmetric rounding errors would grow from step to step.
+    for i in range(len(own)):
+        for j in range(i + 1):
+            own[i, j] = own[i, j] + 0.5 * (more[i, j] + more[j, i])
+            own[j, i] = own[i, j]
+    return own, cross
+
+
+@cached
+def visit(
+    first: int,
+    last: int,
+    sweep: Sweep,
+    others: Float,
+    interval: int,
+    factors: Factors,
+    every: int,
+    covariance: Float,
+    sums: Moments,
+) -> tuple[Float, int]:
+    """Compute covariances of a stretch from its end, and sums for the levels.
+
+    `others` [m, m] is the covariance of the unknowns alive at the end. `covariance` [T, J, 3, 3] is filled
+    unless empty. Sums are made unless `every` is 0, over the
+    pictures of every `every`-th time. Returns the covariance of the unknowns alive at the beginning, and the
+    interval there.
+    """
+    equations, starts, of_time = sweep.equations, sweep.starts, sweep.of_time
+    knots, shared, white = equations.state.knots, equations.state.shared, equations.state.white
+    inverse, across, starting = factors.inverse, factors.across, sums.starting
+    J = equations.state.position.shape[1]
+    n, c = 3 * J, equations.entries.knot_count
+    m = len(others)
+    size = m + n
+    whole = np.empty((size, size))
+    alive = others.copy()
+    picture = linearised(J)
+    posterior = Posterior(
+        np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS)), np.empty((NUMBERS, NUMBERS)), np.empty(WHITE)
+    )
+    last_time = len(equations.t_s) - 3
+    if c and every and last == last_time + 1:
+        walk_of(alive, n, c, knots, sweep.knot_t_s, interval, sums.walked)
+    for time in range(last - 1, first - 2, -1):
+        # As in the forward pass; at the end, the knots before the stretch.
+        while c and interval > (of_time[time] if time >= first else factors.first_interval):
+            interval -= 1
+            row = interval - factors.first_interval
+            alive = before_knot(alive, n, c, factors.knot_inverse[row], factors.knot_across[row])
+            if every:
+                walk_of(alive, n, c, knots, sweep.knot_t_s, interval, sums.walked)
+        if time < first:
+            break
+        row = time - first
+        own, cross = join(inverse[row], across[row], alive)
+        for i in range(n):
+            for j in range(n):
+                whole[i, j] = own[i, j]
+        for i in range(m):
+            for j in range(n):
+                whole[n + i, j] = -cross[i, j]
+                whole[j, n + i] = -cross[i, j]
+            for j in range(m):
+                whole[n + i, n + j] = alive[i, j]
+        if len(covariance):
+            for k in range(3 if time == last_time else 1):
+                for joint in range(J):
+                    p = k * n + 3 * joint
+                    for a in range(3):
+                        for b in range(3):
+                            covariance[time + k, joint, a, b] = whole[
+                                k * n + 3 * joint + a, k * n + 3 * joint + b
+                            ]
+        if every:
+            acceleration_of(
+                whole, equations.state.position, sweep.curvature, sweep.spread, time, sums.acceleration
+            )
+            bones_of(whole, equations.state.position, shared, sweep.bones, time, sums.bones)
+            if time % every == 0:
+                for g in range(starts[time], starts[time + 1]):
+                    posterior_of_picture(g, equations, whole, picture, posterior)
+                    noise_of(picture, posterior, sums.image)
+                    row = equations.pictures.white_row[g]
+                    if row == equations.pictures.camera[g]:  # others have their own precision, not the level
+                        precision = equations.white_precision[row]
+                        white_of(white[g], precision, posterior.of_white, sums.white)
+            if time == 0:
+                for i in range(c):
+                    starting[i, 0] = knots[0, i] ** 2 + whole[3 * n + i, 3 * n + i]
+                    starting[i, 1] = whole[3 * n + i, 3 * n + i]
+                for i in range(len(shared)):
+                    p = 3 * n + 2 * c + i
+                    starting[c + i, 0] = shared[i] ** 2 + whole[p, p]
+                    starting[c + i, 1] = whole[p, p]
+        # The third of the joints' times was not alive before.
+        for i in range(m):
+            below = i if i < 2 * n else i + n
+            for j in range(2 * n):
+                alive[i, j] = whole[below, j]
+            for j in range(2 * n, m):
+                alive[i, j] = whole[below, n + j]
+    return alive, interval
+
+
+@helper
+def before_knot(alive: Float, n: int, c: int, inverse: Float, across: Float) -> Float:
+    """Compute the covariance of the unknowns alive before the elimination of a knot."""
+    m = len(alive)
+    place = np.empty(m - c, np.int64)  # those alive then: all but the knot after the next
+    for i in range(2 * n + c):
+        place[i] = i
+    for i in range(2 * n + 2 * c, m):
+        place[i - c] = i
+    beside = np.empty((m - c, m - c))
+    for i in range(m - c):
+        for j in range(m - c):
+            beside[i, j] = alive[place[i], place[j]]
+    own, cross = join(inverse, across, beside)
+    for i in range(2 * n, 2 * n + c):  # the knot before becomes the knot after
+        place[i] += c
+    joined = np.empty((m, m))
+    for i in range(m - c):
+        for j in range(m - c):
+            joined[place[i], place[j]] = beside[i, j]
+        for j in range(c):
+            joined[place[i], 2 * n + j] = -cross[i, j]
+            joined[2 * n + j, place[i]] = -cross[i, j]
+    for i in range(c):
+        for j in range(c):
+            joined[2 * n + i, 2 * n + j] = own[i, j]
+    return joined
+
+
+@helper
+def walk_of(
+    alive: Float, n: int, c: int, knots: Float, knot_t_s: Float, interval: int, walked: Float
+) -> None:
+    """Add the change of the slow errors between two knots, per second."""
+    elapsed = knot_t_s[interval + 1] - knot_t_s[interval]
+    for i in range(c):
+        p, q = 2 * n + i, 2 * n + c + i
+        variance = (alive[p, p] + alive[q, q] - 2 * alive[p, q]) / elapsed
+        change = knots[interval + 1, i] - knots[interval, i]
+        walked[i, 0] += change**2 / elapsed + variance
+        walked[i, 1] += 1
+        walked[i, 2] += variance
+
+
+@helper
+def acceleration_of(
+    whole: Float, position: Float, curvature: Float, spread: Float, time: int, sums: Float
+) -> None:
+    """Add posterior mean squares, and variances, of the accelerations between three times [2, J, J]."""
+    J = position.shape[1]
+    n = 3 * J
+    at = np.empty((J, 3))
+    for joint in range(J):
+        for a in range(3):
+            at[joint, a] = 0.0
+            for k in range(3):
+                at[joint, a] += curvature[time, k] * position[time + k, joint, a]
+    scale = 1.0 / (3 * spread[time])
+    for i in range(J):
+        for j in range(J):
+            total, variance = 0.0, 0.0
+            for a in range(3):
+                total += at[i, a] * at[j, a]
+            for k in range(3):
+                for m in range(3):
+                    both = curvature[time, k] * curvature[time, m]
+                    for a in range(3):
+                        variance += both * whole[k * n + 3 * i + a, m * n + 3 * j + a]
+            sums[0, i, j] += scale * (total + variance)
+            sums[1, i, j] += scale * variance
+
+
+@helper
+def bones_of(whole: Float, position: Float, shared: Float, bones: Int64, time: int, sums: Float) -> None:
+    """Add posterior mean squares [B] of the deviations of bones from their lengths at a time."""
+    B, size = len(bones), len(whole)
+    column, by = np.empty(7, np.int64), np.empty(7)
+    for b in range(B):
+        i, j = bones[b]
+        length = 0.0
+        for a in range(3):
+            by[3 + a] = position[time, j, a] - position[time, i, a]
+            length += by[3 + a] ** 2
+        length = np.sqrt(length)
+        for a in range(3):
+            by[3 + a] /= max(length, 1e-6)
+            by[a] = -by[3 + a]
+            column[a], column[3 + a] = 3 * i + a, 3 * j + a
+        by[6], column[6] = -1.0, size - B + b
+        total = (length - shared[len(shared) - B + b]) ** 2
+        for p in range(7):
+            for q in range(7):
+                total += by[p] * by[q] * whole[column[p], column[q]]
+        sums[b] += total
+
+
+@helper
+def noise_of(picture: Linearised, posterior: Posterior, sums: Float) -> None:
+    """Add a picture's contribution to image noise [J, 2]."""
+    residual, by_joint, by_number = picture.residual, picture.by_joint, picture.by_number
+    view_weight = picture.view_weight
+    of_joints, across, of_numbers = posterior.of_joints, posterior.across, posterior.of_numbers
+    for joint in range(len(view_weight)):
+        if view_weight[joint] == 0.0:
+            continue
+        for axis in range(2):
+            variance = 0.0
+            for i in range(3):
+                follows = 0.0
+                for j in range(3):
+                    follows += of_joints[joint, i, j] * by_joint[joint, axis, j]
+                for a in range(NUMBERS):
+                    follows += 2 * across[joint, i, a] * by_number[joint, axis, a]
+                variance += by_joint[joint, axis, i] * follows
+            for a in range(NUMBERS):
+                follows = 0.0
+                for b in range(NUMBERS):
+                    follows += of_numbers[a, b] * by_number[joint, axis, b]
+                variance += by_number[joint, axis, a] * follows
+            sums[joint, 0] += view_weight[joint] * residual[joint, axis] ** 2
+            sums[joint, 1] += view_weight[joint] * (1 - variance)
+
+
+@helper
+def white_of(white: Float, precision: Float, variance: Float, sums: Float) -> None:
+    """Add a picture's white error [6], with posterior `variance` [6], to the sums [2, 3] of its level."""
+    for i in range(WHITE):
+        if not np.isfinite(precision[i, i]):
+            continue
+        determined = 1 - variance[i] * precision[i, i]
+        part = i // 3
+        sums[part, 0] += white[i] ** 2 + variance[i]
+        sums[part, 1] += 1
+        sums[part, 2] += determined

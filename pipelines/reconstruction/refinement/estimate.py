@@ -24,11 +24,18 @@ from scipy.sparse.csgraph import connected_components
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import ROTATION, PoseErrors, Process
-from pipelines.reconstruction.refinement.elimination import Eliminated, eliminate, moments, step
+from pipelines.reconstruction.refinement.elimination import Eliminated, Moments, eliminate, moments, step
 from pipelines.reconstruction.refinement.kernels import State
-from pipelines.reconstruction.refinement.problem import REMEMBERED, Knowledge, Problem, lay_out
-from pipelines.reconstruction.refinement.sweeps import Moments
-from pipelines.reconstruction.refinement.system import System, loss, misfit, prior_cost
+from pipelines.reconstruction.refinement.system import (
+    REMEMBERED,
+    Knowledge,
+    Problem,
+    System,
+    lay_out,
+    loss,
+    misfit,
+    prior_cost,
+)
 
 BOUND = 3.5
 """Residual, in standard deviations, beyond which an image point's weight falls: one good view in 450."""
@@ -36,13 +43,11 @@ BOUND = 3.5
 
 # A step that moves joints by less than this changes no figure.
 _CONVERGED_M = 2e-4
-_BOUNDS = (20.0, 8.0, BOUND)
+BOUNDS = (20.0, 8.0, BOUND)
 # The linearisation in the body's size is not valid for a larger step.
 _MOST_GROWTH = 0.15
 # Of a step, no smaller share is tried; that is made even if it raises the cost.
 _LEAST = 0.01
-# An estimate fits its prior after so many rounds.
-_SETTLED = 3
 # The first bounds are so many times the usual residual of the start, because poses are not corrected yet.
 _WIDE = 4.0
 
@@ -53,7 +58,7 @@ def solve(
     state: State,
     *,
     rounds: int,
-    bounds: tuple[float, ...] = _BOUNDS,
+    bounds: tuple[float, ...] = BOUNDS,
     most_growth: float = np.inf,
 ) -> tuple[System, State, Eliminated]:
     """Solve by Gauss-Newton, with steps halved if the cost would rise and a robust bound that tightens.
@@ -124,7 +129,7 @@ def learn(
     """
     for index in range(rounds):
         if index == 0:
-            system, state, at = solve(problem, known, state, rounds=len(_BOUNDS))
+            system, state, at = solve(problem, known, state, rounds=len(BOUNDS))
         else:
             system, state, at = solve(
                 problem, known, state, rounds=1, bounds=(BOUND,), most_growth=_MOST_GROWTH
@@ -138,35 +143,6 @@ def learn(
             if not poses and tau > REMEMBERED:
                 break  # nothing is left to be learned
     return known, state
-
-
-def evidence(problem: Problem, known: Knowledge, state: State) -> float:
-    """Compute the log evidence of a prior given the pictures, up to a constant of the pictures.
-
-    Laplace's approximation around the estimate under the prior, at most three Gauss-Newton steps from
-    `state`. The pictures count as if only one in `known.memory` existed.
-    """
-    system, state, _ = solve(problem, known, state, rounds=_SETTLED, bounds=(BOUND,))
-    at = eliminate(system, state)
-    grown = system.grown(state)
-    times = len(problem.t_s)
-    value = -0.5 * cost(system, state) - at.log_determinant
-    seen = np.isfinite(problem.pictures.rays[..., 0]).sum()
-    value -= 2 * float(seen) / known.memory * np.log(known.pixel_scale)
-    # Motion and bones in units of the body's size, which has a flat prior.
-    _, log_determinant = np.linalg.slogdet(known.acceleration / known.size_m**2)
-    value -= 1.5 * (times - 2) * float(log_determinant)
-    value -= times * float(np.log(known.bone_sigma_m / known.size_m).sum())
-    value -= (state.position.size + len(problem.bones)) * float(np.log(known.size_m * grown))
-    there = np.isfinite(system.white_precision[:, 0, 0])
-    certainty = np.zeros(len(there))
-    certainty[there] = np.linalg.slogdet(system.white_precision[there])[1]
-    value += 0.5 * float(certainty[system.pictures.white_row].sum())
-    for (_, process), (at_knots, column) in zip(system.layout.processes, system.layout.place, strict=True):
-        value -= 3 * float(np.log(process.sigma0))
-        if at_knots:
-            value -= 0.5 * float(np.log(system.tie_variance[:, column : column + 3]).sum())
-    return float(value)
 
 
 def initial_state(problem: Problem, known: Knowledge, position: Float) -> State:

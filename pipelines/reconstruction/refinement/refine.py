@@ -27,24 +27,26 @@ from pipelines.reconstruction.refinement.elimination import (
 )
 from pipelines.reconstruction.refinement.estimate import (
     BOUND,
-    evidence,
+    BOUNDS,
     initial_state,
     learn,
     solve,
 )
 from pipelines.reconstruction.refinement.kernels import State, turned
-from pipelines.reconstruction.refinement.problem import (
+from pipelines.reconstruction.refinement.system import (
     REMEMBERED,
     Knowledge,
     Pictures,
     Problem,
     Sighting,
+    System,
     build,
+    misfit,
 )
-from pipelines.reconstruction.refinement.system import System, misfit
 
-_WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
-_LEARNING_ROUNDS, _FEWER_ROUNDS = 8, 3
+# The prior is learned from all of a flight of so many times, and from stretches of a longer one.
+_WHOLE_TIMES, _WINDOWS, _WINDOW = 400, 3, 100
+_LEARNING_ROUNDS = 8
 # Estimates converge in fewer rounds.
 _ROUNDS = 8
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a walking body, its limbs
@@ -61,16 +63,10 @@ SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
 # A prior that leaves more than so many times the image noise between neighbours is wrong.
 _UNEXPLAINED = 1.15
-_LEFT_BY_GIVEN = 2**0.5
-"""Factor on the image noise under estimated levels: twice the variance. Right levels leave less."""
 # Right flights are not so many standard deviations from their prior.
 _SIGMAS = 4.0
-# So many rounds show how well given levels explain the pictures.
+# Estimates under other levels converge in so many rounds.
 _SETTLING = 4
-# Other levels must exceed the log evidence of stated ones by this much.
-_STATED = 10.0
-# The same for each picture if errors change over time: between knots they count as white.
-_STATED_DRIFT = 0.5
 # Levels of constant errors settle in so many rounds.
 _LEVEL_ROUNDS = 3
 # Constant errors have this share of the usual level where the pictures let the scene grow.
@@ -101,10 +97,7 @@ a million times.
 """
 _DETERMINED_PLACE = 0.7
 """Share of a triangulated point's error by slow pose errors; above it, pictures do not determine a place."""
-# Stated levels are tried after refused ones if their log evidence is at most this much lower per picture.
-_REFUSED = 0.5
-_UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; "
-_INSTEAD = {"estimated": "it was estimated instead", "exact": "the poses were taken as they are"}
+_UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; it was estimated instead"
 PLACED_AS_LOGGED = (
     "refined: the videos do not determine the person's absolute position; it is taken from the logged poses "
     "(state pose_noise to change this)"
@@ -144,8 +137,7 @@ def refine(
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
     *,
-    contested: bool = True,
-    threads: int = 1,
+    measured: bool = False,
 ) -> Refined:
     """Estimate a skeleton, its cameras' pose errors and clocks together (maximum a posteriori).
 
@@ -156,8 +148,8 @@ def refine(
         bones: [B, 2] pairs of joints with a nearly constant distance; without any, the first two joints.
         prior: prior of each camera's pose errors; None without stated noise.
         clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
-        contested: False if the prior was measured, and no other level of pose errors competes with it.
-        threads: at most two are used, one for each half of the flight; the result does not depend on it.
+        measured: True if the prior was measured. If another one does not explain the pictures, the levels are
+            estimated.
     """
     part = _participating(start)
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
@@ -167,18 +159,14 @@ def refine(
         tuple(_of_joints(sighting, part) for sighting in sightings),
         _renumbered(bones, part),
         _without_gaps(t_s, start[:, part]),
-        threads,
     )
     del sightings  # a clock's offset and the choice of joints made copies
     refused = None
     try:
         stretches, filled = views.stretches()
-        if prior is None or contested:
-            priors = _priors(stretches, filled, prior, clock_sigma_s)
-        else:
-            priors = _measured_prior(stretches, filled, prior, clock_sigma_s)
+        priors = _priors(stretches, filled, prior, clock_sigma_s, measured=measured)
         for found in priors:
-            refined = _refined(views, found, measured=not contested)
+            refined = _refined(views, found, measured=measured)
             refined = replace(
                 refined,
                 position=_of_all_joints(refined.position, part),
@@ -200,16 +188,15 @@ class _RefinementInput:
     sightings: tuple[Sighting, ...]
     bones: Int64  # [B, 2]
     start: Float  # [T, J, 3] m, without gaps
-    threads: int
 
     def problem(self) -> Problem:
         """Build the problem of the whole flight."""
-        return build(self.t_s, self.sightings, self.bones, threads=self.threads)
+        return build(self.t_s, self.sightings, self.bones)
 
     def stretches(self) -> tuple[Problem, Float]:
         """Build that of the stretches from which the prior is learned, and take their start [T', J, 3]."""
         chosen = _stretches(len(self.t_s))
-        problem = build(self.t_s[chosen], self.sightings, self.bones, threads=self.threads)
+        problem = build(self.t_s[chosen], self.sightings, self.bones)
         return problem, self.start[chosen]
 
 
@@ -218,6 +205,7 @@ class _Prior:
     """Candidate parameters of the prior."""
 
     known: Knowledge
+    state: State  # of the stretches with them
     learned: bool  # the levels of pose errors were not stated
     warnings: tuple[str, ...]
     expected_m: float  # largest allowed move of the skeleton
@@ -233,11 +221,14 @@ def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refin
         LinAlgError: its equations are singular.
     """
     known, problem = prior.known, views.problem()
-    state = initial_state(problem, known, views.start)
+    whole = len(prior.state.position) == len(problem.t_s)
+    state = prior.state if whole else initial_state(problem, known, views.start)
     clock_s, clock_left_s = _clocks(problem, known, state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)
-    system, state, at = solve(problem, known, state, rounds=_ROUNDS)
+        state, whole = initial_state(problem, known, state.position), False
+    bounds = (BOUND,) if whole else BOUNDS
+    system, state, at = solve(problem, known, state, rounds=_ROUNDS, bounds=bounds)
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
     as_stated = not prior.learned and _scale_unseen(system, state, at)
@@ -402,83 +393,47 @@ def _priors(
     start: Float,
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
+    *,
+    measured: bool,
 ) -> Iterator[_Prior]:
     """Yield parameters of the prior from stretches of the flight, then alternatives if a check refuses them.
-
-    Estimated levels of pose errors, exact poses, and stated levels compete by their evidence. If the checks
-    refuse estimated levels, the stated ones are tried, provided that their evidence is only a little lower:
-    learning can diverge in the scale, which pictures determine worst.
 
     Raises:
         LinAlgError: none of them explains the pictures.
     """
     cameras = len(clock_sigma_s)
-    guess, image, disagreement_m, range_m = _first_guess(problem, start)
-    stated_m = 0.0 if prior is None else float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
-    spread = _spread_of(cameras)
+    guess, image, disagreement_m, _ = _first_guess(problem, start)
+    if prior is not None:
+        for known in _known_prior(problem, start, prior, clock_sigma_s):
+            if measured or known.known.memory > REMEMBERED or known.known.pixel_scale < _UNEXPLAINED * image:
+                yield known
+        if measured:
+            return
     unlearned = _unlearned(problem, start, (guess,) * cameras, clock_sigma_s)
     state = initial_state(problem, unlearned, start)
     free, state = learn(problem, unlearned, state, poses=True, memory=True, rounds=_LEARNING_ROUNDS)
-    if prior is None and free.memory >= _UNINFORMATIVE_MEMORY:
+    if free.memory >= _UNINFORMATIVE_MEMORY:
         # Keypoints determine no levels of lasting errors, which are possible all the same.
         position, rotation = UNKNOWN_SIGMA
         lasting = (Process(SHIFT_IN_WORLD, position), Process(ROTATION, rotation))
         usual = PoseErrors(guess.white, lasting, assumed=True)
-        for possible in _measured_prior(problem, start, [usual] * cameras, clock_sigma_s):
+        for possible in _known_prior(problem, start, [usual] * cameras, clock_sigma_s):
             # Two views disagree across one line only, which says too little without a background.
             yield replace(possible, learned=possible.learned or cameras == 2)
         return
-    # The alternatives use the same motion, bones and image noise: from round to round, learning these changes
-    # the evidence by more than the differences between right levels.
-    found = {}
-    if free.memory < _UNINFORMATIVE_MEMORY:
-        found["estimated"] = (evidence(problem, free, state), free, state)
-    exact = (PoseErrors((0.0, 0.0), ()),) * cameras
-    others = {} if prior is None else {"stated": tuple(prior)}
-    if exact not in others.values():
-        others["exact"] = exact
-    for name, poses in others.items():
-        known = replace(free, poses=poses)
-        try:
-            _, settled, _ = solve(
-                problem, known, initial_state(problem, known, state.position), rounds=_SETTLING
-            )
-            found[name] = (evidence(problem, known, settled), known, settled)
-        except np.linalg.LinAlgError:
-            continue
-    if not found:
-        raise np.linalg.LinAlgError("the equations are singular whatever the pose noise")
-    # Stated levels are replaced only for a clear difference of evidence.
-    reason = {"stated": _evidence_margin(problem, prior, correlated=free.memory > REMEMBERED)}
-    best = max(found, key=lambda name: found[name][0] + reason.get(name, 0.0))
-    tried = [best]
-    if best == "estimated" and "stated" in found:
-        behind = found[best][0] - found["stated"][0]
-        if behind < _STATED + _REFUSED * len(problem.pictures.first):
-            tried.append("stated")
-    for name in tried:
-        _, known, state = found[name]
-        if name != "estimated":
-            known, state = learn(problem, known, state, poses=False, memory=False, rounds=_FEWER_ROUNDS)
-        most = min(_UNEXPLAINED * image, _LEFT_BY_GIVEN * free.pixel_scale)
-        if known.memory < REMEMBERED and known.pixel_scale > most:
-            raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
-        of_stated = (_FARTHEST_STATED if name == best else _FARTHEST) * stated_m if name == "stated" else 0.0
-        yield _Prior(
-            known,
-            learned=name != "stated",
-            warnings=(_UNLIKE_STATED + _INSTEAD[name],) if "stated" in others and name != "stated" else (),
-            expected_m=spread * max(_FARTHEST * disagreement_m, of_stated),
-        )
+    if free.memory < REMEMBERED and free.pixel_scale > _UNEXPLAINED * image:
+        raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
+    warnings = () if prior is None else (_UNLIKE_STATED,)
+    yield _Prior(free, state, True, warnings, _spread_of(cameras) * _FARTHEST * disagreement_m)
 
 
-def _measured_prior(
+def _known_prior(
     problem: Problem,
     start: Float,
     prior: Sequence[PoseErrors],
     clock_sigma_s: Float,
 ) -> Iterator[_Prior]:
-    """Yield the prior with measured pose errors; motion, bones and keypoint noise are learned beside them.
+    """Yield the prior with known pose errors; motion, bones and keypoint noise are learned beside them.
 
     Constant errors that are only assumed have estimated levels, then usual ones. If a check refuses both,
     they are held as logged: motion, bones and what changes in the poses are estimated all the same.
@@ -500,13 +455,13 @@ def _measured_prior(
     measured_m = float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     expected_m = _spread_of(len(prior)) * max(_FARTHEST * disagreement_m, _FARTHEST_STATED * measured_m)
     for number, level in enumerate(levels, 1):
-        yield _Prior(level, learned=number < len(levels), warnings=(), expected_m=expected_m)
+        yield _Prior(level, state, number < len(levels), (), expected_m)
     if any(errors.assumed for errors in prior):
         levels_held = {kind: _HELD * sigma for kind, sigma in _usual_levels(guessed).items()}
         held = _of_levels(known, levels_held)
         ray_m = _ray_sigma_m(PoseErrors(USUAL_CONSTANT, ()), range_m)
         held_m = _spread_of(len(prior)) * ray_m / float(np.sqrt(3))
-        yield _Prior(held, learned=False, warnings=(), expected_m=expected_m, held_m=held_m)
+        yield _Prior(held, state, False, (), expected_m, held_m)
 
 
 def _usual_levels(guessed: Mapping[int, float]) -> dict[int, float]:
@@ -575,18 +530,9 @@ def _of_level(errors: PoseErrors, level: Mapping[int, float]) -> PoseErrors:
     return replace(errors, processes=tuple(processes))
 
 
-def _evidence_margin(problem: Problem, stated: Sequence[PoseErrors] | None, *, correlated: bool) -> float:
-    """Compute the margin by which the evidence of other levels must exceed that of the stated ones.
-
-    With correlated keypoint errors the margin is larger, because keypoints then count little in the evidence.
-    """
-    changes = any(not process.constant for errors in stated or () for process in errors.processes)
-    return _STATED + (_STATED_DRIFT * len(problem.pictures.first) if changes or correlated else 0.0)
-
-
 def _stretches(times: int) -> Int64:
     """Choose the times from which the prior is learned: all of a short flight, else stretches over it."""
-    if times <= _WINDOWS * _WINDOW:
+    if times <= _WHOLE_TIMES:
         return np.arange(times)
     begins = np.linspace(0, times - _WINDOW, _WINDOWS).astype(np.int64)
     return (begins[:, None] + np.arange(_WINDOW)).ravel()
