@@ -287,12 +287,9 @@ class _FlightReader:
                 self._take_note(f"{name}: {numbers}")
             detections = within(detections, frames)
             if not len(detections.frame):
-                raise DataError(
-                    self._flight_path,
-                    f"cameras.{name}: no frame of its keypoints is one of its pictures",
-                    "check first_frame and frame_times",
-                    code="no-overlap",
-                )
+                problem = f"cameras.{name}: no frame of its keypoints is one of its pictures"
+                remedy = "check first_frame and frame_times"
+                raise DataError(self._flight_path, problem, remedy, code="no-overlap")
             detections, repeats = without_repeats(detections, frames)
             for repeat in repeats:
                 self._take_note(f"{name} {repeat}: they are left out")
@@ -460,12 +457,11 @@ class _FlightReader:
     def _refuse_later_map(self, log: str, from_ns: int, entries: Mapping[str, CameraEntry]) -> None:
         first, last = span_of_pictures(entries)
         if from_ns > last:
-            raise DataError(
-                f"{self._flight_path}: map.file {log}",
-                f"has its first map at {from_ns / 1e9:.3f} s, after the pictures ({span_words(first, last)})",
-                "check its clock, or take `stamps: receive`",
-                code="no-overlap",
+            problem = (
+                f"has its first map at {from_ns / 1e9:.3f} s, after the pictures ({span_words(first, last)})"
             )
+            remedy = "check its clock, or take `stamps: receive`"
+            raise DataError(f"{self._flight_path}: map.file {log}", problem, remedy, code="no-overlap")
 
     @property
     def map_doubts(self) -> list[Doubt]:
@@ -531,12 +527,9 @@ def _refuse_unsound(flight_path: Path, description: Description) -> None:
     parts |= {f"{name}: plan": sent.dropped for name, sent in (description.plan or {}).items()}
     lost = [f"{part}: {losses(dropped)}" for part, dropped in parts.items() if dropped]
     if lost:
-        raise DataError(
-            flight_path,
-            f"is not whole, and --strict was given ({'; '.join(lost)})",
-            "copy what is damaged again, or ingest without --strict",
-            code="losses",
-        )
+        problem = f"is not whole, and --strict was given ({'; '.join(lost)})"
+        remedy = "copy what is damaged again, or ingest without --strict"
+        raise DataError(flight_path, problem, remedy, code="losses")
     for doubt in description.doubts:
         raise DataError(flight_path, f"is doubted: {doubt.what} ({doubt.code})", doubt.remedy, code="doubted")
 
@@ -545,12 +538,9 @@ def _refuse_ways_out(flight: Manifest, path: Path) -> None:
     """Refuse relative paths out of the manifest's folder: a flight that was sent reads its own files."""
     ways_out = [stated for stated in flight.files if leads_out(stated)]
     if ways_out:
-        raise DataError(
-            path,
-            f"leads out of its folder ({', '.join(ways_out)})",
-            "write such paths in full, from the root on, or put the files beside the manifest",
-            code="outside-folder",
-        )
+        problem = f"leads out of its folder ({', '.join(ways_out)})"
+        remedy = "write such paths in full, from the root on, or put the files beside the manifest"
+        raise DataError(path, problem, remedy, code="outside-folder")
 
 
 def _refuse_other_flight(target: Path, flight: Manifest, overwrite: bool) -> None:
@@ -562,12 +552,9 @@ def _refuse_other_flight(target: Path, flight: Manifest, overwrite: bool) -> Non
     except DataError:
         return  # a damaged session is written again
     if held != flight.name:
-        raise DataError(
-            target,
-            f"holds the flight {held!r}, not {flight.name!r}",
-            "choose another place with --output, or replace it with --overwrite",
-            code="exists",
-        )
+        problem = f"holds the flight {held!r}, not {flight.name!r}"
+        remedy = "choose another place with --output, or replace it with --overwrite"
+        raise DataError(target, problem, remedy, code="exists")
 
 
 def _counts(entries: Mapping[str, CameraEntry]) -> dict[str, object]:
@@ -589,13 +576,12 @@ def _check_overlap(flight_path: Path, entries: Mapping[str, CameraEntry]) -> Non
             # The smaller side is the odd one out.
             late = 2 * place >= len(ordered)
             odd, rest = (ordered[place:], ordered[:place]) if late else (ordered[:place], ordered[place:])
-            raise DataError(
-                flight_path,
+            problem = (
                 f"cameras.{', '.join(odd)}: frames ({_span_of(odd, entries)}) overlap in time with no other"
-                f" camera's ({_span_of(rest, entries)})",
-                "check frame_times.start and clock.offset_s",
-                code="no-overlap",
+                f" camera's ({_span_of(rest, entries)})"
             )
+            remedy = "check frame_times.start and clock.offset_s"
+            raise DataError(flight_path, problem, remedy, code="no-overlap")
         reached_ns = max(reached_ns, frames.last_t_ns)
 
 

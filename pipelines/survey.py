@@ -164,13 +164,12 @@ def _of_yaml(path: Path) -> Survey:
     title, most = max(known.items(), key=lambda each: each[1])
     if list(known.values()).count(most) > 1:  # `schema` and `name` are keys of several kinds
         like = describe_unknown(path)
-        raise DataError(
-            path,
-            like.problem,
+        problem = like.problem
+        remedy = (
             like.remedy
-            or "flight manifests have `cameras:`, scenarios `drones:`, planner settings keys like `w_obs:`",
-            code="wrong-kind",
+            or "flight manifests have `cameras:`, scenarios `drones:`, planner settings keys like `w_obs:`"
         )
+        raise DataError(path, problem, remedy, code="wrong-kind")
     return Survey(path, title, kinds[title][1](path))
 
 

@@ -135,19 +135,15 @@ class FlightCameras:
                 return self._frames_by_stamps(triggered, {}, pictures)
             return self._frames_of_file(self._files.path(times.file), pictures)
         if pictures is None:
-            raise DataError(
-                self._manifest,
-                f"cameras.{name}: nothing says when its frames were taken",
-                "write frame_times: {start: SECONDS, fps: 30}",
-                code="clock-unknown",
-            )
+            problem = f"cameras.{name}: nothing says when its frames were taken"
+            remedy = "write frame_times: {start: SECONDS, fps: 30}"
+            raise DataError(self._manifest, problem, remedy, code="clock-unknown")
         if video is not None and video.codec == UNTIMED:
-            raise DataError(
-                self._manifest,
-                f"cameras.{name}: its pictures have no times of their own that rise from one to the next",
-                "write frame_times: {start: SECONDS, fps: 30}, or give a csv",
-                code="clock-unknown",
+            problem = (
+                f"cameras.{name}: its pictures have no times of their own that rise from one to the next"
             )
+            remedy = "write frame_times: {start: SECONDS, fps: 30}, or give a csv"
+            raise DataError(self._manifest, problem, remedy, code="clock-unknown")
         for line in video.notes if video is not None else ():
             self._note(f"{name}: {line}")
         if video is not None and video.codec == SHARED_SECONDS and camera.clock is None:
@@ -159,30 +155,20 @@ class FlightCameras:
             return replace(pictures, t_ns=self._start_ns(name, camera, times) + pictures.pts_ns)
         if times.has_start or times.start_from == "container":
             key = "start" if times.has_start else "start_from"
-            raise DataError(
-                self._manifest,
-                f"cameras.{name}.frame_times: {key} has no use, the log stamps its pictures",
-                "leave it out, or correct the log's clock with logs: {...: {clock: ...}}",
-                code="stated-twice",
-            )
+            problem = f"cameras.{name}.frame_times: {key} has no use, the log stamps its pictures"
+            remedy = "leave it out, or correct the log's clock with logs: {...: {clock: ...}}"
+            raise DataError(self._manifest, problem, remedy, code="stated-twice")
         return pictures
 
     def _listed_frames(self, camera: CameraSources, detections: Detections | None) -> int:
         if detections is None or camera.keypoints is None:
-            raise DataError(
-                self._manifest,
-                "a camera without video and keypoints has no frames",
-                "give it one of them",
-                code="no-pictures",
-            )
+            problem = "a camera without video and keypoints has no frames"
+            raise DataError(self._manifest, problem, "give it one of them", code="no-pictures")
         count = int(detections.frames_listed[-1]) + 1
         if count > MAX_FRAMES:
-            raise DataError(
-                self._files.path(camera.keypoints.file),
-                f"numbers its frames up to {count - 1}",
-                "say with first_frame which number the first frame bears",
-                code="bad-value",
-            )
+            problem = f"numbers its frames up to {count - 1}"
+            remedy = "say with first_frame which number the first frame bears"
+            raise DataError(self._files.path(camera.keypoints.file), problem, remedy, code="bad-value")
         return count
 
     def _frames_of_file(self, path: Path, pictures: CameraFrames | None) -> CameraFrames:
@@ -192,12 +178,8 @@ class FlightCameras:
             return CameraFrames(stamps.frame, stamps.t_ns, since_start, dropped=stamps.dropped)
         t_ns, known = times_of_frames(stamps, pictures.pts_ns)
         if not known.any():
-            raise DataError(
-                path,
-                "has a time for none of the pictures",
-                "check that they belong together",
-                code="clock-unknown",
-            )
+            problem = "has a time for none of the pictures"
+            raise DataError(path, problem, "check that they belong together", code="clock-unknown")
         lost = Counter(pictures.dropped) + Counter(stamps.dropped)
         lost["without a time"] += int((~known).sum())
         return replace(
@@ -217,12 +199,9 @@ class FlightCameras:
         path = self._files.video_file(camera)
         made_ns = _made_ns(path) if path is not None else None
         if made_ns is None:
-            raise DataError(
-                path or self._manifest,
-                "does not say when it was made",
-                f"write frame_times: {{start: SECONDS}} for camera {name}",
-                code="clock-unknown",
-            )
+            problem = "does not say when it was made"
+            remedy = f"write frame_times: {{start: SECONDS}} for camera {name}"
+            raise DataError(path or self._manifest, problem, remedy, code="clock-unknown")
         if camera.clock is None and path is not None and not path.is_dir():
             self._note(
                 f"{name}: its video says that it was made at {made_ns / 1e9:.0f} s, to a second at best:"
@@ -393,21 +372,16 @@ def _with_size(intrinsics: Intrinsics, size: tuple[int, int] | None, source: Pat
         DataError: the size of the pictures is not known, or their middle is far from the principal point.
     """
     if size is None:
-        raise DataError(
-            source,
-            "states no picture size, and no video does",
-            "add the size to the calibration",
-            code="wrong-size",
-        )
+        problem = "states no picture size, and no video does"
+        raise DataError(source, problem, "add the size to the calibration", code="wrong-size")
     offset = np.abs(np.divide((2 * intrinsics.cx + 1, 2 * intrinsics.cy + 1), size) - 1)
     if offset.max() > MAX_CENTRE_OFFSET:
-        raise DataError(
-            source,
+        problem = (
             f"has its principal point at {intrinsics.cx:.0f}, {intrinsics.cy:.0f} px, which is not the middle"
-            f" of pictures of {size[0]} x {size[1]} px",
-            "give the calibration of these pictures, or the size of its own",
-            code="wrong-size",
+            f" of pictures of {size[0]} x {size[1]} px"
         )
+        remedy = "give the calibration of these pictures, or the size of its own"
+        raise DataError(source, problem, remedy, code="wrong-size")
     return replace(intrinsics, width=size[0], height=size[1])
 
 
@@ -444,11 +418,10 @@ def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: De
     share_beyond, share_outside = (float(np.average(which, weights=weight)) for which in (beyond, outside))
     if share_beyond > MAX_SHARE_BEYOND or share_outside > MAX_SHARE_OUTSIDE:
         (left, top), (right, bottom) = np.percentile(xy[outside], [1, 99], axis=0)
-        raise DataError(
-            place,
+        problem = (
             f"is for {intrinsics.width}x{intrinsics.height} pictures, but {share_outside:.0%} of the"
             f" keypoints lie outside (those from x = {left:.0f}, y = {top:.0f} to x = {right:.0f},"
-            f" y = {bottom:.0f})",
-            "give the calibration of these pictures, or their size with keypoints: {image_size: [W, H]}",
-            code="wrong-size",
+            f" y = {bottom:.0f})"
         )
+        remedy = "give the calibration of these pictures, or their size with keypoints: {image_size: [W, H]}"
+        raise DataError(place, problem, remedy, code="wrong-size")

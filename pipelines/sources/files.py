@@ -108,12 +108,9 @@ class FlightFiles:
                 continue
             self.options(part, source, YamlModel, place)
             if source.topic is not None and not self.is_log(part, source):
-                raise DataError(
-                    f"{self._manifest}: {place}",
-                    f"has a topic, and {source.file} is no log ({self.format_of(part, source).title})",
-                    "leave the topic out, or name the log",
-                    code="wrong-option",
-                )
+                problem = f"has a topic, and {source.file} is no log ({self.format_of(part, source).title})"
+                remedy = "leave the topic out, or name the log"
+                raise DataError(f"{self._manifest}: {place}", problem, remedy, code="wrong-option")
 
     def keypoints(self, source: KeypointSource) -> tuple[Detections, str]:
         """Read the keypoints that the manifest gives for a camera; return them with their format's name."""
@@ -125,12 +122,9 @@ class FlightFiles:
         skeleton = self.options("keypoints", source, DetectorOutput).skeleton
         detections = reader.read_keypoints(path, skeleton=skeleton, first_frame=source.first_frame)
         if not len(detections.frame):
-            raise DataError(
-                path,
-                "holds no keypoints",
-                "run the detector again, or leave the camera out",
-                code="no-keypoints",
-            )
+            problem = "holds no keypoints"
+            remedy = "run the detector again, or leave the camera out"
+            raise DataError(path, problem, remedy, code="no-keypoints")
         if source.image_size:
             detections = replace(detections, image_size=(source.image_size[0], source.image_size[1]))
         return detections, reader.name
@@ -159,12 +153,9 @@ class FlightFiles:
             return next(iter(cameras.values()))
         if (camera or name) not in cameras:
             listed = ", ".join(sorted(cameras)[:20])
-            raise DataError(
-                self.path(path),
-                f"holds no camera {camera or name!r} (there are {listed})",
-                "say which with {file: ..., camera: ...}",
-                code="no-such-name",
-            )
+            problem = f"holds no camera {camera or name!r} (there are {listed})"
+            remedy = "say which with {file: ..., camera: ...}"
+            raise DataError(self.path(path), problem, remedy, code="no-such-name")
         return cameras[camera or name]
 
     def true_joints(self, source: TruthSource) -> JointMotion:
@@ -177,12 +168,8 @@ class FlightFiles:
         reader = recognise(path, JointFormat, "file of true joints", name=source.format)
         own_axes = source.axes is not None or source.up is not None
         if not own_axes and self._flight.world.frame == "ned":
-            raise DataError(
-                path,
-                "has joints of unknown axes in a NED world",
-                "say truth: {axes: ned}, or up: z",
-                code="axes-unknown",
-            )
+            problem = "has joints of unknown axes in a NED world"
+            raise DataError(path, problem, "say truth: {axes: ned}, or up: z", code="axes-unknown")
         as_written = own_axes or self._flight.world.up not in {None, "z"}
         axes = "z-up" if as_written else None
         motion = reader.read_joints(path, unit=source.unit, axes=axes)
@@ -218,12 +205,10 @@ class FlightFiles:
             other = _of_subject(path, reader.read_joints(path, unit=unit, axes=axes), source.subject)
             other_m = _body_size_m(_without_zeros(other))
             if low_m <= other_m <= high_m:
-                raise DataError(
-                    path,
-                    f"holds people of {size_m:.1f} m by its unit, and of {other_m:.2g} m if it is {unit}",
-                    f"say truth: {{unit: {unit}}}",
-                    code="unit-unknown",
+                problem = (
+                    f"holds people of {size_m:.1f} m by its unit, and of {other_m:.2g} m if it is {unit}"
                 )
+                raise DataError(path, problem, f"say truth: {{unit: {unit}}}", code="unit-unknown")
 
 
 def _of_subject(path: Path, motion: JointMotion, subject: str | None) -> JointMotion:
@@ -343,12 +328,9 @@ def refuse_written(flight: Manifest, base: Path, stamps: Mapping[str, str]) -> N
     """
     for path, stamp in source_stamps(flight, base).items():
         if stamp != stamps[path]:
-            raise DataError(
-                named(base, path),
-                "was written to while it was being read",
-                "run `mocap ingest` again when it is complete",
-                code="changed",
-            )
+            problem = "was written to while it was being read"
+            remedy = "run `mocap ingest` again when it is complete"
+            raise DataError(named(base, path), problem, remedy, code="changed")
 
 
 def _hash_of(path: Path) -> str:

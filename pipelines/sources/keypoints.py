@@ -45,13 +45,12 @@ def in_pixels(detections: Detections, intrinsics: Intrinsics, source: str) -> De
     if not len(known) or np.abs(known).max() > _MAX_SHARE:
         return detections
     if (known < 0).mean() > _MAX_NEGATIVE_SHARE:
-        raise DataError(
-            source,
+        problem = (
             f"has keypoints from {known.min():.3g} to {known.max():.3g}, which are no pixels: they seem to"
-            " count from the middle of the picture, in halves of its sides or of its width",
-            "write them in pixels from the top left",
-            code="keypoints-normalised",
+            " count from the middle of the picture, in halves of its sides or of its width"
         )
+        remedy = "write them in pixels from the top left"
+        raise DataError(source, problem, remedy, code="keypoints-normalised")
     xy = detections.xy * [intrinsics.width, intrinsics.height] - 0.5
     number = int(np.isfinite(xy[..., 0]).sum())
     adjusted = {"keypoints from shares of the picture (0 to 1) to pixels": number}

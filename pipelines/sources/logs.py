@@ -123,12 +123,8 @@ class FlightLog:
             raise DataError(self.source, problem, remedy, code="no-such-topic")
         if len(there) != 1:
             problem = f"has {len(there)} topics with {noun} ({listed})"
-            raise DataError(
-                self.source,
-                problem,
-                "say which with `topic:`" if there else "name another log",
-                code="ambiguous",
-            )
+            remedy = "say which with `topic:`" if there else "name another log"
+            raise DataError(self.source, problem, remedy, code="ambiguous")
         self.note(f"{self.source}: took {noun} from {there[0]}, the only candidate")
         return there[0]
 
@@ -312,22 +308,16 @@ class FlightLogs:
                 if sample.intrinsics is not None:
                     found.setdefault(sample.intrinsics, sample.note)
                 if len(found) > 1:
-                    raise DataError(
-                        source,
-                        f"{name} changes during the flight (zoom?)",
-                        "give one calibration in a file or inline",
-                        code="no-intrinsics",
-                    )
+                    problem = f"{name} changes during the flight (zoom?)"
+                    remedy = "give one calibration in a file or inline"
+                    raise DataError(source, problem, remedy, code="no-intrinsics")
             for note in filter(None, found.values()):
                 opened.note(f"{source}: {note}")
         if not found:
             problem = f"{name}: the camera is not calibrated (K is 0 in {count} messages)"
-            raise DataError(
-                source,
-                problem if count else f"{name} is empty",
-                "calibrate it, name another topic, or give a calibration file under `intrinsics`",
-                code="no-intrinsics" if count else "empty",
-            )
+            problem = problem if count else f"{name} is empty"
+            remedy = "calibrate it, name another topic, or give a calibration file under `intrinsics`"
+            raise DataError(source, problem, remedy, code="no-intrinsics" if count else "empty")
         return next(iter(found))
 
     def frames(self, log: str, topic: str | None) -> Frames:

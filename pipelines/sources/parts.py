@@ -154,13 +154,12 @@ def _poses_entry(
         without_pose = int(np.isnan(position[:, 0]).sum())
         if without_pose == len(frames_t_ns):
             frames, poses = (span_words(*t_ns[[0, -1]]) for t_ns in (frames_t_ns, trajectory.t_ns))
-            raise DataError(
-                named(base, pose.file),
+            problem = (
                 f"has a pose for none of the {without_pose} frames of camera {name}: frames span {frames},"
-                f" poses {poses} at {_rate(trajectory.t_ns) or 0:.3g} Hz",
-                "check clocks and units, or raise --max-pose-gap",
-                code="no-poses",
+                f" poses {poses} at {_rate(trajectory.t_ns) or 0:.3g} Hz"
             )
+            remedy = "check clocks and units, or raise --max-pose-gap"
+            raise DataError(named(base, pose.file), problem, remedy, code="no-poses")
         if without_pose:
             note(
                 f"{name}: {without_pose} of {len(frames_t_ns)} frames have no pose (no logged pose within"
@@ -271,9 +270,5 @@ def refuse_no_overlap(source: Path | str, t_ns: Int64, entries: Mapping[str, Cam
     """
     first, last = span_of_pictures(entries)
     if t_ns[0] > last or t_ns[-1] < first:
-        raise DataError(
-            source,
-            f"spans {span_words(t_ns[0], t_ns[-1])}, the pictures {span_words(first, last)}",
-            "check its time base: stamps are world times",
-            code="no-overlap",
-        )
+        problem = f"spans {span_words(t_ns[0], t_ns[-1])}, the pictures {span_words(first, last)}"
+        raise DataError(source, problem, "check its time base: stamps are world times", code="no-overlap")

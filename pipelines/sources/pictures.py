@@ -73,12 +73,9 @@ def refuse_changed_pictures(session: Path, description: Description, cameras: It
                 continue
             stamp = file_stamp(path)
             if stamp != noted.get(source) and _content(path, stamp) != description.sources.get(source):
-                raise DataError(
-                    path,
-                    f"does not hold the pictures of {camera} that were ingested (other SHA-256)",
-                    "run `mocap ingest` again, or put back the file that was ingested",
-                    code="changed",
-                )
+                problem = f"does not hold the pictures of {camera} that were ingested (other SHA-256)"
+                remedy = "run `mocap ingest` again, or put back the file that was ingested"
+                raise DataError(path, problem, remedy, code="changed")
 
 
 @cache
@@ -137,12 +134,9 @@ class LoggedPictures:
         """Refuse a topic with an unknown encoding at once, because all its pictures share the encoding."""
         first = next(self._begin(), None)
         if first is not None and not is_known(first):
-            raise DataError(
-                self._source,
-                f"the pictures of {self._topic} are encoded as {first.encoding!r}, which is not known",
-                f"convert them to one of {', '.join(KNOWN)}, or give the camera a video",
-                code="unsupported",
-            )
+            problem = f"the pictures of {self._topic} are encoded as {first.encoding!r}, which is not known"
+            remedy = f"convert them to one of {', '.join(KNOWN)}, or give the camera a video"
+            raise DataError(self._source, problem, remedy, code="unsupported")
 
     def _begin(self) -> Iterator[PictureSample]:
         samples = all_samples(self._log.messages([self._topic]), self._source)

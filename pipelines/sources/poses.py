@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from pipelines.geometry.poses import (
     compose,
     interpolate_points,
     interpolate_poses,
-    matrix_from_quaternion,
     mounted_covariance,
     multiply,
     quaternion_from_matrix,
@@ -63,6 +63,7 @@ from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.parts import CameraFrames
 from pipelines.sources.world import (
+    LEVEL,
     METRES,
     Projection,
     as_stated,
@@ -90,6 +91,9 @@ _ADD_ANGLES = (
     " gimbal: {yaw_deg: 90, pitch_deg: -30} if the camera never turned"
 )
 _ADD_MOUNT = "say how the camera sits on the body, mount: {looks: forward, down_deg: 0}, or add a gimbal"
+
+
+Track = TypeVar("Track", PositionTrack, AttitudeTrack)
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,6 @@ class FlightPoses:
         self._note = note
         self._origin: Origin | None = None
         self._telemetry: dict[str, Telemetry] = {}
-        self._stated: dict[str, tuple[Path, Trajectory]] = {}  # read for the origin
         self._upright = upright(flight.world)
         crs = flight.world.crs
         self._projection = Projection(crs, f"{manifest}: world.crs") if crs else None
@@ -169,25 +172,20 @@ class FlightPoses:
 
     def _stated_poses(self, name: str, camera: CameraSources) -> tuple[Path, Trajectory]:
         """Read poses of a camera or of its body, in ENU axes, but not yet out of a map projection."""
-        if name in self._stated:
-            return self._stated.pop(name)
         pose = camera.pose
         path = self._files.path(pose.file)
         if self.is_still(camera):
             calibrated = self._files.camera(name, "pose", pose)
             if calibrated.position is None or calibrated.quaternion_xyzw is None:
-                raise DataError(
-                    path,
-                    "holds intrinsics but no camera pose",
-                    "name a file with extrinsics",
-                    code="no-poses",
-                )
+                problem = "holds intrinsics but no camera pose"
+                raise DataError(path, problem, "name a file with extrinsics", code="no-poses")
             still = Trajectory(
                 t_ns=np.zeros(1, dtype=np.int64),
                 position=calibrated.position[None],
                 quaternion_xyzw=calibrated.quaternion_xyzw[None],
             )
             return path, self._enu(moved(still, scale=METRES[pose.unit or "m"]), pose.axes)
+        of_body = not self._is_of_camera(camera)
         if self._is_log(pose):
             settings, options = self._logs.settings(pose.file), self._logged(pose)
             logged = self._logs.trajectory(
@@ -195,10 +193,10 @@ class FlightPoses:
             )
             logged = as_stated(logged, pose, options)
             axes = pose.axes or self._logs.axes(pose.file, pose.topic, options.parent)
-            turned = self._turned(camera, logged, axes)
+            turned = self._enu(logged, axes, of_body=of_body)
             return path, in_world(turned, settings.world_from_source)
         filed = as_stated(self._filed_trajectory(pose), pose, self._files.options("pose", pose, FiledPose))
-        return path, self._turned(camera, filed, pose.axes)
+        return path, self._enu(filed, pose.axes, of_body=of_body)
 
     # --- kinds of sources ------------------------------------------------------------------------------
 
@@ -267,9 +265,6 @@ class FlightPoses:
             return not camera.is_carried
         return camera.pose.of != "body"
 
-    def _turned(self, camera: CameraSources, poses: Trajectory, *stated: Axes | None) -> Trajectory:
-        return self._enu(poses, *stated, of_body=not self._is_of_camera(camera))
-
     def _enu(self, trajectory: Trajectory, *stated: Axes | None, of_body: bool = False) -> Trajectory:
         """Convert poses to east, north, up: from the axes that are stated for them, else from the world's."""
         turned = in_enu(trajectory, self._axes(*stated), of_body=of_body)
@@ -309,12 +304,8 @@ class FlightPoses:
             dropped |= lost
         known = ~np.isnan(quaternion[:, 0])
         if not known.any():
-            raise DataError(
-                self._manifest,
-                f"cameras.{name}: its gimbal's angles and the poses of its body share no time",
-                "check the clocks of the two logs",
-                code="no-overlap",
-            )
+            problem = f"cameras.{name}: its gimbal's angles and the poses of its body share no time"
+            raise DataError(self._manifest, problem, "check the clocks of the two logs", code="no-overlap")
         covariance = body.covariance
         if covariance is not None:
             covariance = mounted_covariance(covariance, body.quaternion_xyzw, lever_arm, quaternion)
@@ -394,22 +385,16 @@ class FlightPoses:
         own = self._files.video_file(camera)
         if found.video_began_ns is not None and own and own.samefile(path):
             if frames is None:
-                raise DataError(
-                    place,
+                problem = (
                     "its attitudes are at the times of its pictures, which start_from: motion cannot find by"
-                    " them",
-                    "state frame_times: {start: SECONDS}",
-                    code="clock-unknown",
+                    " them"
                 )
+                raise DataError(place, problem, "state frame_times: {start: SECONDS}", code="clock-unknown")
             track = replace(track, t_ns=_at_pictures(track.t_ns - found.video_began_ns, frames))
             clock = "at the times of its pictures"
         elif found.clock == "the video's start":
-            raise DataError(
-                path,
-                "has angles that count from its own start, and is not the camera's video",
-                "name that video, if they are in it",
-                code="clock-unknown",
-            )
+            problem = "has angles that count from its own start, and is not the camera's video"
+            raise DataError(path, problem, "name that video, if they are in it", code="clock-unknown")
         else:
             track = replace(track, t_ns=self._world_times(stated, track.t_ns, int(track.t_ns[0])))
             clock = f"by {found.clock}"
@@ -453,14 +438,10 @@ class FlightPoses:
 
     def joints(self, source: Path, position: Float, *, own_axes: bool) -> Float:
         """Return positions [..., 3] of people in the world; errors as for poses."""
-        if not own_axes and self._upright != Placement():
-            turn = matrix_from_quaternion(turn_of(self._upright))
-            position = self._upright.scale * position @ turn.T
-        origin = self.origin()
-        if self._projection is not None and origin is not None:
-            position = self._projection.points(source, position, origin.place)
-        self.refuse_projected(source, position.reshape(-1, 3), self._projection)
-        return position
+        level = np.tile(LEVEL, (position.size // 3, 1))
+        points = Trajectory(np.zeros(len(level), np.int64), position.reshape(-1, 3), level)
+        placed = self._local(source, points if own_axes else in_world(points, self._upright))
+        return placed.position.reshape(position.shape)
 
     def map(self, source: Path, grid: Occupancy, crs: str | None) -> Occupancy:
         """Return a map in the world; `crs` is the stated one of its coordinates, else its own counts.
@@ -482,12 +463,9 @@ class FlightPoses:
             self._note(f"{source}: placed on Earth by the CRS in it, {own.name}")
         if projection is not None:
             if origin is None:
-                raise DataError(
-                    f"{self._manifest}: map.crs",
-                    "places the map on Earth, and nothing says where the world's origin is",
-                    "write world.origin (latitude_deg, longitude_deg, altitude_m) or world.crs",
-                    code="place-unknown",
-                )
+                problem = "places the map on Earth, and nothing says where the world's origin is"
+                remedy = "write world.origin (latitude_deg, longitude_deg, altitude_m) or world.crs"
+                raise DataError(f"{self._manifest}: map.crs", problem, remedy, code="place-unknown")
             if stated is not None and own is not None:
                 self._compare_crs(source, grid, stated, own, origin.place)
             grid, error_m = projection.map(source, grid, origin.place)
@@ -547,12 +525,13 @@ class FlightPoses:
                 track = replace(track, t_ns=opened.world_times(track.t_ns))
                 dropped = dict(Counter(dropped) + opened.lost)
                 return replace(self._points(name or "actor", log, track), dropped=dropped)
+        return self._of_log(log, self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns))
+
+    def _of_log(self, log: str, trajectory: Trajectory) -> Trajectory:
+        """Return a trajectory of a log in the world."""
         settings = self._logs.settings(log)
-        trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
-        return self._local(
-            self._logs.paths(log)[0],
-            in_world(self._enu(trajectory, settings.axes), settings.world_from_source),
-        )
+        turned = in_world(self._enu(trajectory, settings.axes), settings.world_from_source)
+        return self._local(self._logs.paths(log)[0], turned)
 
     def planned(self, plan: PlanSource) -> Trajectory:
         """Read the commanded positions of a drone; the rotation has no meaning."""
@@ -561,14 +540,10 @@ class FlightPoses:
         if isinstance(reader, TrajectoryFormat):
             path = self._files.path(log)
             return self._local(path, self._enu(reader.read_trajectory(path)))
-        settings = self._logs.settings(log)
         sent = self._logs.commands(log, topic)
         if sent is None:
             sent = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
-        return self._local(
-            self._logs.paths(log)[0],
-            in_world(self._enu(sent, settings.axes), settings.world_from_source),
-        )
+        return self._of_log(log, sent)
 
     def true_poses(self, stated: str) -> Trajectory:
         """Read the true poses of one camera."""
@@ -579,15 +554,26 @@ class FlightPoses:
     # --- drones' own logs ------------------------------------------------------------------------------
 
     def _read(self, pose: PoseSource) -> Telemetry:
-        """Read a drone's own log, at its own times; each log is read once."""
+        """Read a drone's own log, at world times; each log is read once."""
         key = pose.model_dump_json(exclude={"of"})
         if key not in self._telemetry:
             reader = self._files.format_of("pose", pose)
             if isinstance(reader, TelemetryFormat):
                 choice = self._files.options("pose", pose, TelemetryChoice)
-                self._telemetry[key] = reader.read_telemetry(self._one_file(pose.file), choice)
+                found = reader.read_telemetry(self._one_file(pose.file), choice)
             else:
-                self._telemetry[key] = self._logged_telemetry(pose, self._logged(pose))
+                found = self._logged_telemetry(pose, self._logged(pose))
+            since_ns = int(found.position.t_ns[0])
+
+            def clocked(track: Track) -> Track:
+                return replace(track, t_ns=self._world_times(pose.file, track.t_ns, since_ns))
+
+            self._telemetry[key] = replace(
+                found,
+                position=clocked(found.position),
+                body=None if found.body is None else clocked(found.body),
+                gimbal=None if found.gimbal is None else clocked(found.gimbal),
+            )
         return self._telemetry[key]
 
     def _logged_telemetry(self, pose: PoseSource, options: LoggedPose) -> Telemetry:
@@ -662,7 +648,7 @@ class FlightPoses:
                 return self._origin
         if self._projection is not None:  # the first position of the first camera
             name, camera = next(iter(self._flight.cameras.items()))
-            self._stated[name] = source, poses = self._stated_poses(name, camera)
+            source, poses = self._stated_poses(name, camera)
             self._origin = Origin(self._projection.first_place(source, poses.position), str(source.name))
         return self._origin
 
@@ -679,7 +665,6 @@ class FlightPoses:
 
     def _in_world(self, name: str, track: PositionTrack) -> tuple[Float, Float]:
         """Return positions [N, 3] m in the world, and the rotation of the track's own ENU in it [4]."""
-        level = np.array([0.0, 0.0, 0.0, 1.0])
         origin = self.origin()
         if not track.on_earth and (track.origin is None or origin is None):
             if origin is not None:
@@ -687,17 +672,17 @@ class FlightPoses:
                     f"{name}: its {track.name} counts from a place that its log does not state: taken for the"
                     " world's origin (else say world_from_source under `logs`)"
                 )
-            return track.values, level
+            return track.values, LEVEL
         if origin is None:
             raise AssertionError("a track on Earth gives the origin")
         if not track.on_earth and track.origin is not None:
             rotation, position = enu_from_enu(track.origin, origin.place)
             turned = quaternion_from_matrix(rotation)
-            return compose((position, turned), (track.values, level))[0], turned
+            return compose((position, turned), (track.values, LEVEL))[0], turned
         latitude, longitude, height = track.values.T
         if track.height in _ABOVE_TAKE_OFF:  # z counts from the take-off, at any height on Earth
             height = height + origin.place.altitude_m
-        return enu_from_geodetic(latitude, longitude, height, origin.place), level
+        return enu_from_geodetic(latitude, longitude, height, origin.place), LEVEL
 
     def _points(self, name: str, log: str, track: PositionTrack) -> Trajectory:
         """Return positions without a rotation in the world, as a trajectory; its rotation has no meaning.
@@ -706,14 +691,11 @@ class FlightPoses:
             DataError: the world's origin on Earth is unknown.
         """
         if self.origin() is None:
-            raise DataError(
-                self._manifest,
-                f"{name}: {log} says where it was on Earth, and no camera does",
-                "write world: {origin: {latitude_deg: ..., longitude_deg: ..., altitude_m: ...}}",
-                code="place-unknown",
-            )
+            problem = f"{name}: {log} says where it was on Earth, and no camera does"
+            remedy = "write world: {origin: {latitude_deg: ..., longitude_deg: ..., altitude_m: ...}}"
+            raise DataError(self._manifest, problem, remedy, code="place-unknown")
         values, _ = self._in_world(name, track)
-        still = np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
+        still = np.tile(LEVEL, (len(values), 1))
         return in_world(Trajectory(track.t_ns, values, still), self._logs.settings(log).world_from_source)
 
     # --- poses of cameras ------------------------------------------------------------------------------
@@ -736,11 +718,7 @@ class FlightPoses:
             self._note(note)
         gimbal = angles or self._gimbal(name, camera, telemetry)
         self._refuse_unturned(name, camera, telemetry, gimbal)
-        since_ns = int(telemetry.position.t_ns[0])
         track, body = telemetry.position, telemetry.body
-        track = replace(track, t_ns=self._world_times(stated, track.t_ns, since_ns))
-        if body is not None:
-            body = replace(body, t_ns=self._world_times(stated, body.t_ns, since_ns))
         values, turn = self._in_world(name, track)
         self._doubt(name, track)
         t_ns = _fastest(track.t_ns, [part.t_ns for part in (gimbal or body,) if part is not None])
@@ -758,13 +736,12 @@ class FlightPoses:
         placed, turned = ~np.isnan(position[:, 0]), ~np.isnan(quaternion[:, 0])
         known = placed & turned
         if not known.any():
-            raise DataError(
-                self._manifest,
+            problem = (
                 f"cameras.{name}: its positions and attitudes share no time (or are further apart than"
-                f" {self._max_gap_ns / 1e9:g} s)",
-                "check the clocks of the two logs, or raise --max-pose-gap",
-                code="no-overlap",
+                f" {self._max_gap_ns / 1e9:g} s)"
             )
+            remedy = "check the clocks of the two logs, or raise --max-pose-gap"
+            raise DataError(self._manifest, problem, remedy, code="no-overlap")
         causes = {
             "attitude without a position": int(np.count_nonzero(~placed)),
             "position without an attitude": int(np.count_nonzero(placed & ~turned)),
@@ -781,26 +758,18 @@ class FlightPoses:
             if own is None or camera.pose.of == "body":
                 return None
             self._note(f"{name}: its camera is turned by {own.name} of {camera.pose.file}")
-            return self._at_world_times(camera.pose, telemetry, own)
+            return own
         if own is None:
-            raise DataError(
-                self._manifest,
-                f"cameras.{name}.gimbal: {camera.pose.file} holds no gimbal angles",
-                "name the log and topic that do, or fixed angles",
-                code="no-attitude",
-            )
-        moved = self._at_world_times(camera.pose, telemetry, own)
+            problem = f"cameras.{name}.gimbal: {camera.pose.file} holds no gimbal angles"
+            remedy = "name the log and topic that do, or fixed angles"
+            raise DataError(self._manifest, problem, remedy, code="no-attitude")
         place = f"{self._manifest}: cameras.{name}.gimbal"
-        turned = _turned_as_named(place, camera.pose.file, moved, gimbal)
+        turned = _turned_as_named(place, camera.pose.file, own, gimbal)
         self._note(
             f"{name}: its camera is turned by {own.name} of {camera.pose.file},"
             f" relative to the {turned.relative_to} as stated"
         )
         return turned
-
-    def _at_world_times(self, pose: PoseSource, telemetry: Telemetry, track: AttitudeTrack) -> AttitudeTrack:
-        since_ns = int(telemetry.position.t_ns[0])
-        return replace(track, t_ns=self._world_times(pose.file, track.t_ns, since_ns))
 
     def _refuse_unturned(
         self, name: str, camera: CameraSources, telemetry: Telemetry, gimbal: AttitudeTrack | None
@@ -811,13 +780,11 @@ class FlightPoses:
             problem = f"{stated} says where the drone was but not how it was turned"
             raise DataError(place, problem, _ADD_ANGLES, code="no-attitude")
         if telemetry.body is None and gimbal is not None and gimbal.relative_to != "world":
-            raise DataError(
-                place,
+            problem = (
                 f"its gimbal's angles are relative to the {gimbal.relative_to}, but {stated} does not say how"
-                " the body turned",
-                "give angles relative to the world",
-                code="no-attitude",
+                " the body turned"
             )
+            raise DataError(place, problem, "give angles relative to the world", code="no-attitude")
         if gimbal is None and camera.mount is None:
             raise DataError(place, f"{stated} holds no gimbal angles", _ADD_MOUNT, code="no-attitude")
 
@@ -846,12 +813,8 @@ def _refuse_heading(place: str, knows_north: bool, gimbal: GimbalSource) -> None
         )
     if not knows_north and gimbal.yaw_deg is None:
         problem = "lacks yaw_deg: the file says how the camera turned, not where it looked at first"
-        raise DataError(
-            place,
-            problem,
-            "add the heading of its first picture from north to east: yaw_deg: 90",
-            code="no-attitude",
-        )
+        remedy = "add the heading of its first picture from north to east: yaw_deg: 90"
+        raise DataError(place, problem, remedy, code="no-attitude")
 
 
 def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: GimbalSource) -> AttitudeTrack:
@@ -864,12 +827,8 @@ def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: Gimb
     if gimbal.relative_to is None or (meant == track.relative_to and meant not in track.stated):
         return track
     if meant not in track.stated:
-        raise DataError(
-            place,
-            f"{track.name} of {source} cannot be taken relative to the {meant}",
-            f"write relative_to: {track.relative_to}",
-            code="wrong-option",
-        )
+        problem = f"{track.name} of {source} cannot be taken relative to the {meant}"
+        raise DataError(place, problem, f"write relative_to: {track.relative_to}", code="wrong-option")
     turned = attitude_in_enu(track.stated[meant], relative_to=meant, axes="ned")
     return replace(track, quaternion_xyzw=turned, relative_to=meant)
 

@@ -172,18 +172,11 @@ def refuse_projected(source: Path | str, position: Float, origin: Place, crs: st
         away = f"{away_m / 1000:.0f} km from the world's origin ({place})"
         if crs:
             problem = f"lies {away} by its CRS, {crs}"
-            raise DataError(
-                source,
-                problem,
-                "give the files of one place, or correct world.crs or map.crs",
-                code="place-unknown",
-            )
-        raise DataError(
-            source,
-            f"lies about x {x_m:.0f} m, y {y_m:.0f} m (UTM or another map projection), {away}",
-            "state the CRS, world: {crs: EPSG:32632} or map: {crs: ...}; or give metres from that origin",
-            code="place-unknown",
-        )
+            remedy = "give the files of one place, or correct world.crs or map.crs"
+            raise DataError(source, problem, remedy, code="place-unknown")
+        problem = f"lies about x {x_m:.0f} m, y {y_m:.0f} m (UTM or another map projection), {away}"
+        remedy = "state the CRS, world: {crs: EPSG:32632} or map: {crs: ...}; or give metres from that origin"
+        raise DataError(source, problem, remedy, code="place-unknown")
 
 
 def doubts_of_speed(trajectory: Trajectory) -> list[str]:
@@ -266,12 +259,8 @@ class Projection:
         pyproj: Any = need("pyproj", "places")
         crs = _crs(name)
         if crs is None:
-            raise DataError(
-                place,
-                f"{name!r} is no projected or geographic CRS",
-                "write one like EPSG:32632 (UTM 32 north)",
-                code="place-unknown",
-            )
+            problem = f"{name!r} is no projected or geographic CRS"
+            raise DataError(place, problem, "write one like EPSG:32632 (UTM 32 north)", code="place-unknown")
         authority = crs.to_authority(min_confidence=100)
         self.name = ":".join(authority) if authority else crs.name
         self._step = 1.0 if crs.is_projected else 1e-5  # a unit north by which grid north is found
