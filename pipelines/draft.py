@@ -33,7 +33,7 @@ from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
 from pipelines.formats.drone_logs.tlog import FORMAT as TLOG
 from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import header_ns, kind_of, samples
-from pipelines.formats.logs.presets import FIXES, namespaces, pairs_of, parts_of
+from pipelines.formats.logs.positions import FIXES, pairs_of
 from pipelines.formats.logs.trajectories import poses_of
 from pipelines.formats.poses import times_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
@@ -628,7 +628,7 @@ def _recording(path: Path, place: NamePlace, format_: LogFormat) -> FoundLog:
                     link = (topic.name, sample.target, sample.source, still)
                     edges.setdefault(FoundLink(*link, sample.receive_ns, lead_ns))
             topics[topic.name] = known
-        topics |= {f"{each.rank}": each for each in _drivers(log, path, place)}
+        topics |= {f"{each.rank}": each for each in _pairs(log, path, place)}
     return FoundLog(path, place, format_.title, topics, tuple(edges), (path,))
 
 
@@ -647,45 +647,25 @@ def _pose_topic(log: Log, topic: Proposal, type_: str, count: int) -> Proposal:
     )
 
 
-def _drivers(log: Log, path: Path, place: NamePlace) -> Iterator[Proposal]:
-    """Yield the drones whose drivers' usual topics are in a log: together they hold more than each alone."""
+def _pairs(log: Log, path: Path, place: NamePlace) -> Iterator[Proposal]:
+    """Yield topics of positions on Earth with the attitudes beside them."""
     topics = {topic.name: topic for topic in log.topics if topic.count}
-    every = namespaces(list(topics))
-    found: list[tuple[dict[str, object], str, list[str], bool, bool, bool]] = []
-    for preset, namespace in every:
-        parts = parts_of(preset, namespace, list(topics))
-        alone = len([known for known, _ in every if known == preset]) == 1
-        settings: dict[str, object] = {"preset": preset} | ({} if alone else {"namespace": namespace or "/"})
-        by_gps = any(topics[name].type in FIXES for name in parts.position)
-        named = "" if alone else namespace
-        found.append(
-            (settings, named, list(parts.position), bool(parts.attitude), bool(parts.gimbal), by_gps)
-        )
     for position, attitude in pairs_of(list(topics.values())):
-        found.append(({"topic": position, "attitude": attitude}, position, [position], True, False, True))
-    for settings, named, names, body, gimbal, by_gps in found:
-        parts_ = [topics[name] for name in names]
-        span = TimeSpan(min(t.first_ns or 0 for t in parts_), max(t.last_ns or 0 for t in parts_))
-        count = max(topic.count for topic in parts_)
-        preset_ = "preset" in settings
-        likelihood = -1 if preset_ else LAST_POSE_TYPE
-        what = (
-            f"usual topics{' with gimbal angles' if gimbal else ''}" if preset_ else "positions and attitudes"
-        )
+        topic = topics[position]
+        span = TimeSpan(topic.first_ns or 0, topic.last_ns or 0)
         yield Proposal(
             "pose",
             path,
             place,
-            f"{what}, {span}",
-            {"file": path, **settings},
+            f"positions and attitudes, {span}",
+            {"file": path, "topic": position, "attitude": attitude},
             ((),),
-            (1, 1 - int(gimbal) + int(not body), likelihood, -count, named),
+            (1, 1, LAST_POSE_TYPE, -topic.count, position),
             span,
-            of_body=body and not gimbal,
-            unturned=not (body or gimbal),
-            by_gps=by_gps,
-            topic=named,
-            lead_ns=_lead_ns(log, names[0]),
+            of_body=True,
+            by_gps=True,
+            topic=position,
+            lead_ns=_lead_ns(log, position),
         )
 
 

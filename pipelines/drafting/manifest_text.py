@@ -304,7 +304,7 @@ class _ManifestWriter:
         example = {"looks": "forward", "translation": [0, 0, 0]}
         lever = DraftedKey(None, ["the lever arm to the gimbal, m"], example=example)
         if not (taken.of_body or taken.unturned):
-            return {"mount": lever} if isinstance(taken, FlownPoses) or "preset" in taken.settings else {}
+            return {"mount": lever} if isinstance(taken, FlownPoses) else {}
         if gimbal is not None:
             what = "relative_to, what its angles are relative to; order and units if not ypr and deg"
             turned = self.stated({**gimbal.taken.settings, "relative_to": "world"})

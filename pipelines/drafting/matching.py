@@ -446,7 +446,7 @@ class _Chooser:
         rivals = [c for c in candidates if likeness[id(c)] >= least]
         # The only candidate is taken, and for a lone camera the likeliest topic of the only log.
         one_log = self._lone and len({c.path for c in candidates if c.topic or "parent" in c.settings}) == 1
-        one_log &= all(c.topic or "parent" in c.settings or "preset" in c.settings for c in candidates)
+        one_log &= all(c.topic or "parent" in c.settings for c in candidates)
         if not rivals and (one_log or (len(candidates) == 1 and (self._lone or shared))):
             own = self._camera.label
             rivals = [c for c in candidates if not any(_are_two(own, label) for label in c.labels)]

@@ -90,16 +90,11 @@ class CalibrationFormat(Format, Protocol):
         """Read every camera; the world's axes are those of the file."""
 
 
-class PositionChoice(YamlModel):
-    """A choice among a drone's own estimates."""
+class TelemetryChoice(YamlModel):
+    """Options of a drone's own log."""
 
     position: Literal["local", "global", "gps"] | None = None
     """Estimate of the position that is read."""
-
-
-class TelemetryChoice(PositionChoice):
-    """Options of a drone's own log."""
-
     instance: int | None = Field(None, ge=0, le=255)
     """Number of the estimator, receiver or vehicle."""
     time: Literal["gps", "boot"] | None = None

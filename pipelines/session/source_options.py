@@ -17,7 +17,6 @@ from pipelines.session.registries import (
     Format,
     KeypointFormat,
     LogFormat,
-    PositionChoice,
     TelemetryChoice,
     TelemetryFormat,
     TrajectoryFormat,
@@ -45,15 +44,11 @@ class FramedSource(YamlModel):
     """Frame that is the log's world."""
 
 
-class LoggedPose(FiledPose, FramedSource, PositionChoice):
+class LoggedPose(FiledPose, FramedSource):
     """Options of poses in a log of topics."""
 
     child: str | None = None
     """Frame of the camera or body, for poses that are chained from transforms."""
-    preset: Literal["dji_osdk", "mavros"] | None = None
-    """Driver whose usual topics are read."""
-    namespace: str | None = None
-    """Namespace of the preset's topics in a log of several drones."""
     attitude: str | None = None
     """Topic of attitudes, for a topic that has only positions."""
 
@@ -61,18 +56,14 @@ class LoggedPose(FiledPose, FramedSource, PositionChoice):
     def _complete(self) -> LoggedPose:
         if (self.parent is None) != (self.child is None):
             raise ValueError("needs both parent and child, or neither")
-        if self.preset and self.parent:
-            raise ValueError("has a preset and names frames: leave one of them out")
-        if self.attitude and (self.preset or self.parent):
-            raise ValueError("has attitude beside a preset or frames: leave one of them out")
-        if self.preset is None and (self.namespace or self.position):
-            raise ValueError("namespace and position belong to a preset: add one or leave them out")
+        if self.attitude and self.parent:
+            raise ValueError("has attitude beside frames: leave one of them out")
         return self
 
     @property
     def joins_topics(self) -> bool:
         """True if position and attitude come from separate topics."""
-        return self.preset is not None or self.attitude is not None
+        return self.attitude is not None
 
 
 class LoggedAngles(YamlModel):

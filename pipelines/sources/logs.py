@@ -30,7 +30,7 @@ from pipelines.formats.logs.pictures import (
     picture_stamps,
     read_triggers,
 )
-from pipelines.formats.logs.presets import FIXES, axes_of_topic, pairs_of
+from pipelines.formats.logs.positions import FIXES, axes_of_topic, pairs_of
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.formats.logs.trajectories import (
     COMMAND_TYPES,

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
-from pipelines.formats.logs.presets import FIXES, read_pair, read_positions, read_preset
+from pipelines.formats.logs.positions import FIXES, read_pair, read_positions
 from pipelines.formats.maps.voxel_grids import placed
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit
@@ -244,8 +244,6 @@ class FlightPoses:
             yield "a mount or gimbal needs the pose of the body", "add `of: body` to `pose`"
         if is_log:
             logged = self._logged(pose)
-            if logged.preset and pose.topic:
-                yield "pose: has a preset and a topic", "leave one of them out"
             if logged.attitude and not pose.topic:
                 yield "pose: attitude: needs the topic of the positions", "add topic: TOPIC"
 
@@ -577,18 +575,13 @@ class FlightPoses:
         return self._telemetry[key]
 
     def _logged_telemetry(self, pose: PoseSource, options: LoggedPose) -> Telemetry:
-        """Read telemetry from a driver's usual topics, or from two named ones, at the log's own times."""
-        choice = TelemetryChoice(position=options.position)
+        """Read telemetry from a topic of positions and one of attitudes, at the log's own times."""
         with self._logs.open(pose.file) as opened:
             recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
-            if options.preset:
-                found = read_preset(recording, source, options.preset, options.namespace, choice, stamps)
-            else:
-                axes = self._axes(pose.axes, opened.settings.axes)
-                topics = pose.topic or "", options.attitude or ""
-                found = read_pair(recording, source, *topics, axes, stamps)
-                if not (pose.axes or opened.settings.axes):
-                    found = self._upright_pair(found)
+            axes = self._axes(pose.axes, opened.settings.axes)
+            found = read_pair(recording, source, pose.topic or "", options.attitude or "", axes, stamps)
+            if not (pose.axes or opened.settings.axes):
+                found = self._upright_pair(found)
             return replace(found, dropped=dict(Counter(found.dropped) + opened.lost))
 
     def _upright_pair(self, telemetry: Telemetry) -> Telemetry:

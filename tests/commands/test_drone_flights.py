@@ -139,7 +139,27 @@ def _osdk(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
             ),
         ]
     write_log(folder, name, "ros1", entries)
-    return {"file": f"{name}.bag", "preset": "dji_osdk"}
+    return {"file": f"{name}.bag", "topic": "/dji_sdk/gps_position", "attitude": "/dji_sdk/attitude"}
+
+
+def _on_gimbals_of_osdk(folder: Path) -> SyntheticFlight:
+    """Write a flight whose bags hold gimbal angles in NED from north, as pitch, roll, yaw."""
+    flight = with_poses(folder, _osdk, ON_GIMBAL)
+    for camera in flight.settings["cameras"].values():
+        angles = {"file": camera["pose"]["file"], "topic": "/dji_sdk/gimbal_angle", "order": "pry"}
+        camera["gimbal"] = {**angles, "axes": "ned", "relative_to": "world"}
+        camera["pose"]["of"] = "body"
+    flight.save()
+    return flight
+
+
+def test_topics_of_djis_onboard_sdk(tmp_path: Path) -> None:
+    flight = _on_gimbals_of_osdk(tmp_path)
+    ingest(flight.manifest)
+    for k in range(2):
+        off_m, off_deg = errors(flight, k)
+        assert off_m < 1e-4
+        assert off_deg < 1e-4
 
 
 def _tlog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
@@ -200,7 +220,6 @@ def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
         # Angles of the body to 0.005 deg on a lever arm of 0.15 m; GPS time, by which the clock is set, to a
         # ms (at 1 m/s), and the origin to 1e-7 deg (11 mm).
         (_dataflash, 0.013, 0.1),
-        (_osdk, 1e-4, 1e-4),
         (_tlog, 0.015, 0.1),  # 1e-7 deg are 11 mm, and a ms of the boot time 1 mm and 0.06 deg
         (_record, 1e-3, 1e-4),  # 1e-9 deg are 0.1 mm
     ],
@@ -218,7 +237,7 @@ UTM = np.array([512_767.0, 5_403_710.0, 0.0])  # where the cloud below lies, zon
 
 
 def test_one_origin_for_all_where_none_is_stated(tmp_path: Path) -> None:
-    flight = with_poses(tmp_path, _osdk, ON_GIMBAL)
+    flight = _on_gimbals_of_osdk(tmp_path)
     del flight.settings["world"]["origin"]
     flight.save()
     ingest(flight.manifest)

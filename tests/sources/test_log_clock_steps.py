@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.logs.presets import read_pair
+from pipelines.formats.logs.positions import read_pair
 from pipelines.session.manifest import LogSource, Manifest
 from pipelines.session.records import Trajectory
 from pipelines.session.registries import LogFormat, recognise

@@ -22,16 +22,16 @@ from tests.synthetic.flights import SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_mcap
 
-MAVROS = [
+FIXES = [
     Entry(
-        "/mavros/global_position/raw/fix",
+        "/fix",
         "sensor_msgs/msg/NavSatFix",
         k * 10**9,
         {"header": header(k * 10**9, "gps"), "latitude": 47.5, "longitude": 8.5, "altitude": 400.0},
     )
     for k in range(1, 4)
 ]
-"""Log with positions of MAVROS."""
+"""Log with positions of a receiver."""
 
 
 @pytest.fixture(scope="module")
@@ -104,14 +104,12 @@ def checked(flight: SyntheticFlight, change: dict[str, Any]) -> None:
     ("file", "options", "code", "key"),
     [
         ("a.SRT", {"instance": 1}, "wrong-option", "instance"),
-        ("a.SRT", {"preset": "mavros"}, "wrong-option", "preset"),
+        ("a.SRT", {"attitude": "/imu"}, "wrong-option", "attitude"),
         ("a.SRT", {"unit": "cm"}, "wrong-option", "unit"),
         ("a.SRT", {"axes": "ned"}, "wrong-option", "axes"),
         ("a.SRT", {"topic": "/pose"}, "wrong-option", "topic"),
         ("a.SRT", {"altitude": "high"}, "bad-value", "altitude"),
         ("a.bin", {"altitude": 3}, "wrong-option", "altitude"),
-        ("a.mcap", {"preset": "mavos"}, "bad-value", "preset"),
-        ("a.mcap", {"preset": "mavros", "topic": "/pose"}, "wrong-option", "topic"),
         ("a.mcap", {"attitude": "/imu"}, "wrong-option", "attitude"),
         ("a.mcap", {"parent": "map"}, "bad-value", "parent"),
         ("drone1.tum", {"camera": "left"}, "wrong-option", "camera"),
@@ -124,7 +122,7 @@ def test_an_option_belongs_to_the_format_of_its_file(
     folder, truth = flight.manifest.parent, drone_of(flight, 0)
     write_srt(folder / "a.SRT", truth)
     write_dataflash(folder / "a.bin", truth)
-    write_mcap(folder / "a.mcap", MAVROS)
+    write_mcap(folder / "a.mcap", FIXES)
     with pytest.raises(DataError) as caught:
         checked(flight, {"pose": {"file": file, **options}, "mount": None})
     assert caught.value.code == code
@@ -136,7 +134,7 @@ def test_an_option_belongs_to_the_format_of_its_file(
     [
         {"file": "a.SRT", "altitude": 30},
         {"file": "a.bin", "position": "local", "instance": 1, "time": "boot"},
-        {"file": "a.mcap", "preset": "mavros", "position": "gps"},
+        {"file": "a.mcap", "topic": "/fix", "attitude": "/imu"},
         {"file": "drone1.tum", "inverse": True, "quaternion": "wxyz", "z": "down", "unit": "mm"},
         {"file": "drone1.tum", "format": "tum"},
     ],
@@ -147,7 +145,7 @@ def test_an_option_is_taken_by_the_format_of_its_file(
     folder, truth = flight.manifest.parent, drone_of(flight, 0)
     write_srt(folder / "a.SRT", truth)
     write_dataflash(folder / "a.bin", truth)
-    write_mcap(folder / "a.mcap", MAVROS)
+    write_mcap(folder / "a.mcap", FIXES)
     checked(flight, {"pose": options})
 
 

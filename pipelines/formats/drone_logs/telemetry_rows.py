@@ -11,7 +11,7 @@ import numpy as np
 from pipelines.formats.common.rows import NORM_TOLERANCE, kept_rows
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
-from pipelines.geometry.geodesy import Place, enu_from_geodetic, place_at
+from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import RelativeTo, attitude_from_angles, attitude_in_enu, level_heading
 from pipelines.geometry.poses import (
     interpolate_points,
@@ -145,25 +145,6 @@ def pictures_on_gps_time(source: Path, t_ns: Int64, fit: ClockFit | None, choice
     """Return the times of pictures, sorted and each once, in UTC as in `on_gps_time`."""
     fit = on_gps_time(source, fit, choice.time, [])
     return np.unique(t_ns) if fit is None else np.unique(fit.other_ns(np.unique(t_ns)))
-
-
-def placed_by(track: PositionTrack, fixes: PositionTrack) -> tuple[PositionTrack, str]:
-    """Give a track in metres its origin on Earth, by GPS fixes of the same drone; say how they agree.
-
-    The origin comes from the median difference of the two, so single wild fixes do not matter. A constant
-    error of the fixes stays in it.
-    """
-    near = Place(*fixes.values[0].tolist())
-    latitude, longitude, height = fixes.values.T
-    at_fixes = interpolate_points(track.t_ns, track.values, fixes.t_ns, max_gap_ns=_HELD_NS)
-    apart = enu_from_geodetic(latitude, longitude, height, near) - at_fixes
-    apart = apart[np.isfinite(apart).all(axis=1)]
-    if not len(apart):
-        return track, f"{track.name} and {fixes.name} share no time: nothing says where on Earth it lies"
-    middle = np.median(apart, axis=0)
-    scatter_m = 1.4826 * float(np.median(np.linalg.norm(apart - middle, axis=1)))
-    note = f"{track.name} placed on Earth by {fixes.name}, which scatters by {scatter_m:.2g} m about it"
-    return replace(track, origin=place_at(middle, near)), note
 
 
 def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Float) -> Float:

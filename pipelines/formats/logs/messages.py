@@ -204,6 +204,10 @@ def _quaternion_stamped(message: Message, _: Source) -> Iterator[Sample]:
     yield AngleSample(_stamp_ns(message), message.receive_ns, None, _quaternion(message.value.quaternion))
 
 
+def _bare_quaternion(message: Message, _: Source) -> Iterator[Sample]:
+    yield AngleSample(0, message.receive_ns, None, _quaternion(message.value))
+
+
 def _vector_stamped(message: Message, _: Source) -> Iterator[Sample]:
     yield AngleSample(_stamp_ns(message), message.receive_ns, _vector(message.value.vector), None)
 
@@ -388,6 +392,7 @@ _ROS_READERS: dict[str, tuple[Kind, _Reader]] = {
     "geometry_msgs/msg/PoseStamped": ("poses", _pose_stamped),
     "geometry_msgs/msg/PoseWithCovariance": ("poses", _bare_pose),
     "geometry_msgs/msg/PoseWithCovarianceStamped": ("poses", _pose_with_covariance),
+    "geometry_msgs/msg/Quaternion": ("angles", _bare_quaternion),
     "geometry_msgs/msg/QuaternionStamped": ("angles", _quaternion_stamped),
     "geometry_msgs/msg/TransformStamped": ("poses", _transform),
     "geometry_msgs/msg/Vector3Stamped": ("angles", _vector_stamped),

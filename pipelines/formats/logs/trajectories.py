@@ -111,6 +111,10 @@ class LoggedRows:
         header_ns = without_steps(self.header_ns, self.steps)
         return np.where(header_ns == 0, self.receive_ns, header_ns)
 
+    def notes(self, place: str, stamps: Stamps) -> list[str]:
+        """Describe the steps of the header's clock, if its stamps are used."""
+        return [f"{place}: {step}" for step in self.steps if stamps == "header"]
+
     def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
         """Return the poses, cleaned, with covariances whose rotation is in the body's axes."""
         covariance = self.covariance

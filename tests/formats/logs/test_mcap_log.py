@@ -248,11 +248,11 @@ def test_version_2_of_cdr_is_refused(tmp_path: Path, kind: int, container: str) 
             schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
             channel = writer.register_channel(topic, "cdr", schema)
             writer.add_message(channel, 1, bytes([0, kind, 0, 0, 1, 0, 0, 0, 0]), 1)
-            writer.finish()
+            writer.finish()  # type: ignore[no-untyped-call]
     else:
         path = write_log(tmp_path, "a", "ros2-sqlite3", FLIGHT)
-        (file,) = path.glob("*.db3")
-        database = sqlite3.connect(file)
+        (stored,) = path.glob("*.db3")
+        database = sqlite3.connect(stored)
         with database:
             rows = database.execute("SELECT id, data FROM messages").fetchall()
             changed = [(bytes([0, kind]) + data[2:], id_) for id_, data in rows]

@@ -1,0 +1,97 @@
+"""Positions and attitudes of separate topics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.logs.positions import axes_of_topic, pairs_of, read_pair, read_positions
+from pipelines.session.records import Telemetry, Topic
+from pipelines.session.registries import LogFormat, recognise
+from tests.real_data import real_data
+from tests.synthetic.logged_flights import header
+from tests.synthetic.logs import Entry, write_mcap
+
+START_NS = 1_700_000_000_000_000_000
+ROWS = 8
+
+
+def stamps() -> list[int]:
+    return [START_NS + k * 50_000_000 for k in range(ROWS)]
+
+
+def fixes(topic: str, latitude: float = 47.5, **more: Any) -> list[Entry]:
+    return [
+        Entry(
+            topic,
+            "sensor_msgs/msg/NavSatFix",
+            t,
+            {
+                "header": header(t, "gps"),
+                "latitude": latitude,
+                "longitude": 8.5 + 1e-6 * k,
+                "altitude": 400.0,
+                **more,
+            },
+        )
+        for k, t in enumerate(stamps())
+    ]
+
+
+def _pair(path: Path, position: str, attitude: str) -> Telemetry:
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        return read_pair(log, str(path), position, attitude, "enu", "header")
+
+
+def test_a_real_gps_fix_is_where_the_nav_sat_fix_beside_it_is() -> None:
+    path = real_data("second/novatel_bestpos.bag")
+    own, other = (_pair(path, topic, "/novatel/oem7/odom").position for topic in ("/gps/gps", "/gps/fix"))
+    assert (own.on_earth, own.height, len(own.t_ns)) == (True, "ellipsoid", len(other.t_ns))
+    np.testing.assert_array_equal(own.values, other.values)
+    assert np.abs(own.t_ns - other.t_ns).max() < 1_000_000  # the driver stamps one after the other
+
+
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+def test_fixes_of_foxglove(tmp_path: Path, encoding: Any) -> None:
+    entries = []
+    for k, t in enumerate(stamps()):
+        sec, nsec = divmod(t, 10**9)
+        stamp = {"sec": sec, "nsec": nsec} if encoding == "json" else {"seconds": sec, "nanos": nsec}
+        place = {"latitude": 47.5 + k, "longitude": 8.5, "altitude": 400.0, "frame_id": "gps"}
+        # The receipt is later: the message's own time counts.
+        entries.append(Entry("/place", "foxglove.LocationFix", t + 10**8, {"timestamp": stamp, **place}))
+    path = write_mcap(tmp_path / "a.mcap", entries, encoding)
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        track = read_positions(log, "a", "/place", "header", {})
+    assert (track.on_earth, track.t_ns.tolist()) == (True, stamps())
+    np.testing.assert_array_equal(track.values, [[47.5 + k, 8.5, 400.0] for k in range(ROWS)])
+
+
+def test_attitudes_beside_positions_are_those_that_share_most_of_the_name() -> None:
+    names = {
+        "/drone1/fix": "sensor_msgs/msg/NavSatFix",
+        "/drone2/fix": "sensor_msgs/msg/NavSatFix",
+        "/drone1/imu": "sensor_msgs/msg/Imu",
+        "/drone2/imu": "sensor_msgs/msg/Imu",
+        "/drone2/imu_raw": "sensor_msgs/msg/Imu",
+    }
+    topics = [Topic(name, type_, "cdr", 9, 0, 9) for name, type_ in names.items()]
+    assert pairs_of(topics) == [("/drone1/fix", "/drone1/imu"), ("/drone2/fix", "/drone2/imu")]
+
+
+@pytest.mark.parametrize(
+    ("topic", "parent", "axes"),
+    [
+        ("/airsim_node/drone_1/odom_local_ned", None, "ned"),
+        ("/a/airsim_node/Drone2/odom_local_ned", None, "ned"),
+        ("/airsim_node/drone_1/odom_local_enu", None, None),
+        ("/drone/odom_local_ned", None, None),
+        (None, "world_ned", "ned"),
+        (None, "world", None),
+    ],
+)
+def test_axes_by_the_names_of_known_programs(topic: str | None, parent: str | None, axes: str | None) -> None:
+    assert axes_of_topic(topic, parent) == axes
