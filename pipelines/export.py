@@ -387,17 +387,16 @@ def _work_in(target: Path) -> Iterator[Path]:
         BusyError: another process uses it.
     """
     with working_folder(target / _WORK, target) as work:
-        _clear(target, work)
+        _clear(work)
         try:
             yield work
         finally:
-            _clear(target, work)
+            _clear(work)
 
 
-def _clear(target: Path, work: Path) -> None:
+def _clear(work: Path) -> None:
     """Remove what killed exports left behind."""
-    left = [*target.glob(f"{_WORK}-*"), *(path for path in work.iterdir() if path.is_dir())]
-    for path in left:  # the first have the names of versions without a lock
+    for path in [each for each in work.iterdir() if each.is_dir()]:
         remove_tree(path)
 
 

@@ -20,7 +20,7 @@ from pipelines.geometry.poses import interpolate_points
 from pipelines.session.description import Description
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion
-from pipelines.session.tables import ACTOR, Span, read_table
+from pipelines.session.tables import ACTOR, read_table
 
 Bone = tuple[str, str]
 
@@ -225,18 +225,17 @@ class LoggedActor:
         return interpolate_points(self.t_ns, self.hips, t_ns, max_gap_ns=MAX_GAP_OF_ACTOR_NS)
 
 
-def logged_actor(folder: Path, description: Description, span_ns: Span | None = None) -> LoggedActor | None:
-    """Load the first logged person of a session, of some times; None where nobody was logged."""
-    return next(iter(logged_people(folder, description, span_ns)), None)
+def logged_actor(folder: Path, description: Description) -> LoggedActor | None:
+    """Load the first logged person of a session; None where nobody was logged."""
+    return next(iter(logged_people(folder, description)), None)
 
 
-def logged_people(folder: Path, description: Description, span_ns: Span | None = None) -> list[LoggedActor]:
-    """Load all people of a session who were logged: person 0, 1, ...; of some times if a span is stated."""
+def logged_people(folder: Path, description: Description) -> list[LoggedActor]:
+    """Load all people of a session who were logged: person 0, 1, ... in this order."""
     entries = description.logged_people
     if not entries:
         return []
-    about = None if span_ns is None else (span_ns[0] - MAX_GAP_OF_ACTOR_NS, span_ns[1] + MAX_GAP_OF_ACTOR_NS)
-    table = read_table(folder / "actor.parquet", ACTOR, about)
+    table = read_table(folder / "actor.parquet", ACTOR)
     person, t_ns = table["person"].to_numpy(np.int64), table["t_ns"].to_numpy(np.int64)
     place = table[["x", "y", "z"]].to_numpy(np.float64)
     return [

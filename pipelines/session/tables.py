@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow.parquet as pq
 
-Span = tuple[int, int]
-"""First and last time, ns."""
-
 _T_NS, _CAMERA, _PERSON = ("t_ns", pa.int64()), ("camera", pa.string()), ("person", pa.int64())
 _FRAME, _JOINT, _STATUS = ("frame", pa.int64()), ("joint", pa.string()), ("status", pa.string())
 _XY, _XYZ = ([(name, pa.float64()) for name in names] for names in ("xy", "xyz"))
@@ -176,15 +173,13 @@ def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], p
     return [(metadata.row_group(k).column(0).statistics.min, partial(read, k)) for k in filled]
 
 
-def read_table(path: Path, schema: pa.Schema, span_ns: Span | None = None) -> pd.DataFrame:
-    """Read a table with the columns of `schema` (more are kept), within a span, both ends included.
+def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
+    """Read a table with the columns of `schema` (more are kept).
 
     DataError: missing, not a Parquet file, truncated, columns are missing, or it holds absurd numbers.
     """
     with _opened(path) as opened:
-        batches = _batches_within(opened, span_ns)
-        table = opened.read() if span_ns is None else pa.Table.from_batches(batches, opened.schema_arrow)
-    return _frame_of(path, table, schema)
+        return _frame_of(path, opened.read(), schema)
 
 
 def figures_by_joint(table: pd.DataFrame) -> dict[str, dict[str, float | None]]:
@@ -194,15 +189,6 @@ def figures_by_joint(table: pd.DataFrame) -> dict[str, dict[str, float | None]]:
         for joint, own in table.groupby("joint", sort=False)
         for rows in [zip(own["figure"], own["value"], strict=True)]
     }
-
-
-def read_first(path: Path, schema: pa.Schema) -> pd.DataFrame:
-    """Read the first row of a table, and no row of an empty one; DataError as of `read_table`."""
-    with _opened(path) as opened:
-        first = next(opened.iter_batches(1, columns=schema.names), None)
-    table = schema.empty_table() if first is None else pa.Table.from_batches([first])
-    frame: pd.DataFrame = table.to_pandas()
-    return frame
 
 
 def distinct(path: Path, name: str) -> Int64:
@@ -244,28 +230,11 @@ def _batches(opened: Any, columns: Sequence[str] | None = None) -> Iterator[Any]
         yield from opened.iter_batches(ROWS_PER_BATCH, row_groups=[group], columns=columns)
 
 
-def _batches_within(opened: Any, span_ns: Span | None) -> Iterator[Any]:
-    """Yield the rows of a Parquet file whose times lie within a span (all without one), a few at a time."""
-    import pyarrow.compute as pc
-
-    if span_ns is None or "t_ns" not in opened.schema_arrow.names:
-        yield from _batches(opened)
-        return
-    first, last = (pa.scalar(t_ns, pa.int64()) for t_ns in span_ns)
-    column = opened.schema_arrow.names.index("t_ns")
-    for number in range(opened.metadata.num_row_groups):
-        known = opened.metadata.row_group(number).column(column).statistics
-        if known is None or not known.has_min_max or (known.max >= span_ns[0] and known.min <= span_ns[1]):
-            for batch in opened.iter_batches(ROWS_PER_BATCH, row_groups=[number]):
-                within = pc.and_(pc.greater_equal(batch["t_ns"], first), pc.less_equal(batch["t_ns"], last))
-                yield batch.filter(within)
-
-
-def _parts(path: Path, schema: pa.Schema, span_ns: Span | None) -> Iterator[pd.DataFrame]:
+def _parts(path: Path, schema: pa.Schema) -> Iterator[pd.DataFrame]:
     """Yield what `read_table` returns in parts; the first has the columns and no rows."""
     with _opened(path) as opened:
         yield _frame_of(path, opened.schema_arrow.empty_table(), schema)
-        for batch in _batches_within(opened, span_ns):
+        for batch in _batches(opened):
             yield _frame_of(path, pa.Table.from_batches([batch], opened.schema_arrow), schema)
 
 
@@ -475,9 +444,7 @@ def motion_from(table: pd.DataFrame, joints: tuple[str, ...]) -> JointMotion:
     return motion
 
 
-def read_motion(
-    path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = None, span_ns: Span | None = None
-) -> JointMotion:
+def read_motion(path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = None) -> JointMotion:
     """Read the motion of these joints (None: of all) from a table of `tables.TRUTH` or `tables.SKELETON`.
 
     It is that of `motion_from`, with one part of the table in memory at a time.
@@ -486,12 +453,12 @@ def read_motion(
         DataError: see `read_table`.
     """
     times, people, names = [np.empty(0, np.int64)], 1, dict[str, None]()
-    for part in _parts(path, schema, span_ns):
+    for part in _parts(path, schema):
         times.append(np.unique(part["t_ns"].to_numpy(np.int64)))
         people = max(people, _people_of(part))
         names |= dict.fromkeys(part["joint"].unique())
     motion = _unknown_motion(np.unique(np.concatenate(times)), joints or tuple(names), people, part)
-    for part in _parts(path, schema, span_ns):
+    for part in _parts(path, schema):
         _fill_motion(motion, part)
     return motion
 

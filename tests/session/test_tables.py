@@ -17,7 +17,6 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.tables import (
     SKELETON,
     TRUTH,
-    Span,
     join_tables,
     motion_from,
     read_motion,
@@ -53,28 +52,19 @@ def skeleton(seed: int, times: int, people: int) -> pd.DataFrame:
     times=st.integers(1, 30),
     people=st.integers(1, 3),
     parts=st.integers(1, 5),
-    span=st.none() | st.tuples(st.integers(0, 30), st.integers(0, 30)),
     joints=st.none() | st.permutations(JOINTS).map(lambda names: tuple(names[:2])),
 )
 def test_a_motion_read_in_parts_is_that_of_the_whole_table(
-    seed: int,
-    times: int,
-    people: int,
-    parts: int,
-    span: tuple[int, int] | None,
-    joints: tuple[str, ...] | None,
+    seed: int, times: int, people: int, parts: int, joints: tuple[str, ...] | None
 ) -> None:
     table = skeleton(seed, times, people)
     rows = np.array_split(np.arange(len(table)), parts)
-    span_ns: Span | None = None
-    if span is not None:
-        span_ns = 1_000_000_000 + 33_000_000 * min(span), 1_000_000_000 + 33_000_000 * max(span)
     with tempfile.TemporaryDirectory() as place:
         path = Path(place, "skeleton.parquet")
         join_tables(path, (table.iloc[some] for some in rows), SKELETON)
-        whole = read_table(path, SKELETON, span_ns)
+        whole = read_table(path, SKELETON)
         expected = motion_from(whole, joints or tuple(dict.fromkeys(whole["joint"])))
-        found = read_motion(path, SKELETON, joints, span_ns)
+        found = read_motion(path, SKELETON, joints)
     assert found.joints == expected.joints
     for name in ("t_ns", "position", "status", "views", "reprojection_px", "covariance"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))

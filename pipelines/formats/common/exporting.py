@@ -17,8 +17,6 @@ CHI2_95 = 7.815
 
 # Viewers stay fluent up to this number of cubes.
 MOST_CUBES = 1_000_000
-# So many layers of a map are searched at once, which bounds the memory.
-_SLAB = 16
 
 
 def safe_file_name(name: str) -> str:
@@ -138,22 +136,10 @@ def surface_of(occupancy: Occupancy) -> MapSurface:
 
     Voxels beyond the map's box and unknown voxels count as not occupied.
     """
-    layers = occupancy.probability.shape[0]
-    found: list[Int64] = []
-    for first in range(0, layers, _SLAB):
-        last = min(first + _SLAB, layers)
-        low, high = max(first - 1, 0), min(last + 1, layers)
-        with np.errstate(invalid="ignore"):
-            part = occupancy.probability[low:high] >= 0.5
-        padding = ((int(first == 0), int(last == layers)), (1, 1), (1, 1))
-        part = np.pad(part, padding)
-        inner = part[1:-1, 1:-1, 1:-1].copy()
-        for axis in range(3):
-            for side in (slice(None, -2), slice(2, None)):
-                inner &= part[tuple(side if a == axis else slice(1, -1) for a in range(3))]
-        here = np.argwhere(part[1:-1, 1:-1, 1:-1] & ~inner)
-        found.append(here.astype(np.int64) + np.array([first, 0, 0]))
-    voxels = np.concatenate(found)
+    from scipy.ndimage import binary_erosion
+
+    occupied = occupancy.probability >= 0.5  # False where nothing is known
+    voxels = np.argwhere(occupied & ~binary_erosion(occupied))
     gathered, cubes = 1, voxels
     while len(cubes) > MOST_CUBES:
         gathered += 1

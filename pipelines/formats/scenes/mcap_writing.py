@@ -10,9 +10,8 @@ RViz shows it, too, except for the videos: it has no display for CompressedVideo
 | /sigma | sensor_msgs/JointState | standard deviations of the joints, per axis, m, in the field `position` |
 | /doubts | rcl_interfaces/Log | what contradicts itself in the flight, as warnings at the beginning |
 | /tf | tf2_msgs/TFMessage | the cameras in `world`, at most 50 times a second |
-| /frustums | visualization_msgs/MarkerArray | the cameras' views, in their own frames, every second |
 | /CAMERA/path | nav_msgs/Path | the camera's path, at most 10 poses a second, written once |
-| /CAMERA/camera_info | sensor_msgs/CameraInfo | with every picture, else every second |
+| /CAMERA/camera_info | sensor_msgs/CameraInfo | with every picture, else every second: the frustum |
 | /CAMERA/image/video | foxglove_msgs/CompressedVideo | H.264, at most 960 px wide |
 | /map | sensor_msgs/PointCloud2 | the middles of the map's surface voxels |
 
@@ -146,8 +145,6 @@ def _value(store: Typestore, kind: Any, given: Any) -> Any:
 
 
 _TF_HZ, _ELLIPSOIDS_HZ, _PATH_HZ, _STANDING_HZ = 50.0, 10.0, 10.0, 1.0
-# A frustum of this length shows where a camera looks and hides nobody.
-_FRUSTUM_M = 1.0
 # Stamps of ROS count seconds in 31 bits.
 _LATEST_NS = (1 << 31) * 10**9
 _LINE_LIST, _SPHERE, _SPHERE_LIST = 5, 2, 7
@@ -188,7 +185,6 @@ class McapExport:
             streams += [_path(topics[name], track, start_ns), _transforms(name, track)]
             if lens is not None:
                 streams.append(_pictures(recording, name, topics[name], lens, (start_ns, end_ns)))
-        streams.append(_frustums(recording.lenses, list(tracks), (start_ns, end_ns)))
         if motion is not None:
             streams += [_skeleton(motion), _uncertainty(motion), _sigmas(recording, motion)]
             recording.progress.start("Writing mcap", len(motion.t_ns))
@@ -359,40 +355,6 @@ def _path(topic: str, track: Trajectory, start_ns: int) -> Iterator[Entry]:
     ]
     fields = {"header": {"stamp": start_ns, "frame_id": "world"}, "poses": poses}
     yield start_ns, f"{topic}/path", "nav_msgs/msg/Path", fields
-
-
-def _frustums(
-    lenses: Mapping[str, Intrinsics], cameras: list[str], span_ns: tuple[int, int]
-) -> Iterator[Entry]:
-    corners = {name: _frustum(lenses[name]) for name in cameras if name in lenses}
-    if not corners:
-        return
-    for t_ns in _seconds(span_ns):
-        markers = [
-            {
-                "header": {"stamp": t_ns, "frame_id": name},
-                "ns": "frustums",
-                "id": k,
-                "type": _LINE_LIST,
-                "pose": _POSE,
-                "scale": {"x": 0.02},
-                "color": {"r": 0.6, "g": 0.6, "b": 0.6, "a": 1.0},
-                "frame_locked": True,
-                "points": _points(points),
-            }
-            for k, (name, points) in enumerate(corners.items())
-        ]
-        yield t_ns, "/frustums", "visualization_msgs/msg/MarkerArray", {"markers": markers}
-
-
-def _frustum(lens: Intrinsics) -> Float:
-    """Return eight lines as pairs of points [16, 3]: from the eye to the corners 1 m away, and around."""
-    across = [(-0.5 - lens.cx) / lens.fx, (lens.width - 0.5 - lens.cx) / lens.fx]
-    down = [(-0.5 - lens.cy) / lens.fy, (lens.height - 0.5 - lens.cy) / lens.fy]
-    corners = [(across[0], down[0]), (across[1], down[0]), (across[1], down[1]), (across[0], down[1])]
-    far = _FRUSTUM_M * np.array([[x, y, 1.0] for x, y in corners])
-    rays = [(np.zeros(3), corner) for corner in far]
-    return np.array([*rays, *((far[k], far[k - 1]) for k in range(4))]).reshape(-1, 3)
 
 
 def _pictures(

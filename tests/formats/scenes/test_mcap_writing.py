@@ -56,7 +56,6 @@ def test_the_mcap_reader_finds_every_topic_with_a_schema_that_parses(log: Path) 
         "/map": 1,
         "/cam_1/path": 1,
         "/tf": 60,
-        "/frustums": 2,
         "/cam_1/camera_info": 4,
         "/cam_1/image/video": 4,
         "/skeleton": 60,
@@ -113,15 +112,6 @@ def test_cameras_fly_and_look_where_they_do(log: Path) -> None:
     np.testing.assert_array_equal([rotation.x, rotation.y, rotation.z, rotation.w], LOOKING_NORTH)
     ((_, path),) = messages(log, "/cam_1/path")
     assert [pose.pose.position.x for pose in path.poses] == track.position[::3, 0].tolist()
-    _, frustums = messages(log, "/frustums")[0]
-    corner = frustums.markers[0].points[1]
-    # The picture's corner, half a pixel outside the centre of the first pixel.
-    np.testing.assert_allclose(
-        [corner.x, corner.y, corner.z],
-        [(-0.5 - LENS.cx) / LENS.fx, (-0.5 - LENS.cy) / LENS.fy, 1.0],
-        rtol=1e-12,
-    )
-    assert (frustums.markers[0].header.frame_id, frustums.markers[0].frame_locked) == ("cam-1", True)
 
 
 def test_pictures_come_with_the_lens_of_their_size(log: Path) -> None:
