@@ -22,6 +22,7 @@ _is_script = os.path.basename(sys.argv[0]) == "mocap"  # noqa: PTH119  # pathlib
 if _is_script and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, _leave_at_once)  # until the command is loaded
 
+from contextlib import suppress  # noqa: E402
 from importlib import import_module  # noqa: E402
 
 import click  # noqa: E402
@@ -48,6 +49,7 @@ class Mocap(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; an error that the user can correct is one line on stderr and exit status 1."""
         try:
+            _refuse_little_memory()
             return super().invoke(ctx)
         except MocapError as error:
             print_error(error)
@@ -79,6 +81,20 @@ _SHORT_OF_MEMORY = (
     *("annot allocate memory", "failed to map segment", "start new thread", "std::bad_alloc"),
     *("load shared object file", "error return without exception set"),
 )
+
+
+# Below it, libraries in C++ end the process themselves, with words of their own.
+MIN_ADDRESS_SPACE_BYTES = 700 << 20
+
+
+def _refuse_little_memory() -> None:
+    """Refuse a limit (`ulimit -v`) with which libraries cannot be loaded; other systems have none."""
+    with suppress(ImportError):
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_BYTES:
+            raise OUT_OF_MEMORY
 
 
 def _is_short_of_memory(error: BaseException) -> bool:
