@@ -66,6 +66,8 @@ _UNREAD = (
     (re.compile(rb"PK\x03\x04.{26}[\w.-]{1,60}\.npy", re.DOTALL),
      "a NumPy archive of other arrays than a map's",
      "a map has probability or occupancy, origin and resolution_m; save a calibration as YAML, poses as CSV"),
+    (re.compile(rb"\x93NUMPY"), "a NumPy array without names and times",
+     "write joints as CSV: time, nose_x, nose_y, nose_z, ... (FreeMoCap does beside its .npy)"),
     (re.compile(rb"PK\x03\x04"), "a ZIP archive", "unpack it"),
     (re.compile(rb"ASTM-E57"), "an E57 point cloud", "convert it to LAS or PLY (CloudCompare does)"),
     (re.compile(rb"II\*\0|MM\0\*"), "a TIFF picture",

@@ -16,7 +16,9 @@ from pipelines.formats.common.exporting import write_tables
 from pipelines.formats.common.files import read_head, read_text
 from pipelines.formats.common.rows import (
     Heading,
+    TextTable,
     bounding_box,
+    cell_name,
     describe_times,
     find_heading,
     parse_stamps,
@@ -250,12 +252,16 @@ _TIMES_AT_ONCE = 1000
 _MOST_CELLS_PER_ROW = 100
 
 
+# Tables of devices have one or two points of such columns.
+LEAST_JOINTS_OF_WIDE = 4
+
+
 class JointsCsvFormat:
     """Reader of the header `t_ns,[person,]joint,x,y,z` in any order; the time may be t, time, ... in seconds.
 
-    Metres and z up unless the user states otherwise. Rows may come in any order. People are ranked by
-    their number, joints in order of appearance. A position that is blank, infinite or absent is
-    missing (NaN).
+    Tables with a row for each time are read, too: time, nose_x, nose_y, nose_z, ... (FreeMoCap, caliscope).
+    Metres and z up unless the user states otherwise. Rows of single joints may come in any order; people are
+    ranked by their number. A position that is blank, infinite or absent is missing (NaN).
     """
 
     name = "joints_csv"
@@ -264,7 +270,8 @@ class JointsCsvFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the header names a time, a joint and x y z."""
-        return _find_heading(read_head(path, self.suffixes)) is not None
+        head = read_head(path, self.suffixes)
+        return _find_heading(head) is not None or len(_joints_of_wide(head)) >= LEAST_JOINTS_OF_WIDE
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe joints, people, times, missing values, and the box as if in metres with z up."""
@@ -274,24 +281,57 @@ class JointsCsvFormat:
         """Read every joint."""
         text = read_text(path)
         heading = _find_heading(text)
+        if heading is None and (columns := _joints_of_wide(text)):
+            return _read_wide(path, text, columns, unit or "m", axes or "z-up")
         if heading is None:
             problem = "has no header that names the time, joint and x y z"
             raise DataError(path, problem, "begin with t_ns,joint,x,y,z", code="missing-column")
         names = heading.names
         words = {name: column for name, column in names.items() if name in ("joint", "person")}
         table = rows_below(path, heading, text, words, {axis: names[axis] for axis in "xyz"})
-        if table.truncated:
-            raise DataError(
-                path, "its last line broke off", "copy the file again, or delete that line", code="damaged"
-            )
-        stamps, readable = parse_stamps(
-            path, table.text["stamp"], heading.unit, unit_stated=heading.unit_stated
-        )
-        if not readable.all():
-            raise DataError(path, f"{np.count_nonzero(~readable)} rows have no readable time", "correct them")
+        stamps = _stamps(path, heading, table)
         position = to_metres_z_up(path, table.stack(("x", "y", "z")), unit or "m", axes or "z-up")
         people = _people(path, table.text.get("person"), len(stamps))
         return _dense(path, stamps, people, table.text["joint"], position)
+
+
+def _stamps(path: Path, heading: Heading, table: TextTable) -> Int64:
+    """Return the times of a table that is whole and has one in every row."""
+    if table.truncated:
+        remedy = "copy the file again, or delete that line"
+        raise DataError(path, "its last line broke off", remedy, code="damaged")
+    column = table.text["stamp"]
+    stamps, readable = parse_stamps(path, column, heading.unit, unit_stated=heading.unit_stated)
+    if not readable.all():
+        raise DataError(path, f"{np.count_nonzero(~readable)} rows have no readable time", "correct them")
+    return stamps
+
+
+def _joints_of_wide(text: str) -> dict[str, int]:
+    """Return the column of x of every point that has columns `NAME_x`, `NAME_y`, `NAME_z`, side by side."""
+    names = [cell_name(cell)[0] for cell in text.split("\n", 1)[0].split(",")]
+    threes = zip(names, names[1:], names[2:], strict=False)
+    return {
+        x[:-2]: column
+        for column, (x, y, z) in enumerate(threes)
+        if x[-2:] == "_x" and (y, z) == (f"{x[:-2]}_y", f"{x[:-2]}_z")
+    }
+
+
+def _read_wide(path: Path, text: str, columns: dict[str, int], unit: str, axes: str) -> JointMotion:
+    heading = find_heading(text.split("\n", 1)[0], delimiters=",")
+    if heading is None:
+        problem, remedy = "states no times", "give the .trc that caliscope writes beside it, or add `time`"
+        raise DataError(path, problem, remedy, code="clock-unknown")
+    numbers = {f"{joint} {k}": column + k for joint, column in columns.items() for k in range(3)}
+    table = rows_below(path, heading, text, {}, numbers)
+    stamps = _stamps(path, heading, table)
+    if (np.diff(stamps) <= 0).any():
+        raise DataError(path, "its times do not increase", "sort its rows", code="bad-value")
+    position = table.stack([*numbers]).reshape(len(stamps), len(columns), 3)
+    return JointMotion(
+        stamps, joint_names(tuple(columns)), to_metres_z_up(path, position, unit, axes)[:, None]
+    )
 
 
 def _find_heading(text: str) -> Heading | None:

@@ -13,9 +13,10 @@ from pipelines.formats import poses as trajectory_files
 from pipelines.formats.skeletons import joint_files
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
-from pipelines.session.registries import Export, JointFormat
+from pipelines.session.registries import Export, JointFormat, recognise
 from tests.formats.motions import motions
 from tests.formats.refusals import refuses
+from tests.raising import refused
 
 READER: JointFormat = joint_files.JOINTS_CSV
 WRITER: Export = joint_files.CSV_EXPORT
@@ -100,3 +101,22 @@ def test_export_writes_skeleton_and_cameras(tmp_path: Path) -> None:
     )
     with refuses("walk", "reconstruct"):
         WRITER.write(Recording("walk", None, {}), tmp_path)
+
+
+def test_a_row_for_each_time_as_freemocap_writes_them(tmp_path: Path) -> None:
+    names = ("nose", "left_shoulder", "mouth_left", "right_hip", "body_com")
+    head = ",".join(f"{name}_{axis}" for name in names for axis in "xyz")
+    rows = [f"{t},{t},{','.join(str(100 * k + t) for k in range(15))}" for t in (0, 1)]
+    path = tmp_path / "by_frame.csv"
+    path.write_text("\n".join([f"frame,timestamp,{head}", *rows]) + "\n")
+    reader = recognise(path, JointFormat, "joint file")
+    motion = reader.read_joints(path, unit="mm", axes=None)
+    assert motion.joints == ("nose", "left_shoulder", "left_mouth", "right_hip", "body_com")
+    assert motion.t_ns.tolist() == [0, 10**9]
+    np.testing.assert_allclose(motion.position[1, 0, 1], [0.301, 0.401, 0.501])
+    path.write_text("\n".join([f"sync_index,{head}", *(row.partition(",")[2] for row in rows)]) + "\n")
+    with refused("clock-unknown", path):
+        reader.read_joints(path, unit=None, axes=None)
+    np.save(tmp_path / "skeleton_3d.npy", np.zeros((4, 33, 3)))
+    with refused("wrong-kind", tmp_path / "skeleton_3d.npy", "NumPy"):
+        recognise(tmp_path / "skeleton_3d.npy", JointFormat, "joint file")
