@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mocap_cli.options import (
-    RenamedOptions,
     Shown,
     any_place,
     force_option,
@@ -24,11 +23,6 @@ from mocap_cli.terminal import one_line, print_json, say, watching
 if TYPE_CHECKING:
     from mocap_cli.options import ChosenPictures
     from pipelines.batch import BatchSettings
-
-GONE = {
-    "--every": "write --pictures ::N",
-    "--provider": "write --detector onnx:MODEL.onnx,provider=NAME",
-}
 
 
 def _settings(stages: str, pictures: ChosenPictures, **others: Any) -> BatchSettings:
@@ -63,9 +57,7 @@ _settings_options = grouped(
 )
 
 
-@click.command(
-    "batch", cls=RenamedOptions, gone=GONE, short_help="Run all stages over many flights, on Dask."
-)
+@click.command("batch", short_help="Run all stages over many flights, on Dask.")
 @click.argument("flights", nargs=-1, required=True, metavar="FLIGHT.yaml...")
 @click.option(
     "-o",

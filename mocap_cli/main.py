@@ -37,11 +37,6 @@ COMMANDS = (
 )
 """The commands in the order of their use. Each is `NAME_command` in the module `mocap_cli.NAME`."""
 
-_GONE = {
-    "ablate": "`mocap study tilt_deg=0:60:15`, robots=... or noise=...",
-    "replan-sweep": "`mocap study range_m=8,10 SESSION`",
-}
-
 
 class Mocap(click.Group):
     """Group that prints errors in one line."""
@@ -118,8 +113,6 @@ class _Lazy(Mocap):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command; for an unknown name all of them, from which click suggests the nearest."""
-        if cmd_name in _GONE:
-            raise click.UsageError(f"{cmd_name} does not exist any more: write {_GONE[cmd_name]}.", ctx)
         for name in (cmd_name,) if cmd_name in COMMANDS else COMMANDS:
             module = name.replace("-", "_")
             self.add_command(getattr(import_module(f"mocap_cli.{module}"), f"{module}_command"))

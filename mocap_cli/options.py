@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -76,28 +76,6 @@ force_option = click.option(
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print the result as JSON; everything else goes to stderr."
 )
-
-
-class RenamedOptions(click.Command):
-    """Command that refuses options which no longer exist and names what replaces them.
-
-    Args:
-        gone: by an option's former name the text that says what to write instead.
-    """
-
-    def __init__(self, *arguments: Any, gone: Mapping[str, str], **values: Any) -> None:
-        super().__init__(*arguments, **values)
-        self._gone = gone
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments, or raise a usage error."""
-        try:
-            return super().parse_args(ctx, args)
-        except click.NoSuchOption as error:
-            instead = self._gone.get(error.option_name)
-            if instead is None:
-                raise
-            raise click.UsageError(f"{error.option_name} does not exist any more: {instead}.", ctx) from None
 
 
 @dataclass(frozen=True)

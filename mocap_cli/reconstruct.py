@@ -13,7 +13,6 @@ import click
 
 from mocap_cli.options import (
     FiniteRange,
-    RenamedOptions,
     Shown,
     any_path,
     force_option,
@@ -28,21 +27,6 @@ from mocap_cli.terminal import print_table, say, say_warnings, watching
 if TYPE_CHECKING:
     from mocap_cli.options import ChosenPictures
     from pipelines.reconstruct import Reconstructed, ReconstructSettings
-
-GONE = {
-    "--strict": "`mocap check SESSION --strict` does it",
-    "--refine-cameras": "--method auto does it",
-    "--pixel-noise": "it is estimated from the keypoints",
-    "--min-confidence": "keypoints below 0.3 are not used",
-    "--trials": 'write --disturb-poses "MODEL x20"',
-    "--seed": 'write --disturb-poses "MODEL seed=3"',
-    "--provider": "write --detector onnx:MODEL.onnx,provider=NAME",
-    "--fill": 'write --smooth "fill:max_s=0.2"',
-    "--every": "write --pictures ::N",
-    "--start": "write --pictures START:END",
-    "--end": "write --pictures START:END",
-    "--overlay": "write `mocap export SESSION --to overlay` or --to overlay:left_knee",
-}
 
 
 class People(click.ParamType["int | str"]):
@@ -138,9 +122,7 @@ _settings_options = grouped(
 )
 
 
-@click.command(
-    "reconstruct", cls=RenamedOptions, gone=GONE, short_help="Detect, triangulate, measure the errors."
-)
+@click.command("reconstruct", short_help="Detect, triangulate, measure the errors.")
 @each("session", "SESSION", ".session")
 @click.option(
     "-o",

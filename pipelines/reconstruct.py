@@ -40,6 +40,8 @@ from pipelines.reconstruction.doubts.turning import common_offset
 from pipelines.reconstruction.finishing import finish, smoother
 from pipelines.reconstruction.ground import bind_positions
 from pipelines.reconstruction.loading import (
+    PoseDisturbance,
+    disturbed,
     is_time_unknown,
     load_cameras,
     load_clock_sigma,
@@ -76,6 +78,7 @@ from pipelines.reconstruction.results import (
     of_people,
     people_warnings,
     skeleton_parts,
+    summary_of_trials,
     write_figures,
 )
 from pipelines.reconstruction.solving import (
@@ -86,7 +89,6 @@ from pipelines.reconstruction.solving import (
     solver_for,
     views_with_noise,
 )
-from pipelines.reconstruction.trials import PoseDisturbance, disturbed, summary_of_trials
 from pipelines.session.description import (
     Description,
     Doubt,

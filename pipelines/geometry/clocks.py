@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64
 from pipelines.geometry.poses import conjugate, interpolate_poses, matrix_from_quaternion, multiply, rotate
 
 # --- tuning ---
@@ -56,26 +56,6 @@ _DIFFERENCE_STEP_S = 0.01
 _BLOCK_S = 1.0
 # Three pictures of a 30 Hz video: a start known less well is of no use.
 _MAX_START_SIGMA_S = 0.1
-
-
-@dataclass(frozen=True)
-class ClockFit:
-    """The other clock's reading is `at_ns + offset_ns + (t - at_ns) * drift`, for a reading t of this one."""
-
-    at_ns: int  # reading of this clock, in the middle of the events
-    offset_ns: int  # other - this, at `at_ns`
-    drift_ppm: float  # 0 if it is not significant
-    drift_sigma_ppm: float
-    residual_s: float  # scatter of the events about the line: 1.4826 times their median deviation
-    events: int  # that were compared
-    rejected: int  # of them, further than six times the scatter from the line
-    steps_s: tuple[float, ...] = ()  # of the other clock, taken out so that its last readings count
-
-    def other_ns(self, t_ns: Int64) -> Int64:
-        """Convert times of this clock to readings of the other; exact integers except for the drift."""
-        drifted = np.rint((t_ns - self.at_ns) * (self.drift_ppm * 1e-6)).astype(np.int64)
-        moved: Int64 = t_ns + (self.offset_ns + drifted)
-        return moved
 
 
 def fit_clock(this_ns: Int64, other_ns: Int64) -> ClockFit | None:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, RelativeTo
 from pipelines.geometry.poses import (
     ENU_FROM_NED,
     multiply,
@@ -78,10 +78,6 @@ def attitude_from_angles(
     in_rad = np.radians(angles) if units == "deg" else angles
     yaw, pitch, roll = np.moveaxis(in_rad[..., [order.index(letter) for letter in "ypr"]], -1, 0)
     return multiply(multiply(_turn("z", yaw), _turn("y", pitch)), _turn("x", roll))
-
-
-RelativeTo = Literal["world", "body", "heading"]
-"""The reference of a gimbal's angles. Heading: yaw from the nose, pitch and roll from the horizon."""
 
 
 def attitude_in_enu(quaternion_xyzw: Float, *, relative_to: RelativeTo, axes: Literal["enu", "ned"]) -> Float:

@@ -32,9 +32,9 @@ docs/estimate.md.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
-from itertools import combinations, islice
+from itertools import combinations, islice, pairwise
 from itertools import count as count_up
 from math import comb, cos, gcd, radians
 from typing import Literal, NamedTuple
@@ -160,10 +160,7 @@ def triangulate(views: Views, *, method: Method, min_views: int = 2, gate: float
     blocks = []
     for first in range(0, max(len(views.weight), 1), _BLOCK):
         part = slice(first, first + _BLOCK)
-        block = replace(
-            views, rays=views.rays[part], weight=views.weight[part], pose_index=views.pose_index[part]
-        )
-        blocks.append(_triangulate_block(block, poses, method, min_views, gate))
+        blocks.append(_triangulate_block(_rows(views, part), poses, method, min_views, gate))
     return Triangulation(*(np.concatenate(results) for results in zip(*blocks, strict=True)))
 
 
@@ -354,9 +351,7 @@ def estimate_noise(views: Views) -> Float:
     if cameras < 2:
         return views.pixel_sigma
     chosen = np.linspace(0, n - 1, min(n, _NOISE_SAMPLE)).astype(np.int64)
-    sample = replace(
-        views, rays=views.rays[chosen], weight=views.weight[chosen], pose_index=views.pose_index[chosen]
-    )
+    sample = _rows(views, chosen)
 
     def explain(seen: Views, method: Method, sigma: Float) -> Float:
         result = triangulate(replace(seen, pixel_sigma=sigma), method=method)
@@ -452,6 +447,8 @@ _MIN_JOINTS = 5
 
 # The second round has residuals of points without gross errors.
 _GROSS_ROUNDS = 2
+# Gross errors of so many joint-frames are judged at once: some minutes of a flight, in 200 MB.
+_ROWS_AT_ONCE = 1 << 18
 
 
 def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) -> Triangulation:
@@ -462,14 +459,22 @@ def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) ->
 
     Args:
         views: the observations; `views.pixel_sigma` as `estimate_noise` found it.
-        picture: [N] rows with the same number (not negative) are the joints of one person in one picture of
-            every camera. If a camera shows fewer than five of them, its views are not judged.
+        picture: [N] ascending; rows with the same number are the joints of one person in one picture of every
+            camera. If a camera shows fewer than five of them, its views are not judged.
         pixel_sigma: [C] px, that of the detector alone; `views.pixel_sigma` includes unexplained pose errors.
 
     Returns:
         As `triangulate`. Views that are left out are not inliers but have their residuals. A joint-frame with
         too few views because of them is `rejected`.
     """
+    if len(picture) > _ROWS_AT_ONCE:
+        cuts = np.searchsorted(picture, picture[_ROWS_AT_ONCE::_ROWS_AT_ONCE]).tolist()
+        parts = [
+            triangulate_pictures(_rows(views, part), picture=picture[part], pixel_sigma=pixel_sigma)
+            for part in (slice(*ends) for ends in pairwise([0, *cuts, len(picture)]))
+        ]
+        names = [field.name for field in fields(Triangulation)]
+        return Triangulation(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
     first = triangulate(views, method="robust")
     gross = _gross(views, picture, first.points, pixel_sigma)
     if not gross.any():
@@ -479,9 +484,14 @@ def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) ->
     lost = rows[np.isnan(found.points[rows, 0])]
     status, residual_px = found.status.copy(), found.residual_px.copy()
     status[lost] = STATUS.index("rejected")
-    own = replace(views, rays=views.rays[rows], weight=views.weight[rows], pose_index=views.pose_index[rows])
-    residual_px[rows] = np.where(gross[rows], reprojection_px(own, found.points[rows]), residual_px[rows])
+    again = reprojection_px(_rows(views, rows), found.points[rows])
+    residual_px[rows] = np.where(gross[rows], again, residual_px[rows])
     return replace(found, status=status, residual_px=residual_px)
+
+
+def _rows(views: Views, rows: slice | Int64) -> Views:
+    """Take some joint-frames."""
+    return replace(views, rays=views.rays[rows], weight=views.weight[rows], pose_index=views.pose_index[rows])
 
 
 def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float) -> Bool:

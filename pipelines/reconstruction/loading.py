@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,8 +16,10 @@ from pipelines.geometry.noise import (
     UNKNOWN_SIGMA,
     NoiseModel,
     PoseErrors,
+    disturb,
     errors_of_level,
     pose_errors,
+    sum_sigma,
 )
 from pipelines.reconstruction.log_stretches import Mended, mend, said_stretches
 from pipelines.reconstruction.observations import Camera
@@ -24,6 +27,7 @@ from pipelines.session.camera_poses import stated_models, stated_noise
 from pipelines.session.description import Description
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion
+from pipelines.session.registries import parsed_noise_models
 from pipelines.session.stages import StageRecord
 from pipelines.session.tables import (
     FRAMES,
@@ -252,3 +256,56 @@ def is_time_unknown(description: Description, cameras: Sequence[Camera]) -> bool
 def load_truth(folder: Path, description: Description, joints: tuple[str, ...]) -> JointMotion | None:
     """Load the true joints, NaN for joints without truth; None if the session has no truth."""
     return read_motion(folder / "truth.parquet", TRUTH, joints) if description.has_true_joints else None
+
+
+# --- errors that are added -----------------------------------------------------------------------------
+
+# More trials would take days and change no interval.
+MAX_TRIALS = 1000
+
+_DRAWS = re.compile(r"(?P<text>.*?)(\s+x(?P<trials>[0-9]+))?(\s+seed=(?P<seed>[0-9]+))?\s*", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class PoseDisturbance:
+    """Errors that are added to the logged poses in several trials."""
+
+    text: str  # the noise models, as users write them
+    models: list[NoiseModel]
+    trials: int
+    seed: int
+
+    @classmethod
+    def parse(cls, text: str) -> PoseDisturbance:
+        """Parse `MODELS [xTRIALS] [seed=SEED]`; without them there is one trial, and the seed is 0.
+
+        Raises:
+            DataError: it cannot be parsed, all sizes are 0, or there are no trials or too many.
+        """
+        place = "--disturb-poses"
+        found = _DRAWS.fullmatch(text)
+        words = {} if found is None else found.groupdict()
+        models = parsed_noise_models(place, words["text"])
+        one = np.ones(1)  # any elapsed time, speed and turn rate
+        if not sum_sigma(models, one, one, one).any():
+            raise DataError(
+                place, f"{text!r} disturbs nothing", "state at least one size above 0", code="bad-value"
+            )
+        trials, seed = int(words["trials"] or 1), int(words["seed"] or 0)
+        if not 1 <= trials <= MAX_TRIALS or seed >= 2**32:
+            problem = f"x{trials} seed={seed} is out of range"
+            raise DataError(
+                place, problem, f"state x1 to x{MAX_TRIALS}, and a seed below 2^32", code="bad-value"
+            )
+        return cls(words["text"], models, trials, seed)
+
+
+def disturbed(cameras: Sequence[Camera], models: Sequence[NoiseModel], seed: int, trial: int) -> list[Camera]:
+    """Add errors to every logged pose of the cameras; the stated noise of the logs stays the same."""
+    moved = []
+    for c, camera in enumerate(cameras):
+        log = camera.trajectory
+        rng = np.random.default_rng([seed, trial, c])
+        position, quaternion = disturb(models, log.t_ns, log.position, log.quaternion_xyzw, rng)
+        moved.append(replace(camera, trajectory=replace(log, position=position, quaternion_xyzw=quaternion)))
+    return moved

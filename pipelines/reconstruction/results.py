@@ -376,6 +376,66 @@ def _summary(used: Mapping[str, Any], clocks_s: Mapping[str, tuple[float, float]
     return "used " + "; ".join(parts) + (f". Not used: {'; '.join(left_out)}" if left_out else "")
 
 
+# --- trials ---------------------------------------------------------------------------------------------
+
+_OF_TRIALS = (
+    "mpjpe_mm",
+    "root_mpjpe_mm",
+    "pa_mpjpe_mm",
+    "e_recon_m2",
+    "e_recon_terms",
+    "e_recon_per_joint_frame_m2",
+    "pck150",
+    "pck150_auc",
+    "acceleration_error_mm_s2",
+    "reconstructed_share",
+)
+
+
+def summary_of_trials(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) -> dict[str, Any]:
+    """Summarise all trials for metrics.json.
+
+    Args:
+        text: the errors, as users write them.
+        seed: seed of the draws, and of the resampling of trials.
+
+    Returns:
+        JSON-able, null for figures that could not be measured: `each` trial's figures, their `mean`, `std`
+        (about the mean, n - 1) and the `intervals` of `geometry.metrics` over trials; both null for less
+        than two trials.
+    """
+    each = [_figures_of_trial(trial) for trial in metrics]
+    mean: dict[str, float | None] = {}
+    std: dict[str, float | None] = {}
+    ends: dict[str, list[float] | None] = {}
+    for name in each[0]:
+        values = np.array([trial[name] for trial in each if trial[name] is not None], dtype=np.float64)
+        mean[name] = float(values.mean()) if values.size else None
+        std[name] = ends[name] = None
+        if values.size > 1:
+            std[name] = float(values.std(ddof=1))
+            found = intervals({name: (values, np.ones(values.size))}, None, seed=seed)[name]
+            ends[name] = None if found is None else list(found)
+    return {
+        "disturb_poses": text,
+        "seed": seed,
+        "count": len(each),
+        "stored": 0,
+        "mean": mean,
+        "std": std,
+        "intervals": ends,
+        "each": each,
+    }
+
+
+def _figures_of_trial(metrics: Mapping[str, Any]) -> dict[str, float | None]:
+    figures: dict[str, float | None] = {name: metrics[name] for name in _OF_TRIALS}
+    figures["reprojection_px_median"] = metrics["reprojection_px"]["median"]
+    if "refinement" in metrics:
+        figures["fell_back"] = float(metrics["refinement"]["fallback"] is not None)
+    return figures
+
+
 # --- tables --------------------------------------------------------------------------------------------
 
 

@@ -16,7 +16,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
-from pipelines.geometry.mounting import Looks, RelativeTo
+from pipelines.geometry.arrays import RelativeTo
+from pipelines.geometry.mounting import Looks
 from pipelines.session.errors import DataError
 from pipelines.session.old_spellings import old_spellings
 from pipelines.session.source_options import option_names

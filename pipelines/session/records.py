@@ -13,11 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.arrays import ClockFit, Float, Int64, RelativeTo
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place
-from pipelines.geometry.mounting import RelativeTo
 from pipelines.session.progress import Progress, Silent
 
 if TYPE_CHECKING:

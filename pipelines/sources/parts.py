@@ -7,9 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.geometry.arrays import Int64
+from pipelines.geometry.arrays import ClockFit, Int64
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.poses import gaps
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import (

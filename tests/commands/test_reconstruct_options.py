@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from mocap_cli.main import Mocap
-from mocap_cli.reconstruct import GONE, reconstruct_command
+from mocap_cli.reconstruct import reconstruct_command
 from tests.commands.runner import succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
@@ -190,14 +190,6 @@ def test_intervals_are_about_their_figures(clean: tuple[SyntheticFlight, Path]) 
     assert (nose["value"] < nose["high"]).tolist() == [True]
     bones = pd.read_parquet(session / "reconstruct" / "bones.parquet")
     assert bones["median_mm"].between(50, 600).all()
-
-
-@pytest.mark.parametrize("gone", list(GONE))
-def test_an_option_that_went_names_what_replaces_it(tmp_path: Path, gone: str) -> None:
-    done = command(tmp_path, gone)
-    assert done.exit_code == 2
-    assert gone in done.stderr
-    assert GONE[gone] in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.geometry.arrays import ClockFit
+from pipelines.geometry.clocks import fit_clock
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.cameras import Intrinsics
+from pipelines.reconstruction.loading import PoseDisturbance, disturbed
 from pipelines.reconstruction.observations import Camera
-from pipelines.reconstruction.trials import PoseDisturbance, disturbed, summary_of_trials
+from pipelines.reconstruction.results import summary_of_trials
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections, Trajectory
 

@@ -35,10 +35,9 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     turned_as_stated,
     world_from_heading,
 )
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.clocks import ClockFit
+from pipelines.geometry.arrays import ClockFit, Float, Int64
 from pipelines.geometry.geodesy import Place
-from pipelines.geometry.mounting import RelativeTo, attitude_in_enu
+from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice, need

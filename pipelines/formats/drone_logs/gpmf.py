@@ -39,8 +39,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     position_track,
     turned_as_stated,
 )
-from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.clocks import ClockFit
+from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.geometry.poses import conjugate, interpolate_points, multiply, rotate
 from pipelines.session.errors import DataError

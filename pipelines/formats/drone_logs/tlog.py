@@ -33,8 +33,8 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     refuse_marks,
 )
 from pipelines.formats.drone_logs.ulog import Columns, UlogTopic, telemetry_of
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.geometry.arrays import ClockFit, Float, Int64
+from pipelines.geometry.clocks import fit_clock
 from pipelines.session.errors import DataError
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice, need
