@@ -280,8 +280,12 @@ def _detected(
             "leave the span out of --pictures",
             code="no-pictures",
         )
-    if detected is None and settings.every > 1:
-        progress.note("every camera came with keypoints: --pictures says nothing about them")
+    unused = {
+        "--pictures": settings.every > 1,
+        "--detector": settings.detector != ReconstructSettings.detector,
+    }
+    for option in (option for option, is_stated in unused.items() if is_stated and detected is None):
+        progress.note(f"every camera came with keypoints: {option} has no effect on them")
     return detected
 
 

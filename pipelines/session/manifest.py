@@ -310,12 +310,12 @@ class GimbalSource(OwnAxes, FileSource):
             if not self.is_fixed and self.relative_to is None:
                 raise ValueError(
                     "needs a file, constant angles {yaw_deg, pitch_deg}, or what the drone's own angles are"
-                    " relative_to"
+                    " relative_to: world, body or heading"
                 )
         elif self.pitch_deg is not None:
             raise ValueError("has a file and constant angles: leave one of them out")
         elif self.topic is not None and self.relative_to is None:
-            raise ValueError("lacks relative_to: what the angles of the topic are relative to")
+            raise ValueError("lacks relative_to: world, body or heading, which its angles are relative to")
         return self
 
     @property
@@ -384,13 +384,22 @@ class CameraSources(YamlModel):
     """Times of the pictures."""
     clock: CameraClock | None = None
     """Clock of the pictures, relative to the world's."""
-    pose: PoseSource
+    pose: PoseSource = Field(
+        examples=[
+            "pose: drone1.tum, {file: drone1.mcap, topic: /odometry, of: body}, or a calibration with poses"
+        ]
+    )
     """Poses of the camera."""
     mount: Mount | None = None
     """Pose of the camera on the body whose poses are logged."""
     gimbal: GimbalSource | None = None
     """Angles of the gimbal that turns the camera."""
-    intrinsics: IntrinsicsSource
+    intrinsics: IntrinsicsSource = Field(
+        examples=[
+            "intrinsics: lens.yaml (OpenCV, ROS, Kalibr, TOML, COLMAP), {file: drone1.mcap, topic: /info}, or"
+            " {width: 1920, height: 1080, fx: 1400, fy: 1400, cx: 959.5, cy: 539.5}"
+        ]
+    )
     """Lens."""
     keypoints: KeypointSource | None = None
     """Keypoints of a detector of your own."""
@@ -489,14 +498,14 @@ class Manifest(YamlModel):
             raise ValueError("actor and actors: leave one of them out")
         if self.logged_people and not any(actor.weight for actor in self.logged_people.values()):
             raise ValueError("weight: somebody must have one above 0")
-        named = [self.clock_reference] if self.clock_reference else []
-        named += [*(self.truth.poses if self.truth else []), *self.plan]
-        for name in named:
+        named = [("clock_reference", self.clock_reference)] if self.clock_reference else []
+        named += [("truth.poses", name) for name in (self.truth.poses if self.truth else ())]
+        named += [("plan", name) for name in self.plan]
+        for key, name in named:
             if name not in self.cameras:
                 near = difflib.get_close_matches(name, self.cameras, n=1)
-                raise ValueError(
-                    f"{name!r} is no camera of this flight" + (f", did you mean {near[0]!r}?" if near else "")
-                )
+                hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(self.cameras)}"
+                raise ValueError(f"{key}: {name!r} is no camera of this flight, {hint}")
         return self
 
     @property

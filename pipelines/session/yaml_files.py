@@ -17,6 +17,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.fields import FieldInfo
 
 from pipelines.session.errors import DataError
 from pipelines.session.storage import code_of, plain_text, refuse_special
@@ -160,10 +161,11 @@ def describe_problem(
     """Describe a problem that pydantic found, with its place."""
     place = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
-        known = _keys_at(model, problem["loc"][:-1])
+        known = list(_fields_at(model, problem["loc"][:-1]))
         return f"{place}: {unknown_key(str(problem['loc'][-1]), known)}"
     if problem["type"] == "missing":
-        return f"{place}: is missing"
+        examples = _fields_at(model, problem["loc"][:-1])[problem["loc"][-1]].examples
+        return f"{place}: is missing" + (f", for example {examples[0]}" if examples else "")
     if problem["type"] in {"model_type", "model_attributes_type", "dict_type"}:
         return f"{place}: must be a mapping (key: value), not {str(problem['input'])[:60]!r}"
     if problem["type"] == "too_short" and problem["ctx"]["min_length"] == 1:
@@ -179,8 +181,8 @@ def unknown_key(key: str, known: Sequence[str]) -> str:
     return f"unknown key, {hint}"
 
 
-def _keys_at(model: type[YamlModel], place: tuple[str | int, ...]) -> list[str]:
-    """List the keys that the schema allows at a place, by walking the types of the fields."""
+def _fields_at(model: type[YamlModel], place: tuple[str | int, ...]) -> dict[str, FieldInfo]:
+    """Return the fields by key that the schema allows at a place, by walking the types of the fields."""
     kind: Any = model
     for part in place:
         if isinstance(kind, type) and issubclass(kind, YamlModel):
@@ -188,7 +190,7 @@ def _keys_at(model: type[YamlModel], place: tuple[str | int, ...]) -> list[str]:
             kind = _plain(fields[str(part)].annotation)
         else:  # a list or a dict
             kind = _plain(get_args(kind)[-1])
-    return [field.alias or name for name, field in kind.model_fields.items()]
+    return {field.alias or name: field for name, field in kind.model_fields.items()}
 
 
 def _plain(annotation: Any) -> Any:

@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import socket
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,46 @@ def test_unknown_key_names_the_nearest(flight: SyntheticFlight) -> None:
     flight.save()
     line = refusal(mocap_process("ingest", flight.manifest))  # as a shell sees it
     assert re.search(r"cameras\.drone2\.keypoint: [^;]*'keypoints'\?; wrold: [^;]*'world'\?$", line)
+
+
+def without_intrinsics(settings: Any) -> None:
+    del settings["cameras"]["drone1"]["intrinsics"]
+
+
+def with_angles_of_a_topic(settings: Any) -> None:
+    settings["cameras"]["drone1"]["gimbal"] = {"file": "drone1.mcap", "topic": "/gimbal"}
+
+
+def with_a_reference(settings: Any) -> None:
+    settings["clock_reference"] = "drone4"
+
+
+def with_the_truth_of_another(settings: Any) -> None:
+    settings["truth"]["poses"] = {"dron1": "drone1_true.tum"}
+
+
+def with_a_start_of_the_machine(settings: Any) -> None:
+    settings["cameras"]["drone1"]["frame_times"]["start"] = 12.5
+
+
+@pytest.mark.parametrize(
+    ("change", "names"),
+    [
+        (without_intrinsics, ["cameras.drone1.intrinsics: ", "Kalibr", "topic: /info", "fx: 1400"]),
+        (with_angles_of_a_topic, ["relative_to", "world, body or heading"]),
+        (with_a_reference, ["clock_reference: 'drone4'", "'drone"]),
+        (with_the_truth_of_another, ["truth.poses: 'dron1'", "'drone1'"]),
+        (with_a_start_of_the_machine, ["cameras.drone1.frame_times.start: 1699999", "clock: {offset_s"]),
+    ],
+)
+def test_a_refusal_names_the_key_and_what_may_stand_there(
+    flight: SyntheticFlight, change: Callable[[Any], None], names: list[str]
+) -> None:
+    change(flight.settings)
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert [name for name in names if name not in line] == []
+    assert "--max-pose-gap" not in line
 
 
 @pytest.mark.parametrize("change", [{"map": "site.bt"}, {"truth": "true.csv"}])
