@@ -371,35 +371,35 @@ F = TypeVar("F")
 def find_detector(text: str) -> Detector:
     """Find the detector of a user's text: a registered name, or a family's name, a colon and its argument.
 
-    Raises:
-        DataError: no such name, an argument where none is taken, none where one is needed, or a bad one.
+    DataError: no such name, an argument where none is taken, none where one is needed, or a bad one.
     """
     name, colon, argument = text.partition(":")
     found = DETECTORS.get(name)
-    if isinstance(found, DetectorFamily):
-        if not argument:
-            raise DataError(
-                text, "does not say which model", f"write {found.usage.splitlines()[0]}", code="bad-option"
-            )
-        return found.configured(argument)
-    if colon:
-        raise DataError(text, f"{name} takes nothing behind its name", f"write {name}", code="bad-option")
-    return found
+    if not isinstance(found, DetectorFamily):
+        _refuse_argument(text, name, colon)
+        return found
+    if not argument:
+        remedy = f"write {found.usage.splitlines()[0]}"
+        raise DataError(text, "does not say which model", remedy, code="bad-option")
+    return found.configured(argument)
 
 
 def find_export(text: str) -> Export:
     """Find the export of a user's text: a registered name, for some with a colon and an argument.
 
-    Raises:
-        DataError: no such name, an argument where none is taken, or a bad one.
+    DataError: no such name, an argument where none is taken, or a bad one.
     """
     name, colon, argument = text.partition(":")
     found = EXPORTS.get(name.lower())
-    if not colon:
-        return found
-    if not isinstance(found, ExportFamily):
+    if colon and isinstance(found, ExportFamily):
+        return found.configured(argument)
+    _refuse_argument(text, name, colon)
+    return found
+
+
+def _refuse_argument(text: str, name: str, colon: str) -> None:
+    if colon:
         raise DataError(text, f"{name} takes nothing behind its name", f"write {name}", code="bad-option")
-    return found.configured(argument)
 
 
 def find_models(text: str) -> FetchesModels:
@@ -481,33 +481,26 @@ def _unrecognised(path: Path, noun: str, known: list[str]) -> DataError:
 
 
 def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[NoiseModel]:
-    """Build the pose noise models that a manifest names; `place` names the setting in error messages.
-
-    Raises:
-        DataError: an unknown model or parameter, or a value out of range.
-    """
+    """Build the pose noise models that a manifest names; DataError about `place` for unknown or bad ones."""
     return _built(place, parts.items())
 
 
 def parsed_noise_models(place: str, text: str) -> list[NoiseModel]:
     """Build the pose noise models of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
 
-    Raises:
-        DataError: the text has another form, or names an unknown model or parameter.
+    DataError about `place` if the text has another form, or names an unknown model or parameter.
     """
     try:
         parts = parse(text)
     except ValueError as error:
-        raise DataError(
-            place, str(error), "write white:position_m=0.3,rotation_deg=1", code="bad-value"
-        ) from None
+        remedy = "write white:position_m=0.3,rotation_deg=1"
+        raise DataError(place, str(error), remedy, code="bad-value") from None
     return _built(place, parts)
 
 
 def _built(place: str, parts: Iterable[tuple[str, Mapping[str, object]]]) -> list[NoiseModel]:
-    classes = dict(zip(NOISE_MODELS.names(), NOISE_MODELS.all(), strict=True))
     try:
-        return build(parts, classes)
+        return build(parts, dict(zip(NOISE_MODELS.names(), NOISE_MODELS.all(), strict=True)))
     except ValueError as error:
         raise DataError(place, str(error), code="bad-value") from None
 

@@ -177,57 +177,23 @@ def parse_stamps(
     state its unit, stamps after the year 2262 are read in the unit in which they are not. Dates with times by
     ISO 8601 are read whatever the unit; without a zone they are UTC.
     """
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    column = texts if isinstance(texts, pa.ChunkedArray) else pa.chunked_array([pa.array(texts, pa.string())])
-    column = pc.utf8_trim_whitespace(pc.fill_null(column, ""))
-    t_ns, readable = _parse_plain(column, unit)
+    cells = texts if isinstance(texts, Sequence) else texts.to_pylist()
+    t_ns, readable = np.zeros(len(cells), np.int64), np.zeros(len(cells), np.bool_)
     too_large: list[Decimal] = []
-    for index in np.flatnonzero(~readable):
-        cell = column[int(index)].as_py()
-        if (date_ns := _date_ns(cell)) is not None:
-            t_ns[index], readable[index] = date_ns, True
-            continue
-        value = _decimal(cell)
-        if value is None:
-            continue
-        exact = value.scaleb(unit)
-        if abs(exact) > _LARGEST:
+    for index, cell in enumerate(cells):
+        text = (cell or "").strip()
+        value = _decimal(text)
+        exact = _date_ns(text) if value is None else int(value.scaleb(unit).to_integral_value(ROUND_HALF_UP))
+        if exact is not None and abs(exact) <= _LARGEST:
+            t_ns[index], readable[index] = exact, True
+        elif value is not None:
             too_large.append(abs(value))
-            continue
-        t_ns[index] = int(exact.to_integral_value(ROUND_HALF_UP))
-        readable[index] = True
     if len(too_large) > np.count_nonzero(readable):
         typical = sorted(too_large)[len(too_large) // 2]
         if not unit_stated and typical < 10**20:
-            return parse_stamps(source, column, _likely_unit(typical))
+            return parse_stamps(source, cells, _likely_unit(typical))
         raise _wrong_unit(source, typical)
     return t_ns, readable
-
-
-def _parse_plain(column: pa.ChunkedArray, unit: int) -> tuple[Int64, Bool]:
-    """Parse the stamps without an exponent, vectorised: sign, digits, dot, digits."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    parts = pc.extract_regex(column, r"^(?P<sign>[+-]?)(?P<whole>\d*)\.?(?P<fraction>\d*)$")
-    sign, whole, fraction = (pc.fill_null(pc.struct_field(parts, [k]), "") for k in range(3))
-    digits = pc.add(pc.utf8_length(whole), pc.utf8_length(fraction))
-    # Below 10 ** (18 - unit) whole units nothing overflows; 10 digits suffice for today's seconds.
-    safe_whole = pc.less_equal(pc.utf8_length(whole), 18 - unit if unit < SECONDS else 10)
-    plain = np.asarray(pc.and_(pc.greater(digits, 0), safe_whole).to_numpy(), dtype=np.bool_)
-
-    def integers(text: pa.ChunkedArray) -> Int64:
-        held = pc.if_else(pa.chunked_array([pa.array(plain)]), text, "0")
-        return np.asarray(pc.cast(held, pa.int64()).to_numpy(), dtype=np.int64)
-
-    one_more = pc.utf8_slice_codeunits(pc.utf8_rpad(fraction, unit + 1, "0"), 0, unit + 1)
-    units = integers(pc.if_else(pc.equal(whole, ""), "0", whole))
-    plain &= units < _LARGEST // 10**unit
-    magnitude = np.where(plain, units, 0) * 10**unit + (integers(one_more) + 5) // 10
-    negative = np.asarray(pc.equal(sign, "-").to_numpy(), dtype=np.bool_)
-    return np.where(plain, np.where(negative, -magnitude, magnitude), 0), plain
 
 
 def _date_ns(text: str) -> int | None:
