@@ -142,7 +142,6 @@ def fetched(url: str, *, fresh: bool = False) -> Path:
         with FileLock(folder.with_suffix(".lock")):  # others wait, and find it there
             known = _noted(note) if target.exists() else {}
             if known and not fresh:
-                os.utime(note)  # what was used last is removed last
                 return target
             files, version = _asked(url, _files_at)
             if known.get("version") != version:
@@ -154,7 +153,7 @@ def fetched(url: str, *, fresh: bool = False) -> Path:
 def _fetch(url: str, files: dict[str, tuple[str, int]], target: Path) -> None:
     """Replace a copy by the files of a store; `files` as of `_files_at`."""
     folder = target.parent
-    _make_room(folder, sum(size for _, size in files.values()), url)
+    _refuse_full_disk(folder, sum(size for _, size in files.values()), url)
     new = folder.with_suffix(".new")
     remove_tree(new)
     folder.with_suffix(".json").unlink(missing_ok=True)
@@ -190,18 +189,12 @@ def _files_at(store: Any, path: str) -> tuple[dict[str, tuple[str, int]], str]:
     return {names[name]: (name, int(own["size"] or 0)) for name, own in found.items()}, hash_of(stamps)
 
 
-def _make_room(folder: Path, size: int, url: str) -> None:
-    """Remove the sources that were not used for longest, until one of this size fits on the disk."""
-    notes = sorted((_cache() / "sources").glob("*.json"), key=lambda note: note.stat().st_mtime_ns)
-    while shutil.disk_usage(folder.parent).free < size + MIN_FREE_BYTES_BESIDE_SOURCES:
-        if not notes:
-            free = shutil.disk_usage(folder.parent).free
-            problem = f"has {size / 1e9:.3g} GB, and the disk of {folder.parent} has {free / 1e9:.3g} GB free"
-            remedy = "free some space, or set XDG_CACHE_HOME to another disk"
-            raise DataError(url, problem, remedy, code="disk-full")
-        oldest = notes.pop(0)
-        remove_tree(oldest)
-        remove_tree(oldest.with_suffix(""))
+def _refuse_full_disk(folder: Path, size: int, url: str) -> None:
+    free = shutil.disk_usage(folder.parent).free
+    if free < size + MIN_FREE_BYTES_BESIDE_SOURCES:
+        problem = f"has {size / 1e9:.3g} GB, and the disk of {_cache()} has {free / 1e9:.3g} GB free"
+        remedy = "free some space (what was fetched lies there), or set XDG_CACHE_HOME to another disk"
+        raise DataError(url, problem, remedy, code="disk-full")
 
 
 # --- sessions ------------------------------------------------------------------------------------------

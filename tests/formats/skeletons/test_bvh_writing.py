@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.skeletons import bvh_writing
-from pipelines.formats.skeletons.bvh import read_motion
-from pipelines.formats.skeletons.bvh_writing import fit_rig
+from pipelines.formats.skeletons import bvh
+from pipelines.formats.skeletons.bvh import fit_rig, read_motion
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import multiply, rotate
 from pipelines.session.people import take_joints, with_derived
@@ -20,7 +19,7 @@ from pipelines.session.records import JointMotion, SkeletalMotion
 from pipelines.session.registries import ExportWithChoices
 from tests.formats.exported import Listener, recording, walking, without
 
-WRITER: ExportWithChoices = bvh_writing.EXPORT
+WRITER: ExportWithChoices = bvh.EXPORT
 WRITTEN_M = 1e-6  # six decimals of a degree over 2 m of bones, and of a centimetre: 0.04 micrometres
 
 
