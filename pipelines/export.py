@@ -177,11 +177,7 @@ def _chosen(format_: Export, asked: Mapping[str, str | None]) -> dict[str, str]:
 
 
 def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
-    """Load skeleton, cameras and maps of a session, with a given number of pictures per second.
-
-    Raises:
-        DataError: not a session, or damaged; a table of it was changed.
-    """
+    """Load skeleton, cameras and maps of a session, with pictures at a rate; DataError if it is damaged."""
     session = open_session(folder)
     description = read_description(folder)
     session.ingested()
@@ -288,10 +284,8 @@ class _Overlays:
     ) -> tuple[Int64, Iterator[Picture]] | None:
         """Return the times of all pictures of a camera, and these; None without pictures.
 
-        Pictures that cannot be decoded are grey, with a text. They are counted in a note.
-
-        Raises:
-            DataError: the pictures are not those that were ingested.
+        Pictures that cannot be decoded are grey, and counted in a note. DataError if they are not those
+        ingested.
         """
         media = self.description.cameras[camera].media
         if media is None:
@@ -381,11 +375,7 @@ def _stills(
 
 @contextmanager
 def _work_in(target: Path) -> Iterator[Path]:
-    """Make a working folder in the target, empty at first and removed at the end.
-
-    Raises:
-        BusyError: another process uses it.
-    """
+    """Make a working folder in the target, empty at first and removed at the end; it has one user."""
     with working_folder(target / _WORK, target) as work:
         _clear(work)
         try:

@@ -156,12 +156,7 @@ def describe_trajectory(trajectory: Trajectory) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class TrajectoryFile:
-    """Reader of the poses of a text file.
-
-    Args:
-        is_known: recognises the beginning of a file.
-        read: returns its poses; `clean_poses` documents which rows are dropped.
-    """
+    """Reader of the poses of a text file: `is_known` recognises its beginning, `read` returns its poses."""
 
     name: str
     title: str

@@ -22,8 +22,7 @@ def poses_at(
 ) -> tuple[Float, Float]:
     """Interpolate world_from_camera at [T] times; the first pose of a static camera holds all the time.
 
-    Returns:
-        Positions [T, 3] m and quaternions [T, 4] xyzw; NaN where there is no pose.
+    Positions [T, 3] m and quaternions [T, 4] xyzw are NaN where there is no pose.
     """
     if static:
         still = np.zeros(len(t_ns), dtype=np.intp)
@@ -53,11 +52,7 @@ class StatedNoise(NamedTuple):
 
 
 def stated_models(name: str, entry: CameraEntry, pose_noise: str | None) -> list[NoiseModel] | None:
-    """Return the models of a camera's pose errors; None if neither command line nor flight.yaml names any.
-
-    Raises:
-        DataError: a model is not known.
-    """
+    """Return the models of a camera's pose errors; None if neither command line nor flight.yaml names any."""
     if pose_noise:
         return parsed_noise_models(COMMAND_LINE, pose_noise)
     if entry.pose_noise:

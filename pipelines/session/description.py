@@ -423,11 +423,7 @@ def assumptions_as_warnings(assumptions: Sequence[str]) -> list[str]:
 
 
 def read_description(session: Path) -> Description:
-    """Read session.json of a session folder.
-
-    Raises:
-        DataError: the file is damaged or does not hold what this version needs.
-    """
+    """Read session.json of a session folder; DataError if it is damaged or of a later version."""
     path = session / "session.json"
     document = read_json(path, "ingest the flight again with --force")
     if isinstance(document.get("schema"), int) and document["schema"] > SCHEMA:

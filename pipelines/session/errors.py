@@ -69,11 +69,7 @@ CODES = {
 
 
 class MocapError(Exception):
-    """Root of every error that is reported as one line instead of a traceback.
-
-    Attributes:
-        code: its kind, one of `CODES`.
-    """
+    """Root of every error that is reported as one line; `code` is its kind, one of `CODES`."""
 
     code: str = "data"
 

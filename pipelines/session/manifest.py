@@ -553,12 +553,7 @@ def _assumed_in(mapping: Mapping[str, Any], place: str) -> Iterator[str]:
 
 
 def read_flight(path: Path) -> Manifest:
-    """Read and validate a manifest.
-
-    Raises:
-        DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
-            every problem that was found.
-    """
+    """Read and validate a manifest; one DataError holds every problem that was found."""
     flight = read_yaml_model(
         path,
         Manifest,

@@ -50,11 +50,7 @@ _DAMAGED = (
 
 
 def check_resolution(source: Path | str, resolution_m: float) -> float:
-    """Return the side of a voxel, or refuse one that cannot be right.
-
-    Raises:
-        DataError: not a number, or not within 0.1 mm and 10 km.
-    """
+    """Return the side of a voxel; DataError if it does not lie within 0.1 mm and 10 km."""
     if not FINEST_M <= resolution_m <= COARSEST_M:
         problem = f"voxels of {resolution_m:g} m are no map"
         raise DataError(source, problem, f"the resolution must lie between {FINEST_M:g} and {COARSEST_M:g} m")
@@ -134,20 +130,12 @@ def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> list[HeldMap]:
 
 
 def load_maps(session: Path) -> list[Occupancy]:
-    """Load the maps of a session in the order they were stored; an empty list without `map/`.
-
-    Raises:
-        DataError: the index or a map is missing or damaged.
-    """
+    """Load the maps of a session in the order they were stored; see `each_map`."""
     return list(each_map(session))
 
 
 def each_map(session: Path) -> Iterator[Occupancy]:
-    """Yield the maps of a session in the order they were stored, one in memory at a time.
-
-    Raises:
-        DataError: the index or a map is missing or damaged.
-    """
+    """Yield the maps of a session in their order, one in memory at a time; DataError if one is damaged."""
     place = session / "map"
     if not place.exists():
         return
@@ -180,9 +168,7 @@ def write_grid(path: Path, occupancy: Occupancy) -> None:
 def read_grid(path: Path) -> Occupancy:
     """Read one map in the layout of the module's docstring, whichever program wrote it.
 
-    Raises:
-        DataError: no zip, damaged, arrays missing or of another shape or kind, a probability outside 0..1,
-            an impossible resolution, or more than `MOST_VOXELS`.
+    DataError if it is damaged, of another layout, holds impossible numbers, or more than `MOST_VOXELS`.
     """
     refuse_special(path)
     try:

@@ -58,11 +58,7 @@ def available_bytes() -> int | None:
 
 
 class Waiting:
-    """Arrays in files without a name, which take memory only while they are used.
-
-    Args:
-        folder: where the files are; they are gone when the process ends, however it ends.
-    """
+    """Arrays in files of a folder, without a name, which take memory only while they are used."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

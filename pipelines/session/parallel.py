@@ -150,11 +150,7 @@ class SharedSession:
         return cls(str(folder.absolute()), _key_of_ingest(folder), version("mocap-pipeline"))
 
     def opened(self) -> Path:
-        """Return the session's folder on the worker.
-
-        Raises:
-            DataError: the worker has another version of mocap, or finds no such session there.
-        """
+        """Return the session's folder on the worker; DataError if that has another mocap or session."""
         if self.code != version("mocap-pipeline"):
             problem = f"a Dask worker has mocap {version('mocap-pipeline')}, not {self.code}"
             remedy = "install the same version on every machine"

@@ -167,11 +167,7 @@ def joint_called(name: str) -> str | None:
 
 
 def get_skeleton(name: str) -> Skeleton:
-    """Return the skeleton of a name.
-
-    Raises:
-        DataError: no such name; the message lists the existing ones.
-    """
+    """Return the skeleton of a name; DataError with those there are if it is none of them."""
     if name not in SKELETONS:
         raise DataError(name, "no such skeleton", f"there are {', '.join(SKELETONS)}", code="no-such-name")
     return SKELETONS[name]

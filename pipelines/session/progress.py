@@ -50,11 +50,7 @@ class Halt:
         self._asked.set()
 
     def check(self) -> None:
-        """Raise an error if all workers are asked to stop.
-
-        Raises:
-            InterruptedError: they are asked to stop.
-        """
+        """Raise an InterruptedError if all workers are asked to stop."""
         if self._asked.is_set():
             raise InterruptedError("another part failed, or the user stopped it")
 

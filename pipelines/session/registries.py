@@ -301,10 +301,8 @@ class Export(Protocol):
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write into an existing empty folder and return the paths written, sorted.
 
-        Samples that are held, moved or thinned out are counted in a note to `recording.progress`.
-
-        Raises:
-            DataError: there is no content to write.
+        What is held, moved or thinned out is counted in a note to `recording.progress`. DataError if there is
+        nothing to write.
         """
 
 
@@ -344,11 +342,7 @@ class Registry(Generic[T]):
         return list(self._entries)
 
     def get(self, name: str) -> T:
-        """Load the object of a name.
-
-        Raises:
-            DataError: no such name; the message lists the existing ones.
-        """
+        """Load the object of a name; DataError with the existing names if it is none of them."""
         if name not in self._entries:
             remedy = f"there are {', '.join(self.names()) or 'none'}"
             raise DataError(name, f"no such {self.noun}", remedy, code="no-such-name")
@@ -403,11 +397,7 @@ def _refuse_argument(text: str, name: str, colon: str) -> None:
 
 
 def find_models(text: str) -> FetchesModels:
-    """Find what has model files: an export that needs some, else the detector of a user's text.
-
-    Raises:
-        DataError: neither has that name; the message lists what does. Else see `find_detector`.
-    """
+    """Find what has model files: an export that needs some, else the detector of a user's text."""
     exports = {export.name: export for export in EXPORTS.all() if isinstance(export, FetchesModels)}
     if text in exports:
         return exports[text]

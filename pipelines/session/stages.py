@@ -74,12 +74,7 @@ class NewerSchemaError(DataError):
 
 @dataclass(frozen=True)
 class Stage:
-    """One of the stages of a session.
-
-    Args:
-        name: its folder in the session.
-        revision: a number that is increased when the same inputs and settings give other results than before.
-    """
+    """A stage of a session; its revision grows when equal inputs and settings give other results."""
 
     name: str
     revision: int
@@ -115,11 +110,10 @@ def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, st
 
 
 def outdated(records: Mapping[str, StageRecord], recorded: Mapping[str, str]) -> list[str]:
-    """The stages, by name, of which something that they were made of has changed since.
+    """List the stages of which something that they were made of has changed since.
 
-    Args:
-        records: the finished stages of a session, by name. Inputs that none of them made do not count.
-        recorded: the hashes of the recordings that were ingested (`Description.recorded`).
+    `recorded` are the hashes of the recordings (`Description.recorded`); inputs that no stage made do not
+    count.
     """
     made = {**recorded, **{stage: record.key for stage, record in records.items()}}
     for record in records.values():
@@ -133,11 +127,7 @@ def outdated(records: Mapping[str, StageRecord], recorded: Mapping[str, str]) ->
 
 
 def read_record(path: Path) -> StageRecord:
-    """Read a `stage.json`.
-
-    Raises:
-        DataError: it is damaged or of a later version.
-    """
+    """Read a `stage.json`; DataError if it is damaged or of a later version."""
     remedy = "run the stage again with --force"
     document = read_json(path, remedy)
     refuse_newer(path, document, remedy)
@@ -160,11 +150,7 @@ def read_record(path: Path) -> StageRecord:
 
 
 def usable_record(path: Path) -> StageRecord | None:
-    """Read a `stage.json`; return None if it is missing or damaged.
-
-    Raises:
-        NewerSchemaError: it is of a later version.
-    """
+    """Read a `stage.json`; None if it is missing or damaged, a NewerSchemaError if of a later version."""
     try:
         return read_record(path) if path.exists() else None
     except NewerSchemaError:
@@ -289,11 +275,7 @@ class Session:
         self.folder = folder
 
     def record(self, stage: str) -> StageRecord | None:
-        """Read the record of a stage; None if it was never finished.
-
-        Raises:
-            DataError: the record is damaged or of a later version.
-        """
+        """Read the record of a stage; None if it was never finished, a DataError if the record is damaged."""
         path = self.folder / stage / "stage.json"
         return read_record(path) if path.exists() else None
 
@@ -319,11 +301,7 @@ class Session:
         return record
 
     def ingested(self) -> StageRecord:
-        """Return the record of the ingest after checking its files, as `intact_record` does.
-
-        Raises:
-            DataError: as of `intact_record`, or the folder is a copy of a part of a session.
-        """
+        """Return the record of the ingest as `intact_record` does; DataError for a part of a session."""
         record = self.intact_record("ingest")
         if record is None:
             problem, remedy = "was never ingested completely", "run `mocap ingest` again, or copy all of it"
@@ -333,11 +311,7 @@ class Session:
     def finished(
         self, stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, str]
     ) -> StageRecord | None:
-        """Return the record of a stage that these settings and inputs made, if its files are undamaged.
-
-        Raises:
-            DataError: the stage was written by a later version.
-        """
+        """Return the record of a stage that these settings and inputs made, if its files are undamaged."""
         record = usable_record(self.folder / stage.name / "stage.json")
         key = key_of(stage, settings, inputs)
         return record if record is not None and record.key == key and self._intact(record) else None
@@ -379,13 +353,7 @@ class WritableSession(Session):
         return Run(self.folder, stage, key, settings, inputs, before=before, finished=False)
 
     def reusable(self, stage: Stage) -> StageRecord | None:
-        """Return the record of a finished stage whose files a new run may take over.
-
-        None if the stage was never finished, is of another revision, or one of its files was changed since.
-
-        Raises:
-            DataError: the stage was written by a later version.
-        """
+        """Return the record of a finished stage of this revision whose files a new run may take over."""
         before = usable_record(self.folder / stage.name / "stage.json")
         if before is None or before.revision != stage.revision or not self._intact(before):
             return None
@@ -440,9 +408,7 @@ class Run:
     def chunk(self, name: str, produce: Callable[[Path], None]) -> Path:
         """Return the folder of a finished part of a long stage; call `produce` if no earlier run finished it.
 
-        Args:
-            name: of the part; the parts of a stage are stored by the stage's key.
-            produce: writes the part into the empty folder that it gets.
+        Parts are stored by the stage's key. `produce` writes into the empty folder that it gets.
         """
         return finished_part(self._chunks / name, produce)
 
@@ -455,11 +421,7 @@ class Run:
         return self._session / ".partial" / f"{self._stage.name}-{self._key}"
 
     def publish(self, *, counts: Mapping[str, object], warnings: Sequence[str] = ()) -> StageRecord:
-        """End the stage: the content of `folder` replaces its earlier files, completely or not at all.
-
-        Args:
-            counts: numbers of things found, used and dropped, of types that `jsonable` accepts.
-        """
+        """End the stage: the content of `folder` replaces its earlier files, completely or not at all."""
         sync_tree(self.folder)
         self._record = StageRecord(
             stage=self._stage.name,
@@ -515,9 +477,8 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 def open_session(folder: Path) -> Session:
     """Open a session for reading; nothing is written into it.
 
-    Raises:
-        DataError: not a session, damaged, of a later version, unreadable, or a stage was interrupted between
-            the renames that publish it.
+    DataError if it is none, is damaged, of a later version, or a stage was interrupted while it was
+    published.
     """
     try:
         for stage in STAGES:
@@ -703,10 +664,7 @@ _ORIGIN = "copied_from.json"
 def copy_session(folder: Path, target: Path) -> None:
     """Copy a session, so that stages can run on the copy; its videos stay where they are.
 
-    A target that is a copy of this session stays as it is, with what was made in it.
-
-    Raises:
-        DataError: not a session, or the target is something else.
+    A target that is a copy of this session stays as it is, with what was made in it; any other is refused.
     """
     record = open_session(folder).ingested()
     try:

@@ -70,11 +70,7 @@ def code_of(error: OSError) -> str:
 
 
 def refuse_camera_names(names: Collection[str]) -> None:
-    """Refuse camera names that cannot each name their own folder.
-
-    Raises:
-        ValueError: a name is not allowed, or two names differ in case only.
-    """
+    """Refuse, with a ValueError, camera names that cannot each name their own folder."""
     bad = [name for name in names if not CAMERA_NAME.fullmatch(name)]
     if bad:
         raise ValueError(f"camera name {bad[0]!r}: use 1 to 64 of A-Z a-z 0-9 _ -, it names a folder")
@@ -83,11 +79,7 @@ def refuse_camera_names(names: Collection[str]) -> None:
 
 
 def refuse_names_of_people(names: Collection[str]) -> None:
-    """Refuse names of people that cannot be parts of file names, or that unnamed people have.
-
-    Raises:
-        ValueError: a name is not allowed, is `person` with a number, or two names differ in case only.
-    """
+    """Refuse, with a ValueError, names that cannot be parts of file names, or that unnamed people have."""
     bad = [name for name in names if not CAMERA_NAME.fullmatch(name)]
     if bad:
         raise ValueError(f"name {bad[0]!r} of a person: use 1 to 64 of A-Z a-z 0-9 _ -, it is in file names")
@@ -116,11 +108,7 @@ def is_special(path: Path) -> bool:
 
 
 def refuse_special(path: Path) -> None:
-    """Refuse a path that exists but is neither a file nor a folder.
-
-    Raises:
-        DataError: it is a pipe, a socket or a device.
-    """
+    """Refuse, with a DataError, a pipe, a socket or a device."""
     if is_special(path):
         remedy = "write what comes out of it to a file, and name that"
         raise DataError(path, "is a pipe, a socket or a device", remedy, code="special-file")
@@ -143,10 +131,7 @@ def plain_text(content: bytes, errors: str = "replace") -> str:
 def sha256_of(path: Path) -> str:
     """Hash the content of a file, or of a folder: the relative names and contents of its files, sorted.
 
-    Empty folders and the content of linked folders are ignored.
-
-    Raises:
-        DataError: the path is missing, cannot be read, or is no file or folder.
+    Empty folders and the content of linked folders are ignored. DataError if something cannot be read.
     """
     refuse_special(path)
     try:
@@ -165,9 +150,6 @@ def file_stamp(path: Path) -> str:
     """Hash a file's size and time of change, or those of all files of a folder with their names.
 
     If the stamp is unchanged, nothing was written, and the content need not be read again.
-
-    Raises:
-        DataError: the path is missing or cannot be read.
     """
     try:
         if not path.is_dir():
@@ -195,9 +177,7 @@ def _files(folder: Path) -> list[Path]:
 def jsonable(value: object) -> Any:
     """Convert a value to JSON types: NaN to null, numpy numbers and arrays to plain ones, tuples to lists.
 
-    Raises:
-        TypeError: anything else (a path, an object, a key that is no string).
-        ValueError: an infinite number, which is neither a number in JSON nor missing.
+    TypeError for anything else (a path, a key that is no string), ValueError for an infinite number.
     """
     match value:
         case None | bool() | int():
@@ -233,8 +213,7 @@ def hash_of(value: object) -> str:
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a JSON object with its keys in their order; a kill leaves the old file or the new one, complete.
 
-    Raises:
-        ValueError: it holds NaN or an infinite number (`jsonable` turns NaN into null).
+    ValueError if it holds NaN or an infinite number (`jsonable` turns NaN into null).
     """
     text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     write_whole(path, text.encode("utf-8"))
@@ -269,11 +248,7 @@ def drop_link(path: Path) -> None:
 
 
 def read_json(path: Path, remedy: str = "run the stage that wrote it again with --force") -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        DataError: missing, unreadable, not a file, too large, not JSON, not an object, or it holds NaN.
-    """
+    """Read a JSON object; DataError if it is missing, too large, no JSON or no object, or holds NaN."""
     refuse_special(path)
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
@@ -373,11 +348,7 @@ def remove_if_unused(folder: Path, lock: str) -> None:
 
 @contextmanager
 def working_folder(work: Path, target: Path) -> Iterator[Path]:
-    """Make and lock the hidden folder in which a target is written; it is removed if it ends up empty.
-
-    Raises:
-        BusyError: another process uses it.
-    """
+    """Make and lock the hidden folder in which a target is written; it is removed if it ends up empty."""
     drop_link(work)
     try:
         make_folder(work)
@@ -404,11 +375,7 @@ def finished_part(finished: Path, produce: Callable[[Path], None]) -> Path:
 
 
 class Making:
-    """A folder that is being made.
-
-    Attributes:
-        folder: the folder to write into; it becomes the target when published.
-    """
+    """A folder that is being made: what is written into `folder` becomes the target when published."""
 
     def __init__(self, work: Path, target: Path, key: str) -> None:
         self.folder = work / "whole"

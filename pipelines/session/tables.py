@@ -133,12 +133,7 @@ def join_tables(path: Path, parts: Iterable[pd.DataFrame], schema: pa.Schema) ->
 
 @contextmanager
 def _opened(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file.
-
-    Raises:
-        DataError: it is missing, is no Parquet file, is cut off, or is a small file of many equal rows, which
-            no stage writes.
-    """
+    """Open a Parquet file; DataError if it is damaged, or a small file of many equal rows."""
     import pyarrow.parquet as pq
 
     refuse_special(path)
@@ -156,11 +151,7 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], pd.DataFrame]]]:
-    """List the parts of a table of `join_tables`: the least value of the first column, and a reader of each.
-
-    Raises:
-        DataError: see `read_table`.
-    """
+    """List the parts of a table of `join_tables`: least value of the first column, and a reader of each."""
 
     def read(number: int) -> pd.DataFrame:
         with _opened(path) as opened:
@@ -192,11 +183,7 @@ def figures_by_joint(table: pd.DataFrame) -> dict[str, dict[str, float | None]]:
 
 
 def distinct(path: Path, name: str) -> Int64:
-    """Return the different integers in a column of a table, sorted; memory grows with their number alone.
-
-    Raises:
-        DataError: not a Parquet file, truncated, or without this column.
-    """
+    """Return the different integers in a column of a table, sorted; memory grows with their number alone."""
     with _opened(path) as opened:
         batches = _batches(opened, [name])
         parts = [np.unique(batch.column(0).to_numpy(zero_copy_only=False)) for batch in batches]
@@ -357,13 +344,7 @@ def trajectory_from(table: pd.DataFrame) -> Trajectory:
 
 
 def keypoints_table(detections: Detections, known_frame: Int64, t_ns: Int64) -> pd.DataFrame:
-    """Make rows of `tables.KEYPOINTS` from the joints that were found.
-
-    Args:
-        detections: in known frames only.
-        known_frame: [F] sorted.
-        t_ns: [F] their times.
-    """
+    """Make rows of `tables.KEYPOINTS` from the joints that were found, in known frames [F] with times [F]."""
     import pandas as pd
 
     row, joint = np.nonzero(~np.isnan(detections.xy[..., 0]))
@@ -445,13 +426,7 @@ def motion_from(table: pd.DataFrame, joints: tuple[str, ...]) -> JointMotion:
 
 
 def read_motion(path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = None) -> JointMotion:
-    """Read the motion of these joints (None: of all) from a table of `tables.TRUTH` or `tables.SKELETON`.
-
-    It is that of `motion_from`, with one part of the table in memory at a time.
-
-    Raises:
-        DataError: see `read_table`.
-    """
+    """Read the motion of these joints (None: of all) as `motion_from` does, with parts of the table."""
     times, people, names = [np.empty(0, np.int64)], 1, dict[str, None]()
     for part in _parts(path, schema):
         times.append(np.unique(part["t_ns"].to_numpy(np.int64)))

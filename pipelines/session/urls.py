@@ -115,12 +115,9 @@ def as_urls(text: str) -> str:
 
 
 def media_path(base: Path, stated: str, session: Path) -> str:
-    """Write where a source lies, for a session: its URL, or its path relative to the session's folder.
+    """Write where a source (or `base` itself) lies: its URL, or its path from the session's folder.
 
     A session at a URL holds the whole path instead.
-
-    Args:
-        stated: empty for `base` itself.
     """
     url = source_url(base, stated or ".")
     if url is not None:
@@ -262,9 +259,8 @@ def _digests(folder: Path) -> dict[str, str]:
 def _upload(url: str, folder: Path, note: Path) -> None:
     """Upload what has changed of a copy of a session, and remove in the store what is gone.
 
-    Raises:
-        BusyError: somebody else has uploaded since the copy was made.
-        DataError: the store cannot be written. The copy stays, and the same command continues.
+    BusyError if somebody else has uploaded since. After a DataError the copy stays; the same command
+    continues.
     """
     known, files = _noted(note), _digests(folder)
     before: dict[str, str] = known.get("files", {})
@@ -367,12 +363,9 @@ async def _public_client(**options: Any) -> Any:
 
 
 def _asked(url: str, call: Callable[[Any, str], T], *, missing: type[Exception] | None = None) -> T:
-    """Call a function with the store and the path of a URL.
+    """Call a function with the store and the path of a URL; errors become one line without the store's words.
 
-    Errors become one line that repeats none of the store's words.
-
-    Args:
-        missing: raised for an object that does not exist, instead of a DataError.
+    `missing` is raised for an object that does not exist, instead of a DataError.
     """
     store, path = _opened(url)
     try:

@@ -215,10 +215,7 @@ MAX_MERGED_ENTRIES = 100_000
 def plain_yaml(path: Path, text: str) -> object:
     """Parse YAML into plain types only.
 
-    Raises:
-        DataError: no valid YAML; the message names the line if it is known. Or it is beyond reason, as
-            merges of merges. Or a value that no program can use: a text that cannot be written, an integer
-            beyond any float.
+    DataError if it is no YAML, beyond reason as merges of merges, or holds what no program can use.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.constructor import ConstructorError, SafeConstructor

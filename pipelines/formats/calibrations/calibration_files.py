@@ -389,11 +389,7 @@ def _read_camodocal(path: Path) -> Cameras:
 def _fisheye_like(
     size: Sequence[float], matrix: Float, radtan: Sequence[float], xi: float
 ) -> tuple[float, list[float], float]:
-    """Fit a fisheye to a unified projection over its picture.
-
-    Returns:
-        The factor of the focal lengths, the four coefficients, and the largest difference, px.
-    """
+    """Fit a fisheye to a unified projection; return a factor of focal lengths, k1 to k4, the error in px."""
     k1, k2, p1, p2 = radtan
     corners = np.array([[-0.5, -0.5], [size[0] - 0.5, size[1] - 0.5]])
     reach = float(np.hypot(*np.abs((corners - matrix[:2, 2]) / np.diag(matrix)[:2]).max(axis=0)))

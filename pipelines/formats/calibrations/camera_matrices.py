@@ -115,12 +115,7 @@ def invert_matrix(source: Path, camera: str, rotation: Float, translation: Float
 
 @dataclass(frozen=True)
 class CalibrationFile:
-    """Reader of the cameras of a file.
-
-    Args:
-        is_known: recognises the beginning of a file.
-        read: returns its cameras by name.
-    """
+    """Reader of the cameras of a file: `is_known` recognises its beginning, `read` returns them by name."""
 
     name: str
     title: str

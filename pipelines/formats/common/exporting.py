@@ -97,8 +97,7 @@ def write_tables(
 def ellipsoids_95(covariance: Float) -> tuple[Float, Float]:
     """Compute half axes [..., 3] in m and world_from_axes quaternions [..., 4] of 95 % ellipsoids.
 
-    Args:
-        covariance: [..., 6] m^2, upper triangle: xx, xy, xz, yy, yz, zz; NaN gives NaN.
+    `covariance` is [..., 6] m^2, the upper triangle by rows; NaN gives NaN.
     """
     full = covariance[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*covariance.shape[:-1], 3, 3)
     known = np.isfinite(full).all(axis=(-2, -1))

@@ -246,8 +246,7 @@ class Gathering:
     def frame_of(self, name: object, where: str, file: Path | None = None) -> int:
         """Return the frame number of a picture's name or number, and list that frame.
 
-        `where` names the entry for messages. `file` is stated if each of several files counts frames by
-        itself.
+        `file` is stated if each of several files counts frames by itself.
         """
         frame = frame_number(name, self.digits)
         if frame is None:
@@ -280,10 +279,8 @@ class Gathering:
     ) -> None:
         """Add a person of a frame with its rows [K, 3] of x, y, confidence.
 
-        Args:
-            frame: result of `frame_of`.
-            rank: position within the frame, if the file groups people by frame; else the next one.
-            own_id: the tracker's id of the person.
+        `rank` is the position within the frame, if the file groups people by frame; `own_id` that of a
+        tracker.
         """
         if self._rows and len(rows) != len(self._rows[0]):
             problem = f"holds {len(rows)} keypoints where the people before hold {len(self._rows[0])}"

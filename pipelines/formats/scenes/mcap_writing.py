@@ -112,12 +112,7 @@ class Ros2Recording:
 
 
 def build(store: Typestore, type_: str, fields: Mapping[str, Any]) -> Any:
-    """Build a message of a ROS type.
-
-    Args:
-        type_: in the spelling of ROS 2.
-        fields: all fields that are not zero, in ROS 2 spelling. A stamp is a plain number of nanoseconds.
-    """
+    """Build a message of a ROS 2 type; `fields` are all that are not zero, stamps plain nanoseconds."""
     if type_ in _STAMPS:
         raise TypeError("stamps are plain numbers")
     _, described = store.fielddefs[type_]

@@ -207,11 +207,7 @@ def scale_model(library: Any, model: Any, scaling: Any, motion: JointMotion, per
 def solve(
     library: Any, model: Any, weights: dict[str, float], motion: JointMotion, person: int
 ) -> Kinematics:
-    """Run inverse kinematics over the times with enough markers.
-
-    `weights` are those of markers by name, and of coordinates that are drawn to their default value; others
-    do not take part.
-    """
+    """Run inverse kinematics over the times with enough markers; what has no weight does not take part."""
     named = [(k, marker_name(joint)) for k, joint in enumerate(motion.joints)]
     seen: Bool = np.asarray(np.isfinite(motion.position[:, person]).all(axis=-1).any(axis=0))
     of_model = model.getMarkerSet()
