@@ -33,9 +33,8 @@ from pipelines.formats.logs.pictures import (
 from pipelines.formats.logs.positions import FIXES, axes_of_topic, pairs_of
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.formats.logs.trajectories import (
-    COMMAND_TYPES,
+    PATH,
     Gathered,
-    StampCheck,
     attitudes_of,
     chained,
     frames_of_poses,
@@ -143,13 +142,10 @@ class FlightLog:
         for step in steps if self.settings.stamps == "header" else ():
             self.note(f"{self.source} {topic}: {step}")
 
-    def at_world_times(self, gathered: Gathered, topic: str) -> Trajectory:
-        """Return a trajectory at world times, with all losses; note how its stamps disagree."""
-        self.note_steps(topic, gathered.stamps.steps)
+    def at_world_times(self, gathered: Gathered) -> Trajectory:
+        """Return a trajectory at world times, with all losses and notes."""
         for line in gathered.notes:
             self.note(line)
-        for doubt in doubts_of_stamps(gathered.stamps, self.settings.stamps):
-            self.note(f"{self.source}: {doubt}")
         trajectory = gathered.trajectory
         return replace(
             trajectory,
@@ -242,7 +238,7 @@ class FlightLogs:
             else:
                 name = opened.choose("poses", topic)
                 gathered = poses_of(recording, name, source, stamps)
-            return opened.at_world_times(gathered, name)
+            return opened.at_world_times(gathered)
 
     def axes(self, log: str, topic: str | None, parent: str | None) -> Axes | None:
         """Return the axes that the manifest states for a log, else those that its program is known to use."""
@@ -267,7 +263,7 @@ class FlightLogs:
     def commands(self, log: str, topic: str | None) -> Trajectory | None:
         """Read commanded positions of a drone, at world times; None if the topic holds no command type."""
         with self.open(log) as opened:
-            if topic is None or opened.type_of(topic) not in COMMAND_TYPES:
+            if topic is None or opened.type_of(topic) != PATH:
                 return None
             found = read_commands(opened.recording, opened.source, topic, opened.settings.stamps)
             dropped = dict(Counter(found.dropped) + opened.lost)
@@ -287,7 +283,7 @@ class FlightLogs:
             samples = all_samples(opened.recording.messages([name]), source)
             stamps = opened.settings.stamps
             gathered = attitudes_of(samples, f"{source} {name}", stamps=stamps, order=order, units=units)
-            return opened.at_world_times(gathered, name)
+            return opened.at_world_times(gathered)
 
     def intrinsics(self, log: str, topic: str | None) -> Intrinsics:
         """Return the intrinsics of a topic of camera infos; messages that are not calibrated are left out.
@@ -359,32 +355,6 @@ class FlightLogs:
                 if (picture := decode(sample)) is not None:
                     return picture.shape[1], picture.shape[0]
         return None
-
-
-def doubts_of_stamps(check: StampCheck, stamps: str) -> list[str]:
-    """Describe how the stamps of a log disagree with each other, one line each."""
-    used, doubts = f"{stamps} stamps are used", []
-    if check.without_header:
-        doubts.append(
-            f"{check.without_header} of {check.count} messages have no header stamp, their time of receipt is"
-            " taken"
-        )
-    if check.disagreeing:
-        doubts.append(
-            f"header and receive stamps disagree by up to {check.largest_disagreement_s:.3g} s in"
-            f" {check.disagreeing} of {check.count} messages; {used}"
-        )
-    drift = check.drift
-    if drift is not None and drift.drift_ppm and not check.jumps:
-        doubts.append(
-            f"header stamps drift {drift.drift_ppm:.1f} ppm (+- {drift.drift_sigma_ppm:.1g}) against those of"
-            f" receipt; {used}, not corrected (logs: clock: drift_ppm does)"
-        )
-    doubts += [
-        f"the clock jumps by {jump.jump_s:.3g} s at {jump.header_ns / 1e9:.3f} s; {used}"
-        for jump in check.jumps[:5]
-    ]
-    return doubts
 
 
 DEFAULT_HEIGHT_M = 2.5

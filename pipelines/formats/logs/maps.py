@@ -11,6 +11,7 @@ occupied voxels.
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.logs.message_decoders import OCTOMAP
-from pipelines.formats.logs.messages import Stamps, bytes_of, nanoseconds
+from pipelines.formats.logs.messages import FAULTS, Stamps, bytes_of, nanoseconds
 from pipelines.formats.maps.octomap import leaves_of, occupancy_from
 from pipelines.formats.maps.voxel_grids import Pose, VoxelSet, extruded, placed
 from pipelines.geometry.arrays import Float, Int64
@@ -225,21 +226,23 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
 
 def _made(message: Message, about: MapTopic) -> Occupancy | None:
     """Make the map of one message; None if the pose of its frame is unknown."""
-    try:
+    with _one_line(about):
         t_ns = _time_of(message, about)
         pose = _place_at(t_ns, about)
         if pose is None:
             return None
         make = _octomap if message.topic.type == OCTOMAP else _plan
         return replace(make(message.value, about, pose), from_ns=t_ns)
-    except AttributeError as error:
-        raise DataError(
-            about.source, f"lacks the field {error.name!r}", _RECORD_AGAIN, code="missing-column"
-        ) from error
-    except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(
-            about.source, f"cannot be read ({str(error)[:100]})", _RECORD_AGAIN, code="damaged"
-        ) from error
+
+
+@contextmanager
+def _one_line(about: MapTopic) -> Iterator[None]:
+    """Turn errors from fields of a message into one of the topic."""
+    try:
+        yield
+    except FAULTS as error:
+        problem = f"a message cannot be read ({str(error)[:100]})"
+        raise DataError(about.source, problem, _RECORD_AGAIN, code="damaged") from error
 
 
 def _made_again(
@@ -326,19 +329,10 @@ def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
     clouds = 0
     for message in messages:
         try:
-            t_ns = _time_of(message, about)
-            pose = _place_at(t_ns, about)
-            points = cloud_points(message.value, about.source)
-        except (AttributeError, TypeError, ValueError, OverflowError) as error:
-            lost.damaged(
-                DataError(
-                    about.source,
-                    f"a cloud cannot be read ({str(error)[:100]})",
-                    _RECORD_AGAIN,
-                    code="damaged",
-                )
-            )
-            continue
+            with _one_line(about):
+                t_ns = _time_of(message, about)
+                pose = _place_at(t_ns, about)
+                points = cloud_points(message.value, about.source)
         except DataError as fault:
             lost.damaged(fault)
             continue
@@ -367,18 +361,13 @@ def cloud_points(value: Any, source: str) -> Float:
     width, height, stride = int(value.width), int(value.height), int(value.point_step)
     order = ">" if value.is_bigendian else "<"
     fields = {str(each.name): each for each in value.fields}
-    columns: dict[str, tuple[str, int]] = {}
+    columns: list[tuple[str, str, int]] = []
     for name in ("x", "y", "z"):
         kind = _FLOAT_TYPES.get(int(fields[name].datatype)) if name in fields else None
         if kind is None:
             stated = f"of type {int(fields[name].datatype)}" if name in fields else "not there"
             raise DataError(source, f"its field {name} is {stated}", "x, y, z of float32 or float64 are read")
-        offset = int(fields[name].offset)
-        if offset < 0 or offset + int(kind[1]) > stride:
-            raise DataError(
-                source, f"its field {name} lies beyond the {stride} bytes of a point", _RECORD_AGAIN
-            )
-        columns[name] = order + kind, offset
+        columns.append((name, order + kind, int(fields[name].offset)))
     row_bytes = int(value.row_step) or width * stride
     data = bytes_of(value.data)
     if row_bytes < width * stride or len(data) < row_bytes * height:
@@ -388,15 +377,13 @@ def cloud_points(value: Any, source: str) -> Float:
             _RECORD_AGAIN,
             code="damaged",
         )
-    # Rows may be padded, and values may be unaligned, so they are copied.
-    rows = np.ascontiguousarray(data[: row_bytes * height].reshape(height, row_bytes)[:, : width * stride])
-    records = rows.reshape(-1, stride) if width * height else rows.reshape(0, stride)
-    points = np.empty((len(records), 3))
+    # Fields that lie beyond the point are a ValueError here. Rows may be padded, and values unaligned.
+    names, formats, offsets = zip(*columns, strict=True)
+    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": stride})
+    rows = data[: row_bytes * height].reshape(height, row_bytes)[:, : width * stride]
+    records = np.frombuffer(rows.tobytes(), layout)
     with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN warns
-        for axis, (kind, offset) in enumerate(columns.values()):
-            values = np.ascontiguousarray(records[:, offset : offset + np.dtype(kind).itemsize])
-            points[:, axis] = values.view(kind)[:, 0] if len(values) else 0
-    return points
+        return np.stack([records[name].astype(np.float64) for name in names], axis=1)
 
 
 def _is_the_world(pose: Pose) -> bool:

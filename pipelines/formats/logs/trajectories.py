@@ -7,7 +7,7 @@ streams through.
 from array import array
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -40,7 +40,7 @@ from pipelines.geometry.clocks import (
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.geometry.poses import Link, chain, continuous_signs, find_route, pose_covariance_in_body
 from pipelines.session.errors import DataError
-from pipelines.session.records import AngleSample, Message, PoseSample, Sample, Trajectory
+from pipelines.session.records import AngleSample, PoseSample, Sample, Trajectory
 from pipelines.session.registries import Log
 
 Source = Path | str
@@ -49,6 +49,7 @@ Edge = tuple[str, str]
 
 _MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
 _MAY_JUMP_S = 1.0  # from one message to the next, in addition to the time that passed
+_MOST_JUMPS = 5  # more are not listed
 _SAME_VALUE = 1e-6  # m, and parts of a quaternion: rounding
 _FIXED_FRAMES = ("world", "map", "odom", "earth")  # names of fixed frames in REP 105
 
@@ -57,33 +58,10 @@ _THE_WORLD = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[0.0,
 
 
 @dataclass(frozen=True)
-class ClockJump:
-    """Jump of header stamps relative to the stamps of receipt."""
-
-    index: int  # of the first sample after the jump, in the order of receipt
-    header_ns: int  # its header stamp
-    jump_s: float  # negative is backward
-
-
-@dataclass(frozen=True)
-class StampCheck:
-    """Comparison of header stamps and stamps of receipt."""
-
-    count: int  # samples
-    without_header: int  # samples without a header stamp: that of receipt replaces it
-    disagreeing: int  # others whose header and receipt stamps are further apart than allowed
-    largest_disagreement_s: float  # header - receipt, where that is largest in size
-    jumps: tuple[ClockJump, ...]
-    drift: ClockFit | None = None  # from receipt to header, for samples with both
-    steps: tuple[ClockStep, ...] = ()  # of the header's clock; the clear ones are taken out of all else
-
-
-@dataclass(frozen=True)
 class Gathered:
-    """Trajectory from a log, with the check of its stamps."""
+    """Trajectory from a log, with notes on its stamps and values."""
 
     trajectory: Trajectory
-    stamps: StampCheck
     frames: Edge  # as the log names them; empty if it names none
     notes: tuple[str, ...] = ()
 
@@ -110,9 +88,36 @@ class LoggedRows:
         header_ns = without_steps(self.header_ns, self.steps)
         return np.where(header_ns == 0, self.receive_ns, header_ns)
 
-    def notes(self, place: str, stamps: Stamps) -> list[str]:
-        """Describe the steps of the header's clock, if its stamps are used."""
-        return [f"{place}: {step}" for step in self.steps if stamps == "header"]
+    def notes(self, place: Source, stamps: Stamps) -> list[str]:
+        """Describe steps of the header's clock that are used, and how header and receipt disagree."""
+        notes = [str(step) for step in self.steps if stamps == "header"]
+        (stamped,) = np.nonzero(self.header_ns)
+        used = f"{stamps} stamps are used"
+        if without := len(self.header_ns) - len(stamped):
+            notes.append(
+                f"{without} of {len(self.header_ns)} messages have no header stamp, their time of receipt is"
+                " taken"
+            )
+        header_ns, receive_ns = without_steps(self.header_ns, self.steps)[stamped], self.receive_ns[stamped]
+        lead_s = (header_ns - receive_ns) / 1e9
+        if disagreeing := int(np.count_nonzero(np.abs(lead_s) > _MAY_DISAGREE_S)):
+            largest_s = float(lead_s[np.argmax(np.abs(lead_s))])
+            notes.append(
+                f"header and receive stamps disagree by up to {largest_s:.3g} s in"
+                f" {disagreeing} of {len(self.header_ns)} messages; {used}"
+            )
+        jumps_s = np.diff(lead_s)
+        jumps = np.flatnonzero(np.abs(jumps_s) > _MAY_JUMP_S)[:_MOST_JUMPS].tolist()
+        notes += [
+            f"the clock jumps by {jumps_s[k]:.3g} s at {header_ns[k + 1] / 1e9:.3f} s; {used}" for k in jumps
+        ]
+        drift = fit_clock(receive_ns, header_ns) if lead_s.any() and not jumps else None
+        if drift is not None and drift.drift_ppm:
+            notes.append(
+                f"header stamps drift {drift.drift_ppm:.1f} ppm (+- {drift.drift_sigma_ppm:.1g}) against"
+                f" those of receipt; {used}, not corrected (logs: clock: drift_ppm does)"
+            )
+        return [f"{place}: {note}" for note in notes]
 
     def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
         """Return the poses, cleaned, with covariances whose rotation is in the body's axes."""
@@ -130,26 +135,6 @@ class LoggedRows:
         if poses.covariance is None:
             return poses
         return replace(poses, covariance=pose_covariance_in_body(poses.covariance, poses.quaternion_xyzw))
-
-    def check(self) -> StampCheck:
-        """Compare the stamps of header and receipt."""
-        (stamped,) = np.nonzero(self.header_ns)
-        header_ns = without_steps(self.header_ns, self.steps)[stamped]
-        receive_ns = self.receive_ns[stamped]
-        lead_ns = header_ns - receive_ns
-        jump_ns = np.diff(lead_ns)
-        return StampCheck(
-            count=len(self.header_ns),
-            without_header=len(self.header_ns) - len(stamped),
-            disagreeing=int(np.count_nonzero(np.abs(lead_ns) > _MAY_DISAGREE_S * 1e9)),
-            largest_disagreement_s=float(lead_ns[np.argmax(np.abs(lead_ns))]) / 1e9 if len(stamped) else 0.0,
-            jumps=tuple(
-                ClockJump(int(stamped[k + 1]), int(header_ns[k + 1]), float(jump_ns[k]) / 1e9)
-                for k in np.flatnonzero(np.abs(jump_ns) > _MAY_JUMP_S * 1e9)
-            ),
-            drift=fit_clock(receive_ns, header_ns) if lead_ns.any() else None,
-            steps=tuple(self.steps),
-        )
 
 
 @dataclass(frozen=True)
@@ -205,7 +190,7 @@ def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gath
     """
     place = f"{source} {topic}"
     rows = logged_poses(all_samples(recording.messages([topic]), source), place)
-    return Gathered(rows.trajectory(place, stamps), rows.check(), rows.frames)
+    return Gathered(rows.trajectory(place, stamps), rows.frames, tuple(rows.notes(place, stamps)))
 
 
 def logged_poses(samples: Iterable[Sample], source: Source) -> LoggedRows:
@@ -260,7 +245,7 @@ def attitudes_of(
     trajectory = clean_poses(
         source, rows.times(stamps), np.ones(count, dtype=np.bool_), np.zeros((count, 3)), quaternion
     )
-    return Gathered(trajectory, rows.check(), ("", ""))
+    return Gathered(trajectory, ("", ""), tuple(rows.notes(source, stamps)))
 
 
 # --- transforms ------------------------------------------------------------------------------------------
@@ -318,7 +303,6 @@ def chained(
     links: dict[Edge, Link] = {}
     dropped: dict[str, int] = {}
     notes: list[str] = []
-    checks = []
     for edge in route.edges:
         rows = every[edge]
         if is_static := edge not in transforms.moving or len(rows.header_ns) == 1:
@@ -334,7 +318,7 @@ def chained(
                 f" {apart_m:.3g} m apart; each is used from its publication on"
             )
         if not is_static:
-            checks.append(rows.check())
+            notes += rows.notes(f"{source}: {_named(edge)}", stamps)
             dropped |= {f"{cause} ({_named(edge)})": count for cause, count in poses.dropped.items()}
     found = chain(links, parent, child, max_gap_ns=max_gap_ns)
     known = ~np.isnan(found.position[:, 0])
@@ -349,7 +333,7 @@ def chained(
     trajectory = Trajectory(
         found.t_ns[known], found.position[known], found.quaternion_xyzw[known], dropped=dropped
     )
-    return Gathered(trajectory, _together(checks), (parent, child), tuple(notes))
+    return Gathered(trajectory, (parent, child), tuple(notes))
 
 
 def _published_values(logged: Sequence[LoggedRows]) -> LoggedRows:
@@ -460,18 +444,6 @@ def _by_edge(samples: Iterable[Sample], source: Source) -> dict[Edge, LoggedRows
     return {edge: gathered.rows(7) for edge, gathered in by_edge.items()}
 
 
-def _together(checks: Sequence[StampCheck]) -> StampCheck:
-    return StampCheck(
-        count=sum(check.count for check in checks),
-        without_header=sum(check.without_header for check in checks),
-        disagreeing=sum(check.disagreeing for check in checks),
-        largest_disagreement_s=max((c.largest_disagreement_s for c in checks), key=abs, default=0.0),
-        jumps=tuple(jump for check in checks for jump in check.jumps),
-        drift=next((check.drift for check in checks if check.drift), None),
-        steps=tuple(dict.fromkeys(step for check in checks for step in check.steps)),
-    )
-
-
 def _named(edge: Edge) -> str:
     target, source = edge
     return f"{source!r} in {target!r}"
@@ -552,12 +524,7 @@ def _clock_stepped(log: OpenLog, gap: StampGap, at_ns: int) -> bool | None:
 # A plan looks ahead and is replaced by the next one: each is valid up to the first point of the next.
 
 PATH = "nav_msgs/msg/Path"
-TRAJECTORY = "trajectory_msgs/msg/MultiDOFJointTrajectory"
-TARGET = "mavros_msgs/msg/PositionTarget"
-COMMAND_TYPES = (PATH, TRAJECTORY, TARGET)
-"""Message types that are read here; setpoints that are poses (PoseStamped, Odometry) are read as poses."""
-
-_LOCAL_FRAME, _NO_POSITION = 1, 0b111  # PositionTarget: coordinate_frame, and type_mask of x, y, z
+"""Message type that is read here; setpoints that are poses (PoseStamped, Odometry) are read as poses."""
 
 _Point = tuple[int, float, float, float]
 
@@ -586,20 +553,19 @@ class _CommandedWay:
 
 
 def read_commands(recording: Log, source: str, topic: str, stamps: Stamps) -> Trajectory:
-    """Read the positions that a topic of one of `COMMAND_TYPES` commanded, in the axes of the log.
+    """Read the positions that a topic of `PATH` commanded, in the axes of the log.
 
-    By the stamps of receipt, a plan begins at the time of its receipt.
-
-    Setpoints without a position or relative to the body are dropped and counted, and so are empty
-    plans. The rotation is the identity and has no meaning.
+    By the stamps of receipt, a plan begins at the time of its receipt. Empty plans are counted. The rotation
+    is the identity and has no meaning.
     """
-    way, dropped = _CommandedWay(), Counter[str]()
+    way, empty = _CommandedWay(), 0
     for message in recording.messages([topic]):
         try:
-            points = list(_POINTS[message.topic.type](message, dropped))
+            points = [_point(pose.header.stamp, pose.pose.position) for pose in message.value.poses]
         except FAULTS as error:
             raise unreadable(message, source, error) from error
         if not points:
+            empty += 1
             continue
         if any(later[0] <= earlier[0] for earlier, later in pairwise(points)):
             raise DataError(
@@ -610,41 +576,9 @@ def read_commands(recording: Log, source: str, topic: str, stamps: Stamps) -> Tr
         late_ns = message.receive_ns - points[0][0] if stamps == "receive" or not points[0][0] else 0
         way.replace_from([(t_ns + late_ns, x, y, z) for t_ns, x, y, z in points])
     found = way.trajectory(f"{source} {topic}")
-    found.dropped.update(Counter(found.dropped) + dropped)
+    found.dropped.update(+Counter({"empty plan": empty}))
     return found
 
 
-def _of_path(message: Message, dropped: Counter[str]) -> Iterator[_Point]:
-    if not message.value.poses:
-        dropped["empty plan"] += 1
-    for stated in message.value.poses:
-        yield _point(nanoseconds(stated.header.stamp), stated.pose.position)
-
-
-def _of_trajectory(message: Message, dropped: Counter[str]) -> Iterator[_Point]:
-    value = message.value
-    if not value.points:
-        dropped["empty plan"] += 1
-    begins_ns = nanoseconds(value.header.stamp)
-    for stated in value.points:
-        if len(stated.transforms) != 1:
-            raise ValueError(f"it moves {len(stated.transforms)} things, not one")
-        after_ns = nanoseconds(stated.time_from_start)
-        yield _point(begins_ns + after_ns, stated.transforms[0].translation)
-
-
-def _of_target(message: Message, dropped: Counter[str]) -> Iterator[_Point]:
-    value = message.value
-    if value.type_mask & _NO_POSITION:
-        dropped["setpoint without a position"] += 1
-    elif value.coordinate_frame != _LOCAL_FRAME:
-        dropped["setpoint relative to the body"] += 1
-    else:
-        yield _point(nanoseconds(value.header.stamp), value.position)
-
-
-def _point(t_ns: int, position: Any) -> _Point:
-    return t_ns, float(position.x), float(position.y), float(position.z)
-
-
-_POINTS = {PATH: _of_path, TRAJECTORY: _of_trajectory, TARGET: _of_target}
+def _point(stamp: Any, position: Any) -> _Point:
+    return nanoseconds(stamp), float(position.x), float(position.y), float(position.z)

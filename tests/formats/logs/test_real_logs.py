@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from pipelines.formats.logs import recordings
+from pipelines.formats.logs.messages import bytes_of
 from pipelines.session.registries import FORMATS, Format, LogFormat, recognise
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
@@ -112,7 +113,7 @@ def test_pictures_in_json_are_bytes() -> None:
     with recognise(path, LogFormat, "log").open_log([path]) as log:
         picture = next(log.messages(["/image/compressed"])).value
         lens = next(log.messages(["/camera_calibration"])).value
-    assert picture.data[:3] == b"\xff\xd8\xff"  # the first bytes of a JPEG
+    assert bytes_of(picture.data)[:3].tobytes() == b"\xff\xd8\xff"  # the first bytes of a JPEG
     assert (lens.width, lens.K[:3]) == (640, [800, 0, 320])
 
 
