@@ -162,7 +162,7 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
             )
     is_dji = path.suffix.lower() in {".txt", ".dat"} and _DJI_BINARY.match(head)
     if is_dji or (_DJI_NAME.match(path.name) and _undecodable(head)):
-        ways = "Airdata, PhantomHelp, Flight Reader or dji-log-parser; DatCon or CsvView of the drone's own"
+        ways = "Airdata, PhantomHelp, Flight Reader or dji-log-parser"
         remedy = f"convert it to CSV ({ways}) and give that: pose: {{file: RECORD.csv}}"
         return Likeness("is DJI's binary flight record, which mocap does not decode", remedy)
     for pattern, kind, remedy in _UNREAD:

@@ -4,11 +4,8 @@ The record is the only place where most consumer drones log their gimbal's angle
 that the exporting service chose, in feet or metres, often in both. Known are those of Airdata
 (`time(millisecond),datetime(utc),latitude,...,height_above_takeoff(feet),...,gimbal_pitch(degrees)`), of
 Flight Reader (`CUSTOM.updateTime [local],OSD.flyTime [s],OSD.latitude,...,GIMBAL.pitch`), PhantomHelp
-(`Time(seconds),...,Altitude(feet),Altitude(meters),...,Pitch,Roll,Yaw`), Litchi
-(`latitude,longitude,altitude(m),...,gimbalPitchRaw`, in tenths of a degree) and dji-log-parser
-(`CUSTOM.dateTime,OSD.flyTime,OSD.latitude`; `OSD.lalitude` in its first versions). DatCon and CsvView make
-one of the drone's own record (`Clock:offsetTime,IMU_ATTI(0):Latitude,...,IMU_ATTI(0):yaw:C`). The reference
-of its gimbal's yaw is not public, so that is left out.
+(`Time(seconds),...,Altitude(feet),Altitude(meters),...,Pitch,Roll,Yaw`) and dji-log-parser
+(`CUSTOM.dateTime,OSD.flyTime,OSD.latitude`).
 
 Angles are those of an FRD body and gimbal in NED (docs/formats.md).
 """
@@ -27,12 +24,11 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
-from pipelines.formats.common.rows import describe_times
 from pipelines.formats.drone_logs.dji_subtitles import (
     DjiRows,
     any_finite,
     attitudes_of_rows,
-    range_of,
+    describe_rows,
     telemetry_of_rows,
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
@@ -46,36 +42,31 @@ _FIRST_YEAR, _LAST_YEAR = 1970, 2200  # of dates; others are damage
 _LONGEST_S = 1e6
 _METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "metres": 1.0, "ft": 0.3048, "feet": 0.3048}
 _SECONDS = {"millisecond": 1e-3, "ms": 1e-3, "seconds": 1.0, "s": 1.0}
-_IN_SECONDS = ("osd.flytime", "clock:offsettime", "offsettime")  # without a unit
+_IN_SECONDS = ("osd.flytime",)  # without a unit
 _LENGTHS = {  # the preferred name first
-    "relative": (
-        *("height_above_takeoff", "osd.height", "altitude"),
-        *("imu_atti:relativeheight", "general:relativeheight"),
-    ),
-    "absolute": ("altitude_above_sealevel", "osd.altitude", "gps:heightmsl"),
+    "relative": ("height_above_takeoff", "osd.height", "altitude"),
+    "absolute": ("altitude_above_sealevel", "osd.altitude"),
 }
 _ELAPSED = ("time", "osd.flytime")
 _NUMBERS = {
-    "latitude": ("latitude", "osd.latitude", "osd.lalitude", "imu_atti:latitude", "gps:lat"),
-    "longitude": ("longitude", "osd.longitude", "imu_atti:longitude", "gps:long"),
-    "drone_yaw": ("compass_heading", "osd.yaw", "yaw", "imu_atti:yaw"),
-    "drone_pitch": ("pitch", "osd.pitch", "imu_atti:pitch"),
-    "drone_roll": ("roll", "osd.roll", "imu_atti:roll"),
-    "gb_yaw": ("gimbal_heading", "gimbal.yaw", "gimbalyawraw"),
-    "gb_pitch": ("gimbal_pitch", "gimbal.pitch", "gimbalpitchraw"),
-    "gb_roll": ("gimbal_roll", "gimbal.roll", "gimbalrollraw"),
+    "latitude": ("latitude", "osd.latitude"),
+    "longitude": ("longitude", "osd.longitude"),
+    "drone_yaw": ("compass_heading", "osd.yaw", "yaw"),
+    "drone_pitch": ("pitch", "osd.pitch"),
+    "drone_roll": ("roll", "osd.roll"),
+    "gb_yaw": ("gimbal_heading", "gimbal.yaw"),
+    "gb_pitch": ("gimbal_pitch", "gimbal.pitch"),
+    "gb_roll": ("gimbal_roll", "gimbal.roll"),
 }
 _CLOCKS = {  # columns of date and time of day, each with the zone that the heading states
     "utc": (
         (("datetime", "utc"),),
         (("custom.date", "utc"), ("custom.updatetime", "utc")),
         (("custom.datetime", ""),),
-        (("gps:datetimestamp", ""),),
     ),
     "local": ((("datetime", "local"),), (("custom.date", "local"), ("custom.updatetime", "local"))),
 }
 _FILMS = ("isvideo", "camera.isvideo", "istakingvideo")
-_OF_DATCON = re.compile(r"\(0\)(?=:)|:[cd](?=$|\[)")  # the number of a unit, the kind of a value
 _HEADING = re.compile(r"([^\[(]+?)\s*(?:[\[(]([^\])]*)[\])]+)?")
 _CLOCK = re.compile(
     r"(\d{1,4})[-/.](\d{1,2})[-/.](\d{1,4})[ T]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?"
@@ -83,7 +74,6 @@ _CLOCK = re.compile(
 )
 _DAY_OF_NAME = re.compile(r"(\d{4})[-_](\d{2})[-_](\d{2})")
 _MARK = re.compile(r"[.,](?=\d)")
-_THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?")
 # Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -103,24 +93,8 @@ class DjiRecordFormat:
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, times, ranges of the positions, heights and angles, recordings, and losses."""
         record = _read(path)
-        t_ns, timed = record.times
-        placed = record.placed
-        facts: dict[str, object] = {
-            "rows": len(t_ns),
-            "positions": int(np.count_nonzero(placed)),
-            **describe_times(np.unique(t_ns[timed])),
-            "clock": record.clock,
-        }
-        for name in ("latitude", "longitude"):
-            facts[f"{name}_deg"] = range_of(record.columns[name][placed], 7)
-        for label, name in (("height_above_take_off_m", "relative"), ("height_absolute_m", "absolute")):
-            if any_finite(record.columns[name]):
-                facts[label] = range_of(record.columns[name], 3)
-        for label, part in (("gimbal", "gb"), ("body", "drone")):
-            angles = record.angles(part)
-            if any_finite(angles):
-                facts[f"{label}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
-                facts[f"{label}_pitch_deg"] = range_of(angles[:, 1], 2)
+        t_ns, _ = record.times
+        facts = {"rows": len(t_ns)} | describe_rows(record.rows)
         if record.films:
             facts["videos_started_s"] = [round(int(t_ns[first]) / 1e9, 3) for first, _ in record.films]
         return facts | {f"dropped: {cause}": count for cause, count in record.dropped.items()}
@@ -250,12 +224,12 @@ def _find_heading(text: str) -> _RecordHeading | None:
         cells = next(csv.reader([lines[line]], delimiter=delimiter), [])
     except csv.Error:
         return None
-    matches = [_HEADING.fullmatch(_OF_DATCON.sub("", cell.strip().lower())) for cell in cells]
+    matches = [_HEADING.fullmatch(cell.strip().lower()) for cell in cells]
     names = [(match[1], match[2] or "") if match else ("", "") for match in matches]
     numbers: dict[str, tuple[int, float]] = {}
     for name, known in _NUMBERS.items():
         if (column := _column(names, known)) is not None:
-            numbers[name] = (column, 0.1 if names[column][0].endswith("raw") else 1.0)
+            numbers[name] = (column, 1.0)
     for name, known in _LENGTHS.items():
         if found := _measured(names, known, _METRES):
             numbers[name] = found
@@ -369,13 +343,11 @@ def _rows(path: Path, heading: _RecordHeading) -> Iterator[list[str]]:
 
 
 def _number(cell: str, *, decimal_commas: bool) -> float:
-    """Parse a number whose commas are decimal or separate thousands; a blank cell is NaN."""
+    """Parse a number with a decimal dot or comma; a blank cell is NaN."""
     text = cell.strip()
-    if "," not in text:
-        return float(text or "nan")
     if decimal_commas and text.count(",") == 1 and "." not in text:
-        return float(text.replace(",", "."))
-    return float(text.replace(",", "") if not decimal_commas and _THOUSANDS.fullmatch(text) else text)
+        text = text.replace(",", ".")
+    return float(text or "nan")
 
 
 def _parse_clocks(path: Path, texts: Sequence[str], notes: list[str]) -> tuple[Int64, bool]:

@@ -188,6 +188,28 @@ def angles_track(
     return attitude_track(name, t_ns[kept], turned_as_stated(between), dropped, stated=as_logged)
 
 
+def describe_rows(found: DjiRows) -> dict[str, object]:
+    """Describe positions, times, ranges of places, heights and angles."""
+    columns = found.columns
+    facts: dict[str, object] = {
+        "positions": int(np.count_nonzero(np.isfinite(columns["latitude"]))),
+        **describe_times(np.unique(found.t_ns[found.timed])),
+        "clock": found.clock,
+    }
+    ranges = {"latitude_deg": "latitude", "longitude_deg": "longitude"}
+    ranges |= {"height_above_take_off_m": "relative", "height_absolute_m": "absolute", "height_m": "altitude"}
+    facts |= {
+        label: range_of(columns[name], 7 if label.endswith("deg") else 3)
+        for label, name in ranges.items()
+        if any_finite(columns[name])
+    }
+    for label, angles in (("gimbal", found.gimbal), ("body", found.body)):
+        if any_finite(angles):
+            facts[f"{label}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
+            facts[f"{label}_pitch_deg"] = range_of(angles[:, 1], 2)
+    return facts
+
+
 def any_finite(values: Float) -> bool:
     """Return True if there is any number."""
     return bool(np.isfinite(values).any())
@@ -348,29 +370,7 @@ class DjiSrtFormat:
     def describe(self, path: Path) -> dict[str, object]:
         """Describe subtitles, times, ranges of the positions, heights and angles."""
         subtitles = read_subtitles(path)
-        columns = _columns(subtitles.texts)
-        t_ns, timed = subtitles.times()
-        placed = np.isfinite(columns["latitude"])
-        facts: dict[str, object] = {
-            "subtitles": len(subtitles.texts),
-            "positions": int(np.count_nonzero(placed)),
-            **describe_times(np.unique(t_ns[timed])),
-            "clock": _clock_name(subtitles),
-        }
-        for name in ("latitude", "longitude"):
-            facts[f"{name}_deg"] = range_of(columns[name], 7)
-        heights = {
-            "height_above_take_off_m": "relative",
-            "height_absolute_m": "absolute",
-            "height_m": "altitude",
-        }
-        named = {label: name for label, name in heights.items() if any_finite(columns[name])}
-        facts |= {label: range_of(columns[name], 3) for label, name in named.items()}
-        for label, part in (("gimbal", "gb"), ("body", "drone")):
-            angles = _angles(columns, part)
-            if any_finite(angles):
-                facts[f"{label}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
-                facts[f"{label}_pitch_deg"] = range_of(angles[:, 1], 2)
+        facts = {"subtitles": len(subtitles.texts)} | describe_rows(_rows(subtitles))
         if not any(name.endswith("_angles") for name in facts):
             facts["orientation"] = "none: state a gimbal in the manifest"
         return facts

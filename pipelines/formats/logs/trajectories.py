@@ -26,7 +26,7 @@ from pipelines.formats.logs.messages import (
 )
 from pipelines.formats.logs.recordings import LogPart, OpenLog, open_parts
 from pipelines.formats.poses import clean_poses
-from pipelines.geometry.arrays import ClockFit, Float, Int64
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import (
     MAX_STEP_S,
     ClockStep,

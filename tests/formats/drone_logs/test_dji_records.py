@@ -148,66 +148,6 @@ def test_semicolons_and_decimal_commas(tmp_path: Path) -> None:
     assert np.degrees(np.arctan2(ahead[0], ahead[1])) == pytest.approx(-80)
 
 
-LITCHI = (
-    "latitude,longitude,altitude(m),time(millisecond),datetime(utc),pitch(deg),roll(deg),yaw(deg),"
-    "isTakingVideo"
-)
-PARSER = (
-    "CUSTOM.dateTime,OSD.flyTime,OSD.lalitude,OSD.longitude,OSD.height,OSD.altitude,"
-    "OSD.pitch,OSD.roll,OSD.yaw"
-)
-
-
-def _services() -> list[Any]:
-    """Return heading, first and last row, and the clock's zone of each service; all show the same flight."""
-    litchi = f"{LITCHI},gimbalPitchRaw,gimbalRollRaw,gimbalYawRaw"
-    parser = f"{PARSER},GIMBAL.pitch,GIMBAL.roll,GIMBAL.yaw,CAMERA.isVideo"
-    datcon = (
-        "Clock:Tick#,Clock:offsetTime,IMU_ATTI(0):Longitude[degrees [-180;180]],"
-        "IMU_ATTI(0):Latitude[degrees [-180;180]],IMU_ATTI(0):relativeHeight:C[meters],IMU_ATTI(0):roll:C,"
-        "IMU_ATTI(0):pitch:C,IMU_ATTI(0):yaw:C,GPS:dateTimeStamp,Gimbal:yaw"
-    )
-    return [
-        pytest.param(
-            litchi,
-            [f"47.5,8.25,30.5,{k}00,2024-05-01 10:00:00.{k}00,2,1,-90,1,-305,0,900" for k in range(5)],
-            id="litchi",
-        ),
-        pytest.param(
-            parser,
-            [f"2024-05-01T10:00:00.{k}Z,0.{k},47.5,8.25,30.5,530,2,1,-90,-30.5,0,90,true" for k in range(5)],
-            id="dji-log-parser",
-        ),
-        pytest.param(
-            datcon,
-            [f"{k},0.{k},8.25,47.5,30.5,1,2,-90,2024-05-01T10:00:00Z,90" for k in range(5)],
-            id="datcon",
-        ),
-    ]
-
-
-@pytest.mark.parametrize(("heading", "rows"), _services())
-def test_services_and_programs_by_their_headings(tmp_path: Path, heading: str, rows: list[str]) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
-    telemetry = read(path)
-    np.testing.assert_allclose(telemetry.position.values, [[47.5, 8.25, 30.5]] * 5, rtol=1e-12)
-    fine = not heading.startswith("Clock")  # whole seconds: the middle of the one that is shown
-    began_ns = 1_714_557_600_000_000_000 + (0 if fine else 300_000_000)
-    assert telemetry.position.t_ns.tolist() == [began_ns + k * 100_000_000 for k in range(5)]
-    assert telemetry.clock == "UTC"
-    assert telemetry.body is not None
-    nose = rotate(telemetry.body.quaternion_xyzw[0], np.array([1.0, 0, 0]))
-    np.testing.assert_allclose(nose, [-np.cos(np.radians(2)), 0, np.sin(np.radians(2))], atol=1e-12)
-    if not fine:
-        assert telemetry.gimbal is None
-        return
-    assert telemetry.gimbal is not None
-    view = rotate(telemetry.gimbal.quaternion_xyzw[0], np.array([1.0, 0, 0]))
-    np.testing.assert_allclose(view, [np.cos(np.radians(30.5)), 0, -np.sin(np.radians(30.5))], atol=1e-12)
-    assert len(recordings_of(path)) == 1
-
-
 def test_damage_is_counted(tmp_path: Path) -> None:
     path = airdata(tmp_path / "a.csv")
     lines = path.read_text().split("\n")
