@@ -19,6 +19,7 @@ from pipelines.session.errors import DataError
 )
 @click.option("--detector", default="blazepose", show_default=True, help="See `mocap models`.")
 @click.option("--strict", is_flag=True, help="Exit 1 if there is a doubt.")
+@click.option("--fix", is_flag=True, help="Write the remedies that were tried into flight.yaml.")
 @click.option(
     "--workers",
     type=click.IntRange(1, 256),
@@ -32,6 +33,7 @@ def check_command(
     pose_noise: str | None,
     detector: str,
     strict: bool,
+    fix: bool,
     workers: int,
     shown: Shown,
 ) -> dict[str, Any] | None:
@@ -41,19 +43,25 @@ def check_command(
     undone in turn, and the one that explains what is odd is named (docs/mistakes.md). `mocap reconstruct`
     does the same. Of a flight without keypoints, the detector looks at a few seconds.
     """
-    from pipelines.check import check
+    from pipelines import check
 
     with watching(shown.level) as progress:
-        result = check(path, pose_noise=pose_noise, detector=detector, workers=workers, progress=progress)
+        options: dict[str, Any] = {"pose_noise": pose_noise, "detector": detector, "workers": workers}
+        options["progress"] = progress
+        result, changes = check.fix(path, **options) if fix else (check.check(path, **options), [])
     say_warnings(result.warnings, shown.quiet)
     if strict and result.doubts:
         first = result.doubts[0]
         raise DataError(path, f"is doubted: {first.what} ({first.code})", first.remedy, code="doubted")
     if shown.as_json:
-        return {"path": str(path), "doubts": [doubt.as_json() for doubt in result.doubts]}
+        found = {"path": str(path), "doubts": [doubt.as_json() for doubt in result.doubts]}
+        return found | ({"changes": changes} if fix else {})
+    for line in changes:
+        say(line)
     for doubt in result.doubts:
         say(f"{doubt.code}: {doubt.what}")
-        say("  " + ", ".join(f"{name} {value:g}" for name, value in doubt.evidence.items()))
+        numbers = {name: value for name, value in doubt.evidence.items() if not isinstance(value, dict)}
+        say("  " + ", ".join(f"{name} {value:g}" for name, value in numbers.items()))
         for line in doubt.instructions:
             say(f"  {line}")
     if not result.doubts:

@@ -100,8 +100,17 @@ def _is_short_of_memory(error: BaseException) -> bool:
 
 
 def print_error(error: MocapError) -> None:
-    """Print an error as one line on stderr."""
-    say(f"mocap: {one_line(str(error))}", err=True)
+    """Print an error as one line on stderr, and lines of flight.yaml that mend it each on its own below."""
+    remedy = error.remedy if isinstance(error, DataError) else ""
+    changes = remedy.split("; ")
+    if not any(change.removeprefix("set ").startswith(("cameras.", "world.")) for change in changes):
+        say(f"mocap: {one_line(str(error))}", err=True)
+        return
+    say(f"mocap: {one_line(str(error).removesuffix(f'; {remedy}'))}", err=True)
+    from pipelines.session.description import as_instruction
+
+    for change in changes:
+        say(f"  {one_line(as_instruction(change))}", err=True)
 
 
 class _Lazy(Mocap):

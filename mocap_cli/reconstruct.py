@@ -176,7 +176,22 @@ def reconstruct_command(
     if not shown.quiet:
         _print(result, every_joint=shown.verbose)
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
+    if not shown.quiet and "verdict" in result.metrics:  # unless an earlier version wrote it
+        _print_verdict(result.metrics["verdict"], result.folder)
     return None
+
+
+def _print_verdict(verdict: dict[str, Any], session: Path) -> None:
+    """Print how good the result is without truth, what holds it back, and the next command."""
+    expected = verdict["expected_error_mm"]
+    error = "nothing was measured"
+    if expected is not None:
+        low, median, high = expected
+        error = f"the error is about {median:.0f} mm, in 4 of 5 flights {low:.0f} to {high:.0f} mm"
+    say(f"{verdict['grade']}: {error}")
+    for reason in verdict["why"]:
+        say(f"  {reason}")
+    say(f"next: {verdict['next'].replace('SESSION', str(session))}")
 
 
 def _print(result: Reconstructed, *, every_joint: bool) -> None:

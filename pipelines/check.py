@@ -5,10 +5,12 @@ detector looks at a few seconds in the middle of the flight, in a temporary copy
 The backgrounds of these pictures are followed, too: only they tell that all cameras' clocks are alike wrong.
 """
 
+import difflib
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pipelines.detect import (
     BACKGROUND,
@@ -22,13 +24,16 @@ from pipelines.ingest import ingest
 from pipelines.reconstruct import chosen_detections, find_people
 from pipelines.reconstruction.background_tracks import Followed, load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
+from pipelines.reconstruction.doubts.remedies import mended
 from pipelines.reconstruction.loading import load_cameras
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt, read_description
+from pipelines.session.errors import DataError
 from pipelines.session.memory import return_freed_arrays
 from pipelines.session.people import logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Session, StageRecord, WritableSession, copy_session, locked, open_session
+from pipelines.session.storage import write_whole
 
 LOOK_S = 8.0
 """Seconds in the middle of a flight that the detector looks at."""
@@ -82,6 +87,50 @@ def check(
             ingest(path, copy, progress=progress)
         with locked(copy) as writable:
             return _checked(writable, pose_noise, detector, workers, progress)
+
+
+def fix(manifest: Path, **options: Any) -> tuple[Checked, list[str]]:
+    """Check a flight, and write into its manifest the remedies with which it is doubted less.
+
+    The remedy of the first doubt is put into a copy beside the manifest, which is checked as a whole. It
+    is kept if its doubt is gone and no other appears; then comes that of the next first doubt.
+
+    Args:
+        manifest: flight.yaml.
+        options: those of `check`.
+
+    Returns:
+        The doubts that are left, and the lines of the difference; none where nothing was written.
+
+    Raises:
+        DataError: the path is a session, or the flight cannot be read.
+    """
+    if manifest.is_dir():
+        raise DataError(
+            manifest,
+            "is a session: remedies are written into its flight.yaml",
+            "check that file",
+            code="bad-option",
+        )
+    checked = check(manifest, **options)
+    stated = text = manifest.read_text(encoding="utf-8")
+    copy = manifest.with_name(f".{manifest.name}.tried")  # beside it, since paths are relative
+    try:
+        while checked.doubts and (changed := mended(text, checked.doubts[0].remedy)) is not None:
+            copy.write_text(changed, encoding="utf-8")
+            after = check(copy, **options)
+            left = {doubt.code for doubt in after.doubts}
+            if checked.doubts[0].code in left or left - {doubt.code for doubt in checked.doubts}:
+                break
+            text, checked = changed, after
+        if text != stated:
+            write_whole(manifest, text.encode("utf-8"))
+    finally:
+        copy.unlink(missing_ok=True)
+    name = manifest.name
+    return checked, list(
+        difflib.unified_diff(stated.splitlines(), text.splitlines(), name, name, n=1, lineterm="")
+    )
 
 
 def _checked(

@@ -25,6 +25,21 @@ PCK_THRESHOLD_M = 0.15
 _GAP_STEPS = 3
 # Median absolute deviation to standard deviation, for a normal distribution.
 _SIGMA_PER_MAD = 1.4826
+# World errors are computed in segments of so many samples, as in SLAHMR (Ye et al., CVPR 2023).
+_SEGMENT_SAMPLES = 100
+# A foot whose true speed is lower stands: 10 mm in a frame of 30 Hz (WHAM).
+_STANDING_M_S = 0.3
+_FIELD_RATE_HZ = 30.0
+
+WORLD_ERRORS = (
+    "w_mpjpe_mm",
+    "wa_mpjpe_mm",
+    "rte_percent",
+    "jitter",
+    "foot_sliding_mm",
+    "shifted_mpjpe_mm",
+)
+"""The errors of `world_errors`."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +103,62 @@ def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -
         "pa_frames_left_out": int((shared & ~aligned).sum()),
         "per_joint": {name: distances.errors(slice(j, j + 1)) for j, name in enumerate(joints)},
     }
+
+
+def world_errors(
+    estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64
+) -> dict[str, float | None]:
+    """Compute the errors in the world by their names in the field (Shin et al., WHAM, CVPR 2024).
+
+    Args:
+        estimate: [T, P, J, 3] m.
+        truth: [T, P, J, 3] m, the same people and joints at the same times.
+        joints: the J names.
+        t_ns: [T] strictly increasing stamps.
+
+    Returns:
+        `w_mpjpe_mm` and `wa_mpjpe_mm`: MPJPE in segments of 100 samples after the similarity of their first
+        two samples, and of the whole segment; `rte_percent`: distance of the roots after one rigid motion,
+        over the length of their true way; `jitter`: mean third derivative of the estimate, 10 m/s^3;
+        `foot_sliding_mm`: motion of standing feet in 1/30 s; `shifted_mpjpe_mm`: MPJPE after one shift of the
+        whole flight. None for what could not be measured.
+
+    Raises:
+        ValueError: the shapes disagree, or the stamps do not increase strictly.
+    """
+    _check_shapes(estimate, truth, joints, t_ns)
+    by_first, by_all, rooted, path_m = [], [], [], 0.0
+    for own, true in zip(np.moveaxis(estimate, 1, 0), np.moveaxis(truth, 1, 0), strict=True):
+        there = np.flatnonzero(np.isfinite(own - true).all(axis=-1).any(axis=-1))
+        for start in range(0, len(there), _SEGMENT_SAMPLES):
+            rows = there[start : start + _SEGMENT_SAMPLES]
+            by_first.append(_aligned_as(own[rows], true[rows], 2))
+            by_all.append(_aligned_as(own[rows], true[rows], len(rows)))
+        # A straight way leaves its roll open: the motion is that of all joints.
+        rigid = align_each(own[there].reshape(-1, 3), true[there].reshape(-1, 3), with_scale=False)
+        start, end = (_root(each[there, None], joints)[:, 0] for each in (own, true))
+        rooted.append(_length(rigid.apply(start) - end))
+        path_m += float(np.nansum(_length(np.diff(end, axis=0))))
+    feet = [index for index, name in enumerate(joints) if name.endswith(("ankle", "heel", "big_toe"))]
+    speed = _length(_derivative(estimate[:, :, feet], t_ns, 1))
+    stands = _length(_derivative(truth[:, :, feet], t_ns, 1)) < _STANDING_M_S
+    apart = estimate - truth
+    shift = np.array([_mean(apart[..., axis]) for axis in range(3)])
+    found = {
+        "w_mpjpe_mm": 1e3 * _mean(np.concatenate([np.ravel(each) for each in (*by_first, [])])),
+        "wa_mpjpe_mm": 1e3 * _mean(np.concatenate([np.ravel(each) for each in (*by_all, [])])),
+        "rte_percent": 100 * _mean(np.concatenate([*rooted, []])) / path_m if path_m > 0 else math.nan,
+        "jitter": _mean(_length(_derivative(estimate, t_ns, 3))) / 10,
+        "foot_sliding_mm": 1e3 * _mean(speed[stands]) / _FIELD_RATE_HZ,
+        "shifted_mpjpe_mm": 1e3 * _mean(_length(apart - shift)),
+    }
+    return _jsonable(found)
+
+
+def _aligned_as(own: Float, true: Float, samples: int) -> Float:
+    """Compute distances [T, J] in m after the similarity of the first samples of one person [T, J, 3]."""
+    first = align_each(own[:samples].reshape(-1, 3), true[:samples].reshape(-1, 3), with_scale=True)
+    return _length(first.apply(own.reshape(-1, 3)).reshape(own.shape) - true)
 
 
 def error_series(

@@ -20,6 +20,7 @@ from pipelines.geometry.joint_angles import ANGLE_STATUS, ANGLES, joint_angles
 from pipelines.geometry.metrics import (
     LEVEL,
     RESAMPLES,
+    WORLD_ERRORS,
     JointErrors,
     Series,
     error_series,
@@ -28,9 +29,11 @@ from pipelines.geometry.metrics import (
     measure_shape,
     stretch_samples,
     tracking_errors,
+    world_errors,
 )
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
+from pipelines.reconstruction.expected_error import verdict
 from pipelines.reconstruction.observations import Camera, Observations
 from pipelines.session.description import Interpolation
 from pipelines.session.people import bones_of
@@ -51,7 +54,12 @@ _PER_JOINT = (
     "reprojection_px_mean",
 )
 _UNMEASURED = dict.fromkeys(
-    [*(field.name for field in fields(JointErrors)), "root_frames_left_out", "pa_frames_left_out"]
+    [
+        *(field.name for field in fields(JointErrors)),
+        "root_frames_left_out",
+        "pa_frames_left_out",
+        *WORLD_ERRORS,
+    ]
 )
 """Placeholder for errors without truth."""
 
@@ -94,6 +102,7 @@ def assess(
     if truth is not None:
         own = _own_truth(position, truth)
         errors |= measure(position, own, observations.joints, observations.t_ns)
+        errors |= world_errors(position, own, observations.joints, observations.t_ns)
     for name, figures in errors.pop("per_joint").items():
         per_joint[name] |= _of_truth(figures)
     overall = _figures(status, residual)
@@ -443,7 +452,7 @@ def write_figures(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
     """Write metrics.json, and what it would say of each joint and bone as tables beside it.
 
     Args:
-        folder: the folder of the stage.
+        folder: the folder of the stage, with skeleton.parquet.
         figures: those of `assess` and more, JSON-able.
 
     Returns:
@@ -459,6 +468,7 @@ def write_figures(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
     stored = {name: value for name, value in figures.items() if name != "per_joint"}
     stored["intervals"] = {name: value for name, value in intervals_of.items() if name != "per_joint"}
     stored["shape"] = {name: value for name, value in shape.items() if name != "bones"}
+    stored["verdict"] = verdict(folder, stored)
     write_json(folder / "metrics.json", stored)
     return stored
 

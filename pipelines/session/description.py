@@ -320,7 +320,7 @@ class Doubt(Entry):
     code: str
     cameras: list[str]
     what: str  # one sentence
-    evidence: dict[str, float]
+    evidence: dict[str, float | dict[str, float]]
     remedy: str  # the lines of flight.yaml to change; empty where no cause was found
 
     def as_json(self) -> dict[str, object]:
@@ -340,7 +340,7 @@ class Doubt(Entry):
 
 def as_instruction(remedy: str) -> str:
     """Return a remedy as an instruction: keys of flight.yaml are set, anything else is said as it is."""
-    return f"set {remedy}" if remedy.startswith(("cameras.", "map.")) else remedy
+    return f"set {remedy}" if remedy.startswith(("cameras.", "map.", "world.")) else remedy
 
 
 class Description(Entry):

@@ -76,7 +76,10 @@ def succeeds(*arguments: str | Path) -> str:
 
 
 def refused(*arguments: str | Path, code: str | None = None) -> str:
-    """Run a command that must refuse its input in one line and exit 1, with this code; return that line."""
+    """Run a command that must refuse its input in one line and exit 1, with this code; return that line.
+
+    Changes of flight.yaml that mend it follow it, each in a line of its own.
+    """
     done = mocap(*arguments)
     line = refusal(done)
     assert code is None or (code in CODES and done.code == code), (done.code, line)
@@ -87,10 +90,10 @@ def refusal(done: subprocess.CompletedProcess[str]) -> str:
     """Check that a command refused its input in one line and exited 1; return that line."""
     assert done.returncode == 1, (done.returncode, done.stdout, done.stderr)
     lines = done.stderr.strip().splitlines()
-    assert len(lines) == 1, done.stderr
+    assert all(line.startswith("  ") for line in lines[1:]), done.stderr
     assert lines[0].startswith("mocap: ")
     assert "Traceback" not in done.stderr
-    return lines[0]
+    return "\n".join(lines)
 
 
 def as_if_written(session: Path, name: str, stage: str) -> None:

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.metrics import bone_lengths, measure, measure_shape, tracking_errors
+from pipelines.geometry.metrics import (
+    bone_lengths,
+    measure,
+    measure_shape,
+    tracking_errors,
+    world_errors,
+)
 
 JOINTS = ("left_hip", "right_hip", "left_knee", "right_knee", "nose")
 STANCE = np.array([[0.0, 0.1, 1.0], [0, -0.1, 1.0], [0.02, 0.12, 0.5], [-0.02, -0.12, 0.5], [0.05, 0, 1.7]])
@@ -134,6 +140,35 @@ def test_no_acceleration_across_missing_samples_or_gaps() -> None:
     assert measure(estimate, truth, JOINTS, stamps(7))["acceleration_error_mm_s2"] is None
     late = stamps(4) + np.array([0, 0, 1000, 1000], dtype=np.int64) * MS
     assert measure(truth[:4], truth[:4], JOINTS, late)["acceleration_error_mm_s2"] is None
+
+
+def test_a_place_that_is_wrong_is_no_error_of_the_motion() -> None:
+    moved = walk(150) + np.array([3.0, 4.0, 0.0])
+    found = world_errors(moved, walk(150), JOINTS, stamps(150))
+    # Coordinates of some metres through a rotation and back: 1e-12 mm.
+    for name in ("w_mpjpe_mm", "wa_mpjpe_mm", "rte_percent", "jitter", "shifted_mpjpe_mm"):
+        assert found[name] == pytest.approx(0, abs=1e-6)
+    assert found["foot_sliding_mm"] is None  # it has no feet
+
+
+def test_a_way_that_is_too_long_is_an_error_of_the_world() -> None:
+    """Walk 10 % too fast: the error grows from 0 to 4.8 mm a step, and rigid motion halves it."""
+    truth = walk(101)
+    along = np.arange(101)[:, None] * np.array([0.0048, 0, 0])
+    found = world_errors(truth + along[:, None, None], truth, JOINTS, stamps(101))
+    assert found["rte_percent"] == pytest.approx(100 * 0.0048 * 101 / 4 / 4.8, rel=0.02)
+    assert found["w_mpjpe_mm"] == pytest.approx(4.8 * 49.5, rel=0.1)  # of segments of 100 and of 1
+    assert found["wa_mpjpe_mm"] < found["w_mpjpe_mm"]
+
+
+def test_feet_that_stand_slide_as_far_as_the_estimate_moves_them() -> None:
+    joints = (*JOINTS[:-1], "left_ankle")
+    truth = np.repeat(walk(1), 10, axis=0)
+    found = world_errors(
+        truth + np.arange(10)[:, None, None, None] * [0.004, 0, 0], truth, joints, stamps(10)
+    )
+    # 4 mm in 40 ms are 3.33 mm in a thirtieth of a second.
+    assert found["foot_sliding_mm"] == pytest.approx(4 / 0.04 / 30)
 
 
 def test_shapes_and_stamps_must_agree() -> None:

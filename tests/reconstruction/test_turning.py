@@ -12,7 +12,7 @@ from pipelines.geometry.noise import Drift, pose_errors
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.reconstruction.background import clocks_of_backgrounds
 from pipelines.reconstruction.background_tracks import Followed, Tracks
-from pipelines.reconstruction.doubts.hypotheses import RATES
+from pipelines.reconstruction.doubts.alternatives import RATES
 from pipelines.reconstruction.doubts.turning import Lateness, common_offset, lateness, turns_of
 from pipelines.session.description import Interpolation
 

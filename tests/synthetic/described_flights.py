@@ -10,7 +10,6 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,8 +33,9 @@ from pipelines.geometry.poses import (
 )
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
-from pipelines.reconstruction.doubts.diagnosis import Diagnosis
+from pipelines.reconstruction.doubts.remedies import mended
 from pipelines.reconstruction.doubts.scene import Sampled
+from pipelines.session.description import Doubt
 from pipelines.session.errors import MocapError
 from pipelines.session.people import SKELETONS
 from pipelines.session.tables import POSES, read_table, trajectory_from
@@ -693,21 +693,10 @@ def measured(manifest: Path, error: str = "mpjpe_mm") -> tuple[float | None, lis
 
 def with_remedy(manifest: Path, remedy: str) -> bool:
     """Put the lines of a remedy into a manifest; False if it is no line."""
-    yaml = YAML(typ="safe")
-    document = yaml.load(manifest.read_text())
-    for line in remedy.split("; "):
-        path, _, value = line.partition(": ")
-        keys = path.split(".")
-        if not value or keys[0] not in {"world", *document} or "..." in value:
-            return False
-        place = document
-        for key in keys[:-1]:
-            if not isinstance(place.get(key), dict):
-                place[key] = {}
-            place = place[key]
-        place[keys[-1]] = deepcopy(yaml.load(value))
-    written(document, manifest)
-    return True
+    text = mended(manifest.read_text(encoding="utf-8"), remedy)
+    if text is not None:
+        manifest.write_text(text, encoding="utf-8")
+    return text is not None
 
 
 _MOTIONS = (
@@ -860,9 +849,9 @@ def sampled_of(manifest: Path) -> Sampled:
     """Return what `check` diagnoses of a flight."""
     seen: list[Sampled] = []
 
-    def kept(sampled: Sampled | None, *_: object) -> Diagnosis:
+    def kept(sampled: Sampled | None, *_: object) -> list[Doubt]:
         seen.extend([] if sampled is None else [sampled])
-        return Diagnosis([], float("nan"), 0)
+        return []
 
     with patch("pipelines.reconstruction.doubts.diagnosis.diagnose", kept):
         check(manifest)

@@ -1,76 +1,57 @@
-"""Doubts about a flight: what is odd about it, and the mistake in its description that explains that.
+"""Doubts about a flight: what is odd about it, and the alternative to its description that explains that.
 
 A flight whose score is small is believed, unless a clock or a frame rate explains markedly more. Else every
-mistake that `hypotheses` knows is tried, and the best is named if it explains markedly more than the
-description does. If none does, the doubt is stated without a cause.
+alternative is tried. All are compared by one number: by how much the score and the chi^2 of the rays fall,
+less the price of the alternative. The best is named if that is enough, and if nothing odd is left with it. If
+none is, the doubt is stated without a cause.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pipelines.geometry.arrays import Int64
-from pipelines.reconstruction.background_tracks import Followed
 from pipelines.reconstruction.doubts import remedies
-from pipelines.reconstruction.doubts.faults import (
-    FREE,
-    Fault,
-    fit,
-    origins,
-    picture_variance,
-    tilt_sigma_deg,
-    undone,
-    zoom,
-)
-from pipelines.reconstruction.doubts.hypotheses import (
+from pipelines.reconstruction.doubts.alternatives import (
+    DISCRETE,
     LEAST_GAIN_OF_TIMES,
     RATES,
     TIMES,
-    Hypothesis,
+    Alternative,
     Trial,
-    higher_or_lower,
-    of_descriptions,
+    discrete,
+    of_all_numbers,
+    of_clock,
     of_level,
+    of_noise,
+    of_one_number,
+    of_origins,
     of_scale,
     of_times,
-    pair_of,
-    relative_to,
-    turn_about,
 )
+from pipelines.reconstruction.doubts.body import STATURE_M
+from pipelines.reconstruction.doubts.fit import fit
 from pipelines.reconstruction.doubts.logs import doubts_of_logs
-from pipelines.reconstruction.doubts.scene import CameraLike, Sampled, SceneOfMoments, sample, scene_of
-from pipelines.reconstruction.doubts.score import (
-    STATURE_M,
-    Score,
-    base_of,
-    residual_px,
-    residuals_px,
-    score,
-    solve,
-)
-from pipelines.reconstruction.doubts.turning import (
-    LEAST_GAIN,
-    Lateness,
-    is_sure_clock,
-    lateness,
-    turns_of,
-)
+from pipelines.reconstruction.doubts.scene import Sampled, sample, scene_of
+from pipelines.reconstruction.doubts.score import Score, base_of, residuals_px, score
+from pipelines.reconstruction.doubts.turning import LEAST_GAIN, Lateness, all_turns, is_sure_clock, lateness
+from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
 
 MARGIN = 3.0
-"""By how much a mistake must score better than the description to be named."""
+"""By how much an alternative must lower the objective, beyond its price, to be named."""
 
-MARGIN_OF_TIMES = 2.0
-"""The same for clocks and frame rates, which only the scatter of rays can tell."""
+COST_OF_SCORE = 4.7
+"""Chi^2 that counts as much as one of the score."""
 
 ODD = 3.0
 """Score of a description from which more than times is tried."""
@@ -82,10 +63,7 @@ MISSED = 1.8
 """Misfit of rays from which more than times is tried, whatever the score; 0.4 to 1.6 on right flights."""
 
 STRAINED = 10.0
-"""Chi^2 of constant errors of poses from which faults of one camera's poses are tried."""
-
-GAIN = 14.0
-"""By how much a fault must lower the chi^2 of the rays, to be named."""
+"""Chi^2 of constant errors of poses from which numbers of one camera are tried."""
 
 STRANGE = 5.0
 """Standard deviations from which one oddity is said, whatever the score."""
@@ -94,39 +72,22 @@ STRANGE_SIZE = 2.5
 """The same of the stature: mistakes of scale are less rare than people below 1.27 m or above 2.35 m."""
 
 DOUBTFUL = 6.0
-"""Score of a description above which it is doubted although no mistake explains it."""
+"""Score of a description above which it is doubted although no alternative explains it."""
 
 # Logs nearer to each other than this do not tell own origins from positions in a smaller unit.
 _HOVERING_M = 0.5
 # Drones that all fly lower than this below zero count heights downwards.
 _BELOW_M = 1.0
-# Hypotheses whose scores are this close are stated together.
+# Alternatives that lower the objective by this much less than the best are stated beside it.
 _ALIKE = 1.0
-# Each free number costs this much chi^2, as in Akaike's criterion.
-_COST_OF_NUMBER = 2.0
-# Faults whose chi^2 are this close are stated together.
-_ALIKE_COST = 4.0
-# A right hypothesis raises the residual of the rays by less than this factor.
-_SAME_RESIDUAL = 1.1
-# Leaving a camera out explains much by chance, and must gain this much more.
-_PENALTY_OF_CAMERA = 2.5
-# Hypotheses without a free number have at most this penalty.
-_DISCRETE = 0.8
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """The doubts of a flight, those first that explain the most."""
-
-    doubts: list[Doubt]
-    score: float  # of the description; NaN where the cameras share no time
-    tried: int  # hypotheses
+# So many alternatives of the best scores are fitted to the rays.
+_FITTED = 12
 
 
 def doubts_of(
     folder: Path,
     description: Description,
-    cameras: Sequence[CameraLike],
+    cameras: Sequence[Camera],
     *,
     chosen: Sequence[Int64],
     followed: Mapping[str, object],
@@ -157,15 +118,10 @@ def doubts_of(
         last_map=last[0] if last else None,
         pose_noise=pose_noise,
     )
-    between = description.pose_interpolation
-    turns = {
-        index: turns_of(camera, tracks)
-        for index, camera in enumerate(cameras)
-        if isinstance(tracks := followed.get(camera.name), Followed)
-    }
+    turns = all_turns(cameras, followed)
     first_ns = [description.cameras[camera.name].frames.first_t_ns for camera in cameras]
-    late = lateness(cameras, turns, between, RATES, first_ns)
-    return diagnose(_less_odd(known(chosen=chosen), known()), late).doubts
+    late = lateness(cameras, turns, description.pose_interpolation, RATES, first_ns)
+    return diagnose(_less_odd(known(chosen=chosen), known()), late)
 
 
 def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, float | str]]) -> list[Doubt]:
@@ -180,7 +136,7 @@ def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, 
                 cameras=[name],
                 what=f"the pictures of {name} were taken {remedies.earlier_or_later(late_s)}, as"
                 f" {said[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that",
-                evidence={"clock_s": _rounded(late_s), "clock_sigma_s": _rounded(sigma_s)},
+                evidence={"clock_s": round(late_s, 3), "clock_sigma_s": round(sigma_s, 3)},
                 remedy=f"cameras.{name}.{remedies.offset_of(description.cameras[name], late_s)}",
             )
         )
@@ -200,15 +156,17 @@ def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | No
     return min(chosen, prominent, key=lambda flight: score(flight, scene_of(flight)).total)
 
 
-def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> Diagnosis:
-    """Find what is odd about a flight, and why; a flight whose cameras share no time is not doubted here.
+def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doubt]:
+    """Find what is odd about a flight, and why, that first that explains the most.
+
+    A flight whose cameras share no time is not doubted here.
 
     Args:
         flight: the flight.
         late: what the backgrounds tell of the cameras' times.
     """
     if flight is None:
-        return Diagnosis([], float("nan"), 0)
+        return []
     described = scene_of(flight)
     base, found = base_of(flight, described)
     trial = Trial(flight, described, base)
@@ -216,40 +174,24 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> Diagnosis
     mirrored = any(found.odd[name].sigmas >= STRANGE for name in ("face", "bend") if name in found.odd)
     fits = found.misfit < MISSED and found.scatter < SCATTERED and not mirrored
     level = of_level(trial) if fits else ()
-    hypotheses = [*level, *_of_logs(trial), *_of_turns(trial, late), *of_times(trial)]
-    stated = fit(flight, described, "none", 0)
-    explained = min((each.total for each in hypotheses), default=np.inf)
+    objective = Objective(trial)
+    tried = [*level, *_of_logs(trial), *_of_turns(trial, objective, late), *of_times(trial)]
     strange = _is_strange(found)
     odd = strange or base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
-    if odd or explained <= base.total - MARGIN_OF_TIMES:
-        hypotheses += list(of_descriptions(trial))
+    if odd:
+        tried += [*discrete(trial), *of_all_numbers(trial)]
+        tried += of_clock(trial, trial.every) if trial.moving else ()
     if strange and np.isfinite(found.stature_m):
-        hypotheses.append(trial.scored(of_scale(trial, found.stature_m)))
-    if odd or stated.strain >= STRAINED:
-        hypotheses += list(_of_faults(trial))
-        hypotheses += [trial.scored(noisy) for noisy in _of_noise(trial, stated.cost)]
-    hypotheses.sort(key=lambda each: each.total)
-    causes = _causes(trial, hypotheses)
-    if causes and causes[0].scene is not None and _is_noise(flight, causes[0].scene, hypotheses):
-        causes = []
-    below_zero = _below_zero(trial)
-    if not causes or np.isfinite(causes[0].cost):
-        discrete = _without_number(trial, hypotheses)
-        of_one = _of_one_clock(trial, hypotheses, stated.cost)
-        faults = _faults([*discrete, *of_one, *hypotheses], stated.cost, described)
-        causes = below_zero or faults or causes  # of logs upside down, a fault of one only seems to explain
-    causes = [each for each in causes if _leaves_no_doubt(flight, each)] or below_zero
-    if not causes and base.total >= DOUBTFUL:
-        causes = _bad_camera(trial)
-    if any(each.code == "scale" for each in causes):  # others change the size by making the rays fit worse
-        causes = [each for each in causes if each.code == "scale"]
-    doubts = [_doubt(_with_sigma(trial, each), found, described) for each in causes]
+        tried.append(of_scale(trial, found.stature_m))
+    if odd or objective.fitted.strain >= STRAINED:
+        tried += [*of_one_number(trial), *(trial.scored(each) for each in of_noise(trial))]
+    causes = _causes(trial, objective, tried, odd) or _below_zero(trial)
+    doubts = [_doubt(trial, each, found) for each in causes]
     if doubts or strange or base.total >= DOUBTFUL:
         named = {doubt.code for doubt in doubts}
         named |= {"scale"} if "unit" in named else set()
-        oddities = _oddities(found, described, flight, alone=not doubts)
-        doubts += [doubt for doubt in oddities if doubt.code not in named]
-    return Diagnosis(doubts, base.total, len(hypotheses))
+        doubts += [each for each in _oddities(trial, found, alone=not doubts) if each.code not in named]
+    return doubts
 
 
 def _is_strange(described: Score) -> bool:
@@ -258,133 +200,110 @@ def _is_strange(described: Score) -> bool:
     return any(each.sigmas >= limits.get(name, STRANGE) for name, each in described.odd.items())
 
 
-def _causes(trial: Trial, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
-    """Return the hypotheses that score next to the best, one of each code; none if it explains too little.
+# --- one number by which all alternatives are compared ----------------------------------------------------
 
-    Those without a free number are first. Of clocks and frame rates, which are alike, the better score is.
+
+class Compared(NamedTuple):
+    """The two parts of the objective, of the description and of an alternative with its price."""
+
+    score_before: float
+    score_after: float
+    rays_before: float
+    rays_after: float
+
+    @property
+    def gain(self) -> float:
+        """By how much the alternative lowers the objective, beyond its price."""
+        return self.score_before - self.score_after + self.rays_before - self.rays_after
+
+    def is_enough(self, alternative: Alternative, odd: bool) -> bool:
+        """Test if the gain is more than chance.
+
+        People who lie or stand look alike at all times. So where nothing is odd, and of times of all cameras,
+        the rays alone must tell it; of times of one camera, they must fit as well.
+        """
+        if alternative.code in TIMES:
+            least = -_ALIKE if alternative.alike is None else MARGIN
+        else:
+            least = -np.inf if odd else MARGIN
+        return self.gain >= MARGIN and self.rays_before - self.rays_after >= least
+
+
+class Objective:
+    """The score of a scene, and the chi^2 of its rays with constant errors of all poses.
+
+    Stated errors have a level that is not exact: beyond one of each picture, chi^2 counts by its logarithm
+    (the likelihood of Student's t).
     """
-    explaining: list[Hypothesis] = []
-    for each in hypotheses:
-        if explaining and each.total > explaining[0].total + _ALIKE:
+
+    def __init__(self, trial: Trial) -> None:
+        self._trial = trial
+        self._pictures = float(np.isfinite(trial.described.rays[..., 0]).any(axis=-1).sum())
+        self.fitted = fit(trial.flight, lambda _: trial.described)
+
+    def _rays(self, cost: float) -> float:
+        return 2 * self._pictures * float(np.log1p(cost / self._pictures)) / COST_OF_SCORE
+
+    def compared(self, alternative: Alternative) -> Compared:
+        """Return the objective of the description, and that of an alternative with its price.
+
+        Another clock leaves moments out: then the description is judged by the same moments. Larger errors
+        excuse everything: of them only the chi^2 counts.
+        """
+        trial, scene = self._trial, alternative.scene
+        if scene is None or alternative.score is None:
+            return Compared(np.inf, -np.inf, np.inf, -np.inf)
+        before, total = self.fitted.cost, trial.base.total
+        if alternative.code in (*TIMES, "videos_swapped"):
+            seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
+            same = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
+            before = fit(trial.flight, lambda _: same).cost
+            total = min(total, score(trial.flight, same, trial.base).total)
+        cost = alternative.cost if np.isfinite(alternative.cost) else fit(trial.flight, lambda _: scene).cost
+        scores = (0.0, 0.0) if alternative.price == np.inf else (total, alternative.total)
+        return Compared(*scores, self._rays(before), self._rays(cost))
+
+
+def _causes(trial: Trial, objective: Objective, tried: Sequence[Alternative], odd: bool) -> list[Alternative]:
+    """Return the alternatives that lower the objective next to most, one of each code; none if by too little.
+
+    Those without a free number are first. What leaves something odd is no cause.
+    """
+    by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=lambda each: each.total)
+    by_score = [each for each in by_score[:_FITTED] if each.total <= trial.base.total - LEAST_GAIN_OF_TIMES]
+    weighed = []
+    for each in [*by_score, *(each for each in tried if np.isfinite(each.cost))]:
+        found = objective.compared(each)
+        if found.is_enough(each, odd):
+            tried_as = (found.score_before + found.rays_before, found.score_after + found.rays_after)
+            weighed.append((found.gain, replace(each, tried=tried_as)))
+    weighed.sort(key=lambda pair: -pair[0])
+    causes: list[tuple[float, Alternative]] = []
+    for gain, each in weighed:
+        if causes and gain < causes[0][0] - _ALIKE:
             break
-        if each.total > trial.base.total - MARGIN_OF_TIMES:
-            break
-        if _explains(trial, each):
-            explaining.append(each)
-    causes: dict[str, Hypothesis] = {}
-    free = [each for each in explaining if each.penalty > _DISCRETE and each.code not in TIMES]
-    for each in [*(each for each in explaining if each not in free), *free]:
-        causes.setdefault(each.code, each)
-    discrete = [
-        each
-        for each in causes.values()
-        if each.penalty <= _DISCRETE and each.scene is not None and each.code not in TIMES
-    ]
-    if len(discrete) > 1:  # alike in what is odd: the rays tell which of them fits
-        costs = {each.code: _cost(trial, each) for each in discrete}
-        least = min(costs.values()) + _ALIKE_COST  # where they do not tell, what is odd does, to a tenth
-        discrete.sort(key=lambda each: (max(costs[each.code], least), round(each.total, 1), costs[each.code]))
-    return [*discrete, *(each for each in causes.values() if each not in discrete)]
+        if _leaves_no_doubt(trial.flight, each):
+            causes.append((gain, each))
+    causes.sort(key=lambda pair: (pair[1].price > DISCRETE, -pair[0]))
+    return list({each.code: each for _, each in reversed(causes)}.values())[::-1]
 
 
-def _cost(trial: Trial, hypothesis: Hypothesis) -> float:
-    """Return the chi^2 of a hypothesis without a free number, with constant errors of all poses."""
-    if hypothesis.scene is None:
-        raise ValueError(f"{hypothesis.what} has no scene")
-    return fit(trial.flight, hypothesis.scene, "none", 0).cost
+def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
+    """Test if the flight would not be doubted as the alternative has it.
 
-
-def _without_number(trial: Trial, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the best hypothesis without a free number with its cost, to compete with faults.
-
-    It need not explain as much as the margin asks: of what lowers the chi^2 as much, it is the simpler. Other
-    times do not compete: they show other pictures, or fewer, so that their chi^2 is another sum.
+    It may explain the rays and still leave a flight that cannot be right, for example one in which all
+    sizes shrink to zero.
     """
-    for each in hypotheses:
-        if each.total > trial.base.total - MARGIN_OF_TIMES:
-            break
-        if each.scene is not None and each.penalty <= _DISCRETE and each.code not in TIMES:
-            return [replace(each, cost=_cost(trial, each))]
-    return []
-
-
-def _of_one_clock(trial: Trial, hypotheses: Sequence[Hypothesis], stated: float) -> list[Hypothesis]:
-    """Return clocks and frame rates of one camera with their cost, to compete with faults.
-
-    The chi^2 of the rays is more sensitive to them than the score. Their gain of chi^2, on the moments that
-    they show, is subtracted from the chi^2 of all moments, so that costs can be compared.
-
-    Args:
-        trial: the flight.
-        hypotheses: all that were tried.
-        stated: the cost of a fit without a fault.
-    """
-    found = []
-    for each in hypotheses:
-        if each.scene is None or each.code not in TIMES or each.alike is not None:
-            continue
-        if each.total <= trial.base.total - LEAST_GAIN_OF_TIMES:
-            described = _same_moments(trial, each.scene)
-            gain = fit(trial.flight, described, "none", 0).cost - _cost(trial, each)
-            numbers = 0 if each.penalty <= _DISCRETE else 1
-            found.append(replace(each, cost=stated - gain + numbers * _COST_OF_NUMBER))
-    return [each for each in found if np.isfinite(each.cost)]
-
-
-def _same_moments(trial: Trial, scene: SceneOfMoments) -> SceneOfMoments:
-    """Return the description where another scene has rays, too."""
-    seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
-    return replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
-
-
-def _explains(trial: Trial, hypothesis: Hypothesis) -> bool:
-    """Return True if a hypothesis explains markedly more than the description of the same moments.
-
-    Another clock leaves moments out: in fewer, errors that wander are smaller, and they say less. Times of
-    all cameras alike must explain more than the same pictures do at the times that are stated. Nor may the
-    rays of a person in whom nothing is odd miss each other by more than before; with constant errors of all
-    poses, they must fit markedly better. So must times of all cameras; those of one must fit about as well.
-    """
-    if hypothesis.scene is None:
+    if alternative.scene is None:
         return True
-    if not _leaves_no_doubt(trial.flight, hypothesis):
-        return False
-    is_odd = trial.base.total >= ODD or hypothesis.code in ("scale", "unit")
-    described = _same_moments(trial, hypothesis.scene)
-    if hypothesis.code in TIMES or not is_odd:
-        of_one_clock = hypothesis.code in TIMES and hypothesis.alike is None
-        least = -_ALIKE_COST if of_one_clock else GAIN
-        if _cost(trial, hypothesis) > fit(trial.flight, described, "none", 0).cost - least:
-            return False
-    same = score(trial.flight, described, trial.base)
-    share = np.isfinite(described.rays[..., 0]).sum() / np.isfinite(trial.described.rays[..., 0]).sum()
-    margin = (MARGIN_OF_TIMES if hypothesis.code in TIMES else MARGIN) / share
-    if hypothesis.total > min(same.total, trial.base.total) - margin:
-        return False
-    if hypothesis.alike is not None:
-        flight, stated_scene = trial.as_stated(*hypothesis.alike)
-        # That is so at the stated times alone.
-        unposed = float(np.log1p(same.odd["unposed"].sigmas ** 2)) if "unposed" in same.odd else 0.0
-        if hypothesis.total > score(flight, stated_scene, trial.base).total + unposed - margin:
-            return False
-    missed = [residual_px(scene, solve(scene)) for scene in (described, hypothesis.scene)]
-    return is_odd or missed[1] <= _SAME_RESIDUAL * missed[0]
+    found = score(flight, alternative.scene)
+    return found.total < DOUBTFUL and not _is_strange(found)
 
 
-def _leaves_no_doubt(flight: Sampled, hypothesis: Hypothesis) -> bool:
-    """Test if the flight without the mistake scores below the limit of a doubt.
-
-    A remedy may explain the rays and still leave a flight that cannot be right, for example one in which all
-    sizes shrink to zero. Such a remedy is not given.
-    """
-    return hypothesis.scene is None or score(flight, hypothesis.scene).total < DOUBTFUL
-
-
-def _below_zero(trial: Trial) -> list[Hypothesis]:
+def _below_zero(trial: Trial) -> list[Alternative]:
     """Doubt drones that fly below zero all the time, where neither a map nor an actor says how high zero is.
 
-    Where all fly about equally high, the rays are alike with z upwards and downwards: the penalty of a
-    hypothesis, which has to explain more than the description, is not asked for.
+    Where all fly about equally high, the rays are alike with z upwards and downwards: no gain is asked for.
     """
     located = trial.flight.hips is not None or trial.flight.ground is not None
     height = trial.described.position[trial.moving, :, 2]
@@ -393,317 +312,98 @@ def _below_zero(trial: Trial) -> list[Hypothesis]:
     place = trial.described.position.copy()
     place[trial.moving, :, 2] *= -1
     turned = trial.scored(
-        Hypothesis(
+        Alternative(
             "axes",
             trial.names,
             "all drones fly below zero: their positions count z downwards, or zero is high above the ground",
-            remedies.upside_down(trial.flight.cameras),
-            _DISCRETE,
+            remedies.pose(trial.cameras, remedies.upside_down),
+            DISCRETE,
             replace(trial.described, position=place),
         )
     )
-    alike = turned.score is not None and turned.score.total <= trial.base.total + _ALIKE
-    return [turned] if alike else []
+    return [turned] if turned.total <= trial.base.total + _ALIKE + DISCRETE else []
 
 
-def _bad_camera(trial: Trial) -> list[Hypothesis]:
-    """Find the one camera of three or more without which nothing is odd, where no mistake explains it."""
-    if len(trial.names) < 3:
-        return []
-    tried = []
-    for index, name in enumerate(trial.names):
-        rays = trial.described.rays.copy()
-        rays[index] = np.nan
-        what = f"{name} does not fit the others, which fit each other: its poses, clock or lens may be wrong"
-        tried.append(
-            trial.scored(
-                Hypothesis(
-                    "pose",
-                    (name,),
-                    what,
-                    remedies.another_pose(trial.flight.cameras, index),
-                    _PENALTY_OF_CAMERA,
-                    replace(trial.described, rays=rays),
-                )
-            )
-        )
-    best, second = sorted(tried, key=lambda each: each.total)[:2]
-    explains = best.total <= min(trial.base.total - MARGIN, second.total - _ALIKE)
-    return [best] if explains and _leaves_no_doubt(trial.flight, best) else []
+# --- what is seen without a scene -------------------------------------------------------------------------
 
 
-def _is_noise(flight: Sampled, cause: SceneOfMoments, hypotheses: list[Hypothesis]) -> bool:
-    """Return True if larger errors of the poses fit markedly better than the scene without a mistake."""
-    noise = min((each.cost for each in hypotheses if each.code == "noise"), default=np.inf)
-    return bool(noise < np.inf) and noise < fit(flight, cause, "none", 0).cost - GAIN
-
-
-def _faults(hypotheses: list[Hypothesis], stated: float, scene: SceneOfMoments) -> list[Hypothesis]:
-    """Return the faults of one camera's poses that fit best, one of each code; none if they gain too little.
-
-    Args:
-        hypotheses: all that were tried.
-        stated: the cost of a fit without a fault.
-        scene: as described.
-    """
-    best = min((each.cost for each in hypotheses), default=np.inf)
-    # Where even the best fits badly, errors are larger than their model: chi^2 counts for less.
-    pictures = int(np.isfinite(scene.rays[..., 0]).any(axis=-1).sum())
-    if not best <= stated - GAIN * max(1.0, best / pictures):
-        return []
-    alike: dict[str, Hypothesis] = {}
-    for each in sorted(hypotheses, key=lambda each: (each.penalty > _DISCRETE, each.cost)):
-        if each.cost <= best + _ALIKE_COST:
-            alike.setdefault(each.code, each)
-    return list(alike.values())
-
-
-def _of_turns(trial: Trial, tried: Sequence[Lateness]) -> list[Hypothesis]:
+def _of_turns(trial: Trial, objective: Objective, tried: Sequence[Lateness]) -> list[Alternative]:
     """State the times that the backgrounds tell, where they tell them surely.
 
-    Where they tell some, the rays help to say whose these are: other times of one camera change how its rays
-    meet those of the others, times of all alike do not.
+    The rays help to say whose these are: other times of one camera change how its rays meet those of the
+    others, times of all alike do not.
     """
     if not tried or tried[0].gain < LEAST_GAIN:
         return []
-    late = max(tried, key=lambda each: each.gain + _gain_of_rays(trial, each))
-    if late.gain < LEAST_GAIN:
+
+    def gain(late: Lateness) -> float:
+        if len(late.cameras) == len(trial.names):
+            return late.gain
+        scene = trial.with_times(late.cameras, late.late_s, late.slower)
+        found = objective.compared(trial.scored(Alternative("clock", (), "", "", np.inf, scene)))
+        return late.gain + COST_OF_SCORE * found.gain
+
+    late = max(tried, key=gain)
+    if late.gain < LEAST_GAIN or (late.slower == 1 and not is_sure_clock(late)):
         return []
-    if late.slower == 1 and not is_sure_clock(late):
-        return []
-    names, cameras = trial.names, trial.flight.cameras
+    names, cameras = trial.names, trial.cameras
     whose = "all cameras" if len(late.cameras) == len(names) else names[late.cameras[0]]
     by = "as the turning of their backgrounds shows"
+    evidence = {"turning_gain": round(late.gain, 1)}
     if late.slower != 1:
         code, remedy = "frame_rate", remedies.frame_rate(cameras, late.cameras, late.slower)
         what = f"the frame rate of {whose} is {remedies.times_faster(late.slower)}, {by}"
     else:
         code, remedy = "clock", remedies.clock(cameras, late.cameras, late.late_s)
         what = f"the pictures of {whose} were taken {remedies.earlier_or_later(late.late_s)}, {by}"
-    found = {"turning_gain": round(late.gain, 1)}
-    found |= {"clock_sigma_s": _rounded(late.sigma_s)} if late.slower == 1 else {}
-    named = tuple(names[index] for index in late.cameras)
-    return [Hypothesis(code, named, what, remedy, 0.0, None, sigmas=found)]
+        evidence["clock_sigma_s"] = round(late.sigma_s, 3)
+    return [Alternative(code, trial.named(late.cameras), what, remedy, 0.0, evidence=evidence)]
 
 
-def _gain_of_rays(trial: Trial, late: Lateness) -> float:
-    """Return by how much other times of some cameras lower the chi^2 of the rays; 0 of times of all."""
-    if len(late.cameras) == len(trial.names):
-        return 0.0
-    slower = np.ones(len(trial.names))
-    slower[list(late.cameras)] = late.slower
-    late_s = np.zeros(len(trial.names))
-    late_s[list(late.cameras)] = late.late_s
-    scene = scene_of(trial.flight, trial.described, late_s=late_s, slower=slower)
-    costs = [fit(trial.flight, each, "none", 0).cost for each in (_same_moments(trial, scene), scene)]
-    return costs[0] - costs[1] if np.isfinite(costs).all() else 0.0
-
-
-def _of_logs(trial: Trial) -> Iterator[Hypothesis]:
+def _of_logs(trial: Trial) -> list[Alternative]:
     """Find cameras that fly the same path, or start at the same place: no picture is needed for that.
 
-    Pictures tell where the logs have their zeros.
-
-    Drones that hover together may also be apart in another unit: then the zeros have to explain more.
+    Pictures tell where the logs have their zeros. Drones that hover together may also be apart in another
+    unit: then the zeros have to explain more.
     """
-    cameras = trial.flight.cameras
-    logs = {camera.name: (camera.entry, camera.camera.trajectory) for camera in cameras}
-    for doubt in doubts_of_logs(logs):
-        remedy, sigmas, scene = doubt.remedy, dict[str, float](), None
+    found = []
+    for doubt in doubts_of_logs({each.name: (each.entry, each.camera.trajectory) for each in trial.cameras}):
+        seen = Alternative(doubt.code, tuple(doubt.cameras), doubt.what, doubt.remedy, 0.0)
         if doubt.code == "origin":
-            shifts, sigma = origins(trial.flight, trial.described)
-            if np.isfinite(shifts).all() and sigma.any():
-                remedy = remedies.own_origins(cameras, shifts)
-                sigmas = {"shift_sigma_m": round(float(sigma.max()), 2)}
-                if doubt.evidence["apart_m"] < _HOVERING_M:
-                    moved = trial.described.position + shifts[:, None]
-                    scene = replace(trial.described, position=moved)
-        penalty = 0.0 if scene is None else 1.1 * (len(trial.moving) - 1)
-        names = tuple(doubt.cameras)
-        found = Hypothesis(
-            doubt.code, names, doubt.what, remedy, penalty, scene, same_scatter=True, sigmas=sigmas
-        )
-        yield trial.scored(found)
+            placed, known = of_origins(trial, doubt.what)
+            if known:
+                apart_m = doubt.evidence["apart_m"]
+                hover = isinstance(apart_m, float) and apart_m < _HOVERING_M
+                scene = placed.scene if hover else None
+                seen = replace(placed, cameras=seen.cameras, scene=scene)
+        found.append(trial.scored(seen))
+    return found
 
 
-# --- faults of one camera's poses ----------------------------------------------------------------------
+# --- what is said -----------------------------------------------------------------------------------------
 
 
-def _of_faults(trial: Trial) -> Iterator[Hypothesis]:
-    """Fit a fault of each moving camera's poses: where its log has zero and north, and how it is turned."""
-    located = trial.flight.hips is not None or trial.flight.ground is not None
-    for index in trial.every:
-        for name, penalty in _PENALTIES.items():
-            if index not in trial.moving and name != "focal":
-                continue
-            if name in ("north", "zero") and len(trial.names) == 2 and index == 0 and not located:
-                continue  # of two, one alone can be turned against the other
-            fault = fit(trial.flight, trial.described, name, index, _first_turn(trial, name, index))
-            yield trial.scored(_of_fault(trial, fault, penalty))
-
-
-def _of_noise(trial: Trial, stated: float) -> list[Hypothesis]:
-    """Try if errors of all poses, or of one camera's, some times larger than stated, fit as a fault would.
-
-    Args:
-        trial: the flight.
-        stated: the cost of a fit with the errors as stated.
-
-    Returns:
-        That of all, and that of one camera where it fits markedly better; none that explains nothing, or
-        where nothing is stated of the errors.
-    """
-    if not all(trial.flight.cameras[index].states_noise for index in trial.moving):
-        return []
-    found = [_noisiest(trial, stated)]
-    if len(trial.names) > 2 and trial.moving:  # of two, either errs more
-        of_one = (
-            _noisier(trial, lasting, 1.0, [index])  # errors that change are shared among rays: whose is open
-            for index, lasting in product(trial.moving, _NOISE_FACTORS_OF_ONE)
-        )
-        one = min(of_one, key=lambda each: each.cost)
-        found += [one] if one.cost < found[0].cost - GAIN else []  # else all may err alike
-    return [each for each in found if each.cost < stated]
-
-
-def _noisiest(trial: Trial, stated: float) -> Hypothesis:
-    """Fit errors of all poses that last, that change, and of both kinds, by the best factors."""
-    factors = [(factor, 1.0) for factor in _NOISE_FACTORS] + [(1.0, factor) for factor in _NOISE_FACTORS]
-    found = [_noisier(trial, lasting, changing, trial.every) for lasting, changing in factors]
-    half = len(_NOISE_FACTORS)
-    both = [min(part, key=lambda each: each.cost) for part in (found[:half], found[half:])]
-    if all(each.cost < stated for each in both):
-        chosen = [factors[found.index(each)] for each in both]
-        found.append(_noisier(trial, chosen[0][0], chosen[1][1], trial.every))
-    return min(found, key=lambda each: each.cost)
-
-
-def _noisier(trial: Trial, lasting: float, changing: float, group: Sequence[int]) -> Hypothesis:
-    """Fit errors of some cameras' poses that are larger by given factors: lasting ones, changing ones."""
-    scene = trial.described
-    larger = np.ones((len(trial.names), 2))
-    larger[list(group)] = lasting, changing
-    constant2 = np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0)
-    sigma = scene.sigma.copy()
-    sigma[:, 2:] *= larger[:, 1:]
-    sigma[:, :2] = np.sqrt(larger[:, :1] ** 2 * constant2 + sigma[:, 4:] ** 2)
-    wider = replace(scene, sigma=sigma)
-    # Larger errors are less likely to be what they are: 6 of each camera, and 2 of each picture.
-    pictures = np.isfinite(scene.rays[..., 0]).any(axis=-1).sum(axis=1)
-    before, after = (picture_variance(each) for each in (scene, wider))
-    unlikely = 12 * len(group) * np.log(lasting) + 2 * float(pictures @ np.log(after / before))
-    parts = (("constant", lasting), ("changing", changing))
-    said = ", ".join(f"{part} ones {factor:g} times" for part, factor in parts if factor > 1)
-    everyone, one = len(group) == len(trial.names), trial.names[group[0]]
-    what = "errors of the poses are larger than stated"
-    if not everyone:
-        what = f"the poses of {one} do not fit the other cameras: their errors are larger than stated"
-    return Hypothesis(
-        "noise" if everyone else "pose",
-        trial.names if everyone else (one,),
-        f"{what}, {said}",
-        remedies.pose_noise(trial.flight.cameras, group, lasting, changing),
-        np.inf,  # its score says nothing: larger errors excuse everything
-        wider,
-        cost=fit(trial.flight, wider, "none", 0).cost + unlikely,
-    )
-
-
-_NOISE_FACTORS = (2.0, 4.0, 8.0, 16.0)
-_NOISE_FACTORS_OF_ONE = (4.0, 8.0, 16.0, 32.0)  # a camera whose poses are wrong throughout
-_PENALTIES = {
-    "shift": 1.8,
-    "heading": 1.3,
-    "north": 1.8,
-    "zero": 2.2,
-    "pitch": 1.3,
-    "roll": 1.5,
-    "focal": 1.3,
-}
-_TURNS = np.radians([0, 45, 90, 135, 180, -135, -90, -45])
-
-
-def _first_turn(trial: Trial, name: str, index: int) -> float:
-    """Return from which turn to search: a fit from there finds the best within some 30 deg."""
-    if name in ("shift", "focal"):
-        return 0.0
-    turns = (_TURNS[0], _TURNS[1], _TURNS[-1]) if name == "pitch" else _TURNS
-
-    def misfit(turn: float) -> float:
-        solved = solve(undone(trial.described, name, index, np.zeros(3), turn))
-        chi2 = solved.chi2[solved.views >= 2]
-        return float(np.median(chi2)) if chi2.size else np.inf
-
-    return float(min(turns, key=misfit))
-
-
-def _of_fault(trial: Trial, fault: Fault, penalty: float) -> Hypothesis:
-    cameras, index, degrees = trial.flight.cameras, fault.index, fault.turn_deg
-    name = trial.names[index]
-    far = f"{np.linalg.norm(fault.shift):.1f} m"
-    mounted = fault.name in ("pitch", "roll", "focal")  # of one camera, whatever the others
-    said = {
-        "shift": f"the log of {name} has its zero {far} from the world's",
-        "north": f"the log of {name} has its north {degrees:+.0f} deg from the world's",
-        "zero": f"the log of {name} has its zero {far} and its north {degrees:+.0f} deg from the world's",
-        "heading": f"the heading of {name} is {degrees:+.0f} deg from what is logged",
-        "pitch": f"{name} looks {abs(degrees):.0f} deg {higher_or_lower(degrees)} than stated",
-        "roll": f"{name} is rolled by {degrees:+.0f} deg about the optical axis",
-        "focal": f"the focal length of {name} is {zoom(fault.turn_rad):.3g} times what is stated",
-    }[fault.name]
-    codes = {"heading": "pose", "pitch": "mount", "roll": "mount", "focal": "intrinsics"}
-    code = codes.get(fault.name, "origin")
-    if code == "intrinsics":
-        remedy = remedies.intrinsics(cameras, [index], zoom(fault.turn_rad))
-    elif code == "origin":
-        remedy = remedies.origin(cameras, index, fault.shift, degrees)
-    elif mounted:
-        own = turn_about("x" if fault.name == "pitch" else "z", degrees)
-        remedy = remedies.mount(cameras, [index], lambda mount: mount @ own)
-    else:
-        remedy = remedies.mount(cameras, [index], lambda mount: turn_about("z", degrees) @ mount)
-    return Hypothesis(
-        code,
-        (name,) if mounted else pair_of(trial, [index]),
-        said if mounted else said + relative_to(trial, [index]),
-        remedy,
-        penalty,
-        fault.scene,
-        cost=fault.cost + _COST_OF_NUMBER * FREE[fault.name],
-        sigmas=fault.sigmas,
-    )
-
-
-def _with_sigma(trial: Trial, cause: Hypothesis) -> Hypothesis:
-    """Add how sure a tilt of several cameras is, which was searched by its score."""
-    if cause.code != "mount" or cause.penalty <= _DISCRETE or cause.sigmas or cause.scene is None:
-        return cause
-    group = [trial.names.index(name) for name in cause.cameras]
-    sigma_deg = tilt_sigma_deg(trial.flight, cause.scene, group)
-    return replace(cause, sigmas={"turn_sigma_deg": round(sigma_deg, 2)})
-
-
-def _doubt(cause: Hypothesis, described: Score, scene: SceneOfMoments) -> Doubt:
-    evidence = {"residual_px": residual_px(scene, solve(scene)), "score": round(described.total, 2)}
+def _doubt(trial: Trial, cause: Alternative, described: Score) -> Doubt:
+    evidence = {"residual_px": residuals_px(trial.described)[0], "score": round(described.total, 2)}
     if cause.score is not None and cause.scene is not None:
         evidence |= {
-            "residual_px_if": residual_px(cause.scene, solve(cause.scene)),
+            "residual_px_if": residuals_px(cause.scene)[0],
             "score_if": round(cause.score.total, 2),
-            "stature_m": _rounded(described.stature_m),
-            "stature_m_if": _rounded(cause.score.stature_m),
+            "stature_m": round(described.stature_m, 3),
+            "stature_m_if": round(cause.score.stature_m, 3),
         }
-    evidence |= cause.sigmas
+    evidence |= cause.evidence
+    told: dict[str, float | dict[str, float]] = {k: v for k, v in evidence.items() if np.isfinite(v)}
+    if np.isfinite(cause.tried).all():
+        before, after = (round(value, 2) for value in cause.tried)
+        told["tried"] = {"misfit_before": before, "misfit_after": after, "doubts_after": 0}
     return Doubt(
         code=cause.code,
         cameras=list(cause.cameras),
         what=cause.what,
-        evidence={name: value for name, value in evidence.items() if np.isfinite(value)},
+        evidence=told,
         remedy=cause.remedy,
     )
-
-
-def _rounded(value: float) -> float:
-    return round(float(value), 3)
 
 
 # What is odd about a person, by the name it has in a score: the code of its doubt, and the sentence.
@@ -735,31 +435,33 @@ _ODD = {
 _LEAST_ODD = 2.0
 
 
-def _oddities(described: Score, scene: SceneOfMoments, flight: Sampled, *, alone: bool) -> list[Doubt]:
+def _oddities(trial: Trial, described: Score, *, alone: bool) -> list[Doubt]:
     """State what is odd about the description as such, the oddest of each code, the oddest first.
 
     Where no cause is stated beside it (`alone`), the rays are what is odd if nothing else is.
     """
-    names = [camera.name for camera in flight.cameras]
-    solved = solve(scene)
-    odd = sorted(described.odd.items(), key=lambda item: -item[1].sigmas)
+    names = list(trial.names)
     found: dict[str, Doubt] = {}
-    for name, (sigmas, measured) in odd:
+    for name, (sigmas, measured) in sorted(described.odd.items(), key=lambda item: -item[1].sigmas):
         if sigmas >= _LEAST_ODD and name in _ODD:
             code, said = _ODD[name]
             what = said.format(usual=STATURE_M, **measured)
-            evidence = {key: _rounded(value) for key, value in (*measured.items(), ("sigmas", sigmas))}
+            evidence = {key: round(value, 3) for key, value in (*measured.items(), ("sigmas", sigmas))}
             found.setdefault(code, Doubt(code=code, cameras=names, what=what, evidence=evidence, remedy=""))
     if described.misfit > _LEAST_ODD or (alone and not found):
-        times = f"{described.misfit:.1f} times"
-        what = f"the rays miss each other by {times} what keypoints and poses are stated to err by"
+        residual_px, *each_px = residuals_px(trial.described)
         evidence = {
             "misfit": round(described.misfit, 2),
-            "residual_px": residual_px(scene, solved),
+            "residual_px": residual_px,
             "scatter": round(described.scatter, 2),
         }
-        each = zip(names, residuals_px(scene, solved), strict=True)
-        evidence |= {f"residual_px_{name}": value for name, value in each}
-        evidence = {name: value for name, value in evidence.items() if np.isfinite(value)}
-        found["residual"] = Doubt(code="residual", cameras=names, what=what, evidence=evidence, remedy="")
+        evidence |= {f"residual_px_{name}": value for name, value in zip(names, each_px, strict=True)}
+        times = f"{described.misfit:.1f} times"
+        found["residual"] = Doubt(
+            code="residual",
+            cameras=names,
+            what=f"the rays miss each other by {times} what keypoints and poses are stated to err by",
+            evidence={name: value for name, value in evidence.items() if np.isfinite(value)},
+            remedy="",
+        )
     return list(found.values())

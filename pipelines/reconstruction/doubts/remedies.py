@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import get_args
+from io import StringIO
+from typing import Any, get_args
 
 import numpy as np
+from ruamel.yaml import YAML
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.mounting import Looks, body_from_camera
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.doubts.scene import Filmed
-from pipelines.session.description import CameraEntry
+from pipelines.session.description import CameraEntry, PosesEntry
 
 # Entries of equal rotation matrices differ by less than this.
 _SAME = 1e-3
@@ -132,12 +134,28 @@ def _levels() -> dict[Looks, Float]:
 
 
 def turned_world(cameras: Sequence[Filmed], up: Float) -> str:
-    """State for every camera the shortest rotation of its source that turns a direction [3] upwards."""
+    """Turn every source by the shortest rotation that brings a direction [3] upwards."""
     quaternion = np.append(np.cross(up, [0.0, 0.0, 1.0]), 1.0 + up[2])
-    quaternion /= np.linalg.norm(quaternion)
-    numbers = ", ".join(f"{value:.5g}" for value in quaternion)
-    every = range(len(cameras))
-    return _lines(cameras, every, lambda _: f"pose.world_from_source: {{rotation_xyzw: [{numbers}]}}")
+    turn = matrix_from_quaternion(quaternion / np.linalg.norm(quaternion))
+    return _lines(cameras, range(len(cameras)), lambda camera: _placed(camera, np.zeros(3), turn))
+
+
+def _placed(camera: Filmed, shift: Float, turn: Float) -> str:
+    """State where the world of a camera's log lies, turned [3, 3] and moved [3] m from what is stated."""
+    stated = camera.entry.poses.world_from_source
+    half_rad = np.radians(stated.yaw_deg) / 2
+    quaternion = stated.rotation_xyzw or (0.0, 0.0, np.sin(half_rad), np.cos(half_rad))
+    rotation = quaternion_from_matrix(turn @ matrix_from_quaternion(np.array(quaternion)))
+    translation = np.round(shift + turn @ np.array(stated.translation), 2) + 0.0
+    parts = [f"translation: {_vector(translation.tolist())}"] if translation.any() else []
+    yaw_deg = float(np.degrees(2 * np.arctan2(rotation[2], rotation[3])))
+    yaw_deg -= 360 * round(yaw_deg / 360)
+    if np.abs(rotation[:2]).max() > _SAME:
+        parts.append("rotation_xyzw: [" + ", ".join(f"{value:.5g}" for value in rotation) + "]")
+    elif abs(yaw_deg) > 0.05:
+        parts.append(f"yaw_deg: {yaw_deg:.1f}")
+    parts += [f"scale: {stated.scale:.6g}"] if stated.scale != 1 else []
+    return f"pose.world_from_source: {{{', '.join(parts or ['translation: [0, 0, 0]'])}}}"
 
 
 def unit(cameras: Sequence[Filmed], name: str) -> str:
@@ -145,43 +163,27 @@ def unit(cameras: Sequence[Filmed], name: str) -> str:
     return _lines(cameras, range(len(cameras)), lambda _: f"pose.unit: {name}")
 
 
-def pose(cameras: Sequence[Filmed], key: str) -> str:
-    """State how the poses of the moving cameras are written."""
-    return _lines(cameras, _moving(cameras), lambda _: f"pose.{key}")
+def pose(cameras: Sequence[Filmed], said: Callable[[PosesEntry], str]) -> str:
+    """State how the poses of the moving cameras are written, beside how they are read."""
+    moving = [index for index in range(len(cameras)) if not cameras[index].static]
+    return _lines(cameras, moving, lambda camera: "pose." + said(camera.entry.poses).format(camera.name))
 
 
-def inverse(cameras: Sequence[Filmed]) -> str:
-    """State that the poses of the moving cameras are inverse to what they are read as."""
-    return _lines(
-        cameras,
-        _moving(cameras),
-        lambda camera: f"pose.inverse: {'false' if camera.entry.poses.inverse else 'true'}",
-    )
+def inverse(poses: PosesEntry) -> str:
+    """State that poses are inverse to what they are read as."""
+    return f"inverse: {'false' if poses.inverse else 'true'}"
 
 
-def upside_down(cameras: Sequence[Filmed]) -> str:
-    """State that the positions of the moving cameras count z the other way."""
-    return _lines(
-        cameras,
-        _moving(cameras),
-        lambda camera: f"pose.z: {'up' if camera.entry.poses.z == 'down' else 'down'}",
-    )
+def upside_down(poses: PosesEntry) -> str:
+    """State that positions count z the other way."""
+    return f"z: {'up' if poses.z == 'down' else 'down'}"
 
 
-def of_body(cameras: Sequence[Filmed]) -> str:
-    """State that the poses of the moving cameras are of bodies, on which the cameras look forwards."""
-    both = "pose.of: body; cameras.{}.mount: {{looks: forward}}"
-    return _lines(cameras, _moving(cameras), lambda camera: both.format(camera.name))
+OF_BODY = "of: body; cameras.{}.mount: {{looks: forward}}"
+"""The poses are of bodies, on which the cameras look forwards."""
 
-
-def of_camera(cameras: Sequence[Filmed]) -> str:
-    """State that the poses of the moving cameras are their own, without a mount."""
-    both = "pose.of: camera; cameras.{}.mount: null"
-    return _lines(cameras, _moving(cameras), lambda camera: both.format(camera.name))
-
-
-def _moving(cameras: Sequence[Filmed]) -> list[int]:
-    return [index for index, camera in enumerate(cameras) if not camera.static]
+OF_CAMERA = "of: camera; cameras.{}.mount: null"
+"""The poses are those of the cameras, without a mount."""
 
 
 def keypoints_size(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
@@ -258,26 +260,54 @@ def pose_noise(cameras: Sequence[Filmed], group: Sequence[int], lasting: float, 
     return _lines(cameras, [index for index in group if not cameras[index].static], said)
 
 
-def origin(cameras: Sequence[Filmed], index: int, shift: Float | None, yaw_deg: float | None) -> str:
+def origin(cameras: Sequence[Filmed], index: int, shift: Float, yaw_rad: float = 0.0) -> str:
     """Place the world of a camera's log in the flight's, beside what is stated of that already."""
-    translation, stated = "[east, north, up]", cameras[index].entry.poses.world_from_source
-    if shift is not None:
-        about_up = np.array(
-            [0.0, 0.0, np.sin(np.radians(yaw_deg or 0) / 2), np.cos(np.radians(yaw_deg or 0) / 2)]
-        )
-        placed = shift + matrix_from_quaternion(about_up) @ np.array(stated.translation)
-        translation = _vector((np.round(placed, 2) + 0.0).tolist())
-    turn = f", yaw_deg: {stated.yaw_deg + (yaw_deg or 0):.1f}" if yaw_deg or stated.yaw_deg else ""
-    return _lines(cameras, [index], lambda _: f"pose.world_from_source: {{translation: {translation}{turn}}}")
+    turn = matrix_from_quaternion(np.array([0.0, 0.0, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)]))
+    return _lines(cameras, [index], lambda camera: _placed(camera, shift, turn))
 
 
 def own_origins(cameras: Sequence[Filmed], shifts: Float) -> str:
     """Place the worlds of all logs, which are moved by `shifts` [C, 3] m."""
     moved = [index for index in range(len(cameras)) if np.abs(shifts[index]).max() > 0]
-    return "; ".join(origin(cameras, index, shifts[index], None) for index in moved)
+    return "; ".join(origin(cameras, index, shifts[index]) for index in moved)
 
 
-def another_pose(cameras: Sequence[Filmed], index: int) -> str:
-    """Ask for other poses of a camera, or for the flight without it."""
-    name = cameras[index].name
-    return f"cameras.{name}.pose: {{file: ..., topic: ...}}  # that of {name}; or leave {name} out"
+# Mappings and sequences are indented by one of these (mapping, sequence, dash), as manifests are written.
+_INDENTS = ((2, 2, 0), (2, 4, 2), (4, 4, 2), (4, 4, 0))
+
+
+def mended(text: str, remedy: str) -> str | None:
+    """Put the lines of a remedy into the text of a manifest, with its comments; None if they are no lines."""
+    candidates = []
+    for mapping, sequence, offset in _INDENTS:
+        yaml = YAML()
+        yaml.preserve_quotes, yaml.width = True, 10_000
+        yaml.indent(mapping=mapping, sequence=sequence, offset=offset)
+        document, plain = yaml.load(text), StringIO()
+        yaml.dump(document, plain)
+        if not _are_set(document, remedy):
+            return None
+        written = StringIO()
+        yaml.dump(document, written)
+        same = sum(
+            one == other for one, other in zip(plain.getvalue().split("\n"), text.split("\n"), strict=False)
+        )
+        candidates.append((same, written.getvalue()))
+    return max(candidates, key=lambda each: each[0])[1]
+
+
+def _are_set(document: Any, remedy: str) -> bool:
+    """Set the keys of a remedy; False if one is no key, or asks for what only the user knows."""
+    for line in remedy.split("; "):
+        path, _, value = line.partition(": ")
+        keys, place = path.split("."), document
+        if not value or keys[0] not in {"world", *document} or "..." in value:
+            return False
+        for key in keys[:-1]:
+            if isinstance(place.get(key), str):
+                place[key] = {"file": place[key]}
+            elif not isinstance(place.get(key), dict):
+                place[key] = {}
+            place = place[key]
+        place[keys[-1]] = YAML().load(value)
+    return True

@@ -1,24 +1,25 @@
 """A flight sampled at a few moments: whom each camera saw, from where, and how surely.
 
-Every hypothesis about a mistake in the flight's description is another scene of the same moments.
+Every alternative to the flight's description is another scene of the same moments.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White
 from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.reconstruction.observations import Camera
 from pipelines.session.camera_poses import stated_models
 from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.people import LoggedActor
-from pipelines.session.records import Detections, Occupancy, Trajectory
+from pipelines.session.records import Occupancy
 
 JOINTS = (
     "nose",
@@ -49,49 +50,6 @@ _CHOSEN_SHARE = 0.5
 _NEW_SHARE = 0.5
 
 
-class CameraLike(Protocol):
-    """A camera as `reconstruction.observations` has it; the doubts need no more of it."""
-
-    @property
-    def name(self) -> str:
-        """Its name in flight.yaml."""
-        ...
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """Its calibration."""
-        ...
-
-    @property
-    def frame_t_ns(self) -> Int64:
-        """The times [F] of its pictures."""
-        ...
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """Its logged poses."""
-        ...
-
-    @property
-    def static(self) -> bool:
-        """True if it stands still."""
-        ...
-
-    @property
-    def sigma(self) -> Float | None:
-        """The standard deviations [N, 2] of its poses, m and rad."""
-        ...
-
-    @property
-    def detections(self) -> Detections:
-        """The people in its pictures."""
-        ...
-
-    def poses_at(self, t_ns: Int64, between: Interpolation) -> tuple[Float, Float]:
-        """Return world_from_camera at given times."""
-        ...
-
-
 class PoseSigma(NamedTuple):
     """Standard deviations per axis of a camera's poses, and of parts of them."""
 
@@ -111,7 +69,7 @@ class Filmed:
     intrinsics: Intrinsics
     t_ns: Int64  # [F] of its pictures
     pixels: Float  # [F, J, 2] of `JOINTS`; NaN where nothing was found
-    camera: CameraLike
+    camera: Camera
     entry: CameraEntry
     sigma: PoseSigma
 
@@ -151,10 +109,6 @@ class SceneOfMoments:
     focal_px: Float  # [C]
     sigma: Float  # [C, 6] as `PoseSigma`
     person_px: Float  # [C] height of the person in the pictures, median
-
-    def with_rotation(self, rotation: Float) -> SceneOfMoments:
-        """Replace the attitudes."""
-        return replace(self, rotation=rotation)
 
 
 class Sampled(NamedTuple):
@@ -205,7 +159,7 @@ class GroundOfMap(NamedTuple):
 
 
 def sample(
-    cameras: Sequence[CameraLike],
+    cameras: Sequence[Camera],
     description: Description,
     *,
     actor: LoggedActor | None,
@@ -253,7 +207,7 @@ def sample(
     )
 
 
-def _most_seen(camera: CameraLike) -> Int64:
+def _most_seen(camera: Camera) -> Int64:
     """Return the detections of the person whom the camera shows in most pictures.
 
     People are told apart by the detector's own number; where that person is missing, the next is taken.
@@ -267,7 +221,7 @@ def _most_seen(camera: CameraLike) -> Int64:
     return first
 
 
-def _chosen(camera: CameraLike, of_frame: Int64) -> Int64:
+def _chosen(camera: Camera, of_frame: Int64) -> Int64:
     """Return the detections that were chosen, by their rank [F] among those of their picture.
 
     A camera of which few were chosen fits the others badly: its person is whom it shows most, since what is
@@ -279,7 +233,7 @@ def _chosen(camera: CameraLike, of_frame: Int64) -> Int64:
     return np.searchsorted(camera.detections.frame, frame) + of_frame[frame]
 
 
-def _pixels(camera: CameraLike, detection: Int64) -> Float:
+def _pixels(camera: Camera, detection: Int64) -> Float:
     """Return the pixels [F, J, 2] of given detections, at most one of a picture."""
     found = camera.detections
     pixels = np.full((len(camera.frame_t_ns), len(JOINTS), 2), np.nan)
@@ -289,7 +243,7 @@ def _pixels(camera: CameraLike, detection: Int64) -> Float:
     return pixels
 
 
-def _sigma(camera: CameraLike, entry: CameraEntry, pose_noise: str | None) -> PoseSigma:
+def _sigma(camera: Camera, entry: CameraEntry, pose_noise: str | None) -> PoseSigma:
     models = stated_models(camera.name, entry, pose_noise)
     if models is not None:
         length_s = float(np.ptp(camera.frame_t_ns)) / 1e9
@@ -360,7 +314,8 @@ def scene_of(
             since = since + late_s[index] * 1e9
         at = _interpolated(since, seen, (flight.t_ns - flight.t_ns[0]).astype(np.float64))
         rays.append(undistort(at, camera.intrinsics))
-        person_px.append(_median(_extent(at)))
+        row = at[..., 1]
+        person_px.append(median(np.fmax.reduce(row, axis=1) - np.fmin.reduce(row, axis=1)))
     position, rotation = (posed.position, posed.rotation) if posed else _poses(flight)
     return SceneOfMoments(
         np.array(rays),
@@ -392,16 +347,9 @@ def _interpolated(since: Float, values: Float, at: Float) -> Float:
     return between
 
 
-def _extent(pixels: Float) -> Float:
-    """Return the height [T] px of a person in each picture; NaN where nobody is."""
-    row = pixels[..., 1]
-    seen = np.isfinite(row)
-    some = seen.any(axis=1)
-    high = np.where(seen, row, -np.inf).max(axis=1)
-    low = np.where(seen, row, np.inf).min(axis=1)
-    return np.where(some, high - np.where(some, low, 0.0), np.nan)
-
-
-def _median(values: Float) -> float:
-    finite: Bool = np.isfinite(values)
-    return float(np.median(values[finite])) if finite.any() else float("nan")
+def median(values: Float) -> float:
+    """Return the median of what is finite; `np.median` is slow on small arrays."""
+    ordered = np.sort(values[np.isfinite(values)])
+    if not ordered.size:
+        return float("nan")
+    return float(ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2]) / 2

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
 )
 from pipelines.reconstruction.background_tracks import Followed, Tracks
-from pipelines.reconstruction.doubts.scene import CameraLike
+from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 
 # Over this time cameras turn by more than the errors of followed points, and points are still seen.
@@ -37,7 +36,7 @@ _STEPS = 3
 _BASELINE_M = 1e-3
 # Points beyond this many standard deviations count linearly.
 _HUBER = 1.5
-_LONGEST_S, _STEP_S = 1.0, 0.1  # of clocks that are tried
+_GRID_S = np.linspace(-1.0, 1.0, 21)  # clocks that are tried
 _FINE_STEP_S, _FINE_STEPS = 0.02, 4  # around the best of them
 # Errors of attitudes that wander pass for smaller offsets of clocks.
 _LEAST_LATE_S = 0.2
@@ -70,7 +69,7 @@ class Lateness:
     sigma_s: float  # of `late_s`; NaN of a factor
 
 
-def turns_of(camera: CameraLike, followed: Followed) -> Turns:
+def turns_of(camera: Camera, followed: Followed) -> Turns:
     """Choose pairs of pictures, 0.2 s apart, whose backgrounds tell how a camera turned between them."""
     t_ns = camera.frame_t_ns[followed.rows]
     step_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else np.inf
@@ -142,7 +141,7 @@ def _vectors(rotation: Float) -> Float:
 
 
 def lateness(
-    cameras: Sequence[CameraLike],
+    cameras: Sequence[Camera],
     turns: Mapping[int, Turns],
     between: Interpolation,
     factors: Sequence[float],
@@ -161,27 +160,22 @@ def lateness(
         The largest gain first; none if too little turns, or the logs turn otherwise at all times.
     """
     known = {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
-    if not known:
-        return []
-    grid = np.arange(-_LONGEST_S, _LONGEST_S + _STEP_S / 2, _STEP_S)
-    by_clock = {i: _gains(cameras[i], found, between, [(s, 1.0) for s in grid]) for i, found in known.items()}
     starts = [int(each.frame_t_ns[0]) for each in cameras] if first_ns is None else first_ns
-    rates = [(0.0, factor) for factor in factors]
-    by_rate = {i: _gains(cameras[i], found, between, rates, start_ns=starts[i]) for i, found in known.items()}
-    everyone = tuple(range(len(cameras)))
-    tried = [_best_clock((i,), grid, [curve]) for i, curve in by_clock.items()]
+    times = [*((float(s), 1.0) for s in _GRID_S), *((0.0, factor) for factor in factors)]
+    curves = {i: _gains(cameras[i], found, between, times, start_ns=starts[i]) for i, found in known.items()}
     groups: list[tuple[int, ...]] = [(i,) for i in known]
-    if len(known) == len(cameras):
-        groups.append(everyone)
-        tried.append(_best_clock(everyone, grid, list(by_clock.values())))
-    for group, (place, factor) in product(groups, enumerate(factors)):
-        gain, explained = _summed([by_rate[i][place] for i in group])
-        tried.append(Lateness(group, 0.0, factor, gain, float("nan")) if explained else None)
+    groups += [tuple(known)] if 0 < len(known) == len(cameras) > 1 else []
+    tried: list[Lateness | None] = []
+    for group in groups:
+        tried.append(_best_clock(group, _GRID_S, [curves[i][: len(_GRID_S)] for i in group]))
+        for place, factor in enumerate(factors, start=len(_GRID_S)):
+            gain, explained = _summed([curves[i][place] for i in group])
+            tried.append(Lateness(group, 0.0, factor, gain, float("nan")) if explained else None)
     return sorted((each for each in tried if each is not None), key=lambda each: -each.gain)
 
 
 def common_offset(
-    cameras: Sequence[CameraLike], followed: Mapping[str, object], between: Interpolation
+    cameras: Sequence[Camera], followed: Mapping[str, object], between: Interpolation
 ) -> Lateness | None:
     """Estimate the clock offset that all cameras share, from the turning of their backgrounds.
 
@@ -194,24 +188,28 @@ def common_offset(
         None if the cameras turn too little, if the logs turn differently at every offset, or if the estimate
         is not significant (`is_sure_clock`).
     """
-    turns = {
-        index: found
+    turns = all_turns(cameras, followed)
+    turns = {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
+    late = None
+    for grid in (_GRID_S, _FINE_STEP_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1)):
+        at = grid if late is None else grid + late.late_s
+        curves = [_gains(cameras[i], each, between, [(s, 1.0) for s in at]) for i, each in turns.items()]
+        found = _best_clock(tuple(range(len(cameras))), at, curves) if curves else None
+        if late is not None and found is not None:
+            return replace(late, late_s=found.late_s)
+        late = late or found
+        if late is None or not is_sure_clock(late):
+            return None
+    return late
+
+
+def all_turns(cameras: Sequence[Camera], followed: Mapping[str, object]) -> dict[int, Turns]:
+    """Choose the turns of the cameras whose backgrounds were followed, by index."""
+    return {
+        index: turns_of(camera, tracks)
         for index, camera in enumerate(cameras)
         if isinstance(tracks := followed.get(camera.name), Followed)
-        and len((found := turns_of(camera, tracks)).before) >= _FEWEST_TURNS
     }
-    if not turns:
-        return None
-
-    def best_of(grid: Float) -> Lateness | None:
-        curves = [_gains(cameras[i], each, between, [(s, 1.0) for s in grid]) for i, each in turns.items()]
-        return _best_clock(tuple(range(len(cameras))), grid, curves)
-
-    late = best_of(np.arange(-_LONGEST_S, _LONGEST_S + _STEP_S / 2, _STEP_S))
-    if late is None or not is_sure_clock(late):
-        return None
-    fine = best_of(late.late_s + _FINE_STEP_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1, dtype=np.float64))
-    return late if fine is None else replace(late, late_s=fine.late_s)
 
 
 def is_sure_clock(late: Lateness) -> bool:
@@ -220,7 +218,7 @@ def is_sure_clock(late: Lateness) -> bool:
 
 
 def _gains(
-    camera: CameraLike,
+    camera: Camera,
     turns: Turns,
     between: Interpolation,
     times: Sequence[tuple[float, float]],
@@ -256,7 +254,7 @@ def _gains(
 
 
 def _left(
-    camera: CameraLike, turns: Turns, between: Interpolation, first_ns: Int64, second_ns: Int64
+    camera: Camera, turns: Turns, between: Interpolation, first_ns: Int64, second_ns: Int64
 ) -> tuple[Float, Float]:
     """Return the angles [N] by which the log turns otherwise at given times, and by which it turns.
 

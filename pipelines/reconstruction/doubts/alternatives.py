@@ -1,0 +1,826 @@
+"""Alternatives to a flight's description: what is changed, in a sentence, as a scene and as a remedy.
+
+An alternative has a price that grows with its freedom: a discrete one costs 0.5, one number of one camera 1.2
+and more, so that what explains equally well with less freedom is named first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import permutations, product
+
+import numpy as np
+
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.mounting import level_heading
+from pipelines.geometry.poses import (
+    interpolate_poses,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+)
+from pipelines.reconstruction.doubts import remedies
+from pipelines.reconstruction.doubts.body import STATURE_M, trunk_direction
+from pipelines.reconstruction.doubts.fit import Fit, fit, picture_variance, solve
+from pipelines.reconstruction.doubts.scene import JOINTS, Filmed, Sampled, SceneOfMoments, scene_of
+from pipelines.reconstruction.doubts.score import Base, Score, score
+
+RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
+"""Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
+
+TIMES = ("clock", "frame_rate")
+"""Codes of what is tried on every flight."""
+
+LEAST_GAIN_OF_TIMES = 1.0
+"""Score that clocks and frame rates must gain to be scored exactly: half of what their margin asks."""
+
+DISCRETE = 0.8
+"""Alternatives without a free number have at most this price."""
+
+_FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
+_ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+_FLU_FROM_FRD = np.diag([1.0, -1, -1])
+_FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
+_SIZE_FACTORS = (2.0, 0.5, 1.5, 2 / 3, 3.0, 1 / 3)  # pictures that a detector was given enlarged or reduced
+_UNITS_M = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048}
+# Alternatives whose scores are farther from the best need no exact score.
+_SPARE = 2.0
+# Clocks that are off by more leave no pictures in common in short flights.
+_LONGEST_CLOCK_S = 3.0
+# The grid of clocks has this step; between its values the score is smooth.
+_CLOCK_STEP_S = 0.1
+# Smaller offsets cannot be told from noise by the score.
+_LEAST_CLOCK_S = 0.05
+# Beside a clock that scores worse than the stated one by more than this lies no better one.
+_REACH = 1.0
+# Focal lengths that are wrong by a smaller logarithm cannot be told from noise.
+_LEAST_ZOOM = 0.1
+# Focal lengths are wrong by at most this logarithm: a factor of twenty.
+_MOST_ZOOM = 3.0
+# The shift of a log has this standard deviation: any shift is as likely.
+_LOOSE_M = 30.0
+# The nose is this share of the stature above the ankles (Winter 2009).
+_NOSE_TO_ANKLES = 0.9
+_LEFT_RIGHT = [
+    JOINTS.index(name.replace("left", "@").replace("right", "left").replace("@", "right")) for name in JOINTS
+]
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Something that may be otherwise than described, the scene of that, and how well it fits."""
+
+    code: str
+    cameras: tuple[str, ...]
+    what: str
+    remedy: str
+    price: float
+    scene: SceneOfMoments | None = None  # None of what is seen directly
+    same_scatter: bool = False
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    alike: tuple[float, float] | None = None  # of times of all cameras: seconds late, and factor between them
+    cost: float = np.inf  # chi^2 of the rays, with 2 for each number
+    score: Score | None = None
+    tried: tuple[float, float] = (np.nan, np.nan)  # the objective of the description, and with this change
+
+    @property
+    def total(self) -> float:
+        """The score with the price; what is seen directly, without a scene, wins over everything."""
+        return -np.inf if self.score is None else self.score.total + self.price
+
+
+class Trial:
+    """The flight as described, beside which alternatives are made and scored."""
+
+    def __init__(self, flight: Sampled, described: SceneOfMoments, base: Base) -> None:
+        self.flight = flight
+        self.cameras: tuple[Filmed, ...] = flight.cameras
+        self.described = described
+        self.base = base
+        self.best_total = base.total
+        self.names = tuple(camera.name for camera in flight.cameras)
+        self.every = list(range(len(self.names)))
+        self.moving = [index for index, camera in enumerate(flight.cameras) if not camera.static]
+
+    def scored(self, alternative: Alternative) -> Alternative:
+        """Score an alternative."""
+        if alternative.scene is None:
+            return alternative
+        least = LEAST_GAIN_OF_TIMES if alternative.code in TIMES else -_SPARE
+        found = score(
+            self.flight,
+            alternative.scene,
+            self.base,
+            same_scatter=alternative.same_scatter,
+            limit=min(self.best_total + _SPARE, self.base.total - least),
+        )
+        scored = replace(alternative, score=found)
+        self.best_total = min(self.best_total, scored.total)
+        return scored
+
+    def named(self, group: Sequence[int], *, of_pair: bool = False) -> tuple[str, ...]:
+        """Name the cameras of a group; of two (`of_pair`) both, if neither can be told to be wrong."""
+        if of_pair and len(self.names) == 2:
+            return self.names
+        return tuple(self.names[index] for index in group)
+
+    def whose(self, group: Sequence[int]) -> str:
+        """Name one camera, or say that all are meant."""
+        return self.names[group[0]] if len(group) == 1 < len(self.names) else "every camera"
+
+    def groups(self, members: Sequence[int], dearer: float = 0.3) -> Iterator[tuple[list[int], float]]:
+        """Take all cameras together, then each, which is dearer."""
+        if len(members) > 1:
+            yield list(members), 0.5
+        yield from (([index], 0.5 + dearer) for index in members)
+
+    def turned(self, group: Sequence[int], turn: Callable[[int, Float], Float]) -> SceneOfMoments:
+        """Turn the attitudes [T, 3, 3] of cameras."""
+        rotation = self.described.rotation.copy()
+        for index in group:
+            rotation[index] = turn(index, rotation[index])
+        return replace(self.described, rotation=rotation)
+
+    def mount(self, index: int) -> Float:
+        """Return body_from_camera [3, 3] of a camera; looking forwards where it is not fixed to a body."""
+        stored = self.cameras[index].mount
+        return _FLU_FROM_OPTICAL if stored is None else stored
+
+    def with_times(self, group: Sequence[int], late_s: float = 0.0, slower: float = 1.0) -> SceneOfMoments:
+        """Add seconds to the times of cameras' pictures, and let them follow each other more slowly."""
+        late, factor = np.zeros(len(self.names)), np.ones(len(self.names))
+        late[list(group)], factor[list(group)] = late_s, slower
+        return scene_of(self.flight, self.described, late_s=late, slower=factor)
+
+    def as_stated(self, late_s: float, slower: float) -> tuple[Sampled, SceneOfMoments]:
+        """Look at the pictures that another time of all cameras shows, at the times that are stated."""
+        since = (self.flight.t_ns - self.flight.t_ns[0]) / slower - late_s * 1e9
+        flight = self.flight._replace(t_ns=self.flight.t_ns[0] + since.astype(np.int64), hips=None)
+        return flight, scene_of(flight)
+
+    def with_pixels(self, group: Sequence[int], change: Callable[[Float, Filmed], Float]) -> SceneOfMoments:
+        """Change the pixels [F, J, 2] of cameras."""
+        pixels = [camera.pixels for camera in self.cameras]
+        for index in group:
+            pixels[index] = change(pixels[index], self.cameras[index])
+        return scene_of(self.flight, self.described, pixels=pixels)
+
+
+def turn_about(axis: str, degrees: float) -> Float:
+    """Return the rotation [3, 3] about an axis."""
+    matrix: Float = matrix_from_quaternion(
+        quaternion_from_rotation_vector(np.radians(degrees) * np.eye(3)["xyz".index(axis)])
+    )
+    return matrix
+
+
+# --- times -----------------------------------------------------------------------------------------------
+
+
+def of_times(trial: Trial) -> Iterator[Alternative]:
+    """Try clocks of single cameras, and the frame rate of all and of each."""
+    for index in trial.every:
+        yield from of_clock(trial, [index])
+    for group, price in trial.groups(trial.every):
+        for factor in RATES:
+            whose = "all cameras" if len(group) == len(trial.names) else trial.names[group[0]]
+            yield trial.scored(
+                Alternative(
+                    "frame_rate",
+                    trial.named(group, of_pair=True),
+                    f"the frame rate of {whose} is {remedies.times_faster(factor)}",
+                    remedies.frame_rate(trial.cameras, group, factor),
+                    price,
+                    trial.with_times(group, slower=factor),
+                    alike=(0.0, factor) if len(group) == len(trial.names) else None,
+                )
+            )
+
+
+def of_clock(trial: Trial, group: list[int]) -> Iterator[Alternative]:
+    """Search the clock of one camera, or of all: a grid, then ever smaller steps about its best."""
+    alike = len(group) == len(trial.names)
+    whose = "all cameras" if alike else trial.names[group[0]]
+
+    def at(late_s: float) -> Alternative:
+        return trial.scored(
+            Alternative(
+                "clock",
+                trial.named(group, of_pair=True),
+                f"the pictures of {whose} were taken {remedies.earlier_or_later(late_s)}",
+                remedies.clock(trial.cameras, group, late_s),
+                1.0 + abs(late_s) / 2,
+                trial.with_times(group, late_s),
+                alike=(late_s, 1.0) if alike else None,
+            )
+        )
+
+    step_s = _CLOCK_STEP_S
+    grid = np.arange(-_LONGEST_CLOCK_S, _LONGEST_CLOCK_S + step_s / 2, step_s)
+    best, late_s = min(((at(float(s)), float(s)) for s in grid), key=lambda each: each[0].total)
+    while np.isfinite(best.total) and best.total < trial.base.total + _REACH and step_s > 0.004:
+        step_s /= 2
+        tried = [(best, late_s), *((at(late_s + s), late_s + s) for s in (-step_s, step_s))]
+        best, late_s = min(tried, key=lambda each: each[0].total)
+    if abs(late_s) >= _LEAST_CLOCK_S:
+        yield best
+
+
+# --- the world -------------------------------------------------------------------------------------------
+
+# Up is where neither people nor cameras say, if both say another direction that is this far from z.
+LEAST_TILT_OF_WORLD_DEG = 40.0
+# The trunk of somebody who does more than lie or stand points elsewhere in some pictures.
+LEAST_STEADY_TRUNK = 0.7
+# Upper edges of pictures must be higher by this cosine along the other direction.
+LEAST_GAIN_OF_PICTURES = 0.25
+# A direction this near to an axis is that axis, since people lean.
+AXIS_WITHIN_DEG = 12.0
+# Two in three grown-ups have a stature within this share of the usual one.
+STATURE_SHARE = 0.09
+_UPS = {
+    f"{sign}{axis}": turn * np.eye(3)[k]
+    for sign, turn in (("", 1), ("-", -1))
+    for k, axis in enumerate("xyz")
+}
+
+
+def of_level(trial: Trial) -> Iterator[Alternative]:
+    """Find a world whose z does not point up: people stand, and pictures are upright, along another axis.
+
+    Both must say so: somebody may lie, and a camera may be rolled or look straight down.
+    """
+    up = trunk_direction(solve(trial.described).joints)
+    steady = float(np.linalg.norm(up))
+    if not steady > LEAST_STEADY_TRUNK:
+        return
+    up = up / steady
+    tilt_deg = float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
+    edge = -trial.described.rotation[..., 1].reshape(-1, 3)  # of each picture, upwards
+    higher = (edge @ (up - [0.0, 0.0, 1.0]))[np.isfinite(edge).all(axis=1)]
+    gain = float(higher.mean()) if len(higher) else 0.0
+    if tilt_deg < LEAST_TILT_OF_WORLD_DEG or gain < LEAST_GAIN_OF_PICTURES:
+        return
+    axis = max(_UPS, key=lambda name: float(_UPS[name] @ up))
+    beside_deg = float(np.degrees(np.arccos(np.clip(_UPS[axis] @ up, -1, 1))))
+    remedy = f"world.up: {axis}"
+    if beside_deg > AXIS_WITHIN_DEG:
+        remedy = remedies.turned_world(trial.cameras, up)
+    yield Alternative(
+        "level",
+        trial.names,
+        f"the world's z does not point up: people and pictures are upright {tilt_deg:.0f} deg from it",
+        remedy,
+        0.0,
+        evidence={"tilt_deg": round(tilt_deg, 1), "beside_axis_deg": round(beside_deg, 1)},
+    )
+
+
+def of_scale(trial: Trial, stature: float) -> Alternative:
+    """Scale all positions so that the person has a usual stature: rays that fit go on fitting."""
+    factor, code = STATURE_M / stature, "scale"
+    what = f"all positions are {1 / factor:.2g} times what they should be: the person is {stature:.3g} m tall"
+    remedy, evidence = f"world.scale: {factor:.3g}", {"scale_sigma_share": STATURE_SHARE}
+    for unit, metres in _UNITS_M.items():
+        if abs(np.log(factor / metres)) < STATURE_SHARE:
+            factor, code, evidence = metres, "unit", {}
+            what, remedy = f"the positions are in {unit}", remedies.unit(trial.cameras, unit)
+    scene = replace(trial.described, position=trial.described.position * factor)
+    return trial.scored(
+        Alternative(code, trial.names, what, remedy, 0.5, scene, same_scatter=True, evidence=evidence)
+    )
+
+
+# --- alternatives without a number -----------------------------------------------------------------------
+
+
+def discrete(trial: Trial) -> Iterator[Alternative]:
+    """Try exchanged pictures, other mounts and gimbals, other conventions, and other keypoints."""
+    for alternative in _discrete(trial):
+        yield trial.scored(alternative)
+
+
+def _discrete(trial: Trial) -> Iterator[Alternative]:
+    yield from _exchanged_pictures(trial)
+    yield from _mounts(trial)
+    yield from _gimbals(trial)
+    if trial.moving:
+        yield from _conventions(trial)
+    yield from _keypoints(trial)
+    for factor in _FOCAL_FACTORS:
+        yield Alternative(
+            "intrinsics",
+            trial.names,
+            f"the focal length of every camera is {factor:.3g} times what is stated",
+            remedies.intrinsics(trial.cameras, trial.every, factor),
+            0.5,
+            changed(trial.described, "focal", trial.every, np.log([factor])),
+        )
+
+
+def _exchanged_pictures(trial: Trial) -> Iterator[Alternative]:
+    names = trial.names
+    for order in permutations(trial.every) if 2 <= len(names) <= 5 else ():
+        moved = [index for index in trial.every if order[index] != index]
+        if moved:
+            said = ", ".join(f"{names[index]} has those of {names[order[index]]}" for index in moved)
+            yield Alternative(
+                "videos_swapped",
+                trial.named(moved),
+                f"pictures are exchanged: {said}",
+                remedies.videos(trial.cameras, order),
+                0.5 if len(names) == 2 else 0.8,  # of more cameras there are more ways
+                scene_of(trial.flight, trial.described, order=order),
+            )
+
+
+def _mounts(trial: Trial) -> Iterator[Alternative]:
+    """Try cameras that are rolled, or look another way, by right angles, and the other sign of tilts."""
+    for (group, price), degrees in product(trial.groups(trial.moving), (90, 180, 270)):
+        turn, side = turn_about("z", degrees), "left" if degrees <= 180 else "right"
+        signed = degrees if degrees <= 180 else degrees - 360
+        whose = f"{trial.whose(group)} is"
+        yield Alternative(
+            "mount",
+            trial.named(group),
+            f"{whose} rolled by {signed} deg about the optical axis",
+            remedies.mount(trial.cameras, group, lambda mount, turn=turn: mount @ turn),  # type: ignore[misc]
+            price,
+            trial.turned(group, lambda _, rotation, turn=turn: rotation @ turn),  # type: ignore[misc]
+        )
+        yield Alternative(
+            "mount",
+            trial.named(group),
+            f"{whose} mounted {abs(signed)} deg to the {side} of where it is said to look",
+            remedies.mount(trial.cameras, group, lambda mount, turn=turn: turn @ mount),  # type: ignore[misc]
+            price,
+            trial.turned(
+                group,
+                lambda index, rotation, turn=turn: (  # type: ignore[misc]
+                    rotation @ trial.mount(index).T @ turn @ trial.mount(index)
+                ),
+            ),
+        )
+    down = {index: remedies.down_deg(trial.cameras[index]) for index in trial.moving}
+    tilted = {index: turn_about("x", 2 * degrees) for index, degrees in down.items() if abs(degrees) > 1}
+    if tilted:
+        yield Alternative(
+            "mount",
+            trial.named(list(tilted)),
+            "the tilt of every camera has the wrong sign",
+            "; ".join(
+                remedies.mount(trial.cameras, [index], lambda mount, turn=turn: mount @ turn)  # type: ignore[misc]
+                for index, turn in tilted.items()
+            ),
+            0.5,
+            trial.turned(list(tilted), lambda index, rotation: rotation @ tilted[index]),
+        )
+
+
+_MEANT = {
+    "world": "relative to the world",
+    "body": "relative to the body",
+    "heading": "relative to the body's heading and the horizon",
+}
+
+
+def _gimbals(trial: Trial) -> Iterator[Alternative]:
+    """Try the other axes of gimbals' angles, and angles that are relative to something else."""
+    of = {index: trial.cameras[index].entry.poses for index in trial.moving}
+    group = [index for index, poses in of.items() if poses.gimbal == "world" and not poses.gimbal_fixed]
+    if group:
+        right = "enu" if of[group[0]].gimbal_axes == "ned" else "ned"
+
+        def other_axes(index: int, rotation: Float) -> Float:
+            mount = trial.mount(index)
+            return _ENU_FROM_NED @ rotation @ mount.T @ _FLU_FROM_FRD @ mount
+
+        what = f"the gimbals' angles are in {right.upper()}: tilts have the wrong sign"
+        yield _of_gimbals(trial, group, what, f"axes: {right}", other_axes)
+    carried = {
+        index: body
+        for index, poses in of.items()
+        if poses.gimbal in _MEANT and (body := _body(trial, index)) is not None
+    }
+    for meant, said in _MEANT.items():
+
+        def relative(index: int, rotation: Float, meant: str = meant) -> Float:
+            frames, poses = _frames(carried[index]), of[index]
+            if poses.gimbal_axes == "ned":
+                frames = {
+                    name: frame @ (_ENU_FROM_NED if name == "world" else _FLU_FROM_FRD)
+                    for name, frame in frames.items()
+                }
+            return frames[meant] @ np.swapaxes(frames[poses.gimbal or "world"], -1, -2) @ rotation
+
+        group = [index for index in carried if of[index].gimbal != meant]
+        if group:
+            what = f"the gimbals' angles are {said}"
+            yield _of_gimbals(trial, group, what, f"relative_to: {meant}", relative)
+
+
+def _of_gimbals(
+    trial: Trial, group: list[int], what: str, line: str, turn: Callable[[int, Float], Float]
+) -> Alternative:
+    remedy = "; ".join(f"cameras.{trial.names[index]}.gimbal.{line}" for index in group)
+    return Alternative("gimbal", trial.named(group), what, remedy, 0.5, trial.turned(group, turn))
+
+
+def _body(trial: Trial, index: int) -> Float | None:
+    """Return the attitudes [T, 3, 3] of the body that carries a camera on a gimbal, if it is logged."""
+    track, t_ns = trial.cameras[index].camera.trajectory, trial.flight.t_ns
+    if track.body_xyzw is None:
+        return None
+    gap_ns = trial.flight.between.max_gap_ns
+    xyzw = interpolate_poses(
+        track.t_ns, track.position, track.body_xyzw, t_ns, max_gap_ns=gap_ns, max_extrapolation_ns=gap_ns
+    )[1]
+    return matrix_from_quaternion(xyzw)
+
+
+def _frames(body: Float) -> dict[str, Float]:
+    """Return what angles of a gimbal may be relative to [T, 3, 3], by name, on a body [T, 3, 3]."""
+    level = level_heading(quaternion_from_matrix(np.where(np.isfinite(body), body, np.eye(3))))
+    return {
+        "world": np.broadcast_to(np.eye(3), body.shape),
+        "body": body,
+        "heading": np.where(np.isfinite(body), matrix_from_quaternion(level), np.nan),
+    }
+
+
+def _conventions(trial: Trial) -> Iterator[Alternative]:
+    """Try other meanings of the logged poses: axes, inverses, orders of quaternions, units."""
+    scene, cameras = trial.described, trial.cameras
+    still = [index for index in trial.every if index not in trial.moving]
+    mounts = np.stack([trial.mount(index) for index in trial.every])[:, None]
+    camera, place = scene.rotation, scene.position
+    body = camera @ np.swapaxes(mounts, -1, -2)
+    on_gimbal = {}
+    for index in trial.moving:
+        own = _body(trial, index)
+        if own is not None:
+            body[index] = own
+            on_gimbal[index] = cameras[index].entry.poses.gimbal
+
+    def carried_by(bodies: Float) -> Float:
+        """Return the attitudes [C, T, 3, 3] of the cameras on bodies that are turned otherwise."""
+        turned = bodies @ mounts
+        for index, of in on_gimbal.items():
+            if of is not None:
+                before, after = _frames(body[index])[of], _frames(bodies[index])[of]
+                turned[index] = after @ np.swapaxes(before, -1, -2) @ camera[index]
+        return turned
+
+    def moved(rotation: Float, position: Float) -> SceneOfMoments:
+        rotation, position = rotation.copy(), position.copy()
+        rotation[still], position[still] = scene.rotation[still], scene.position[still]
+        return replace(scene, rotation=rotation, position=position)
+
+    stated = cameras[trial.moving[0]].entry.poses
+    # The exchange of axes is its own inverse.
+    axes, frame = ("enu", "FLU") if stated.axes == "ned" else ("ned", "FRD")
+    in_axes = f"the poses are in {axes.upper()}, of"
+    of_camera, of_body = (
+        f"world_from_{of}" if stated.inverse else f"{of}_from_world" for of in ("camera", "body")
+    )
+    exchanged = remedies.pose(cameras, lambda _: f"axes: {axes}")
+    upside_down = remedies.pose(cameras, remedies.upside_down)
+    inverted = remedies.pose(cameras, remedies.inverse)
+    its_own = remedies.pose(cameras, lambda _: remedies.OF_CAMERA)
+    the_body = remedies.pose(cameras, lambda _: remedies.OF_BODY)
+    z = "up" if stated.z == "down" else "down"
+    turned = carried_by(_ENU_FROM_NED @ body @ _FLU_FROM_FRD)
+    camera_back, body_back = np.swapaxes(camera, -1, -2), np.swapaxes(body, -1, -2)
+    camera_origin, body_origin = (
+        -np.einsum("ctij,ctj->cti", back, place) for back in (camera_back, body_back)
+    )
+    ned, below, swapped = place @ _ENU_FROM_NED.T, place * [1.0, 1.0, -1.0], place[..., [1, 0, 2]]
+    on_body, own = camera @ _FLU_FROM_OPTICAL, body_back @ mounts
+    table: list[tuple[str, str, str, Float, Float]] = [
+        ("axes", f"{in_axes} a body with {frame} axes", exchanged, turned, ned),
+        ("axes", f"{in_axes} the camera", exchanged, _ENU_FROM_NED @ camera, ned),
+        ("axes", f"the positions count z {z}wards, the attitudes do not", upside_down, camera, below),
+        ("axes", "the positions have x and y exchanged", "", camera, swapped),
+        ("convention", f"the poses are {of_camera}", inverted, camera_back, camera_origin),
+        ("convention", f"the poses are {of_body}", inverted, carried_by(body_back), body_origin),
+        ("convention", f"the attitudes are {of_camera}, the positions are not", "", camera_back, place),
+        ("convention", f"the attitudes are {of_body}, the positions are not", "", own, place),
+        ("convention", "the poses are of the body, and are taken for the camera's", the_body, on_body, place),
+        ("convention", "the poses are of the camera, and are taken for the body's", its_own, body, place),
+    ]
+    if any(cameras[index].entry.poses.mount is not None for index in trial.moving):
+        # Of poses of the camera itself, it would be a roll by 180 deg.
+        remedy = remedies.mount(cameras, trial.moving, lambda mount: _FLU_FROM_FRD @ mount)
+        what = "the body's axes are FRD (forward, right, down)"
+        table.append(("axes", what, remedy, body @ _FLU_FROM_FRD @ mounts, place))
+    for attitudes, of_cameras in ((camera, np.asarray), (body, carried_by)):
+        quaternion = quaternion_from_matrix(np.where(np.isfinite(attitudes), attitudes, np.eye(3)))
+        for roll, order in ((-1, "wxyz"), (1, "xyzw")):
+            turned = matrix_from_quaternion(np.roll(quaternion, roll, axis=-1))
+            remedy = remedies.pose(cameras, lambda _, order=order: f"quaternion: {order}")  # type: ignore[misc]
+            what = f"the quaternions are written as {' '.join(order)}"
+            table.append(("convention", what, remedy, of_cameras(turned), place))
+    for code, what, remedy, rotation, position in table:
+        instead = remedy or f"write the log again, since {what}"
+        yield Alternative(code, trial.names, what, instead, 0.5, moved(rotation, position))
+    # Lever arms are stated in metres, whatever the log's unit.
+    levers = np.array([each.lever_m for each in cameras])
+    arms = np.einsum("ctij,cj->cti", body, levers)
+    for unit, metres in _UNITS_M.items():
+        for factor, known, name in (
+            (metres, "", unit),
+            (1 / metres, f", and {1 / metres:.4g} times what is read", "m"),
+        ):
+            yield Alternative(
+                "unit",
+                trial.names,
+                f"the positions are in {name}{known}",
+                remedies.pose(cameras, lambda _, name=name: f"unit: {name}"),  # type: ignore[misc]
+                0.5,
+                moved(camera, (place - arms) * factor + arms),
+                same_scatter=True,
+            )
+
+
+def _keypoints(trial: Trial) -> Iterator[Alternative]:
+    """Try keypoints of pictures of another size, and mirrored ones: of all cameras, then of each."""
+
+    def x(pixels: Float, own: Filmed) -> Float:
+        return np.stack([own.intrinsics.width - 1 - pixels[..., 0], pixels[..., 1]], axis=-1)
+
+    def y(pixels: Float, own: Filmed) -> Float:
+        return np.stack([pixels[..., 0], own.intrinsics.height - 1 - pixels[..., 1]], axis=-1)
+
+    for group, price in trial.groups(trial.every):
+        one = len(group) < len(trial.names)
+        whose = f" of {trial.names[group[0]]}" if one else ""
+        for factor in _SIZE_FACTORS:
+            yield Alternative(
+                "keypoints_size",
+                trial.named(group),
+                f"the keypoints{whose} are of pictures {1 / factor:.3g} times as large",
+                remedies.keypoints_size(trial.cameras, group, 1 / factor),
+                price,
+                trial.with_pixels(group, lambda pixels, _, factor=factor: pixels * factor),  # type: ignore[misc]
+            )
+        changes: dict[str, tuple[str, float, Callable[[Float, Filmed], Float]]] = {
+            "true": (
+                f"the pictures{whose} were mirrored before the keypoints were found",
+                0.0,
+                lambda pixels, own: x(pixels, own)[:, _LEFT_RIGHT],
+            ),
+            "x": (f"the keypoints{whose} count x from the right", 0.0, x),
+        }
+        if not one:  # a detector names and counts alike in all pictures
+            names = f"left and right are exchanged in the names of joints{whose}"
+            changes["y"] = (f"the keypoints{whose} count y from below", 0.0, y)
+            changes["names"] = (names, 0.3, lambda pixels, _: pixels[:, _LEFT_RIGHT])
+        for value, (what, dearer, change) in changes.items():
+            yield Alternative(
+                "mirrored",
+                trial.named(group),
+                what,
+                remedies.mirrored(trial.cameras, group, value),
+                price + dearer,
+                trial.with_pixels(group, change),
+            )
+
+
+# --- alternatives with numbers, which are fitted ---------------------------------------------------------
+
+NUMBERS = {"shift": 3, "heading": 1, "north": 1, "zero": 4, "pitch": 1, "roll": 1, "focal": 1}
+"""What may be off by numbers, and by how many.
+
+`shift`: the log has its zero elsewhere; `north`: it has its north elsewhere; `zero`: both. `heading`,
+`pitch`, `roll`: the camera is turned where it is, about the vertical or its own x and z axes. `focal`: its
+focal length is another; the number is then the logarithm of the factor.
+"""
+
+_PRICES_OF_ONE = {
+    "shift": 1.8,
+    "heading": 1.3,
+    "north": 1.8,
+    "zero": 2.2,
+    "pitch": 1.3,
+    "roll": 1.5,
+    "focal": 1.3,
+}
+_PRICES_OF_ALL = {"focal": 1.0, "pitch": 1.0, "heading": 2.2}
+# A fit finds the best angle from within some 10 deg; those that are not here are tried all around.
+_STARTS_DEG = {"pitch": range(-90, 91, 15), "focal": (0,), "shift": (0,)}
+# Each free number costs this much chi^2, as in Akaike's criterion.
+_COST_OF_NUMBER = 2.0
+
+
+def changed(scene: SceneOfMoments, kind: str, group: Sequence[int], numbers: Float) -> SceneOfMoments:
+    """Return the scene with numbers [n] of some cameras changed."""
+    chosen = list(group)
+    if kind == "focal":
+        factor = np.ones(len(scene.focal_px))
+        factor[chosen] = zoom(numbers[0])
+        return replace(scene, rays=scene.rays / factor[:, None, None, None], focal_px=scene.focal_px * factor)
+    rotation, position = scene.rotation.copy(), scene.position.copy()
+    if kind != "shift":
+        turn = turn_about("x" if kind == "pitch" else "z", float(np.degrees(numbers[-1])))
+        own = kind in ("pitch", "roll")
+        rotation[chosen] = rotation[chosen] @ turn if own else turn @ rotation[chosen]
+        if kind in ("north", "zero"):
+            position[chosen] = position[chosen] @ turn.T
+    if kind in ("shift", "zero"):
+        position[chosen] = position[chosen] + numbers[:3]
+    return replace(scene, rotation=rotation, position=position)
+
+
+def zoom(logarithm: float) -> float:
+    """Return the factor of a focal length from the logarithm that a fit found, which may have run away."""
+    return float(np.exp(np.clip(logarithm, -_MOST_ZOOM, _MOST_ZOOM)))
+
+
+def fitted(trial: Trial, kind: str, group: Sequence[int]) -> Fit:
+    """Fit numbers of some cameras, from where the rays miss each other least."""
+    scene = trial.described
+    starts = np.zeros((len(degrees := _STARTS_DEG.get(kind, range(-180, 180, 15))), NUMBERS[kind]))
+    starts[:, -1] = np.radians(list(degrees))
+
+    def misfit(numbers: Float) -> float:
+        solved = solve(changed(scene, kind, group, numbers))
+        chi2 = np.where(solved.in_front, solved.chi2, np.inf)[solved.views >= 2]
+        return float(np.median(chi2)) if chi2.size else np.inf
+
+    start = min(starts, key=misfit) if len(starts) > 1 else starts[0]
+    loose = [_LOOSE_M] * (3 * (NUMBERS[kind] >= 3)) + [np.inf] * (NUMBERS[kind] in (1, 4))
+    return fit(trial.flight, lambda numbers: changed(scene, kind, group, numbers), start, loose)
+
+
+def of_all_numbers(trial: Trial) -> Iterator[Alternative]:
+    """Fit numbers that all cameras have in common, and each log's own zero."""
+    least_rad = np.radians(max(3.0, 4 * float(np.degrees(trial.described.sigma[:, 1].max()))))
+    for kind, price in _PRICES_OF_ALL.items():
+        group = trial.every if kind == "focal" else trial.moving
+        if group:
+            alternative, number = _of_numbers(trial, kind, group, price)
+            if abs(number) >= (_LEAST_ZOOM if kind == "focal" else least_rad):
+                yield trial.scored(alternative)
+    if len(trial.names) > 2 and trial.moving:
+        yield trial.scored(of_origins(trial, "every log counts positions from a place of its own")[0])
+
+
+def of_one_number(trial: Trial) -> Iterator[Alternative]:
+    """Fit numbers of one camera: where its log has zero and north, how it is turned, its focal length."""
+    located = trial.flight.hips is not None or trial.flight.ground is not None
+    for index, (kind, price) in product(trial.every, _PRICES_OF_ONE.items()):
+        if index not in trial.moving and kind != "focal":
+            continue
+        if kind in ("north", "zero") and len(trial.names) == 2 and index == 0 and not located:
+            continue  # of two, one alone can be turned against the other
+        yield trial.scored(_of_numbers(trial, kind, [index], price)[0])
+
+
+def _of_numbers(trial: Trial, kind: str, group: list[int], price: float) -> tuple[Alternative, float]:
+    found = fitted(trial, kind, group)
+    cameras, whose, number = trial.cameras, trial.whose(group), float(found.numbers[-1])
+    degrees = float(np.degrees(number)) if kind != "shift" else 0.0
+    shift = found.numbers[:3] if NUMBERS[kind] >= 3 else np.zeros(3)
+    far = f"{np.linalg.norm(shift):.1f} m"
+    mounted = kind in ("pitch", "roll", "focal")  # of one camera, whatever the others
+    what = {
+        "shift": f"the log of {whose} has its zero {far} from the world's",
+        "north": f"the log of {whose} has its north {degrees:+.0f} deg from the world's",
+        "zero": f"the log of {whose} has its zero {far} and its north {degrees:+.0f} deg from the world's",
+        "heading": f"the heading of {whose} is {degrees:+.0f} deg from what is logged",
+        "pitch": f"{whose} looks {abs(degrees):.0f} deg {'higher' if degrees > 0 else 'lower'} than stated",
+        "roll": f"{whose} is rolled by {degrees:+.0f} deg about the optical axis",
+        "focal": f"the focal length of {whose} is {zoom(number):.3g} times what is stated",
+    }[kind]
+    if not mounted and len(trial.names) == 2 and len(group) == 1:
+        what += f" (relative to {trial.names[1 - group[0]]}: either may be wrong)"
+    if kind == "focal":
+        code, remedy = "intrinsics", remedies.intrinsics(cameras, group, zoom(number))
+    elif kind in ("shift", "north", "zero"):
+        code, remedy = "origin", remedies.origin(cameras, group[0], shift, np.radians(degrees))
+    elif kind == "heading":
+        turn = turn_about("z", degrees)
+        code, remedy = "pose", remedies.mount(cameras, group, lambda mount: turn @ mount)
+    else:
+        turn = turn_about("x" if kind == "pitch" else "z", degrees)
+        code, remedy = "mount", remedies.mount(cameras, group, lambda mount: mount @ turn)
+    variance = np.diag(found.covariance)
+    evidence = {}
+    if NUMBERS[kind] >= 3:
+        evidence["shift_sigma_m"] = round(float(np.sqrt(variance[:3].sum())), 2)
+    if kind not in ("shift", "focal") and variance.size:
+        evidence["turn_sigma_deg"] = round(float(np.degrees(np.sqrt(variance[-1]))), 2)
+    return Alternative(
+        code,
+        trial.named(group, of_pair=not mounted),
+        what,
+        remedy,
+        price,
+        found.scene,
+        evidence=evidence,
+        cost=found.cost + _COST_OF_NUMBER * NUMBERS[kind],
+    ), number
+
+
+def of_origins(trial: Trial, what: str) -> tuple[Alternative, bool]:
+    """Place the logs of all drones, of which each counts from a place of its own.
+
+    The search begins where each camera by itself sees a person of usual stature: as far away as they are
+    tall in its pictures. Without a logged actor, the world is that of the first log.
+
+    Returns:
+        The alternative, and False if no place was found.
+    """
+    flight, scene = trial.flight, trial.described
+    moved = (
+        trial.moving if flight.hips is not None or len(trial.moving) < len(trial.names) else trial.moving[1:]
+    )
+    hips = [JOINTS.index("left_hip"), JOINTS.index("right_hip")]
+    away_m = scene.focal_px * STATURE_M * _NOSE_TO_ANKLES / np.maximum(scene.person_px, 1.0)
+    rays = np.concatenate([scene.rays[:, :, hips], np.ones((*scene.rays.shape[:2], 2, 1))], axis=-1)
+    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).mean(axis=2)
+    seen = scene.position + away_m[:, None, None] * np.einsum("ctij,ctj->cti", scene.rotation, rays)
+    apart = (seen[0] if flight.hips is None else flight.hips) - seen
+    start = [np.nanmedian(apart[i], axis=0) if np.isfinite(apart[i]).any() else np.zeros(3) for i in moved]
+
+    def make(numbers: Float) -> SceneOfMoments:
+        position = scene.position.copy()
+        position[moved] += numbers.reshape(-1, 1, 3)
+        return replace(scene, position=position)
+
+    found = fit(flight, make, np.concatenate([*start, np.zeros(0)]), [_LOOSE_M] * (3 * len(moved)))
+    shifts = np.zeros((len(trial.names), 3))
+    shifts[moved] = found.numbers.reshape(-1, 3)
+    sigma_m = (
+        np.sqrt(np.diag(found.covariance).reshape(-1, 3).sum(axis=1)) if found.covariance.size else [0.0]
+    )
+    return Alternative(
+        "origin",
+        trial.names,
+        what,
+        remedies.own_origins(trial.cameras, shifts),
+        1.1 * (len(trial.moving) - 1),
+        found.scene,
+        same_scatter=True,
+        evidence={"shift_sigma_m": round(float(np.max(sigma_m)), 2)},
+        cost=found.cost + _COST_OF_NUMBER * 3 * len(moved),
+    ), bool(np.isfinite(found.cost))
+
+
+# --- errors that are larger than stated ------------------------------------------------------------------
+
+_NOISE_FACTORS = (2.0, 5.0, 12.0)
+_NOISE_FACTORS_OF_ONE = (4.0, 12.0, 36.0)  # a camera whose poses are wrong throughout
+
+
+def of_noise(trial: Trial) -> Iterator[Alternative]:
+    """Fit errors that are some times larger than stated: of all poses, or of one camera's.
+
+    Of all, they are constant, change, or both; of one, constant: whose errors change cannot be told. Their
+    score says nothing, since larger errors excuse everything; only their cost counts.
+    """
+    if all(trial.cameras[index].states_noise for index in trial.moving):
+        of_all = [(f, 1.0) for f in _NOISE_FACTORS], [(1.0, f) for f in _NOISE_FACTORS]
+        found = [[_noisier(trial, *factors, trial.every) for factors in pairs] for pairs in of_all]
+        (constant, _), (_, changing) = (
+            min(zip(pairs, each, strict=True), key=lambda pair: pair[1].cost)[0]
+            for pairs, each in zip(of_all, found, strict=True)
+        )
+        both = _noisier(trial, constant, changing, trial.every)
+        yield min([*found[0], *found[1], both], key=lambda each: each.cost)
+    if len(trial.names) > 2 and trial.moving:  # of two, either errs more
+        of_one = product(trial.moving, _NOISE_FACTORS_OF_ONE)
+        yield min((_noisier(trial, f, 1.0, [index]) for index, f in of_one), key=lambda each: each.cost)
+
+
+def _noisier(trial: Trial, constant: float, changing: float, group: Sequence[int]) -> Alternative:
+    """Fit errors of some cameras' poses that are larger by given factors: constant ones, changing ones."""
+    scene = trial.described
+    larger = np.ones((len(trial.names), 2))
+    larger[list(group)] = constant, changing
+    constant2 = np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0)
+    sigma = scene.sigma.copy()
+    sigma[:, 2:] *= larger[:, 1:]
+    sigma[:, :2] = np.sqrt(larger[:, :1] ** 2 * constant2 + sigma[:, 4:] ** 2)
+    wider = replace(scene, sigma=sigma)
+    # Larger errors are less likely to be what they are: 6 of each camera, and 2 of each picture.
+    pictures = np.isfinite(scene.rays[..., 0]).any(axis=-1).sum(axis=1)
+    before, after = (picture_variance(each) for each in (scene, wider))
+    unlikely = 12 * len(group) * np.log(constant) + 2 * float(pictures @ np.log(after / before))
+    parts = (("constant", constant), ("changing", changing))
+    said = ", ".join(f"{part} ones {factor:g} times" for part, factor in parts if factor > 1)
+    everyone = len(group) == len(trial.names)
+    what = "errors of the poses are larger than stated"
+    if not everyone:
+        one = trial.names[group[0]]
+        what = f"the poses of {one} do not fit the other cameras: their errors are larger than stated"
+    return Alternative(
+        "noise" if everyone else "pose",
+        trial.named(group),
+        f"{what}, {said}",
+        remedies.pose_noise(trial.cameras, group, constant, changing),
+        np.inf,
+        wider,
+        cost=fit(trial.flight, lambda _: wider).cost + unlikely,
+    )
