@@ -14,7 +14,9 @@ from typing import Self
 
 import numpy as np
 
+from pipelines.drafting.labels import GIMBAL, is_called
 from pipelines.formats.common.files import leads_out
+from pipelines.formats.logs.messages import kind_of
 from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.doubts.logs import doubts_of_logs, doubts_of_places
 from pipelines.session.description import (
@@ -155,7 +157,7 @@ def ingest(
 
             tracks = {name: _track(run, name) for name in entries}
             doubts = doubts_of_logs({name: (entry, tracks[name]) for name, entry in entries.items()})
-            doubts += doubts_of_places(tracks, reader.map_box) + reader.map_doubts
+            doubts += doubts_of_places(tracks, reader.map_box) + reader.map_doubts + reader.unused_gimbals()
             warnings += [doubt.as_warning() for doubt in doubts]
 
             description = Description(
@@ -467,6 +469,31 @@ class _FlightReader:
     def map_doubts(self) -> list[Doubt]:
         """Doubts of the places of the maps that were stored."""
         return self._poses.map_doubts
+
+    def unused_gimbals(self) -> list[Doubt]:
+        """Doubt cameras that are fixed to a body whose log holds the angles of a gimbal that nobody names."""
+        cameras = self._flight.cameras
+        used = {camera.gimbal.topic for camera in cameras.values() if camera.gimbal is not None}
+        doubts = []
+        for name, camera in cameras.items():
+            log = camera.pose.file
+            if camera.gimbal or camera.mount is None or not self._files.is_log("pose", camera.pose):
+                continue
+            with self._logs.open(log) as opened:
+                angles = [topic.name for topic in opened.recording.topics if kind_of(topic) == "angles"]
+            free = [topic for topic in angles if topic not in used and is_called(topic, GIMBAL)]
+            own = [topic for topic in free if name in topic] or (free if len(free) == 1 else [])
+            if own:
+                doubts.append(
+                    Doubt(
+                        code="unused",
+                        cameras=[name],
+                        what=f"the log of {name} holds the angles of a gimbal, {own[0]}, that nothing uses",
+                        evidence={},
+                        remedy=f"cameras.{name}.gimbal: {{file: {log}, topic: {own[0]}, relative_to: world}}",
+                    )
+                )
+        return doubts
 
     def _near_origin(self, source: Path, maps: Iterable[Occupancy]) -> Iterator[Occupancy]:
         """Yield maps in the world; errors as in `FlightPoses.map`."""

@@ -117,6 +117,12 @@ def load_cameras(
 def _common_joints(folder: Path, sources: Mapping[str, _Keypoints]) -> tuple[str, ...]:
     """List the joints that at least two cameras know, in the order of the camera that knows the most."""
     known = [source.joints for source in sources.values()]
+    if len(known) < 2:
+        raise NoViewsError(
+            ", ".join(sources),
+            "is the only camera with pictures of people, and a place in space needs two",
+            "add a camera that films the same people at the same time",
+        )
     shared = [name for name in max(known, key=len) if sum(name in joints for joints in known) > 1]
     if not shared:
         raise DataError(

@@ -305,6 +305,7 @@ DOUBT_CODES = {
         "One camera does not fit the others: its heading, its topic, or errors larger than stated.",
         "mount, pose.topic, gimbal.topic, pose_noise",
     ),
+    "unused": ("A log holds the angles of a gimbal that nothing uses.", "gimbal"),
     "noise": ("Errors of all poses are larger than stated.", "pose_noise"),
     "body": ("The person has not the size, limbs, posture or speed of people.", ""),
     "ground": ("The feet are not on the ground, or the person is above the drones.", ""),

@@ -145,6 +145,28 @@ def test_the_mistake_is_named_first_and_its_remedy_leaves_no_doubt(flight: Descr
     assert doubts_of(manifest) == []
 
 
+def test_fix_writes_what_was_tried_and_keeps_comments(flight: Described) -> None:
+    manifest = mistaken(flight, CASES["rolled"][1])
+    commented = manifest.read_text().replace("cameras:", "# filmed on Monday\ncameras:  # three\n", 1)
+    manifest.write_text(commented)
+    found = json.loads(succeeds("check", manifest, "--fix", "--json"))
+    assert found["doubts"] == []
+    assert any(line.startswith("+") and "looks: forward" in line for line in found["changes"])
+    assert "# filmed on Monday" in manifest.read_text()
+    assert "# three" in manifest.read_text()
+    assert doubts_of(manifest) == []
+    assert not list(flight.folder.glob(".*"))
+
+
+def test_fix_leaves_a_right_manifest_and_refuses_a_session(flight: Described, tmp_path: Path) -> None:
+    manifest, session = mistaken(flight, None), tmp_path / "right.session"
+    before = manifest.read_bytes()
+    assert json.loads(succeeds("check", manifest, "--fix", "--json"))["changes"] == []
+    assert manifest.read_bytes() == before
+    succeeds("ingest", manifest, "-o", session)
+    refused("check", session, "--fix", code="bad-option")
+
+
 @pytest.mark.parametrize(("change", "code"), [(same_topic, "pose"), (own_origins, "origin")])
 def test_ingest_doubts_what_the_logs_alone_show(
     flight: Described, tmp_path: Path, change: Change, code: str
@@ -310,6 +332,30 @@ def test_a_gimbal_in_other_axes_is_named_and_mended(flight: Described, tmp_path:
     assert first["remedy"].startswith("cameras.drone1.gimbal.axes: enu; ")
     assert with_remedy(manifest, first["remedy"])
     assert doubts_of(manifest) == []
+
+
+def test_one_drone_is_said_to_be_one(flight: Described, tmp_path: Path) -> None:
+    def alone(mistaken: Mistaken) -> None:
+        for name in ("drone2", "drone3"):
+            del mistaken.manifest["cameras"][name]
+
+    line = refused("check", mistaken(flight, alone), code="no-views")
+    assert "drone1" in line
+    assert "mocap-check" not in line  # the folder of a check that nobody asked for
+
+
+def test_a_gimbal_that_nobody_names_is_doubted_at_ingest(flight: Described, tmp_path: Path) -> None:
+    def forgotten(manifest: dict[str, Any]) -> None:
+        del manifest["cameras"]["drone1"]["gimbal"]
+
+    manifest = as_made(flight, tmp_path / "forgotten", forgotten)
+    session = tmp_path / "forgotten.session"
+    succeeds("ingest", manifest, "-o", session)
+    (doubt,) = json.loads((session / "session.json").read_text())["doubts"]
+    assert (doubt["code"], doubt["cameras"]) == ("unused", ["drone1"])
+    assert with_remedy(manifest, doubt["remedy"])
+    succeeds("ingest", manifest, "-o", tmp_path / "mended.session")
+    assert json.loads((tmp_path / "mended.session" / "session.json").read_text())["doubts"] == []
 
 
 @pytest.mark.parametrize("stated", ["body", "heading"])

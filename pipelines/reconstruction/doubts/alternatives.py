@@ -1,7 +1,7 @@
 """Alternatives to a flight's description: what is changed, in a sentence, as a scene and as a remedy.
 
-An alternative has a price that grows with its freedom: a discrete one costs 0.5, one number of one camera 1.2
-and more, so that what explains equally well with less freedom is named first.
+An alternative has a price that grows with its freedom, so that of two that explain as much the one with less is
+named first: that of how many there are of its kind, and that of its numbers.
 """
 
 from __future__ import annotations
@@ -35,8 +35,11 @@ TIMES = ("clock", "frame_rate")
 LEAST_GAIN_OF_TIMES = 1.0
 """Score that clocks and frame rates must gain to be scored exactly: half of what their margin asks."""
 
-DISCRETE = 0.8
-"""Alternatives without a free number have at most this price."""
+PRICE_OF_ALL = 0.5
+"""Price of an alternative of all cameras alike."""
+
+PRICE_OF_ONE = 0.8
+"""Price of an alternative of one camera, of which there are as many as cameras."""
 
 _FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
 _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -58,8 +61,6 @@ _REACH = 1.0
 _LEAST_ZOOM = 0.1
 # Focal lengths are wrong by at most this logarithm: a factor of twenty.
 _MOST_ZOOM = 3.0
-# The shift of a log has this standard deviation: any shift is as likely.
-_LOOSE_M = 30.0
 # The nose is this share of the stature above the ankles (Winter 2009).
 _NOSE_TO_ANKLES = 0.9
 _LEFT_RIGHT = [
@@ -80,7 +81,7 @@ class Alternative:
     same_scatter: bool = False
     evidence: Mapping[str, float] = field(default_factory=dict)
     alike: tuple[float, float] | None = None  # of times of all cameras: seconds late, and factor between them
-    cost: float = np.inf  # chi^2 of the rays, with 2 for each number
+    cost: float = np.inf  # of what is fitted: chi^2 of the rays, and what the numbers cost
     score: Score | None = None
     tried: tuple[float, float] = (np.nan, np.nan)  # the objective of the description, and with this change
 
@@ -597,20 +598,24 @@ NUMBERS = {"shift": 3, "heading": 1, "north": 1, "zero": 4, "pitch": 1, "roll": 
 focal length is another; the number is then the logarithm of the factor.
 """
 
-_PRICES_OF_ONE = {
-    "shift": 1.8,
-    "heading": 1.3,
-    "north": 1.8,
-    "zero": 2.2,
-    "pitch": 1.3,
-    "roll": 1.5,
-    "focal": 1.3,
-}
-_PRICES_OF_ALL = {"focal": 1.0, "pitch": 1.0, "heading": 2.2}
+_OF_ALL = ("focal", "pitch", "heading")
+# A turn of about this size, or a factor of about its exponential, is expected before the pictures are seen.
+_EXPECTED_RAD, _EXPECTED_ZOOM = 1.0, 0.5
+# The zero of a log lies about this far from the world's, before the pictures are seen.
+_EXPECTED_M = 30.0
 # A fit finds the best angle from within some 10 deg; those that are not here are tried all around.
 _STARTS_DEG = {"pitch": range(-90, 91, 15), "focal": (0,), "shift": (0,)}
-# Each free number costs this much chi^2, as in Akaike's criterion.
-_COST_OF_NUMBER = 2.0
+
+
+def _freedom(found: Fit, expected: Sequence[float]) -> float:
+    """Return what numbers cost as chi^2, beside their fit: how much surer the rays make them.
+
+    It is the logarithm of their volume before and after (the Occam factor; MacKay 2003, chapter 28). So a
+    number that stated errors of poses leave open costs little, and gains little.
+    """
+    sign, volume = np.linalg.slogdet(found.covariance)
+    before = 2 * float(np.log(expected).sum())
+    return max(0.0, before - float(volume)) if sign > 0 else np.inf
 
 
 def changed(scene: SceneOfMoments, kind: str, group: Sequence[int], numbers: Float) -> SceneOfMoments:
@@ -649,17 +654,22 @@ def fitted(trial: Trial, kind: str, group: Sequence[int]) -> Fit:
         return float(np.median(chi2)) if chi2.size else np.inf
 
     start = min(starts, key=misfit) if len(starts) > 1 else starts[0]
-    loose = [_LOOSE_M] * (3 * (NUMBERS[kind] >= 3)) + [np.inf] * (NUMBERS[kind] in (1, 4))
-    return fit(trial.flight, lambda numbers: changed(scene, kind, group, numbers), start, loose)
+    return fit(trial.flight, lambda numbers: changed(scene, kind, group, numbers), start, _expected(kind))
+
+
+def _expected(kind: str) -> list[float]:
+    """Return the standard deviations of numbers before the pictures are seen."""
+    angle = [_EXPECTED_ZOOM if kind == "focal" else _EXPECTED_RAD]
+    return [_EXPECTED_M] * (3 * (NUMBERS[kind] >= 3)) + angle * (NUMBERS[kind] in (1, 4))
 
 
 def of_all_numbers(trial: Trial) -> Iterator[Alternative]:
     """Fit numbers that all cameras have in common, and each log's own zero."""
     least_rad = np.radians(max(3.0, 4 * float(np.degrees(trial.described.sigma[:, 1].max()))))
-    for kind, price in _PRICES_OF_ALL.items():
+    for kind in _OF_ALL:
         group = trial.every if kind == "focal" else trial.moving
         if group:
-            alternative, number = _of_numbers(trial, kind, group, price)
+            alternative, number = _of_numbers(trial, kind, group)
             if abs(number) >= (_LEAST_ZOOM if kind == "focal" else least_rad):
                 yield trial.scored(alternative)
     if len(trial.names) > 2 and trial.moving:
@@ -669,15 +679,15 @@ def of_all_numbers(trial: Trial) -> Iterator[Alternative]:
 def of_one_number(trial: Trial) -> Iterator[Alternative]:
     """Fit numbers of one camera: where its log has zero and north, how it is turned, its focal length."""
     located = trial.flight.hips is not None or trial.flight.ground is not None
-    for index, (kind, price) in product(trial.every, _PRICES_OF_ONE.items()):
+    for index, kind in product(trial.every, NUMBERS):
         if index not in trial.moving and kind != "focal":
             continue
         if kind in ("north", "zero") and len(trial.names) == 2 and index == 0 and not located:
             continue  # of two, one alone can be turned against the other
-        yield trial.scored(_of_numbers(trial, kind, [index], price)[0])
+        yield trial.scored(_of_numbers(trial, kind, [index])[0])
 
 
-def _of_numbers(trial: Trial, kind: str, group: list[int], price: float) -> tuple[Alternative, float]:
+def _of_numbers(trial: Trial, kind: str, group: list[int]) -> tuple[Alternative, float]:
     found = fitted(trial, kind, group)
     cameras, whose, number = trial.cameras, trial.whose(group), float(found.numbers[-1])
     degrees = float(np.degrees(number)) if kind != "shift" else 0.0
@@ -716,10 +726,10 @@ def _of_numbers(trial: Trial, kind: str, group: list[int], price: float) -> tupl
         trial.named(group, of_pair=not mounted),
         what,
         remedy,
-        price,
+        PRICE_OF_ONE if len(group) < len(trial.names) else PRICE_OF_ALL,
         found.scene,
         evidence=evidence,
-        cost=found.cost + _COST_OF_NUMBER * NUMBERS[kind],
+        cost=found.cost + _freedom(found, _expected(kind)),
     ), number
 
 
@@ -749,7 +759,7 @@ def of_origins(trial: Trial, what: str) -> tuple[Alternative, bool]:
         position[moved] += numbers.reshape(-1, 1, 3)
         return replace(scene, position=position)
 
-    found = fit(flight, make, np.concatenate([*start, np.zeros(0)]), [_LOOSE_M] * (3 * len(moved)))
+    found = fit(flight, make, np.concatenate([*start, np.zeros(0)]), [_EXPECTED_M] * (3 * len(moved)))
     shifts = np.zeros((len(trial.names), 3))
     shifts[moved] = found.numbers.reshape(-1, 3)
     sigma_m = (
@@ -760,11 +770,11 @@ def of_origins(trial: Trial, what: str) -> tuple[Alternative, bool]:
         trial.names,
         what,
         remedies.own_origins(trial.cameras, shifts),
-        1.1 * (len(trial.moving) - 1),
+        PRICE_OF_ALL,
         found.scene,
         same_scatter=True,
         evidence={"shift_sigma_m": round(float(np.max(sigma_m)), 2)},
-        cost=found.cost + _COST_OF_NUMBER * 3 * len(moved),
+        cost=found.cost + _freedom(found, [_EXPECTED_M] * (3 * len(moved))),
     ), bool(np.isfinite(found.cost))
 
 

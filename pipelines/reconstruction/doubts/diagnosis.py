@@ -20,8 +20,8 @@ import numpy as np
 from pipelines.geometry.arrays import Int64
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.alternatives import (
-    DISCRETE,
     LEAST_GAIN_OF_TIMES,
+    PRICE_OF_ALL,
     RATES,
     TIMES,
     Alternative,
@@ -284,7 +284,7 @@ def _causes(trial: Trial, objective: Objective, tried: Sequence[Alternative], od
             break
         if _leaves_no_doubt(trial.flight, each):
             causes.append((gain, each))
-    causes.sort(key=lambda pair: (pair[1].price > DISCRETE, -pair[0]))
+    causes.sort(key=lambda pair: (np.isfinite(pair[1].cost), -pair[0]))
     return list({each.code: each for _, each in reversed(causes)}.values())[::-1]
 
 
@@ -317,11 +317,11 @@ def _below_zero(trial: Trial) -> list[Alternative]:
             trial.names,
             "all drones fly below zero: their positions count z downwards, or zero is high above the ground",
             remedies.pose(trial.cameras, remedies.upside_down),
-            DISCRETE,
+            PRICE_OF_ALL,
             replace(trial.described, position=place),
         )
     )
-    return [turned] if turned.total <= trial.base.total + _ALIKE + DISCRETE else []
+    return [turned] if turned.total <= trial.base.total + _ALIKE + PRICE_OF_ALL else []
 
 
 # --- what is seen without a scene -------------------------------------------------------------------------
