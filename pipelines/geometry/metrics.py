@@ -127,13 +127,16 @@ def world_errors(
         ValueError: the shapes disagree, or the stamps do not increase strictly.
     """
     _check_shapes(estimate, truth, joints, t_ns)
-    by_first, by_all, rooted, path_m = [], [], [], 0.0
+    by_first: list[Float] = [np.empty(0)]
+    by_all: list[Float] = [np.empty(0)]
+    rooted: list[Float] = [np.empty(0)]
+    path_m = 0.0
     for own, true in zip(np.moveaxis(estimate, 1, 0), np.moveaxis(truth, 1, 0), strict=True):
         there = np.flatnonzero(np.isfinite(own - true).all(axis=-1).any(axis=-1))
         for start in range(0, len(there), _SEGMENT_SAMPLES):
             rows = there[start : start + _SEGMENT_SAMPLES]
-            by_first.append(_aligned_as(own[rows], true[rows], 2))
-            by_all.append(_aligned_as(own[rows], true[rows], len(rows)))
+            by_first.append(_aligned_as(own[rows], true[rows], 2).ravel())
+            by_all.append(_aligned_as(own[rows], true[rows], len(rows)).ravel())
         # A straight way leaves its roll open: the motion is that of all joints.
         rigid = align_each(own[there].reshape(-1, 3), true[there].reshape(-1, 3), with_scale=False)
         start, end = (_root(each[there, None], joints)[:, 0] for each in (own, true))
@@ -145,9 +148,9 @@ def world_errors(
     apart = estimate - truth
     shift = np.array([_mean(apart[..., axis]) for axis in range(3)])
     found = {
-        "w_mpjpe_mm": 1e3 * _mean(np.concatenate([np.ravel(each) for each in (*by_first, [])])),
-        "wa_mpjpe_mm": 1e3 * _mean(np.concatenate([np.ravel(each) for each in (*by_all, [])])),
-        "rte_percent": 100 * _mean(np.concatenate([*rooted, []])) / path_m if path_m > 0 else math.nan,
+        "w_mpjpe_mm": 1e3 * _mean(np.concatenate(by_first)),
+        "wa_mpjpe_mm": 1e3 * _mean(np.concatenate(by_all)),
+        "rte_percent": 100 * _mean(np.concatenate(rooted)) / path_m if path_m > 0 else math.nan,
         "jitter": _mean(_length(_derivative(estimate, t_ns, 3))) / 10,
         "foot_sliding_mm": 1e3 * _mean(speed[stands]) / _FIELD_RATE_HZ,
         "shifted_mpjpe_mm": 1e3 * _mean(_length(apart - shift)),

@@ -227,6 +227,8 @@ def test_reconstruct_states_doubts_and_strict_refuses(flight: Described, tmp_pat
     succeeds("ingest", manifest, "-o", session)
     metrics = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
     assert metrics["doubts"][0]["code"] == "mount"
+    assert metrics["verdict"]["grade"] == "wrong"
+    assert "--fix" in metrics["verdict"]["next"]
     assert metrics["doubts"][0]["remedy"].startswith("cameras.drone1.mount: {looks: forward, down_deg: 15")
     assert "(mount)" in refused("reconstruct", session, "--method", "robust", "--strict")
     assert (session / "reconstruct" / "metrics.json").exists()

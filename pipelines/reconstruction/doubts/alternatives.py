@@ -1,7 +1,7 @@
 """Alternatives to a flight's description: what is changed, in a sentence, as a scene and as a remedy.
 
-An alternative has a price that grows with its freedom, so that of two that explain as much the one with less is
-named first: that of how many there are of its kind, and that of its numbers.
+An alternative has a price that grows with its freedom: for how many there are of its kind, and for its
+numbers. So of two that explain as much, the one with less freedom is named first.
 """
 
 from __future__ import annotations
@@ -780,56 +780,37 @@ def of_origins(trial: Trial, what: str) -> tuple[Alternative, bool]:
 
 # --- errors that are larger than stated ------------------------------------------------------------------
 
-_NOISE_FACTORS = (2.0, 5.0, 12.0)
-_NOISE_FACTORS_OF_ONE = (4.0, 12.0, 36.0)  # a camera whose poses are wrong throughout
+_NOISE_FACTORS = (2.0, 5.0, 12.0, 36.0)  # with the last, poses of one camera hardly count
 
 
 def of_noise(trial: Trial) -> Iterator[Alternative]:
     """Fit errors that are some times larger than stated: of all poses, or of one camera's.
 
-    Of all, they are constant, change, or both; of one, constant: whose errors change cannot be told. Their
-    score says nothing, since larger errors excuse everything; only their cost counts.
+    Their score says nothing, since larger errors excuse everything; only their cost counts.
     """
-    if all(trial.cameras[index].states_noise for index in trial.moving):
-        of_all = [(f, 1.0) for f in _NOISE_FACTORS], [(1.0, f) for f in _NOISE_FACTORS]
-        found = [[_noisier(trial, *factors, trial.every) for factors in pairs] for pairs in of_all]
-        (constant, _), (_, changing) = (
-            min(zip(pairs, each, strict=True), key=lambda pair: pair[1].cost)[0]
-            for pairs, each in zip(of_all, found, strict=True)
-        )
-        both = _noisier(trial, constant, changing, trial.every)
-        yield min([*found[0], *found[1], both], key=lambda each: each.cost)
-    if len(trial.names) > 2 and trial.moving:  # of two, either errs more
-        of_one = product(trial.moving, _NOISE_FACTORS_OF_ONE)
-        yield min((_noisier(trial, f, 1.0, [index]) for index, f in of_one), key=lambda each: each.cost)
+    groups = [trial.every] if all(trial.cameras[index].states_noise for index in trial.moving) else []
+    groups += [[index] for index in trial.moving] if len(trial.names) > 2 else []  # of two, either errs more
+    for group in groups if trial.moving else ():
+        tried = [_noisier(trial, factor, group) for factor in _NOISE_FACTORS]
+        yield trial.scored(min(tried, key=lambda each: each.cost))
 
 
-def _noisier(trial: Trial, constant: float, changing: float, group: Sequence[int]) -> Alternative:
-    """Fit errors of some cameras' poses that are larger by given factors: constant ones, changing ones."""
+def _noisier(trial: Trial, factor: float, group: Sequence[int]) -> Alternative:
+    """Fit errors of some cameras' poses that are larger by a factor."""
     scene = trial.described
-    larger = np.ones((len(trial.names), 2))
-    larger[list(group)] = constant, changing
-    constant2 = np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0)
     sigma = scene.sigma.copy()
-    sigma[:, 2:] *= larger[:, 1:]
-    sigma[:, :2] = np.sqrt(larger[:, :1] ** 2 * constant2 + sigma[:, 4:] ** 2)
+    sigma[list(group)] *= factor
     wider = replace(scene, sigma=sigma)
     # Larger errors are less likely to be what they are: 6 of each camera, and 2 of each picture.
     pictures = np.isfinite(scene.rays[..., 0]).any(axis=-1).sum(axis=1)
     before, after = (picture_variance(each) for each in (scene, wider))
-    unlikely = 12 * len(group) * np.log(constant) + 2 * float(pictures @ np.log(after / before))
-    parts = (("constant", constant), ("changing", changing))
-    said = ", ".join(f"{part} ones {factor:g} times" for part, factor in parts if factor > 1)
-    everyone = len(group) == len(trial.names)
-    what = "errors of the poses are larger than stated"
-    if not everyone:
-        one = trial.names[group[0]]
-        what = f"the poses of {one} do not fit the other cameras: their errors are larger than stated"
+    unlikely = 12 * len(group) * np.log(factor) + 2 * float(pictures @ np.log(after / before))
+    whose = "" if len(group) == len(trial.names) else f" of {trial.names[group[0]]}"
     return Alternative(
-        "noise" if everyone else "pose",
+        "pose" if whose else "noise",
         trial.named(group),
-        f"{what}, {said}",
-        remedies.pose_noise(trial.cameras, group, constant, changing),
+        f"errors of the poses{whose} are larger than stated, about {factor:g} times",
+        remedies.pose_noise(trial.cameras, group, factor),
         np.inf,
         wider,
         cost=fit(trial.flight, lambda _: wider).cost + unlikely,

@@ -184,7 +184,7 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
     if strange and np.isfinite(found.stature_m):
         tried.append(of_scale(trial, found.stature_m))
     if odd or objective.fitted.strain >= STRAINED:
-        tried += [*of_one_number(trial), *(trial.scored(each) for each in of_noise(trial))]
+        tried += [*of_one_number(trial), *of_noise(trial)]
     causes = _causes(trial, objective, tried, odd) or _below_zero(trial)
     doubts = [_doubt(trial, each, found) for each in causes]
     if doubts or strange or base.total >= DOUBTFUL:

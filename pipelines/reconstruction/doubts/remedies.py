@@ -244,17 +244,15 @@ def _lens(camera: Filmed, focal: float, centre: float) -> str:
     )
 
 
-def pose_noise(cameras: Sequence[Filmed], group: Sequence[int], lasting: float, changing: float) -> str:
-    """State larger errors of poses: factors on constant ones, and on those that change."""
+def pose_noise(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
+    """State errors of poses that are larger by a factor: constant ones, and those that change."""
 
     def said(camera: Filmed) -> str:
-        sigma = camera.sigma
-        position = lasting * np.sqrt(max(sigma.position_m**2 - sigma.varying_position_m**2, 0.0))
-        rotation = lasting * np.sqrt(max(sigma.rotation_rad**2 - sigma.varying_rotation_rad**2, 0.0))
+        sigma = factor * np.array(camera.sigma)
+        position, rotation = np.sqrt(np.maximum(sigma[:2] ** 2 - sigma[4:] ** 2, 0.0))
         return (
             f"pose_noise: {{bias: {{position_m: {position:.3g}, rotation_deg: {np.degrees(rotation):.3g}}},"
-            f" white: {{position_m: {changing * sigma.varying_position_m:.3g},"
-            f" rotation_deg: {changing * np.degrees(sigma.varying_rotation_rad):.3g}}}}}"
+            f" white: {{position_m: {sigma[4]:.3g}, rotation_deg: {np.degrees(sigma[5]):.3g}}}}}"
         )
 
     return _lines(cameras, [index for index in group if not cameras[index].static], said)

@@ -191,8 +191,8 @@ def common_offset(
     turns = all_turns(cameras, followed)
     turns = {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
     late = None
-    for grid in (_GRID_S, _FINE_STEP_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1)):
-        at = grid if late is None else grid + late.late_s
+    for grid in (_GRID_S, _FINE_STEP_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1, dtype=np.float64)):
+        at: Float = grid if late is None else grid + late.late_s
         curves = [_gains(cameras[i], each, between, [(s, 1.0) for s in at]) for i, each in turns.items()]
         found = _best_clock(tuple(range(len(cameras))), at, curves) if curves else None
         if late is not None and found is not None:
