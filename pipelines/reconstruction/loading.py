@@ -25,7 +25,7 @@ from pipelines.reconstruction.log_stretches import Mended, mend, said_stretches
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.camera_poses import stated_models, stated_noise
 from pipelines.session.description import Description
-from pipelines.session.errors import DataError
+from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.records import JointMotion
 from pipelines.session.registries import parsed_noise_models
 from pipelines.session.stages import StageRecord
