@@ -100,8 +100,10 @@ def load_cameras(
     """
     sources = _keypoints(folder, description, detected)
     if len(sources) < 2:
-        raise DataError(
-            folder, f"has keypoints of {len(sources)} camera(s)", "a skeleton needs two cameras at least"
+        raise NoViewsError(
+            description.flight,
+            f"{', '.join(sources) or 'no camera'} alone shows people, and a place in space needs two views",
+            "add a camera that films the same people at the same time",
         )
     joints = _common_joints(folder, sources)
     warnings: list[str] = []
@@ -117,12 +119,6 @@ def load_cameras(
 def _common_joints(folder: Path, sources: Mapping[str, _Keypoints]) -> tuple[str, ...]:
     """List the joints that at least two cameras know, in the order of the camera that knows the most."""
     known = [source.joints for source in sources.values()]
-    if len(known) < 2:
-        raise NoViewsError(
-            ", ".join(sources),
-            "is the only camera with pictures of people, and a place in space needs two",
-            "add a camera that films the same people at the same time",
-        )
     shared = [name for name in max(known, key=len) if sum(name in joints for joints in known) > 1]
     if not shared:
         raise DataError(
