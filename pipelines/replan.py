@@ -1,8 +1,8 @@
 """Stage `replan`: fly the formation planners again, offline, with the logged actor and the maps.
 
 Load the logged flight; replay every arm and simulate what its cameras measure of the actor's skeleton; score
-all arms in the same way and compare; store. metrics.json marks what was simulated; run.json has the planning
-times. The stage's folder holds the last comparison, and every one by its name in a folder of its own.
+all arms in the same way and compare; store. metrics.json marks what was simulated. The stage's folder holds
+the last comparison, and every one by its name in a folder of its own.
 """
 
 from __future__ import annotations
@@ -39,14 +39,11 @@ from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.memory import return_freed_arrays, return_unused
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import JointMotion
 from pipelines.session.stages import Stage, StageRecord, WritableSession, key_of, locked, usable_record
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import (
     ACTOR,
     REPLAN,
-    TRUTH,
-    motion_table,
     read_table,
     write_table,
 )
@@ -65,7 +62,7 @@ from pipelines.simulation.scenario import DetectorErrors
 if TYPE_CHECKING:
     import pandas as pd
 
-REPLAN_STAGE = Stage("replan", revision=7)
+REPLAN_STAGE = Stage("replan", revision=8)
 
 # The detector's errors were measured by the size of a person of this height in the picture.
 PERSON_HEIGHT_M = 1.75
@@ -87,10 +84,6 @@ class Replanned:
 
 def settings_of(stated: Sequence[str], **others: Any) -> ReplanSettings:
     """Make settings of YAML files (docs/planner.md) and of texts KEY=VALUE; of a key the last one counts.
-
-    Args:
-        stated: files and texts.
-        others: fields of `ReplanSettings` that are no keys.
 
     Raises:
         DataError: a file cannot be read, or a setting is unknown or out of range.
@@ -117,8 +110,7 @@ def replan(
 ) -> Replanned:
     """Replay the planners on a session, and compare them; run again even if nothing changed with `force`.
 
-    `name` is that of the folder in which the comparison stays when another one is made: by default the first
-    digits of the stage's key. One of the same name is replaced.
+    `name` is that of the folder in which the comparison stays: by default the first digits of the key.
 
     Raises:
         DataError: the session cannot be used (it has no positions of the actor, or a table was changed), or a
@@ -157,7 +149,6 @@ def replan(
             return_unused()
             progress.advance()
         results = {arm: read_result(place) for arm, place in made.items()}
-        times = {arm: read_json(place / "times.json") for arm, place in made.items()}
         keypoints = f"modelled after {errors.detector}"
         metrics = jsonable({"name": name} | compare(scene, results) | {"keypoints": keypoints})
         write_table(run.folder / "actor.parquet", _actor_table(scene), ACTOR)
@@ -173,7 +164,6 @@ def replan(
             "safety": {name: result.flight.safety for name, result in results.items()},
         }
         record = run.publish(counts=counts, warnings=metrics["warnings"])
-        _note_planning_times(folder, times)
         for setting, (before, now) in run.replaces.items():
             if setting != "name":
                 progress.note(f"the comparison before was made with {setting} = {before} (now {now})")
@@ -351,13 +341,8 @@ def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder
     }
     if measured is not None:
         np.save(folder / "error_m.npy", measured.error_m)
-        pictures = scene.t_ns[scene.pictures]
-        by_person = measured.first.reshape(len(pictures), len(scene.people), -1, 3)
-        first = JointMotion(pictures, joints, by_person)
-        write_table(folder / "skeleton.parquet", motion_table(first), TRUTH)
         facts |= {"seen_share": measured.seen_share, "joint_frames": measured.joint_frames}
     write_json(folder / "facts.json", facts)
-    write_json(folder / "times.json", _percentiles({"central": flown.central_s, "local": flown.local_s}))
 
 
 def read_result(folder: Path) -> ArmResult:
@@ -376,25 +361,6 @@ def read_result(folder: Path) -> ArmResult:
         seen_share=facts["seen_share"],
         joint_frames=facts["joint_frames"],
     )
-
-
-def _percentiles(planning_s: Mapping[str, Any]) -> dict[str, object]:
-    """Compute mean, median and 95th percentile of each planner's time per call, ms."""
-    found: dict[str, object] = {}
-    for name, seconds in planning_s.items():
-        if len(seconds):
-            median, p95 = (1e3 * float(value) for value in np.percentile(seconds, [50, 95]))
-            mean = 1e3 * float(np.mean(seconds))
-            found[f"{name}_ms"] = {"mean": mean, "median": median, "p95": p95, "calls": len(seconds)}
-    return found
-
-
-def _note_planning_times(folder: Path, times: Mapping[str, object]) -> None:
-    """Add planning times to the last run of run.json; measured durations are only there."""
-    path = folder / "run.json"
-    runs = read_json(path)
-    runs["runs"][-1]["planning"] = dict(times)
-    write_json(path, runs)
 
 
 def _actor_table(scene: ReplayScene) -> pd.DataFrame:

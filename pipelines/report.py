@@ -99,12 +99,10 @@ def report(
     force: bool = False,
     overwrite: bool = False,
 ) -> Reported:
-    """Write report/index.html of a session, or its page elsewhere. Nothing is written where nothing changed.
+    """Write report/index.html of a session, or its page at `output`, if anything changed.
 
     Args:
-        output: a file instead; the session is only read.
         studies: folders of `mocap study` that the page shows as well.
-        video: the pictures beside the 3D view.
         force: write it again even if nothing changed.
         overwrite: replace a file that lies at `output` and is no page of mocap.
 
@@ -168,17 +166,11 @@ class _Page:
 def compare_sessions(
     folders: Sequence[Path], output: Path | None = None, *, overwrite: bool = False
 ) -> Reported:
-    """Write the page that compares every session with the first.
-
-    Args:
-        folders: the sessions, at least two.
-        output: the file; by default comparison/index.html beside the first session. A page of an earlier
-            comparison is replaced.
-        overwrite: replace also a file that is no comparison.
+    """Write the page that compares every session with the first, by default comparison/index.html beside it.
 
     Raises:
-        DataError: not a session, damaged, changed by hand, stated twice, or the file exists and is no
-            comparison.
+        DataError: not a session, damaged, changed by hand, stated twice, or the file exists and is no page of
+            mocap (see `overwrite`).
     """
     resolved = [folder.resolve() for folder in folders]
     for folder, place in zip(folders, resolved, strict=True):
@@ -211,16 +203,11 @@ def write_figures_of(
     overwrite: bool = False,
     force: bool = False,
 ) -> Reported:
-    """Write the figures of a session's page, or of the page that compares several, as files.
+    """Write the figures of a session's page, or of the page that compares several with the first, as files.
 
-    The files are PNG, SVG and PDF 180 mm wide (90 mm where two are side by side), the numbers of each figure
-    as CSV, and figures.json with titles and captions. The 3D viewer is left out.
-
-    Args:
-        folders: the sessions; two or more are compared, each with the first.
-        target: the folder; figures that an earlier run wrote there are replaced.
-        studies: folders of `mocap study` that the page of a single session shows as well.
-        overwrite: replace also a folder with other things in it, but never a session.
+    The files are PNG, SVG and PDF 180 mm wide, the numbers of each figure as CSV, and figures.json with
+    titles and captions. Figures that an earlier run wrote there are replaced; with `overwrite` also other
+    things, but never a session.
 
     Raises:
         DataError: not a session, or damaged; a table of it, or pictures, were changed; the folder holds
@@ -365,14 +352,7 @@ MAX_ROWS = 200_000
 
 
 class _Shown:
-    """The times of a flight that its page shows: of a long one every k-th, and what was recorded about them.
-
-    Args:
-        folder: the session.
-        t_ns: all times of the skeleton, or of the pictures where there is none.
-        rows: of the skeleton's table, one for each time, person and joint; 0 where there is none.
-        metrics: reconstruct/metrics.json.
-    """
+    """The times of a long flight that its page shows, every k-th, and what was recorded about them."""
 
     def __init__(self, folder: Path, t_ns: Int64, rows: int, metrics: Mapping[str, object] | None) -> None:
         self.every = max(-(-max(rows, len(t_ns)) // MAX_ROWS), 1)
@@ -452,6 +432,8 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
             for name in records["detect"].counts["cameras"]
             if name not in keypoints
         }
+    outputs = records["reconstruct"].outputs if reconstructed else {}
+    angles, errors = "reconstruct/angles.parquet", "reconstruct/joint_errors.parquet"
     maps = load_maps(folder) if description.map else []
     return SessionContent(
         name=session_name(folder),
@@ -466,24 +448,11 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         stages={name: asdict(record) for name, record in records.items()},
         replan=_load_replan(folder, records["replan"], maps) if "replan" in records else None,
         refined=_by_camera(shown, "reconstruct/cameras.parquet", records.get("reconstruct")),
-        true_poses=_by_camera(shown, "truth_poses.parquet", records["ingest"]),
-        angles=_load_angles(shown, records.get("reconstruct")),
-        joint_errors=_load_joint_errors(folder, records.get("reconstruct")),
+        angles=shown.table(angles, ANGLES) if angles in outputs else None,
+        joint_errors=read_table(folder / errors, JOINT_ERRORS) if errors in outputs else None,
         made_by=versions_of(folder),
         outdated=tuple(outdated(records, description.recorded)),
     )
-
-
-def _load_angles(shown: _Shown, record: StageRecord | None) -> pd.DataFrame | None:
-    """Read the joint angles; None of a reconstruction without them."""
-    name = "reconstruct/angles.parquet"
-    return shown.table(name, ANGLES) if record is not None and name in record.outputs else None
-
-
-def _load_joint_errors(folder: Path, record: StageRecord | None) -> pd.DataFrame | None:
-    """Read the figures of single joints; None of a reconstruction without them."""
-    name = "reconstruct/joint_errors.parquet"
-    return read_table(folder / name, JOINT_ERRORS) if record is not None and name in record.outputs else None
 
 
 def _by_camera(shown: _Shown, name: str, record: StageRecord | None) -> dict[str, pd.DataFrame]:

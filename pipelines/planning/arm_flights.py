@@ -57,8 +57,6 @@ class ArmFlight:
     aim: Float  # [N, T, P] shares of people in the place that each camera films
     known: Bool  # [N, T] False where a log has a gap and the position goes straight on
     safety: dict[str, int]  # local plannings by `guard.FlownMotion`; empty for logged arms
-    central_s: Sequence[float] = ()  # measured planning times, different from run to run
-    local_s: Sequence[float] = ()
 
 
 def logged_arm(scene: ReplayScene, name: str) -> ArmFlight:
@@ -130,7 +128,6 @@ def fly_arm(scene: ReplayScene, arm: Arm) -> ArmFlight:
         scene.fields,
         Start(scene.drones, scene.yaw_rad, scene.heading_rad),
         config=scene.config,
-        seed=scene.settings.seed,
         weights=scene.flight.weights,
     )
     return ArmFlight(
@@ -141,8 +138,6 @@ def fly_arm(scene: ReplayScene, arm: Arm) -> ArmFlight:
         aim=done.aim,
         known=np.ones(done.position.shape[:2], dtype=np.bool_),
         safety=done.safety,
-        central_s=done.times.central_s,
-        local_s=done.times.local_s,
     )
 
 
@@ -273,7 +268,6 @@ class MeasuredJoints:
     """Result of the simulated measurements."""
 
     error_m: Float32  # [trials, T, J]; NaN where the joint was not measured or the truth is unknown
-    first: Float  # [T, J, 3] the measured joints of the first trial
     seen_share: float  # of known joints and cameras: in the picture and not hidden
     joint_frames: int  # with a truth
 
@@ -307,7 +301,6 @@ def measure(
         free &= ~hidden_by_people(eyes, standing_in, others)
     sigma = np.stack([_pose_sigma(paths, i) for i in range(cameras)], axis=1)
     error = np.full((trials, times, count), np.nan, dtype=np.float32)
-    first = np.full(joints.shape, np.nan)
     for trial in range(trials):
         rays = np.empty((times, count, cameras, 2))
         weight = np.empty((times, count, cameras))
@@ -337,12 +330,10 @@ def measure(
         points = triangulate(views, method="robust").points.reshape(joints.shape)
         points[~known] = np.nan
         error[trial] = np.sqrt(np.sum((points - joints) ** 2, axis=-1))
-        if trial == 0:
-            first = points
     seen = np.isfinite(pixels[..., 0]) & free
     total = cameras * int(known.sum())
     seen_share = float((seen & known).sum() / total) if total else 0.0
-    return MeasuredJoints(error, first, seen_share, int(known.sum()))
+    return MeasuredJoints(error, seen_share, int(known.sum()))
 
 
 def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:
@@ -351,7 +342,6 @@ def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:
     seen = sum(person.seen_share * count for person, count in zip(people, frames, strict=True))
     return MeasuredJoints(
         error_m=np.concatenate([person.error_m for person in people], axis=2),
-        first=np.concatenate([person.first for person in people], axis=1),
         seen_share=seen / sum(frames) if sum(frames) else 0.0,
         joint_frames=sum(frames),
     )

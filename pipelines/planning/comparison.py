@@ -260,7 +260,6 @@ def _difference(
         "tilt_deg": mean_over_time(tilts[0] - tilts[1], scene.t_ns, seed),
         "occluded_share": mean_over_time(hidden[0] - hidden[1], scene.t_ns, seed),
         **_error_difference(one, other, shared),
-        "interval_over_flights": _over_flights(scene, one, other, shared),
         "simulated": True,
     }
 
@@ -278,25 +277,6 @@ def _error_difference(
         "coverage": mean_of_trials(coverage(a, frames[0]) - coverage(b, frames[1])),
         "pck150": mean_of_trials(pck(a, frames[0]) - pck(b, frames[1])),
     }
-
-
-def _over_flights(
-    scene: ReplayScene, one: ArmResult, other: ArmResult, shared: Bool | None
-) -> dict[str, object]:
-    """Compute the intervals of the differences over stretches of the flight, noise averaged over trials."""
-    a, b = one.error_m, other.error_m
-    if a is None or b is None or shared is None or scene.joints is None:
-        return {"mpjpe_mm": None, "pck150": None}
-    both = shared & np.isfinite(a) & np.isfinite(b)
-    known = np.isfinite(scene.joints[..., 0]).sum(axis=1)
-    right = ((a <= PCK_M).sum(axis=2, dtype=np.float64) - (b <= PCK_M).sum(axis=2)).mean(axis=0)
-    further = np.where(both, a - b, 0.0).sum(axis=2, dtype=np.float64).mean(axis=0)
-    series = {
-        "mpjpe_mm": (1e3 * further, both.sum(axis=2).mean(axis=0)),
-        "pck150": (right, known.astype(np.float64)),
-    }
-    found = intervals(series, scene.t_ns[scene.pictures], seed=scene.settings.seed)
-    return {name: None if ends is None else list(ends) for name, ends in found.items()}
 
 
 def _tilt_deg(scene: ReplayScene, flown: ArmFlight) -> Float:

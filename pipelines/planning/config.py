@@ -2,12 +2,12 @@
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from pipelines.session.errors import DataError
 
@@ -113,8 +113,6 @@ class PlannerTuning:
     # --- actor and cameras ---
     # Planners take the logged position of the actor to err by this much per axis.
     actor_sigma_m: float = 0.2
-    # Replays add no noise to the log; studies of the forecast do.
-    actor_noise_m: float = 0.0
     errors: ErrorModel = ErrorModel()
 
 
@@ -128,62 +126,55 @@ class Zone:
     name: str = ""
 
 
+Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Point = tuple[Number, Number, Number]
+
+
+class _StatedZone(BaseModel):
+    """A zone as users write it: `polygon` with `heights`, or `box` with two opposite corners."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str = ""
+    polygon: Annotated[list[tuple[Number, Number]], Field(min_length=3)] | None = None
+    heights: tuple[Number | None, Number | None] = (None, None)
+    box: tuple[Point, Point] | None = None
+
+    def zone(self) -> Zone:
+        """Return the prism."""
+        if (self.polygon is None) == (self.box is None):
+            raise ValueError("must have either `polygon` and `heights`, or `box`")
+        corners, (low_m, high_m) = list(self.polygon or ()), self.heights
+        if self.box is not None:
+            (x0, x1), (y0, y1), (low_m, high_m) = (sorted(ends) for ends in zip(*self.box, strict=True))
+            corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+        corners = corners[:-1] if corners[0] == corners[-1] else corners
+        if low_m is not None and high_m is not None and low_m >= high_m:
+            raise ValueError(f"its lowest point {low_m:g} must be below its highest {high_m:g}")
+        after = (*corners[1:], corners[0])
+        if any(one == other for one, other in zip(corners, after, strict=True)):
+            raise ValueError("two corners that follow each other are the same")
+        area_m2 = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(corners, after, strict=True)) / 2.0
+        if len(corners) < 3 or abs(area_m2) < MIN_ZONE_AREA_M2:
+            raise ValueError("its corners enclose nothing")
+        return Zone(tuple(corners), low_m, high_m, self.name)
+
+
 def _zones(value: object) -> object:
-    """Convert zones as users write them: `polygon` with `heights`, or `box` with two opposite corners."""
     if not isinstance(value, list | tuple):
         raise ValueError("must be a list of zones")
     zones = []
     for k, stated in enumerate(value):
         try:
-            zone = stated if isinstance(stated, Zone) else _zone(stated)
+            zone = stated if isinstance(stated, Zone) else _StatedZone.model_validate(stated).zone()
+        except ValidationError as error:
+            found = error.errors()[0]
+            place = ".".join(str(part) for part in found["loc"])
+            raise ValueError(f"zone {k + 1}: {place!r} {found['input']!r}: {found['msg']}") from None
         except ValueError as error:
             raise ValueError(f"zone {k + 1}: {error}") from None
         zones.append(zone if zone.name else replace(zone, name=f"zone {k + 1}"))
     return tuple(zones)
-
-
-def _zone(stated: object) -> Zone:
-    if not isinstance(stated, Mapping) or ("polygon" in stated) == ("box" in stated):
-        raise ValueError("must have either `polygon` and `heights`, or `box`")
-    unknown = set(stated) - ({"name", "polygon", "heights"} if "polygon" in stated else {"name", "box"})
-    if unknown:
-        raise ValueError(f"unknown key {', '.join(sorted(map(repr, unknown)))}")
-    if "box" in stated:
-        box = _points(stated["box"], "box", size=3, least=2)
-        if len(box) > 2:
-            raise ValueError("box must be two opposite corners, of 3 numbers each")
-        (x0, x1), (y0, y1), heights = (sorted(ends) for ends in zip(*box, strict=True))
-        corners: Sequence[tuple[float, ...]] = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
-        low_m, high_m = heights
-    else:
-        corners = _points(stated["polygon"], "polygon", size=2, least=3)
-        corners = corners[:-1] if corners[0] == corners[-1] else corners
-        ends = stated.get("heights", (None, None))
-        if not isinstance(ends, list | tuple) or len(ends) != 2:
-            raise ValueError("heights must be the lowest and the highest, null where it is open")
-        low_m, high_m = (None if end is None else _number(end) for end in ends)
-    if low_m is not None and high_m is not None and low_m >= high_m:
-        raise ValueError(f"its lowest point {low_m:g} must be below its highest {high_m:g}")
-    after = (*corners[1:], corners[0])
-    if any(one == other for one, other in zip(corners, after, strict=True)):
-        raise ValueError("two corners that follow each other are the same")
-    area_m2 = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(corners, after, strict=True)) / 2.0
-    if len(corners) < 3 or abs(area_m2) < MIN_ZONE_AREA_M2:
-        raise ValueError("its corners enclose nothing")
-    return Zone(tuple(corners), low_m, high_m, str(stated.get("name") or ""))
-
-
-def _points(value: object, key: str, *, size: int, least: int) -> list[tuple[float, ...]]:
-    fits = isinstance(value, list | tuple) and len(value) >= least
-    if not fits or any(not isinstance(one, list | tuple) or len(one) != size for one in value):  # type: ignore[attr-defined]
-        raise ValueError(f"{key} must be a list of {least} points or more, of {size} numbers each")
-    return [tuple(_number(part) for part in one) for one in value]  # type: ignore[attr-defined]
-
-
-def _number(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{value!r} is no number")
-    return float(value)
 
 
 @dataclass(frozen=True)

@@ -200,11 +200,10 @@ def look(sight: Sight, x: float, y: float, z: float) -> tuple[int, int]:
 def occupied_samples(
     sight: Sight, x: float, y: float, z: float, rule: Float, first: float, end: float
 ) -> int:
-    """Count the samples `first` to `end` of a sight line that lie in occupied voxels.
+    """Count the occupied samples, `first` to `end`, of a line of sight from an actor at x, y, z (voxels).
 
-    The line begins at an actor, x, y, z in voxels from the grid's corner. Samples are at most half a voxel
-    apart, so that the next samples within a voxel's leap need no look. Samples are taken from both ends at
-    once, because the processor can run two independent leaps in parallel.
+    Samples are at most half a voxel apart, so that the next ones within a voxel's leap need no look. They
+    are taken from both ends at once, because the processor can run two independent leaps in parallel.
     """
     x, y, z = x + rule[0], y + rule[1], z + rule[2]
     first, end = _samples_inside(x, rule[6], sight.size[0], first, end)
@@ -326,18 +325,11 @@ class DistanceField:
 
 
 def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> DistanceField:
-    """Compute the distance field of a voxel map.
+    """Compute the distance field of a voxel map: from 0.5 on occupied, NaN unknown.
 
     M = d_free - res/2 outside and -(d_occ - res/2) inside, with the exact Euclidean distances between voxel
-    centres (scipy): the surface lies on the faces between free and occupied voxels. Without the half
-    voxel it would jump by two voxels there.
-
-    Args:
-        occupancy: probabilities, from 0.5 occupied, NaN unknown.
-        unknown: the state of unknown voxels, free or occupied.
-
-    Returns:
-        The field; where a map has no obstacle at all, 1 km everywhere.
+    centres (scipy): the surface lies on the faces between free and occupied voxels. Without the half voxel
+    it would jump by two voxels there. Where a map has no obstacle at all, it is 1 km everywhere.
     """
     with np.errstate(invalid="ignore"):
         occupied = occupancy.probability >= OCCUPIED
@@ -449,16 +441,10 @@ def looked(
 
 
 def visible(field: DistanceField, camera: Float, actor: Float, *, start_m: float) -> Bool:
-    """Test that no occupied voxel lies on the sight line (Amanatides & Woo 1987, every voxel it crosses).
+    """Test that no occupied voxel lies on the line of sight (Amanatides & Woo 1987).
 
-    Args:
-        field: the distance field of the obstacles; there are none outside its grid.
-        camera: [..., 3] metres, world.
-        actor: [..., 3] metres, world, broadcast against `camera`.
-        start_m: the end of the line next to the actor is left out, this much of it: maps contain the actor.
-
-    Returns:
-        [...]; True where camera and actor are nearer to each other than `start_m`, or not finite.
+    Camera and actor are [..., 3] m, world, broadcast. The end next to the actor, `start_m`, is left out:
+    maps contain the actor. True also where they are nearer to each other than that, or not finite.
     """
     camera, actor = np.broadcast_arrays(camera, actor)
     seen = np.empty(camera.shape[:-1], dtype=np.bool_)

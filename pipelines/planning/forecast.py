@@ -32,9 +32,8 @@ class ActorFilter:
     """Position and velocity of the actor from the measurements so far, and nothing later.
 
     x = [p, v] per axis, F = [[1, dt], [0, 1]], Q = q [[dt^3/3, dt^2/2], [dt^2/2, dt]] (white noise
-    acceleration of spectral density q, m^2/s^3), measurements of the position with standard deviation
-    `sigma_m` per axis. All three axes have the same model and noise, so that one 2x2 covariance serves them
-    all.
+    acceleration of spectral density q, m^2/s^3), measurements with `sigma_m` per axis; one 2x2 covariance
+    serves all axes.
     """
 
     def __init__(self, *, q: float, sigma_m: float) -> None:
@@ -103,12 +102,7 @@ class ActorFilter:
 
 
 class PeopleFilter:
-    """Estimates of several people, each with a filter; as one actor they are their weighted middle.
-
-    Args:
-        filters: of person 0, 1, ...
-        weight: [P] not negative, one of them above 0.
-    """
+    """Estimates of several people, a filter for each; as one actor they are their middle by `weight` [P]."""
 
     def __init__(self, filters: Sequence[ActorFilter], weight: Float) -> None:
         self._filters, self._weight = tuple(filters), weight / weight.sum()
@@ -146,14 +140,10 @@ def positions_at(t_ns: Int64, people: Float, at_ns: Int64) -> Float:
 class YawZero:
     """The direction that yaws count from, over time: east, or with `yaw_frame` `heading` the actor's.
 
-    The heading is the level direction of the filtered velocity. The actor stands if the level speed is below
-    `heading_speed_mps`, or below three of its standard deviations; then the last heading holds, and before
-    the first one `heading_rad`. The zero follows the heading the shorter way, no faster than a formation
-    turns: an actor who turns on the spot must not send drones through the middle.
-
-    Args:
-        config: `yaw_frame`, `heading_speed_mps`, `yaw_rate_deg_per_s`.
-        heading_rad: before the first one, counterclockwise from east; no matter in the world frame.
+    The heading is the level direction of the filtered velocity. The actor stands below `heading_speed_mps`,
+    or below three standard deviations of the speed; then the last heading holds, and before the first one
+    `heading_rad`. The zero follows the heading the shorter way, no faster than a formation turns: an actor
+    who turns on the spot must not send drones through the middle.
     """
 
     def __init__(self, config: PlannerConfig, heading_rad: float = 0.0) -> None:
@@ -162,13 +152,7 @@ class YawZero:
         self._from = self._goal = heading_rad if config.yaw_frame == "heading" else 0.0
 
     def follow(self, t_s: float, velocity: Float, covariance: Float) -> None:
-        """Update the zero with the actor's motion.
-
-        Args:
-            t_s: now, not before an earlier one.
-            velocity: [3] m/s.
-            covariance: [2, 2] of position and velocity, per axis.
-        """
+        """Update the zero at a time with the actor's velocity [3] and its covariance [2, 2] per axis."""
         self._from, self._from_s = float(self.at(np.array([t_s]))[0]), t_s
         speed_mps = math.hypot(velocity[0], velocity[1])
         if speed_mps >= max(self._least_mps, MIN_SPEED_SIGMAS * math.sqrt(covariance[1, 1])):

@@ -440,17 +440,11 @@ def best_teams(
 ) -> Int64:
     """Find states of a team that are worth flying: [K, n, T], the cheapest first.
 
-    The cost is the sum of the slots' prices, of turning and of the logarithm of the predicted error. It is
-    descended, drone by drone until none can be improved alone, from the plan before, from the cheapest
-    formation of equal spacing, and from the cheapest one with the error left out. That descent stays at the
-    tilt and range that are asked for. The last one starts from nothing: the drone with the dearest slots
-    chooses first, and the others make room. The cheapest formation is a result, too.
-
-    Args:
-        price: [T, S] cost of a drone in each state.
-        free: [T, S] share of the view that is free, 0 to 1.
-        commanded: [n, 3] slots now.
-        before: [n, T] the plan before.
+    The cost is the sum of the slots' prices [T, S], of turning from the commanded slots [n, 3], and of the
+    logarithm of the predicted error of the free shares [T, S]. It is descended, drone by drone until none
+    can be improved alone: from the plan before [n, T], from the cheapest formation of equal spacing, from
+    the cheapest one with the error left out (at the tilt and range that are asked for), and from nothing:
+    the drone with the dearest slots chooses first. The cheapest formation is a result, too.
     """
     formation = _cheapest_formation(price, free, views, w, commanded)
     plain = _cheapest_formation(price, free, views, TeamWeights(0.0, w.prior, w.apart_m), commanded)
@@ -488,24 +482,6 @@ def _turn_the_shorter_way(slots: Float) -> None:
 
 
 @cached
-def _weighed(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
-    """Compute C [T, S] of costs [T, S, n]; see `cost_map`."""
-    return _weigh(obstacle, share, w_obs, w_occ)
-
-
-@cached
-def _cheapest_sequence(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
-    """Find the cheapest sequence; see `best_sequence`."""
-    return _search(cost, lattice, start)
-
-
-@cached
-def turn_the_shorter_way(slots: Float) -> None:
-    """Make the yaws of slots [T, n, 3] continuous, from knot to knot, in place."""
-    _turn_the_shorter_way(slots)
-
-
-@cached
 def cheapest_slots(
     grid: Grid, sight: Sight, actor: Float, formations: Formations, w: SlotWeights, commanded: Float
 ) -> Float:
@@ -532,13 +508,9 @@ def cheapest_slots(
 
 
 def lattice(states: Float, *, rates: Float, knot_s: float, w_turn: float) -> Lattice:
-    """Connect states that are within reach of each other.
+    """Connect states [S, 3] (yaw rad, tilt rad, range m) that are within reach of each other.
 
-    Args:
-        states: [S, 3] yaw (rad), tilt (rad), range (m).
-        rates: [3] largest change of each per second, above 0: reach does not depend on the lattice's spacing.
-        knot_s: the time between knots.
-        w_turn: cost of 2 s of change at the full rate (45 deg at the default 22.5 deg/s).
+    `rates` [3] are the largest changes per second, `w_turn` the cost of 2 s of change at the full rate.
     """
     time_s = _time_between(states[:, None], states, rates)
     reach, cost = time_s.max(axis=-1), w_turn / 2.0 * time_s.sum(axis=-1)
@@ -558,6 +530,7 @@ def _time_between(start: Float, goal: Float, rates: Float) -> Float:
     return np.abs(way) / rates
 
 
+@cached
 def best_sequence(cost: Float, grid: Lattice, start: Float) -> tuple[Int64, float]:
     """Find the cheapest way through a finite cost map [T, S]: [T] indices of states, and the sum of costs.
 
@@ -565,7 +538,13 @@ def best_sequence(cost: Float, grid: Lattice, start: Float) -> tuple[Int64, floa
     rates allow, or else the nearest state. Ties are broken in favour of the same state, or else the nearest
     one.
     """
-    return _cheapest_sequence(np.ascontiguousarray(cost), grid, start)
+    return _search(cost, grid, start)
+
+
+def turn_the_shorter_way(slots: Float) -> None:
+    """Make the yaws of slots [T, n, 3] continuous, from knot to knot, in place."""
+    steps = wrapped(np.diff(slots[..., YAW], axis=0))
+    slots[1:, :, YAW] = slots[0, :, YAW] + np.cumsum(steps, axis=0)
 
 
 class SlotCosts(NamedTuple):
@@ -599,4 +578,5 @@ def costs_in_frame(field: DistanceField, actor: Forecast, slots: Float, config: 
 
 def cost_map(costs: SlotCosts, config: PlannerConfig) -> Float:
     """Compute C [T, S] = w_obs sum O + w_occ sum of occupied shares over the drones."""
-    return _weighed(costs.obstacle, costs.occluded, config.w_obs, config.w_occ)
+    cost: Float = config.w_obs * costs.obstacle.sum(axis=-1) + config.w_occ * costs.occluded.sum(axis=-1)
+    return cost

@@ -349,18 +349,11 @@ def _apart(a: Float, b: Float) -> float:
 def least_distances(
     grid: Grid, states: Float, stopped: int, others: Float, ahead: Float, people: Float, period_s: float
 ) -> tuple[float, float, float]:
-    """Compute the least distances of a motion to obstacles and drones, and of its plan to people.
+    """Compute the least distances of a motion to obstacles and drones, and of its plan to people, or inf.
 
-    People may walk on as forecast, or stop where they are. Without drones or people the distance is inf.
-
-    Args:
-        grid: obstacles and zones.
-        states: [K + 1, 4, 3] the motion, at rest from row `stopped` on.
-        stopped: that row.
-        others: [M, K + 1, 3] positions of the other drones.
-        ahead: [A, 4, 3] the motion along the plan, without the stop.
-        people: [P, A or more, 3] positions of people.
-        period_s: time between rows.
+    The motion `states` [K + 1, 4, 3] is at rest from row `stopped` on; `others` [M, K + 1, 3] are the other
+    drones; `ahead` [A, 4, 3] is the motion along the plan without the stop. People [P, A or more, 3] may
+    walk on as forecast, or stop where they are.
     """
     drones_m = people_m = math.inf
     for k in range(states.shape[0]):

@@ -107,13 +107,11 @@ def load_flight(
 ) -> LoggedFlight:
     """Read the flight, cut to the time in which the actor and all moving cameras are known.
 
-    Args:
-        reconstructed: the record of stage `reconstruct`, None where that has not run.
-        pose_noise: errors of the poses, in place of those stated in the session.
+    `reconstructed` is the record of stage `reconstruct`, `pose_noise` replaces the errors stated in the
+    session.
 
     Raises:
-        DataError: the actor's position is unknown, or not known while the cameras flew; an unknown noise
-            model.
+        DataError: the actor's position is unknown, or not while the cameras flew; an unknown noise model.
     """
     warnings: list[str] = []
     skeleton, skeleton_source = _skeleton(folder, description, reconstructed)
@@ -163,9 +161,7 @@ def points_at(motion: JointMotion, t_ns: Int64) -> Float:
 
 
 def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> tuple[Float, Float, Bool]:
-    """Interpolate the true poses of the cameras.
-
-    Returns positions [N, T, 3], quaternions [N, T, 4] and a mask of known poses [N, T].
+    """Interpolate the true poses of the cameras: [N, T, 3], [N, T, 4], and a mask [N, T] of known ones.
 
     Positions are linear across gaps of the log, so that a flight can be scored as a whole.
     """

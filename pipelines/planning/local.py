@@ -17,7 +17,6 @@ threads and no fastmath: the same numbers give the same bytes.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -286,8 +285,8 @@ def _descend(
     iterations: int,
     tolerance: float,
     step_cap_m: float,
-) -> tuple[Float, float, int]:
-    """Improve a path [N + 3, 3]; return the new path, its cost, and the number of evaluations."""
+) -> tuple[Float, float]:
+    """Improve a path [N + 3, 3]; return the new path and its cost."""
     n = slots.shape[0]
     path, tried = path.copy(), path.copy()
     gradient, tried_gradient, step = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
@@ -295,7 +294,7 @@ def _descend(
     cost = _total(path, slots, actor, others, grid, w, terms, gradient)
     eta = 1.0
     fresh = True
-    for used in range(1, iterations):
+    for _ in range(1, iterations):
         if fresh:
             _apply_inverse(factor, gradient, step)
             expected = largest = 0.0
@@ -304,7 +303,7 @@ def _descend(
                     expected += gradient[i, axis] * step[i, axis] / 2.0
                     largest = max(largest, abs(step[i, axis]))
             if expected < tolerance:
-                return path, cost, used
+                return path, cost
         scale = min(1.0 / eta, step_cap_m / largest)
         for i in range(n):
             for axis in range(3):
@@ -319,17 +318,8 @@ def _descend(
         else:
             eta *= 3.0
             if eta > MAX_ETA:
-                return path, cost, used + 1
-    return path, cost, iterations
-
-
-@dataclass(frozen=True)
-class LocalPlan:
-    """Result of the local planner."""
-
-    plan: DronePlan
-    cost: float
-    evaluations: int
+                return path, cost
+    return path, cost
 
 
 class LocalPlanner:
@@ -351,30 +341,24 @@ class LocalPlanner:
         others: Sequence[DronePlan],
         field: DistanceField,
         previous: DronePlan | None,
-    ) -> LocalPlan:
-        """DronePlan from the drone's place and velocity.
+    ) -> DronePlan:
+        """Plan from the drone's place and velocity [3].
 
-        Args:
-            position: [3] metres, world.
-            velocity: [3] m/s.
-            slots: [N, 3] wanted places of the drone at each waypoint's time.
-            actor: [N, 3] forecast of the actor then.
-            others: the latest plans of the other drones.
-            previous: this drone's previous plan, the initial guess; without one it is the slots.
+        `slots` and `actor` [N, 3] are the wanted places of the drone and the forecast at each waypoint's
+        time, `others` the latest plans of the other drones, and `previous` this drone's plan before, the
+        initial guess; without one it is the slots.
         """
         config = self._config
         times = t_s + config.tuning.waypoint_s * np.arange(1, config.tuning.waypoints + 1, dtype=np.float64)
         waypoints = np.stack([p.at(np.append(t_s, times))[0] for p in others]) if others else _nobody(times)
         guess = slots if previous is None else previous.at(times)[0]
-        path, cost, evaluations = self._descended(position, velocity, guess, slots, actor, waypoints, field)
+        path, cost = self._descended(position, velocity, guess, slots, actor, waypoints, field)
         if previous is not None and np.linalg.norm(path[-1] - slots[-1]) > ASTRAY_M:
             # Caught behind something: descend once more from the slots, and take the better result.
             other = self._descended(position, velocity, slots, slots, actor, waypoints, field)
-            evaluations += other[2]
             if other[1] < cost:
-                path, cost = other[:2]
-        plan = DronePlan(t_s, path[2:].copy(), velocity.copy(), config.tuning.waypoint_s)
-        return LocalPlan(plan, cost, evaluations)
+                path = other[0]
+        return DronePlan(t_s, path[2:].copy(), velocity.copy(), config.tuning.waypoint_s)
 
     def _descended(
         self,
@@ -385,8 +369,8 @@ class LocalPlanner:
         actor: Float,
         others: Float,
         field: DistanceField,
-    ) -> tuple[Float, float, int]:
-        """Descend from a guess [N, 3]: path [N + 3, 3], cost, evaluations. `others` is [M, N + 1, 3]."""
+    ) -> tuple[Float, float]:
+        """Descend from a guess [N, 3]: path [N + 3, 3] and cost. `others` is [M, N + 1, 3]."""
         config = self._config
         return _descend(
             _with_start(position, velocity, guess, config.tuning.waypoint_s),

@@ -1,13 +1,12 @@
 """Replay of an arm: its planner in flight (`Pilot`), offline, against the logged actor and the maps.
 
-Equal arguments give equal replays, but for the measured times. No measurement or map is used before its
+Equal arguments give equal replays. No measurement or map is used before its
 time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -43,14 +42,6 @@ class Start(NamedTuple):
     heading_rad: float = 0.0  # the actor's before walking, from east, if `yaw_frame` is `heading`
 
 
-@dataclass
-class PlanningTimes:
-    """Measured seconds of every planning call; they differ from run to run."""
-
-    central_s: list[float]
-    local_s: list[float]
-
-
 @dataclass(frozen=True)
 class Replay:
     """A replayed flight of N cameras at T times, one per tracking step."""
@@ -64,7 +55,6 @@ class Replay:
     estimate: Float  # [N, T, 3] the planner's estimate of whom each camera films
     aim: Float  # [N, T, P] shares of people in the place that each camera films
     safety: dict[str, int]  # local plannings by `guard.FlownMotion`
-    times: PlanningTimes
 
     @property
     def t_s(self) -> Float:
@@ -100,11 +90,10 @@ class Pilot:
         start: Start,
         *,
         weights: Sequence[float] = (1.0,),
-        clock: Callable[[], float] = perf_counter,
     ) -> None:
         if not 1 <= start.drones <= MOST_DRONES:
             raise ValueError(f"{start.drones} drones: 1 to {MOST_DRONES} can be planned for")
-        self._config, self._clock = config, clock
+        self._config = config
         self._zero = YawZero(config, start.heading_rad)
         yaw_rad = start.yaw_rad - float(self._zero.at(np.zeros(1))[0])
         self._formation_planner = arm.start(config, drones=start.drones, yaw_rad=yaw_rad)
@@ -123,7 +112,6 @@ class Pilot:
         self._next_central_s = self._next_local_s = -np.inf
         self.guard: Guard | None = None
         """Filter of the local plans: it decides which motion is flown. Set by a replay; None otherwise."""
-        self.times = PlanningTimes([], [])
 
     def measure(self, t_s: float, position: Float, person: int = 0) -> None:
         """Take in the position [3] of the actor or of one of several people: the hips' middle, m, world.
@@ -182,7 +170,6 @@ class Pilot:
 
     def _plan_formation(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
         config = self._config
-        started = self._clock()
         knots = t_s + config.tuning.knot_s * np.arange(1, config.horizon_knots + 1, dtype=np.float64)
         commanded = self._formation.at(np.array([t_s]))[0]
         if config.yaw_frame == "heading":
@@ -194,7 +181,6 @@ class Pilot:
                 self._roll_out, t_s=t_s, position=position, velocity=velocity, field=field
             )
         self._formation = self._formation_planner.plan(t_s, commanded, actor, field)
-        self.times.central_s.append(self._clock() - started)
 
     def _wanted_ahead(self, path: FormationPath, t_s: float) -> tuple[Float, Float]:
         """Return wanted places of drones [T, N, 3] and the places [N, T, 3] that they film, at waypoints."""
@@ -210,7 +196,7 @@ class Pilot:
         wanted, aimed = self._wanted_ahead(path, t_s)
         made: list[DronePlan] = []
         for i, previous in enumerate(self._plans):
-            local = self._local_planner.plan(
+            plan = self._local_planner.plan(
                 t_s,
                 position[i],
                 velocity[i],
@@ -220,13 +206,12 @@ class Pilot:
                 field=field,
                 previous=previous,
             )
-            made.append(local.plan)
+            made.append(plan)
         return np.stack([plan.path[1:] for plan in made]), aimed[0]
 
     def _plan_locally(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
         slots, aimed = self._wanted_ahead(self._formation, t_s)
         for i in range(len(self._plans)):
-            started = self._clock()
             made = self._local_planner.plan(
                 t_s,
                 position[i],
@@ -237,9 +222,8 @@ class Pilot:
                 field=field,
                 previous=self._plans[i],
             )
-            self.times.local_s.append(self._clock() - started)
             self._plans[i] = (
-                made.plan if self.guard is None else self.guard.admit(i, t_s, made.plan, self._filter, field)
+                made if self.guard is None else self.guard.admit(i, t_s, made, self._filter, field)
             )
 
 
@@ -251,26 +235,18 @@ def replay(
     start: Start,
     *,
     config: PlannerConfig,
-    seed: int = 0,
     weights: Sequence[float] = (1.0,),
-    clock: Callable[[], float] = perf_counter,
 ) -> Replay:
     """Fly an arm against a log.
 
-    The drones start in their slots, at rest, and fly what `guard.Guard` admits. The actor is measured as
-    logged, with `actor_noise_m` added from the seed. Several people are one actor for most arms, their
-    weighted middle; `group` decides whom each drone films.
+    The drones start in their slots, at rest, and fly what `guard.Guard` admits. Several people are one actor
+    for most arms, their weighted middle; `group` decides whom each drone films.
 
     Args:
-        arm: the planner of the cameras' slots.
-        actor_t_ns: [A] stamps of the log, ascending, at least two.
         actor: [A, 3] metres, world, the middle of the hips; or [A, P, 3] of several people. Who is NaN was
             not measured then. The replay lasts while everybody is measured.
         fields: the maps by the time from which they hold; before the first one nothing is known.
-        start: the formation at the start.
-        config: weights and rates, the same for all arms of a comparison.
         weights: of the people.
-        clock: seconds, to measure planning times.
 
     Raises:
         ValueError: times that do not ascend, fewer than two measurements, an impossible number of drones.
@@ -283,8 +259,6 @@ def replay(
         raise ValueError("a replay needs two measurements of the actor or more, their stamps ascending")
     first, last = int(known.argmax(axis=0).max()), len(t_ns) - int(known[::-1].argmax(axis=0).max())
     log_s = (t_ns - t_ns[first]) / 1e9
-    noise = np.random.default_rng(seed).normal(size=measured.shape)
-    noisy = measured + config.tuning.actor_noise_m * noise
     maps = sorted(fields, key=lambda field: field.from_ns)
     replay_ns = tracking_times(t_ns[first:last], config)
     map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")
@@ -293,9 +267,9 @@ def replay(
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
 
     weight = np.array(weights, dtype=np.float64)
-    pilot = Pilot(arm, config, start, weights=weights, clock=clock)
+    pilot = Pilot(arm, config, start, weights=weights)
     for row, person in np.argwhere(known[: first + 1]):
-        pilot.measure(log_s[row], noisy[row, person], person)
+        pilot.measure(log_s[row], measured[row, person], person)
     first_slots, first_estimate = pilot.wanted(np.zeros(1))
     guard = pilot.guard = Guard(first_estimate[:, 0] + slot_offsets(first_slots[0]), config)
     shape = (start.drones, len(replay_ns), 3)
@@ -306,7 +280,7 @@ def replay(
     while k < len(times_s):
         if taken_in[k] > done:
             for row, person in np.argwhere(known[done : taken_in[k]]):
-                pilot.measure(log_s[done + row], noisy[done + row, person], person)
+                pilot.measure(log_s[done + row], measured[done + row, person], person)
             done = int(taken_in[k])
         pilot.replan(float(times_s[k]), guard.position, guard.velocity, fields_known[map_at[k]])
         measured_next = int(np.searchsorted(taken_in, done, side="right"))
@@ -326,5 +300,4 @@ def replay(
         estimate=estimate,
         aim=aim,
         safety={kind.value: guard.counts[kind] for kind in FlownMotion},
-        times=pilot.times,
     )

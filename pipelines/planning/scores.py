@@ -108,15 +108,9 @@ def _minors(matrix: Float) -> tuple[Float, Float]:
 
 
 def hidden_by_people(camera: Float, target: Float, people: Float) -> Bool:
-    """Test if somebody's body, an upright cylinder, stands in a sight line.
+    """Test [...] if somebody's body, an upright cylinder, stands in a line of sight.
 
-    Args:
-        camera: [..., 3] metres, world.
-        target: [..., 3] metres, world.
-        people: [Q, ..., 3] metres, world; hips of those who may stand in the way, not of the target.
-
-    Returns:
-        [...], all shapes broadcast.
+    Camera and target are [..., 3] m, world; people [Q, ..., 3] the hips of those who may stand in the way.
     """
     way, aside = target - camera, people - camera
     level = np.maximum((way[..., :2] ** 2).sum(axis=-1), 1e-12)
@@ -137,17 +131,11 @@ def sights(
     maps: DistanceField | MapsInTurn,
     config: PlannerConfig,
 ) -> Bool:
-    """Test [P, N, T] which cameras see which people.
+    """Test [P, N, T] which cameras [N, T, 3] see which people [P, T, 3] (the middle of the hips).
 
-    The person is in the level field of view, and neither the map nor anybody else stands between. A single
-    person is in the picture of every camera that films them, so that only the map counts.
-
-    Args:
-        camera: [N, T, 3] metres, world.
-        looks_rad: [N, T] yaw of the optical axis from east.
-        people: [P, T, 3] metres, world, the middle of the hips.
-        maps: the distance field, or the map of each of the T moments.
-        config: `sight_start_m` and the field of view.
+    The person is in the level field of view of the axis' yaw [N, T], and neither the map of each moment nor
+    anybody else stands between. A single person is in the picture of every camera, so that only the map
+    counts.
     """
     seen = []
     for p, person in enumerate(people):
@@ -180,28 +168,15 @@ def score(
     people: Float | None = None,
     seen: Bool | None = None,
 ) -> Scores:
-    """Compute the figures of one flight.
+    """Compute the figures of one flight, JSON-able: degrees and metres by name, None where nothing counts.
 
-    Args:
-        t_s: [T] seconds, ascending, at least four of them over half a second or more.
-        position: [N, T, 3] metres, world, the cameras; finite.
-        actor: [T, 3] metres, world; finite. Or [N, T, 3], whom each camera films.
-        maps: the distance field, or the map of each moment.
-        config: limits, no-fly zones, `sight_start_m` and the ray model.
-        people: [P, T, 3] metres, world, if there are several. Shares and errors are means over them, and
-            distances to the actor are those to the nearest of them.
-        seen: [P, N, T] who is seen from which camera; by default sight lines to the actor that are free.
-
-    Returns:
-        JSON-able: degrees and metres by name; None where there is nothing to count (no pair of drones,
-        no obstacle at all). `limit_violations` counts episodes per drone (per pair for
-        separation): in an obstacle (`collision`), within `drone_radius_m` of one (`clearance`), within
-        `actor_distance_m` of the actor (`actor`), in a no-fly zone (`zone`), and beyond
-        the other limits of the configuration. `path_m` is the mean length of a drone's way, `energy_kj` the
-        mean propulsion energy of a drone (`propulsion_w`), `blind_s` the time in which fewer than two drones
-        see the actor.
-        `predicted_error_m` is sqrt(tr S) of the ray model over the times at which two free views or more
-        determine it, `undetermined_share` the share of the others.
+    `position` [N, T, 3] m are the cameras at `t_s` [T], `actor` [T, 3] or [N, T, 3] whom they film; all
+    finite. `people` are [P, T, 3] if there are several: shares and errors are means over them, distances are
+    those to the nearest. `seen` is [P, N, T], by default the free lines of sight to the actor.
+    `limit_violations` counts episodes of each drone (of each pair for separation). `path_m` and `energy_kj`
+    are means over drones, `blind_s` is the time in which fewer than two of them see the actor.
+    `predicted_error_m` is sqrt(tr S) of the ray model over the times at which two free views or more
+    determine it.
     """
     slots = slot_of(position - actor)
     tilt_deg = np.degrees(slots[..., TILT])
@@ -258,22 +233,13 @@ def blind_s(t_s: Float, seen: Bool) -> float:
 def coverage(
     position: Float, looks_rad: Float, people: Float, heading_rad: Float, *, fov_rad: float
 ) -> Float:
-    """Compute how densely one camera sees the faces of people, up to the camera's constant.
+    """Compute how densely one camera sees the faces of people, [..., A, 7] 1/m^2: six sides and the lid.
 
-    Each face counts with c = |d look| (-d n) / |d|^4 where d is from the camera to the face's centre and n
-    its normal: pixels per area, times the cosine of the view (Hughes et al., "Multi-Robot Planning for
-    Filming Groups of Moving Actors Leveraging Submodularity and Pixel Density", CDC 2024). Faces that look
-    away have 0, and so have people whose axis is out of the level field of view. Nobody hides anybody.
-
-    Args:
-        position: [..., 3] metres, world; the camera.
-        looks_rad: [...] yaw of its optical axis from east; the axis is level.
-        people: [..., A, 3] metres, world; the centres of the prisms' sides.
-        heading_rad: [..., A] yaw from east.
-        fov_rad: level field of view.
-
-    Returns:
-        [..., A, 7] 1/m^2: six sides and the lid.
+    Each face counts with c = |d look| (-d n) / |d|^4 where d is from the camera [..., 3] to the face's
+    centre and n its normal: pixels per area, times the cosine of the view (Hughes et al., "Multi-Robot
+    Planning for Filming Groups of Moving Actors Leveraging Submodularity and Pixel Density", CDC 2024).
+    Faces that look away have 0, and so have people [..., A, 3] (centres of the sides) out of the level field
+    of view. Nobody hides anybody. Yaws are from east, the axis [...] is level, people have theirs [..., A].
     """
     normal, centre = _faces(people, heading_rad)
     look = np.stack([np.cos(looks_rad), np.sin(looks_rad), np.zeros_like(looks_rad)], axis=-1)

@@ -157,18 +157,11 @@ def roll_out(
     flying: Flying,
     states: Float,
 ) -> int:
-    """Follow a plan for some periods and then brake to a stop.
+    """Follow a plan for some periods and then brake to a stop; return the row of the stop.
 
-    Args:
-        path: [N + 1, 3] m, of the plan, as the next two.
-        start_velocity: [3] m/s.
-        after_s: time from the start of the plan to the drone's first state.
-        ticks: number of periods for which the plan is followed.
-        flying: gains, limits and period.
-        states: [K + 1, 4, 3]; the first is the drone's state, the others are written.
-
-    Returns:
-        The row at which the drone stands still; all that follow are like it.
+    The plan is `path` [N + 1, 3] m, its first velocity and step; `after_s` is the time from its start to the
+    drone's state `states[0]`. The others of `states` [K + 1, 4, 3] are written; all after the stop are like
+    it.
     """
     x, v, a, wanted, scratch = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     braking = min(BRAKING_PER_S, 0.5 * flying.jerk_mps3 / flying.acceleration_mps2)

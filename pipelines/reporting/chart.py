@@ -674,9 +674,7 @@ def write_figures(
 ) -> None:
     """Write `<figure>.png`, `.svg`, `.pdf` and `.csv` of every figure into an empty folder, and the mark.
 
-    Args:
-        contents: the sessions that they are of, by label; the mark names their flights.
-        key: equal for equal figures; it is stored in the mark.
+    The mark names the flights of `contents` and holds `key`, which is equal for equal figures.
     """
     listed = []
     for figure in figures:
@@ -706,11 +704,7 @@ def write_drawing(folder: Path, name: str, figure: Figure) -> list[str]:
 
 
 def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
-    """Refuse to write figures over what is not ours.
-
-    Args:
-        folder: the folder for figures; its old contents are removed.
-        overwrite: replace other people's files; sessions and their parts are never replaced.
+    """Refuse to write figures over what is not ours; with `overwrite` only over sessions and their parts.
 
     Raises:
         DataError: a session, a part of one, or a folder that contains one; a file, or a folder that contains

@@ -57,7 +57,7 @@ MAX_BANDS = 3
 # Focal lengths closer than this factor make pixels of the same size.
 SAME_LENS_FACTOR = 1.02
 
-_OVER_TIME = ("predicted", "tilt", "share")
+_OVER_TIME = ("predicted", "share")
 _ARROW = {"less": " (less is better)", "more": " (more is better)", "": ""}
 _WHAT = {"mpjpe": "from the truth", "reprojection": "from the keypoints in the pictures"}
 
@@ -68,10 +68,8 @@ def render_comparison(contents: Mapping[str, SessionContent]) -> str:
     figures: dict[str, Block] = {figure.key: figure for figure in draw_comparison(comparison)}
     sentences = [_sentence(pair) for pair in comparison.pairs]
     doubts = list(dict.fromkeys(_doubts(comparison)))
-    measure = shown_measure(comparison)
     tables = [_measures_table(comparison), *map(_pair_table, range(len(comparison.pairs)), comparison.pairs)]
     bars = [figures.pop("compare-joints")] if "compare-joints" in figures else []
-    folded = [] if measure is None else [Fold("Every joint", [_joints_table(comparison, measure)])]
     made: list[Block] = [
         _sessions_table(comparison),
         Fold("Settings that differ", [_settings_table(comparison)]),
@@ -99,7 +97,7 @@ def render_comparison(contents: Mapping[str, SessionContent]) -> str:
             Section(
                 "measures", "Measures", [*(tables if comparison.measures else []), how, *figures.values()]
             ),
-            Section("joints", "Joint by joint", [*bars, *folded]),
+            Section("joints", "Joint by joint", bars),
             Section("made", "How they were made", made),
         ],
         footer="What is doubtful about each session, and its pictures, stand on its own page.",
@@ -155,17 +153,6 @@ def _pair_table(k: int, pair: Pair) -> Table:
     how = "moment by moment" if pair.by_time else "joint by joint"
     caption = f"“{pair.other.label}” less “{pair.first.label}”, paired {how}."
     return Table(f"pair-{k + 1}", caption, columns, rows, "arms")
-
-
-def _joints_table(comparison: Comparison, measure: Measure) -> Table:
-    columns = [Column("Joint", text=True), *(Column(one.label) for one in comparison.sessions)]
-    estimates = [one.per_joint.get(measure.key, {}) for one in comparison.sessions]
-    rows = [
-        [joint_label(name), *(_cell(of.get(name), measure) for of in estimates)]
-        for name in joints_of(comparison)
-    ]
-    caption = f"{measure.label} of every joint in {measure.unit}, below it the 95 % interval."
-    return Table("joints-table", caption, columns, rows, "arms")
 
 
 def _sessions_table(comparison: Comparison) -> Table:
@@ -385,12 +372,12 @@ def _over_time(comparison: Comparison, measure: Measure) -> Figure:
             centres, values = (bins[:-1] + bins[1:]) / 2, one.values[of.key].values
             colour, style = colour_and_style(comparison.sessions.index(one))
             middle, low, high = percentiles(values, seconds[one.label], bins)
-            if of.key in {"share", "tilt"}:
+            if of.key == "share":
                 middle = means(values, seconds[one.label], bins)
             banded = of is measure and len(there) <= MAX_BANDS
             ends = (low, high) if banded else (None, None)
             lines.append(Line(centres, middle, colour, one.label, ends[0], ends[1], style))
-        span = (0, 104) if of.unit == "%" else None if of.key == "tilt" else (0, None)
+        span = (0, 104) if of.unit == "%" else (0, None)
         label = f"{of.name.replace(' ', chr(10))}\n({of.unit})"
         panels.append([Panel(lines, TIME_LABEL if of is shown[-1] else "", label, y_span=span)])
     first, last = min(s[0] for s in seconds.values()), max(s[-1] for s in seconds.values())
@@ -398,7 +385,7 @@ def _over_time(comparison: Comparison, measure: Measure) -> Figure:
     heights = [1.5, *[1.1] * (len(shown) - 1)]
     caption = (
         "Errors are medians over joints, with the range from the 10th to the 90th percentile of up to three"
-        " sessions; tilt and share are means. Times of flights without the same motion count from the"
+        " sessions; shares are means. Times of flights without the same motion count from the"
         " first frame of each."
     )
     title = f"{measure.label} over time, and what goes with it"

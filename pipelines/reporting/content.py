@@ -58,7 +58,6 @@ class SessionContent:
     stages: dict[str, dict[str, object]]  # stage: its stage.json
     replan: ReplanContent | None = None
     refined: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where refined
-    true_poses: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where known
     made_by: dict[str, dict[str, str]] = field(default_factory=dict)  # stage: program or library, and version
     outdated: tuple[str, ...] = ()  # stages whose inputs have changed since
     angles: pd.DataFrame | None = None  # tables.ANGLES, where the reconstruction has them

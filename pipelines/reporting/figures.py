@@ -69,12 +69,7 @@ def draw_all(
     residuals: Mapping[str, tuple[Float, Float]] | None = None,
     angles: pd.DataFrame | None = None,
 ) -> list[Figure]:
-    """Draw every figure that the session has the data for.
-
-    Args:
-        residuals: of each camera the times in s and the distances in px, as `residuals_over_time` gives them.
-        angles: tables.ANGLES.
-    """
+    """Draw every figure that the session has the data for."""
     motion = summary.motion
     measured = motion if motion is not None and motion.measured.any() else None
     figures: list[Figure | None] = [_timeline(summary.cameras)]

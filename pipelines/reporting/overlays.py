@@ -108,12 +108,7 @@ class OverlayMoment:
 def collect_moments(
     content: SessionContent, summary: Summary, read_frame: ReadFrame | None
 ) -> tuple[OverlayMoment, ...]:
-    """Collect the cameras' views at a few moments; nothing without a skeleton or without keypoints.
-
-    Args:
-        content: with `frames` and `keypoints` of the cameras that have them.
-        read_frame: reads the pictures, where there are any.
-    """
+    """Collect the cameras' views at a few moments; nothing without a skeleton or without keypoints."""
     motion = summary.motion
     if motion is None or not motion.measured.any():
         return ()
@@ -158,13 +153,8 @@ def residuals_over_time(
 ) -> dict[str, tuple[Float, Float]]:
     """Compute each camera's median distance between keypoints and joints, in at most so many of its frames.
 
-    Args:
-        content: as for `collect_moments`.
-        most: the largest number of frames of a camera, evenly spread.
-
-    Returns:
-        For each camera with keypoints the times [N] of its frames in s, and the medians [N] in px, NaN where
-        nothing can be compared.
+    Return for each camera with keypoints the times [N] in s and the medians [N] px, NaN where nothing can be
+    compared.
     """
     motion = summary.motion
     if motion is None or not motion.measured.any():
@@ -188,14 +178,10 @@ def _largest_mm(error_mm: Float | None, row: int) -> float | None:
 def choose_moments(motion: MeasuredMotion, error_mm: Float | None = None) -> tuple[list[int], int]:
     """Choose rows of the motion to show, in order, and the worst of them.
 
-    Each of `MOMENTS` equal stretches gives one: the stretch with the worst time gives that, every other the
-    time with the most joints, nearest its middle. Where truth is known, the worst is the time of the largest
-    error of a measured joint: views may agree on legs that were swapped. Without truth it is the
-    time with the largest median reprojection error, where at least half of the most joints were measured,
-    just before and after as well: one wrong joint does not make a moment.
-
-    Args:
-        error_mm: [T, P, J] its distance from truth; None where there is none.
+    Each of `MOMENTS` equal stretches gives the time with the most joints, nearest its middle, and the worst
+    one itself. Where truth is known (`error_mm` [T, P, J]), the worst is the time of the largest error of a
+    measured joint: views may agree on legs that were swapped. Else it has the largest median reprojection
+    error among the times with at least half of the most joints, just before and after as well.
     """
     count = motion.measured.sum(axis=(1, 2))
     around = np.concatenate([count[:1], count, count[-1:]])
@@ -220,14 +206,9 @@ def choose_moments(motion: MeasuredMotion, error_mm: Float | None = None) -> tup
 
 
 def match_people(reprojected: Float, found: Float) -> list[int | None]:
-    """Match people to detections: the nearest one, each taken once, none too far away.
+    """Match people [P, J, 2] px to detections [D, J, 2] px: the nearest one, each taken once.
 
-    Args:
-        reprojected: [P, J, 2] px, NaN where a joint is not known.
-        found: [D, J, 2] px, likewise.
-
-    Returns:
-        For each person the index of a detection; None where none lies within half the body's size.
+    Return for each person the index of a detection; None where none lies within half the body's size.
     """
     matches: list[int | None] = []
     for body in reprojected:
@@ -312,10 +293,6 @@ def angles_at(motion: MeasuredMotion, angles: pd.DataFrame, name: str, t_ns: Int
     """Interpolate a joint angle and its standard deviation to [N] times, as the skeleton is; [N, P, 2] deg.
 
     NaN where a neighbour in time is not determined. Values lie within 180 deg of 0.
-
-    Args:
-        angles: tables.ANGLES.
-        name: of `geometry.joint_angles.ANGLES`.
     """
     own = angles[angles["angle"] == name]
     times, persons = (np.unique(angles[column]) for column in ("t_ns", "person"))
@@ -343,11 +320,8 @@ def views_of(
 ) -> list[OverlayView]:
     """Reproject the skeleton into frames of a camera, beside the detections there; no pictures.
 
-    Args:
-        at: [N] rows of its frames.
-        motion: the skeleton; interpolated to the frames' times, never across a gap or a missing joint.
-        status: [N, P, J] of the joints at these frames, index into triangulation.STATUS.
-        origin_ns: the zero of the views' times.
+    `at` [N] are rows of its frames and `status` [N, P, J] that of the joints there. The skeleton is
+    interpolated to the frames' times, never across a gap or a missing joint.
     """
     frame, t_ns = camera.frame[at], camera.frame_t_ns[at]
     skeleton = interpolate_points(
@@ -389,18 +363,10 @@ def views_of(
 
 
 def seen_spread(points: Float, covariance: Float, world_from_camera: Float, lens: Intrinsics) -> Float:
-    """Propagate the covariance of joints into a picture, to first order: J R' S R J'.
+    """Propagate the covariance of joints [..., 6] m^2 (world, upper triangle) into a picture: J R' S R J'.
 
-    It is that of the joints alone: the camera's pose is taken as exact.
-
-    Args:
-        points: [..., 3] m, in the camera.
-        covariance: [..., 6] m^2, in the world: xx, xy, xz, yy, yz, zz.
-        world_from_camera: [..., 3, 3] rotations.
-        lens: the camera's; J is its derivative there, by central differences.
-
-    Returns:
-        [..., 2, 2] px^2, NaN where a number is missing.
+    It is that of the joints alone, [..., 2, 2] px^2, NaN where a number is missing: the camera's pose is
+    exact. Points [..., 3] m are in the camera; J is the lens's derivative there, by central differences.
     """
     step = DERIVATIVE_STEP * np.abs(points[..., 2])[..., None]
     columns = [
@@ -450,11 +416,9 @@ def refined_poses(folder: Path, record: StageRecord) -> dict[str, Trajectory]:
 def read_filmed(
     folder: Path, description: Description, record: StageRecord, frames: Mapping[str, pd.DataFrame]
 ) -> dict[str, FilmedCamera]:
-    """Read cameras with logged or refined poses, and frames by the estimated clocks.
+    """Read cameras with logged or refined poses, and frames (the tables) by the estimated clocks.
 
-    Args:
-        record: of its reconstruction: keypoints below its least confidence are left out.
-        frames: the frame tables of the cameras that are wanted.
+    Keypoints below the least confidence of the reconstruction's record are left out.
     """
     offset_ns = estimated_clocks(read_json(folder / "reconstruct" / "metrics.json"))
     refined = refined_poses(folder, record)

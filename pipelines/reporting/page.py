@@ -117,9 +117,8 @@ def _template(name: str, **context: object) -> Markup:
 def render_page(content: SessionContent, read_frame: ReadFrame | None = None, video: Video = "none") -> str:
     """Render the complete HTML of a session's report.
 
-    Args:
-        read_frame: reads the pictures behind the overlays; without it they are drawn on plain ground.
-        video: how many pictures stand beside the 3D view.
+    `read_frame` reads the pictures behind the overlays; without it they are drawn on plain ground. `video`
+    says how many pictures stand beside the 3D view.
     """
     summary = summarise(content)
     replan = _replan(summary, content)

@@ -114,21 +114,13 @@ def draw_frame(
     *,
     residuals: bool = False,
 ) -> Picture:
-    """Draw a view's skeleton and keypoints, and lines of text at the upper left, on a copy of a picture.
+    """Draw a view's skeleton and keypoints on a copy of a picture of any size, with text at the upper left.
 
     Bones and joints are coloured by the side of the body; NaN is not drawn. Thin ellipses are the 95 %
-    regions of the body's joints, by their own uncertainty alone. Rings are keypoints that were found, crosses
-    those of joints that were rejected (red) or not reconstructed (grey), small dots the keypoints of other
-    people. Four corners mark the box of a person's found keypoints, with a tenth to spare.
-
-    Args:
-        picture: [height, width, 3]; if its size differs from the camera's, it is the same view at another
-            scale.
-        view: the view to draw; its own picture is not used.
-        caption: lines of ASCII, or none; left out where the picture is too small to read them.
-        labels: in ASCII, each written beside its joint. A label is left out in small pictures, without its
-            joint, and where no room is left below the others.
-        residuals: draw a thin line from each keypoint to its joint, in place of the box of a person.
+    regions of the joints, by their own uncertainty alone. Rings are keypoints that were found, crosses those
+    of joints that were rejected (red) or not reconstructed (grey), small dots those of other people. Four
+    corners mark the box of a person's keypoints; with `residuals` a thin line leads from each keypoint to
+    its joint instead. Caption and labels are ASCII; they are left out where there is no room for them.
     """
     drawn = picture.copy()
     height, width = drawn.shape[:2]
@@ -506,13 +498,7 @@ def _moment(k: int, moment: OverlayMoment) -> Figure:
 def make_strips(
     content: SessionContent, summary: Summary, read_frame: ReadFrame | None, video: Video
 ) -> list[Strip]:
-    """Make the pictures of every camera that has any; nothing without a skeleton.
-
-    Args:
-        content: as for `collect_moments`.
-        read_frame: reads the pictures.
-        video: the budget for all cameras together.
-    """
+    """Make the pictures of every camera that has any, within the budget; nothing without a skeleton."""
     motion = summary.motion
     if video == "none" or read_frame is None or motion is None or not motion.measured.any():
         return []

@@ -19,7 +19,6 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.metrics import (
     Series,
     aligned_distances,
-    bone_lengths,
     interval_of,
     intervals,
     resampled,
@@ -27,9 +26,6 @@ from pipelines.geometry.metrics import (
 )
 from pipelines.reporting.content import MeasuredMotion, SessionContent, middles, text
 from pipelines.reporting.summary import Summary, summarise
-from pipelines.session.camera_poses import poses_at
-from pipelines.session.people import bones_of
-from pipelines.session.tables import trajectory_from
 
 # The field counts a joint as right within this distance (PCK at 150 mm).
 PCK_M = 0.15
@@ -79,8 +75,6 @@ MEASURES = (
         "reprojection", "Reprojection", "px", 2, "less", "mean distance from the keypoints, of the views used"
     ),
     Measure("share", "Reconstructed", "%", 1, "more", "share of joint-frames measured"),
-    Measure("visibility", "Visibility", "%", 1, "more", "share of the cameras that a joint was taken from"),
-    Measure("bones", "Bone length spread", "mm", 1, "less", "mean distance of bones from their usual length"),
     Measure(
         "predicted",
         "Predicted error",
@@ -89,7 +83,6 @@ MEASURES = (
         "less",
         "root of the trace of a joint's stated covariance, mean",
     ),
-    Measure("tilt", "Tilt", "deg", 1, "", "of the cameras above the actor, mean over cameras"),
 )
 MEASURE_OF = {measure.key: measure for measure in MEASURES}
 
@@ -213,7 +206,7 @@ def compare(contents: Mapping[str, SessionContent]) -> Comparison:
 
 def _judged(label: str, content: SessionContent) -> Judged:
     summary = summarise(content)
-    values = _values(content, summary, summary.motion) if summary.motion is not None else {}
+    values = _values(summary, summary.motion) if summary.motion is not None else {}
     t_ns = summary.motion.t_ns if summary.motion is not None else np.empty(0, dtype=np.int64)
     whole = {key: one.series() for key, one in values.items()}
     joints = {key: one.by_name() for key, one in values.items()}
@@ -236,17 +229,15 @@ def _estimates(series: Mapping[str, Series], t_ns: Int64) -> dict[str, Estimate]
     }
 
 
-def _values(content: SessionContent, summary: Summary, motion: MeasuredMotion) -> dict[str, Values]:
+def _values(summary: Summary, motion: MeasuredMotion) -> dict[str, Values]:
     """Return every measure that has a value at all."""
     position = motion.measured_position
     listed = motion.status >= 0
     people = position.shape[1]
-    cameras = max(len(content.keypoints), 1)
     variance = motion.covariance[..., [0, 3, 5]].sum(axis=-1)
     found = {
         "reprojection": np.where(motion.measured, motion.reprojection_px, np.nan),
         "share": np.where(listed, 100.0 * motion.measured, np.nan),
-        "visibility": np.where(listed, 100 * motion.views / cameras, np.nan),
         "predicted": np.where(motion.measured, 1e3 * np.sqrt(np.maximum(variance, 0)), np.nan),
     }
     if summary.truth is not None and summary.errors_mm is not None:
@@ -261,42 +252,7 @@ def _values(content: SessionContent, summary: Summary, motion: MeasuredMotion) -
     values = {
         key: Values(motion.joints * people, array.reshape(len(array), -1)) for key, array in found.items()
     }
-    values |= {"bones": _bone_values(motion), "tilt": _tilt(content, summary, motion)}
     return {key: one for key, one in values.items() if np.isfinite(one.values).any()}
-
-
-def _bone_values(motion: MeasuredMotion) -> Values:
-    """Compute the deviation of each bone of each person from its own median length, mm."""
-    bones = bones_of(motion.joints)
-    lengths = 1e3 * bone_lengths(motion.measured_position, motion.joints, bones)
-    lengths = lengths.reshape(len(lengths), -1)
-    usual = np.full(lengths.shape[1], np.nan)
-    there = np.isfinite(lengths).any(axis=0)
-    usual[there] = np.nanmedian(lengths[:, there], axis=0)
-    names = tuple(f"{start}-{end}" for start, end in bones) * motion.position.shape[1]
-    return Values(names, np.abs(lengths - usual))
-
-
-def _tilt(content: SessionContent, summary: Summary, motion: MeasuredMotion) -> Values:
-    """Compute the cameras' mean elevation above the first person, deg [T, 1]; NaN where one has no pose."""
-    actor = middles(motion.measured_position)[:, 0]
-    away = camera_positions(content, summary, motion.t_ns) - actor
-    tilt = np.degrees(np.arctan2(away[..., 2], np.linalg.norm(away[..., :2], axis=-1)))
-    return Values(("formation",), tilt.mean(axis=0)[:, None])
-
-
-def camera_positions(content: SessionContent, summary: Summary, t_ns: Int64) -> Float:
-    """Interpolate positions [C, T, 3] m of the cameras that have poses; NaN at times without one."""
-    between = summary.description.pose_interpolation
-    poses = content.poses | content.refined
-    positions = []
-    for camera in summary.cameras:
-        if camera.name not in poses:
-            continue
-        track = trajectory_from(poses[camera.name])
-        position, _ = poses_at(track, t_ns, between, static=camera.entry.poses.static)
-        positions.append(position)
-    return np.stack(positions) if positions else np.full((1, len(t_ns), 3), np.nan)
 
 
 # --- two sessions ---

@@ -76,20 +76,11 @@ _BEST = ("auto", "robust", "midpoint", "dlt")  # the sentence is about the first
 
 
 def estimates(rows: Sequence[Row], axis: str) -> list[dict[str, Any]]:
-    """Compute the means over trials of every condition and method.
+    """Compute the means over trials of every condition and method, in the order of the rows.
 
-    Intervals are those of `geometry.metrics` over trials.
-
-    Args:
-        axis: tilt_deg, robots or noise: the condition that the ratio compares.
-
-    Returns:
-        In the order of the rows, each with the condition and method, and with
-        - `metrics`: by name `mean`, `interval` (None where all trials are alike) and the number of `trials`
-          that had the figure; None where none had it;
-        - `ratio`: of `mpjpe_mm` to the first tilt or number of drones, or for `noise` to the first method,
-          trials paired; None where that mean is zero;
-        - `per_joint`: means.
+    Each has `metrics` by name: `mean`, `interval` (None where all trials are alike) and the number of
+    `trials`, or None where none had the figure; `ratio` of `mpjpe_mm` to the first value of `axis` (of
+    `noise`: to the first method), trials paired, None where that mean is zero; and `per_joint` means.
     """
     by_condition: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:

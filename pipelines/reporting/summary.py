@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import conjugate, interpolate_poses, multiply, rotation_vector_from_quaternion
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import (
     Bone,
@@ -166,7 +165,7 @@ def summarise(content: SessionContent) -> Summary:
         counts=counts,
         inside_95=share_inside_95(motion, truth) if motion is not None and truth is not None else None,
         sigma_mm=finite_median(1000 * motion.sigma_m) if motion is not None else None,
-        joints=tuple(_joint_rows(motion, error, content.joint_errors)) if motion is not None else (),
+        joints=tuple(_joint_rows(motion, content.joint_errors)) if motion is not None else (),
         bones=tuple(watched_bones(motion)) if motion is not None else (),
         metrics=metrics,
     )
@@ -213,36 +212,25 @@ def _camera_row(name: str, entry: CameraEntry, origin_ns: int) -> CameraRow:
     )
 
 
-def _joint_rows(motion: MeasuredMotion, error: Float | None, stored: pd.DataFrame | None) -> list[JointRow]:
+def _joint_rows(motion: MeasuredMotion, stored: pd.DataFrame | None) -> list[JointRow]:
     per_joint = {} if stored is None else figures_by_joint(stored)
-    sigma = 1000 * motion.sigma_m
     rows = []
     for j, name in enumerate(motion.joints):
-        stated = per_joint.get(name, {})
-        status = motion.status[..., j]
+        stated, status = per_joint.get(name, {}), motion.status[..., j]
         measured = motion.measured[..., j]
         counted = np.bincount(status[status >= 0], minlength=len(STATUS))
-        computed = _mean(error[..., j]) if error is not None else None
-        mpjpe = stated.get("mpjpe_mm")
-        reprojection = stated.get("reprojection_px_median")
-        seen = finite_median(motion.reprojection_px[..., j][measured])
         rows.append(
             JointRow(
                 name=name,
                 share=float(measured.sum() / max(counted.sum(), 1)),
-                mpjpe_mm=computed if mpjpe is None else mpjpe,
+                mpjpe_mm=stated.get("mpjpe_mm"),
                 root_mpjpe_mm=stated.get("root_mpjpe_mm"),
-                reprojection_px=seen if reprojection is None else reprojection,
-                sigma_mm=finite_median(sigma[..., j][measured]),
+                reprojection_px=finite_median(motion.reprojection_px[..., j][measured]),
+                sigma_mm=finite_median(1000 * motion.sigma_m[..., j][measured]),
                 counts={word: int(n) for word, n in zip(STATUS, counted, strict=True)},
             )
         )
     return rows
-
-
-def _mean(values: Float) -> float | None:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else None
 
 
 def finite_median(values: Float) -> float | None:
@@ -409,17 +397,13 @@ def table_of_quality(content: SessionContent, summary: Summary) -> Table:
     """Make the table of the quality of every camera's data."""
     columns = (
         Column("Camera", text=True),
-        Column("Pose noise", "stated", text=True),
-        Column("Pose noise", "measured"),
+        Column("Pose noise", text=True),
         Column("Clock", "offset"),
         Column("Clock", "σ"),
         Column("Person found", "of frames"),
         Column("Keypoints used", "of those found"),
     )
-    caption = (
-        "How good the data of every camera is. Pose noise is per axis, measured as root mean square of logged"
-        " less true poses; a clock’s offset is as stated, plus what was estimated."
-    )
+    caption = "Pose noise is per axis. A clock’s offset is as stated, plus what was estimated."
     rows = [_quality(content, summary, camera) for camera in summary.cameras]
     return Table("quality", caption, columns, rows, "quality")
 
@@ -430,12 +414,9 @@ def _quality(content: SessionContent, summary: Summary, camera: CameraRow) -> li
     offset = quantity(clock.offset_s, "s", 3)
     if found is not None:
         offset += f" {'+' if found >= 0 else ''}{quantity(found, 's', 3)}"
-    poses, truth = content.poses.get(camera.name), content.true_poses.get(camera.name)
-    unknown = poses is None or truth is None or camera.entry.poses.static
     return [
         camera.name,
-        _stated_noise(camera, poses),
-        ABSENT if unknown or poses is None or truth is None else _measured_noise(poses, truth, summary),
+        _stated_noise(camera, content.poses.get(camera.name)),
         offset,
         _clock_words(clock, number(section(summary.metrics, "clock_offset_sigmas_s"), camera.name)),
         *(percent(share) for share in _detection(content, camera)),
@@ -471,27 +452,6 @@ def _noise_words(name: str, model: dict[str, float | str]) -> str:
         stated = f"{value:g}{THIN}{unit}".strip() if isinstance(value, float | int) else str(value)
         words.append(f"{before} {stated}".strip())
     return f"{name.replace('_', ' ')} {', '.join(words)}"
-
-
-def _measured_noise(logged: pd.DataFrame, true: pd.DataFrame, summary: Summary) -> str:
-    """Compute the root mean square per axis of the logged poses' errors at their own stamps."""
-    log, truth = trajectory_from(logged), trajectory_from(true)
-    between = summary.description.pose_interpolation
-    position, quaternion = interpolate_poses(
-        truth.t_ns,
-        truth.position,
-        truth.quaternion_xyzw,
-        log.t_ns,
-        max_gap_ns=between.max_gap_ns,
-        max_extrapolation_ns=0,
-    )
-    there = np.isfinite(position).all(axis=1)
-    if not there.any():
-        return ABSENT
-    off_m = log.position[there] - position[there]
-    turn = multiply(conjugate(quaternion[there]), log.quaternion_xyzw[there])
-    off_rad = rotation_vector_from_quaternion(turn)
-    return _position_and_rotation(*(float(np.sqrt((v**2).mean())) for v in (off_m, np.degrees(off_rad))))
 
 
 def _position_and_rotation(position_m: float, rotation_deg: float) -> str:

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 # Longer flights are thinned out, so that a page with 15 MB of pictures stays below 25 MB in base64.
 MAX_BYTES = 6_000_000
-# Ellipsoids change more slowly than joints, and take at least this share in longer flights.
-SHARE_OF_ELLIPSOIDS = 0.25
 # Cameras alone need no more times to move smoothly.
 MAX_TIMES_WITHOUT_SKELETON = 3000
 # Millimetres in 16 bits reach no farther from the middle of the body.
@@ -86,8 +84,9 @@ def make_scene(
     body = _PackedBody.of(motion, summary.truth) if motion is not None else None
     arms = [arm for arm in replan.arms if arm.simulated] if replan is not None else []
     all_cameras = len(cameras) + sum(len(arm.cameras) for arm in arms)
-    thinned = _Thinned.of(len(all_t_ns), body, all_cameras)
-    kept = slice(None, None, thinned.every)
+    per_time = all_cameras * (3 * 4 + 4 * 2) + (0 if body is None else body.bytes_per_time)
+    every = max(math.ceil(len(all_t_ns) * per_time / MAX_BYTES), 1)
+    kept = slice(None, None, every)
     t_ns = all_t_ns[kept]
     placed = [_placed(camera, poses[camera.name], t_ns, summary) for camera in cameras]
     for a, arm in enumerate(arms):
@@ -104,7 +103,7 @@ def make_scene(
         "cameras": [camera.packed(origin) for camera in placed],
     }
     if body is not None:
-        data["body"] = body.packed(thinned, origin) | {"names": list(summary.people)}
+        data["body"] = body.packed(kept, origin) | {"names": list(summary.people)}
     around = surface(replan.around) if replan is not None and replan.around is not None else None
     if around is not None and around.voxels:
         points = _packed(1000 * (around.points - origin), np.int32)
@@ -116,7 +115,7 @@ def make_scene(
         people=summary.people if body is not None else (),
         truth=body is not None and body.truth is not None,
         ellipsoids=body is not None and body.root is not None,
-        notes=tuple(_notes(thinned, len(all_t_ns), body, around, strips)),
+        notes=tuple(_notes(every, len(all_t_ns), body, around, strips)),
         arms=tuple(arm.name for arm in arms),
         surface="surface" in data,
         film=tuple(strip.camera for strip in strips) if body is not None else (),
@@ -124,7 +123,7 @@ def make_scene(
 
 
 def _notes(
-    thinned: _Thinned,
+    every: int,
     times: int,
     body: _PackedBody | None,
     around: RaisedSurface | None,
@@ -132,14 +131,9 @@ def _notes(
 ) -> list[str]:
     """List differences from the tables, in whole sentences."""
     notes = []
-    if thinned.every > 1:
+    if every > 1:
         notes.append(
-            f"The page holds one time in {thinned.every} of {whole(times)}, and draws straight lines between "
-            "them."
-        )
-    if thinned.ellipsoids_every > 1:
-        notes.append(
-            f"Ellipsoids are those of the nearest of one time in {thinned.ellipsoids_every} of these."
+            f"The page holds one time in {every} of {whole(times)}, and draws straight lines between them."
         )
     if body is not None:
         notes += body.notes()
@@ -201,20 +195,13 @@ class _PackedBody:
 
     @property
     def bytes_per_time(self) -> int:
-        """Size of all but the ellipsoids at one time."""
-        channels = 3 + 3 * (self.truth is not None)
+        """Size at one time."""
+        channels = 3 + 3 * (self.truth is not None) + 6 * (self.root is not None)
         return self.people * (4 * 4 + len(self.joints) * channels * 2)
 
-    @property
-    def bytes_of_ellipsoids(self) -> int:
-        """Size of the ellipsoids at one time."""
-        return 0 if self.root is None else self.people * len(self.joints) * 6 * 2
-
-    def packed(self, thinned: _Thinned, origin: Float) -> dict[str, object]:
+    def packed(self, kept: slice, origin: Float) -> dict[str, object]:
         """Return the body as JSON, at the kept times."""
         joints = self.joints
-        kept = slice(None, None, thinned.every)
-        with_ellipsoids = slice(None, None, thinned.every * thinned.ellipsoids_every)
         derived = [
             (name, parents) for name, parents in DERIVED if name not in joints and set(parents) <= set(joints)
         ]
@@ -234,8 +221,7 @@ class _PackedBody:
             "joint": _packed(1000 * self.joint[kept], np.int16),
             "truth": None if self.truth is None else _packed(1000 * self.truth[kept], np.int16),
             # A tenth of a millimetre: the least that anybody states.
-            "root": None if self.root is None else _packed(10_000 * self.root[with_ellipsoids], np.int16),
-            "rootEvery": thinned.ellipsoids_every,
+            "root": None if self.root is None else _packed(10_000 * self.root[kept], np.int16),
         }
 
     def notes(self) -> list[str]:
@@ -319,26 +305,6 @@ def _picture_corners(camera: CameraRow) -> list[float]:
 
 
 # --- packing ---
-
-
-@dataclass(frozen=True)
-class _Thinned:
-    """Choice of the times that a page holds, so that they need at most MAX_BYTES."""
-
-    every: int  # of the skeleton's times
-    ellipsoids_every: int = 1  # of the times that the page holds
-
-    @classmethod
-    def of(cls, times: int, body: _PackedBody | None, cameras: int) -> _Thinned:
-        per_time = cameras * (3 * 4 + 4 * 2) + (0 if body is None else body.bytes_per_time)
-        ellipsoids = 0 if body is None else body.bytes_of_ellipsoids
-        if times * (per_time + ellipsoids) <= MAX_BYTES:
-            return cls(1)
-        share = SHARE_OF_ELLIPSOIDS if ellipsoids else 0.0
-        every = math.ceil(times * per_time / ((1 - share) * MAX_BYTES))
-        held = -(-times // every)
-        left = MAX_BYTES - held * per_time
-        return cls(every, math.ceil(held * ellipsoids / left) if ellipsoids else 1)
 
 
 def _times_without_skeleton(summary: Summary) -> Int64:

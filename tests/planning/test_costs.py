@@ -62,13 +62,3 @@ def test_closed_forms_equal_linear_algebra(seed: int) -> None:
     information = ray_information(rng.uniform(2, 12, (3, 3)), CONFIG.tuning.errors).sum(axis=0) + np.eye(3)
     assert predicted_error(information) ** 2 == pytest.approx(np.trace(np.linalg.inv(information)))
     assert log_determinant(information) == pytest.approx(np.linalg.slogdet(information)[1])
-
-
-def test_steeper_views_are_worth_less() -> None:
-    errors = ErrorModel(0.0, 0.0, (15, 30, 45, 60), (0.02, 0.02, 0.04, 0.04), (1.0, 0.9, 0.8, 0.6))
-    tilts = np.radians([15.0, 30.0, 45.0, 60.0, 80.0])
-    offsets = slot_offsets(
-        formation_slots(np.zeros(1), 1, tilt_rad=0.0, range_m=10.0) + np.outer(tilts, [0, 1, 0])[:, None]
-    )
-    worth = np.trace(ray_information(offsets[:, 0], errors), axis1=-2, axis2=-1)
-    assert worth / worth[0] == pytest.approx(np.array([1.0, 0.9, 0.2, 0.15, 0.15]))

@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from pipelines.geometry.arrays import Bool, Float32
 from pipelines.planning.config import Zone
 from pipelines.planning.distance_field import (
     distance_field,
     in_turn,
-    open_space,
     visible,
     zone_distances,
     zone_edges,
@@ -45,24 +42,6 @@ def test_a_flat_surface_is_exact(x: float, y: float, z: float) -> None:
         assert gradient == pytest.approx([0, 0, 1], abs=1e-5)
 
 
-def expected_distances(occupied: Bool) -> Float32:
-    """Compute the distances of a whole map at once, with scipy."""
-    free_m, inside_m = (distance_transform_edt(side, sampling=RES) for side in (~occupied, occupied))
-    return np.where(occupied, RES / 2 - inside_m, free_m - RES / 2).astype(np.float32)
-
-
-@given(st.lists(st.tuples(st.integers(0, 8), st.integers(1, 9)), min_size=3, max_size=3))
-def test_a_block_anywhere_has_the_distances_of_the_whole(ends: list[tuple[int, int]]) -> None:
-    """Distances inside come from the box around what is occupied, which may touch the border of the map."""
-    occupied = np.zeros((9, 9, 9), dtype=np.bool_)
-    occupied[tuple(slice(first, first + length) for first, length in ends)] = True
-    occupied[4, 4, 4] = False
-    if not occupied.any():
-        return
-    field = distance_field(Occupancy(occupied.astype(np.float32), np.zeros(3), RES))
-    assert np.array_equal(field.grid.distance_m, expected_distances(occupied))
-
-
 def test_gradient_is_the_derivative_of_the_interpolated_value() -> None:
     """On random fields, inside cells: central differences of a polynomial of degree 3 are off by h^2."""
     rng = np.random.default_rng(2)
@@ -82,18 +61,6 @@ def test_unknown_is_free_or_occupied_as_asked() -> None:
     blocked = distance_field(slab(unknown_above=True), unknown="occupied")
     assert blocked.sample(point)[0] == pytest.approx(-1.0, abs=1e-5)
     assert blocked.from_ns == 7
-
-
-def test_maps_without_anything_and_of_one_layer() -> None:
-    nothing = Occupancy(np.zeros((1, 5, 1), dtype=np.float32), np.zeros(3), RES)
-    assert distance_field(nothing).sample(np.zeros((2, 2, 3)))[0].min() > 100
-    assert open_space().sample(np.array([1e6, -1e6, 0.0]))[0] > 100
-    solid = Occupancy(np.ones((1, 1, 4), dtype=np.float32), np.zeros(3), RES)
-    assert distance_field(solid).sample(np.zeros(3))[0] < -100
-    layer = np.zeros((1, 8, 1), dtype=np.float32)
-    layer[0, 0, 0] = 1
-    distance, _ = distance_field(Occupancy(layer, np.zeros(3), RES)).sample(np.array([5.0, 1.0, -5.0]))
-    assert distance == pytest.approx(1.0 - RES, abs=1e-6)
 
 
 YARD = Zone(((0.0, 0.0), (6.0, 0.0), (6.0, 2.0), (2.0, 2.0), (2.0, 6.0), (0.0, 6.0)), -1.0, 3.0)  # an L

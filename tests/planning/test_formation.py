@@ -7,11 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.geometry.poses import look_at, matrix_from_quaternion
 from pipelines.planning.formation import (
     FormationPath,
     formation_slots,
-    slot_of,
     slot_offsets,
     wrapped,
     yaw_set,
@@ -30,12 +28,6 @@ def test_slots_are_evenly_spaced_but_for_two(drones: int, apart_deg: float) -> N
     assert offsets[..., 2] == pytest.approx(np.full((2, drones), 10 * np.sin(0.25)))
 
 
-@given(st.floats(-3.14, 3.14), st.floats(-1.5, 1.5), st.floats(0.1, 100))
-def test_a_slot_is_found_again_from_its_offset(yaw: float, tilt: float, distance: float) -> None:
-    slot = np.array([yaw, tilt, distance])
-    assert slot_of(slot_offsets(slot)) == pytest.approx(slot, abs=1e-9)
-
-
 @given(st.integers(1, 72), st.floats(-10, 10))
 def test_yaws_are_equidistant_and_hold_the_start(yaws: int, start: float) -> None:
     cells = yaw_set(yaws, start)
@@ -52,13 +44,3 @@ def test_knots_are_approached_at_the_full_rate_and_then_waited_for() -> None:
     found = path.at(np.array([4.0, 5.0, 5.4, 6.5, 8.0, 9.0, 20.0]))[:, 0]
     assert np.degrees(found[:, 0]) == pytest.approx([0, 0, 9, 20, 42.5, 65, 65])
     assert found[:, 2] == pytest.approx([10, 10, 9.6, 9, 9, 9, 9])
-
-
-def test_cameras_look_at_the_target_and_stand_upright() -> None:
-    rng = np.random.default_rng(1)
-    camera, target = rng.normal(size=(50, 3)) * 10, rng.normal(size=(50, 3))
-    right, down, forward = np.moveaxis(matrix_from_quaternion(look_at(camera, target)), -1, 0)
-    towards = (target - camera) / np.linalg.norm(target - camera, axis=-1, keepdims=True)
-    assert forward == pytest.approx(towards, abs=1e-12)
-    assert right[:, 2] == pytest.approx(np.zeros(50), abs=1e-12)
-    assert (down[:, 2] < 0).all()

@@ -8,7 +8,7 @@ import pytest
 from pipelines.planning.arms import ADAPTIVE, GROUP
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import open_space
-from pipelines.planning.forecast import ActorFilter, Forecast, PeopleFilter
+from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import formation_slots, slot_offsets
 from pipelines.planning.replay import Start, replay
 from pipelines.planning.scores import blind_s, hidden_by_people, sights
@@ -39,20 +39,6 @@ def test_a_body_hides_what_is_behind_it_and_nothing_else() -> None:
     for name, (hips, hides) in bodies.items():
         assert hidden_by_people(camera, target, np.array([hips])) == hides, name
     assert not hidden_by_people(camera, target, np.zeros((0, 3)))
-
-
-def test_the_middle_of_people_has_the_errors_of_a_mean() -> None:
-    """The mean of two independent estimates has half the variance."""
-    each = [ActorFilter(q=0.1, sigma_m=0.2) for _ in range(2)]
-    both = PeopleFilter(each, np.array([1.0, 1.0]))
-    for k in range(20):
-        for person, start in enumerate((0.0, 4.0)):
-            both.measure(0.1 * k, np.array([start + 0.1 * k, 0.0, 1.0]), person)
-    position, velocity, covariance = both.at(2.0)
-    assert position == pytest.approx([4.0, 0.0, 1.0], abs=0.02)
-    assert velocity == pytest.approx([1.0, 0.0, 0.0], abs=0.02)
-    assert covariance == pytest.approx(each[0].at(2.0)[2] / 2)
-    assert both.each(np.array([2.0]))[:, 0, 0] == pytest.approx([2.0, 6.0], abs=0.02)
 
 
 @pytest.mark.parametrize(("weights", "filming"), [((1.0, 1.0), [2, 2]), ((1.0, 0.0), [4, 0])])

@@ -15,13 +15,12 @@ from pipelines.planning.config import PlannerConfig, Zone
 from pipelines.planning.distance_field import (
     DistanceField,
     distance_field,
-    in_turn,
     open_space,
     zone_distances,
     zone_edges,
 )
 from pipelines.planning.forecast import ActorFilter
-from pipelines.planning.guard import FlownMotion, Guard, least_distances, nearest_free, wanted_clearance_m
+from pipelines.planning.guard import FlownMotion, Guard, least_distances, wanted_clearance_m
 from pipelines.planning.replay import Start, replay
 from pipelines.planning.scores import score
 from pipelines.planning.tracking import DronePlan
@@ -112,36 +111,6 @@ def test_drones_can_always_stop_in_free_space_whatever_plans_ask_for(
     assert guard.counts.total() == 25 * drones
 
 
-def test_least_distances_are_those_of_all_rows() -> None:
-    rng = np.random.default_rng(7)
-    states, others, people = (
-        rng.normal(size=(9, 4, 3)),
-        rng.normal(size=(2, 9, 3)),
-        rng.normal(size=(3, 9, 3)),
-    )
-    ahead = states[:5] + 0.1
-    grid = open_space().grid
-    found = least_distances(grid, states, 8, others, ahead, people, 0.02)
-    drones_m = np.linalg.norm(others - states[:, 0], axis=-1).min()
-    walking, stopped = people[:, :5] - ahead[:, 0], people[:, :1] - ahead[:, 0]
-    people_m = np.linalg.norm(np.concatenate([walking, stopped]), axis=-1).min()
-    np.testing.assert_allclose(found[1:], (drones_m, people_m), rtol=1e-14)
-    assert least_distances(grid, states, 8, NOBODY, ahead, NOBODY, 0.02)[1:] == (np.inf, np.inf)
-
-
-def test_distances_of_the_field_hold_to_the_corners_of_voxels() -> None:
-    """If the field has the value of `wanted_clearance_m`, voxels (cubes) are at least a radius away."""
-    for side_m in (0.1, 0.25, 0.5):
-        field = boulders(3, side_m)
-        points = np.random.default_rng(1).uniform([-10, -10, 0], [10, 10, 10], (300_000, 3))
-        near = points[np.abs(field.sample(points)[0] - wanted_clearance_m(CONFIG, field.grid)) < 0.02]
-        centres = field.grid.origin + side_m * (np.argwhere(field.grid.distance_m < 0) + 0.5)
-        assert len(near) > 100
-        for point in near[:400]:
-            over = np.maximum(np.abs(centres - point) - side_m / 2, 0.0)
-            assert np.linalg.norm(over, axis=1).min() >= CONFIG.drone_radius_m - 0.02
-
-
 @pytest.mark.parametrize("depth_m", [0.3, -0.2])  # in the wall, and within the radius of it
 def test_who_starts_too_near_leaves_by_the_shortest_way(depth_m: float) -> None:
     """The wall is 4 m thick; its near face is at y = 0. The way out is straight back, never deeper."""
@@ -165,20 +134,6 @@ def test_who_starts_too_near_leaves_by_the_shortest_way(depth_m: float) -> None:
     assert np.linalg.norm(flown[: out + 1, [0, 2]] - start[0, [0, 2]], axis=1).max() < 0.25  # one voxel aside
 
 
-def test_the_nearest_free_voxel_is_the_nearest_of_all() -> None:
-    field = boulders(5)
-    rng = np.random.default_rng(2)
-    grid = field.grid
-    free = np.argwhere(grid.distance_m >= 1.0)
-    centres = grid.origin + grid.resolution_m * (free + 0.5)
-    for point in rng.uniform([-14, -14, -3], [14, 14, 13], (50, 3)):
-        found = nearest_free(field, point, 1.0)
-        assert found is not None
-        assert np.linalg.norm(found - point) == pytest.approx(np.linalg.norm(centres - point, axis=1).min())
-    full = distance_field(Occupancy(np.ones((4, 4, 4), np.float32), np.zeros(3), 0.5))
-    assert nearest_free(full, np.ones(3), 1.0) is None
-
-
 def test_a_drone_in_the_way_of_somebody_who_walks_gives_way() -> None:
     """They walk at 1.5 m/s straight through where the drone wants to hover, at hip height."""
     place = np.array([0.0, 0.0, 1.5])
@@ -197,30 +152,6 @@ def test_a_drone_in_the_way_of_somebody_who_walks_gives_way() -> None:
             guard.fly(1)
     assert nearest >= CONFIG.actor_distance_m
     assert guard.counts[FlownMotion.GAVE_WAY] + guard.counts[FlownMotion.CLIMBED] > 0
-
-
-def test_a_map_that_comes_late_is_left_and_reported() -> None:
-    """From 4 s on the map says that both drones are in a block of concrete: the scores say so."""
-    stamps, hips = walker(8.0, 0.01)
-    start = replay(FIXED, stamps, hips, [], Start(1), config=CONFIG).position[0, 0]
-    side_m = 0.5
-    occupied = np.zeros((80, 80, 40), dtype=np.float32)
-    origin = np.array([-20.0, -20.0, -2.0])
-    low, high = ((start + way - origin) // side_m for way in (-1.5, 1.5))
-    occupied[tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))] = 1
-    late = distance_field(Occupancy(occupied, origin, side_m, from_ns=4_000_000_000))
-    result = replay(FIXED, stamps, hips, [late], Start(1), config=CONFIG)
-    assert result.safety[FlownMotion.LEFT] > 0
-    for maps in (late, in_turn([late], result.t_ns)):
-        figures = score(result.t_s, result.position, result.actor, maps, CONFIG)
-        violations = figures["limit_violations"]
-        assert isinstance(violations, dict)
-        assert violations["collision"] == violations["clearance"] == 1
-    inside = late.sample(result.position[0])[0] < 0
-    early = np.where(result.t_s < 4.0 - 1e-9, inside, False)
-    assert early.any()  # the last map alone would blame what happened before it came
-    assert figures["min_clearance_m"] == late.sample(result.position[:, result.t_s >= 4.0])[0].min()
-    assert late.sample(result.position[0, -1])[0] >= CONFIG.drone_radius_m
 
 
 def test_no_drone_flies_into_a_zone() -> None:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT, Arm
+from pipelines.planning.arms import ADAPTIVE, FIXED, Arm
 from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import open_space
 from pipelines.planning.forecast import Forecast, YawZero
@@ -25,7 +25,7 @@ from pipelines.planning.formation import (
     yaw_set,
 )
 from pipelines.planning.replay import Start, replay
-from tests.planning.worlds import trees, walker
+from tests.planning.worlds import trees
 
 WORLD_FRAME = PlannerConfig()
 HEADING_FRAME = replace(WORLD_FRAME, yaw_frame="heading")
@@ -62,17 +62,6 @@ def test_who_stands_keeps_the_last_heading(speed_mps: float, sigma_mps: float, t
     up = YawZero(HEADING_FRAME, heading_rad=0.5)
     up.follow(0.0, np.array([0.0, 0.0, 3.0]), SURE)  # who climbs a ladder heads nowhere
     assert up.at(np.array([9.0])) == 0.5
-
-
-@pytest.mark.parametrize("arm", [FIXED, ADAPTIVE, JOINT], ids=lambda arm: arm.name)
-def test_who_walks_straight_east_is_filmed_alike_in_both_frames(arm: Arm) -> None:
-    flights = [
-        replay(arm, *walker(4.0), [WORLD], Start(2, 0.7), config=config)
-        for config in (WORLD_FRAME, HEADING_FRAME)
-    ]
-    for name in ("position", "slots"):
-        assert np.array_equal(getattr(flights[0], name), getattr(flights[1], name))
-    assert np.ptp(flights[0].position[0], axis=0).max() > 2
 
 
 def on_a_circle(seconds: float) -> tuple[NDArray[np.int64], Float, Float]:

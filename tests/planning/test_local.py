@@ -59,44 +59,6 @@ def test_the_gradient_is_the_derivative_of_the_cost(seed: int, speed_floor: floa
     assert np.abs(numeric - gradient).max() < 1e-4 * np.abs(gradient).max()
 
 
-def test_fine_waypoints_have_the_functional_gradient_of_the_papers() -> None:
-    """s (I - vv'/s^2) grad c - c (I - vv'/s^2) a / s, in the interior, for a field that is linear in z.
-
-    Central differences at step h leave h^2/6 times the third derivative: below 1e-3 here.
-    """
-    occupied = np.zeros((4, 4, 40), dtype=np.float32)
-    occupied[:, :, :4] = 1
-    field = distance_field(Occupancy(occupied, np.array([-1.0, -1.0, -2.0]), 0.5))  # M = z
-    h, n = 0.02, 200
-    none = {"l_sep": 0.0, "a_velocity": 0.0, "a_acceleration": 0.0, "a_jerk": 1e-15}
-    tuning = PlannerTuning(waypoints=n, waypoint_s=h, eps_obs_m=8.0, **none)  # type: ignore[arg-type]
-    config = PlannerConfig(l_obs=1.0, l_occ=0.0, l_form=1e-12, tuning=tuning)
-    t = h * np.arange(n + 1)
-    path = np.stack([1.5 * t, np.sin(t), 3.0 + np.cos(0.8 * t)], axis=1)
-    _, _, gradient = LocalPlanner(config).cost(
-        path[0],
-        np.zeros(3),
-        path[1:],
-        slots=path[1:],
-        actor=path[1:],
-        others=np.empty((0, n, 3)),
-        field=field,
-    )
-    v = np.stack([1.5 + 0 * t, np.cos(t), -0.8 * np.sin(0.8 * t)], axis=1)
-    a = np.stack([0 * t, -np.sin(t), -0.64 * np.cos(0.8 * t)], axis=1)
-    s = np.sqrt((v**2).sum(axis=1) + 1.0)[:, None]
-    c = (path[:, 2:] - 8.0) ** 2 / 16.0
-    grad_c = (path[:, 2:] - 8.0) / 8.0 * [0, 0, 1]
-
-    def across(w: Float) -> Float:
-        left: Float = w - v * (v * w).sum(axis=1)[:, None] / s**2
-        return left
-
-    expected = s * across(grad_c) - c * across(a) / s
-    inner = slice(2, n - 3)
-    assert gradient[inner] / h == pytest.approx(expected[1:][inner], abs=2e-3)
-
-
 def test_the_metric_is_the_curvature_of_the_smooth_terms() -> None:
     """Without obstacles the cost is quadratic, and the first step of eta = 1 its minimum."""
     rng = np.random.default_rng(6)
@@ -106,18 +68,16 @@ def test_the_metric_is_the_curvature_of_the_smooth_terms() -> None:
     made = planner.plan(
         0.0, position, velocity, slots=slots, actor=slots + 9, others=[], field=open_space(), previous=None
     )
-    assert made.evaluations <= 3
-    total, terms, gradient = planner.cost(
+    _, terms, gradient = planner.cost(
         position,
         velocity,
-        made.plan.path[1:],
+        made.path[1:],
         slots=slots,
         actor=slots + 9,
         others=NOBODY,
         field=open_space(),
     )
     assert np.abs(gradient).max() < 1e-9
-    assert total == pytest.approx(made.cost)
     assert terms["obs"] == terms["occ"] == terms["sep"] == 0
     assert tuple(terms) == TERMS
 
@@ -167,7 +127,7 @@ def test_who_stands_inside_the_mound_gets_out_if_speed_has_a_floor(
     made = planner.plan(
         0.0, inside, np.zeros(3), slots=slots, actor=slots - [0, 9, 2], others=[], field=field, previous=None
     )
-    assert (field.sample(made.plan.path[-1])[0] > 0) == gets_out
+    assert (field.sample(made.path[-1])[0] > 0) == gets_out
 
 
 def straight(start: Float, end: Float, start_s: float = 0.0) -> DronePlan:

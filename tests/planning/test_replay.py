@@ -10,12 +10,12 @@ import pytest
 
 from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT, Arm, FormationPlanner
-from pipelines.planning.config import PlannerConfig, PlannerTuning
+from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.formation import FormationPath
 from pipelines.planning.replay import Replay, Start, replay
 from pipelines.planning.scores import score
-from tests.planning.worlds import bare_ground, high_wall, mound, trees, walker, wall
+from tests.planning.worlds import bare_ground, mound, trees, walker, wall
 
 CONFIG = PlannerConfig()
 
@@ -58,18 +58,6 @@ def test_the_adaptive_formation_goes_round_the_mound_and_the_fixed_one_over_it()
     for result in (fixed, adaptive):
         assert field.sample(result.position)[0].min() > 1
         assert np.linalg.norm(result.position[0] - result.position[1], axis=-1).min() > 3
-
-
-def test_a_wall_blinds_the_fixed_formation_and_not_the_adaptive_one() -> None:
-    """1 m thick, 12 m high, 5 m beside the way: too high to look over, and the slots are behind it."""
-    field = high_wall()
-    fixed, adaptive = fly(FIXED, field, seconds=25.0), fly(ADAPTIVE, field, seconds=25.0)
-    blind, seeing = (score(*positions_of(result), field, CONFIG) for result in (fixed, adaptive))
-    assert blind["occluded_share"] > 0.1  # type: ignore[operator]
-    assert seeing["occluded_share"] == 0.0
-    assert tilt_deg(adaptive).max() < 20
-    for result in (fixed, adaptive):
-        assert field.sample(result.position)[0].min() > 1
 
 
 @pytest.mark.parametrize("arm", [FIXED, ADAPTIVE], ids=lambda arm: arm.name)
@@ -122,15 +110,9 @@ def test_drones_that_want_the_same_slot_keep_three_metres(drones: int) -> None:
 
 @pytest.mark.parametrize("arm", [ADAPTIVE, JOINT], ids=lambda arm: arm.name)
 def test_the_same_arguments_give_the_same_bytes(arm: Arm) -> None:
-    config = replace(CONFIG, tuning=PlannerTuning(actor_noise_m=0.2))
-
-    def flown(seed: int) -> Replay:
-        return replay(arm, *walker(5.0), [wall()], Start(2), config=config, seed=seed)
-
-    first, again, other = flown(1), flown(1), flown(2)
+    first, again = (replay(arm, *walker(5.0), [wall()], Start(2), config=CONFIG) for _ in range(2))
     for name in ("position", "velocity", "quaternion_xyzw", "slots", "estimate"):
         assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
-    assert not np.array_equal(first.estimate, other.estimate)
 
 
 def test_nothing_is_seen_before_its_time() -> None:
@@ -149,10 +131,3 @@ def test_nothing_is_seen_before_its_time() -> None:
     assert not np.allclose(plain.position[:, -1], changed.position[:, -1], atol=0.5)
     assert np.ptp(changed.formation_yaw_rad[before]) == 0
     assert np.ptp(changed.formation_yaw_rad) > 0
-
-
-def test_the_rates_of_planning() -> None:
-    """10 Hz and 5 Hz over 4 s, both ends included, the local planner for each of 3 drones."""
-    result = fly(FIXED, bare_ground(), seconds=4.1, drones=3)
-    assert len(result.times.central_s) == 41
-    assert len(result.times.local_s) == 3 * 21

@@ -48,21 +48,6 @@ def test_a_still_formation_in_the_open() -> None:
     assert predicted_errors(position, actor, open_space(), CONFIG) == pytest.approx(np.full(len(T_S), error))
 
 
-def test_a_turning_formation_has_the_speed_of_a_circle() -> None:
-    """At 10 Hz: v = r w sinc(w h / 2), and one more such factor per derivative; 5 % covers them."""
-    w = 0.9
-    position, actor = ring(3, 0.0, rate_rad_per_s=w)
-    figures = score(T_S, position, actor, open_space(), CONFIG)
-    assert figures["max_speed_mps"] == pytest.approx(10 * w, rel=0.05)
-    assert figures["max_acceleration_mps2"] == pytest.approx(10 * w**2, rel=0.05)
-    assert figures["max_jerk_mps3"] == pytest.approx(10 * w**3, rel=0.05)
-    violations = figures["limit_violations"]
-    assert isinstance(violations, dict)
-    assert violations["speed"] == 3  # one episode for each drone, all the time
-    assert violations["acceleration"] == 3
-    assert violations["jerk"] == 0
-
-
 def test_the_energy_of_hovering_turning_and_climbing() -> None:
     """Hovering takes P0 + Pi; a circle of 10 m at 0.5 rad/s that of 5 m/s; climbing the weight besides.
 

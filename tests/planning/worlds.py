@@ -34,12 +34,6 @@ def wall(resolution_m: float = 0.5) -> DistanceField:
     return as_field((np.abs(y - 8) < 1.5) & (x > 0) & (x < 25) & (z < 6), resolution_m)
 
 
-def high_wall(resolution_m: float = 0.5) -> DistanceField:
-    """Make a wall 1 m thick and 12 m high, from x = 15 to x = 35, 5 m beside the way."""
-    x, y, z = voxel_centres(resolution_m)
-    return as_field((np.abs(y - 5) < 0.5) & (x > 15) & (x < 35) & (z < 12), resolution_m)
-
-
 def trees(resolution_m: float = 0.5) -> DistanceField:
     """Make trunks and crowns on both sides of the way, none nearer than 5 m."""
     x, y, z = voxel_centres(resolution_m)

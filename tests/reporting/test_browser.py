@@ -15,7 +15,6 @@ from pipelines.reporting.page import render_page
 
 from .browser import Browser, browser
 from .comparisons import make_comparison
-from .reading import numbers
 
 # Of the pixels that have exactly the colour of the left limbs: how many, and their middle.
 _LEFT_LIMBS = """(() => {
@@ -91,17 +90,6 @@ def test_playing_moves_the_skeleton(opened: Browser) -> None:
     assert np.hypot(moved_x - x, moved_y - y) > 15
 
 
-def test_joints_that_were_not_measured_are_not_drawn(opened: Browser) -> None:
-    _go_to(opened, 7.0)  # between 6 and 8 s nobody was measured
-    opened.click("#viewer-truth")
-    assert _limbs(opened, "body")[0] == 0
-    assert numbers(opened.evaluate("document.getElementById('viewer-said').textContent")) == [0, 17]
-    _go_to(opened, 9.0)
-    assert _limbs(opened, "body")[0] > 100
-    said = opened.evaluate("document.getElementById('viewer-said').textContent")
-    assert numbers(said) == [15, 17, 22]
-
-
 def test_dragging_turns_and_the_wheel_zooms(opened: Browser) -> None:
     _go_to(opened, 3.0)
     before = _limbs(opened, "body")
@@ -154,18 +142,6 @@ def test_tab_alone_reaches_player_slider_curves_tables_and_links_with_a_visible_
     ]
     places = [reached.index(each) for each in wanted]
     assert places == sorted(places)  # in the order of the page
-
-
-def test_paper_has_dark_lines_on_white_even_from_a_dark_screen(opened: Browser) -> None:
-    opened.show_as(scheme="dark")
-    assert opened.evaluate(_DRAWN)
-    dark = opened.evaluate("getComputedStyle(document.documentElement).getPropertyValue('--left')")
-    opened.show_as(scheme="dark", media="print")
-    assert opened.evaluate(_DRAWN)
-    assert opened.evaluate("getComputedStyle(document.documentElement).getPropertyValue('--left')") != dark
-    assert _limbs(opened, "body")[0] > 50  # counted by the colour that the page has now
-    visible = "[...document.querySelectorAll('.moment')].every((m) => getComputedStyle(m).display !== 'none')"
-    assert opened.evaluate(visible)
 
 
 def test_a_foreign_script_does_not_run(chromium: Browser, page: Path, tmp_path: Path) -> None:
@@ -264,38 +240,6 @@ def test_the_first_screen_holds_the_verdict_and_the_person(opened: Browser, widt
     for shown in (".verdict code", "#viewer-body"):
         bottom = opened.evaluate(f"document.querySelector('{shown}').getBoundingClientRect().bottom")
         assert bottom < height, shown
-
-
-def test_seen_from_a_drone_the_actor_is_in_the_middle_of_its_picture(opened: Browser) -> None:
-    opened.send(
-        "Emulation.setDeviceMetricsOverride", width=1200, height=900, deviceScaleFactor=3, mobile=False
-    )  # lines of a few pixels have some of exactly their colour
-    _go_to(opened, 5.0)
-    assert opened.evaluate(_DRAWN)
-    width, height = opened.evaluate(
-        "(() => { const e = document.getElementById('viewer-flight'); return [e.width, e.height]; })()"
-    )
-
-    def see_from(camera: str) -> None:
-        opened.evaluate(
-            f"(() => {{ const e = document.getElementById('viewer-from'); e.value = '{camera}';"
-            "e.dispatchEvent(new Event('change')); })()"
-        )
-
-    outside = _limbs(opened, "flight")
-    see_from("1")
-    count, x, y = _limbs(opened, "flight")
-    # The drone looks 7 cm above the hips from 10 m: the left side has its middle at most 0.3 m from there,
-    # 1/24 of what the picture's 1920 px show across at 1400 px focal length.
-    assert count > 10
-    assert abs(x - width / 2) < width / 24
-    assert abs(y - height / 2) < width / 24
-    see_from("")
-    assert _limbs(opened, "flight") == outside
-    see_from("0")
-    opened.evaluate("document.getElementById('viewer-flight').focus()")
-    opened.press("ArrowLeft")  # turning leaves the camera
-    assert opened.evaluate("document.getElementById('viewer-from').value") == ""
 
 
 def test_a_table_is_saved_with_its_numbers(opened: Browser) -> None:

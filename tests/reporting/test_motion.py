@@ -3,7 +3,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from pipelines.geometry.triangulation import STATUS
@@ -39,18 +38,6 @@ def test_truth_is_interpolated_but_not_beside_a_hole_nor_outside() -> None:
     nose = coarse[~((coarse["joint"] == "nose") & (coarse["t_ns"] == stamps[6]))]
     result = truth_at(nose, motion)[:, 0, JOINTS.index("nose"), 0]
     assert np.array_equal(np.isnan(result), np.isin(np.arange(20), [5, 6, 7, 19]))
-
-
-def test_people_are_compared_with_the_nearest_truth() -> None:
-    def shifted(table: pd.DataFrame, person: int, metres: float) -> pd.DataFrame:
-        return table.assign(person=person, x=table["x"] + metres)
-
-    skeleton = make_skeleton(20)
-    truth = make_truth(20)
-    motion = motion_from_skeleton(pd.concat([shifted(skeleton, 0, 0), shifted(skeleton, 1, 5)]))
-    swapped = pd.concat([shifted(truth, 0, 5), shifted(truth, 1, 0)])
-    error = errors_mm(motion, truth_at(swapped, motion))
-    assert np.nanmax(error) == pytest.approx(1000 * np.linalg.norm(OFFSET_M), abs=1e-6)
 
 
 def test_a_calibrated_covariance_holds_95_percent_of_the_truth() -> None:

@@ -22,7 +22,7 @@ from pipelines.reporting.overlays import (
 )
 from pipelines.reporting.summary import summarise
 
-from .conftest import ASIDE_PX, CAMERAS, FRAMES, JOINTS, START_NS, make_skeleton, true_pixels
+from .conftest import ASIDE_PX, CAMERAS, JOINTS, START_NS, make_skeleton, true_pixels
 
 
 def _views(content: SessionContent, camera: str) -> list[OverlayView]:
@@ -52,46 +52,6 @@ def test_residuals_are_the_distance_that_the_keypoints_were_put_aside(
         assert seen.sum() >= 15
         assert view.reprojected[0, : len(JOINTS)][seen] == pytest.approx(expected[seen], abs=0.15)
         assert view.found[0][seen] == pytest.approx(expected[seen] + ASIDE_PX, abs=0.15)
-
-
-def test_bystander_is_another_person(content: SessionContent) -> None:
-    for view in _views(content, "drone2"):
-        if view.has_pose:
-            assert len(view.others) == 1
-            assert np.nanmedian(view.found[0, :, 0] - view.others[0, :, 0]) == pytest.approx(500)
-        else:
-            assert len(view.others) == 2  # nobody can tell who is who without a pose
-
-
-def test_a_rejected_joint_is_marked_and_has_no_residual(content: SessionContent) -> None:
-    wrist = JOINTS.index("left_wrist")
-    early = [view for view in _views(content, "mast") if view.t_s < 10]
-    late = [view for view in _views(content, "mast") if view.t_s >= 10]
-    assert len(early) == len(late) == 3
-    assert all(view.rejected[0, wrist] and np.isnan(view.residual_px[0, wrist]) for view in early)
-    assert not any(view.rejected.any() for view in late)
-
-
-def test_pictures_are_asked_for_by_camera_and_frame(content: SessionContent) -> None:
-    moments = collect_moments(
-        content,
-        summarise(content),
-        lambda camera, frame: np.full((2, 2, 3), frame % 256, dtype=np.uint8) if camera == "mast" else None,
-    )
-    views = [view for moment in moments for view in moment.views]
-    assert all((view.picture is not None) == (view.camera == "mast") for view in views)
-    for view in views:
-        assert view.frame == round(view.t_s * 30)
-        if view.picture is not None:
-            assert view.picture[0, 0, 0] == view.frame % 256
-
-
-def test_moments_are_spread_and_hold_the_worst() -> None:
-    motion = motion_from_skeleton(_with_error(433, list(JOINTS), 80.0))
-    chosen, worst = choose_moments(motion)
-    assert worst == 433
-    assert [row // (FRAMES // MOMENTS) for row in chosen] == list(range(MOMENTS))
-    assert 433 in chosen
 
 
 def test_the_worst_moment_is_that_of_the_largest_error_where_truth_is_known() -> None:

@@ -8,13 +8,11 @@ from collections import Counter
 from dataclasses import replace
 from html import unescape
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.reporting.chart import PALETTE
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.overlays import MOMENTS
 from pipelines.reporting.page import render_page
@@ -105,25 +103,6 @@ def _policy(page: str) -> str:
     found = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
     assert found is not None
     return unescape(found.group(1))
-
-
-def test_figures_take_their_colours_from_the_page(page: str) -> None:
-    drawings = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
-    assert not re.search(r"#[0-9a-f]{6}\b", "".join(re.findall(r"<[^>]+>", "".join(drawings))))
-    for variable in re.findall(r"var\((--[a-z0-9-]+)\)", "".join(drawings)):
-        assert f"{variable}: #" in page
-    # Light and dark both define the whole palette.
-    for variable in PALETTE.values():
-        assert page.count(f"{variable}: #") == 2, variable
-
-
-def test_same_content_gives_the_same_bytes_whatever_was_drawn_before(
-    content: SessionContent, page: str
-) -> None:
-    with mpl.rc_context({"font.size": 20, "axes.facecolor": "red", "svg.fonttype": "path"}):
-        again = render_page(content)
-        assert mpl.rcParams["font.size"] == 20  # left as it was
-    assert again == page
 
 
 def test_numbers_of_the_page_are_those_of_the_data(page: str) -> None:

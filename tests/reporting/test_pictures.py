@@ -18,8 +18,6 @@ from pipelines.reporting.pictures import (
     UNMEASURED,
     draw_frame,
     draw_panel,
-    panel_source,
-    panel_width,
     window_of,
 )
 
@@ -72,16 +70,6 @@ def _only(joint: int) -> NDArray[np.float64]:
     return alone
 
 
-def test_a_missing_joint_takes_its_bones_along(view: OverlayView) -> None:
-    lost = BODY.copy()
-    lost[0, 2] = np.nan
-    drawn = changed(draw_frame(GROUND, replace(view, reprojected=lost), ()))
-    assert not drawn[310:, 530:].any()  # nothing to, at or from the left hip
-    assert drawn[340, 523]
-    assert drawn[300, 570]
-    assert not changed(draw_frame(GROUND, replace(view, reprojected=MISSING), ())).any()
-
-
 def test_keypoints_are_rings_and_lost_ones_crosses(view: OverlayView) -> None:
     flags = np.eye(4, dtype=np.bool_)
     drawn = draw_frame(
@@ -115,22 +103,6 @@ def test_ellipses_hold_95_percent(view: OverlayView) -> None:
     assert not changed(draw_frame(GROUND, replace(alone, spread=1e8 * spread), ()))[~drawn].any()
 
 
-def test_corners_hold_the_person_that_was_found(view: OverlayView) -> None:
-    found = BODY.copy()
-    found[0, 1] = np.nan
-    lost = np.ones((1, 4), np.bool_)
-    drawn = draw_frame(GROUND, replace(view, reprojected=MISSING, found=found), ())
-    low, high = np.nanmin(found[0], axis=0), np.nanmax(found[0], axis=0)
-    spare = 0.1 * (high - low).max()
-    rows, columns = np.nonzero(changed(drawn))
-    box = [columns.min(), rows.min(), columns.max(), rows.max()]
-    np.testing.assert_allclose(box, [*(low - spare), *(high + spare)], atol=1.5)  # the pen
-    middle = int(low[0] + high[0]) // 2
-    assert not changed(drawn)[: int(low[1]) - 10, middle].any(), "its sides are open"
-    nobody = replace(view, reprojected=MISSING, found=MISSING, unmeasured=lost)
-    assert not changed(draw_frame(GROUND, nobody, ())).any()
-
-
 def test_labels_stand_beside_their_joints_and_do_not_cover_each_other(view: OverlayView) -> None:
     both = [(0, "left_hip", "left hip flexion 12 deg"), (0, "left_shoulder", "left shoulder 30 deg")]
     bare = draw_frame(GROUND, view, ())
@@ -153,20 +125,6 @@ def test_labels_stand_beside_their_joints_and_do_not_cover_each_other(view: Over
 # --- panels ---
 
 
-@pytest.mark.parametrize("corner", [(0.0, 0.0), (WIDTH - 101.0, HEIGHT - 81.0), (520.0, 300.0)])
-def test_a_panel_is_a_square_about_the_person_in_the_picture(
-    view: OverlayView, corner: tuple[float, float]
-) -> None:
-    moved = BODY - BODY.min(axis=(0, 1)) + corner
-    astray = moved.copy()
-    astray[0, 0] = [9e5, -9e5]  # points outside the picture do not count
-    window = window_of(replace(view, found=moved, reprojected=astray))
-    assert window.width == np.ceil(1.3 * 100)
-    assert -0.5 <= window.left <= WIDTH - 0.5 - window.width
-    assert -0.5 <= window.top <= HEIGHT - 0.5 - window.width
-    assert window_of(replace(view, reprojected=MISSING)).width == WIDTH  # nobody: the whole picture
-
-
 @pytest.mark.parametrize("scale", [1, 2])
 def test_a_picture_lies_under_its_pixels(view: OverlayView, scale: int) -> None:
     """White from 568 to 572 by 340 to 344 px, in a picture as large as the calibration's or twice."""
@@ -178,20 +136,3 @@ def test_a_picture_lies_under_its_pixels(view: OverlayView, scale: int) -> None:
     place = np.array([columns[inside].mean(), rows[inside].mean()]) + 0.5
     found = place / px * window.width + [window.left, window.top]
     assert found == pytest.approx([570, 342], abs=0.2)
-
-
-def test_a_panel_shows_residuals_and_the_same_bytes_again(view: OverlayView) -> None:
-    aside = replace(view, found=BODY + np.array([6.0, 8.0]))
-    between = draw_panel(aside, 650)
-    window = window_of(aside)
-    x, y = ((BODY[0, 1] + [3.0, 4.0] - [window.left, window.top]) / window.width * 650).astype(int)
-    near = between[y - 2 : y + 3, x - 2 : x + 3].astype(int)
-    assert np.abs(near - FOUND).max(axis=-1).min() < 40  # the line is smoothed
-    assert panel_source(aside, 300) == panel_source(aside, 300)
-    assert panel_source(aside, 300).startswith("data:image/webp;base64,")
-
-
-@pytest.mark.parametrize(("panels", "width"), [(1, 640), (12, 640), (48, 353)])
-def test_many_panels_share_the_room(panels: int, width: int) -> None:
-    assert panel_width(panels) == width
-    assert panels * panel_width(panels) ** 2 <= 6_000_000

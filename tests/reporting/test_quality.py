@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.summary import summarise, table_of_quality
@@ -14,28 +13,13 @@ from pipelines.session.tables import COVARIANCE_COLUMNS
 
 from .conftest import described, make_poses, make_session
 
-STATED, MEASURED, OFFSET, SIGMA, DETECTED, CONFIDENT = range(1, 7)
+STATED, OFFSET, SIGMA, DETECTED, CONFIDENT = range(1, 6)
 
 
 def _rows(content: SessionContent) -> dict[str, list[str]]:
     """Return the rows of the table by camera."""
     rows = table_of_quality(content, summarise(content)).rows
     return {str(row[0]): [str(cell) for cell in row] for row in rows}
-
-
-def test_pose_noise_is_measured_per_axis(content: SessionContent) -> None:
-    true = make_poses()["drone1"]
-    off = true.assign(x=true["x"] + 0.03, z=true["z"] - 0.04)
-    turned = Rotation.from_quat(true[["qx", "qy", "qz", "qw"]].to_numpy()) * Rotation.from_rotvec(
-        [0.6, 0, 0], True
-    )
-    off[["qx", "qy", "qz", "qw"]] = turned.as_quat()
-    row = _rows(replace(content, poses=content.poses | {"drone1": off}, true_poses={"drone1": true}))[
-        "drone1"
-    ]
-    # 0.05 m and 0.6 deg in all: a root of three less per axis.
-    assert row[MEASURED] == f"{0.05 / np.sqrt(3):.3f}{THIN}m, {0.6 / np.sqrt(3):.2f}{THIN}deg"
-    assert _rows(content)["drone1"][MEASURED] == "–"
 
 
 def test_who_states_the_pose_noise_is_said(content: SessionContent) -> None:

@@ -10,7 +10,6 @@ import pytest
 from pipelines.reporting.arms import (
     MapAround,
     Replan,
-    bounds_of,
     heights,
     map_around,
     summarise_replan,
@@ -21,7 +20,6 @@ from pipelines.session.records import Occupancy
 from .comparisons import (
     BLOCK,
     RANGE_M,
-    TIMES,
     actor,
     make_comparison,
     make_map,
@@ -120,11 +118,3 @@ def test_the_surface_is_the_shell_of_what_rises() -> None:
     # Every voxel lies in one of the cubes.
     offset = np.abs(found.points[:, None] - thin.points[None]).max(axis=-1)
     assert (offset.min(axis=1) < thin.cube_m / 2).all()
-
-
-def test_bounds_hold_all_arms_and_the_actor(compared: Replan) -> None:
-    low, high = bounds_of(compared.arms)
-    paths = [positions(arm, k) for arm in ARMS for k in range(2)] + [actor()]
-    assert len(paths[0]) == TIMES
-    np.testing.assert_allclose(low, np.concatenate(paths)[:, :2].min(axis=0))
-    np.testing.assert_allclose(high, np.concatenate(paths)[:, :2].max(axis=0))

@@ -138,20 +138,6 @@ def test_a_joint_gone_far_astray_is_left_out_and_counted(content: SessionContent
     assert [numbers(note) for note in scene.notes] == [[3, 33]]
 
 
-def test_bones_know_their_side_and_join_what_is_derived(content: SessionContent) -> None:
-    body: Any = _scene(content).data["body"]
-    names = [label.replace(" ", "_") for label in [*body["joints"], "neck", "hip"]]
-    bones = {(names[a], names[b]): ("", "left", "right")[side] for a, b, side in body["bones"]}
-    assert bones["left_shoulder", "left_elbow"] == "left"
-    assert bones["right_knee", "right_ankle"] == "right"
-    assert bones["left_hip", "right_hip"] == ""
-    assert bones["hip", "neck"] == ""
-    assert [[names[parent] for parent in parents] for parents in body["derived"]] == [
-        ["left_shoulder", "right_shoulder"],
-        ["left_hip", "right_hip"],
-    ]
-
-
 def test_simulated_arms_bring_their_cameras_and_the_map(content: SessionContent) -> None:
     summary = summarise(content)
     replan = summarise_replan(make_comparison(), START_NS, len(CAMERAS))

@@ -497,10 +497,8 @@
   }
 
   function ellipsoidParts(eye, joints, person, at) {
-    const stored = body.root.length / 6 / people / jointCount;
-    const nearest = Math.min(Math.round(at.near / body.rootEvery), stored - 1);
     return joints.slice(0, jointCount).flatMap((joint, j) => {
-      const row = (nearest * people + person) * jointCount + j;
+      const row = (at.near * people + person) * jointCount + j;
       if (!joint || body.root[6 * row] === MISSING[2]) return [];
       return [{ depth: eye.inside(joint)[2] + 0.01, draw: () => ellipsoid(eye, joint, row, body.sides[j]) }];
     });
