@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 import re
@@ -23,12 +21,10 @@ import pytest
 
 from pipelines import batch
 from pipelines import detect as detection
-from pipelines.batch import BatchSettings, Job, Outcome, run_flight
+from pipelines.batch import BatchSettings, Job, run_flight
 from pipelines.detect import Following, detect
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.reconstruction import windows
-from pipelines.reporting.page import FlightRow
-from pipelines.session.errors import BusyError
 from pipelines.session.parallel import connected
 from pipelines.session.registries import install_command
 from pipelines.session.stages import locked
@@ -230,51 +226,6 @@ def test_a_session_at_a_url_is_uploaded_when_its_flight_is_done(
     failed = run_flight(replace(job, session=Path("s3://me:pw@bucket/x.session")))
     assert failed.failed_stage == "ingest"
     assert "pw" not in str(failed.error)
-
-
-def test_session_that_is_held_for_a_moment_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-
-    def busy_once() -> bool:
-        calls.append(1)
-        if len(calls) == 1:
-            raise BusyError("held")
-        return True
-
-    monkeypatch.setattr(time, "sleep", lambda _: None)
-    assert batch._patiently(busy_once)
-    monkeypatch.setattr(batch, "MAX_WAIT_FOR_OWNER_S", -1.0)
-    calls.clear()
-    with pytest.raises(BusyError):
-        batch._patiently(busy_once)
-
-
-@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t", "\r", "\n", "＝", "a;=", 'a";=', "a,=", "a\n="])
-def test_no_text_of_the_summary_is_a_formula(tmp_path: Path, start: str) -> None:
-    text = f"{start}HYPERLINK(1)"
-    row = FlightRow(
-        text,
-        name=text,
-        failed_stage=None,
-        error=text,
-        figures={"mpjpe_mm": -1.5},
-        warnings=(),
-        report=f"{text}.html",
-    )
-    batch._store(tmp_path, [row], [Outcome()])
-    table = (tmp_path / "summary.csv").read_bytes().decode()
-    for delimiter in ",;":  # which of them depends on the country that the spreadsheet is set to
-        rows = csv.reader(io.StringIO(table, newline=""), delimiter=delimiter)
-        starts = [cell[0] for cells in rows for cell in cells if cell and cell != "-1.5"]
-        assert not set(starts) & set("=+-@\t\r\n＝"), table
-    header, cells = csv.reader(io.StringIO(table, newline=""))
-    told = dict(zip(header, cells, strict=True))
-    for name in ("flight", "name", "error"):
-        assert told[name].replace("'", "") == text
-    assert float(told["mpjpe_mm"]) == -1.5  # a number is no formula
-    read = pd.read_csv(tmp_path / "summary.csv").iloc[0]
-    assert read["mpjpe_mm"] == -1.5
-    batch._refuse_foreign(tmp_path, overwrite=False)  # it is still known for a batch's
 
 
 def test_what_a_batch_cannot_start_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -166,20 +166,6 @@ def test_refined_poses_and_estimated_clocks_move_the_skeleton(
     assert all(is_near(picture, between[joint], flight.joints[joint]) for joint in there)
 
 
-def test_an_angle_is_written_beside_its_joint(filmed: tuple[SyntheticFlight, Path], session: Path) -> None:
-    flight, _ = filmed
-    bare, shown = drawn(session, "drone1"), drawn(session, "drone1", "overlay:left_knee")
-    knee = flight.joints.index("left_knee")
-    for before, after, pixels in zip(bare, shown, true_pixels(flight, "drone1"), strict=True):
-        rows, columns = np.nonzero(np.abs(before.astype(int) - after).max(axis=-1) > 60)
-        assert len(rows) > 500
-        assert abs(np.median(rows) - pixels[knee, 1]) < 15
-        assert abs(np.median(columns) - pixels[knee, 0]) < 400
-    for wrong in ("overlay:left_nose", "trc:left_knee"):
-        with pytest.raises(DataError):
-            export(session, [wrong])
-
-
 def test_pictures_that_are_gone_or_others_and_no_skeleton(session: Path) -> None:
     (session.parent / "drone1.mp4").unlink()
     notes = Notes()

@@ -47,16 +47,6 @@ def test_one_that_fails_stops_none_of_the_others(folder: Path, tmp_path: Path) -
     assert "friday.export/Test_flight.csv" in content(tmp_path / "out")
 
 
-def test_pages_of_the_others_are_written(folder: Path, tmp_path: Path) -> None:
-    succeeds("ingest", folder / "friday" / "flight.yaml", "-o", tmp_path / "a.session")
-    done = mocap("report", tmp_path / "no.session", tmp_path / "a.session", "--json")
-    assert done.returncode == 1
-    told = json.loads(done.stdout)
-    assert told["pages"] == [f"{tmp_path}/a.session/report/index.html"]
-    assert told["comparison"] is None
-    assert list(told["failed"]) == [f"{tmp_path}/no.session"]
-
-
 def test_output_of_several_is_a_folder_around_them(folder: Path, tmp_path: Path) -> None:
     flights = [folder / name / "flight.yaml" for name in ("friday", "monday")]
     (tmp_path / "file").write_text("", encoding="utf-8")
@@ -66,12 +56,3 @@ def test_output_of_several_is_a_folder_around_them(folder: Path, tmp_path: Path)
     assert f"{tmp_path}/one.session: " in refused("ingest", *flights, "-o", tmp_path / "one.session")
     assert content(tmp_path / "one.session") == before
     assert refused("ingest", folder / "*.yml").startswith(f"mocap: {folder}/*.yml: ")
-
-
-def test_info_says_what_each_of_several_is(folder: Path) -> None:
-    done = mocap("info", folder / "*" / "flight.yaml")
-    assert done.returncode == 1
-    titles = [line for line in done.stdout.splitlines() if not line.startswith(" ")]
-    files = [f"{folder}/{name}/flight.yaml" for name in ("friday", "monday")]
-    assert [title.rpartition(": ")[0] for title in titles] == files
-    assert f"{folder}/lost/flight.yaml" in done.stderr

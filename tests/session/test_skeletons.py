@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipelines.session.people import (
     DERIVED,
     SKELETONS,
     get_skeleton,
     mirrored,
-    take_joints,
     with_derived,
 )
-
-NAMES = st.sampled_from(sorted(SKELETONS))
-
 
 # Joints by number as the detectors' own documentation gives them, a few of each group.
 NUMBERED = {
@@ -50,16 +44,6 @@ def test_bones_are_symmetric_and_join_joints_that_are_there(name: str) -> None:
     assert bones == {frozenset(mirrored(joint) for joint in bone) for bone in bones}
     assert set().union(*bones) <= set(skeleton.joints)
     assert {frozenset(("left_hip", "left_knee")), frozenset(("right_elbow", "right_wrist"))} <= bones
-
-
-@given(NAMES, NAMES, st.integers(0, 2**32 - 1))
-def test_taking_joints_there_and_back_keeps_the_shared_ones(one: str, other: str, seed: int) -> None:
-    a, b = get_skeleton(one).joints, get_skeleton(other).joints
-    values = np.random.default_rng(seed).normal(size=(3, len(a), 2))
-    back = take_joints(take_joints(values, a, b), b, a)
-    shared = np.isin(a, b)
-    np.testing.assert_array_equal(back[:, shared], values[:, shared])
-    assert np.isnan(back[:, ~shared]).all()
 
 
 def test_neck_and_hip_are_the_midpoints_of_their_parents() -> None:

@@ -279,16 +279,6 @@ def test_a_reader_refuses_what_was_published_halfway_and_a_writer_finishes_it(tm
     assert contents(folder) == expected
 
 
-def test_a_copy_kept_by_the_user_stays(tmp_path: Path) -> None:
-    folder = tmp_path / "a.session"
-    work(folder)
-    shutil.copytree(folder / "reconstruct", folder / "reconstruct.old")
-    kept = (folder / "reconstruct" / "skeleton").read_text()
-    reconstruct(folder, "dlt")
-    assert (folder / "reconstruct" / "skeleton").read_text() != kept
-    assert (folder / "reconstruct.old" / "skeleton").read_text() == kept
-
-
 def test_an_unchanged_stage_is_skipped_and_a_forced_one_redone_to_the_same_bytes(tmp_path: Path) -> None:
     folder = tmp_path / "a.session"
     work(folder)
@@ -390,13 +380,6 @@ def fail_to_ingest(folder: Path) -> None:
     with locked(folder, create=True) as session:
         (session.begin(INGEST, settings={}, inputs={}).folder / "truth.parquet").touch()
         raise DataError("flight.yaml", "cannot be used")
-
-
-def test_a_failed_first_ingest_leaves_nothing(tmp_path: Path) -> None:
-    folder = tmp_path / "deep" / "a.session"
-    with refused("data", "flight.yaml"):
-        fail_to_ingest(folder)
-    assert not folder.exists()
 
 
 def test_a_failed_ingest_leaves_an_existing_folder_and_an_existing_session(tmp_path: Path) -> None:

@@ -69,14 +69,6 @@ def test_the_real_file_projects_as_opencv_does() -> None:
     np.testing.assert_allclose(project(points, lens), expected[:, 0], rtol=0, atol=1e-9)
 
 
-def test_without_a_size_the_pictures_decide(tmp_path: Path) -> None:
-    text = "\n".join(line for line in FISHEYE.splitlines() if "width" not in line and "height" not in line)
-    first = READER.read_calibration(write(tmp_path, text))["Camera1"]
-    assert not first.size_stated
-    assert first.intrinsics is not None
-    assert (first.intrinsics.width, first.intrinsics.height) == (510, 514)  # 2 * 254.5 + 1, 2 * 256.75 + 1
-
-
 @pytest.mark.parametrize(
     ("old", "new", "word"),
     [

@@ -46,15 +46,6 @@ def test_the_real_file_holds_what_is_known_of_it() -> None:
     assert sorted(set(found.person.tolist())) == [0, 1]
 
 
-def test_frames_and_tracks(tmp_path: Path) -> None:
-    merged = entry("cam1_0012.jpg", [[3.0], [4.0]])
-    path = written(tmp_path, [merged, entry("cam1_0010.jpg", [7]), entry("cam1_0010.jpg", 3)])
-    found = FORMAT.read_keypoints(path, skeleton="coco17", first_frame=10)
-    assert found.frame.tolist() == [0, 0, 2]
-    assert found.person.tolist() == [3, 7, 3]
-    assert found.frames_listed.tolist() == [0, 2]
-
-
 @pytest.mark.parametrize(
     "content",
     [

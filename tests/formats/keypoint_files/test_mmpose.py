@@ -74,18 +74,6 @@ def test_a_real_picture_is_frame_0() -> None:
     np.testing.assert_array_equal(found.xy, [person["keypoints"] for person in stated])
 
 
-@pytest.mark.parametrize(("count", "body"), [(136, "halpe26"), (133, "coco23")])
-def test_of_whole_body_keypoints_the_body_is_kept_and_the_rest_counted(
-    tmp_path: Path, count: int, body: str
-) -> None:
-    path = written(tmp_path / "walk.json", video([instance(count=count), instance(9.0, count)]))
-    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-    joints = get_skeleton(body).joints
-    assert found.joints == joints
-    assert found.xy[1, :, 0].tolist() == [9.0 + k for k in range(len(joints))]
-    assert list(found.dropped.values()) == [2 * (count - len(joints))]
-
-
 @pytest.mark.parametrize(
     "relative",
     [

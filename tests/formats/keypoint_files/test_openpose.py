@@ -123,15 +123,6 @@ def test_bad_folders_are_one_clear_line(tmp_path: Path) -> None:
         read("absent")
 
 
-@pytest.mark.parametrize("name", ["{:06d}_cam2", "{:06d}_rtmpose-m_256x192", "cam2_{:012d}_keypoints"])
-def test_pictures_are_numbered_by_the_digits_that_change(tmp_path: Path, name: str) -> None:
-    for k in range(3, 15):
-        frame_file(tmp_path / "a", f"{name.format(k)}.json", person(x=k))
-    found = FORMAT.read_keypoints(tmp_path / "a", skeleton=None, first_frame=0)
-    assert found.frame.tolist() == list(range(3, 15))
-    assert found.xy[:, 0, 0].tolist() == list(range(3, 15))
-
-
 def test_the_coco_model_and_the_key_of_its_time(tmp_path: Path) -> None:
     old = person(count=18)
     old["pose_keypoints"] = old.pop("pose_keypoints_2d")

@@ -61,17 +61,3 @@ def test_joints_and_bones_are_where_the_motion_has_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(tip[known], place[known], rtol=0, atol=FLOAT32_M)
     assert not size[~known].any()
     assert document["asset"]["extras"]["zero_ns"] == str(START_NS)
-
-
-def test_cameras_look_along_their_negative_z(tmp_path: Path) -> None:
-    _, document, buffer = written(tmp_path)
-    for camera in document["cameras"]:
-        turn = animated(document, buffer, camera["name"], "rotation")
-        # The recording's cameras look north, which is -z in the file, with their heads up.
-        np.testing.assert_allclose(
-            rotate(turn, np.array([0.0, 0.0, -1.0])), [[0, 0, -1]] * len(turn), atol=1e-6
-        )
-        np.testing.assert_allclose(
-            rotate(turn, np.array([0.0, 1.0, 0.0])), [[0, 1, 0]] * len(turn), atol=1e-6
-        )
-    assert document["cameras"]

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from pipelines.formats.skeletons import bvh
 from pipelines.formats.skeletons.bvh import fit_rig, read_motion
@@ -41,21 +39,6 @@ def joint_positions(motion: SkeletalMotion) -> Float:
     return place
 
 
-def seen_by_bvhtoolbox(path: Path, folder: Path) -> tuple[list[str], Float]:
-    """Return joints and world positions [T, B, 3] by bvhtoolbox, in the file's unit and axes."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # bvhtoolbox still imports pkg_resources
-        bvhtoolbox = pytest.importorskip("bvhtoolbox")
-        converter = pytest.importorskip("bvhtoolbox.convert.bvh2csv")
-    tree = bvhtoolbox.BvhTree(path.read_text())
-    positions = folder / "positions.csv"
-    assert converter.write_joint_positions(tree, str(positions))
-    header, *rows = (folder / "positions.csv").read_text().splitlines()
-    values = np.array([[float(cell) for cell in row.split(",")] for row in rows])
-    names = [cell.rpartition(".")[0] for cell in header.split(",")[1::3]]
-    return names, values[:, 1:].reshape(len(values), -1, 3)
-
-
 def test_a_body_of_rigid_bones_is_followed_exactly() -> None:
     motion = walking(90)
     rigged = fit_rig("x", motion, 0)
@@ -64,27 +47,6 @@ def test_a_body_of_rigid_bones_is_followed_exactly() -> None:
         joint_positions(rigged.motion), measured(motion, rigged.joints), rtol=0, atol=1e-9
     )
     assert (rigged.first, rigged.without_hips, rigged.turns_held) == (0, 0, 0)
-
-
-@pytest.mark.parametrize(("unit", "scale"), [("cm", 100.0), ("m", 1.0)])
-def test_another_reader_sees_the_joints_where_the_rig_has_them(
-    tmp_path: Path, unit: str, scale: float
-) -> None:
-    asked = replace(recording(15), unit=unit)
-    (path,) = WRITER.write(asked, tmp_path)
-    assert asked.motion is not None
-    rigged = fit_rig("x", asked.motion, 0)
-    names, positions = seen_by_bvhtoolbox(path, tmp_path)
-    assert names == list(rigged.motion.bones)
-    ours = joint_positions(rigged.motion)
-    # It writes five decimals of the unit; the file's axes are the world's (y, z, x).
-    np.testing.assert_allclose(
-        positions / scale, ours[..., [1, 2, 0]], rtol=0, atol=WRITTEN_M + 5.1e-6 / scale
-    )
-    back = read_motion(path, unit=unit, axes="y-up")
-    assert back.bones == rigged.motion.bones
-    np.testing.assert_allclose(joint_positions(back), ours, rtol=0, atol=WRITTEN_M)
-    np.testing.assert_allclose(back.t_s, rigged.motion.t_s, atol=15 * 0.5e-9)
 
 
 def test_bones_have_their_median_length_and_point_where_they_were_measured() -> None:
