@@ -16,10 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
-from pipelines.session.storage import hash_of, read_json, refuse_camera_names
-
-# The first version of session.json is the only one so far.
-SCHEMA = 1
+from pipelines.session.storage import hash_of, read_json, refuse_camera_names, refuse_newer
 
 
 class Entry(BaseModel):
@@ -426,14 +423,12 @@ def assumptions_as_warnings(assumptions: Sequence[str]) -> list[str]:
 def read_description(session: Path) -> Description:
     """Read session.json of a session folder; DataError if it is damaged or of a later version."""
     path = session / "session.json"
-    document = read_json(path, "ingest the flight again with --force")
-    if isinstance(document.get("schema"), int) and document["schema"] > SCHEMA:
-        problem = f"has schema {document['schema']}, this version reads up to {SCHEMA}"
-        raise DataError(path, problem, "update mocap", code="newer-schema")
+    remedy = "ingest the flight again with --force"
+    document = read_json(path, remedy)
+    refuse_newer(path, document, remedy)
     try:
         return Description.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        problem = f"is damaged ({place + ': ' if place else ''}{first['msg']})"
-        raise DataError(path, problem, "ingest the flight again with --force", code="damaged") from None
+        place = "".join(f"{part}: " for part in [".".join(map(str, first["loc"]))] if part)
+        raise DataError(path, f"is damaged ({place}{first['msg']})", remedy, code="damaged") from None

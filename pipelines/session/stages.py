@@ -31,6 +31,8 @@ from typing import Any
 
 from pipelines.session.errors import DataError, MocapError
 from pipelines.session.storage import (
+    SCHEMA,
+    NewerSchemaError,
     as_data_error,
     drop_link,
     finished_part,
@@ -39,6 +41,7 @@ from pipelines.session.storage import (
     jsonable,
     make_folder,
     read_json,
+    refuse_newer,
     refuse_special,
     remove_if_unused,
     remove_tree,
@@ -47,9 +50,6 @@ from pipelines.session.storage import (
     sync_tree,
     write_json,
 )
-
-SCHEMA = 1
-"""Version of session.json and stage.json. Older ones are read, newer ones refused."""
 
 STAGES = ("ingest", "detect", "background", "reconstruct", "replan", "film", "report")
 """The stages in the order in which they may run."""
@@ -64,12 +64,6 @@ COMMANDS = {
     "report": "mocap report",
 }
 """The command that makes each stage."""
-
-
-class NewerSchemaError(DataError):
-    """Error for a file that a later version of this program wrote."""
-
-    code = "newer-schema"
 
 
 @dataclass(frozen=True)
@@ -100,12 +94,7 @@ class StageRecord:
 
 def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, str]) -> str:
     """Compute the SHA-256 of everything that determines a stage's result: equal keys, equal bytes."""
-    ingredients = {
-        "stage": stage.name,
-        "revision": stage.revision,
-        "settings": settings,
-        "inputs": inputs,
-    }
+    ingredients = {"stage": stage.name, "revision": stage.revision, "settings": settings, "inputs": inputs}
     return hash_of(ingredients)
 
 
@@ -131,16 +120,8 @@ def read_record(path: Path) -> StageRecord:
     remedy = "run the stage again with --force"
     document = read_json(path, remedy)
     refuse_newer(path, document, remedy)
-    kinds = {
-        "stage": str,
-        "revision": int,
-        "key": str,
-        "settings": dict,
-        "inputs": dict,
-        "outputs": dict,
-        "counts": dict,
-        "warnings": list,
-    }
+    kinds = {"stage": str, "revision": int, "key": str, "warnings": list}
+    kinds |= dict.fromkeys(("settings", "inputs", "outputs", "counts"), dict)
     wrong = [name for name, kind in kinds.items() if not isinstance(document.get(name), kind)]
     if not wrong and any(PurePosixPath(name).is_absolute() or ".." in name for name in document["outputs"]):
         wrong = ["outputs"]
@@ -157,17 +138,6 @@ def usable_record(path: Path) -> StageRecord | None:
         raise
     except DataError:
         return None
-
-
-def refuse_newer(path: Path, document: Mapping[str, Any], remedy: str) -> None:
-    """Refuse, with a DataError, a file of a later version or without a version."""
-    schema = document.get("schema")
-    if not isinstance(schema, int):
-        raise DataError(path, f"states no schema number (schema: {schema!r})", remedy, code="damaged")
-    if schema > SCHEMA:
-        raise NewerSchemaError(
-            path, f"has schema {schema}, this version reads up to {SCHEMA}", "update mocap to read it"
-        )
 
 
 _LIBRARIES = (
@@ -289,16 +259,19 @@ class Session:
         if record is None:
             return None
         command = COMMANDS[stage]
+        for path in self._changed(record):
+            problem = f"is not what `{command}` wrote (other SHA-256): it was changed since"
+            if not path.is_file():
+                problem = f"is gone although `{command}` wrote it"
+            raise DataError(path, problem, f"run `{command}` again, which makes it anew", code="changed")
+        return record
+
+    def _changed(self, record: StageRecord) -> Iterator[Path]:
+        """Yield the files that are not as the stage wrote them."""
         for name, expected in record.outputs.items():
             path = self.folder / name
-            if not path.is_file():
-                raise DataError(
-                    path, f"is gone although `{command}` wrote it", f"run `{command}` again", code="changed"
-                )
-            if sha256_of(path) != expected:
-                problem = f"is not what `{command}` wrote (other SHA-256): it was changed since"
-                raise DataError(path, problem, f"run `{command}` again, which makes it anew", code="changed")
-        return record
+            if not path.is_file() or sha256_of(path) != expected:
+                yield path
 
     def ingested(self) -> StageRecord:
         """Return the record of the ingest as `intact_record` does; DataError for a part of a session."""
@@ -314,11 +287,8 @@ class Session:
         """Return the record of a stage that these settings and inputs made, if its files are undamaged."""
         record = usable_record(self.folder / stage.name / "stage.json")
         key = key_of(stage, settings, inputs)
-        return record if record is not None and record.key == key and self._intact(record) else None
-
-    def _intact(self, record: StageRecord) -> bool:
-        files = {self.folder / name: expected for name, expected in record.outputs.items()}
-        return all(path.is_file() and sha256_of(path) == expected for path, expected in files.items())
+        unchanged = record is not None and record.key == key and not any(self._changed(record))
+        return record if unchanged else None
 
 
 class WritableSession(Session):
@@ -355,7 +325,7 @@ class WritableSession(Session):
     def reusable(self, stage: Stage) -> StageRecord | None:
         """Return the record of a finished stage of this revision whose files a new run may take over."""
         before = usable_record(self.folder / stage.name / "stage.json")
-        if before is None or before.revision != stage.revision or not self._intact(before):
+        if before is None or before.revision != stage.revision or any(self._changed(before)):
             return None
         return before
 

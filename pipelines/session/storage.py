@@ -263,6 +263,26 @@ def read_json(path: Path, remedy: str = "run the stage that wrote it again with 
     return document
 
 
+SCHEMA = 1
+"""Version of session.json and stage.json. Older ones are read, newer ones refused."""
+
+
+class NewerSchemaError(DataError):
+    """Error for a file that a later version of this program wrote."""
+
+    code = "newer-schema"
+
+
+def refuse_newer(path: Path, document: Mapping[str, Any], remedy: str) -> None:
+    """Refuse, with a DataError, a file of a later version or without a version."""
+    schema = document.get("schema")
+    if not isinstance(schema, int):
+        raise DataError(path, f"states no schema number (schema: {schema!r})", remedy, code="damaged")
+    if schema > SCHEMA:
+        problem = f"has schema {schema}, this version reads up to {SCHEMA}"
+        raise NewerSchemaError(path, problem, "update mocap to read it")
+
+
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"holds {name}, which is not JSON")
 

@@ -20,14 +20,13 @@ import pytest
 from pipelines.session.errors import BusyError, DataError
 from pipelines.session.stages import (
     COMMANDS,
-    SCHEMA,
     Run,
     Stage,
     locked,
     open_session,
     versions_of,
 )
-from pipelines.session.storage import read_json, sha256_of, write_json
+from pipelines.session.storage import SCHEMA, read_json, sha256_of, write_json
 from tests.raising import refused
 
 INGEST = Stage("ingest", 1)

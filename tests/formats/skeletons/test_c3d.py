@@ -166,4 +166,4 @@ def test_gait_events_are_read_by_ezc3d(tmp_path: Path) -> None:
     assert events["USED"]["value"].tolist() == [3]
     assert events["CONTEXTS"]["value"] == ["Left", "Right", "Left"]
     assert events["LABELS"]["value"] == ["Foot Strike", "Foot Off", "Foot Strike"]
-    np.testing.assert_allclose(events["TIMES"]["value"], [[0, 0, 1], [0.25, 0.9, 5.5]], atol=1e-6)
+    np.testing.assert_allclose(events["TIMES"]["value"], np.array([[0, 0, 1], [0.25, 0.9, 5.5]]), atol=1e-6)
