@@ -393,7 +393,7 @@ def _write_tables(folder: Path, attempt: Attempt, gait: pd.DataFrame) -> None:
 
 def _counts(metrics: Mapping[str, Any], attempt: Attempt, swaps: Mapping[str, object]) -> dict[str, object]:
     """Count joints by status, undone swaps, filled and smoothed joints, and events of the association."""
-    events = ("views", "ambiguous", "switches", "refused", "resumed")
+    events = ("views", "refused", "resumed")
     return {
         **metrics["status_counts"],
         "no_people": metrics["people"]["no_people"],

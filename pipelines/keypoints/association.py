@@ -8,24 +8,19 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from pipelines.geometry.arrays import Bool, Float
-from pipelines.keypoints.common_errors import without_common_errors
-from pipelines.keypoints.exchanges import undo_exchanges
-from pipelines.keypoints.grouping import TracksOfDetections, follow
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.keypoints.bodies import Bodies, SightLines, find_bodies, median_of, meeting_points, rays_of
 from pipelines.keypoints.no_people import (
     PossiblePerson,
-    SightLines,
     Surroundings,
     level_of_most_seen,
     tell_no_people,
     why_no_body,
     why_no_person,
 )
-
-Int64 = NDArray[np.int64]
 
 # Within 3 sigma of the logged actor counts for a track, beyond it against the track.
 _NEAR_CHI2 = 9.0
@@ -53,8 +48,6 @@ class Association:
 
     choice: Int64  # [T, C, P] index into the detections of the camera at that time, -1 none
     views: Int64  # [P] camera-frames chosen
-    ambiguous: Int64  # [P] of these: another detection of the same camera fits within one sigma as well
-    switches: Int64  # [P] of these: against the continuity of the picture (swapped ids, bodies crossing)
     refused: Int64  # [P] camera-frames with detections, none of them the person that other cameras see
     resumed: Int64  # [P] times the person was lost by all and taken up again
     people: Int64  # [T] people whom at least two cameras see
@@ -95,10 +88,8 @@ def associate(
 ) -> Association:
     """Choose the detections of the people who were logged, then of others, most seen first.
 
-    Detections of different cameras are grouped into bodies by how near their viewing rays pass each
-    other, in units of the stated angular noise, and bodies are followed over time by the continuity of
-    each camera's picture and by their place (see `grouping`). Where several are seen, this is done again
-    without the pose errors that all bodies of a picture share (`common_errors`). Of the bodies each logged
+    Detections of different cameras and times are grouped into bodies (see `bodies`). Where several are seen,
+    this is done again without the pose errors that all bodies of a picture share. Of the bodies each logged
     person is the one that fits their log best, so that the sum over all of them is greatest; nobody stands in
     for a logged person whom no camera sees. Others are those seen in most camera-frames by two cameras or
     more, ties by confidence. The order of detections within a camera and frame does not matter.
@@ -131,7 +122,7 @@ def associate(
     if logged:
         logs = np.stack([np.c_[log, np.full(len(log), actor_sigma_m)] for log in logged], axis=1)
     views = SightLines(xy, confidence, position, rotation, sigma)
-    seen = follow(time_s, *views, logs)
+    seen = find_bodies(time_s, views, logs)
     dropped: dict[str, Int64] = {}
     kept = seen.track >= 0
     if scene is not None:
@@ -147,11 +138,10 @@ def associate(
         logs[..., 3] = noise_m
         again |= noise_m < actor_sigma_m
     if several:
-        views, before = without_common_errors(time_s, views, undo_exchanges(time_s, views, seen)), views
+        views, before = without_common_errors(time_s, views, seen), views
         again |= views is not before
     if again:
-        seen = follow(time_s, *views, logs)
-        seen = undo_exchanges(time_s, views, seen) if several else seen
+        seen = find_bodies(time_s, views, logs, seen)
     xy, confidence = views.xy, views.confidence
     tracks = _tracks(seen, np.where(np.isfinite(xy).all(-1) & (confidence > 0), confidence, 0.0))
     near, unseen, reasons = _near_logs(tracks, logged, noise_m, actor_sigma_m)
@@ -159,6 +149,8 @@ def associate(
     refused: Counter[str] = Counter()
     if scene is not None and scene.ground is None:
         scene = scene._replace(ground=level_of_most_seen(seen))
+    # Bodies are judged by the noise that they have.
+    views = views._replace(sigma=views.sigma * max(seen.noise, 1.0))
     if people is None:
         refused = _add_people(chains, tracks, time_s, seen.track, views, scene)
     bodies = [chain.body(seen.track) for chain in chains]
@@ -166,11 +158,11 @@ def associate(
     chosen = np.stack([body.choice for body in bodies], axis=-1)
     resumed = np.array([max(0, len(chain.taken) - 1) for chain in chains], np.int64)
     if not np.any(chosen >= 0):
-        reasons.append(_nobody(seen.nearest))
+        reasons.append("no two cameras agree on anybody: check poses, clocks and the stated noise")
     return _counted(chosen, seen, resumed, dropped, refused, doubts, unseen, tuple(reasons))
 
 
-def _noise_of_logs_m(seen: TracksOfDetections, logs: Float, most_m: float) -> float:
+def _noise_of_logs_m(seen: Bodies, logs: Float, most_m: float) -> float:
     """Estimate the standard deviation on each axis (m) of the logs [T, A, 3] of several people.
 
     Bodies that three cameras or more place are right. Their median distance to the nearest log gives one
@@ -205,7 +197,7 @@ def _is_near(tracks: list[_BodyTrack], log: Float, sigma_m: float) -> bool:
     return any(_likeness(track, log, sigma_m) > 0 for track in tracks)
 
 
-def _tracks(seen: TracksOfDetections, confidence: Float) -> list[_BodyTrack]:
+def _tracks(seen: Bodies, confidence: Float) -> list[_BodyTrack]:
     """Collect the tracks as rows over time, from the values of each detection."""
     time, camera, detection = np.nonzero(np.isfinite(seen.spread))
     identity = seen.track[time, camera, detection]
@@ -398,19 +390,9 @@ def _far_from_log(tracks: list[_BodyTrack], log: Float) -> str:
     )
 
 
-def _nobody(nearest: Float) -> str:
-    known = nearest[np.isfinite(nearest)]
-    if not len(known):
-        return "no two cameras with poses see somebody at the same time from directions that differ enough"
-    return (
-        f"no two cameras agree on anybody: at best their viewing rays pass at {np.median(known):.1f} sigma "
-        "(median over frames); check poses, clocks and the stated noise"
-    )
-
-
 def _counted(
     chosen: Int64,
-    seen: TracksOfDetections,
+    seen: Bodies,
     resumed: Int64,
     dropped: dict[str, Int64],
     phantoms: Mapping[str, int],
@@ -419,13 +401,7 @@ def _counted(
     reasons: tuple[str, ...],
 ) -> Association:
     """Build the result: the choice with its counts."""
-    at = np.maximum(chosen.transpose(2, 0, 1), 0)[..., None]  # [P, T, C, 1]
     present = (chosen >= 0).transpose(2, 0, 1)
-
-    def count(flag: Bool) -> Int64:
-        counts: Int64 = (np.take_along_axis(flag[None], at, -1)[..., 0] & present).sum((1, 2))
-        return counts
-
     others_see = present.sum(-1, keepdims=True) > 1
     refused = ~present & others_see & (seen.track >= 0).any(-1)
     standing = np.where(
@@ -434,8 +410,6 @@ def _counted(
     return Association(
         choice=chosen,
         views=present.sum((1, 2)),
-        ambiguous=count(seen.doubtful),
-        switches=count(seen.overruled),
         refused=refused.sum((1, 2)),
         resumed=resumed,
         people=np.rint(standing.sum((1, 2))).astype(np.int64),
@@ -446,3 +420,116 @@ def _counted(
         unseen=unseen,
         reasons=reasons,
     )
+
+
+# --- errors of a whole picture ---------------------------------------------------------------------------
+
+# The errors of keypoints average out over this time, and those of poses hardly change.
+_ERROR_WINDOW_S = 0.5
+# The last round changes the disagreement by less than a tenth.
+_TURNS = 3
+# About this many joints are used, which is enough to average their errors.
+_FEW_JOINTS = 8
+# The rays of this many times take 30 MB of memory.
+_TIMES_AT_ONCE = 2_000
+# A larger correction means that the person may be none.
+_MAX_CORRECTION_SIGMAS = 3.0
+# If more of the first squares remains, the errors change from picture to picture.
+_MAX_REMAINING_SHARE = 0.4
+# Position errors move the far less than the near, so this share of the noise of rays remains.
+_REMAINING_NOISE_SHARE = 0.7
+
+
+def without_common_errors(time_s: Float, views: SightLines, seen: Bodies) -> SightLines:
+    """Turn the cameras so that the views of the person seen most agree.
+
+    A camera that is turned or shifted moves everybody in its picture by about the same. The person who is
+    seen most is surely one body, so what their views have in common shows these errors. Without them, two
+    people who stand near each other are further apart than the views of one person. Only the part on which
+    views can disagree is found. Cameras that all err alike show the person elsewhere, and still agree.
+
+    Args:
+        time_s: [T] s, increasing.
+        views: all detections.
+        seen: their tracks.
+
+    Returns:
+        The views with other rotations and less noise; as they were where the errors do not last, and without
+        anybody whom two cameras see.
+    """
+    person = _most_seen(seen)
+    if person is None:
+        return views
+    detection = np.where(person.any(axis=-1), person.argmax(axis=-1), -1)
+    fewer = slice(None, None, max(1, views.xy.shape[3] // _FEW_JOINTS))
+    few = views._replace(xy=views.xy[..., fewer, :], confidence=views.confidence[..., fewer])
+    rotation = views.rotation.copy()
+    total = np.zeros((*views.sigma.shape, 2))
+    left = []
+    for _ in range(_TURNS):
+        missed = np.concatenate(
+            [
+                _missed(few, rotation, detection, slice(start, start + _TIMES_AT_ONCE))
+                for start in range(0, len(time_s), _TIMES_AT_ONCE)
+            ]
+        )
+        left.append(
+            float(np.mean(missed**2, where=np.isfinite(missed))) if np.isfinite(missed).any() else 0.0
+        )
+        # A mean of means has no negative weight at any frequency, so the rounds do not amplify one.
+        turn = np.stack([_mean(time_s, _mean(time_s, missed[:, c])) for c in range(missed.shape[1])], axis=1)
+        total += turn
+        rotation = rotation @ _turned(turn)
+    small = np.hypot(*np.moveaxis(total, -1, 0)) <= _MAX_CORRECTION_SIGMAS * views.sigma
+    if not left[-1] < _MAX_REMAINING_SHARE * left[0]:
+        return views
+    return views._replace(
+        rotation=np.where(small[..., None, None], rotation, views.rotation),
+        sigma=np.where(small, _REMAINING_NOISE_SHARE, 1.0) * views.sigma,
+    )
+
+
+def _most_seen(seen: Bodies) -> Bool | None:
+    """Find the detections [T, C, D] of the track whom two cameras or more see most; None without one."""
+    tracks, views = np.unique(seen.track[np.isfinite(seen.spread)], return_counts=True)
+    if not len(tracks):
+        return None
+    person = np.isfinite(seen.spread) & (seen.track == tracks[views.argmax()])
+    return np.asarray(person)
+
+
+def _missed(views: SightLines, rotation: Float, detection: Int64, rows: slice) -> Float:
+    """Compute how far a person's joints are from where they are seen [N, C, 2], median over joints."""
+    taken = np.maximum(detection[rows], 0)[..., None, None]
+    xy = np.take_along_axis(views.xy[rows], taken[..., None], axis=2)[:, :, 0]
+    confidence = np.take_along_axis(views.confidence[rows], taken, axis=2)[:, :, 0]
+    origin, rotation = np.nan_to_num(views.position[rows]), np.nan_to_num(rotation[rows])
+    there = (detection[rows] >= 0)[..., None] & (confidence > 0) & np.isfinite(xy).all(axis=-1)
+    there &= np.isfinite(views.position[rows][..., :1])
+    rays = np.moveaxis(rays_of(xy, rotation), 1, 2)
+    weight = np.moveaxis(np.asarray(there), 1, 2).astype(np.float64)
+    points, _ = meeting_points(rays, np.broadcast_to(origin[:, None], rays.shape), weight)
+    u, v, depth = np.einsum("ncji,nckj->inck", rotation, points[:, None] - origin[:, :, None])
+    ahead = np.where(there & (depth > 0), depth, np.nan)
+    return median_of(np.stack([u / ahead, v / ahead], axis=-1) - xy, axis=2)
+
+
+def _mean(time_s: Float, values: Float) -> Float:
+    """Average values [T, 2] within the window about each time; where none is, the nearest average; or 0."""
+    known = np.isfinite(values[:, 0])
+    if not known.any():
+        return np.zeros_like(values)
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(np.c_[np.nan_to_num(values), known], axis=0)])
+    first = np.searchsorted(time_s, time_s - _ERROR_WINDOW_S / 2, side="left")
+    last = np.searchsorted(time_s, time_s + _ERROR_WINDOW_S / 2, side="right")
+    within = total[last] - total[first]
+    rows = np.flatnonzero(within[:, 2] > 0)
+    mean = within[rows, :2] / within[rows, 2:]
+    return np.stack([np.interp(time_s, time_s[rows], column) for column in mean.T], axis=1)
+
+
+def _turned(offset: Float) -> Float:
+    """Return the rotations [..., 3, 3] that move a whole picture by a small offset [..., 2] in it."""
+    across, along = np.moveaxis(offset, -1, 0)
+    vector = np.stack([-along, across, np.zeros_like(across)], axis=-1)
+    return matrix_from_quaternion(quaternion_from_rotation_vector(vector))

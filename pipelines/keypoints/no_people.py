@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
-from pipelines.keypoints.grouping import TracksOfDetections
+from pipelines.keypoints.bodies import SAME_BODY_M, Bodies, SightLines, meeting_points, rays_of
 
 Int64 = NDArray[np.int64]
 Ground = Callable[[Float], tuple[Float, Float]]
@@ -71,16 +71,6 @@ _MAX_MISFIT = 4.0
 _SAMPLES = 200
 # Where a level is all that is known, a crown at 3 m is not on the ground.
 _DOUBTED_SHARE = 0.5
-
-
-class SightLines(NamedTuple):
-    """All detections of a flight, as `tell_no_people` takes them."""
-
-    xy: Float  # [T, C, D, J, 2]
-    confidence: Float  # [T, C, D, J]
-    position: Float  # [T, C, 3]
-    rotation: Float  # [T, C, 3, 3]
-    sigma: Float  # [T, C]
 
 
 class PossiblePerson(NamedTuple):
@@ -194,22 +184,19 @@ def _body_of(choice: Int64, rows: NDArray[np.intp], views: SightLines) -> tuple[
     xy = views.xy[time, camera, taken]
     confidence = np.where((choice[rows] >= 0)[..., None], views.confidence[time, camera, taken], 0.0)
     seen = (confidence > 0) & np.isfinite(xy).all(axis=-1) & np.isfinite(views.position[rows])[..., :1]
-    several = seen.sum(axis=1) > 1
-    ray = np.concatenate([np.where(seen[..., None], xy, 0.0), np.ones((*seen.shape, 1))], axis=-1)
-    ray = np.einsum("ncij,nckj->ncki", np.nan_to_num(views.rotation[rows]), ray)
-    ray /= np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-12)
-    origin = np.nan_to_num(views.position[rows])[:, :, None]
-    across = np.where(seen[..., None, None], np.eye(3) - ray[..., :, None] * ray[..., None, :], 0.0)
-    normal = across.sum(axis=1) + np.where(several, 1e-9, 1.0)[..., None, None] * np.eye(3)
-    target = np.einsum("nckij,nckj->nki", across, np.broadcast_to(origin, ray.shape))
-    points = np.where(several[..., None], np.linalg.solve(normal, target[..., None])[..., 0], np.nan)
+    rays = np.moveaxis(rays_of(xy, np.nan_to_num(views.rotation[rows])), 1, 2)  # [N, J, C, 3]
+    origin = np.nan_to_num(views.position[rows])[:, None]
+    weight = np.moveaxis(seen, 1, 2).astype(np.float64)
+    points, _ = meeting_points(rays, np.broadcast_to(origin, rays.shape), weight)
+    several = np.isfinite(points[..., 0])
     box = np.nanmax(points, axis=1, initial=-np.inf) - np.nanmin(points, axis=1, initial=np.inf)
     extent = np.linalg.norm(box[several.sum(axis=1) > 1], axis=-1)
-    sight = points[:, None] - origin
-    reach = np.linalg.norm(sight, axis=-1)
-    sine = np.linalg.norm(np.cross(ray, sight), axis=-1) / np.maximum(reach, 1e-9)
-    square = np.where(seen & several[:, None], (sine / views.sigma[rows][..., None]) ** 2, 0.0).sum(axis=1)
-    misfit = (square / np.maximum(2 * seen.sum(axis=1) - 3, 1))[several]
+    sight = points[:, :, None] - origin
+    off2 = (np.cross(rays, sight) ** 2).sum(axis=-1)
+    variance = (views.sigma[rows][:, None] * np.linalg.norm(sight, axis=-1)) ** 2 + SAME_BODY_M**2
+    used = (weight > 0) & several[..., None]
+    square = np.where(used, off2 / variance, 0.0).sum(axis=2)
+    misfit = (square / np.maximum(2 * used.sum(axis=2) - 3, 1))[several]
     if not len(extent):
         return np.nan, np.nan
     return float(np.median(extent)), float(np.median(misfit))
@@ -241,7 +228,7 @@ def level_of(hips: Float) -> Ground:
 
 
 def tell_no_people(
-    seen: TracksOfDetections,
+    seen: Bodies,
     xy: Float,
     confidence: Float,
     position: Float,
@@ -287,7 +274,7 @@ def tell_no_people(
     return found
 
 
-def level_of_most_seen(seen: TracksOfDetections) -> Ground | None:
+def level_of_most_seen(seen: Bodies) -> Ground | None:
     """Return the level of the person whom several cameras see most; None without one."""
     placed = seen.spread < _MAX_PLACE_SIGMA_M
     people, views = np.unique(seen.track[placed], return_counts=True)
@@ -303,7 +290,7 @@ def _shares(track: NDArray[np.intp], said: Bool, judged: Bool) -> Float:
 
 
 def _verdicts(
-    seen: TracksOfDetections,
+    seen: Bodies,
     at: tuple[Int64, int, Int64],
     seen_by: tuple[Float, Float, Float, Float, Float],
     scene: Surroundings,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Bool, Float
-from pipelines.keypoints.grouping import TracksOfDetections
+from pipelines.keypoints.bodies import Bodies
 from pipelines.keypoints.no_people import Ground, NoPeople, Surroundings, tell_no_people
 
 TIMES, JOINTS = 6, 17
@@ -63,14 +63,11 @@ def told(
         return np.repeat(values[None], times, axis=0)
 
     return tell_no_people(
-        TracksOfDetections(
+        Bodies(
             track=always(np.where(followed, np.arange(len(bodies)), -1)),
             views=always(views),
             middle=always(middle),
             spread=always(np.where(views > 1, 0.1, np.nan)),
-            doubtful=always(np.zeros_like(followed)),
-            overruled=always(np.zeros_like(followed)),
-            nearest=np.zeros(times),
         ),
         always(xy),
         always(np.where(followed[..., None], np.full(JOINTS, 0.8), 0.0)),
