@@ -131,13 +131,11 @@ class TlogFormat:
                 notes.append("holds no GPS time: its stamps are turned to the ground station's clock")
         else:
             fit = on_gps_time(path, fit, choice.time, notes)
-        messages = _topics(log, system)
-        topics = [topic for topic, _ in messages]
+        topics = _topics(log, system)
         kinds = {"vehicle_global_position": "global", "vehicle_local_position": "local"}
         there = next((kind for name, kind in kinds.items() if any(t.name == name for t in topics)), None)
         asked = choice.model_copy(update={"instance": None, "position": choice.position or there})
         found = telemetry_of(path, topics, asked, fit, notes)
-        found = _by_messages(found, {topic.name: name for topic, name in messages})
         found = replace(found, dropped=dict(Counter(found.dropped) + Counter(log.dropped)))
         return replace(found, clock="the ground station's clock", fit=None) if station else found
 
@@ -156,23 +154,23 @@ class TlogFormat:
         timed = (stamps_us > 0) & (stamps_us < _LAST_US)
         stamps_us, numbers = columns["time_usec"][timed].astype(np.int64), np.unique(number[timed])
         drones_own = "take the times of frames from the drone's own log (.bin, .ulg) or otherwise"
-        if not len(stamps_us):
-            raise DataError(path, "states no time for any of its pictures", drones_own, code="clock-unknown")
+        is_utc = stamps_us > _UNIX_US
+        if not len(stamps_us) or (is_utc.any() and not is_utc.all()):
+            problem = (
+                "mixes times of its pictures since boot and in UTC" if len(stamps_us) else "states no time"
+            )
+            raise DataError(path, f"{problem} for its pictures", drones_own, code="clock-unknown")
         if (lost := int(numbers[-1] - numbers[0]) + 1 - len(numbers)) > 0:
             problem = f"lacks {lost} of the pictures between {numbers[0]} and {numbers[-1]}"
             raise DataError(path, f"{problem}: their packets did not arrive", drones_own)
-        is_utc = stamps_us > _UNIX_US
-        boot_ns, utc_ns = stamps_us[~is_utc] * 1000, stamps_us[is_utc] * 1000
-        if choice.time == "boot" and len(utc_ns):
-            raise DataError(path, "states the times of its pictures in UTC", "leave time: boot out")
-        if not len(boot_ns):
-            return np.unique(utc_ns)
+        if is_utc.all():
+            if choice.time == "boot":
+                raise DataError(path, "states the times of its pictures in UTC", "leave time: boot out")
+            return np.unique(stamps_us * 1000)
         fit = log.gps_time(system)
         if fit is None and choice.time is None:
             fit = log.station_time(system)
-        if fit is None and len(utc_ns):
-            raise DataError(path, "mixes times of pictures since boot and in UTC", drones_own)
-        return np.union1d(pictures_on_gps_time(path, boot_ns, fit, choice), utc_ns)
+        return pictures_on_gps_time(path, stamps_us * 1000, fit, choice)
 
 
 def _vehicle(path: Path, log: _Packets, stated: int | None, messages: frozenset[int]) -> int:
@@ -196,13 +194,13 @@ def _vehicle(path: Path, log: _Packets, stated: int | None, messages: frozenset[
 # --- content of a log ----------------------------------------------------------------------------------
 
 
-def _topics(log: _Packets, system: int) -> list[tuple[UlogTopic, str]]:
-    """Make PX4's topics of the messages of one vehicle; each with the name of its message."""
-    topics: list[tuple[UlogTopic, str]] = []
+def _topics(log: _Packets, system: int) -> list[UlogTopic]:
+    """Make PX4's topics of the messages of one vehicle; each is labelled with the name of its message."""
+    topics: list[UlogTopic] = []
 
     def add(name: str, message: int, columns: Columns) -> None:
         if len(columns["timestamp"]):
-            topics.append((UlogTopic(name, 0, columns), log.dialect.mavlink_map[message].msgname))
+            topics.append(UlogTopic(name, 0, columns, log.dialect.mavlink_map[message].msgname))
 
     place = log.columns(system, _GLOBAL_POSITION)
     scaled = {"lat": place["lat"] * 1e-7, "lon": place["lon"] * 1e-7, "alt": place["alt"] * 1e-3}
@@ -243,19 +241,6 @@ def _topics(log: _Packets, system: int) -> list[tuple[UlogTopic, str]]:
     columns = {"timestamp": _boot_us(mount), "device_flags": flags, **_quaternion(gimbal)}
     add("gimbal_device_attitude_status", _MOUNT_ORIENTATION, columns)
     return topics
-
-
-def _by_messages(found: Telemetry, names: Mapping[str, str]) -> Telemetry:
-    """Name the tracks and notes by MAVLink's messages instead of PX4's topics."""
-
-    def named(text: str) -> str:
-        for topic, message in names.items():
-            text = text.replace(f"{topic} (instance 0)", message).replace(topic, message)
-        return text
-
-    tracks = {part: getattr(found, part) for part in ("position", "body", "gimbal")}
-    renamed = {part: replace(track, name=named(track.name)) for part, track in tracks.items() if track}
-    return replace(found, notes=tuple(map(named, found.notes)), **renamed)
 
 
 def _boot_us(columns: Columns) -> Int64:

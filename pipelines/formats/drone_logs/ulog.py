@@ -165,13 +165,9 @@ def _position(
         for kind, names in _POSITIONS.items()
     }
     found = {kind: topic for kind, topic in there.items() if topic is not None}
-    if (
-        not found
-        and choice.instance is not None
-        and any(_there(topics, names) for names in _POSITIONS.values())
-    ):
-        listed = [topic for names in _POSITIONS.values() for topic in _there(topics, names)]
-        raise _no_instance(path, choice.instance, "a position", listed)
+    every = [topic for names in _POSITIONS.values() for topic in _there(topics, names)]
+    if not found and choice.instance is not None and every:
+        raise _no_instance(path, choice.instance, "a position", every)
     if choice.position is not None and choice.position not in found:
         raise DataError(
             path,
@@ -188,14 +184,14 @@ def _position(
         )
     kind = choice.position or _likeliest(found)
     topic = found[kind]
-    notes.append(f"took the {kind} position from {topic.name} (instance {topic.instance})")
+    notes.append(f"took the {kind} position from {topic}")
     if kind == "local":
         return _local(path, topic, dropped, notes)
     if kind == "global":
         values, usable = topic.numbers("lat", "lon", "alt"), np.ones(len(topic), dtype=np.bool_)
     else:
         values, usable = _fixes(topic)
-    track = fixes_track(path, topic.name, topic.t_ns(), values, usable, dropped)
+    track = fixes_track(path, topic.title, topic.t_ns(), values, usable, dropped)
     return replace(track, accuracy_m=_accuracy(topic, usable))
 
 
@@ -218,7 +214,7 @@ def _local(
     valid = _local_is_valid(topic)
     if not valid.any():
         notes.append(
-            f"{topic.name} never calls its horizontal position valid: its poses are of no use, unless the"
+            f"{topic.title} never calls its horizontal position valid: its poses are of no use, unless the"
             " drone was held in place"
         )
         valid = np.ones(len(topic), dtype=np.bool_)
@@ -240,7 +236,7 @@ def _local(
         if len(places) > 1:
             notes.append(f"the estimator moved its origin {len(places) - 1} times; followed")
     track = position_track(
-        path, topic.name, topic.t_ns(), enu, dropped, on_earth=False, origin=origin, unusable=unusable
+        path, topic.title, topic.t_ns(), enu, dropped, on_earth=False, origin=origin, unusable=unusable
     )
     return replace(track, accuracy_m=_accuracy(topic, valid))
 
@@ -290,7 +286,7 @@ def _body(
     topic = found[0]
     ned_from_frd = topic.numbers("q[1]", "q[2]", "q[3]", "q[0]")
     turned = attitude_in_enu(ned_from_frd, relative_to="world", axes="ned")
-    return attitude_track(topic.name, topic.t_ns(), turned, dropped)
+    return attitude_track(topic.title, topic.t_ns(), turned, dropped)
 
 
 def _gimbal(
@@ -317,7 +313,7 @@ def _gimbal(
                 whatever_from(of_angles(angles)),
             )
             return attitude_track(
-                topic.name, topic.t_ns(), turned, dropped, relative_to="body", stated=stated
+                topic.title, topic.t_ns(), turned, dropped, relative_to="body", stated=stated
             )
     return None
 
@@ -336,7 +332,7 @@ def _gimbal_device(
             turned[~from_north] = np.nan
         else:
             turned[~from_north] = world_from_heading(body, topic.t_ns()[~from_north], stated[~from_north])
-    return attitude_track(topic.name, topic.t_ns(), turned, dropped, stated=whatever_from(stated))
+    return attitude_track(topic.title, topic.t_ns(), turned, dropped, stated=whatever_from(stated))
 
 
 def _gps_time(topics: Sequence[UlogTopic]) -> ClockFit | None:
@@ -395,6 +391,16 @@ class UlogTopic:
     name: str
     instance: int
     columns: Columns
+    label: str = ""  # its name in the log, where that is another
+
+    @property
+    def title(self) -> str:
+        """Name for users."""
+        return self.label or self.name
+
+    def __str__(self) -> str:
+        """Return the name with the number of the instance."""
+        return self.label or f"{self.name} (instance {self.instance})"
 
     def __len__(self) -> int:
         return len(self.columns["timestamp"])
