@@ -126,8 +126,7 @@ class FlightCameras:
             start_ns = self._start_ns(name, camera, times)
             return CameraFrames(np.arange(count), start_ns + since_start, since_start, topic, lost)
         if times.file and self._files.is_log("frame_times", times):
-            triggers = self._logs.triggers(times.file, times.topic)
-            stamped = triggers or self._logs.frames(times.file, times.topic)
+            stamped = self._logs.frames(times.file, times.topic)
             return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
         if times.file:
             triggered = self._poses.triggers(times)

@@ -24,11 +24,9 @@ from pipelines.formats.logs.maps import (
 )
 from pipelines.formats.logs.messages import Kind, all_samples, kind_of
 from pipelines.formats.logs.pictures import (
-    TRIGGER_TYPES,
     decode,
     later_times,
     picture_stamps,
-    read_triggers,
 )
 from pipelines.formats.logs.positions import FIXES, axes_of_topic, pairs_of
 from pipelines.formats.logs.recordings import OpenLog
@@ -250,15 +248,6 @@ class FlightLogs:
             if (axes := axes_of_topic(name, parent)) is not None:
                 self._note(f"{opened.source}: {name or parent} is AirSim's, in {axes.upper()}")
             return axes
-
-    def triggers(self, log: str, topic: str | None) -> Frames | None:
-        """Read trigger times of pictures from a topic, at world times; None if it is no topic of triggers."""
-        with self.open(log) as opened:
-            if topic is None or opened.type_of(topic) not in TRIGGER_TYPES:
-                return None
-            t_ns, repeated = read_triggers(opened.recording, opened.source, topic)
-            lost = opened.lost + Counter({"trigger without a later stamp": repeated})
-            return Frames(topic, opened.world_times(t_ns), dict(lost))
 
     def commands(self, log: str, topic: str | None) -> Trajectory | None:
         """Read commanded positions of a drone, at world times; None if the topic holds no command type."""

@@ -277,7 +277,7 @@ def test_fixes_and_attitudes_of_any_driver_an_actor_with_a_receiver_and_triggers
         camera = flight.settings["cameras"][name]
         yaw, pitch, roll = drone_of(flight, k).gimbal_ypr_deg[0].tolist()
         camera["gimbal"] = {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}
-        camera["frame_times"] = {"file": f"{name}.bag", "topic": "/trigger"}
+        camera["frame_times"] = {"file": f"{name}.bag", "topic": "/picture"}
     flight.save()
     ingest(flight.manifest)
     for k, name in enumerate(flight.cameras):
@@ -307,7 +307,7 @@ def _any_driver(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
         entries += [
             Entry("/fix", "sensor_msgs/msg/NavSatFix", stamp_ns, _fix(truth, row)),
             Entry("/imu", "sensor_msgs/msg/Imu", stamp_ns, {"header": stamped, "orientation": turned}),
-            Entry("/trigger", "sensor_msgs/msg/TimeReference", stamp_ns, {"header": stamped}),
+            Entry("/picture", "sensor_msgs/msg/CompressedImage", stamp_ns, {"header": stamped}),
         ]
     write_log(folder, name, "ros1", entries)
     return {"file": f"{name}.bag", "topic": "/fix", "attitude": "/imu"}

@@ -24,12 +24,10 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     describe_fit,
     fit_gps_time,
     fixes_track,
-    of_angles,
     on_gps_time,
     on_one_clock,
     pictures_on_gps_time,
     position_track,
-    turned_as_stated,
     whatever_from,
     world_from_heading,
 )
@@ -54,7 +52,6 @@ _WANTED = {
     "vehicle_attitude",
     "estimator_attitude",
     "gimbal_device_attitude_status",
-    "mount_orientation",
 }
 _POSITIONS = {
     "local": ("vehicle_local_position", "estimator_local_position"),
@@ -295,26 +292,12 @@ def _gimbal(
     dropped: MutableMapping[str, int],
     notes: list[str],
 ) -> AttitudeTrack | None:
-    """Read the gimbal's own attitude, or else its commanded angles relative to the body."""
+    """Read the gimbal's own attitude."""
     devices = sorted(_there(topics, ["gimbal_device_attitude_status"]), key=lambda topic: topic.instance)
     if devices:
         if len(devices) > 1:
             notes.append(f"has {len(devices)} gimbals: took the angles of the first, {devices[0].instance}")
         return _gimbal_device(devices[0], body, dropped)
-    for topic in topics:
-        if topic.name == "mount_orientation" and len(topic):
-            roll, pitch, yaw = (topic.numbers(f"attitude_euler_angle[{k}]") for k in range(3))
-            angles = np.degrees(np.stack([yaw, pitch, roll], axis=1))
-            notes.append(
-                "mount_orientation is taken as relative to the body (else gimbal: {relative_to: world})"
-            )
-            turned, stated = (
-                turned_as_stated(angles, relative_to="body"),
-                whatever_from(of_angles(angles)),
-            )
-            return attitude_track(
-                topic.title, topic.t_ns(), turned, dropped, relative_to="body", stated=stated
-            )
     return None
 
 
@@ -447,47 +430,36 @@ def topics_of(log: Any) -> list[UlogTopic]:
 
 def _refuse_bombs(path: Path) -> None:
     """Refuse definitions that expand without end: nested arrays may mean billions of fields."""
+    again = "download it from the autopilot again"
+    formats: dict[str, list[tuple[str, str]]] = {}  # type and count of each field, by the name of the message
     try:
-        formats = dict(_definitions(path))
+        with path.open("rb") as file:
+            if file.read(16)[: len(MAGIC)] != MAGIC:
+                wanted = "give the .ulg that the autopilot wrote"
+                raise DataError(path, "is no PX4 log", wanted, code="wrong-kind")
+            while len(head := file.read(3)) == 3:
+                size, kind = struct.unpack("<HB", head)
+                body = file.read(size)
+                if kind in b"ADL" or len(body) < size:
+                    break
+                if kind == ord("F"):
+                    name, _, fields = body.decode("utf-8", errors="replace").partition(":")
+                    formats[name] = re.findall(r"([^\s;\[]+)(?:\[(\d{1,9})\])?\s+[^;]+;?", fields)
     except OSError as error:
         raise damaged(path, error) from error
     sizes: dict[str, int] = {}
 
-    def size(name: str, depth: int) -> int:
-        if depth > 20:
-            raise DataError(path, f"defines {name} by itself", "download it from the autopilot again")
+    def size_of(name: str, depth: int) -> int:
         if name not in formats:
             return 1  # a plain type
-        if name not in sizes:
-            sizes[name] = sum(count * size(inner, depth + 1) for inner, count in formats[name])
-        if sizes[name] > _MOST_FIELDS:
-            raise DataError(
-                path, f"defines {name} with {sizes[name]} fields", "download it from the autopilot again"
-            )
+        if depth <= 20 and name not in sizes:
+            sizes[name] = sum(int(n or 1) * size_of(inner, depth + 1) for inner, n in formats[name])
+        if depth > 20 or sizes[name] > _MOST_FIELDS:
+            raise DataError(path, f"defines {name} with more than {_MOST_FIELDS} fields, or by itself", again)
         return sizes[name]
 
     for name in formats:
-        size(name, 0)
-
-
-def _definitions(path: Path) -> list[tuple[str, list[tuple[str, int]]]]:
-    """Read the message definitions, (type, count) of the fields by name, up to the start of the data."""
-    found: list[tuple[str, list[tuple[str, int]]]] = []
-    with path.open("rb") as file:
-        if file.read(16)[: len(MAGIC)] != MAGIC:
-            raise DataError(
-                path, "is no PX4 log", "give the .ulg that the autopilot wrote", code="wrong-kind"
-            )
-        while len(head := file.read(3)) == 3:
-            size, kind = struct.unpack("<HB", head)
-            body = file.read(size)
-            if kind in {ord("A"), ord("D"), ord("L")} or len(body) < size:
-                break
-            if kind == ord("F"):
-                name, _, fields = body.decode("utf-8", errors="replace").partition(":")
-                parts = re.findall(r"([^\s;\[]+)(?:\[(\d{1,9})\])?\s+[^;]+;?", fields)
-                found.append((name, [(inner, int(count or 1)) for inner, count in parts]))
-    return found
+        size_of(name, 0)
 
 
 FORMAT = UlogFormat()

@@ -112,104 +112,65 @@ def unreadable(message: Message, source: Source, error: Exception) -> DataError:
 # --- poses, transforms, gimbal angles ------------------------------------------------------------------
 
 
-def _odometry(message: Message, _: Source) -> Iterator[Sample]:
-    value, stated = message.value, message.value.pose
-    yield _pose(message, value.header, stated.pose, str(value.child_frame_id), stated.covariance)
-
-
-def _pose_stamped(message: Message, _: Source) -> Iterator[Sample]:
-    yield _pose(message, message.value.header, message.value.pose)
-
-
-def _bare_pose(message: Message, _: Source) -> Iterator[Sample]:
-    """Yield a pose without a header: it has only the time of its receipt."""
-    value = message.value
+def _pose(message: Message, _: Source) -> Iterator[Sample]:
+    """Yield the pose of a Pose, PoseStamped, PoseWithCovariance(Stamped), Odometry or PoseInFrame."""
+    value = pose = message.value
     covariance = getattr(value, "covariance", None)
-    pose = value.pose if hasattr(value, "pose") else value
+    while hasattr(pose, "pose"):
+        pose = pose.pose
+        covariance = getattr(pose, "covariance", covariance)
+    header = getattr(value, "header", None)
+    frame = value.frame_id if _is_foxglove(message) else header.frame_id if header is not None else ""
     yield PoseSample(
-        0,
+        _stamp_ns(message) if header is not None or _is_foxglove(message) else 0,
         message.receive_ns,
-        "",
-        "",
+        str(frame),
+        str(getattr(value, "child_frame_id", "")),
         _vector(pose.position),
         _quaternion(pose.orientation),
         None if covariance is None else np.asarray(covariance, dtype=np.float64).reshape(6, 6),
     )
 
 
-def _pose_with_covariance(message: Message, _: Source) -> Iterator[Sample]:
-    stated = message.value.pose
-    yield _pose(message, message.value.header, stated.pose, covariance=stated.covariance)
-
-
 def _path(message: Message, source: Source) -> Iterator[Sample]:
-    poses = message.value.poses
-    stamps = [nanoseconds(pose.header.stamp) for pose in poses]
+    stamps = [nanoseconds(pose.header.stamp) for pose in message.value.poses]
     if 0 in stamps:
         raise DataError(
             source,
             f"topic {message.topic.name}: the poses of a path have no stamps of their own",
             "name a topic of Odometry or PoseStamped instead",
         )
-    for pose, stamp_ns in zip(poses, stamps, strict=True):
+    for pose, stamp_ns in zip(message.value.poses, stamps, strict=True):
         receive_ns = _checked(message.receive_ns + stamp_ns - stamps[-1])
-        yield _pose(replace(message, receive_ns=receive_ns), pose.header, pose.pose)
-
-
-def _pose(message: Message, header: Any, pose: Any, frame: str = "", covariance: Any = None) -> PoseSample:
-    return PoseSample(
-        nanoseconds(header.stamp),
-        message.receive_ns,
-        str(header.frame_id),
-        frame,
-        _vector(pose.position),
-        _quaternion(pose.orientation),
-        None if covariance is None else np.asarray(covariance, dtype=np.float64).reshape(6, 6),
-    )
-
-
-def _foxglove_pose(message: Message, _: Source) -> Iterator[Sample]:
-    stamp_ns, frame, pose = _stamp_ns(message), str(message.value.frame_id), message.value.pose
-    place, turn = _vector(pose.position), _quaternion(pose.orientation)
-    yield PoseSample(stamp_ns, message.receive_ns, frame, "", place, turn)
-
-
-def _transform(message: Message, _: Source) -> Iterator[Sample]:
-    yield _link(message, message.value)
+        yield from _pose(replace(message, receive_ns=receive_ns, value=pose), source)
 
 
 def _transforms(message: Message, _: Source) -> Iterator[Sample]:
-    for stated in message.value.transforms:
-        yield _link(message, stated)
+    """Yield the transforms of a message, or the only one that it is."""
+    for stated in getattr(message.value, "transforms", (message.value,)):
+        if _is_foxglove(message):
+            stamp, frame, moved = stated.timestamp, stated.parent_frame_id, stated
+        else:
+            stamp, frame, moved = stated.header.stamp, stated.header.frame_id, stated.transform
+        yield PoseSample(
+            nanoseconds(stamp),
+            message.receive_ns,
+            str(frame),
+            str(stated.child_frame_id),
+            _vector(moved.translation),
+            _quaternion(moved.rotation),
+        )
 
 
-def _link(message: Message, stated: Any) -> PoseSample:
-    if _is_foxglove(message):
-        stamp, frame = stated.timestamp, stated.parent_frame_id
-        place, turn = stated.translation, stated.rotation
+def _angles(message: Message, _: Source) -> Iterator[Sample]:
+    """Yield the angles of a Vector3Stamped, or the rotation of a Quaternion or QuaternionStamped."""
+    value = message.value
+    stamp_ns = _stamp_ns(message) if hasattr(value, "header") else 0
+    if hasattr(value, "vector"):
+        yield AngleSample(stamp_ns, message.receive_ns, _vector(value.vector), None)
     else:
-        stamp, frame = stated.header.stamp, stated.header.frame_id
-        place, turn = stated.transform.translation, stated.transform.rotation
-    return PoseSample(
-        nanoseconds(stamp),
-        message.receive_ns,
-        str(frame),
-        str(stated.child_frame_id),
-        _vector(place),
-        _quaternion(turn),
-    )
-
-
-def _quaternion_stamped(message: Message, _: Source) -> Iterator[Sample]:
-    yield AngleSample(_stamp_ns(message), message.receive_ns, None, _quaternion(message.value.quaternion))
-
-
-def _bare_quaternion(message: Message, _: Source) -> Iterator[Sample]:
-    yield AngleSample(0, message.receive_ns, None, _quaternion(message.value))
-
-
-def _vector_stamped(message: Message, _: Source) -> Iterator[Sample]:
-    yield AngleSample(_stamp_ns(message), message.receive_ns, _vector(message.value.vector), None)
+        turned = _quaternion(getattr(value, "quaternion", value))
+        yield AngleSample(stamp_ns, message.receive_ns, None, turned)
 
 
 # --- intrinsics ----------------------------------------------------------------------------------------
@@ -388,15 +349,15 @@ _Reader = Callable[[Message, Source], Iterator[Sample]]
 _PATH = "nav_msgs/msg/Path"
 
 _ROS_READERS: dict[str, tuple[Kind, _Reader]] = {
-    "geometry_msgs/msg/Pose": ("poses", _bare_pose),
-    "geometry_msgs/msg/PoseStamped": ("poses", _pose_stamped),
-    "geometry_msgs/msg/PoseWithCovariance": ("poses", _bare_pose),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": ("poses", _pose_with_covariance),
-    "geometry_msgs/msg/Quaternion": ("angles", _bare_quaternion),
-    "geometry_msgs/msg/QuaternionStamped": ("angles", _quaternion_stamped),
-    "geometry_msgs/msg/TransformStamped": ("poses", _transform),
-    "geometry_msgs/msg/Vector3Stamped": ("angles", _vector_stamped),
-    "nav_msgs/msg/Odometry": ("poses", _odometry),
+    "geometry_msgs/msg/Pose": ("poses", _pose),
+    "geometry_msgs/msg/PoseStamped": ("poses", _pose),
+    "geometry_msgs/msg/PoseWithCovariance": ("poses", _pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("poses", _pose),
+    "geometry_msgs/msg/Quaternion": ("angles", _angles),
+    "geometry_msgs/msg/QuaternionStamped": ("angles", _angles),
+    "geometry_msgs/msg/TransformStamped": ("poses", _transforms),
+    "geometry_msgs/msg/Vector3Stamped": ("angles", _angles),
+    "nav_msgs/msg/Odometry": ("poses", _pose),
     _PATH: ("poses", _path),
     "sensor_msgs/msg/CameraInfo": ("intrinsics", _camera_info),
     "sensor_msgs/msg/CompressedImage": ("pictures", _compressed_image),
@@ -407,9 +368,9 @@ _ROS_READERS: dict[str, tuple[Kind, _Reader]] = {
 _FOXGLOVE_READERS: dict[str, tuple[Kind, _Reader]] = {
     "CameraCalibration": ("intrinsics", _camera_info),
     "CompressedImage": ("pictures", _compressed_image),
-    "FrameTransform": ("transforms", _transform),
+    "FrameTransform": ("transforms", _transforms),
     "FrameTransforms": ("transforms", _transforms),
-    "PoseInFrame": ("poses", _foxglove_pose),
+    "PoseInFrame": ("poses", _pose),
     "RawImage": ("pictures", _image),
 }
 _READERS: dict[str, tuple[Kind, _Reader]] = {

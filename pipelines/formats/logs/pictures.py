@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from pipelines.formats.logs.messages import FAULTS, all_samples, nanoseconds, unreadable
+from pipelines.formats.logs.messages import all_samples
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample
@@ -19,13 +19,6 @@ from pipelines.session.registries import Log
 
 # Transport and decoding delay a picture by less.
 _MAY_LEAP_NS = 1_000_000_000
-
-TRIGGER_TYPES = (
-    "std_msgs/msg/Header",
-    "sensor_msgs/msg/TimeReference",
-    "mavros_msgs/msg/CameraImageCaptured",
-    "mavros_msgs/msg/CamIMUStamp",
-)
 
 _PIXELS: dict[str, tuple[int, str | None]] = {
     "mono8": (1, "GRAY2BGR"),
@@ -114,10 +107,6 @@ def later_times(header_ns: Int64, receive_ns: Int64, stamps: str) -> Int64:
         receive_ns: [N] of receipt.
         stamps: which of them order the pictures: header or receive.
     """
-    times = np.where((header_ns != 0) & (stamps == "header"), header_ns, receive_ns)
-    leaps = np.where((header_ns[1:] != 0) & (header_ns[:-1] != 0), np.diff(header_ns - receive_ns), 0)
-    if (np.diff(times) > 0).all() and (leaps <= _MAY_LEAP_NS).all():
-        return times  # the usual case
     pictures = map(_Stamps, header_ns.tolist(), receive_ns.tolist())
     return np.array([stamp_of(picture, stamps) for picture in later_pictures(pictures, stamps)], np.int64)
 
@@ -132,29 +121,6 @@ def _leap_ns(before: Stamped, after: Stamped) -> int:
 def stamp_of(picture: Stamped, stamps: str) -> int:
     """Return the header stamp if it exists and is wanted, else the stamp of receipt."""
     return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns
-
-
-def read_triggers(recording: Log, source: str, topic: str) -> tuple[Int64, int]:
-    """Read the times at which pictures were triggered, increasing, and count messages without a new time.
-
-    The time is the message's own stamp: that of its header, or CamIMUStamp's frame_stamp.
-    """
-    stated = array("q")
-    messages = 0
-    for message in recording.messages([topic]):
-        value = message.value
-        messages += 1
-        try:
-            holder = getattr(value, "header", value)
-            stamp = getattr(value, "frame_stamp", None) or holder.stamp
-            stated.append(nanoseconds(stamp))
-        except FAULTS as error:
-            raise unreadable(message, source, error) from error
-    t_ns = np.unique(np.frombuffer(stated, dtype=np.int64))
-    t_ns = t_ns[t_ns > 0]
-    if not len(t_ns):
-        raise DataError(source, f"{topic} states no time", "name another topic", code="clock-unknown")
-    return t_ns, messages - len(t_ns)
 
 
 # --- pixels ----------------------------------------------------------------------------------------------

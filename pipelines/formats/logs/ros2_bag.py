@@ -14,7 +14,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -61,6 +61,7 @@ _SMALLEST_ROW = 6
 # A damaged file must not keep the reader busy for ever.
 _MOST_ATTEMPTS = 10_000
 _UNREADABLE = (apsw.Error, UnicodeDecodeError)  # text in a damaged file may be invalid UTF-8
+_WRONG_TYPES = (KeyError, TypeError, AttributeError, RecursionError, OverflowError)  # in metadata.yaml
 
 _INFORMATION = "rosbag2_bagfile_information"
 # The parser of YAML is slow, and metadata of real bags is far smaller.
@@ -93,9 +94,9 @@ class Ros2Bag:
         """Describe messages, times, storage, topics, losses, and differences from metadata.yaml."""
         with self.open_log([path]) as log:
             facts = log.describe()
-        stated = _contents(path).stated
-        if stated and facts["messages"] and stated.times != {key: facts[key] for key in stated.times}:
-            facts["metadata.yaml states"] = stated.times
+        times = _contents(path).times
+        if facts["messages"] and times != {key: facts[key] for key in times}:
+            facts["metadata.yaml states"] = times
         return facts
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
@@ -103,7 +104,7 @@ class Ros2Bag:
         contents = [_contents(path) for path in paths]
         log = open_recording([file for c in contents for file in c.files], _open_part)
         log.lost += sum((c.lost for c in contents), Counter())
-        stated = [c.stated.messages for c in contents if c.stated]
+        stated = [c.messages for c in contents if c.messages is not None]
         found = sum(len(part.table.stamp_ns) for part in log.parts)
         if len(stated) == len(contents) and found < sum(stated):
             log.lost[NOT_IN_FILES] = sum(stated) - found
@@ -111,19 +112,13 @@ class Ros2Bag:
 
 
 @dataclass(frozen=True)
-class _Metadata:
-    """Content of metadata.yaml about the whole bag."""
-
-    files: list[str]
-    messages: int
-    times: dict[str, object]  # first_ns and span_s
-
-
-@dataclass(frozen=True)
 class _BagFiles:
+    """Files of a bag, with what metadata.yaml states of it."""
+
     files: list[Path]
     lost: Counter[str]
-    stated: _Metadata | None = None
+    messages: int | None = None
+    times: dict[str, object] = field(default_factory=dict)  # first_ns and span_s
 
 
 def _open_part(path: Path) -> LogPart:
@@ -199,38 +194,32 @@ def _contents(path: Path) -> _BagFiles:
     """Return the files of a bag's folder, in order, with its metadata.yaml; a file stands for itself."""
     if not path.is_dir():
         return _BagFiles([path], Counter())
-    lost: Counter[str] = Counter()
-    stated = None
+    found = _BagFiles([], Counter())
     if (path / "metadata.yaml").exists():
         try:
-            stated = _read_metadata(path / "metadata.yaml")
-        except ValueError:
-            lost[BAD_METADATA] = 1
-    files = [path / PurePath(name).name for name in (stated.files if stated else [])]
-    if missing := sum(not file.is_file() for file in files):
-        lost[MISSING_FILES] = missing
-    files = [file for file in files if file.is_file()] or _storage_files(path)
+            found = _read_metadata(path)
+        except (DataError, OSError, ValueError, *_WRONG_TYPES):
+            found.lost[BAD_METADATA] = 1
+    if missing := sum(not file.is_file() for file in found.files):
+        found.lost[MISSING_FILES] = missing
+    files = [file for file in found.files if file.is_file()] or _storage_files(path)
     if not files:
         raise DataError(path, "is a bag without its .db3 or .mcap files", "copy the whole folder again")
-    return _BagFiles(files, lost, stated)
+    return replace(found, files=files)
 
 
-def _read_metadata(path: Path) -> _Metadata:
-    """Read metadata.yaml; ValueError if a required value is missing or invalid."""
-    try:
-        with path.open(encoding="utf-8") as file:
-            content: Any = plain_yaml(path, file.read(_METADATA_LIMIT))
-        information = content[_INFORMATION]
-        return _Metadata(
-            files=[str(name) for name in information["relative_file_paths"]],
-            messages=int(information["message_count"]),
-            times={
-                "first_ns": int(information["starting_time"]["nanoseconds_since_epoch"]),
-                "span_s": int(information["duration"]["nanoseconds"]) / 1e9,
-            },
-        )
-    except (DataError, OSError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        raise ValueError(str(error)) from error
+def _read_metadata(folder: Path) -> _BagFiles:
+    """Read metadata.yaml; names of files cannot lead out of the bag."""
+    path = folder / "metadata.yaml"
+    with path.open(encoding="utf-8") as file:
+        content: Any = plain_yaml(path, file.read(_METADATA_LIMIT))
+    information = content[_INFORMATION]
+    times: dict[str, object] = {
+        "first_ns": int(information["starting_time"]["nanoseconds_since_epoch"]),
+        "span_s": int(information["duration"]["nanoseconds"]) / 1e9,
+    }
+    files = [folder / PurePath(str(name)).name for name in information["relative_file_paths"]]
+    return _BagFiles(files, Counter(), int(information["message_count"]), times)
 
 
 def _states_a_bag(metadata: Path) -> bool:

@@ -62,15 +62,11 @@ class Leaves:
         counts = np.bincount(self.depth[chosen], minlength=DEPTH + 1).tolist()
         return sum(count * 8 ** (DEPTH - depth) for depth, count in enumerate(counts))
 
-    def box(self, chosen: Bool) -> tuple[Int64, Int64]:
-        """Return the lowest and highest corner of chosen leaves, in finest voxels from the world's origin."""
-        key, depth = self.key[chosen].astype(np.int64), self.depth[chosen].astype(np.int64)
-        corner = key + (1 << (DEPTH - depth))[:, None]
-        return key.min(axis=0) - _CENTRE, corner.max(axis=0) - _CENTRE
-
     def extent(self) -> tuple[Int64, Int64]:
-        """Return the box of all leaves."""
-        return self.box(np.ones(len(self.depth), dtype=bool))
+        """Return the lowest and highest corner of all leaves, in finest voxels from the world's origin."""
+        key = self.key.astype(np.int64)
+        corner = key + (1 << (DEPTH - self.depth.astype(np.int64)))[:, None]
+        return key.min(axis=0) - _CENTRE, corner.max(axis=0) - _CENTRE
 
 
 @dataclass(frozen=True)
@@ -115,8 +111,6 @@ class OctomapFormat:
                 occupied=leaves.voxels(occupied),
                 free=leaves.voxels(~occupied),
             ),
-            **_box("occupied", leaves, occupied, header.resolution_m),
-            **_box("free", leaves, ~occupied, header.resolution_m),
         }
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
@@ -276,16 +270,6 @@ def _halvings(source: Path | str, finest_m: float, resolution_m: float | None) -
             f"state resolution_m: {finest_m:g}, {2 * finest_m:g}, {4 * finest_m:g}, ...",
         )
     return halvings
-
-
-def _box(name: str, leaves: Leaves, chosen: Bool, resolution_m: float) -> dict[str, object]:
-    if not chosen.any():
-        return {}
-    low, high = leaves.box(chosen)
-    return {
-        f"{name}_box_min_m": [round(v, 4) for v in (low * resolution_m).tolist()],
-        f"{name}_box_max_m": [round(v, 4) for v in (high * resolution_m).tolist()],
-    }
 
 
 # --- writing -------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from pipelines.formats.common.files import leads_out, numbers, read_head, read_y
 from pipelines.formats.maps.voxel_grids import extruded
 from pipelines.geometry.arrays import Bool, Float, Float32
 from pipelines.session.errors import DataError
-from pipelines.session.maps import check_resolution, describe_grid
+from pipelines.session.maps import check_resolution
 from pipelines.session.records import Occupancy
 from pipelines.session.storage import refuse_special
 
@@ -79,7 +79,7 @@ class RosMap:
         return [_read_plan(path).image]
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Describe the YAML's values, pixels by state, and the extruded map."""
+        """Describe the YAML's values, and pixels by state."""
         plan = _read_plan(path)
         pixels = _probabilities(path, plan)
         summary: dict[str, object] = {"image": plan.image.name}
@@ -96,13 +96,7 @@ class RosMap:
             "unknown_pixels": pixels.size - occupied - free,
             "extruded_m": HEIGHT_M,
         }
-        try:
-            grid = _grid(path, plan, pixels, plan.resolution_m)
-        except DataError as error:  # too large
-            return summary | {"voxels": error.problem}
-        known = {"occupied": grid.probability >= 0.5, "free": grid.probability < 0.5}
-        counts = {name: int(np.count_nonzero(which)) for name, which in known.items()}
-        return summary | describe_grid(grid.resolution_m, grid.origin, grid.probability.shape, **counts)
+        return summary
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
         """Read, turn and extrude the plan; the grid's axes are the world's."""

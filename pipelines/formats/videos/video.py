@@ -149,25 +149,15 @@ def index_video(path: Path) -> VideoIndex:
         return reader.index
 
 
-# Telemetry by the names of tracks (as their writers call them) or of codecs, with the way to read it.
-_TELEMETRY = (
-    (re.compile(r"GoPro MET"), "GoPro's telemetry (GPMF), read as `gopro`"),
-    (re.compile(r"(?i)djmd|(DJI|CAM|HAL) meta"), "DJI's telemetry (djmd), not read"),
-    (re.compile(r"(?i)parrot"), "Parrot's telemetry, not read"),
-    (re.compile(r"klv"), "MISB KLV, not read"),
-)
-
-
 def data_tracks(path: Path) -> list[str]:
-    """Name the tracks beside pictures and sound: telemetry by its kind, others by the name in the file."""
+    """Name the tracks beside pictures and sound by the names in the file: GoPro MET, DJI meta, ..."""
     container, _ = open_container(path)
     with container:
-        names = [
+        return [
             f"{stream.metadata.get('handler_name', '').strip()} {stream.name or ''}".strip()
             for stream in container.streams
             if stream.type == "data"
         ]
-    return [next((kind for known, kind in _TELEMETRY if known.search(name)), name) for name in names]
 
 
 def created_ns(path: Path) -> int | None:

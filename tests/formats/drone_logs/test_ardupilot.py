@@ -34,24 +34,6 @@ def read(path: Path, **choice: Any) -> Telemetry:
     return FORMAT.read_telemetry(path, TelemetryChoice(**choice))
 
 
-def test_what_is_in_it(tmp_path: Path, truth: DroneTruth) -> None:
-    path = write_dataflash(tmp_path / "a.bin", truth)
-    assert FORMAT.recognises(path)
-    described = FORMAT.describe(path)
-    rows = len(truth.t_ns)
-    assert described["topics"] == [
-        f"ATT {rows}",
-        f"CAM {rows}",
-        "FMT 8",
-        f"GPS {rows}",
-        f"MNT {rows}",
-        "ORGN 2",
-        f"POS {rows}",
-        f"XKF1 {rows}",
-    ]
-    assert described["gps_fixes"] == rows - 1
-
-
 @pytest.mark.parametrize(
     ("position", "tolerance_m"),
     [("local", 2e-6), ("global", 0.013), ("gps", 0.013)],  # floats; 1e-7 deg, and heights in cm

@@ -18,7 +18,6 @@ from pipelines.geometry.poses import rotate
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import FORMATS, TelemetryChoice
 from tests.commands.runner import refused
-from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
 REAL = "second/upteko_dji_flight_record50m_30m"
@@ -159,21 +158,6 @@ def test_damage_is_counted(tmp_path: Path) -> None:
     assert len(telemetry.position.t_ns) == 56
     assert list(telemetry.dropped.values()) == [2, 1, 1]
     assert FORMAT.describe(path)["rows"] == 58
-
-
-def test_refusals(tmp_path: Path) -> None:
-    empty = tmp_path / "empty.csv"
-    empty.write_text(AIRDATA + "\n")
-    with refuses(empty, "0"):
-        read(empty)
-    lowless = tmp_path / "low.csv"
-    lowless.write_text("time(millisecond),latitude,longitude,pitch(degrees)\n0,47.5,8.25,1\n")
-    with refuses(lowless, "altitude: 30"):
-        read(lowless)
-    assert read(lowless, altitude=30).position.values[0, 2] == 30
-    other = tmp_path / "other.csv"
-    other.write_text("t,latitude,longitude\n0,47.5,8.25\n")
-    assert not FORMAT.recognises(other)
 
 
 def test_a_real_binary_record_is_refused_with_the_way_to_a_csv() -> None:

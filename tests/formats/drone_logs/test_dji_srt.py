@@ -156,17 +156,6 @@ def test_an_altitude_that_names_no_reference(
     assert (track.height, track.values[0, 2]) == (height, metres)
 
 
-def test_a_mavic_air_2_counts_from_its_take_off() -> None:
-    # It hovers above ground that is more than 50 m above the sea.
-    path = real_data("second/mavic_air2.srt")
-    assert FORMAT.describe(path)["height_m"] == [27.3, 29.2]
-    for stated in (None, "relative"):
-        telemetry = read(path, altitude=stated)
-        assert telemetry.position.height == "take-off"
-        assert (telemetry.position.values[:, 2].min(), telemetry.position.values[:, 2].max()) == (27.3, 29.2)
-    assert read(path, altitude="absolute").position.height == "unknown"
-
-
 def test_losses_are_counted(tmp_path: Path) -> None:
     good = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]"
     path = subtitles(

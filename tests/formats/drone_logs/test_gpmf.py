@@ -21,7 +21,6 @@ from pipelines.geometry.poses import (
 )
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice, VideoFormat, recognise
-from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import DroneTruth, drone_of
 from tests.synthetic.flights import write_flight
@@ -31,7 +30,6 @@ from tests.synthetic.video_tracks import (
     gpmf_nested,
     gpmf_numbers,
     write_gopro,
-    write_track,
 )
 
 READER = gpmf.FORMAT
@@ -132,14 +130,6 @@ def test_a_real_karma_is_where_and_when_it_was_filmed() -> None:
     assert (level * said).sum(axis=1).min() > np.cos(np.radians(5))
 
 
-def test_accelerations_of_the_real_file_are_those_of_another_reader() -> None:
-    parser = pytest.importorskip("telemetry_parser").Parser(str(real_data(KARMA)))
-    packets = [each["Accelerometer"] for each in parser.telemetry() if "Accelerometer" in each]
-    told = [[row[axis] / each["Scale"] for axis in "xyz"] for each in packets for row in each["Data"]]
-    ours = np.concatenate(gpmf._read(real_data(KARMA)).rows["ACCL"])
-    np.testing.assert_allclose(ours, told, rtol=1e-12)
-
-
 # --- attitudes -----------------------------------------------------------------------------------------
 
 _QUANTUM_DEG = 0.02  # a part of a quaternion is a whole 1/32767, in each of four of them
@@ -188,24 +178,3 @@ def test_turns_are_those_of_another_reader(tmp_path: Path) -> None:
     optical = body_from_camera("forward")
     ours = multiply(READER.read_attitudes(path).camera.quaternion_xyzw, optical)
     assert between_deg(multiply(conjugate(told[0]), told), multiply(conjugate(ours[0]), ours)) < _QUANTUM_DEG
-
-
-def test_turns_that_contradict_gravity_are_refused(tmp_path: Path) -> None:
-    """The orientations of a camera that rolls over, beside the gravity of one that stands still."""
-    truth, picture, _ = filmed(tmp_path / "f")
-    angle = np.linspace(0, np.pi, len(picture))[:, None]
-    rolled = multiply(picture[:1], quaternion_from_rotation_vector(angle * [0.0, 0.0, 1.0]))
-    scale = gpmf_numbers("SCAL", "s", [[32767]])
-    packets = [
-        (k * 10**9, gpmf_nested("DEVC", content[: content.index(b"GRAV") - 20], still))
-        for k, (content, still) in enumerate(
-            zip(
-                gopro_turns(truth.t_ns.tolist(), rolled),
-                [gpmf_nested("STRM", scale, gpmf_numbers("GRAV", "s", [[0, 32767, 0]] * 30))] * 2,
-                strict=True,
-            )
-        )
-    ]
-    path = write_track(tmp_path / "a.mp4", packets, last_s=1)
-    with refuses(path, "GRAV"):
-        READER.read_attitudes(path)

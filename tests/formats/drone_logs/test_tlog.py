@@ -169,19 +169,3 @@ def test_damage_costs_the_packets_that_it_hits(tmp_path: Path, truth: DroneTruth
     assert list(read(hit).dropped.values()) == [1]
     hit.write_bytes(whole.read_bytes()[: len(data) // 2])
     assert rows // 2 <= len(read(hit).position.t_ns) <= rows // 2 + 1
-
-
-def test_refusals(tmp_path: Path, truth: DroneTruth) -> None:
-    empty = tmp_path / "empty.tlog"
-    empty.write_bytes(b"")
-    other = tmp_path / "other.tlog"
-    other.write_bytes(bytes(range(256)) * 20)
-    for path in (empty, other):
-        assert not FORMAT.recognises(path)
-        with refuses(path):
-            read(path)
-    nowhere = tmp_path / "nowhere.tlog"
-    nowhere.write_bytes(b"".join(mavlink("ATTITUDE", k, 0, 0, 0, 0, 0, 0, stamp_ns=10**18) for k in range(9)))
-    assert FORMAT.recognises(nowhere)
-    with refuses(nowhere, "GLOBAL_POSITION_INT"):
-        read(nowhere)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -157,24 +157,6 @@ def test_damaged_and_empty_maps_are_counted(tmp_path: Path) -> None:
     assert any(re.search(r"tree.*\(2 ", note) for note in found.notes)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda file: file[:-2],
-        lambda file: file + b"\0\0",
-        lambda file: file.partition(b"data\n")[0] + b"data\n",
-        lambda file: file.replace(b"res 0.2", b"res nan"),
-        lambda file: file.replace(b" binary", b"").replace(b"id OcTree", b"id TsdfTree"),
-    ],
-)
-def test_unusable_octomaps_are_one_clear_line(tmp_path: Path, change: Callable[[bytes], bytes]) -> None:
-    file = change(as_bt(box(), tmp_path / "site"))
-    with pytest.raises(DataError) as caught:
-        Read(tmp_path, [octomap_entry(file, T0)])
-    assert "\n" not in str(caught.value)
-    assert "/octomap" in str(caught.value)
-
-
 # --- the log's world -----------------------------------------------------------------------------------
 
 
@@ -186,24 +168,6 @@ def occupied_centres(one: Occupancy) -> NDArray[np.float64]:
 def in_order(points: NDArray[np.float64]) -> NDArray[np.float64]:
     rounded = np.round(points, 6) + 0.0
     return rounded[np.lexsort(rounded.T)]
-
-
-@pytest.mark.parametrize("yaw_deg", [30.0, 45.0, -100.0])
-def test_other_turns_lose_no_obstacle_and_grow_by_a_voxel_at_most(tmp_path: Path, yaw_deg: float) -> None:
-    file = as_bt(box(), tmp_path / "site")
-    place = Placement(translation=[1.0, 2.0, 3.0], yaw_deg=yaw_deg)
-    one = Read(tmp_path, [octomap_entry(file, T0)], place=place).only
-    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
-    true = occupied_centres(READER.read_map(tmp_path / "site" / "map.bt"))
-    true = true @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + place.translation
-    found = occupied_centres(one)
-    apart = np.linalg.norm(true[:, None, :2] - found[None, :, :2], axis=2)
-    level = np.abs(true[:, None, 2] - found[None, :, 2]) < 1e-6
-    apart = np.where(level, apart, np.inf)
-    # A sample is within both voxels, so centres are at most two half diagonals apart.
-    limit = 0.2 * math.sqrt(2) + 1e-9
-    assert apart.min(axis=1).max() <= limit
-    assert apart.min(axis=0).max() <= limit
 
 
 def test_transforms_of_the_log_place_a_map(tmp_path: Path) -> None:
@@ -243,16 +207,6 @@ def test_plan_is_raised_from_its_origin(tmp_path: Path, container: Container) ->
         one.probability, np.repeat((cells / 100)[:, :, None], 4, axis=2).astype("f4")
     )
     assert (one.origin.tolist(), one.resolution_m) == ([-3.0, 7.0, 1.25], 0.5)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"data": np.zeros(5, np.int8)}, {"data": np.full(12, 101, np.int8)}, {"data": np.full(12, -1, np.int8)}],
-)
-def test_unusable_plans_are_one_clear_line(tmp_path: Path, change: dict[str, Any]) -> None:
-    entry = grid_entry(plan(), T0)
-    with pytest.raises(DataError):
-        Read(tmp_path, [Entry(entry.topic, entry.type, T0, {**entry.fields, **change})])
 
 
 # --- clouds --------------------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from pipelines.session.records import (
     AngleSample,
     IntrinsicsSample,
     PoseSample,
-    Topic,
 )
 from tests.formats.foxglove_protobuf import protobuf
 from tests.formats.log_values import (
@@ -275,7 +274,3 @@ def test_what_is_no_camera_is_refused(stated: Any) -> None:
 # --- pictures ------------------------------------------------------------------------------------------
 
 # --- kinds and refusals --------------------------------------------------------------------------------
-
-
-def topic(type_name: str) -> Topic:
-    return Topic("/t", type_name, "cdr", 0, None, None)

@@ -12,7 +12,6 @@ from pipelines.formats.logs.positions import axes_of_topic, pairs_of, read_pair,
 from pipelines.session.records import Telemetry, Topic
 from pipelines.session.registries import LogFormat, recognise
 from tests.real_data import real_data
-from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_mcap
 
 START_NS = 1_700_000_000_000_000_000
@@ -21,24 +20,6 @@ ROWS = 8
 
 def stamps() -> list[int]:
     return [START_NS + k * 50_000_000 for k in range(ROWS)]
-
-
-def fixes(topic: str, latitude: float = 47.5, **more: Any) -> list[Entry]:
-    return [
-        Entry(
-            topic,
-            "sensor_msgs/msg/NavSatFix",
-            t,
-            {
-                "header": header(t, "gps"),
-                "latitude": latitude,
-                "longitude": 8.5 + 1e-6 * k,
-                "altitude": 400.0,
-                **more,
-            },
-        )
-        for k, t in enumerate(stamps())
-    ]
 
 
 def _pair(path: Path, position: str, attitude: str) -> Telemetry:

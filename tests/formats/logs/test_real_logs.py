@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.formats.logs import recordings
 from pipelines.formats.logs.messages import bytes_of
-from pipelines.session.registries import FORMATS, Format, LogFormat, recognise
+from pipelines.session.registries import FORMATS, LogFormat, recognise
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
@@ -86,12 +86,6 @@ def test_every_message_comes_in_the_order_of_receipt(path: str) -> None:
         assert counts == {t.name: 0 if t.name in undefined else t.count for t in log.topics}
         lost = sum(topic.count for topic in log.topics if topic.name in undefined)
         assert log.dropped == ({recordings.UNDEFINED: lost} if lost else {})
-
-
-@pytest.mark.parametrize("path", LOGS)
-def test_one_format_alone_recognises_a_log(path: str) -> None:
-    everything: list[Format] = FORMATS.all()
-    assert [f.name for f in everything if f.recognises(real_data(path))] == [LOGS[path]]
 
 
 def test_values_are_those_the_ordinary_reader_saw() -> None:

@@ -9,7 +9,6 @@ import numpy as np
 from pipelines.formats.maps import voxel_grids
 from pipelines.session import maps
 from pipelines.session.registries import MapFormat
-from tests.formats.damaged_maps import refuse_or_read
 from tests.formats.refusals import refuses
 
 READER: MapFormat = voxel_grids.NPZ
@@ -54,21 +53,3 @@ def test_other_npz_files_are_not_taken_for_maps(tmp_path: Path) -> None:
     broken.write_bytes(b"PK\3\4 no zip")
     assert not READER.recognises(other)
     assert not READER.recognises(broken)
-
-
-def test_an_array_that_states_to_be_huge_is_refused_before_it_is_read(tmp_path: Path) -> None:
-    """The sizes of the second member stand behind byte 20 of its entry in the directory of the archive."""
-    path = write(tmp_path / "site.npz")
-    content = bytearray(path.read_bytes())
-    entry = content.index(b"PK\1\2", content.index(b"PK\1\2") + 4)
-    content[entry + 10 : entry + 12] = bytes(2)  # stored, not deflated
-    content[entry + 20 : entry + 24] = (2**32 - 2).to_bytes(4, "little")
-    path.write_bytes(content)
-    with refuses(path, "origin"):
-        READER.read_map(path)
-
-
-def test_damage_is_refused_or_read(tmp_path: Path) -> None:
-    content = write(tmp_path / "site.npz").read_bytes()
-    damaged = tmp_path / "bad.npz"
-    assert refuse_or_read(READER, damaged, content, tries=150) > 75

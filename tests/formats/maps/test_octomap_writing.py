@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pipelines.formats.maps import octomap
 from pipelines.formats.maps.octomap import write_octomap
 from pipelines.session.records import Occupancy
-from tests.formats.refusals import refuses
 
 FREE, OCCUPIED = np.float32(octomap.FREE_PROBABILITY), np.float32(octomap.OCCUPIED_PROBABILITY)
 
@@ -76,29 +75,3 @@ def test_octomap_reads_the_same_leaves(tmp_path: Path) -> None:
     described = octomap.FORMAT.describe(file)
     assert described["nodes"] == tree.size()
     assert described["leaves"] == tree.getNumLeafNodes()
-
-
-def test_the_corners_of_the_tree_can_be_reached_and_not_passed(tmp_path: Path) -> None:
-    file, one = tmp_path / "a.bt", np.ones((1, 1, 1), dtype=np.float32)
-    for index in (-32768, 32767):
-        write_octomap(file, Occupancy(one, np.full(3, index * 0.5), 0.5))
-        assert voxels_of(octomap.FORMAT.read_map(file)) == {(index, index, index): True}
-    for index, reach in ((-32769, "16384.5"), (32768, "16384.5")):
-        with refuses(file, 16384, reach):
-            write_octomap(file, Occupancy(one, np.array([0, index * 0.5, 0]), 0.5))
-
-
-@pytest.mark.parametrize(
-    ("grid", "origin", "problem"),
-    [
-        (np.ones((1, 1, 1)), [0.0, 0.05, 0.0], "not on OctoMap's grid, the multiples of 0.2 m"),
-        (np.ones((1, 1, 1)), [0.0, np.nan, 0.0], "not on OctoMap's grid"),
-        (np.full((2, 2, 2), np.nan), [0.0, 0.0, 0.0], "nothing in the map is known"),
-    ],
-)
-def test_what_cannot_be_written(
-    tmp_path: Path, grid: NDArray[np.float64], origin: list[float], problem: str
-) -> None:
-    with pytest.raises(ValueError, match=problem):
-        write_octomap(tmp_path / "a.bt", Occupancy(grid.astype(np.float32), np.array(origin), 0.2))
-    assert not (tmp_path / "a.bt").exists()

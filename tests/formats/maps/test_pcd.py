@@ -8,16 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pipelines.formats.maps import point_files
 from pipelines.formats.maps.octree import decompress
 from pipelines.geometry.arrays import Float
-from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
 from tests.formats import clouds
-from tests.formats.damaged_maps import refuse_or_read
 from tests.real_data import real_data
 
 READER: MapFormat = point_files.PCD
@@ -124,40 +120,6 @@ def test_lzf_reads_what_liblzf_wrote() -> None:
     intensity = np.arange(36, dtype="<u2") // 3
     fields = [points[:, 0], intensity, points[:, 1], points[:, 2]]
     assert unpacked(PACKED_BY_LIBLZF, 504) == b"".join(field.tobytes() for field in fields)
-
-
-@settings(deadline=None)  # the first call compiles
-@given(st.lists(st.sampled_from([b"a", b"bc", b"abcabc", b"\0" * 300, b"d" * 9]), max_size=12))
-def test_lzf_round_trip(parts: list[bytes]) -> None:
-    content = b"".join(parts)
-    assert unpacked(squeezed(content), len(content)) == content
-    assert unpacked(literals(content), len(content)) == content
-
-
-XYZ = ("x y z", "4 4 4", "F F F", "1 1 1")
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"VERSION 0.7\nFIELDS x y z\n",
-        header("x y z", "4 4 4", "F F F", "1 1 2", 1, "ascii") + b"1 2 3 4\n",
-        header(*XYZ, 2, "ascii") + b"1 2 3\n",
-        header(*XYZ, 2, "ascii") + b"1 2 3\n1 b 3\n",
-        header(*XYZ, 2, "binary_compressed") + struct.pack("<II", 2, 24) + b"\0a",
-    ],
-)
-def test_unusable_files_are_one_clear_line(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "bad.pcd"
-    path.write_bytes(content)
-    with pytest.raises(DataError):
-        READER.read_map(path)
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-def test_damage_is_refused_or_read(tmp_path: Path, encoding: str) -> None:
-    content = write(tmp_path / "a.pcd", encoding).read_bytes()
-    assert refuse_or_read(READER, tmp_path / "a.pcd", content, tries=300) > 100
 
 
 @pytest.mark.parametrize("name", ["pcl_bunny_ascii", "pcl_colored_cloud", "ndt_omp_251370668"])

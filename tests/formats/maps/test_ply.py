@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from pipelines.formats.maps import point_files
-from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
 from tests.formats import clouds
-from tests.formats.damaged_maps import refuse_or_read
 from tests.real_data import real_data
 
 READER: MapFormat = point_files.PLY
-XYZ = "property float x\nproperty float y\nproperty float z\n"
 
 
 def head(encoding: str, elements: str) -> bytes:
@@ -58,33 +55,6 @@ def test_voxels_hold_the_vertices(tmp_path: Path, encoding: str) -> None:
     said = READER.describe(path)
     assert said["elements"] == {"sensor": 2, "vertex": 5, "face": 1}
     assert (said["points"], said["finite_points"], said["occupied_voxels"]) == (5, 3, 2)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"ply\nformat ascii 1.0\n",
-        head("ascii", "element vertex -1\n" + XYZ),
-        head("ascii", "element face 1\nproperty list uchar int i\n"),
-        head("ascii", f"element vertex 1\n{XYZ}property list uchar int i\n"),
-        head("ascii", f"element vertex 1\n{XYZ}") + b"1 2\n",
-        head(
-            "binary_little_endian",
-            f"element face 1\nproperty list uchar int i\nelement vertex 1\n{XYZ}",
-        ),
-    ],
-)
-def test_unusable_files_are_one_clear_line(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "bad.ply"
-    path.write_bytes(content)
-    with pytest.raises(DataError):
-        READER.read_map(path)
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_damage_is_refused_or_read(tmp_path: Path, encoding: str) -> None:
-    content = write(tmp_path / "a.ply", encoding).read_bytes()
-    assert refuse_or_read(READER, tmp_path / "a.ply", content, tries=300) > 100
 
 
 def test_the_real_cloud_is_read_as_by_other_readers() -> None:

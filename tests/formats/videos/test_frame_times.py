@@ -10,7 +10,6 @@ import pytest
 
 from pipelines.formats.videos import frame_times
 from pipelines.formats.videos.frame_times import FrameStamps, read_frame_times, times_of_frames
-from pipelines.session.errors import DataError
 from tests.real_data import real_data
 
 
@@ -63,23 +62,6 @@ def test_rows_that_cannot_be_used_are_counted_by_cause(tmp_path: Path) -> None:
     assert stamps.frame.tolist() == [0, 2, 5]
     assert stamps.t_ns.tolist() == [1_000_000_000, 3_000_000_000, 4_000_000_000]
     assert sorted(stamps.dropped.values()) == [1, 1, 1, 2, 3]  # cut line, time, twice; late; number
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "0,1.0\n1,1.1\n",
-        "frame,t\n",
-        "t\n",
-        "frame,t\n0,1\n1,2,3\n2,3\n",
-        "frame,t_s\n0,1700000000000\n1,1700000000100\n",
-    ],
-)
-def test_what_is_no_csv_of_frame_times(tmp_path: Path, text: str) -> None:
-    with pytest.raises(DataError) as caught:
-        read_frame_times(written(tmp_path / "f.csv", text))
-    assert "\n" not in str(caught.value)
 
 
 # --- subtitles ------------------------------------------------------------------------------------------
