@@ -118,7 +118,7 @@ def test_calibrated_still_cameras_are_left_to_robust(tmp_path: Path) -> None:
     left_to_robust(session)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_backgrounds_and_ground_of_the_sample_flight_take_part(tmp_path: Path) -> None:
     """Require half of the error of `robust` (132 and 38 mm in the mean of two draws), on 4 s of 12."""
     fetch_networks("blazepose")

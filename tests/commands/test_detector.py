@@ -66,7 +66,7 @@ def test_detector_and_triangulation_agree_with_the_peers_skeleton(flight: Path) 
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_keypoints_do_not_depend_on_workers(flight: Path) -> None:
     session = flight.with_suffix(".session")
     results = []
