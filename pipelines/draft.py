@@ -11,7 +11,9 @@ import numpy as np
 
 from pipelines.drafting.found import (
     LAST_POSE_TYPE,
+    NED,
     NO_DATE_NS,
+    OPTICAL,
     POSE_TYPES,
     FlownPoses,
     FoundAngles,
@@ -19,12 +21,15 @@ from pipelines.drafting.found import (
     FoundFrames,
     FoundLink,
     FoundLog,
+    NamePlace,
     Proposal,
     SourceKind,
     TimeSpan,
     VideoStart,
+    is_called,
+    label_of,
+    label_of_place,
 )
-from pipelines.drafting.labels import NED, OPTICAL, NamePlace, is_called, label_of, label_of_place
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import MotionMatch, match
 from pipelines.formats.common.rows import median_step_ns
@@ -92,9 +97,6 @@ TRANSFORMS_READ = 2000
 
 # A calibration of more cameras holds the pictures of one moving camera.
 MAX_CAMERAS_OF_CALIBRATION = 200
-
-# So many files of a folder tell if they are keypoints of one camera.
-FILES_ASKED = 16
 
 KINDS = (
     KeypointFormat,
@@ -289,8 +291,7 @@ class _FileSearch:
         if not isinstance(format_, KeypointFormat):
             return True
         files = [child for child in children if child.suffix.lower() == ".json"]
-        asked = files[:: max(1, len(files) // FILES_ASKED)]
-        if len(files) < 2 or any(f is not format_ for file in asked for f in self._recognising(file)):
+        if len(files) < 2 or any(f is not format_ for file in files[:2] for f in self._recognising(file)):
             return False
         try:
             format_.read_keypoints(folder, skeleton=None, first_frame=0)

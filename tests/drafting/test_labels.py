@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.drafting.labels import (
+from pipelines.drafting.found import (
     EQUAL,
     NUMBER,
     OTHER,

@@ -37,7 +37,7 @@ CLASSES: dict[str, type[NoiseModel]] = {
     "latency": Latency,
 }
 EPOCH = 1_700_000_000_000_000_000
-DRAWS = 3000
+DRAWS = 800
 
 
 def circling(t_s: Float) -> tuple[Int64, Float, Float]:
