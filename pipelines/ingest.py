@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from pipelines.drafting.labels import GIMBAL, is_called
+from pipelines.drafting.found import GIMBAL, is_called
 from pipelines.formats.common.files import leads_out
 from pipelines.formats.logs.messages import kind_of
 from pipelines.geometry.arrays import Float
