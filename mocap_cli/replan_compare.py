@@ -140,14 +140,12 @@ def _print(metrics: dict[str, Any]) -> None:
         [
             {
                 "arm": name,
-                "drones": arm["drones"],
                 "range m": arm["range_m"]["mean"],
-                "tilt deg": arm["tilt_deg"]["mean"],
+                "tilt": arm["tilt_deg"]["mean"],
                 "max": arm["tilt_deg"]["max"],
                 "hidden %": 100 * arm["occluded_share"],
-                "path m": arm["path_m"],
                 **_errors(arm["reconstruction_error"]),
-                "violations": sum(arm["limit_violations"].values()),
+                "broken": sum(arm["limit_violations"].values()),
             }
             for name, arm in arms.items()  # near ones first
         ]
