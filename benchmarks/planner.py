@@ -42,11 +42,10 @@ from pipelines.formats.common.files import read_yaml
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import White
 from pipelines.ingest import ingest
-from pipelines.planning.arm_flights import CameraPaths, measure
 from pipelines.planning.arms import PLANNER_ARMS, SlotChoice, Worth, plan_in_turn
 from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.formation import Lattice
-from pipelines.planning.replay import Start, replay
+from pipelines.planning.replay import CameraPaths, Start, measure, replay
 from pipelines.planning.scene import ReplanSettings
 from pipelines.planning.scores import coverage, predicted_errors, score, view_quality
 from pipelines.replan import detect_by_model, error_model, replan

@@ -22,9 +22,9 @@ from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
 from pipelines.keypoints.hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
 from pipelines.keypoints.tracking import FollowedPeople
-from pipelines.planning.arm_flights import poses_from
 from pipelines.planning.formation import TILT, slot_of
-from pipelines.planning.loading import LoggedFlight, load_flight
+from pipelines.planning.replay import poses_from
+from pipelines.planning.scene import LoggedFlight, load_flight
 from pipelines.reconstruction.refining import refined_points
 from pipelines.reporting.overlays import OverlayView
 from pipelines.reporting.pictures import draw_frame, with_inlet

@@ -19,7 +19,10 @@ import numpy as np
 
 from pipelines.formats.common.files import read_yaml
 from pipelines.geometry.arrays import Float
-from pipelines.planning.arm_flights import (
+from pipelines.planning.arms import PLANNER_ARMS
+from pipelines.planning.comparison import ArmResult, compare
+from pipelines.planning.config import ErrorModel
+from pipelines.planning.replay import (
     FLOWN,
     LOGGED,
     PLANNED,
@@ -29,11 +32,14 @@ from pipelines.planning.arm_flights import (
     measure_arm,
     trajectories,
 )
-from pipelines.planning.arms import PLANNER_ARMS
-from pipelines.planning.comparison import ArmResult, compare
-from pipelines.planning.config import ErrorModel
-from pipelines.planning.loading import LoggedFlight, load_flight
-from pipelines.planning.scene import ReplanSettings, ReplayScene, build_scene, replan_settings
+from pipelines.planning.scene import (
+    LoggedFlight,
+    ReplanSettings,
+    ReplayScene,
+    build_scene,
+    load_flight,
+    replan_settings,
+)
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
@@ -318,7 +324,7 @@ def detect_by_model(
     joints: tuple[str, ...],
     errors: DetectorErrors,
 ) -> tuple[Float, Float]:
-    """Simulate the detector by a model with tilt and distance (`arm_flights.Detect`)."""
+    """Simulate the detector by a model with tilt and distance (`replay.Detect`)."""
     tilt_deg, height_px = view_of(camera, target, height_m=PERSON_HEIGHT_M, focal_px=focal_px)
     return detect_keypoints(pixels, free, tilt_deg, height_px, errors, rng, joints=joints)
 

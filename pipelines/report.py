@@ -14,7 +14,6 @@ import numpy as np
 
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.reporting.chart import MARK, refuse_foreign, write_figures
-from pipelines.reporting.comparison_page import draw_comparison, render_comparison
 from pipelines.reporting.content import (
     ReplanContent,
     SessionContent,
@@ -24,7 +23,7 @@ from pipelines.reporting.content import (
 )
 from pipelines.reporting.page import draw_session, render_page
 from pipelines.reporting.pictures import Video
-from pipelines.reporting.session_comparison import compare, labels_of
+from pipelines.reporting.session_comparison import compare, draw_comparison, labels_of, render_comparison
 from pipelines.reporting.studies import draw_study, study_blocks
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError

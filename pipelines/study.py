@@ -26,8 +26,7 @@ from pipelines.keypoints.hints import project_actor
 from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.planning.comparison import SMALLEST_DIFFERENCE_MM, capped_mm, compare, mean_of_trials
 from pipelines.planning.config import SETTINGS, PlannerConfig, planner_config
-from pipelines.planning.loading import load_flight
-from pipelines.planning.scene import ReplanSettings, ReplayScene, build_scene
+from pipelines.planning.scene import ReplanSettings, ReplayScene, build_scene, load_flight
 from pipelines.reconstruction.refining import refined_points
 from pipelines.replan import (
     detector_errors,

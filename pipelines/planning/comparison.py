@@ -13,9 +13,9 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Float32, Int64
 from pipelines.geometry.metrics import LEVEL, STRETCH_S, intervals
-from pipelines.planning.arm_flights import LOGGED, ArmFlight, aimed_at, looks_rad, seen_people
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.formation import TILT, slot_of
+from pipelines.planning.replay import LOGGED, ArmFlight, aimed_at, looks_rad, seen_people
 from pipelines.planning.scene import ReplayScene
 from pipelines.planning.scores import blind_s, score, view_quality
 from pipelines.planning.scores import coverage as viewed

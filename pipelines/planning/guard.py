@@ -22,7 +22,7 @@ from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, Grid, barred, zone_distances
 from pipelines.planning.forecast import ActorFilter, PeopleFilter
-from pipelines.planning.tracking import (
+from pipelines.planning.local import (
     POSITION,
     VELOCITY,
     DronePlan,

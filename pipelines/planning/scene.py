@@ -1,16 +1,18 @@
-"""Data that all arms of a comparison share: settings, the actor, the maps, the cameras and the times."""
+"""Data that all arms of a comparison share: actor, maps, cameras, skeleton, times and settings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.noise import sum_sigma
-from pipelines.geometry.poses import rates
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.noise import NoiseModel, White, sum_sigma
+from pipelines.geometry.poses import gaps, interpolate_points, rates
 from pipelines.planning.config import ErrorModel, PlannerConfig, planner_config
 from pipelines.planning.distance_field import (
     DistanceField,
@@ -20,18 +22,395 @@ from pipelines.planning.distance_field import (
     in_turn,
     zone_edges,
 )
-from pipelines.planning.forecast import first_heading
+from pipelines.planning.forecast import first_heading, positions_at
 from pipelines.planning.formation import (
     YAW,
     formation_slots,
     slot_of,
     slot_offsets,
 )
-from pipelines.planning.loading import LoggedFlight, Source, flown_poses, points_at
-from pipelines.planning.tracking import tracking_times
-from pipelines.session.description import Description
+from pipelines.planning.local import tracking_times
+from pipelines.session.camera_poses import COMMAND_LINE, known_variances, poses_at, stated_models
+from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.errors import DataError
-from pipelines.session.records import Occupancy
+from pipelines.session.people import logged_people
+from pipelines.session.records import JointMotion, Occupancy, Trajectory
+from pipelines.session.stages import StageRecord
+from pipelines.session.tables import (
+    CAMERA_POSES,
+    PLAN,
+    POSES,
+    SKELETON,
+    TRUTH,
+    read_motion,
+    read_table,
+    trajectory_from,
+)
+
+Source = Literal["log", "reconstruction", "truth"]
+
+# Joints are interpolated across a missed frame at 10 Hz.
+MIN_INTERPOLATED_NS = 200_000_000
+# Joints are not interpolated across more than this many median steps.
+MAX_STEPS_INTERPOLATED = 1.5
+# A person can turn round within a second, so that longer gaps of the actor's measurements give a warning.
+LONG_GAP_NS = 1_000_000_000
+# Planners send several commands a second, so that a command that is older does not hold.
+COMMAND_HOLDS_NS = 2_000_000_000
+# A shorter flight has too few plans to compare.
+MIN_FLIGHT_S = 1.0
+# People without a common time are matched last: no distance is as large.
+NEVER_TOGETHER_M = 1e6
+# Others who are reconstructed at less than half of the first person's times are not filmed again.
+MIN_SHARE_OF_TIMES = 0.5
+
+_HIPS = ("left_hip", "right_hip")
+
+
+@dataclass(frozen=True)
+class SessionCamera:
+    """A camera of the session: lens, poses and pose noise."""
+
+    name: str
+    intrinsics: Intrinsics
+    trajectory: Trajectory  # one row where it stands still
+    static: bool
+    noise: tuple[NoiseModel, ...]  # of its logged poses
+
+
+@dataclass(frozen=True)
+class LoggedFlight:
+    """The logged flight, as far as the session knows it."""
+
+    actor_t_ns: Int64  # [A] ascending
+    actor: Float  # [A, P, 3] m, world: input of the planners, the middle of the hips; NaN: not measured then
+    actor_source: Source
+    hips: JointMotion | None  # the true hips, [T, P, 1, 3], NaN where unknown; None without truth
+    skeleton: JointMotion | None  # [T, P, J, 3] NaN where unknown
+    skeleton_source: Source | None
+    cameras: tuple[SessionCamera, ...]
+    poses_source: Source
+    noise_source: str  # source of the poses' noise
+    warnings: tuple[str, ...]
+    planned: dict[str, tuple[Int64, Float]] = field(default_factory=dict)
+    """Positions to which cameras were sent: stamps [K] and [K, 3] m, world."""
+    people: tuple[str, ...] = ("",)
+    """Names of the P people; the only one may have none."""
+    weights: tuple[float, ...] = (1.0,)
+    """Weights of the P people."""
+
+    @property
+    def moves(self) -> bool:
+        """True if any camera moves."""
+        return not all(camera.static for camera in self.cameras)
+
+    def scored_actor(self, t_ns: Int64) -> tuple[Float, Source]:
+        """Return the positions [P, T, 3] of the people to score against.
+
+        These are the true hips if they are known all the time.
+        """
+        if self.hips is not None:
+            true_hips = points_at(self.hips, t_ns)[:, :, 0]
+            if np.isfinite(true_hips).all():
+                return true_hips.swapaxes(0, 1), "truth"
+        return positions_at(self.actor_t_ns, self.actor, t_ns), self.actor_source
+
+
+def load_flight(
+    folder: Path,
+    description: Description,
+    reconstructed: StageRecord | None,
+    *,
+    pose_noise: str | None,
+) -> LoggedFlight:
+    """Read the flight, cut to the time in which the actor and all moving cameras are known.
+
+    `reconstructed` is the record of stage `reconstruct`, `pose_noise` replaces the errors stated in the
+    session.
+
+    Raises:
+        DataError: the actor's position is unknown, or not while the cameras flew; an unknown noise model.
+    """
+    warnings: list[str] = []
+    skeleton, skeleton_source = _skeleton(folder, description, reconstructed)
+    t_ns, actor, source = _actor(folder, description, reconstructed, warnings)
+    people = actor.shape[1]
+    logged = description.logged_people if source == "log" else []
+    if skeleton is not None:
+        skeleton = _of_people(skeleton, t_ns, actor, logged=bool(logged))
+    cameras, poses_source, noise_source = _cameras(folder, description, pose_noise)
+    if noise_source == "nobody":
+        warnings.append("nobody states the noise of the cameras' poses: taken as exact; state --pose-noise")
+    hips = _hips(skeleton) if skeleton is not None and skeleton_source == "truth" else None
+    spans = {f"the poses of {c.name}": c.trajectory.t_ns[[0, -1]] for c in cameras if not c.static}
+    if hips is not None:
+        known = np.isfinite(hips.position[..., 0, 0]).all(axis=1)
+        spans["the truth"] = hips.t_ns[np.flatnonzero(known)[[0, -1]]]
+    t_ns, actor = _cut(folder, t_ns, actor, spans)
+    missing = [gap for own in np.isfinite(actor[..., 0]).T for gap in gaps(t_ns[own], LONG_GAP_NS)]
+    if missing:
+        longest_s = max(last - first for first, last in missing) / 1e9
+        warnings.append(
+            f"the actor was not measured {len(missing)} times for more than {LONG_GAP_NS / 1e9:g} s, at most"
+            f" {longest_s:.1f} s: planners take a straight way meanwhile"
+        )
+    return LoggedFlight(
+        actor_t_ns=t_ns,
+        actor=actor,
+        actor_source=source,
+        hips=hips,
+        skeleton=skeleton,
+        skeleton_source=skeleton_source,
+        cameras=cameras,
+        poses_source=poses_source,
+        noise_source=noise_source,
+        warnings=tuple(warnings),
+        planned=_planned(folder, description),
+        people=tuple(description.names_of_people(people)) if people > 1 else ("",),
+        weights=tuple(person.weight for person in logged) or (1.0,) * people,
+    )
+
+
+def points_at(motion: JointMotion, t_ns: Int64) -> Float:
+    """Interpolate the joints [T, P, J, 3] at given times; NaN where not known nearby."""
+    step_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
+    longest_ns = max(MIN_INTERPOLATED_NS, round(MAX_STEPS_INTERPOLATED * step_ns))
+    return interpolate_points(motion.t_ns, motion.position, t_ns, max_gap_ns=longest_ns)
+
+
+def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> tuple[Float, Float, Bool]:
+    """Interpolate the true poses of the cameras: [N, T, 3], [N, T, 4], and a mask [N, T] of known ones.
+
+    Positions are linear across gaps of the log, so that a flight can be scored as a whole.
+    """
+    trusted = description.pose_interpolation
+    shape = (len(flight.cameras), len(t_ns))
+    position, quaternion = np.empty((*shape, 3)), np.empty((*shape, 4))
+    known = np.empty(shape, dtype=np.bool_)
+    for i, camera in enumerate(flight.cameras):
+        log, static = camera.trajectory, camera.static
+        known[i] = np.isfinite(poses_at(log, t_ns, trusted, static=static)[0][:, 0])
+        everywhere = Interpolation(
+            max_gap_s=float(np.ptp(log.t_ns)) / 1e9, max_extrapolation_s=float(np.ptp(t_ns)) / 1e9
+        )
+        position[i], quaternion[i] = poses_at(log, t_ns, everywhere, static=static)
+    return position, quaternion, known
+
+
+def planned_positions(flight: LoggedFlight, t_ns: Int64) -> tuple[Float, Bool]:
+    """Interpolate the on-board planner's commanded positions [K, T, 3], linearly, and mask the valid ones.
+
+    The mask [K, T] is False before the first command, after the last one, and between two that lie far apart.
+    """
+    position, known = np.empty((len(flight.planned), len(t_ns), 3)), []
+    for i, (stamps, sent) in enumerate(flight.planned.values()):
+        after = np.searchsorted(stamps, t_ns, side="left").clip(1, max(len(stamps) - 1, 1))
+        apart = np.diff(stamps, append=stamps[-1])[after - 1]
+        known.append((t_ns >= stamps[0]) & (t_ns <= stamps[-1]) & (apart <= COMMAND_HOLDS_NS))
+        for axis in range(3):
+            position[i, :, axis] = np.interp(t_ns - stamps[0], stamps - stamps[0], sent[:, axis])
+    return position, np.array(known, dtype=np.bool_).reshape(position.shape[:2])
+
+
+# --- the person ----------------------------------------------------------------------------------------
+
+
+def _skeleton(
+    folder: Path, description: Description, reconstructed: StageRecord | None
+) -> tuple[JointMotion | None, Source | None]:
+    """Return the true skeleton, or else the reconstructed one."""
+    if description.truth is not None and description.has_true_joints:
+        joints = tuple(description.truth.joints)
+        return read_motion(folder / "truth.parquet", TRUTH, joints), "truth"
+    return (None, None) if reconstructed is None else (_reconstruction(folder), "reconstruction")
+
+
+def _reconstruction(folder: Path) -> JointMotion:
+    """Read the reconstructed skeleton; joints that are not `ok` are NaN."""
+    motion = read_motion(folder / "reconstruct" / "skeleton.parquet", SKELETON)
+    if motion.status is not None:
+        motion.position[motion.status != "ok"] = np.nan
+    return motion
+
+
+def _of_people(skeleton: JointMotion, t_ns: Int64, actor: Float, *, logged: bool) -> JointMotion:
+    """Return the skeletons of the P people whose hips [A, P, 3] were measured; NaN for those without one."""
+    from scipy.optimize import linear_sum_assignment
+
+    people = actor.shape[1]
+    position = np.full((len(skeleton.t_ns), people, *skeleton.position.shape[2:]), np.nan)
+    hips = _hips_of(skeleton)
+    if logged or hips is None:
+        person = whose = np.arange(min(people, skeleton.position.shape[1]))
+    else:
+        there = positions_at(t_ns, actor, skeleton.t_ns).swapaxes(0, 1)
+        apart = np.linalg.norm(hips[:, None] - there[:, :, None], axis=-1)  # [T, P, Q]
+        known = np.isfinite(apart)
+        mean = np.where(known, apart, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        person, whose = linear_sum_assignment(np.where(known.any(axis=0), mean, NEVER_TOGETHER_M))
+    position[:, person] = skeleton.position[:, whose]
+    return JointMotion(skeleton.t_ns, skeleton.joints, position)
+
+
+def _hips_of(skeleton: JointMotion) -> Float | None:
+    """Compute the middle of everybody's hips [T, P, 3]; None where the skeleton has none."""
+    names = ("hip",) if "hip" in skeleton.joints else _HIPS
+    if not set(names) <= set(skeleton.joints):
+        return None
+    middle: Float = skeleton.position[:, :, [skeleton.joints.index(name) for name in names]].mean(axis=2)
+    return middle
+
+
+def _hips(skeleton: JointMotion) -> JointMotion | None:
+    """Compute the middle of everybody's hips, [T, P, 1, 3]; None if somebody's are never known."""
+    middle = _hips_of(skeleton)
+    if middle is None or not np.isfinite(middle[..., 0]).all(axis=1).any():
+        return None
+    return JointMotion(skeleton.t_ns, ("hip",), middle[:, :, None])
+
+
+def _actor(
+    folder: Path,
+    description: Description,
+    reconstructed: StageRecord | None,
+    warnings: list[str],
+) -> tuple[Int64, Float, Source]:
+    """Return the planners' input, [A] and [A, P, 3]: the logs of the people, or the reconstructed hips."""
+    logged = logged_people(folder, description)
+    warnings.extend(
+        f"the {entry.point} of {entry.name or 'the actor'} were logged: hips taken"
+        f" {entry.hip_above_m:+.2f} m above"
+        for entry in description.logged_people
+        if entry.point in ("feet", "head")
+    )
+    if logged:
+        t_ns = np.unique(np.concatenate([person.t_ns for person in logged]))
+        hips = np.full((len(t_ns), len(logged), 3), np.nan)
+        for k, person in enumerate(logged):
+            hips[np.searchsorted(t_ns, person.t_ns), k] = person.hips
+        return *_measured(folder, t_ns, hips, "the actor's log"), "log"
+    if reconstructed is None:
+        raise DataError(
+            folder,
+            "has no logged actor and no reconstruction to take one from",
+            "run `mocap reconstruct`, or name the actor's topic under `actor:` in flight.yaml",
+            code="no-actor",
+        )
+    found = _reconstruction(folder)
+    middle = _hips_of(found)
+    if middle is None or not np.isfinite(middle[:, 0]).any():
+        raise DataError(
+            folder,
+            "has no logged actor, and the reconstruction has no time at which both hips are ok",
+            "name the actor's topic under `actor:` in flight.yaml, or mend the reconstruction",
+            code="no-actor",
+        )
+    known = np.isfinite(middle[..., 0])
+    filmed = known[known[:, 0]].mean(axis=0) >= MIN_SHARE_OF_TIMES
+    return *_measured(folder, found.t_ns, middle[:, filmed], "the reconstruction's hips"), "reconstruction"
+
+
+def _measured(folder: Path, t_ns: Int64, position: Float, what: str) -> tuple[Int64, Float]:
+    known = np.isfinite(position[..., 0])
+    fewest = int(known.sum(axis=0).min())
+    if fewest < 2:
+        raise DataError(folder, f"{what} hold {fewest} positions", "a replay needs two or more")
+    rows = known.any(axis=1)
+    return t_ns[rows], position[rows]
+
+
+def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.int64]]) -> tuple[Int64, Float]:
+    """Cut the actor to the time in which all else is known."""
+    own = [t_ns[known][[0, -1]] for known in np.isfinite(actor[..., 0]).T]
+    first_ns = max(int(span[0]) for span in [*own, *spans.values()])
+    last_ns = min(int(span[1]) for span in [*own, *spans.values()])
+    kept = (t_ns >= first_ns) & (t_ns <= last_ns)
+    shared_s = float(np.ptp(t_ns[kept]) / 1e9) if kept.any() else 0.0
+    if shared_s < MIN_FLIGHT_S:
+        raise DataError(
+            folder,
+            f"{', '.join(['the actor', *spans])} are known together for {shared_s:.2f} s, less than"
+            f" {MIN_FLIGHT_S:g} s",
+            "check the clocks of the logs",
+            code="no-overlap",
+        )
+    return t_ns[kept], actor[kept]
+
+
+# --- the cameras ---------------------------------------------------------------------------------------
+
+
+def _cameras(
+    folder: Path, description: Description, pose_noise: str | None
+) -> tuple[tuple[SessionCamera, ...], Source, str]:
+    true_poses = _true_poses(folder, description)
+    cameras, stating = [], set()
+    for name, entry in description.cameras.items():
+        logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
+        noise, stated_by = _noise(name, entry, logged, pose_noise)
+        stating.add(stated_by)
+        cameras.append(
+            SessionCamera(
+                name=name,
+                intrinsics=entry.intrinsics.intrinsics(),
+                trajectory=true_poses.get(name, logged) if not entry.poses.static else logged,
+                static=entry.poses.static,
+                noise=noise,
+            )
+        )
+    return tuple(cameras), "truth" if true_poses else "log", _said_by(stating)
+
+
+def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]:
+    """Return the true poses of all cameras, if all of them are known."""
+    moving = {name for name, entry in description.cameras.items() if not entry.poses.static}
+    if description.truth is None or not moving or not moving <= set(description.truth.cameras):
+        return {}
+    table = read_table(folder / "truth_poses.parquet", CAMERA_POSES)
+    return {name: trajectory_from(table[table["camera"] == name]) for name in sorted(moving)}
+
+
+def _planned(folder: Path, description: Description) -> dict[str, tuple[Int64, Float]]:
+    """Read the positions to which the on-board planner sent each camera of the session."""
+    if not description.plan:
+        return {}
+    table = read_table(folder / "plan.parquet", PLAN)
+    found = {}
+    for name in (camera for camera in description.cameras if camera in description.plan):
+        own = table[table["camera"] == name]
+        found[name] = own["t_ns"].to_numpy(np.int64), own[["x", "y", "z"]].to_numpy(np.float64)
+    return found
+
+
+def _noise(
+    name: str, entry: CameraEntry, logged: Trajectory, pose_noise: str | None
+) -> tuple[tuple[NoiseModel, ...], str]:
+    """Return the errors of a camera's poses, and the source of that statement."""
+    models = stated_models(name, entry, pose_noise)
+    if models is not None:
+        return tuple(models), COMMAND_LINE if pose_noise else "flight.yaml"
+    sigma = _logged_sigma(logged)
+    if sigma is not None:
+        white = White(position_m=sigma[0], rotation_deg=float(np.degrees(sigma[1])))
+        return (white,), "the logs' covariances, as white noise"
+    return (), "still cameras are exact" if entry.poses.static else "nobody"
+
+
+def _said_by(stating: set[str]) -> str:
+    return "nobody" if "nobody" in stating else ", ".join(sorted(stating))
+
+
+def _logged_sigma(trajectory: Trajectory) -> tuple[float, float] | None:
+    """Compute the median standard deviation per axis (m, rad) of the logged covariances."""
+    if trajectory.covariance is None:
+        return None
+    variances, known_axes = known_variances(trajectory.covariance)
+    known = [variances[:, block][known_axes[:, block]] for block in range(2)]
+    if not all(values.size for values in known):
+        return None
+    position, rotation = (float(np.sqrt(np.median(values))) for values in known)
+    return position, rotation
+
 
 # More drones are refused, because no comparison of more was ever checked.
 MOST_DRONES = 8

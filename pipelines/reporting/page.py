@@ -27,13 +27,14 @@ from pipelines.reporting.pictures import Video, draw_overlays, make_strips, pane
 from pipelines.reporting.studies import draw_study, study_blocks
 from pipelines.reporting.summary import (
     Summary,
+    at_a_glance,
+    give_verdict,
     summarise,
     table_of_cameras,
     table_of_joints,
     table_of_quality,
     tables_of_errors,
 )
-from pipelines.reporting.verdict import at_a_glance, give_verdict
 from pipelines.reporting.viewer import ViewerScene, make_scene
 from pipelines.reporting.wording import Column, Table, environment
 

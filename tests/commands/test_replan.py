@@ -17,7 +17,7 @@ from mocap_cli.main import Mocap
 from mocap_cli.replan_compare import replan_compare_command
 from pipelines.detect import DETECT
 from pipelines.ingest import ingest
-from pipelines.planning.arm_flights import fly_arm
+from pipelines.planning.replay import fly_arm
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.stages import locked
 from pipelines.simulate import simulate

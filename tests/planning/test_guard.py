@@ -21,9 +21,9 @@ from pipelines.planning.distance_field import (
 )
 from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.guard import FlownMotion, Guard, least_distances, wanted_clearance_m
+from pipelines.planning.local import DronePlan
 from pipelines.planning.replay import Start, replay
 from pipelines.planning.scores import score
-from pipelines.planning.tracking import DronePlan
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import walker
 from tests.synthetic.worlds import fly, world_of

@@ -10,8 +10,7 @@ import pytest
 from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import DistanceField, distance_field, open_space
-from pipelines.planning.local import TERMS, LocalPlanner
-from pipelines.planning.tracking import DronePlan
+from pipelines.planning.local import TERMS, DronePlan, LocalPlanner
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import bare_ground, mound
 

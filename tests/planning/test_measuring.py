@@ -10,8 +10,8 @@ from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import White
 from pipelines.geometry.poses import look_at
-from pipelines.planning.arm_flights import CameraPaths, measure
 from pipelines.planning.distance_field import open_space
+from pipelines.planning.replay import CameraPaths, measure
 
 LENS = Intrinsics(1280, 720, 760.0, 760.0, 639.5, 359.5)
 TIMES, JOINTS = 40, 5

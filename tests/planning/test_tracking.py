@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.tracking import (
+from pipelines.planning.local import (
     ACCELERATION,
     INTEGRAL,
     POSITION,

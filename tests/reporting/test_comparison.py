@@ -11,9 +11,14 @@ import pandas as pd
 import pytest
 
 from pipelines.geometry.metrics import RESAMPLES, STRETCH_S
-from pipelines.reporting.comparison_page import draw_comparison, lead, render_comparison
 from pipelines.reporting.content import SessionContent
-from pipelines.reporting.session_comparison import compare, labels_of
+from pipelines.reporting.session_comparison import (
+    compare,
+    draw_comparison,
+    labels_of,
+    lead,
+    render_comparison,
+)
 
 from .conftest import JOINTS, OFFSET_M, make_skeleton, make_truth
 from .reading import Outline, numbers, plain

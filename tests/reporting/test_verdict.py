@@ -7,8 +7,7 @@ import pandas as pd
 import pytest
 
 from pipelines.reporting.content import SessionContent, items
-from pipelines.reporting.summary import summarise
-from pipelines.reporting.verdict import Verdict, give_verdict
+from pipelines.reporting.summary import Verdict, give_verdict, summarise
 from pipelines.reporting.wording import STATUS_REASONS, STATUS_REMEDIES, joint_label
 
 from .conftest import STAGES, make_skeleton
@@ -38,7 +37,7 @@ def test_the_verdict_of_the_metrics_is_shown(content: SessionContent) -> None:
     }
     verdict = _verdict(replace(content, metrics={**(content.metrics or {}), "verdict": given}))
     assert (verdict.grade, verdict.why, verdict.next) == ("poor", ("a", "b", "c"), "mocap x")
-    assert numbers(verdict.error) == [80, 50, 120]
+    assert numbers(verdict.error) == [80, 50, 120, 22]  # and the one against truth
     assert numbers(verdict.lead) == [81.1, 10_200]
 
 
