@@ -31,7 +31,7 @@ from mocap_cli.terminal import one_line, say  # noqa: E402
 from pipelines.session.errors import DataError, MocapError  # noqa: E402
 
 COMMANDS = (
-    *("init", "ingest", "check", "reconstruct", "replan-compare", "report"),
+    *("run", "init", "ingest", "check", "reconstruct", "replan-compare", "report"),
     *("batch", "export", "simulate", "study"),
     *("info", "models"),
 )

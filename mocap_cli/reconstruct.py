@@ -177,12 +177,17 @@ def reconstruct_command(
         _print(result, every_joint=shown.verbose)
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
     if not shown.quiet and "verdict" in result.metrics:  # unless an earlier version wrote it
-        _print_verdict(result.metrics["verdict"], result.folder)
+        print_verdict(result.metrics["verdict"], result.folder)
     return None
 
 
-def _print_verdict(verdict: dict[str, Any], session: Path) -> None:
-    """Print how good the result is without truth, what holds it back, and the next command."""
+def print_verdict(verdict: dict[str, Any], session: Path, *, reported: bool = False) -> None:
+    """Print how good the result is without truth, what holds it back, and the next command.
+
+    Args:
+        verdict: of metrics.json.
+        reported: the page is written, so that the next command is another one.
+    """
     expected = verdict["expected_error_mm"]
     error = "nothing was measured"
     if expected is not None:
@@ -191,7 +196,10 @@ def _print_verdict(verdict: dict[str, Any], session: Path) -> None:
     say(f"{verdict['grade']}: {error}")
     for reason in verdict["why"]:
         say(f"  {reason}")
-    say(f"next: {verdict['next'].replace('SESSION', str(session))}")
+    follows = verdict["next"]
+    if reported and follows.startswith("mocap report"):
+        follows = "mocap export SESSION --to bvh"
+    say(f"next: {follows.replace('SESSION', str(session))}")
 
 
 def _print(result: Reconstructed, *, every_joint: bool) -> None:

@@ -19,6 +19,7 @@ CODES = {
     "doubted": "the flight.yaml cannot be right, and --strict was given",
     "empty": "a file holds nothing",
     "exists": "something would be overwritten",
+    "incomplete": "a drafted flight.yaml lacks what only the user knows, or assumes what is not right",
     "keypoints-normalised": "The keypoints are shares of the picture, and not pixels.",
     "losses": "data were lost, and --strict was given",
     "missing-column": "a table lacks a column or a header",

@@ -1,0 +1,130 @@
+"""`mocap run`: from the folder of a flight to its report and verdict."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mocap_cli.options import Shown, any_path, output_options
+from mocap_cli.reconstruct import print_verdict
+from mocap_cli.terminal import one_line, print_json, say, say_warnings, watching
+from pipelines.session.errors import DataError
+
+if TYPE_CHECKING:
+    from pipelines.session.description import Description
+    from pipelines.session.progress import Progress
+
+# More questions are not answered with care, and the report lists every assumption.
+MAX_QUESTIONS = 3
+
+MANIFEST = "flight.yaml"
+
+
+@click.command("run", short_help="Go from a folder to the verdict in one command.")
+@click.argument("folder", type=any_path, metavar="FOLDER|FLIGHT.yaml")
+@click.option("--yes", is_flag=True, help="Take the likely answer to every question.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 256),
+    default=lambda: os.cpu_count() or 1,
+    show_default="all cores",
+    help="As of `mocap reconstruct`; the result does not depend on it.",
+)
+@output_options
+def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
+    """Draft the flight.yaml of a folder, then ingest, reconstruct, replan and report the flight.
+
+    A flight.yaml that is there is taken as it is. What no file tells is asked in a terminal, at most three
+    questions with the likely answer first, and assumed elsewhere. Planners are compared where the flight has
+    a map and an actor. The same command again continues: what is finished is skipped.
+    """
+    from pipelines.ingest import ingest
+    from pipelines.reconstruct import reconstruct
+    from pipelines.report import report
+
+    manifest = folder if folder.suffix in {".yaml", ".yml"} else folder / MANIFEST
+    asks = not (yes or shown.as_json or shown.quiet) and sys.stdin.isatty() and sys.stderr.isatty()
+    with watching(shown.level) as progress:
+        assumed = [] if manifest.exists() else _draft(folder, manifest, progress)
+    for remark in assumed[:MAX_QUESTIONS] if asks else ():
+        _ask(manifest, remark)
+    with watching(shown.level) as progress:
+        ingested = ingest(manifest, progress=progress)
+        session = ingested.folder
+        result = reconstruct(session, workers=workers, progress=progress)
+        if _may_replan(ingested.description):
+            _replan(session, progress)
+        page = report(session)
+    verdict: dict[str, Any] = result.metrics["verdict"]
+    if shown.as_json:
+        print_json(
+            {
+                "flight": str(manifest),
+                "session": str(session),
+                "assumed": assumed,
+                "verdict": verdict,
+                "page": str(page.place),
+            }
+        )
+        return
+    say_warnings(list(dict.fromkeys([*ingested.description.warnings, *result.record.warnings])), shown.quiet)
+    if assumed:
+        say(
+            f"{len(assumed)} assumptions, marked in {manifest}: {'; '.join(map(one_line, assumed))}", err=True
+        )
+    say(f"page: {page.place}")
+    print_verdict(verdict, session, reported=True)
+
+
+def _draft(folder: Path, manifest: Path, progress: Progress) -> list[str]:
+    """Write the manifest of a folder's files; return what it assumes.
+
+    Raises:
+        DataError: the folder holds no flight, or something is missing that only the user knows.
+    """
+    from pipelines.draft import draft
+
+    drafted = draft([folder], manifest, progress=progress)
+    progress.note(f"{manifest}: drafted, with {len(drafted.cameras)} cameras")
+    if drafted.missing:
+        raise DataError(
+            manifest,
+            f"was drafted and lacks {'; '.join(map(one_line, drafted.missing))}",
+            "write it there, where a comment marks the place, and run the same command again",
+            code="incomplete",
+        )
+    return drafted.assumed
+
+
+def _ask(manifest: Path, remark: str) -> None:
+    """Ask if an assumption is right.
+
+    Raises:
+        DataError: it is not; the manifest says what can be written instead.
+    """
+    if not click.confirm(f"assumed: {one_line(remark)}. Is that right?", default=True, err=True):
+        raise DataError(
+            manifest,
+            f"assumes what is not right: {one_line(remark)}",
+            "correct the line, take `assumed: true` away, and run the same command again",
+            code="incomplete",
+        )
+
+
+def _may_replan(description: Description) -> bool:
+    """Return True if a flight has what planners are compared on: a map, and somebody who was logged."""
+    return description.map is not None and description.actor is not None
+
+
+def _replan(session: Path, progress: Progress) -> None:
+    """Compare planners; note why, where the flight does not allow it."""
+    from pipelines.replan import replan
+
+    try:
+        progress.note(f"planners: {replan(session, progress=progress).metrics['verdict']}")
+    except DataError as error:
+        progress.note(f"planners were not compared: {error}")
