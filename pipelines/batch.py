@@ -7,15 +7,12 @@ done.
 
 import csv
 import io
-import json
 import os
-import resource
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -40,7 +37,7 @@ STAGES = ("ingest", "reconstruct", "replan-compare", "report")
 
 # The summary goes there if sessions lie beside their flights.
 _FOLDER = "batch"
-_TABLE, _PAGE, _TIMES = "summary.csv", "summary.html", "run.json"
+_TABLE, _PAGE = "summary.csv", "summary.html"
 # A worker that lost its scheduler notices that within this time, and releases its session.
 MAX_WAIT_FOR_OWNER_S = 30.0
 
@@ -49,7 +46,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class BatchSettings:
-    """BatchSettings for every flight."""
+    """Settings for every flight."""
 
     stages: tuple[str, ...] = STAGES
     method: Method | Literal["refined", "auto"] = "auto"
@@ -82,9 +79,7 @@ class Outcome:
     warnings: tuple[str, ...] = ()
     doubt: str | None = None  # code of the doubt that explains the most
     reported: bool = False  # the session has a report, perhaps of an earlier run
-    seconds: dict[str, dict[str, float]] = field(default_factory=dict)  # of every stage: wall and cpu
-    peak_memory_mb: float | None = None  # of the worker, up to the end of this flight
-    worker: int | None = None  # its process id
+    started: bool = False  # at least one stage was run, or tried
 
 
 @dataclass(frozen=True)
@@ -147,7 +142,7 @@ def batch(
     ]
     outcomes = dict(_outcomes(jobs, workers, scheduler, progress))
     rows = tuple(_row(folder, job, outcomes[k]) for k, job in enumerate(jobs))
-    _store(folder, rows, [outcomes[k] for k in range(len(jobs))])
+    _store(folder, rows)
     unchanged = sum(outcome.unchanged for outcome in outcomes.values())
     return Batch(rows, unchanged, folder / _TABLE, folder / _PAGE)
 
@@ -162,7 +157,7 @@ def run_flight(job: Job) -> Outcome:
             here = fetched(flight, fresh=True) if flight else job.flight
             outcome = _run_stages(replace(job, flight=here, session=folder))
     except MocapError as error:  # of a store: before the first stage, or in the upload after the last
-        stage = job.settings.stages[-1 if outcome.seconds else 0]
+        stage = job.settings.stages[-1 if outcome.started else 0]
         outcome = replace(outcome, failed_stage=stage, error=" ".join(str(error).split()))
     return outcome
 
@@ -171,12 +166,10 @@ def _run_stages(job: Job) -> Outcome:
     """Run all stages of one flight."""
     failed: dict[str, str] = {}  # the first error, by its stage
     finished: list[str] = []
-    seconds: dict[str, dict[str, float]] = {}
     unchanged = True
     for stage in (stage for stage in STAGES if stage in job.settings.stages):
         if failed and not (stage == "report" and _is_ingested(job, failed)):
             continue
-        wall_s, cpu_s = time.perf_counter(), time.process_time()
         try:
             unchanged &= _patiently(partial(_run, stage, job))
             finished.append(stage)
@@ -185,10 +178,6 @@ def _run_stages(job: Job) -> Outcome:
         except Exception as error:  # a bug of mocap in one flight must not stop the others
             line = f"{job.flight}: a bug of mocap stopped {stage} ({type(error).__name__}: {error})"
             failed = failed or {stage: line}
-        seconds[stage] = {
-            "wall": round(time.perf_counter() - wall_s, 3),
-            "cpu": round(time.process_time() - cpu_s, 3),
-        }
     outcome = Outcome()
     try:
         if _is_ingested(job, failed):
@@ -201,9 +190,7 @@ def _run_stages(job: Job) -> Outcome:
         error=next((" ".join(line.split()) for line in failed.values()), None),
         unchanged=unchanged and not failed,
         reported=(job.session / "report" / "index.html").is_file(),
-        seconds=seconds,
-        peak_memory_mb=_peak_memory_mb(),
-        worker=os.getpid(),
+        started=True,
     )
 
 
@@ -269,11 +256,6 @@ def _summed_up(session: Path, stages: Sequence[str]) -> Outcome:
         warnings=tuple(dict.fromkeys(warnings)),
         doubt=doubts[0]["code"] if doubts else None,
     )
-
-
-def _peak_memory_mb() -> float:
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(most / (2**20 if sys.platform == "darwin" else 2**10), 1)  # macOS counts bytes
 
 
 # --- on Dask -------------------------------------------------------------------------------------------
@@ -362,7 +344,7 @@ def _from(folder: Path, path: Path) -> str:
     return Path(os.path.relpath(path, folder)).as_posix()
 
 
-def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome]) -> None:
+def _store(folder: Path, rows: Sequence[FlightRow]) -> None:
     arms = list(dict.fromkeys(name for row in rows for name in row.arms))
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(map(cell_text, [*COLUMNS, *arms, "warnings", "report"]))
@@ -370,14 +352,8 @@ def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome])
     for row in rows:
         cells = [*row.cells(), *(row.figures.get(arm) for arm in arms), len(row.warnings), row.report]
         writer.writerow(map(cell_text, cells))
-    times = [
-        {"flight": row.flight, **{k: asdict(outcome)[k] for k in ("seconds", "peak_memory_mb", "worker")}}
-        for row, outcome in zip(rows, outcomes, strict=True)
-    ]
-    document = json.dumps({"schema": 1, "flights": times}, indent=2, ensure_ascii=False)
-    files = {_TABLE: text.getvalue(), _PAGE: render_flights(rows), _TIMES: f"{document}\n"}
     try:
-        for name, content in files.items():
+        for name, content in {_TABLE: text.getvalue(), _PAGE: render_flights(rows)}.items():
             encoded = content.encode("utf-8", "replace")
             if url := url_of(folder / name):
                 put(url, encoded)

@@ -187,8 +187,6 @@ def test_cluster_makes_the_bytes_of_single_runs_and_a_killed_worker_loses_nothin
     metrics = json.loads((manifests[0].parent / "flight.session/reconstruct/metrics.json").read_text())
     for name in ("reconstructed_share", "mpjpe_mm"):
         assert table.loc["day0/flight.yaml", name] == metrics[name]
-    times = json.loads((tmp_path / "batch" / "run.json").read_text())["flights"]
-    assert set(times[0]["seconds"]) == set(FEW_STAGES.split(","))
 
     # The same again, now on a cluster that this machine makes for itself, finds all done, and is silent.
     (manifests[1].parent / "broken.yaml").unlink()
