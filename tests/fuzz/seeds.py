@@ -15,6 +15,7 @@ from pipelines.formats.skeletons import bvh, joint_files, trc
 from pipelines.session.registries import Export
 from tests.formats.calibrations import (
     test_anipose_toml,
+    test_camodocal,
     test_colmap,
     test_kalibr,
     test_opencv_yaml,
@@ -23,7 +24,7 @@ from tests.formats.calibrations import (
 )
 from tests.formats.drone_logs import test_dji_records
 from tests.formats.exported import flown, recording, walking
-from tests.formats.keypoint_files import test_coco_results, test_mmpose
+from tests.formats.keypoint_files import test_coco_results, test_mmpose, test_other_programs
 from tests.formats.log_entries import entries
 from tests.formats.maps import test_grid_npz, test_las, test_octomap, test_pcd, test_ply, test_ros_map
 from tests.formats.poses import test_kitti, test_pose_csv
@@ -140,14 +141,17 @@ SEEDS: dict[str, Writer] = {
     "c3d": lambda folder: test_c3d.write(folder / "a.c3d", walking(12)),
     "camera_info": lambda folder: test_ros_camera_info.stored(folder / "left.yaml"),
     "camera_info as ini": _text("left.ini", test_ros_camera_info.INI),
+    "camodocal": _text("cam.yaml", test_camodocal.HEAD.format("MEI") + test_camodocal.mei()),
     "coco": _keypoints("coco"),
     "coco data set": _json("set.json", test_coco_results.dataset()),
     "colmap": _colmap("binary"),
     "colmap as text": _colmap("text"),
     "csv": _text("poses.csv", test_pose_csv.EUROC * 2),
+    "deeplabcut": lambda folder: test_other_programs.deeplabcut(folder / "a.csv", individuals=True),
     "dji": lambda folder: drone_logs.write_srt(folder / "a.SRT", _truth(folder)),
     "dji_record": lambda folder: test_dji_records.airdata(folder / "a.csv"),
     "easymocap": test_opencv_yaml.write_easymocap,
+    "easymocap_keypoints": test_other_programs.easymocap,
     "flight": lambda folder: write_flight(folder, seconds=0.2),
     "flight from logs": _logged_flight,
     "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),
@@ -184,6 +188,7 @@ SEEDS: dict[str, Writer] = {
     "ros2 in mcap": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), storage="mcap"),
     "ros2, compressed": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), compression="file"),
     "ros_map": test_ros_map.write,
+    "sleap": _text("a.csv", test_other_programs.sleap()),
     "tlog": _tlog,
     "trc": _export(trc.EXPORT),
     "trc of others": _text(
@@ -191,6 +196,7 @@ SEEDS: dict[str, Writer] = {
     ),
     "tum": lambda folder: trajectory_files.write_tum(folder / "a.tum", flown(12)),
     "ulog": _ulog,
+    "ultralytics": _json("results.json", test_other_programs.PICTURES),
     "video": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
     "video, mkv": lambda folder: videos.write_video(folder / "a.mkv", videos.even_ticks(15)),
 }

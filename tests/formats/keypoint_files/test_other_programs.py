@@ -29,12 +29,17 @@ def at(found: Detections, row: int, joint: str) -> list[float]:
     return [*found.xy[row, k].tolist(), float(found.confidence[row, k])]
 
 
-def test_easymocap(tmp_path: Path) -> None:
+def easymocap(folder: Path) -> Path:
+    """Write the annotations of three pictures, with a person in two of them."""
     people = [{"personID": 3, "bbox": [0, 0, 9, 9, 1], "keypoints": [[k, 2 * k, 0.5] for k in range(1, 26)]}]
     for frame, annots in ((0, people), (1, []), (2, people[:1])):
         content = {"filename": f"images/a/{frame:06d}.jpg", "height": 720, "width": 1280, "annots": annots}
-        (tmp_path / f"{frame:06d}.json").write_text(json.dumps(content))
-    found = read(tmp_path, "easymocap_keypoints")
+        (folder / f"{frame:06d}.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_easymocap(tmp_path: Path) -> None:
+    found = read(easymocap(tmp_path), "easymocap_keypoints")
     assert (found.frame.tolist(), found.person.tolist()) == ([0, 2], [3, 3])
     assert (found.joints, found.image_size) == (get_skeleton("body25").joints, (1280, 720))
     assert found.frames_listed.tolist() == [0, 1, 2]
@@ -53,16 +58,17 @@ def person(x: float, **more: object) -> dict[str, object]:
     return {"name": "person", "class": 0, "confidence": 0.9, "box": box, "keypoints": points, **more}
 
 
+PICTURES = [[person(1, track_id=7), person(100, track_id=4)], [], [person(3, track_id=7)]]
+
+
 @pytest.mark.parametrize("whole", [True, False])
 def test_ultralytics_in_one_file_or_in_one_for_each_picture(tmp_path: Path, whole: bool) -> None:
-    pictures = [[person(1, track_id=7), person(100, track_id=4)], [], [person(3, track_id=7)]]
+    path = tmp_path
+    for k, picture in enumerate([] if whole else PICTURES):
+        (path / f"clip_{k + 10}.json").write_text(json.dumps(picture))
     if whole:
         path = tmp_path / "results.json"
-        path.write_text(json.dumps(pictures))
-    else:
-        path = tmp_path
-        for k, picture in enumerate(pictures):
-            (path / f"clip_{k + 10}.json").write_text(json.dumps(picture))
+        path.write_text(json.dumps(PICTURES))
     found = read(path, "ultralytics", first_frame=0 if whole else 10)
     assert (found.frame.tolist(), found.person.tolist()) == ([0, 0, 2], [4, 7, 7])
     assert found.frames_listed.tolist() == [0, 1, 2]
@@ -114,14 +120,19 @@ def test_deeplabcut_labels_of_a_mouse_and_hdf5_are_refused(tmp_path: Path) -> No
         read(tmp_path / "a.h5", "deeplabcut")
 
 
-def test_sleap(tmp_path: Path) -> None:
+def sleap() -> str:
+    """Return the analysis of two tracks in two frames; the left shoulder was not found."""
     cells = [f"{part}.{axis}" for part in JOINTS for axis in ("x", "y", "score")]
     lines = [["track", "frame_idx", "instance.score", *cells]]
     for track, frame in (("one", 4), ("two", 4), ("one", 5)):
         values = [str(value) for k in range(len(JOINTS)) for value in (k + frame, 2.0, 0.25)]
-        values[3:6] = ["", "", ""]  # the left shoulder was not found
+        values[3:6] = ["", "", ""]
         lines.append([track, str(frame), "0.9", *values])
-    (tmp_path / "a.csv").write_text("\n".join(map(",".join, lines)) + "\n")
+    return "\n".join(map(",".join, lines)) + "\n"
+
+
+def test_sleap(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(sleap())
     found = read(tmp_path / "a.csv", "sleap")
     assert (found.frame.tolist(), found.person.tolist()) == ([4, 4, 5], [0, 1, 0])
     assert at(found, 2, "left_hip") == [8, 2, 0.25]
