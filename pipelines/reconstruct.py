@@ -492,8 +492,7 @@ def load_flight(
         pose_noise=settings.pose_noise,
         calibrated=read_calibration(measured).probabilities if measured else None,
     )
-    cameras, swaps = _without_swaps(cameras)
-    cameras = waiting.put(cameras)
+    cameras, swaps = _without_swaps(cameras, waiting)
     followed: dict[str, Followed | str] = {}
     if settings.asks_background and cameras_to_follow(description):
         for camera in cameras:
@@ -528,12 +527,13 @@ def _ground(folder: Path, description: Description, actors: Sequence[LoggedActor
     return level_of(actors[0].hips) if actors else None
 
 
-def _without_swaps(cameras: list[Camera]) -> tuple[list[Camera], dict[str, dict[str, int]]]:
+def _without_swaps(cameras: list[Camera], waiting: Waiting) -> tuple[list[Camera], dict[str, dict[str, int]]]:
     """Undo left-right swaps over time, from the motion of joints in each camera; return also counts."""
     mended, counts = [], {}
-    for camera in cameras:
+    while cameras:  # one after the other gives its memory back
+        camera = cameras.pop(0)
         detections, counts[camera.name] = undo_swaps_of_tracks(camera.detections, camera.frame_t_ns)
-        mended.append(replace(camera, detections=detections))
+        mended.append(waiting.put(replace(camera, detections=detections)))
     return mended, counts
 
 

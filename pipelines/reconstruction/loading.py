@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +40,6 @@ from pipelines.session.tables import (
     read_table,
     trajectory_from,
 )
-
-if TYPE_CHECKING:
-    pass
 
 # More people in one picture are errors of the detector, and memory grows with their number.
 _MOST_PEOPLE = 12
@@ -143,15 +140,16 @@ def _load_camera(
     mended = Mended(trajectory, None, 0, 0, 0, 0.0) if entry.poses.static else mend(trajectory)
     warnings += said_stretches(name, mended)
     keypoints = read_table(source.table, KEYPOINTS)
-    confident = keypoints[keypoints["confidence"] >= min_confidence]
-    if calibrated is not None and entry.keypoints is None:
-        raw, joint = confident["confidence"].to_numpy(np.float64), confident["joint"].to_numpy(str)
-        confident = confident.assign(confidence=calibrated(raw, joint))
     if (keypoints["frame"] > frames["frame"].max()).any():
         raise DataError(
             source.table, "holds keypoints of frames that are not there", "run it again with --force"
         )
-    detections = detections_from(confident, joints)
+    keypoints = keypoints[keypoints["confidence"] >= min_confidence]
+    if calibrated is not None and entry.keypoints is None:
+        raw, joint = keypoints["confidence"].to_numpy(np.float64), keypoints["joint"].to_numpy(str)
+        keypoints = keypoints.assign(confidence=calibrated(raw, joint))
+    detections = detections_from(keypoints, joints)
+    del keypoints
     detections, crowd = most_confident(detections, _MOST_PEOPLE)
     if crowd:
         warnings.append(f"{name}: {crowd} detections left out, more than {_MOST_PEOPLE} in a picture")

@@ -39,30 +39,28 @@ def test_without_pictures_it_is_the_refinement(tmp_path: Path) -> None:
     assert unasked["mpjpe_mm"] == refined["mpjpe_mm"]
 
 
-def left_to_robust(session: Path) -> dict[str, Any]:
-    """Reconstruct by both methods, and check that `auto` gives the joints of `robust`; return its metrics."""
-    unasked, skeleton = reconstructed(session)
-    _, of_robust = reconstructed(session, "--method", "robust")
-    assert skeleton == of_robust
-    assert not unasked["method_used"]["body"]["used"]
-    return unasked
-
-
-def test_a_flight_too_short_for_motion_and_bones_keeps_the_rest(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, seconds=0.5)
+@pytest.mark.parametrize("static", [False, True], ids=["too short", "calibrated and still"])
+def test_what_motion_and_bones_cannot_serve_is_left_to_robust(tmp_path: Path, static: bool) -> None:
+    """Check the choices that the real recording supports (docs/estimate.md)."""
+    flight = write_flight(tmp_path, seconds=1.0 if static else 0.5, static=static)
     for camera in flight.settings["cameras"].values():
         del camera["pose_noise"]
     flight.save()
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
-    unasked = left_to_robust(session)
-    assert unasked["method_used"]["body"]["reason"] == unasked["refinement"]["fallback"]
+    unasked, skeleton = reconstructed(session)
+    _, of_robust = reconstructed(session, "--method", "robust")
+    assert skeleton == of_robust
+    assert not unasked["method_used"]["body"]["used"]
     assert unasked["method_used"]["pose_noise"] == "none"
+    if static:
+        return
+    assert unasked["method_used"]["body"]["reason"] == unasked["refinement"]["fallback"]
     said = mocap("reconstruct", session, "--force")
     assert unasked["method_used"]["summary"] in said.stdout
 
 
-@pytest.mark.parametrize("method", ["auto", "dlt"])
+@pytest.mark.parametrize("method", ["refined", "dlt"])
 def test_every_method_is_served_by_the_clocks_that_were_found(tmp_path: Path, method: str) -> None:
     flight = write_flight(tmp_path, cameras=2, seconds=3.0, static=True, pose_noise={})
     # Stamped 200 ms too early: at 1.2 m/s 240 mm beside one of two cameras; keypoints err by 26 mm.
@@ -88,7 +86,7 @@ def test_a_stated_clock_that_is_wrong_is_moved_and_doubted(
     tmp_path: Path, cameras: int, late_s: dict[str, float], within_s: float
 ) -> None:
     """Question clocks that are stated as exact: wrong ones are found, right ones are not moved at all."""
-    flight = write_flight(tmp_path, cameras=cameras, seconds=4.0, pose_noise={})
+    flight = write_flight(tmp_path, cameras=cameras, seconds=3.0 if cameras == 3 else 4.0, pose_noise={})
     for name, seconds in late_s.items():
         flight.settings["cameras"][name]["clock"]["offset_s"] = -seconds
     flight.save()
@@ -108,14 +106,6 @@ def test_a_stated_clock_that_is_wrong_is_moved_and_doubted(
         metrics.get("clock_offsets_s", {}).get(name, 0.0) == 0.0 for name in {*flight.cameras} - {*late_s}
     )
     assert metrics["mpjpe_mm"] < 15
-
-
-def test_calibrated_still_cameras_are_left_to_robust(tmp_path: Path) -> None:
-    """Check the choice that the real recording supports (docs/estimate.md)."""
-    flight = write_flight(tmp_path, seconds=1.5, static=True, pose_noise={})
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    left_to_robust(session)
 
 
 @pytest.mark.long

@@ -24,7 +24,7 @@ from pipelines import detect as detection
 from pipelines.batch import BatchSettings, Job, run_flight
 from pipelines.detect import Following, detect
 from pipelines.reconstruct import ReconstructSettings, reconstruct
-from pipelines.reconstruction import windows
+from pipelines.reconstruction import refining
 from pipelines.session.parallel import connected
 from pipelines.session.registries import install_command
 from pipelines.session.stages import locked
@@ -138,7 +138,7 @@ def test_windows_of_a_long_flight_on_a_cluster_make_the_bytes_of_one_process(
     tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in {"MAX_WINDOW_S": 1.0, "OVERLAP_S": 0.5, "BLENDED_S": 0.3}.items():
-        monkeypatch.setattr(windows, name, value)
+        monkeypatch.setattr(refining, name, value)
     manifest = write_flight(tmp_path, seconds=1.8).manifest
     here, there = tmp_path / "here.session", tmp_path / "there.session"
     succeeds("ingest", manifest, "-o", here)

@@ -75,9 +75,7 @@ class Flight:
         return self.detected(detector, start_s).key
 
 
-@pytest.mark.parametrize(
-    ("point", "height_m"), [("hip", 1.0), ("centre", 1.0), ("feet", 0.05), ("head", 1.7)]
-)
+@pytest.mark.parametrize(("point", "height_m"), [("hip", 1.0), ("feet", 0.05), ("head", 1.7)])
 def test_the_hint_is_at_the_hips_whatever_point_was_logged(
     tmp_path: Path, point: str, height_m: float
 ) -> None:

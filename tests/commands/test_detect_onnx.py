@@ -16,7 +16,7 @@ from tests.keypoints.spotted_flights import FPS, person_at, spot_detector, write
 
 
 def test_keypoints_of_the_users_model_become_a_skeleton(tmp_path: Path) -> None:
-    frames = 30
+    frames = 12
     session = write_spotted_flight(tmp_path, frames).with_suffix(".session")
     succeeds("ingest", tmp_path / "flight.yaml")
     detector = spot_detector(tmp_path)

@@ -1,4 +1,4 @@
-"""Long flights: their joint estimate in windows, here of two seconds for minutes, and their page."""
+"""Long flights: their joint estimate in windows, here of seconds for minutes, and their page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from pipelines import report
 from pipelines.reconstruct import ReconstructSettings, reconstruct
-from pipelines.reconstruction import windows
+from pipelines.reconstruction import refining
 from pipelines.report import content_of
 from pipelines.reporting.summary import summarise
 from pipelines.session.camera_poses import poses_at
@@ -22,10 +22,10 @@ from tests.synthetic.flights import SyntheticFlight, write_flight
 
 @pytest.fixture
 def short_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make windows of two seconds that overlap by one."""
-    monkeypatch.setattr(windows, "MAX_WINDOW_S", 2.0)
-    monkeypatch.setattr(windows, "OVERLAP_S", 1.0)
-    monkeypatch.setattr(windows, "BLENDED_S", 0.6)
+    """Make windows of one and a half seconds that overlap by one."""
+    monkeypatch.setattr(refining, "MAX_WINDOW_S", 1.5)
+    monkeypatch.setattr(refining, "OVERLAP_S", 1.0)
+    monkeypatch.setattr(refining, "BLENDED_S", 0.6)
 
 
 def ingested(flight: SyntheticFlight) -> Path:
@@ -37,14 +37,14 @@ def ingested(flight: SyntheticFlight) -> Path:
 def test_windows_give_the_flight_with_any_number_of_processes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_windows: None
 ) -> None:
-    session = ingested(write_flight(tmp_path, cameras=3, seconds=4.0))
+    session = ingested(write_flight(tmp_path, cameras=3, seconds=3.0))
     apart = tmp_path / "apart.session"
     shutil.copytree(session, apart)
     divided = reconstruct(session, workers=1).metrics
     reconstruct(apart, workers=2)
     assert content(session / "reconstruct") == content(apart / "reconstruct")
     skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
-    monkeypatch.setattr(windows, "MAX_WINDOW_S", 60.0)
+    monkeypatch.setattr(refining, "MAX_WINDOW_S", 60.0)
     whole = reconstruct(apart, force=True).metrics
     assert divided["status_counts"] == whole["status_counts"]
     # Constant errors of poses are estimated from half of the pictures, the body's motion as before.
@@ -59,7 +59,7 @@ def test_windows_give_the_flight_with_any_number_of_processes(
 
 
 def test_a_clock_is_that_of_the_whole_flight(tmp_path: Path, short_windows: None) -> None:
-    flight = write_flight(tmp_path, cameras=3, seconds=4.0)
+    flight = write_flight(tmp_path, cameras=3, seconds=3.0)
     # Stamped 130 ms too early, and nobody says so.
     flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -0.13, "sigma_s": 0.2}
     flight.save()

@@ -158,16 +158,6 @@ def test_smoothing_is_said_and_lowers_what_noise_does(tmp_path: Path) -> None:
     assert smooth["reprojection_px"]["mean"] != rough["reprojection_px"]["mean"]
 
 
-def test_the_terminal_shows_the_figures_that_matter_in_a_table(clean: tuple[SyntheticFlight, Path]) -> None:
-    _, session = clean
-    text = command(session, "--smooth", "butterworth").stdout
-    assert re.search(r"\bbutterworth\b.*\b6 Hz", text)
-    for figure in ("MPJPE mm", "PCK@150 mm %", "reprojection px, mean", "jerk", "reconstructed %"):
-        assert sum(line.startswith(figure) for line in text.splitlines()) == 1
-    assert "left_wrist" not in text
-    assert "left_wrist" in command(session, "-v").stdout
-
-
 def test_intervals_are_about_their_figures(clean: tuple[SyntheticFlight, Path]) -> None:
     _, session = clean
     metrics = run(session, "--disturb-poses", "white:position_m=0.05")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.reconstruction import refining
 from pipelines.session.people import mirrored
 from tests.commands.runner import mocap, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
@@ -46,18 +44,6 @@ def test_refined_halves_the_error_of_noisy_poses_and_writes_them(tmp_path: Path)
     assert np.mean(errors) < 0.2 * np.sqrt(3)
 
 
-def test_refined_gives_the_same_bytes_for_any_number_of_workers(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=3, seconds=1.0, pose_noise=NOISE)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    results = []
-    for workers in (1, 2):
-        succeeds("reconstruct", session, "--method", "refined", "--workers", str(workers), "--force")
-        folder = session / "reconstruct"
-        results.append([(folder / name).read_bytes() for name in ("skeleton.parquet", "metrics.json")])
-    assert results[0] == results[1]
-
-
 def test_refined_takes_the_sides_on_which_the_views_agreed(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=4, seconds=1.5, pose_noise=GOOD)
     # A camera that calls left right all the time: only the other cameras tell.
@@ -71,50 +57,6 @@ def test_refined_takes_the_sides_on_which_the_views_agreed(tmp_path: Path) -> No
     # With a quarter of the views on the wrong sides it is no better than what it started from.
     assert refined["refinement"]["fallback"] is None
     assert refined["mpjpe_mm"] < 0.5 * robust["mpjpe_mm"]
-
-
-def test_refined_finds_how_far_a_clock_is_off(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=2, seconds=3.0, static=True, pose_noise={})
-    # Stamped 200 ms too early; the cameras stand still, and only the walk tells.
-    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -0.2, "sigma_s": 0.2}
-    flight.save()
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    robust = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
-    refined = json.loads(succeeds("reconstruct", session, "--method", "refined", "--json"))
-    assert refined["clock_offsets_s"]["drone1"] == 0.0
-    # 17 joints in 90 frames tell it to about 2 ms: two and a half of those.
-    assert abs(refined["clock_offsets_s"]["drone2"] - 0.2) < 0.005
-    assert refined["clock_offset_sigmas_s"]["drone2"] < 0.005
-    # At 1.2 m/s 200 ms are 240 mm beside one of two cameras; without them the keypoints' 26 mm are left.
-    assert refined["mpjpe_mm"] < 0.3 * robust["mpjpe_mm"]
-
-
-def test_a_clock_that_does_not_settle_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flight = write_flight(tmp_path, cameras=2, seconds=3.0, static=True, pose_noise={})
-    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -0.17, "sigma_s": 0.2}
-    flight.save()
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    # The search ahead of the estimate goes in steps of 67 ms and leaves some 30 of these.
-    monkeypatch.setattr(refining, "_MOST_SHIFTS", 0)
-    done = mocap("reconstruct", session, "--method", "refined")
-    (line,) = [line for line in done.stderr.splitlines() if "settle" in line]
-    assert re.search(r"\bdrone2\b.*\b1\b.*\d ms", line)
-
-
-@pytest.mark.slow
-def test_refined_finds_the_clock_of_a_moving_camera(tmp_path: Path) -> None:
-    offset_s = -0.2
-    flight = write_flight(tmp_path, cameras=2, seconds=8.0, pose_noise={})
-    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -offset_s, "sigma_s": 0.2}
-    flight.save()
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    refined = json.loads(succeeds("reconstruct", session, "--method", "refined", "--json"))
-    assert refined["refinement"]["fallback"] is None
-    # Known to 1.7 ms, of the table in docs/results.md: three of those.
-    assert abs(refined["clock_offsets_s"]["drone2"] - offset_s) < 0.005
 
 
 def a_second_late(folder: Path) -> SyntheticFlight:

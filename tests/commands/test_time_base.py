@@ -84,20 +84,6 @@ def test_truth_is_not_bridged_over_missing_samples(tmp_path: Path) -> None:
     assert result["joint_frames"] == (len(flight.t_ns) - 6) * len(flight.joints)
 
 
-def test_still_and_moving_cameras_together(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=3, clean=True)
-    del flight.settings["cameras"]["drone3"]
-    still = write_flight(tmp_path / "still", cameras=3, clean=True, static=True)
-    camera = still.settings["cameras"]["drone3"]
-    camera["keypoints"]["file"] = f"still/{camera['keypoints']['file']}"
-    camera["pose"] = {"file": "still/calibration.toml"}
-    camera["intrinsics"] = "still/calibration.toml"
-    flight.settings["cameras"]["drone3"] = camera
-    flight.settings["truth"] = {"file": "truth.csv"}
-    flight.save()
-    assert measured(flight)["mpjpe_mm"] < 0.5
-
-
 def test_guesses_stay_visible_until_they_are_confirmed(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=3, clean=True)
     cameras = flight.settings["cameras"]

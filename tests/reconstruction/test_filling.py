@@ -79,14 +79,6 @@ def test_only_gaps_with_measured_sides_and_of_that_length(
         assert filled.counts["joint_frames"] == 0
 
 
-def test_a_pause_of_the_recorder_counts_as_part_of_the_gap() -> None:
-    position, covariance, status = skeleton(line(60), [range(20, 21)])
-    t_ns = stamps(60)
-    t_ns[20:] += 10**9
-    filled = fill_gaps(t_ns, position, covariance, status, max_gap_s=0.5)
-    assert filled.counts["gaps"] == 0
-
-
 def test_a_gap_that_nothing_like_it_judges_stays_open() -> None:
     position, covariance, status = skeleton(line(30), [range(10, 18)])
     filled = fill_gaps(stamps(30), position, covariance, status, max_gap_s=1)

@@ -35,10 +35,15 @@ def manifest_of(folder: Path, keypoints: str | None = None) -> Path:
     return path
 
 
-def reconstructed(folder: Path, keypoints: str, *options: str) -> tuple[pd.DataFrame, dict[str, Any]]:
-    manifest = manifest_of(folder, keypoints)
-    session = manifest.with_suffix(".session")
+@pytest.fixture(scope="module")
+def associated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ingest the keypoints of the one person whom Pose2Sim chose."""
+    manifest = manifest_of(tmp_path_factory.mktemp("associated"), "pose-associated")
     succeeds("ingest", manifest)
+    return manifest.with_suffix(".session")
+
+
+def reconstructed(session: Path, *options: str) -> tuple[pd.DataFrame, dict[str, Any]]:
     metrics: dict[str, Any] = json.loads(succeeds("reconstruct", session, "--json", *options))
     return pd.read_parquet(session / "reconstruct" / "skeleton.parquet"), metrics
 
@@ -67,14 +72,14 @@ def distance_to_peer_mm(skeleton: pd.DataFrame) -> Any:
     return 1e3 * np.linalg.norm(ours.position - peer.position, axis=-1)
 
 
-def test_dlt_is_the_peers_triangulation(tmp_path: Path) -> None:
+def test_dlt_is_the_peers_triangulation(associated: Path) -> None:
     # The equations are the same where the peer left no camera out, but it weighs them by confidence: 7.6 mm.
-    skeleton, _ = reconstructed(tmp_path, "pose-associated", "--method", "dlt")
+    skeleton, _ = reconstructed(associated, "--method", "dlt")
     assert np.nanmedian(distance_to_peer_mm(skeleton)) < 10.0
 
 
-def test_default_disagrees_less_with_the_pictures_than_the_peer(tmp_path: Path) -> None:
-    skeleton, metrics = reconstructed(tmp_path, "pose-associated")
+def test_default_disagrees_less_with_the_pictures_than_the_peer(associated: Path) -> None:
+    skeleton, metrics = reconstructed(associated)
     assert metrics["reprojection_px"]["median"] < PEER_MEDIAN_PX
     assert metrics["reconstructed_share"] > 0.98
     assert np.nanmedian(distance_to_peer_mm(skeleton)) < 25.0
@@ -96,9 +101,10 @@ def test_letterboxed_videos_get_the_intrinsics_of_their_pictures(tmp_path: Path)
     assert cameras["cam03"]["intrinsics"]["cy"] == pytest.approx(955.0051, abs=1e-3)
 
 
-def test_raw_detections_with_bystanders_give_the_same_person(tmp_path: Path) -> None:
-    chosen, _ = reconstructed(tmp_path, "pose-associated", "--method", "robust")
-    raw, metrics = reconstructed(tmp_path, "pose", "--method", "robust")
+def test_raw_detections_with_bystanders_give_the_same_person(associated: Path, tmp_path: Path) -> None:
+    chosen, _ = reconstructed(associated, "--method", "robust")
+    succeeds("ingest", manifest_of(tmp_path, "pose"))
+    raw, metrics = reconstructed(tmp_path / "pose.session", "--method", "robust")
     assert metrics["reconstructed_share"] > 0.98
     joints = tuple(dict.fromkeys(raw["joint"]))
     apart = np.linalg.norm(motion_from(raw, joints).position - motion_from(chosen, joints).position, axis=-1)
