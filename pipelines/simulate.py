@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.calibrations.camera_matrices import write_camera_info
-from pipelines.formats.maps.octomap import write_octomap
 from pipelines.formats.scenes.mcap_writing import Ros2Recording
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import join_videos, write_h264
@@ -105,7 +104,6 @@ def simulate(
         write_truth(making.folder, flight)
         progress.advance()
         occupancy = flight.world.occupancy(scenario.world.map.resolution_m, scenario.world.map.height_m)
-        write_octomap(making.folder / "site.bt", occupancy)
         _write_grid(making.folder / "site.npz", occupancy)
         progress.advance()
         for drone in flight.drones:
@@ -223,7 +221,7 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
 
 
 def _write_grid(path: Path, occupancy: Occupancy) -> None:
-    """Write the map as arrays too, in the npz layout that `map:` reads."""
+    """Write the map in the npz layout that `map:` reads."""
     np.savez_compressed(
         path,
         probability=occupancy.probability,

@@ -22,7 +22,6 @@ from benchmarks.corpus.stored import RECORDED, Flight, read_backgrounds, read_ke
 from pipelines.detect import Block as DetectorBlock
 from pipelines.detect import FollowedBlock
 from pipelines.formats.calibrations.camera_matrices import write_camera_info
-from pipelines.formats.maps.octomap import write_octomap
 from pipelines.formats.scenes.mcap_writing import Ros2Recording
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import write_h264
@@ -38,6 +37,7 @@ from pipelines.geometry.poses import (
 )
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import still_name
+from pipelines.session.maps import write_grid
 from pipelines.session.parallel import contents_of
 from pipelines.session.registries import noise_models
 from pipelines.session.storage import write_json
@@ -129,7 +129,7 @@ class DrawnFlight:
         self.folder.mkdir(parents=True)
         flight = self.simulated
         spec = flight.scenario.world.map
-        write_octomap(self.folder / "site.bt", flight.world.occupancy(spec.resolution_m, spec.height_m))
+        write_grid(self.folder / "site.npz", flight.world.occupancy(spec.resolution_m, spec.height_m))
         for drone in flight.drones:
             lens = drone.intrinsics
             write_camera_info(self.folder / f"{drone.name}_camera.yaml", drone.name, lens)

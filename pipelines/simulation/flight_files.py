@@ -183,7 +183,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
     poses = ", ".join(f"{drone.name}: truth/{drone.name}.tum" for drone in flight.drones)
     lines += [
         *_logged_people(flight),
-        "map: site.bt",
+        "map: site.npz",
         "truth:",
         "  file: truth/joints.csv",
         f"  poses: {{{poses}}}",

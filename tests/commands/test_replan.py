@@ -341,8 +341,8 @@ def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:
     session_of(tmp_path, CALM)
     manifest = tmp_path / "flight" / "flight.yaml"
     text = manifest.read_text(encoding="utf-8")
-    assert "site.bt" in text
-    manifest.write_text(text.replace("site.bt", str(site)), encoding="utf-8")
+    assert "site.npz" in text
+    manifest.write_text(text.replace("site.npz", str(site)), encoding="utf-8")
     session = tmp_path / "building.session"
     ingest(manifest, session=session)
     stated = json.loads((session / "session.json").read_text())["map"]

@@ -121,7 +121,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(small: Path, tm
     same = {name for name in flights[0] if flights[0][name] == flights[2][name]}
     # What a seed cannot change: the lens, the map, the offsets, and how the files hang together.
     lenses = {"drone1_camera.yaml", "drone2_camera.yaml"}
-    assert same == {*lenses, "flight.yaml", "true_poses.yaml", "site.bt", "site.npz", "truth/clocks.json"}
+    assert same == {*lenses, "flight.yaml", "true_poses.yaml", "site.npz", "truth/clocks.json"}
 
 
 @pytest.mark.slow
@@ -168,17 +168,6 @@ def test_the_log_is_read_by_the_libraries_that_others_use(small: Path) -> None:
     covariance = odometry[0].pose.covariance.reshape(6, 6)  # type: ignore[attr-defined]
     # White 0.1 m and bias 0.2 m are the camera's; the lever arm adds what 0.5 deg does to 0.11 m.
     assert np.sqrt(np.diag(covariance)[:3]) == pytest.approx(np.hypot(0.1, 0.2), rel=1e-3)
-
-
-def test_the_map_is_read_by_octomap_itself(small: Path) -> None:
-    pyoctomap = pytest.importorskip("pyoctomap")
-    site = small.parent / "site.bt"
-    tree = pyoctomap.OcTree(0.1)
-    assert tree.readBinary(str(site))
-    assert tree.getResolution() == 0.5
-    for place, occupied in {(6.2, 6.2, 1.2): True, (6.2, 6.2, 4.2): False, (0.2, -8.0, 1.2): True}.items():
-        node = tree.search(np.array(place))
-        assert tree.isNodeOccupied(node) is occupied
 
 
 @pytest.fixture(scope="module")

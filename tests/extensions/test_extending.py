@@ -79,7 +79,7 @@ cameras:
     frame_times: {{start: 1700000000.03}}
     intrinsics: {_SAMPLE}/drone2_camera.yaml
     pose: {{file: {_SAMPLE}/truth/drone2.tum}}
-map: {_SAMPLE}/site.bt
+map: {_SAMPLE}/site.npz
 actor: {{file: {_SAMPLE}/drone1.mcap, topic: /actor}}
 """,
         encoding="utf-8",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.formats.logs.mcap_log import FORMAT as MCAP
-from pipelines.formats.maps.octomap import FORMAT as OCTOMAP
+from pipelines.formats.maps.voxel_grids import NPZ
 from pipelines.formats.poses import TUM
 from pipelines.formats.skeletons.joint_files import JOINTS_CSV
 from pipelines.formats.videos.video import FORMAT as VIDEO
@@ -70,7 +70,7 @@ def test_the_scenario_makes_the_truth_that_stands_in_the_repository(again: Path)
         early = other.t_ns < other.t_ns[0] + EXACT_S * 1e9
         np.testing.assert_allclose(mine.position[early], other.position[early], rtol=0, atol=2e-6)
         np.testing.assert_allclose(mine.position, other.position, rtol=0, atol=SAME_PATH_M)
-    mapped, stored = (OCTOMAP.read_map(folder / "site.bt") for folder in (again, SAMPLE))
+    mapped, stored = (NPZ.read_map(folder / "site.npz") for folder in (again, SAMPLE))
     assert np.array_equal(mapped.probability, stored.probability, equal_nan=True)
 
 

@@ -276,7 +276,7 @@ class Described:
             manifest["logs"] = {"drone1": {"file": "made/drone1.mcap"}}
             manifest["actor"] = made["actor"]
         if self.flight.map:
-            manifest["map"] = "made/site.bt"
+            manifest["map"] = "made/site.npz"
         manifest["truth"] = "made/truth/joints.csv"
         return manifest
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from rosbags.typesys import get_types_from_msg
 
 from pipelines.formats.logs.maps import OCCUPANCY_GRID, POINT_CLOUD
 from pipelines.formats.logs.message_decoders import OCTOMAP
-from pipelines.formats.maps.octomap import write_octomap
 from pipelines.geometry.arrays import Float
 from pipelines.session.records import Occupancy
 from tests.synthetic.logged_flights import header
@@ -50,9 +50,14 @@ def octomap_entry(
 
 
 def as_bt(occupancy: Occupancy, folder: Path) -> bytes:
-    """Convert a map to the bytes of a .bt file."""
+    """Convert a map to the bytes of a .bt file, by OctoMap's own library."""
+    pyoctomap = pytest.importorskip("pyoctomap")
     folder.mkdir(parents=True, exist_ok=True)
-    write_octomap(folder / "map.bt", occupancy)
+    tree = pyoctomap.OcTree(occupancy.resolution_m)
+    for index in np.argwhere(np.isfinite(occupancy.probability)):
+        centre = occupancy.origin + (index + 0.5) * occupancy.resolution_m
+        tree.updateNode(centre, bool(occupancy.probability[*index] >= 0.5))
+    assert tree.writeBinary(str(folder / "map.bt"))
     return (folder / "map.bt").read_bytes()
 
 

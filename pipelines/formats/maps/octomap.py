@@ -1,4 +1,4 @@
-"""Reader and writer of OctoMap trees: `.bt` (each leaf occupied or free) and `.ot` (each node's log odds).
+"""Reader of OctoMap trees: `.bt` (each leaf occupied or free) and `.ot` (each node's log odds).
 
 Layout (octomap 1.10, OcTreeBaseImpl.hxx and OccupancyOcTreeBase.hxx), little-endian, nodes depth first:
 
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes, read_bytes, split_header
-from pipelines.geometry.arrays import Bool, Bytes, Float, Float32, Int32, Int64
+from pipelines.geometry.arrays import Bool, Bytes, Float32, Int32, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size, describe_grid
 from pipelines.session.records import Occupancy
@@ -270,65 +270,6 @@ def _halvings(source: Path | str, finest_m: float, resolution_m: float | None) -
             f"state resolution_m: {finest_m:g}, {2 * finest_m:g}, {4 * finest_m:g}, ...",
         )
     return halvings
-
-
-# --- writing -------------------------------------------------------------------------------------------
-
-# Origins are sums and products of rounded decimal numbers, which are off by less.
-_OFF_GRID = 1e-4
-
-_HEADER = """# Octomap OcTree binary file
-# (feel free to add / change comments, but leave the first line as it is!)
-#
-id OcTree
-size {nodes}
-res {resolution_m!r}
-data
-"""
-
-
-def write_octomap(path: Path, occupancy: Occupancy) -> None:
-    """Write a map as a pruned .bt: at least 0.5 is occupied, below is free, NaN is left out."""
-    from pipelines.formats.maps.octree import FREE, INNER, OCCUPIED, UNKNOWN, nodes_of, write_depth_first
-
-    side_m = float(occupancy.resolution_m)
-    first = _first_key(occupancy.origin, side_m)
-    _check_reach(path, first, occupancy.probability.shape, side_m)
-    states = np.full(occupancy.probability.shape, UNKNOWN, dtype=np.uint8)
-    states[occupancy.probability < 0.5] = FREE
-    states[occupancy.probability >= 0.5] = OCCUPIED
-    if not states.any():
-        raise ValueError("nothing in the map is known")
-    flat, begin, low, shape = nodes_of(states, first)
-    words = np.empty(int((flat == INNER).sum()), dtype="<u2")
-    leaves = write_depth_first(flat, begin, low, shape, words)
-    header = _HEADER.format(nodes=len(words) + leaves, resolution_m=side_m)
-    path.write_bytes(header.encode() + words.tobytes())
-
-
-def _first_key(origin: Float, side_m: float) -> Int64:
-    """Return the finest voxel's key at the grid's corner, counted from the tree's lower end."""
-    steps = np.asarray(origin, dtype=np.float64) / side_m
-    nearest = np.rint(steps)
-    if not (np.abs(steps - nearest) <= _OFF_GRID).all():
-        raise ValueError(
-            f"the origin {np.asarray(origin).tolist()} is not on OctoMap's grid, "
-            f"the multiples of {side_m:g} m"
-        )
-    key: Int64 = nearest.astype(np.int64) + _CENTRE
-    return key
-
-
-def _check_reach(path: Path, first: Int64, shape: tuple[int, ...], side_m: float) -> None:
-    end = first + np.array(shape)
-    if (first < 0).any() or (end > 2 * _CENTRE).any():
-        reach_m = max(int((_CENTRE - first).max()), int((end - _CENTRE).max())) * side_m
-        raise DataError(
-            path,
-            f"an OctoMap of {side_m:g} m voxels ends {_CENTRE * side_m:g} m from the world's origin, "
-            f"the map reaches {reach_m:g} m",
-            "take larger voxels or a map nearer to the origin",
-        )
 
 
 FORMAT = OctomapFormat()

@@ -1,4 +1,4 @@
-"""Compiled walks of OctoMap's trees (from a stream to leaves, from a grid to a stream) and of LZF streams.
+"""Compiled walks of OctoMap's trees, from a stream to leaves, and of LZF streams.
 
 This module is imported where it is used, because numba takes long to import.
 """
@@ -120,69 +120,6 @@ def fill(grid: Float32, key: Int32, depth: Bytes, probability: Float32, low: Int
                 for z in range(z0, z0 + side):
                     if not grid[x, y, z] >= value:  # also true for NaN, the unknown voxels
                         grid[x, y, z] = value
-
-
-def nodes_of(states: Bytes, first: Int64) -> tuple[Bytes, Int64, Int64, Int64]:
-    """Compute the nodes of every level within the grid's box, root first, from the grid upwards.
-
-    Eight children that are all free or all occupied become one leaf.
-
-    Returns:
-        All states one level after another; the start of each level [DEPTH + 1]; the key of its first node
-        [DEPTH + 1, 3], in nodes of that level; and its shape [DEPTH + 1, 3].
-    """
-    levels, lows = [states], [first]
-    for _ in range(DEPTH):
-        states, first = _merged(states, first)
-        levels.append(states)
-        lows.append(first)
-    levels, lows = levels[::-1], lows[::-1]
-    begin = np.cumsum([0, *(level.size for level in levels[:-1])])
-    flat = np.concatenate([level.ravel() for level in levels])
-    return flat, begin, np.array(lows), np.array([level.shape for level in levels], dtype=np.int64)
-
-
-def _merged(states: Bytes, first: Int64) -> tuple[Bytes, Int64]:
-    """Merge to the level above: a node has its children's state if they share one, else it is inner."""
-    before = first % 2
-    after = (before + states.shape) % 2
-    padded = np.pad(states, np.stack([before, after], axis=1), constant_values=UNKNOWN)
-    x, y, z = (side // 2 for side in padded.shape)
-    least = most = padded.reshape(x, 2, y, 2, z, 2)
-    for axis in (5, 3, 1):
-        least, most = least.min(axis=axis), most.max(axis=axis)
-    return np.where(least == most, least, np.uint8(INNER)), first // 2
-
-
-@cached
-def write_depth_first(flat: Bytes, begin: Int64, low: Int64, shape: Int64, words: NDArray[np.uint16]) -> int:
-    """Write one word for every inner node, children after their parent; return the number of leaves."""
-    stack = np.empty((8 * (DEPTH + 1), 4), dtype=np.int64)
-    stack[0] = 0
-    waiting, written, leaves = 1, 0, 0
-    while waiting:
-        waiting -= 1
-        level = stack[waiting, 0] + 1  # of the children
-        x0, y0, z0 = 2 * stack[waiting, 1], 2 * stack[waiting, 2], 2 * stack[waiting, 3]
-        word = np.int64(0)
-        for child in range(7, -1, -1):  # downwards, so that the first child is on top
-            x, y, z = x0 + (child & 1), y0 + ((child >> 1) & 1), z0 + (child >> 2)
-            i, j, k = x - low[level, 0], y - low[level, 1], z - low[level, 2]
-            if not (0 <= i < shape[level, 0] and 0 <= j < shape[level, 1] and 0 <= k < shape[level, 2]):
-                continue
-            state = np.int64(flat[begin[level] + (i * shape[level, 1] + j) * shape[level, 2] + k])
-            word |= state << (2 * child)
-            if state == INNER:
-                stack[waiting, 0] = level
-                stack[waiting, 1] = x
-                stack[waiting, 2] = y
-                stack[waiting, 3] = z
-                waiting += 1
-            elif state != UNKNOWN:
-                leaves += 1
-        words[written] = word
-        written += 1
-    return leaves
 
 
 @cached
