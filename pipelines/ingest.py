@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -537,28 +537,27 @@ def _store_camera(reader: _FlightReader, name: str, check_sources: Callable[[], 
 
 def _refuse_unsound(flight_path: Path, description: Description) -> None:
     """Refuse a flight of which anything was dropped, in one line by part and cause, or that is doubted."""
-    parts = {
-        f"{name}: {what}": dropped
-        for name, camera in description.cameras.items()
-        for what, dropped in (
-            ("frames", camera.frames.dropped),
-            ("poses", camera.poses.dropped),
-            ("keypoints", camera.keypoints.dropped if camera.keypoints else {}),
-        )
-    }
-    parts |= {actor.name or "actor": actor.dropped for actor in description.logged_people}
-    parts["truth"] = description.truth.dropped if description.truth else {}
-    poses_dropped = description.truth.poses_dropped if description.truth else {}
-    parts |= {f"{name}: true poses": dropped for name, dropped in poses_dropped.items()}
-    parts["map"] = description.map.dropped if description.map else {}
-    parts |= {f"{name}: plan": sent.dropped for name, sent in (description.plan or {}).items()}
-    lost = [f"{part}: {losses(dropped)}" for part, dropped in parts.items() if dropped]
+    lost = list(_losses_in(description.model_dump(), ""))
     if lost:
         problem = f"is not whole, and --strict was given ({'; '.join(lost)})"
         remedy = "copy what is damaged again, or ingest without --strict"
         raise DataError(flight_path, problem, remedy, code="losses")
     for doubt in description.doubts:
         raise DataError(flight_path, f"is doubted: {doubt.what} ({doubt.code})", doubt.remedy, code="doubted")
+
+
+def _losses_in(part: Mapping[str, Any], place: str) -> Iterator[str]:
+    """Yield each part of a description of which something was dropped, with the causes."""
+    for key, value in part.items():
+        if key == "dropped" and value:
+            yield f"{place}: {losses(value)}"
+        elif key == "poses_dropped":
+            yield from (f"{name}: true poses: {losses(dropped)}" for name, dropped in value.items())
+        elif isinstance(value, dict) and not (key == "actor" and part["actors"]):
+            yield from _losses_in(value, f"{place}.{key}" if place else key)
+        elif key == "actors":
+            for actor in value:
+                yield from _losses_in(actor, actor["name"] or "actor")
 
 
 def _refuse_ways_out(flight: Manifest, path: Path) -> None:

@@ -1,6 +1,6 @@
 """Stage `survey`: description of a file or folder, for `mocap info`."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from pipelines.session.registries import FORMATS
 from pipelines.session.stages import STAGES, open_session, outdated
 from pipelines.session.storage import SCHEMA, SIMULATION_MARK, STUDY_MARK, read_json, refuse_special
 from pipelines.session.unknown_files import EXPECTED, describe_unknown
-from pipelines.session.yaml_files import keys_of
+from pipelines.session.yaml_files import YamlModel, keys_of
 from pipelines.simulation.scenario import Scenario, read_scenario
 
 
@@ -155,40 +155,19 @@ def _of_study(metrics: Mapping[str, Any]) -> dict[str, Any]:
 def _of_yaml(path: Path) -> Survey:
     """Describe a flight manifest, a scenario or planner settings; the kind is that of most of the keys."""
     stated = read_yaml(path)
-    kinds = {
-        "flight manifest": (keys_of(Manifest), _of_manifest),
-        "scenario": (keys_of(Scenario), _of_scenario),
-        "planner settings": ({*SETTINGS, "yaw_deg", "mode"}, _of_planner),
+    kinds: dict[str, tuple[Set[str], Callable[[Path], YamlModel] | None]] = {
+        "flight manifest": (keys_of(Manifest), read_flight),
+        "scenario": (keys_of(Scenario), read_scenario),
+        "planner settings": ({*SETTINGS, "yaw_deg", "mode"}, None),
     }
     known = {title: len(keys & stated.keys()) for title, (keys, _) in kinds.items()}
     title, most = max(known.items(), key=lambda each: each[1])
     if list(known.values()).count(most) > 1:  # `schema` and `name` are keys of several kinds
         like = describe_unknown(path)
-        problem = like.problem
-        remedy = (
-            like.remedy
-            or "flight manifests have `cameras:`, scenarios `drones:`, planner settings keys like `w_obs:`"
-        )
-        raise DataError(path, problem, remedy, code="wrong-kind")
-    return Survey(path, title, kinds[title][1](path))
-
-
-def _of_manifest(path: Path) -> dict[str, Any]:
-    flight = read_flight(path)
-    stated = flight.model_dump(mode="json", exclude_defaults=True)
-    facts = {"name": flight.name, "clock_reference": flight.reference_camera, "cameras": stated["cameras"]}
-    return facts | {part: stated.get(part) for part in ("actor", "actors", "map", "truth", "plan")}
-
-
-def _of_scenario(path: Path) -> dict[str, Any]:
-    scenario = read_scenario(path)
-    stated = scenario.model_dump(mode="json", exclude_defaults=True)
-    facts = {"name": scenario.name, "seed": scenario.seed, "duration_s": scenario.duration_s}
-    facts |= {part: stated[part] for part in ("actor", "actors", "world", "keypoints") if part in stated}
-    return facts | {"drones": {"count": scenario.drones.count} | stated.get("drones", {})}
-
-
-def _of_planner(path: Path) -> dict[str, Any]:
-    stated = read_yaml(path)
-    replan_settings(stated, path)
-    return stated
+        keys = "flight manifests have `cameras:`, scenarios `drones:`, planner settings keys like `w_obs:`"
+        raise DataError(path, like.problem, like.remedy or keys, code="wrong-kind")
+    read = kinds[title][1]
+    if read is None:
+        replan_settings(stated, path)
+        return Survey(path, title, stated)
+    return Survey(path, title, read(path).model_dump(mode="json", exclude_defaults=True))

@@ -72,7 +72,7 @@ def test_strict_refuses_what_is_salvaged_otherwise(tmp_path: Path) -> None:
     log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["file"]
     log.write_bytes(log.read_bytes()[:-2000])
     line = refused("ingest", flight.manifest, "--strict")
-    assert re.search(r"flight\.yaml: .*--strict .*\(drone1: ", line)
+    assert re.search(r"flight\.yaml: .*--strict .*\(cameras.drone1.", line)
     assert f"1 {TRUNCATED}" in line
     kept = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
     assert kept["cameras"]["drone1"]["poses"]["dropped"] == {}  # the session is the one from before

@@ -121,7 +121,7 @@ def test_keypoints_slightly_outside_are_kept_and_far_ones_left_out(tmp_path: Pat
     entry = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
     dropped = entry["cameras"]["drone1"]["keypoints"]["dropped"]
     assert {cause.split()[0]: count for cause, count in dropped.items()} == {"keypoints": 18, "people": 1}
-    assert "drone1: keypoints: 18 " in refused("ingest", flight.manifest, "--strict")
+    assert "cameras.drone1.keypoints: 18 " in refused("ingest", flight.manifest, "--strict")
 
 
 def keypoints_of(flight: SyntheticFlight) -> pd.DataFrame:
