@@ -36,8 +36,8 @@ def study_command(
     every method reconstructs the same data. Variables: tilt_deg, robots (the number of drones), method, and
     noise: a level (none, low: 0.1 m and 0.5 deg per axis, medium: 0.3, 1, high: 0.5, 2), a kind (white, bias,
     body-bias, drift, gauss-markov, or as in bias@high), or models as in --pose-noise, between semicolons.
-    With a single value: keypoints (model, exact), detector (looks at rendered pictures), seconds, rate_hz,
-    trials, seed.
+    With a single value: keypoints (model, exact), seconds, rate_hz, trials, seed, pixel_noise (px),
+    min_confidence.
 
     On a session, planner arms fly again against the log. Variables: arm, range_m, tilt_deg, robots, every
     setting of the planner. With a single value: config (PLANNER.yaml), pose_noise, trials, seed.

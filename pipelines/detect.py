@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.geometry.arrays import Bytes, Float, Int64, Picture
-from pipelines.keypoints.hints import Hint, actor_hints
+from pipelines.keypoints.search import Hint, actor_hints
 from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.reconstruction.background_tracks import Follower, rows_to_follow, still_name, tracks_path
 from pipelines.session.description import Description, MediaEntry, read_description

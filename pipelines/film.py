@@ -20,7 +20,7 @@ from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
-from pipelines.keypoints.hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
+from pipelines.keypoints.search import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
 from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.replay import poses_from

@@ -22,8 +22,6 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import Views, triangulate
-from pipelines.keypoints.hints import project_actor
-from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.planning.comparison import SMALLEST_DIFFERENCE_MM, capped_mm, compare, mean_of_trials
 from pipelines.planning.config import SETTINGS, PlannerConfig, planner_config
 from pipelines.planning.scene import ReplanSettings, ReplayScene, build_scene, load_flight
@@ -42,7 +40,6 @@ from pipelines.reporting.studies import Row, draw, estimates, rows_csv
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
-from pipelines.session.registries import Detector, find_detector, hashes_of_models
 from pipelines.session.stages import locked
 from pipelines.session.storage import (
     STUDY_MARK,
@@ -60,12 +57,9 @@ from pipelines.session.yaml_files import plain_yaml
 from pipelines.simulate import recorded_motions
 from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import build_set
-from pipelines.simulation.renderer import Renderer
-from pipelines.simulation.scenario import WorldSettings, read_scenario
+from pipelines.simulation.scenario import read_scenario
 from pipelines.simulation.walks import (
     IMITATED,
-    CameraFormation,
-    SimulatedKeypoints,
     StudiedNoise,
     StudyMethod,
     Walk,
@@ -80,17 +74,14 @@ from pipelines.simulation.walks import (
     walk_of,
     walk_study,
 )
-from pipelines.simulation.world import build_world
 
 # It is raised whenever the same study gives other figures than before.
-_REVISION = 6
+_REVISION = 7
 _PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
-# The camera looks exactly at the person, so that the hint of the person's position is nearly exact.
-_HINT_SIGMA_M = 0.1
 # A study with more combinations would take days.
 _MAX_CELLS = 500
 _RANGE = re.compile(r"(-?[0-9.]+):(-?[0-9.]+):([0-9.]+)")
-_UNDIVIDED = ("detector", "config")  # variables whose value may hold commas
+_UNDIVIDED = ("config",)  # variables whose value may hold commas
 _OF_SESSION = ("arm", "robots", "range_m", "tilt_deg", "config", "trials", "seed", "pose_noise")
 _SETTINGS = {"range_m": "radius_m", "tilt_deg": "tilt_deg"}  # variables with the names of planner settings
 
@@ -156,7 +147,7 @@ def study(
 
     Raises:
         DataError: a variable or value is wrong, the folder cannot be written or is a session's, the session
-            or the scenario cannot be used, the detector is missing, or nothing was reconstructed.
+            or the scenario cannot be used, or nothing was reconstructed.
         BusyError: another process makes the same folder, or writes the session.
     """
     progress = progress or Silent()
@@ -215,11 +206,6 @@ class _Condition:
     robots: int
     noise: StudiedNoise
 
-    @property
-    def filmed(self) -> tuple[float, int]:
-        """The settings on which its keypoints depend: tilt in deg and number of drones."""
-        return self.tilt_deg, self.robots
-
     def row(self) -> Row:
         """Return its columns."""
         model = self.noise.model
@@ -238,7 +224,6 @@ def _study_walk(
     if scenario is not None and "seconds" not in stated:
         stated = {**stated, "seconds": (f"{scenario.duration_s:g}",)}
     settings = walk_study(stated)
-    detector = None if settings.detector is None else find_detector(settings.detector)
     ingredients: dict[str, object] = {"settings": asdict(settings)}
     motions = {}
     if scenario is not None and place is not None:
@@ -247,43 +232,28 @@ def _study_walk(
         ingredients["motions"] = {
             name: sha256_of(file) for name, (file, _) in scenario.motion_files(place.parent).items()
         }
-    if detector is None:
-        imitated = IMITATED if scenario is None else scenario.keypoints.detector
-        ingredients["errors"] = sha256_of(errors_of(imitated))
-        keypoints = "exact" if settings.keypoints == "exact" else f"modelled after {imitated}"
-    else:
-        ingredients["detector"] = detector.name
-        ingredients["models"] = hashes_of_models(detector)
-        detector.load(threads=1)  # raises an error at once if a file is missing
-        keypoints = f"{settings.detector} on rendered pictures"
+    imitated = IMITATED if scenario is None else scenario.keypoints.detector
+    ingredients["errors"] = sha256_of(errors_of(imitated))
+    keypoints = "exact" if settings.keypoints == "exact" else f"modelled after {imitated}"
 
     def produce(making: Making) -> tuple[dict[str, Any], Sequence[Row]]:
         if scenario is None:
             filmed = walk(settings.seconds, settings.rate_hz, settings.seed)
         else:
-            scenery = build_set(scenario, bvh=motions)
-            filmed = walk_of(scenery.people[0], scenario, settings.seconds, settings.rate_hz)
+            performer = build_set(scenario, bvh=motions).people[0]
+            filmed = walk_of(performer, scenario, settings.seconds, settings.rate_hz)
         conditions = [
             _Condition(*each)
             for noise in settings.noise
             for each in product(settings.tilts_deg, settings.robots, [noise])
         ]
-        seen: dict[tuple[float, int], SimulatedKeypoints] = {}
-        if detector is not None:
-            sun = np.array((WorldSettings() if scenario is None else scenario.world).sun)
-            if scenario is None:
-                world = build_world(WorldSettings(), settings.seed, keep_clear=filmed.motion.root[:, :2])
-            else:
-                world = scenery.world
-            renderer = Renderer(world.surfaces(), filmed.lens, sun=sun, seed=settings.seed)
-            seen = _detect_all(filmed, conditions, detector, renderer, workers, making, progress)
         progress.start("Measuring", len(conditions) * settings.trials)
         halt = Halt()
         work = [
-            (f"cell-{k:04d}", partial(_measure_condition, settings, filmed, each, seen, halt, progress))
+            (f"cell-{k:04d}", partial(_measure_condition, settings, filmed, each, halt, progress))
             for k, each in enumerate(conditions)
         ]
-        parts = _parts(work, making, workers, halt)
+        parts = side_by_side(lambda each: making.part(*each), work, workers=workers, halt=halt)
         rows = [row for part in parts for row in read_json(part / "rows.json")["rows"]]
         cells = estimates(rows, settings.axis)
         if not any(cell["metrics"]["mpjpe_mm"] for cell in cells):
@@ -307,18 +277,10 @@ def _study_walk(
     return store(ingredients, produce)
 
 
-def _parts(
-    work: Sequence[tuple[str, Callable[[Path], None]]], making: Making, workers: int, halt: Halt
-) -> list[Path]:
-    """Run the work in parallel and return the folders of the parts, in the order of the work."""
-    return side_by_side(lambda each: making.part(*each), work, workers=workers, halt=halt)
-
-
 def _measure_condition(
     settings: WalkStudy,
     filmed: Walk,
     condition: _Condition,
-    seen: Mapping[tuple[float, int], SimulatedKeypoints],
     halt: Halt,
     progress: Progress,
     folder: Path,
@@ -330,13 +292,16 @@ def _measure_condition(
     rows: list[Row] = []
     for trial in range(settings.trials):
         halt.check()
-        if settings.detector is not None:
-            sightings = seen[condition.filmed]
-        elif settings.keypoints == "model":
+        sightings = exact
+        if settings.keypoints == "model":
             sightings = model_keypoints(filmed, cameras, exact, seed=settings.seed, trial=trial)
-        else:
-            sightings = exact
-        views = views_of(filmed, cameras, sightings, models, seed=settings.seed, trial=trial)
+        views = views_of(
+            *(filmed, cameras, sightings, models),
+            seed=settings.seed,
+            trial=trial,
+            pixel_sigma=settings.pixel_noise,
+            min_confidence=settings.min_confidence,
+        )
         points, fell_back = {}, {}
         for method in settings.methods:
             points[method], doubt = _reconstructed(method, views, filmed, models)
@@ -392,67 +357,6 @@ def _compared(points: Mapping[StudyMethod, Float], filmed: Walk) -> dict[StudyMe
         }
         rows[method] = errors
     return rows
-
-
-# --- pictures of a walk --------------------------------------------------------------------------------
-
-
-def _detect_all(
-    filmed: Walk,
-    conditions: Sequence[_Condition],
-    detector: Detector,
-    renderer: Renderer,
-    workers: int,
-    making: Making,
-    progress: Progress,
-) -> dict[tuple[float, int], SimulatedKeypoints]:
-    """Film the walk from every formation and detect keypoints in the pictures."""
-    geometries = sorted({condition.filmed for condition in conditions})
-    cameras = [(tilt, robots, k) for tilt, robots in geometries for k in range(robots)]
-    progress.start("Filming", len(cameras) * len(filmed.t_ns))
-    halt = Halt()
-
-    def film(tilt_deg: float, robots: int, camera: int) -> Callable[[Path], None]:
-        seen_by = formation(filmed, cameras=robots, tilt_deg=tilt_deg)
-        return partial(_film, filmed, seen_by, camera, renderer, detector, halt, progress)
-
-    work = [(f"pictures-{tilt:g}-{robots}-{k}", film(tilt, robots, k)) for tilt, robots, k in cameras]
-    found: dict[tuple[float, int], list[tuple[Float, Float]]] = {}
-    for (tilt, robots, _), made in zip(cameras, _parts(work, making, workers, halt), strict=True):
-        with np.load(made / "keypoints.npz") as stored:
-            found.setdefault((tilt, robots), []).append((stored["xy"], stored["confidence"]))
-    return {
-        geometry: SimulatedKeypoints(*(np.stack(each) for each in zip(*own, strict=True)))
-        for geometry, own in found.items()
-    }
-
-
-def _film(
-    filmed: Walk,
-    seen_by: CameraFormation,
-    camera: int,
-    renderer: Renderer,
-    detector: Detector,
-    halt: Halt,
-    progress: Progress,
-    folder: Path,
-) -> None:
-    """Write the keypoints of a detector in the pictures of one camera: xy [T, J, 2], confidence [T, J]."""
-    names = filmed.person.joints
-    follower = FollowedPeople(detector.load(threads=1), names, only_one=True)
-    xy = np.full((len(filmed.t_ns), len(names), 2), np.nan)
-    confidence = np.zeros(xy.shape[:-1])
-    for frame in range(len(filmed.t_ns)):
-        halt.check()
-        pose = seen_by.position[camera, frame], seen_by.quaternion_xyzw[camera, frame]
-        surface = filmed.person.surface(filmed.motion.root[frame], filmed.motion.rotation[frame])
-        picture = renderer.picture(*pose, [surface], frame)
-        hint = project_actor(filmed.aim[frame], pose, seen_by.lens, sigma_m=_HINT_SIGMA_M, sigma_rad=0.0)
-        found, sure = follower.step(picture, hints=[hint])
-        if len(found):
-            xy[frame], confidence[frame] = found[0], sure[0]
-        progress.advance()
-    np.savez(folder / "keypoints.npz", xy=xy, confidence=confidence)
 
 
 # --- a session -----------------------------------------------------------------------------------------

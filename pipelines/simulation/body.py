@@ -24,24 +24,434 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Index
 from pipelines.geometry.compilation import cached
-from pipelines.geometry.poses import matrix_from_quaternion, multiply
+from pipelines.geometry.poses import matrix_from_quaternion, multiply, quaternion_from_matrix
 from pipelines.session.people import get_skeleton
-from pipelines.simulation.body_outfits import (
-    BUILDS,
-    OUTFITS,
-    SEXES,
-    UNIT_M,
-    Dressed,
-    Undressed,
-    dress,
-    neutral_offsets,
-    neutral_turns,
-)
 from pipelines.simulation.raster import TriangleSurface
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, BodyMotion, Rig
 from pipelines.simulation.scenario import Body
+
+# Order of the arrays in `data/body.npz` (`python tools/body_asset.py` made it, and describes them).
+SEXES = ("female", "male")
+BUILDS = ("average", "slim", "heavy")
+PARTS = ("skin", "lips", "brow", "white", "iris", "cloth")
+# The asset stores places as whole tenths of a millimetre.
+UNIT_M = 1e-4
+
+
+def neutral_turns(rest_joint: Float, lean_rad: float) -> Float:
+    """Compute the turn of each bone from rest to neutral: [22, 4] quaternions xyzw.
+
+    Trunk and head stay. Legs come down straight, arms straight with the hands forward of the elbows'
+    bend, so that a knee or elbow bends about the axis from side to side; feet point ahead, soles level.
+
+    Args:
+        rest_joint: [22, 3] m, x forward, y left, z up.
+        lean_rad: angle of the arms from the vertical, outward, to clear the hips.
+    """
+    turns = np.tile(np.eye(3), (len(BONES), 1, 1))
+    for sign, side in zip((1.0, -1.0), SIDES, strict=True):
+
+        def bone(name: str, side: str = side) -> int:
+            return BONE[f"{side}_{name}"]
+
+        def along(upper: str, lower: str, side: str = side) -> Float:
+            way: Float = rest_joint[BONE[f"{side}_{lower}"]] - rest_joint[BONE[f"{side}_{upper}"]]
+            return way
+
+        down = np.array([0.0, sign * np.sin(lean_rad), -np.cos(lean_rad)])
+        axis = np.array([0.0, -np.cos(lean_rad), -sign * np.sin(lean_rad)])
+        upper, lower = along("upper_arm", "forearm"), along("forearm", "hand")
+        rest_axis = np.cross(upper, lower)
+        turns[bone("upper_arm")] = _turn((upper, rest_axis), (down, axis))
+        turns[bone("forearm")] = turns[bone("hand")] = _turn((lower, rest_axis), (down, axis))
+
+        left, straight = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
+        turns[bone("thigh")] = _turn((along("thigh", "shank"), left), (straight, left))
+        turns[bone("shank")] = _turn((along("shank", "foot"), left), (straight, left))
+        ahead = along("foot", "toes") * [1.0, 1.0, 0.0]
+        up = np.array([0.0, 0.0, 1.0])
+        turns[bone("foot")] = turns[bone("toes")] = _turn((ahead, up), (np.array([1.0, 0.0, 0.0]), up))
+    return quaternion_from_matrix(turns)
+
+
+def neutral_offsets(rest_joint: Float, turns: Float) -> Float:
+    """Compute each joint's place relative to its parent's, neutral pose: [22, 3] m, the root's row zero.
+
+    Parts that must be zero, sideways in the trunk and in a hanging leg, are exactly zero.
+    """
+    matrix = matrix_from_quaternion(turns)
+    offset = np.zeros((len(BONES), 3))
+    for name, parent in PARENT.items():
+        if parent is not None:
+            along = rest_joint[BONE[name]] - rest_joint[BONE[parent]]
+            offset[BONE[name]] = np.einsum("ij,j->i", matrix[BONE[parent]], along)
+    offset[np.abs(offset) < 1e-12] = 0.0
+    return offset
+
+
+def _turn(source: tuple[Float, Float], target: tuple[Float, Float]) -> Float:
+    """Return the rotation that takes the first source direction to the first target direction."""
+    turn: Float = np.einsum("ik,jk->ij", _frame(*target), _frame(*source))
+    return turn
+
+
+def _frame(first: Float, second: Float) -> Float:
+    """Return axes in columns: along the first, across both, and the third."""
+    x = first / np.linalg.norm(first)
+    z = np.cross(x, second)
+    z /= np.linalg.norm(z)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Triangles [F, 3] and values [V, ...] of their vertices, by name."""
+
+    values: dict[str, Float]
+    faces: Index
+
+    def replaced(self, **values: Float) -> Patch:
+        """Return the same patch with other or additional values."""
+        return Patch(self.values | values, self.faces)
+
+
+def triangles(quads: Index) -> Index:
+    """Split quads [Q, 4] into triangles [2 Q, 3]."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def normals(vertices: Float, faces: Index) -> Float:
+    """Compute outward unit normals [V, 3], means over the triangles around by area; zero where none are."""
+    across = np.cross(
+        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+    )
+    total = np.zeros_like(vertices)
+    for corner in faces.T:
+        np.add.at(total, corner, across)
+    unit: Float = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    return unit
+
+
+def cut(patch: Patch, keep: Float) -> Patch:
+    """Return the part of a patch where `keep` [V], linear in each triangle, is not negative.
+
+    Along the cut, vertices are added whose values are linear between the ends of the edge that was cut.
+    """
+    inside = keep[patch.faces] >= 0
+    count = inside.sum(axis=1)
+    one = _odd_first(patch.faces[count == 1], inside[count == 1])
+    two = _odd_first(patch.faces[count == 2], ~inside[count == 2])
+    crossed = np.concatenate([one[:, [0, 1]], one[:, [0, 2]], two[:, [0, 1]], two[:, [0, 2]]])
+    edges, which = np.unique(np.sort(crossed, axis=1), axis=0, return_inverse=True)
+    one_b, one_c, two_b, two_c = np.split(
+        which.ravel() + len(keep), np.cumsum([len(one), len(one), len(two)])
+    )
+    faces = np.concatenate(
+        [
+            patch.faces[count == 3],
+            np.stack([one[:, 0], one_b, one_c], axis=1),
+            np.stack([two_b, two[:, 1], two[:, 2]], axis=1),
+            np.stack([two_b, two[:, 2], two_c], axis=1),
+        ]
+    )
+    first, second = edges.T
+    share = keep[first] / (keep[first] - keep[second])
+
+    def extended(value: Float) -> Float:
+        part = share.reshape(-1, *(1,) * (value.ndim - 1))
+        return np.concatenate([value, value[first] + part * (value[second] - value[first])])
+
+    return _compact({name: extended(value) for name, value in patch.values.items()}, faces)
+
+
+def pick(patch: Patch, wanted: NDArray[np.bool_]) -> Patch:
+    """Return some triangles [F] of a patch, whole."""
+    return _compact(patch.values, patch.faces[wanted])
+
+
+def together(patches: list[Patch], names: tuple[str, ...]) -> Patch:
+    """Join several patches side by side, with the values named."""
+    counts = [len(patch.values[names[0]]) for patch in patches]
+    first = np.cumsum([0, *counts[:-1]])
+    faces = np.concatenate([patch.faces + k for patch, k in zip(patches, first, strict=True)])
+    return Patch({name: np.concatenate([patch.values[name] for patch in patches]) for name in names}, faces)
+
+
+def _odd_first(faces: Index, odd: NDArray[np.bool_]) -> Index:
+    """Rotate each triangle's corners, in their order, until the one that differs comes first."""
+    turn = (np.argmax(odd, axis=1)[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(faces, turn, axis=1)
+
+
+def _compact(values: dict[str, Float], faces: Index) -> Patch:
+    used, corners = np.unique(faces, return_inverse=True)
+    return Patch({name: value[used] for name, value in values.items()}, corners.reshape(faces.shape))
+
+
+Colour = tuple[float, float, float]
+
+# Places along a limb: 0 at its root, 1 at the knee or elbow, 2 at the ankle or wrist.
+_SOCK_TOP, _SHOE_TOP = 1.78, 1.88
+# Skin goes on for about 4 cm under a hem, so that no gap shows when a limb bends.
+_TUCKED = 0.12
+
+# Metres for a body of 1.75 m; scaled with it.
+_USUAL_HEIGHT_M = 1.75
+# A shoe has its sole this far below the bare foot.
+_SOLE_M = 0.016
+# The edge of a sole ends this far above the bare foot.
+_SOLE_EDGE_M = 0.008
+# Cloth stands off by this much for each unit of its wrinkle.
+_WRINKLE_M = 0.004
+# Waves with this standard deviation of their numbers make folds of about 20 cm.
+_WRINKLE_PER_M = 28.0
+
+
+@dataclass(frozen=True)
+class Outfit:
+    """Colours and lengths of clothes.
+
+    Colours are linear RGB reflectances. `sleeve` and `leg` say where they end, in places along a limb.
+    """
+
+    sleeve: float
+    leg: float
+    shirt: Colour
+    trousers: Colour
+    shoes: Colour
+    soles: Colour
+    skin: Colour
+    hair: Colour
+
+
+OUTFITS = {
+    "casual": Outfit(
+        sleeve=0.6,
+        leg=1.93,
+        shirt=(0.42, 0.06, 0.05),
+        trousers=(0.05, 0.08, 0.2),
+        shoes=(0.2, 0.19, 0.18),
+        soles=(0.7, 0.7, 0.66),
+        skin=(0.5, 0.31, 0.22),
+        hair=(0.035, 0.02, 0.012),
+    ),
+    "sport": Outfit(
+        sleeve=0.45,
+        leg=0.72,
+        shirt=(0.06, 0.3, 0.62),
+        trousers=(0.05, 0.05, 0.06),
+        shoes=(0.65, 0.08, 0.06),
+        soles=(0.75, 0.75, 0.75),
+        skin=(0.33, 0.18, 0.115),
+        hair=(0.012, 0.009, 0.008),
+    ),
+    "dark": Outfit(
+        sleeve=1.93,
+        leg=1.93,
+        shirt=(0.025, 0.027, 0.03),
+        trousers=(0.035, 0.035, 0.042),
+        shoes=(0.02, 0.02, 0.02),
+        soles=(0.03, 0.03, 0.03),
+        skin=(0.5, 0.31, 0.22),
+        hair=(0.02, 0.014, 0.01),
+    ),
+    "bright": Outfit(
+        sleeve=1.93,
+        leg=1.93,
+        shirt=(0.8, 0.36, 0.03),
+        trousers=(0.55, 0.5, 0.41),
+        shoes=(0.6, 0.6, 0.6),
+        soles=(0.3, 0.2, 0.12),
+        skin=(0.55, 0.36, 0.27),
+        hair=(0.16, 0.09, 0.035),
+    ),
+}
+_LIPS, _BROW, _WHITE, _IRIS = (0.36, 0.13, 0.11), (0.04, 0.025, 0.015), (0.7, 0.7, 0.68), (0.05, 0.04, 0.03)
+_SOCKS = (0.65, 0.65, 0.65)
+
+
+@dataclass(frozen=True)
+class Undressed:
+    """A body at rest, as stored in the asset, in metres."""
+
+    vertices: Float  # [V, 3]
+    quads: NDArray[np.intp]  # [Q, 4]
+    part: NDArray[np.uint8]  # [V]
+    weights: Float  # [V, 22]
+    joint: Float  # [22, 3]
+    height_m: float
+
+
+@dataclass(frozen=True)
+class Dressed:
+    """The visible surface of a person, at rest."""
+
+    vertices: Float  # [N, 3] m
+    weights: Float  # [N, 22]
+    faces: NDArray[np.int32]  # [F, 3]
+    colour: NDArray[np.float32]  # [N, 3]
+    sole: NDArray[np.bool_]  # [N] the level undersides of the shoes
+
+
+def dress(body: Undressed, outfit: Outfit, *, hair_m: float) -> Dressed:
+    """Put clothes, shoes and hair on a body; hair stands `hair_m` off the scalp on a body of 1.75 m."""
+    unit = body.height_m / _USUAL_HEIGHT_M
+    waist = body.joint[BONE["pelvis"], 2] + 0.02 * unit
+    skin, suit = _bare(body), _suit(body)
+
+    arm, leg, above = suit.values["arm"], suit.values["leg"], suit.values["place"][:, 2]
+    shirt = cut(suit, np.minimum(outfit.sleeve - arm, above - waist + 0.08 * unit))
+    shirt = cut(shirt, shirt.values["below_collar"])
+    trousers = cut(suit, np.minimum(outfit.leg - leg, waist - above - 0.03 * unit))
+    shoes = cut(suit, leg - _SOCK_TOP)
+
+    worn = _put_on(shirt, outfit.shirt, (0.018 + _WRINKLE_M * shirt.values["wrinkle"]) * unit)
+    loose = np.clip((trousers.values["leg"] - 0.1) / 1.6, 0.0, 1.0)
+    fold_m = _WRINKLE_M * trousers.values["wrinkle"] * np.clip(2 * loose, 0.2, 1.0)
+    worn_below = _put_on(trousers, outfit.trousers, (0.006 + 0.014 * loose + fold_m) * unit)
+    layers = [*_skin_and_hair(skin, outfit, hair_m * unit), worn, worn_below, *_shoes(shoes, outfit, unit)]
+    whole = together(layers, ("place", "weights", "colour", "sole"))
+    return Dressed(
+        whole.values["place"],
+        whole.values["weights"],
+        whole.faces.astype(np.int32),
+        np.clip(whole.values["colour"], 0.0, 1.0).astype(np.float32),
+        whole.values["sole"] > 0,
+    )
+
+
+# --- the patches that all is cut from ------------------------------------------------------------------
+
+
+def _bare(body: Undressed) -> Patch:
+    """Return skin and eyes."""
+    quads = body.quads[body.part[body.quads].min(axis=1) != PARTS.index("cloth")]
+    return _with_values(body, triangles(quads))
+
+
+def _suit(body: Undressed) -> Patch:
+    """Return the tights that clothes are cut from."""
+    quads = body.quads[body.part[body.quads].min(axis=1) == PARTS.index("cloth")]
+    return _with_values(body, triangles(quads))
+
+
+def _with_values(body: Undressed, faces: NDArray[np.intp]) -> Patch:
+    unit = body.height_m / _USUAL_HEIGHT_M
+    x, _, z = (body.vertices - body.joint[BONE["neck"]]).T / unit
+    eyes = body.vertices[body.part == PARTS.index("white")].mean(axis=0)
+    ahead, _, above = (body.vertices - eyes).T / unit
+    values = {
+        "place": body.vertices,
+        "normal": normals(body.vertices, faces),
+        "weights": body.weights,
+        "part": body.part.astype(np.float64),
+        "arm": _along_limb(body, ("upper_arm", "forearm", "hand")),
+        "leg": _along_limb(body, ("thigh", "shank", "foot")),
+        "below_collar": 0.012 - 0.35 * np.maximum(x - 0.02, 0.0) - z,
+        "hairy": _on_scalp(ahead, above),
+        "wrinkle": _wrinkles(body.vertices / unit),
+        "rough": np.random.default_rng(1).normal(0.0, 1.0, len(body.vertices)),
+        "sole": np.zeros(len(body.vertices)),
+    }
+    return pick(Patch(values, faces), np.ones(len(faces), dtype=np.bool_))
+
+
+def _along_limb(body: Undressed, bones: tuple[str, str, str]) -> Float:
+    """Return each vertex's place [V] along an arm or leg, on its own side; negative or zero off the limb."""
+    place = np.zeros(len(body.vertices))
+    for sign, side in zip((1.0, -1.0), SIDES, strict=True):
+        root, bend, end = (body.joint[BONE[f"{side}_{name}"]] for name in bones)
+        upper = _share(body.vertices, root, bend)
+        lower = _share(body.vertices, bend, end)
+        on_side = body.vertices[:, 1] * sign > 0
+        place = np.where(on_side, np.minimum(upper, 1.0) + np.maximum(lower, 0.0), place)
+    names = (*bones, "toes") if bones[2] == "foot" else bones
+    held = body.weights[:, [BONE[f"{side}_{name}"] for side in SIDES for name in names]].sum(axis=1)
+    return np.where(held > 0.5, place, np.minimum(place, 0.0))
+
+
+def _share(points: Float, start: Float, end: Float) -> Float:
+    way = end - start
+    share: Float = np.einsum("vi,i->v", points - start, way) / np.sum(way * way)
+    return share
+
+
+def _on_scalp(ahead: Float, above: Float) -> Float:
+    """Compute the distance [V] of places inside the hairline, m; negative outside of it."""
+    crown = above - 0.06 + 0.25 * np.maximum(-ahead - 0.02, 0.0)
+    sides = np.minimum(-ahead - 0.045, above - 0.012)
+    back = np.minimum(-ahead - 0.112, above + 0.06)
+    return np.maximum(np.maximum(crown, sides), back)
+
+
+def _wrinkles(vertices: Float) -> Float:
+    """Compute folds of cloth [V], -1.5..1.5: a sum of plane waves, the same for everyone."""
+    draw = np.random.default_rng(0)
+    wave, phase = draw.normal(0.0, _WRINKLE_PER_M, (12, 3)), draw.uniform(0.0, 2 * np.pi, 12)
+    folds = np.sin(np.einsum("vi,ki->vk", vertices, wave) + phase).sum(axis=1) / np.sqrt(12)
+    clipped: Float = np.clip(folds, -1.5, 1.5)
+    return clipped
+
+
+# --- layers --------------------------------------------------------------------------------------------
+
+
+def _put_on(patch: Patch, colour: Colour, off_m: Float) -> Patch:
+    """Return a layer of one colour, `off_m` [V] outward from the body."""
+    place = patch.values["place"] + off_m[:, None] * patch.values["normal"]
+    shade = 1 + 0.1 * patch.values["wrinkle"] + 0.04 * patch.values["rough"]
+    return patch.replaced(place=place, colour=np.array(colour) * shade[:, None])
+
+
+def _skin_and_hair(skin: Patch, outfit: Outfit, hair_m: float) -> tuple[Patch, Patch]:
+    """Return the skin that an outfit bares, with a little under every hem, and the hair on the scalp."""
+    arm, leg = skin.values["arm"], skin.values["leg"]
+    bare = (arm > outfit.sleeve - _TUCKED) | ((leg > outfit.leg - _TUCKED) & (leg < _SOCK_TOP + _TUCKED))
+    bare |= (skin.values["below_collar"] < 0.04) & (arm <= 0)
+    shown = pick(skin, np.any(bare[skin.faces], axis=1))
+
+    # Hair grows from the skin of the head alone: not from eyes, nor from whatever else is as high.
+    head = shown.values["weights"][:, BONE["head"]] + shown.values["weights"][:, BONE["neck"]] > 0.9
+    is_skin = shown.values["part"] == PARTS.index("skin")
+    grows = np.where(head & is_skin, shown.values["hairy"], -1.0)
+    hair = cut(shown, grows)
+    off_m = hair_m * np.clip(hair.values["hairy"] / 0.02, 0.2, 1.0)
+    bald = cut(shown, 0.004 - grows)
+    tone = _skin_colours(outfit)[np.rint(bald.values["part"]).astype(np.intp)]
+    bald = bald.replaced(colour=tone * (1 + 0.03 * bald.values["rough"])[:, None])
+    return bald, _put_on(hair, outfit.hair, off_m)
+
+
+def _skin_colours(outfit: Outfit) -> Float:
+    """Return colours [P, 3] by `PARTS`; lips are darker in the same ratio as the skin."""
+    darker = np.array(outfit.skin) / np.array(OUTFITS["casual"].skin)
+    by_part = dict.fromkeys(PARTS, np.array(outfit.skin))
+    by_part |= {"lips": darker * _LIPS, "brow": np.array(_BROW)}
+    by_part |= {"white": np.array(_WHITE), "iris": np.array(_IRIS)}
+    return np.stack([by_part[part] for part in PARTS])
+
+
+def _shoes(patch: Patch, outfit: Outfit, unit: float) -> list[Patch]:
+    """Return shoes with level soles below the bare feet, and the socks above them."""
+    place, normal, leg = (patch.values[name] for name in ("place", "normal", "leg"))
+    off_m = np.where(leg > _SHOE_TOP, 0.007, 0.006) * unit
+    sole = (place[:, 2] < 0.014 * unit) | ((normal[:, 2] < -0.45) & (place[:, 2] < 0.03 * unit))
+    place = place + off_m[:, None] * normal
+    place[sole, 2] = -_SOLE_M * unit
+    place[:, 2] = np.maximum(place[:, 2], -_SOLE_M * unit)
+    whole = patch.replaced(place=place, sole=sole.astype(np.float64))
+
+    edge_m = _SOLE_EDGE_M * unit
+    below = cut(whole, edge_m - place[:, 2])
+    above = cut(whole, place[:, 2] - edge_m)
+    shoe, sock = (cut(above, side * (above.values["leg"] - _SHOE_TOP)) for side in (1.0, -1.0))
+    return [
+        _put_on(part, colour, np.zeros(len(part.values["leg"])))
+        for part, colour in ((below, outfit.soles), (shoe, outfit.shoes), (sock, _SOCKS))
+    ]
+
 
 _ASSET = Path(__file__).parent / "data" / "body.npz"
 # Transforms of so many frames take 5 MB, however long the motion.

@@ -375,26 +375,20 @@ def _moving(
     start = np.array(actor.start)
 
     def moving(t_s: Float) -> BodyMotion:
-        since = t_s + LEAD_S
+        since, heading_deg, repeat = t_s + LEAD_S, actor.heading_deg, actor.motion.repeat
+        ground = terrain.height
         if bvh is not None:
             motion = retarget(
-                bvh,
-                person.rig,
-                since,
-                ground=terrain.height,
-                start=start,
-                heading_deg=actor.heading_deg,
-                repeat=actor.motion.repeat,
+                bvh, person.rig, since, ground=ground, start=start, heading_deg=heading_deg, repeat=repeat
             )
         else:
             motion = perform(
                 actor.motion.steps or [],
-                person.rig,
-                since,
-                ground=terrain.height,
+                *(person.rig, since),
+                ground=ground,
                 start=start,
-                heading_deg=actor.heading_deg,
-                repeat=actor.motion.repeat,
+                heading_deg=heading_deg,
+                repeat=repeat,
                 seed=seed,
             )
         return BodyMotion(t_s, motion.root, motion.rotation)

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
-from pipelines.simulation.motion_body import two_bones
+from pipelines.simulation.motion_script import two_bones
 from pipelines.simulation.rig import (
     BONE,
     BONES,
@@ -210,15 +210,8 @@ def _without_first_pose(source: SkeletalMotion) -> SkeletalMotion:
     turned = [_angle(source.rotation[i], source.rotation[i + 1]).max() for i in (0, 1)]
     if turned[0] < _T_POSE_TURN or turned[0] < 5 * turned[1]:
         return source
-    return SkeletalMotion(
-        source.t_s[1:] - source.t_s[1],
-        source.bones,
-        source.parent,
-        source.offset,
-        source.end,
-        source.root[1:],
-        source.rotation[1:],
-    )
+    later = {"t_s": source.t_s[1:] - source.t_s[1], "root": source.root[1:], "rotation": source.rotation[1:]}
+    return replace(source, **later)
 
 
 def _angle(one: Float, other: Float) -> Float:
@@ -306,13 +299,7 @@ def _sampled(source: SkeletalMotion, bones: list[int], laid: Float, t_s: Float, 
         seam = np.clip((source.t_s - (duration_s - seam_s)) / seam_s, 0.0, 1.0)
         share = seam * seam * (3 - 2 * seam)
         again = multiply(about(2, np.array([heading[1] - heading[0]])), rotation[0])
-        rotation = np.stack(
-            [
-                partly(rotation[:, b], np.broadcast_to(again[b], rotation[:, b].shape), share)
-                for b in range(len(BONES))
-            ],
-            axis=1,
-        )
+        rotation = partly(rotation, np.broadcast_to(again, rotation.shape), share[:, None])
         root = root.copy()
         root[:, 2] += share * (root[0, 2] - root[-1, 2])
         rounds = np.floor(np.maximum(t_s, 0.0) / duration_s).astype(np.int64)
@@ -323,9 +310,7 @@ def _sampled(source: SkeletalMotion, bones: list[int], laid: Float, t_s: Float, 
     step = np.where(after > before, source.t_s[after] - source.t_s[before], 1.0)
     share = np.clip((since - source.t_s[before]) / step, 0.0, 1.0)
     at = root[before] + share[:, None] * (root[after] - root[before])
-    turned = np.stack(
-        [partly(rotation[before, bone], rotation[after, bone], share) for bone in range(len(BONES))], axis=1
-    )
+    turned = partly(rotation[before], rotation[after], share[:, None])
     if rounds.any():
         at, turned = _rounds(at, turned, rounds, root[-1] - first, first, heading[1] - heading[0])
     return _Pose(at, turned, first, heading[0])

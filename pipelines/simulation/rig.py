@@ -125,9 +125,9 @@ def about(axis: int, angle: Float) -> Float:
 
 
 def partly(start: Float, end: Float, share: Float) -> Float:
-    """Return rotations [T, 4] that are `share` [T] of the shortest way from one to another."""
+    """Return rotations [..., 4] that are `share` [...] of the shortest way from one to another."""
     vector = rotation_vector_from_quaternion(multiply(conjugate(start), end))
-    return multiply(start, quaternion_from_rotation_vector(share[:, None] * vector))
+    return multiply(start, quaternion_from_rotation_vector(share[..., None] * vector))
 
 
 def from_axes(forward: Float, left: Float, up: Float) -> Float:

@@ -28,7 +28,7 @@ from pipelines.geometry.triangulation import (
     triangulate_pictures,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.registries import find_detector, parsed_noise_models
+from pipelines.session.registries import parsed_noise_models
 from pipelines.simulation.body import PosablePerson, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
 from pipelines.simulation.flight import Performer
@@ -207,6 +207,8 @@ def views_of(
     *,
     seed: int,
     trial: int,
+    pixel_sigma: float = PIXEL_SIGMA,
+    min_confidence: float = MIN_CONFIDENCE,
 ) -> Views:
     """Return the input of triangulation: keypoints, logged poses, sigmas; T * J rows, joints fastest.
 
@@ -223,7 +225,7 @@ def views_of(
         rotation[:, camera] = matrix_from_quaternion(turned)
         sigma[:, camera] = sum_sigma(noise, elapsed_s, *rates(of.t_ns, *true))
     rays = undistort(sightings.xy, seen_by.lens)
-    trusted = np.where(sightings.confidence >= MIN_CONFIDENCE, sightings.confidence, 0.0)
+    trusted = np.where(sightings.confidence >= min_confidence, sightings.confidence, 0.0)
     return Views(
         rays=np.moveaxis(rays, 0, 2).reshape(times * joints, cameras, 2),
         weight=np.moveaxis(trusted, 0, 2).reshape(times * joints, cameras),
@@ -231,7 +233,7 @@ def views_of(
         position=position,
         rotation=rotation,
         focal=np.full(cameras, (seen_by.lens.fx + seen_by.lens.fy) / 2),
-        pixel_sigma=np.full(cameras, PIXEL_SIGMA),
+        pixel_sigma=np.full(cameras, pixel_sigma),
         pose_sigma=sigma,
     )
 
@@ -332,11 +334,12 @@ KNOWN = (
     "noise",
     "method",
     "keypoints",
-    "detector",
     "seconds",
     "rate_hz",
     "trials",
     "seed",
+    "pixel_noise",
+    "min_confidence",
 )
 """Variables of a study of a walk."""
 
@@ -372,11 +375,12 @@ class WalkStudy:
     noise: tuple[StudiedNoise, ...]
     methods: tuple[StudyMethod, ...]
     keypoints: Literal["model", "exact"]
-    detector: str | None  # looks at rendered pictures in place of `keypoints`
     seconds: float
     rate_hz: float
     trials: int
     seed: int
+    pixel_noise: float = PIXEL_SIGMA  # standard deviation of a good keypoint for triangulation, px
+    min_confidence: float = MIN_CONFIDENCE
 
 
 def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
@@ -390,21 +394,15 @@ def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
     Raises:
         DataError: an unknown name, a value given twice, or a number out of range.
     """
-    values = {**_USUAL, "detector": (), "rate_hz": (), **stated}
+    values = {**_USUAL, "rate_hz": (), **stated}
     unknown = [name for name in values if name not in KNOWN]
     if unknown:
         raise DataError(unknown[0], "is no variable of a study of a walk", f"there are {', '.join(KNOWN)}",
                         code="no-such-name")  # fmt: skip
     (keypoints,) = _choices(values, "keypoints", ("model", "exact"))
-    detector = values["detector"][0] if values["detector"] else None
-    if detector is not None:
-        find_detector(detector)
-        if "keypoints" in stated:
-            raise DataError("detector", "cannot be given together with keypoints", "leave one of them out",
-                            code="bad-option")  # fmt: skip
     seconds, rate_hz = (
         _single(values, name, 0.1, most, default)
-        for name, most, default in (("seconds", 600, 75), ("rate_hz", 240, 30.0 if detector is None else 1.0))
+        for name, most, default in (("seconds", 600, 75), ("rate_hz", 240, 30.0))
     )
     methods = _choices(values, "method", METHODS)
     needed = _MIN_TIMES_FOR_AUTO if "auto" in methods else 2
@@ -428,11 +426,12 @@ def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
         tuple(noise),
         tuple(name for name in METHODS if name in methods),
         "exact" if keypoints == "exact" else "model",
-        detector,
         float(seconds),
         float(rate_hz),
         int(_single(values, "trials", 1, 10_000, 10)),
         int(_single(values, "seed", 0, 2**32 - 1, 0)),
+        _single(values, "pixel_noise", 0.01, 1000, PIXEL_SIGMA),
+        _single(values, "min_confidence", 0, 1, MIN_CONFIDENCE),
     )
 
 

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 
 from pipelines.detect import detect
 from pipelines.ingest import ingest
-from pipelines.keypoints.hints import Hint, actor_hints, hint_sigma
+from pipelines.keypoints.search import Hint, actor_hints, hint_sigma
 from pipelines.session.description import read_description
 from pipelines.session.people import logged_actor
 from pipelines.session.records import Trajectory

@@ -15,12 +15,8 @@ from mocap_cli.main import Mocap
 from mocap_cli.study import study_command
 from pipelines import study as stage
 from pipelines.geometry.noise import White
-from pipelines.keypoints.tracking import TrackedPerson
 from pipelines.replan import fly_and_measure
 from pipelines.session.errors import DataError
-from pipelines.session.people import get_skeleton
-from pipelines.session.registries import Person, Region
-from pipelines.simulation import walks as studies
 from pipelines.simulation.walks import RANGE_M, exact_keypoints, formation, views_of, walk
 from pipelines.study import Studied, study, values_of
 from tests.commands.runner import content
@@ -123,64 +119,6 @@ def test_trials_of_two_formations_share_their_chance() -> None:
     assert not np.allclose(moved[0][:, 0], moved[0][:, 1])
 
 
-class _Networks:
-    """Networks with all joints of COCO except the last, in another order."""
-
-    joints = tuple(reversed(get_skeleton("coco17").joints[:-1]))
-
-
-class _Pointing:
-    """A detector that puts every joint at the hint."""
-
-    name, title = "pointing", "Pointing"
-
-    def models(self) -> dict[str, Path | None]:
-        return {}
-
-    def load(self, *, threads: int) -> _Networks:  # noqa: ARG002  # a detector's signature
-        return _Networks()
-
-
-class _Follower:
-    """Stand-in for the tracker: the person is at the hint, each joint one pixel right of the last."""
-
-    def __init__(self, networks: _Networks, *, only_one: bool) -> None:
-        assert only_one
-        self.right = np.array([1.0, 0.0]) * np.arange(len(networks.joints))[:, None]
-
-    def step(self, picture: Any, *, hints: Any) -> list[TrackedPerson]:
-        (hint,) = hints
-        # The camera looks at the smoothed hip, and the person stands there: not only ground is seen.
-        x, y = (round(value) for value in hint.centre)
-        assert picture[y - 60 : y + 60, x - 60 : x + 60].std() > 5
-        xy = np.array(hint.centre, dtype=np.float64) + self.right
-        return [TrackedPerson(1, Person(xy, np.full(len(xy), 0.9), 1.0, Region(hint.centre, 100.0, 0.0)))]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
-def test_a_detector_looks_at_rendered_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put joint k at k pixels right of the middle in two perpendicular views: this gives its position."""
-    for module in (stage, studies):
-        monkeypatch.setattr(module, "find_detector", lambda _: _Pointing())
-    monkeypatch.setattr("pipelines.keypoints.tracking.PeopleTracker", _Follower)
-    words = ["tilt_deg=0", "noise=none", "method=dlt", "detector=pointing", "seconds=2", "trials=1"]
-    (cell,) = study(words, None, tmp_path / "out").metrics["cells"]
-    of = walk(2.0, 1.0, 0)
-    seen_by = formation(of, cameras=2, tilt_deg=0.0)
-    metre_per_px = RANGE_M / seen_by.lens.fx
-    # Cameras look west and south from their slots in the east and north: right is north, and west.
-    steps = metre_per_px * np.array([-1.0, 1.0, 0.0])
-    for j, joint in enumerate(of.person.joints[:-1]):
-        place = of.aim + (len(_Networks.joints) - 1 - j) * steps
-        expected_mm = 1e3 * np.linalg.norm(of.joints[:, j] - place, axis=-1).mean()
-        # Rays that are 0.01 rad aslant meet 1 % nearer or farther: some millimetres of 0.3 m.
-        assert cell["per_joint"][joint]["mpjpe_mm"] == pytest.approx(expected_mm, abs=5)
-    assert cell["per_joint"][of.person.joints[-1]]["mpjpe_mm"] is None
-    assert cell["metrics"]["reconstructed_share"]["mean"] == pytest.approx(16 / 17)
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_every_kind_of_noise_has_the_size_of_its_level(tmp_path: Path) -> None:
     made = study(["noise=white,bias,body-bias,drift@high,gauss-markov", *SMALL], None, tmp_path / "out")
     models = made.metrics["settings"]["noise"]
@@ -277,7 +215,6 @@ def test_values_are_lists_ranges_and_models() -> None:
     }
     model = "bias:position_m=0.3,rotation_deg=1 + drift:position_m_per_sqrt_s=0.1"
     assert values_of([f"noise={model}; white:position_m=1"])["noise"] == (model, "white:position_m=1")
-    assert values_of(["detector=onnx:a.onnx,provider=cpu"])["detector"] == ("onnx:a.onnx,provider=cpu",)
 
 
 @pytest.mark.parametrize(
@@ -299,6 +236,7 @@ def test_values_are_lists_ranges_and_models() -> None:
         ("seconds=0.1", "bad-value"),
         ("keypoints=guessed", "no-such-name"),
         ("detector=nobody", "no-such-name"),
+        ("pixel_noise=0", "bad-value"),
         ("radius=8", "no-such-name"),
     ],
 )

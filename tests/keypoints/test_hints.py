@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.keypoints.hints import Hint, project_actor
+from pipelines.keypoints.search import Hint, project_actor
 
 CAMERA = Intrinsics(width=1280, height=720, fx=800.0, fy=800.0, cx=639.5, cy=359.5)
 # At the origin, looking along the world's x: camera x is the world's -y, camera y its -z.

