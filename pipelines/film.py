@@ -27,7 +27,7 @@ from pipelines.planning.replay import poses_from
 from pipelines.planning.scene import LoggedFlight, load_flight
 from pipelines.reconstruction.refining import refined_points
 from pipelines.reporting.overlays import OverlayView
-from pipelines.reporting.pictures import draw_frame, with_inlet
+from pipelines.reporting.pictures import draw_frame
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import LoggedActor, logged_people
@@ -56,8 +56,6 @@ FILM = Stage("film", revision=5)
 MAX_HIPS_OFF_M = 0.05
 # The videos are drawn on and encoded again, so that the first encoding has to be better.
 VIDEO_QUALITY = 20
-# The enlarged square shows the person with a margin for arms.
-INLET_HEIGHTS = 1.3
 # A detection whose joints lie farther than this from a person's, in the median, shows somebody else.
 MAX_MEDIAN_OFF_M = 0.25
 
@@ -467,7 +465,7 @@ def _draw(
     pictures: Path,
     folder: Path,
 ) -> None:
-    """Write <camera>.mp4: the skeletons over the pictures, the person in the middle enlarged in a corner."""
+    """Write <camera>.mp4: the skeletons over the pictures, with the tilt over the person in the middle."""
     lens, name = arm.seen_by.lens, arm.names[camera]
     poses = arm.seen_by.position[camera], arm.seen_by.quaternion_xyzw[camera]
     true = np.stack([of.joints for of in arm.people], axis=1)
@@ -475,7 +473,7 @@ def _draw(
     middles_px = [see(of.motion.root[:, None], *poses, lens)[:, 0] for of in arm.people]
     off_px = [np.linalg.norm(px - (lens.width / 2, lens.height / 2), axis=-1) for px in middles_px]
     enlarged = int(np.argmin([np.nan_to_num(off, nan=lens.width).mean() for off in off_px]))
-    middle_px, nearest = middles_px[enlarged], arm.people[enlarged]
+    nearest = arm.people[enlarged]
     slots = slot_of(poses[0] - nearest.motion.root)
     tilt_rad = slots[..., TILT] if arm.tilt_rad is None else arm.tilt_rad[camera]
 
@@ -509,7 +507,6 @@ def _draw(
                     f"{name}   {view.t_s:.2f} s   tilt {np.degrees(tilt_rad[k]):.0f} deg",
                     f"{int(seen.sum())} joints found, {int(known.sum())} reconstructed, {error_text}",
                 )
-                side_px = INLET_HEIGHTS * lens.fx * nearest.height_m / float(slots[k, 2])
-                yield with_inlet(draw_frame(picture, view, caption), middle_px[k], side_px)
+                yield draw_frame(picture, view, caption)
 
     _write_video(folder / f"{name}.mp4", drawn(), arm.t_ns, lens)

@@ -342,12 +342,11 @@ def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder
     np.save(folder / "aim.npy", flown.aim)
     facts: dict[str, object] = {
         "safety": flown.safety,
-        "seen_share": None,
         "joint_frames": 0,
     }
     if measured is not None:
         np.save(folder / "error_m.npy", measured.error_m)
-        facts |= {"seen_share": measured.seen_share, "joint_frames": measured.joint_frames}
+        facts |= {"joint_frames": measured.joint_frames}
     write_json(folder / "facts.json", facts)
 
 
@@ -364,7 +363,6 @@ def read_result(folder: Path) -> ArmResult:
             facts["safety"],
         ),
         error_m=np.load(errors, mmap_mode="r") if errors.exists() else None,  # large in long flights
-        seen_share=facts["seen_share"],
         joint_frames=facts["joint_frames"],
     )
 

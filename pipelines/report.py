@@ -75,7 +75,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-REPORT = Stage("report", revision=16)
+REPORT = Stage("report", revision=17)
 # Figures of another revision are drawn again.
 _FIGURES_REVISION = 8
 

@@ -112,7 +112,6 @@ class ArmResult:
 
     flight: ArmFlight
     error_m: Float32 | None  # [trials, P, J] NaN where not measured; None without a skeleton
-    seen_share: float | None  # of joints and cameras
     joint_frames: int
 
 
@@ -185,8 +184,6 @@ def _scores(
         "reconstruction_error": {
             "simulated": True,
             **figures,
-            "mpjpe_of_all_it_measured_mm": _own_error(result),
-            "seen_share": result.seen_share,
             "joint_frames": result.joint_frames,
         },
         **_by_person(scene, result, seen, shared),
@@ -204,11 +201,6 @@ def _errors(
         "coverage": mean_of_trials(coverage(error_m, joint_frames)),
         "pck150": mean_of_trials(pck(error_m, joint_frames)),
     }
-
-
-def _own_error(result: ArmResult) -> MeanWithInterval | None:
-    error_m = result.error_m
-    return None if error_m is None else mean_of_trials(mpjpe_mm(error_m, np.isfinite(error_m)))
 
 
 def _by_person(scene: ReplayScene, result: ArmResult, seen: Bool, shared: Bool | None) -> dict[str, Any]:

@@ -559,7 +559,6 @@ class MeasuredJoints:
     """Result of the simulated measurements."""
 
     error_m: Float32  # [trials, T, J]; NaN where the joint was not measured or the truth is unknown
-    seen_share: float  # of known joints and cameras: in the picture and not hidden
     joint_frames: int  # with a truth
 
 
@@ -621,21 +620,13 @@ def measure(
         points = triangulate(views, method="robust").points.reshape(joints.shape)
         points[~known] = np.nan
         error[trial] = np.sqrt(np.sum((points - joints) ** 2, axis=-1))
-    seen = np.isfinite(pixels[..., 0]) & free
-    total = cameras * int(known.sum())
-    seen_share = float((seen & known).sum() / total) if total else 0.0
-    return MeasuredJoints(error, seen_share, int(known.sum()))
+    return MeasuredJoints(error, int(known.sum()))
 
 
 def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:
     """Join what was measured of several people: their joints in a row."""
-    frames = [person.joint_frames for person in people]
-    seen = sum(person.seen_share * count for person, count in zip(people, frames, strict=True))
-    return MeasuredJoints(
-        error_m=np.concatenate([person.error_m for person in people], axis=2),
-        seen_share=seen / sum(frames) if sum(frames) else 0.0,
-        joint_frames=sum(frames),
-    )
+    errors = np.concatenate([person.error_m for person in people], axis=2)
+    return MeasuredJoints(errors, sum(person.joint_frames for person in people))
 
 
 def _pixels(paths: CameraPaths, i: int) -> Float:

@@ -229,7 +229,6 @@ class Panel:
     x_ticks: Mapping[float, str] | None = None
     title: str = ""
     grid: Literal["x", "y", "both"] | None = "y"
-    zero: bool = False  # draw a line at x = 0
     equal: bool = False  # a metre is as long in both directions
 
     @property
@@ -403,8 +402,6 @@ def _draw(figure: Figure) -> Drawing:
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:
-    if panel.zero:
-        axes.axvline(0, color=MUTED, linewidth=0.8)
     for mark in panel.marks:
         _draw_mark(axes, mark)
     axes.set_xlabel(panel.x_label)

@@ -51,12 +51,6 @@ BONE_OF_DIAGONAL = 1 / 700
 TEXT_OF_DIAGONAL = 1 / 2000
 # No letter can be read below this scale of OpenCV.
 MIN_TEXT_SCALE = 0.3
-# The box of a person has this much room at each side.
-BOX_MARGIN = 0.1
-# Longer arms of the corners would close the box.
-BOX_CORNER = 0.15
-# The enlarged square takes so much of the picture's height that the person stays visible.
-INLET_SHARE = 0.42
 # Of a Gaussian in two dimensions 95 % lie within {x : x' S^-1 x = 5.991} (chi-square).
 CHI2_95 = 5.991
 # OpenCV counts in 32 bits: a point just before the camera's plane lies farther out.
@@ -65,10 +59,6 @@ MAX_COORDINATE_PX = 1e6
 PANEL_MARGIN = 1.3
 # Fewer pixels would show single pixels as squares.
 MIN_PANEL_PX = 96.0
-# A panel this wide, by the picture's width, shows nearly all of it and needs no map.
-WHOLE_SHARE = 0.8
-# The map takes a quarter of the panel's width.
-MAP_SHARE = 0.27
 # Wider panels show no more on the page.
 MAX_PANEL_PX = 640
 # All panels of a page together have at most so many pixels, about 1.5 MB.
@@ -118,9 +108,9 @@ def draw_frame(
 
     Bones and joints are coloured by the side of the body; NaN is not drawn. Thin ellipses are the 95 %
     regions of the joints, by their own uncertainty alone. Rings are keypoints that were found, crosses those
-    of joints that were rejected (red) or not reconstructed (grey), small dots those of other people. Four
-    corners mark the box of a person's keypoints; with `residuals` a thin line leads from each keypoint to
-    its joint instead. Caption and labels are ASCII; they are left out where there is no room for them.
+    of joints that were rejected (red) or not reconstructed (grey), small dots those of other people. With
+    `residuals` a thin line leads from each keypoint to its joint. Caption and labels are ASCII; they are left
+    out where there is no room for them.
     """
     drawn = picture.copy()
     height, width = drawn.shape[:2]
@@ -132,8 +122,6 @@ def draw_frame(
     _dots(drawn, others.reshape(-1, 2), bone, UNMEASURED)
     if view.spread is not None:
         _ellipses(drawn, view.joints, reprojected, view.spread * np.outer(scale, scale), max(1, bone // 2))
-    for person in found if not residuals else ():
-        _corners(drawn, person, max(1, bone // 2))
     _bones(drawn, view.joints, reprojected, bone)
     for joint, keypoint in zip(reprojected, found, strict=True) if residuals else ():
         for start, end in zip(joint, keypoint, strict=False):
@@ -231,22 +219,6 @@ def _ellipses(
                 )
 
 
-def _corners(picture: Picture, found: Float, thickness: int) -> None:
-    """Draw the corners of a box about the points [J, 2] that are known; nothing for fewer than two."""
-    known = found[_drawable(found)]
-    if len(known) < 2:
-        return
-    low, high = known.min(axis=0), known.max(axis=0)
-    spare = BOX_MARGIN * float((high - low).max())
-    low, high = low - spare, high + spare
-    arm = BOX_CORNER * float((high - low).min())
-    for x, inward in ((low[0], 1), (high[0], -1)):
-        for y, downward in ((low[1], 1), (high[1], -1)):
-            corner = np.array([x, y])
-            for across in (np.array([inward * arm, 0.0]), np.array([0.0, downward * arm])):
-                _line(picture, corner, corner + across, thickness, FOUND)
-
-
 def _rings(picture: Picture, points: Float, radius: float, thickness: int, colour: Colour) -> None:
     import cv2
 
@@ -276,27 +248,6 @@ def _drawable(points: Float) -> NDArray[np.bool_]:
 def _fixed(point: Float) -> tuple[int, int]:
     x, y = np.round(point * 2**COORDINATE_BITS).astype(int).tolist()
     return x, y
-
-
-def with_inlet(picture: Picture, middle_px: Float, side_px: float) -> Picture:
-    """Draw the square about the middle, enlarged, at the lower right; do nothing without a middle."""
-    import cv2
-
-    height, width = picture.shape[:2]
-    side = int(min(side_px, height, width))
-    if side < 2 or not np.isfinite(middle_px).all():
-        return picture
-    left, upper = (
-        int(np.clip(round(float(centre)) - side // 2, 0, most - side))
-        for centre, most in zip(middle_px, (width, height), strict=True)
-    )
-    edge = round(INLET_SHARE * min(height, width))
-    part = cv2.resize(
-        picture[upper : upper + side, left : left + side], (edge, edge), interpolation=cv2.INTER_CUBIC
-    )
-    picture[-edge:, -edge:] = part
-    cv2.rectangle(picture, (width - edge, height - edge), (width - 1, height - 1), (255, 255, 255), 1)
-    return picture
 
 
 def _write(picture: Picture, lines: Sequence[str], *, top: bool) -> None:
@@ -429,8 +380,6 @@ def panel_width(panels: int) -> int:
 
 def draw_panel(view: OverlayView, px: int) -> Picture:
     """Draw the people of a view in a square of `px` pixels, on plain ground where there is no picture."""
-    import cv2
-
     lens, window = view.intrinsics, window_of(view)
     size = (lens.width, lens.height)
     whole = view.picture if view.picture is not None else np.full((*size[::-1], 3), GREY, np.uint8)
@@ -444,18 +393,7 @@ def draw_panel(view: OverlayView, px: int) -> Picture:
         others=view.others - corner,
         spread=None,
     )
-    drawn = draw_frame(cut_out(whole, size, window, px, GREY), moved, (), residuals=True)
-    if window.width < WHOLE_SHARE * lens.width:
-        wide = round(MAP_SHARE * px)
-        small = cv2.resize(whole, (wide, round(wide * size[1] / size[0])), interpolation=cv2.INTER_AREA)
-        scale = wide / lens.width
-        _dots(small, scale * np.nanmedian(view.others, axis=1), 2, UNMEASURED)
-        start, end = (_fixed(scale * (corner + far)) for far in (0, window.width))
-        cv2.rectangle(small, start, end, _PAPER, 1, cv2.LINE_AA, COORDINATE_BITS)
-        gap = max(round(0.02 * px), 1)
-        part = cv2.copyMakeBorder(small, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=_PAPER)
-        drawn[gap : gap + part.shape[0], gap : gap + part.shape[1]] = part
-    return drawn
+    return draw_frame(cut_out(whole, size, window, px, GREY), moved, (), residuals=True)
 
 
 def panel_source(view: OverlayView, px: int) -> str:

@@ -420,7 +420,6 @@ MAX_BANDS = 3
 SAME_LENS_FACTOR = 1.02
 
 _OVER_TIME = ("predicted", "share")
-_ARROW = {"less": " (less is better)", "more": " (more is better)", "": ""}
 _WHAT = {"mpjpe": "from the truth", "reprojection": "from the keypoints in the pictures"}
 
 
@@ -684,10 +683,7 @@ def _other_lenses(pair: Pair) -> bool:
 def draw_comparison(comparison: Comparison) -> list[Figure]:
     """Draw every figure that has data."""
     measure = shown_measure(comparison)
-    figures = [_differences(comparison)] if any(pair.differences for pair in comparison.pairs) else []
-    if measure is not None:
-        figures += [_over_time(comparison, measure), _joint_bars(comparison, measure)]
-    return figures
+    return [] if measure is None else [_over_time(comparison, measure), _joint_bars(comparison, measure)]
 
 
 def shown_measure(comparison: Comparison) -> Measure | None:
@@ -783,38 +779,3 @@ def _joint_bars(comparison: Comparison, measure: Measure) -> Figure:
     return Figure(
         "compare-joints", title, caption, [panels], height, widths=widths, share_x=False, share_y=True
     )
-
-
-def _differences(comparison: Comparison) -> Figure:
-    pairs = comparison.pairs
-    measures = [
-        one
-        for one in MEASURES
-        if any(one.key in pair.differences and pair.differences[one.key].first > 0 for pair in pairs)
-    ]
-    marks = []
-    for p, pair in enumerate(pairs):
-        shift = (p - (len(pairs) - 1) / 2) * 0.7 / len(pairs)
-        rows, values, ends = [], [], []
-        for k, measure in enumerate(measures):
-            found = pair.differences.get(measure.key)
-            if found is None or found.first <= 0:
-                continue
-            scale, interval = 100 / found.first, found.estimate.interval
-            rows.append(k + shift)
-            values.append(scale * found.estimate.value)
-            ends.append(None if interval is None else (scale * interval[0], scale * interval[1]))
-        marks.append(Points(values, rows, _colour_of(comparison, pair.other), pair.other.label, ends))
-    panel = Panel(
-        marks,
-        f"difference from {shortened(comparison.sessions[0].label)} (% of its value)",
-        rows={float(k): f"{one.label}{_ARROW[one.better]}" for k, one in enumerate(measures)},
-        grid="x",
-        zero=True,
-    )
-    caption = (
-        "A point is the paired difference from the first session, relative to that one, its line the 95 % "
-        "interval; a line across zero is within noise."
-    )
-    height = 0.9 + len(measures) * max(0.2, 0.1 * len(pairs))
-    return Figure("compare-differences", "All differences at a glance", caption, [[panel]], height)

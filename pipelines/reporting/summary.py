@@ -36,6 +36,7 @@ from pipelines.reporting.wording import (
     joint_label,
     listing,
     percent,
+    plain,
     plural,
     quantity,
     whole,
@@ -54,14 +55,6 @@ NEVER_TOGETHER_M = 1e9
 # Keypoints below this confidence are left out by `reconstruct` where its record states no other.
 DEFAULT_MIN_CONFIDENCE = 0.3
 
-_NOISE_UNITS = {
-    "position_m": ("", "m"),
-    "rotation_deg": ("", "deg"),
-    "position_m_per_sqrt_s": ("", "m/√s"),
-    "rotation_deg_per_sqrt_s": ("", "deg/√s"),
-    "correlation_s": ("over", "s"),
-    "offset_s": ("", "s"),
-}
 _PCK = "share of joints within 150 mm of truth; missing ones count as wrong"
 _KNOWN_MEASURES = (
     ("mpjpe_mm", "MPJPE", "mm", 1, "mean distance of joints from truth, in the world"),
@@ -442,7 +435,7 @@ def _clock_words(clock: ClockEntry, found_s: float | None) -> str:
 def _stated_noise(camera: CameraRow, poses: pd.DataFrame | None) -> str:
     """Describe the errors of the poses, by flight.yaml or by the log."""
     if camera.entry.pose_noise:
-        return "; ".join(_noise_words(name, model) for name, model in camera.entry.pose_noise.items())
+        return "; ".join(f"{name} {plain(model)}" for name, model in camera.entry.pose_noise.items())
     covariance = logged_covariance(trajectory_from(poses)) if poses is not None else None
     if covariance is not None:
         variances = np.diagonal(covariance, axis1=1, axis2=2)
@@ -451,15 +444,6 @@ def _stated_noise(camera: CameraRow, poses: pd.DataFrame | None) -> str:
         )
         return f"by the log: {_position_and_rotation(position_m, float(np.degrees(rotation_rad)))}"
     return "stands still" if camera.entry.poses.static else "nothing"
-
-
-def _noise_words(name: str, model: dict[str, float | str]) -> str:
-    words = []
-    for key, value in model.items():
-        before, unit = _NOISE_UNITS.get(key, (key.replace("_", " "), ""))
-        stated = f"{value:g}{THIN}{unit}".strip() if isinstance(value, float | int) else str(value)
-        words.append(f"{before} {stated}".strip())
-    return f"{name.replace('_', ' ')} {', '.join(words)}"
 
 
 def _position_and_rotation(position_m: float, rotation_deg: float) -> str:

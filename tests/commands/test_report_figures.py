@@ -36,5 +36,5 @@ def test_figures_of_a_session_and_of_a_comparison(tmp_path: Path, monkeypatch: p
     succeeds("report", session, other, "-o", tmp_path / "page.html", "--figures", both)
     told = json.loads((both / "figures.json").read_text(encoding="utf-8"))
     keys = [each["figure"] for each in told["figures"]]
-    assert keys == ["compare-differences", "compare-time", "compare-joints"]
+    assert keys == ["compare-time", "compare-joints"]
     assert list(told["sessions"]) == ["robust", "dlt"]

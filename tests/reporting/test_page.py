@@ -80,23 +80,23 @@ def test_page_loads_nothing_and_runs_its_own_script_alone(page: str) -> None:
     assert not re.search(r"\beval\(|new Function|innerHTML|fetch\(|import\(|XMLHttpRequest", script)
 
 
-def test_pictures_are_held_by_the_page(content: SessionContent) -> None:
+def test_pictures_are_held_by_the_page(content: SessionContent, page: str) -> None:
     asked = []
 
     def read_frame(camera: str, frame: int) -> NDArray[np.uint8] | None:
         asked.append((camera, frame))
         return None if camera == "mast" else np.full((1080, 1920, 3), 90, dtype=np.uint8)
 
-    page = render_page(content, read_frame)
-    outline = Outline(page)
+    filmed = render_page(content, read_frame)
+    outline = Outline(filmed)
     pictures = [link for link in outline.links if not link.startswith(("#", "data:text/csv;"))]
     assert all(link.startswith("data:image/webp;base64,") for link in pictures)
     assert len(pictures) == MOMENTS * len(CAMERAS)
     assert len(asked) == len(set(asked)) == MOMENTS * len(CAMERAS)
-    assert _policy(page).endswith("; img-src data:")
+    assert _policy(filmed).endswith("; img-src data:")
     # Both pages say why a ground is plain: a picture that is missing, or no video at all.
     assert "there is no picture" in outline.text
-    assert "No video was ingested" in Outline(render_page(content)).text
+    assert "No video was ingested" in Outline(page).text
 
 
 def _policy(page: str) -> str:
@@ -138,7 +138,7 @@ def test_page_of_unknown_joints_and_two_people(content: SessionContent) -> None:
 
 
 HOSTILE = [
-    "\"'><script>alert(1)</script></desc></svg></style></title><img src=x onerror=alert(1)>",
+    "\"'><script>alert(1)</script></desc></svg></style></title><img src=x onerror=alert(1)>"
     '{{ 7 * 7 }} ${x} $a_b^c$ %s &lt;b&gt; &#60;i&#62; id="figure-top" url(#a) #22262a href="#x"',
     "مشي على – 丘 🚁 line\nbreak\ttab\x00nul\x1besc\u202e" + " long" * 40,
 ]

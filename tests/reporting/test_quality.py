@@ -32,9 +32,8 @@ def test_who_states_the_pose_noise_is_said(content: SessionContent) -> None:
     logged[list(COVARIANCE_COLUMNS)] = np.eye(6)[np.triu_indices(6)] * 0.04
     stated = _rows(replace(content, session=described(session), poses=content.poses | {"drone2": logged}))
     white, bias = stated["drone1"][STATED].split("; ")
-    assert white == f"white 0.1{THIN}m, 0.5{THIN}deg"
-    assert bias.startswith("bias")
-    assert bias.endswith(f"body, 0.2{THIN}m")
+    assert white == "white position_m 0.1, rotation_deg 0.5"
+    assert bias == "bias frame body, position_m 0.2"
     assert stated["drone2"][STATED].endswith(f"log: 0.200{THIN}m, {np.degrees(0.2):.2f}{THIN}deg")
     # Nobody states the noise of a camera that stands still, and of one that moves.
     assert stated["mast"][STATED].endswith("still")
