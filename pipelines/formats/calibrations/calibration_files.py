@@ -374,9 +374,9 @@ def _read_camodocal(path: Path) -> Cameras:
         return {name: _stored_camera(path, name, size, matrix, coefficients, fisheye=True)}
     radtan = [storage.number(f"distortion_parameters/{key}") for key in ("k1", "k2", "p1", "p2")]
     xi = storage.number("mirror_parameters/xi")
-    if model == "PINHOLE" or not xi:
+    if model == "PINHOLE" or not xi or not np.diag(matrix).all():
         return {name: _stored_camera(path, name, size, matrix, radtan)}
-    focal, coefficients, off_px = _fisheye_like(size, matrix, radtan, xi)
+    focal, coefficients, off_px = _fisheye_like(size, matrix, radtan, xi) if xi > 0 else (1.0, [], np.inf)
     if not off_px <= MAX_APPROXIMATION_PX:
         problem = f"is a lens (MEI, xi {xi:g}) that no fisheye of ours fits: it is off by {off_px:.1f} px"
         raise DataError(path, problem, "calibrate it as KANNALA_BRANDT", code="unsupported")

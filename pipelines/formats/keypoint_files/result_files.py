@@ -6,7 +6,7 @@ Each format is a line of a table: how its content is recognised, and how its peo
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -280,66 +280,74 @@ def _add_results_of_yolo(people: Gathering, frame: int, picture: object, file: P
         people.add(frame, np.stack(columns, axis=1), where, rank=rank, own_id=track)
 
 
+# --- tables of keypoints with names of the user's own --------------------------------------------------
+
+Points = dict[str, dict[str, int]]
+"""The columns x, y and, if there is one, score of every keypoint of a person."""
+Rows = Iterator[tuple[list[str], list[tuple[list[str], Float]]]]
+
+
+def _people_in(people: Gathering, rows: list[list[str]], first: int, everybody: Sequence[Points]) -> Rows:
+    """Yield each row with the keypoints [K, 3] of everybody in it; a last row that breaks off is counted."""
+    everybody = [{name: at for name, at in points.items() if {"x", "y"} <= at.keys()} for points in everybody]
+    if not all(everybody) or not everybody:
+        raise DataError(people.path, "has no columns x and y", "export it again", code="missing-column")
+    last = max((k for k, row in enumerate(rows) if any(row)), default=0)
+    for k, row in enumerate(rows[first:], start=first):
+        if not any(row):
+            continue
+        try:
+            if len(row) != len(rows[0]):
+                raise ValueError(f"{len(row)} cells instead of {len(rows[0])}")
+            cells = [float(cell or "nan") if cell[:1] in "-.0123456789" else np.nan for cell in row]
+        except ValueError as error:
+            if k < last:
+                raise DataError(people.path, f"line {k + 1}: {error}", "export it again") from error
+            people.dropped["truncated last line"] += 1
+            return
+        yield row, [
+            (
+                [*points],
+                np.array(
+                    [[cells[at["x"]], cells[at["y"]], cells[at["score"]] if "score" in at else 1.0]
+                     for at in points.values()]
+                ),
+            )
+            for points in everybody
+        ]  # fmt: skip
+
+
 # --- DeepLabCut: a table below lines scorer, individuals, bodyparts, coords ----------------------------
 
 _DLC_LINES = ("scorer", "individuals", "bodyparts", "coords")
 
 
 def _is_deeplabcut(head: object) -> bool:
-    lines = str(head).split("\n", 4)
-    labels = [line.partition(",")[0].strip() for line in lines[:4]]
+    labels = [line.partition(",")[0].strip() for line in str(head).split("\n", 4)[:4]]
     return labels[0] == "scorer" and {"bodyparts", "coords"} <= set(labels)
 
 
 def _gather_deeplabcut(people: Gathering) -> None:
     """Add everybody of every row; its frame is its number, or that in the name of a labelled picture."""
     rows = list(csv.reader(read_text(people.path).split("\n")))
-    count = next((k for k, row in enumerate(rows) if not row or row[0].strip() not in _DLC_LINES), len(rows))
-    head = {row[0].strip(): [cell.strip() for cell in row] for row in rows[:count]}
-    first = next((k for k, cell in enumerate(head["coords"]) if cell in {"x", "y"}), 0)
-    if not first or len({len(line) for line in head.values()}) > 1:
-        raise DataError(people.path, "has no columns x and y below `coords`", "export it again")
-    everybody = head.get("individuals", [""] * len(head["coords"]))
-    columns: dict[str, dict[str, dict[str, int]]] = {}
-    for k in range(first, len(head["coords"])):
-        of_person = columns.setdefault(everybody[k], {})
-        of_person.setdefault(head["bodyparts"][k], {})[head["coords"][k]] = k
-    parts = list(next(iter(columns.values())))
-    table = _cells(people, rows[count:], first, len(head["coords"]), count + 1)
-    for name, values in table:
-        frame = people.frame_of(name, str(people.path))
-        for rank, of_person in enumerate(columns.values()):
-            points = np.array(
-                [
-                    [values[at["x"] - first], values[at["y"] - first],
-                     values[at["likelihood"] - first] if "likelihood" in at else 1.0]
-                    for at in (of_person[part] for part in parts if part in of_person)
-                ]
-            )  # fmt: skip
-            if np.isfinite(points[:, :2]).any():
-                people.add_named(frame, parts, points, str(people.path), rank=rank, own_id=rank)
-
-
-def _cells(
-    people: Gathering, rows: Sequence[list[str]], first: int, width: int, line: int
-) -> list[tuple[object, list[float]]]:
-    """Return the name or number of each row, and its numbers; a last row that breaks off is counted."""
-    found: list[tuple[object, list[float]]] = []
-    for number, row in enumerate(rows, start=line):
-        if not any(row):
-            continue
-        try:
-            if len(row) != width:
-                raise ValueError(f"{len(row)} cells instead of {width}")
-            values = [float(cell) if cell.strip() else np.nan for cell in row[first:]]
-        except ValueError as error:
-            if number == line + len(rows) - 1:
-                people.dropped["truncated last line"] += 1
-                continue
-            raise DataError(people.path, f"line {number}: {error}", "export it again") from error
+    head = {row[0].strip(): [cell.strip() for cell in row] for row in rows[:4] if row}
+    kinds = head.get("coords", [])
+    first = next((k for k, kind in enumerate(kinds) if kind in {"x", "y"}), 0)
+    parts, owners = head.get("bodyparts", []), head.get("individuals", [""] * len(kinds))
+    if not first or not len(rows[0]) == len(kinds) == len(parts) == len(owners):
+        problem = "has no lines bodyparts and coords of equal length"
+        raise DataError(people.path, problem, "export it again", code="missing-column")
+    everybody: dict[str, Points] = {}
+    for k in range(first, len(kinds)):
+        kind = "score" if kinds[k] == "likelihood" else kinds[k]
+        everybody.setdefault(owners[k], {}).setdefault(parts[k], {})[kind] = k
+    below = sum(label in _DLC_LINES for label in head)
+    for row, found in _people_in(people, rows, below, list(everybody.values())):
         name = row[first - 1].strip()
-        found.append((int(name) if name.isdecimal() else name, values))
-    return found
+        frame = people.frame_of(int(name) if name.isdecimal() else name, str(people.path))
+        for rank, (names, points) in enumerate(found):
+            if np.isfinite(points[:, :2]).any():
+                people.add_named(frame, names, points, str(people.path), rank=rank, own_id=rank)
 
 
 # --- SLEAP: analysis as CSV, a row for each person in a frame ------------------------------------------
@@ -353,27 +361,20 @@ def _is_sleap(head: object) -> bool:
 def _gather_sleap(people: Gathering) -> None:
     """Add every row: track, frame_idx, instance.score, then x, y and score of each node."""
     rows = list(csv.reader(read_text(people.path).split("\n")))
+    points: Points = {}
+    for k, cell in enumerate(rows[0]):
+        node, _, kind = cell.strip().rpartition(".")
+        if node != "instance" and kind in {"x", "y", "score"}:
+            points.setdefault(node, {})[kind] = k
     head = {cell.strip(): k for k, cell in enumerate(rows[0])}
-    nodes = [cell.removesuffix(".x") for cell in head if cell.endswith(".x") and f"{cell[:-1]}y" in head]
+    if "frame_idx" not in head:
+        raise DataError(people.path, "has no column frame_idx", "export it again", code="missing-column")
     tracks: dict[str, int] = {}
-    for number, row in enumerate(rows[1:], start=2):
-        if not any(row):
-            continue
-        where = f"{people.path}, line {number}"
-        try:
-            frame = people.frame_of(int(row[head["frame_idx"]]), where)
-            points = np.array(
-                [
-                    [float(row[head[f"{node}.{axis}"]] or "nan") if f"{node}.{axis}" in head else 1.0
-                     for axis in ("x", "y", "score")]
-                    for node in nodes
-                ]
-            )  # fmt: skip
-        except (ValueError, IndexError) as error:
-            raise DataError(where, f"is no row of numbers ({error})", "export it again") from error
-        track = row[head["track"]].strip() if "track" in head else ""
+    for row, [(names, found)] in _people_in(people, rows, 1, [points]):
+        number, track = row[head["frame_idx"]], row[head["track"]].strip() if "track" in head else ""
+        frame = people.frame_of(int(number) if number.isdecimal() else number, str(people.path))
         own_id = tracks.setdefault(track, len(tracks)) if track else None
-        people.add_named(frame, nodes, points, where, own_id=own_id)
+        people.add_named(frame, names, found, str(people.path), own_id=own_id)
 
 
 OPENPOSE = KeypointFile("openpose", "OpenPose keypoints", _is_frame, _gather_openpose)

@@ -316,7 +316,8 @@ def _bones(path: Path, words: list[str]) -> list[_FileBone]:
                     bones[-1].end = offset
             case "CHANNELS" if above and above[-1] == len(bones) - 1 and not bones[-1].channels:
                 count = next(coming, "")
-                named = [next(coming, "").lower() for _ in range(int(count) if count.isdecimal() else 0)]
+                several = int(count) if count.isdecimal() and len(count) < 3 else 0
+                named = [next(coming, "").lower() for _ in range(several)]
                 places = [channel for channel in named if channel.endswith("position")]
                 if not named or set(named) - {*_CHANNELS} or len(set(places)) < len(places):
                     raise _damaged(path, f"CHANNELS {count} {' '.join(named)[:60]} make no sense")
