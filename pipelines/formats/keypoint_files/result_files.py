@@ -343,8 +343,7 @@ def _gather_deeplabcut(people: Gathering) -> None:
         everybody.setdefault(owners[k], {}).setdefault(parts[k], {})[kind] = k
     below = sum(label in _DLC_LINES for label in head)
     for row, found in _people_in(people, rows, below, list(everybody.values())):
-        name = row[first - 1].strip()
-        frame = people.frame_of(int(name) if name.isdecimal() else name, str(people.path))
+        frame = people.frame_of(row[first - 1].strip(), str(people.path))
         for rank, (names, points) in enumerate(found):
             if np.isfinite(points[:, :2]).any():
                 people.add_named(frame, names, points, str(people.path), rank=rank, own_id=rank)
@@ -371,8 +370,8 @@ def _gather_sleap(people: Gathering) -> None:
         raise DataError(people.path, "has no column frame_idx", "export it again", code="missing-column")
     tracks: dict[str, int] = {}
     for row, [(names, found)] in _people_in(people, rows, 1, [points]):
-        number, track = row[head["frame_idx"]], row[head["track"]].strip() if "track" in head else ""
-        frame = people.frame_of(int(number) if number.isdecimal() else number, str(people.path))
+        track = row[head["track"]].strip() if "track" in head else ""
+        frame = people.frame_of(row[head["frame_idx"]].strip(), str(people.path))
         own_id = tracks.setdefault(track, len(tracks)) if track else None
         people.add_named(frame, names, found, str(people.path), own_id=own_id)
 
