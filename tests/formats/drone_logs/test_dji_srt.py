@@ -134,28 +134,6 @@ def test_where_a_gimbal_looks(
     np.testing.assert_allclose(rotate(turned, np.array([0, 0, 1.0])), up, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("text", "stated", "height", "metres"),
-    [
-        ("[altitude: 27.3]", None, "take-off", 27.3),
-        ("[altitude: 27.3]", "relative", "take-off", 27.3),
-        ("[altitude: 27.3]", "absolute", "unknown", 27.3),
-        ("[altitude: 501.0]", None, "unknown", 501),  # DJI's drones climb 500 m at most
-        ("[altitude: 501.0]", "relative", "take-off", 501),
-        ("[rel_alt: 3.5] [altitude: 480.0]", None, "take-off", 3.5),
-        ("[rel_alt: 3.5] [altitude: 480.0]", "absolute", "unknown", 480),
-        ("[altitude: 3.5] [abs_alt: 480.0]", "relative", "take-off", 3.5),
-        ("[altitude: 3.5] [abs_alt: 480.0]", None, "unknown", 480),
-    ],
-)
-def test_an_altitude_that_names_no_reference(
-    tmp_path: Path, text: str, stated: str | None, height: str, metres: float
-) -> None:
-    path = subtitles(tmp_path / "a.srt", *[f"[latitude: 47.5] [longitude: 8.25] {text}"] * 2)
-    track = read(path, altitude=stated).position
-    assert (track.height, track.values[0, 2]) == (height, metres)
-
-
 def test_losses_are_counted(tmp_path: Path) -> None:
     good = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]"
     path = subtitles(

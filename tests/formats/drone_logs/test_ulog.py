@@ -121,16 +121,6 @@ def test_triggers(tmp_path: Path, truth: DroneTruth) -> None:
         FORMAT.picture_times(path, TelemetryChoice())
 
 
-def test_damage(tmp_path: Path, truth: DroneTruth) -> None:
-    whole = write_ulog(tmp_path / "a.ulg", ulog_rows(truth)).read_bytes()
-    cut = tmp_path / "cut.ulg"
-    cut.write_bytes(whole[: len(whole) * 2 // 3])
-    assert 5 < len(read(cut).position.t_ns) < len(truth.t_ns)
-    cut.write_bytes(whole[:12])
-    with refuses(cut):
-        read(cut)
-
-
 def test_definitions_that_unfold_without_end_are_refused(tmp_path: Path) -> None:
     head = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
     nested = [f"m{k}:m{k + 1}[60000] a;" for k in range(8)] + ["m8:float[60000] a;"]

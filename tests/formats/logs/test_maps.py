@@ -111,24 +111,6 @@ def test_octomap_is_that_of_its_file(tmp_path: Path, container: Container) -> No
     assert (found.only.from_ns, found.dropped) == (T0, {})
 
 
-@pytest.mark.parametrize("binary", [True, False])
-def test_octomap_of_octomap_itself(tmp_path: Path, binary: bool) -> None:
-    """Read trees that OctoMap's own library made and wrote."""
-    pyoctomap = pytest.importorskip("pyoctomap")
-    tree = pyoctomap.OcTree(0.25)
-    hits = np.array([[1.1, -2.3, 0.6], [1.4, -2.3, 0.6], [-3.0, 4.0, 1.1]])
-    for point in hits:
-        tree.updateNode(point, True)
-    tree.updateNode(np.array([0.1, 0.1, 0.1]), False)
-    path = tmp_path / ("a.bt" if binary else "a.ot")
-    assert (tree.writeBinary if binary else tree.write)(str(path))
-    one = Read(tmp_path, [octomap_entry(path.read_bytes(), T0)]).only
-    index = np.floor((hits - one.origin) / 0.25).astype(int)
-    assert int((one.probability >= 0.5).sum()) == 3
-    assert (one.probability[*index.T] >= 0.5).all()
-    assert int((one.probability < 0.5).sum()) == 1
-
-
 def test_maps_that_follow_each_other(tmp_path: Path) -> None:
     first, second = (as_bt(box(p), tmp_path / "site") for p in (0.971, 0.1192))
     files = [first, first, second, second, second, first]

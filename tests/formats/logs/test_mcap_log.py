@@ -18,7 +18,6 @@ from pipelines.formats.logs.recordings import (
     TAIL,
     TRUNCATED,
     UNCLOSED,
-    UNDEFINED,
 )
 from pipelines.session.errors import DataError
 from tests.formats.log_entries import (
@@ -114,38 +113,6 @@ def test_a_type_of_the_user_is_decoded_by_its_definition(tmp_path: Path) -> None
     with log_format(path).open_log([path]) as log:
         (value,) = (m.value for m in log.messages(["/t"]))
     assert (value.inner.range.tolist(), value.mode) == ([0.0, 1.0], 7)
-
-
-@pytest.mark.parametrize(
-    ("encoding", "schema", "reason"),
-    [
-        (
-            "cdr",
-            ("my_msgs/msg/A", "ros2msg", b"my_msgs/Missing b\n"),
-            "does not define 'my_msgs/msg/Missing'",
-        ),
-        (
-            "cdr",
-            ("my_msgs/msg/A", "ros2msg", b"my_msgs/A again\n"),
-            "definition of my_msgs/msg/A cannot be used",
-        ),
-        ("cdr", ("my_msgs/msg/A", "ros2msg", b"string[99999999] s\n"), "s has 99999999 entries"),
-        ("cdr", ("my_msgs/msg/A", "ros2msg", b"\xff\xfe"), "definition of my_msgs/msg/A cannot be used"),
-        ("cdr", ("A\nimport os", "ros2msg", b"uint8 a\n"), "is no type of ROS"),
-        ("cdr", None, "'' is no type of ROS"),
-        ("protobuf", ("a.B", "protobuf", b"\xff\xff"), "definition of a.B cannot be used"),
-        ("protobuf", ("a.B", "protobuf", b""), "definition of a.B cannot be used"),
-        ("flatbuffer", ("a.B", "flatbuffer", b""), "messages in encoding 'flatbuffer' are not read"),
-    ],
-)
-def test_definitions_that_cannot_be_used(
-    tmp_path: Path, encoding: str, schema: tuple[str, str, bytes] | None, reason: str
-) -> None:
-    path = raw_mcap(tmp_path / "a.mcap", encoding, schema, bytes(40), bytes(40))
-    assert everything(path) == ([], {UNDEFINED: 2})
-    topics = log_format(path).describe(path)["topics"]
-    assert isinstance(topics, dict)
-    assert reason in topics["/t"][PROBLEM]
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])

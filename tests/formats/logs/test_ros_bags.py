@@ -16,7 +16,7 @@ from pipelines.formats.logs.recordings import (
     TRUNCATED,
     UNCLOSED,
 )
-from pipelines.formats.logs.ros2_bag import BAD_METADATA, MISSING_FILES, NOT_IN_FILES
+from pipelines.formats.logs.ros2_bag import MISSING_FILES, NOT_IN_FILES
 from tests.formats.log_entries import (
     OTHER,
     PICTURE,
@@ -29,7 +29,6 @@ from tests.formats.log_entries import (
     positions,
     recognised_by,
 )
-from tests.formats.refusals import refuses
 from tests.synthetic.logs import (
     CONTAINERS,
     ROS2,
@@ -114,24 +113,6 @@ def test_a_missing_part_costs_its_messages_and_is_said(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        "",
-        "{[",
-        "rosbag2_bagfile_information: 3",
-        "rosbag2_bagfile_information:\n  relative_file_paths: [bag.db3]",
-        "rosbag2_bagfile_information:\n  relative_file_paths: [bag.db3]\n  message_count: 1\n"
-        f"  starting_time: {{nanoseconds_since_epoch: 1}}\n  duration: {{nanoseconds: 1{'0' * 400}}}",
-    ],
-)
-def test_a_damaged_metadata_file_is_said_and_not_needed(tmp_path: Path, content: str) -> None:
-    path = write_ros2(tmp_path / "bag", FLIGHT)
-    (path / "bag.db3").rename(path / "bag_0.db3")
-    (path / "metadata.yaml").write_text(content, encoding="utf-8")
-    assert everything(path) == (ALL, {BAD_METADATA: 1})
-
-
 def test_metadata_cannot_name_files_outside_the_bag(tmp_path: Path) -> None:
     write_ros2(tmp_path / "other", FLIGHT)
     path = write_ros2(tmp_path / "bag", FLIGHT[:10])
@@ -205,14 +186,6 @@ def test_messages_in_the_write_ahead_log_are_read(tmp_path: Path, unmerged: bool
     assert (lost / "a_0.db3").read_bytes() == before
     assert sorted(each.name for each in lost.iterdir()) == ["a_0.db3", "a_0.db3-wal"]
     target.close()
-
-
-def test_a_pointer_of_git_lfs_is_named(tmp_path: Path) -> None:
-    path = write_ros2(tmp_path / "bag", FLIGHT)
-    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 16384\n"
-    (path / "bag.db3").write_bytes(pointer)
-    with refuses(path / "bag.db3", "LFS", 16384):
-        positions(path)
 
 
 def test_big_endian_messages(tmp_path: Path) -> None:

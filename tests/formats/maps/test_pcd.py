@@ -32,31 +32,6 @@ def literals(content: bytes) -> bytes:
     return b"".join(bytes([len(run) - 1]) + run for run in runs)
 
 
-def squeezed(content: bytes) -> bytes:
-    """Pack as LZF that repeats the longest earlier match in reach, found by brute force."""
-    packed, at = bytearray(), 0
-    while at < len(content):
-        best, back = 0, 0
-        for distance in range(1, min(at, 8192) + 1):
-            length = 0
-            while (
-                length < 264
-                and at + length < len(content)
-                and content[at + length - distance] == content[at + length]
-            ):
-                length += 1
-            if length > best:
-                best, back = length, distance
-        if best < 3:
-            packed += bytes([0, content[at]])
-            at += 1
-            continue
-        high, low = divmod(back - 1, 256)
-        packed += bytes([(best - 2) << 5 | high, low] if best < 9 else [7 << 5 | high, best - 9, low])
-        at += best
-    return bytes(packed)
-
-
 def unpacked(packed: bytes, size: int) -> bytes | None:
     target = np.zeros(size, dtype=np.uint8)
     written = decompress(np.frombuffer(packed, np.uint8), target)
@@ -91,7 +66,7 @@ def write(path: Path, encoding: str, points: Float = clouds.POINTS) -> Path:
     else:
         assert records.dtype.names is not None
         content = b"".join(records[name].tobytes() for name in records.dtype.names)
-        packed = squeezed(content)
+        packed = literals(content)
         body = struct.pack("<II", len(packed), len(content)) + packed
     path.write_bytes(head + body)
     return path

@@ -17,7 +17,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.geometry.poses import look_at
 from pipelines.simulation.flight_files import write_tum
-from tests.commands.runner import refused, succeeds
+from tests.commands.runner import succeeds
 from tests.keypoints.spotted_flights import FPS, write_pictures
 
 START_S = 1_700_000_000
@@ -97,20 +97,3 @@ def test_a_video_begins_when_its_pictures_turn_as_the_poses_do(filmed: Path) -> 
     assert 1e-5 < sigma_s < 2e-3
     assert abs(error_s) < 4 * sigma_s + 1e-3  # the same test with formulas alone allows 1 ms
     assert any("motion" in line for line in described["warnings"])
-
-
-def test_a_start_that_is_known_roughly_is_refined(filmed: Path, tmp_path: Path) -> None:
-    manifest = (filmed / "flight.yaml").read_text(encoding="utf-8").replace("drone1.", f"{filmed}/drone1.")
-    path = tmp_path / "flight.yaml"
-    for off_s in (-0.5, 3.0):
-        stated = f"{{start: {START_S + BEGINS_S + off_s}, start_from: motion}}"
-        path.write_text(manifest.replace("{start_from: motion}", stated))
-        if abs(off_s) > 1:
-            line = refused("ingest", path)
-            assert "-3.00 s" in line
-            assert "1 s" in line
-            continue
-        succeeds("ingest", path)
-        described = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
-        frames = described["cameras"]["drone1"]["frames"]
-        assert frames["first_t_ns"] / 1e9 == pytest.approx(START_S + BEGINS_S, abs=0.01)

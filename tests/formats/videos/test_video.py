@@ -203,16 +203,6 @@ def test_a_cut_mp4_is_salvaged_and_its_losses_are_counted(tmp_path: Path, share:
     assert [value for key, value in described.items() if key.startswith("dropped")] == [60 - count]
 
 
-@pytest.mark.parametrize("suffix", [".mkv", ".ts"])
-def test_other_containers_are_read_as_far_as_they_go(tmp_path: Path, suffix: str) -> None:
-    path = write_video(tmp_path / f"v{suffix}", even_ticks(60), b_frames=0)
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) * 2 // 3])
-    numbers = [(number, read_bar_code(picture)) for number, picture in frames(path)]
-    assert 20 < len(numbers) < 50
-    assert numbers == [(k, k) for k in range(len(numbers))]
-
-
 @pytest.mark.parametrize(
     ("suffix", "codec"),
     [
@@ -400,8 +390,3 @@ def test_black_bars_are_counted_to_a_pixel(tmp_path: Path, bars: tuple[int, int,
         return picture
 
     assert black_bars(write_video(tmp_path / "v.mp4", even_ticks(9), draw=draw)) == bars
-
-
-def test_the_real_letterboxed_videos() -> None:
-    for name, rows in (("cam01", 7), ("cam02", 7), ("cam03", 0)):
-        assert black_bars(real_data(f"pose2sim_single/videos/{name}.mp4")) == (0, rows, 0, rows)
