@@ -86,7 +86,6 @@ def attitude_track(
     quaternion_xyzw: Float,
     dropped: MutableMapping[str, int],
     *,
-    relative_to: RelativeTo = "world",
     stated: Mapping[RelativeTo, Float] | None = None,
 ) -> AttitudeTrack | None:
     """Drop the attitudes that cannot be used, counted as "attitude ..."; return None if none is left.
@@ -94,9 +93,8 @@ def attitude_track(
     Args:
         name: name of the attitude in the log.
         t_ns: [N] stamps.
-        quaternion_xyzw: [N, 4] of an FLU body in an ENU world, or of an FLU gimbal in an FLU body.
+        quaternion_xyzw: [N, 4] of an FLU body or gimbal in an ENU world.
         dropped: receives the counts.
-        relative_to: reference of the quaternions, world or body.
         stated: of a gimbal, its angles as the log gives them, as in `AttitudeTrack`.
     """
     with np.errstate(over="ignore", invalid="ignore"):
@@ -112,7 +110,7 @@ def attitude_track(
     for cause, count in found.items():
         dropped[cause] = dropped.get(cause, 0) + count
     of_kept = {reference: angles[keep] / norm[keep, None] for reference, angles in (stated or {}).items()}
-    return AttitudeTrack(name, t_ns[keep], quaternion_xyzw[keep] / norm[keep, None], relative_to, of_kept)
+    return AttitudeTrack(name, t_ns[keep], quaternion_xyzw[keep] / norm[keep, None], "world", of_kept)
 
 
 def turned_as_stated(yaw_pitch_roll_deg: Float, *, relative_to: RelativeTo = "world") -> Float:

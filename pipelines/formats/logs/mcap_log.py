@@ -68,8 +68,6 @@ class McapLog:
 class McapPart(ChunkedPart):
     """MCAP file. Messages outside chunks are handled as uncompressed chunks."""
 
-    record_overhead = _MESSAGE_HEAD.size
-
     def walk(self) -> tuple[int, bool]:
         """Walk the records up to the end of the file or to the first incomplete one."""
         if self.bytes_at(0, len(_MAGIC)) != _MAGIC:

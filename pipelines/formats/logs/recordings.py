@@ -85,12 +85,10 @@ class MessageTable:
     stamp_ns: Int64  # of receipt
     block: Int64  # block that must be read as a whole; 0 if there are no blocks
     place: Int64  # within the block
-    size: Int64  # bytes, uncompressed; bytes between two messages count to the first of them
 
     def rows(self, which: Int64 | Bool) -> MessageTable:
         """Return some rows."""
-        columns = (self.channel, self.stamp_ns, self.block, self.place, self.size)
-        return MessageTable(*(column[which] for column in columns))
+        return MessageTable(self.channel[which], self.stamp_ns[which], self.block[which], self.place[which])
 
 
 class LogPart(ABC):
@@ -103,7 +101,7 @@ class LogPart(ABC):
         self.storage: list[str] = []  # kinds of storage, for `mocap info`
         self.lost: Counter[str] = Counter()  # losses of the file as a whole
         none = np.zeros(0, np.int64)
-        self.table = MessageTable(none, none, none, none, none)
+        self.table = MessageTable(none, none, none, none)
         self.received_ns = none  # [M] stamps of receipt, without steps of the recorder's clock
         self._fates: dict[int, str] = {}  # cause of loss, by row of the table
         self._rows: dict[int, Int64] = {}  # of each channel, in the order of the file
@@ -192,8 +190,6 @@ class Content:
 
 class ChunkedPart(LogPart):
     """File of chunks. A format walks its records, searches chunks and finds a message's bytes."""
-
-    record_overhead: int  # bytes of a message's record besides the message
 
     def __init__(self, path: Path) -> None:
         self.file, file_size = open_file(path)
@@ -345,12 +341,8 @@ class ChunkedPart(LogPart):
         block = np.concatenate([*blocks, np.zeros(0, np.int64)])
         rows = np.concatenate([*(part for c in self.chunks for part in c.index), np.zeros((0, 3), np.int64)])
         order = np.lexsort((rows[:, 2], block))
-        block, rows = block[order], rows[order]
-        ends = np.array([min(chunk.size, CHUNK_LIMIT) for chunk in self.chunks], np.int64)[block]
-        same_block = np.append(block[1:] == block[:-1], False) if len(block) else np.zeros(0, bool)
-        next_place = np.where(same_block, np.roll(rows[:, 2], -1), ends)
-        size = np.maximum(next_place - rows[:, 2] - self.record_overhead, 0)
-        return MessageTable(rows[:, 0], rows[:, 1], block, rows[:, 2], size)
+        rows = rows[order]
+        return MessageTable(rows[:, 0], rows[:, 1], block[order], rows[:, 2])
 
 
 def inflated_limit(file_size: int) -> int:
@@ -428,12 +420,11 @@ class OpenLog:
         return facts | {f"dropped: {cause}": count for cause, count in self.dropped.items()}
 
     def _described(self, topic: Topic) -> dict[str, object]:
-        schemas, stamps, size_bytes = self._messages_of(topic.name, topic.type, topic.encoding)
+        schemas, stamps = self._messages_of(topic.name, topic.type, topic.encoding)
         facts: dict[str, object] = {
             "type": topic.type,
             "encoding": topic.encoding,
             "messages": topic.count,
-            "size_bytes": size_bytes,
         }
         if topic.first_ns is not None and topic.last_ns is not None:
             span_ns = topic.last_ns - topic.first_ns
@@ -449,14 +440,15 @@ class OpenLog:
                 break
         return facts
 
-    def _messages_of(self, *key: str) -> tuple[list[Schema], Int64, int]:
-        """Return the schemas of a topic, each once, its stamps of receipt, sorted, and its size in bytes."""
-        numbers = [[n for n, channel in part.channels.items() if channel.key == key] for part in self.parts]
-        pairs = list(zip(self.parts, numbers, strict=True))
-        schemas = dict.fromkeys(part.channels[n].schema for part, own in pairs for n in own)
-        rows = [(part, part.rows_of(own)) for part, own in pairs]
-        stamps = np.sort(np.concatenate([part.received_ns[own] for part, own in rows]))
-        return list(schemas), stamps, sum(int(part.table.size[own].sum()) for part, own in rows)
+    def _messages_of(self, *key: str) -> tuple[list[Schema], Int64]:
+        """Return the schemas of a topic, each once, and its stamps of receipt, sorted."""
+        schemas: dict[Schema, None] = {}
+        stamps = [np.zeros(0, np.int64)]
+        for part in self.parts:
+            own = [number for number, channel in part.channels.items() if channel.key == key]
+            schemas |= dict.fromkeys(part.channels[number].schema for number in own)
+            stamps.append(part.received_ns[part.rows_of(own)])
+        return list(schemas), np.sort(np.concatenate(stamps))
 
     def take_out(self, part: LogPart, row: int, step_ns: int) -> None:
         """Take a step of the recorder's clock out of the stamps of receipt, from a row of a part on."""
@@ -500,7 +492,7 @@ class OpenLog:
                 yield Message(topic, stamps[k], value)
 
     def _summary(self, name: str, type_: str, encoding: str) -> Topic:
-        _, stamps, _ = self._messages_of(name, type_, encoding)
+        _, stamps = self._messages_of(name, type_, encoding)
         first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
         return Topic(name, type_, encoding, len(stamps), first, last)
 

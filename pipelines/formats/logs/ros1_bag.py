@@ -52,8 +52,6 @@ class Ros1Bag:
 
 
 class _Bag(ChunkedPart):
-    record_overhead = 46  # lengths of header and message, and the header's fields op, conn and time
-
     def walk(self) -> tuple[int, bool]:
         """Walk the records up to the end of the file or to the first incomplete one."""
         position, chunks_stated = self._bag_header()

@@ -335,28 +335,28 @@ class Sqlite3Part(LogPart):
         query = (
             "SELECT rowid AS place, CASE typeof(timestamp) WHEN 'integer' "
             "THEN ifnull(CAST(topic_id AS INTEGER), -1) ELSE -1 END AS topic, "
-            "ifnull(CAST(timestamp AS INTEGER), 0) AS stamp, ifnull(length(data), 0) AS size "
+            "ifnull(CAST(timestamp AS INTEGER), 0) AS stamp "
             "FROM messages WHERE rowid > ? ORDER BY rowid"
         )
         numbers = array("q")
         # Pages of a damaged file can form a loop and give rows without end.
-        most = 4 * (self.file_size // _SMALLEST_ROW)
+        most = 3 * (self.file_size // _SMALLEST_ROW)
         whole, attempts, last, step = False, 0, -1, 1
         while not whole and last < _LARGEST_ROWID and attempts < _MOST_ATTEMPTS:
             attempts += 1
             begin = len(numbers)
             whole = self._take_rows(query, last, numbers, most)
             if len(numbers) > begin:
-                last, step = numbers[-4], 1
+                last, step = numbers[-3], 1
             if not whole:
                 # A page is missing or damaged: continue after it, in growing steps.
                 self.lost[GAPS] += step == 1
                 last, step = last + step, 2 * step
-        rows = np.array(numbers, np.int64).reshape(-1, 4)
-        return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0], rows[:, 3])
+        rows = np.array(numbers, np.int64).reshape(-1, 3)
+        return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0])
 
     def _take_rows(self, query: str, last: int, numbers: array[int], most: int) -> bool:
-        """Append rows of four numbers; the first must rise from `last` on. Return True if that was all."""
+        """Append rows of three numbers; the first must rise from `last` on. Return True if that was all."""
         try:
             found = self.database.execute(query, (last,))
             while len(numbers) < most:
@@ -365,14 +365,14 @@ class Sqlite3Part(LogPart):
                     # Rows that were read before an error stay.
                     numbers.extend(chain.from_iterable(islice(found, _BATCH)))
                 finally:
-                    risen = np.diff(np.array(numbers[begin::4], np.int64), prepend=last) > 0
+                    risen = np.diff(np.array(numbers[begin::3], np.int64), prepend=last) > 0
                     taken = len(risen) if risen.all() else int(np.argmin(risen))
-                    del numbers[begin + 4 * taken :]
+                    del numbers[begin + 3 * taken :]
                 if taken < len(risen):
                     return False
                 if not taken:
                     return True
-                last = numbers[-4]
+                last = numbers[-3]
         except _UNREADABLE:
             pass
         return False
