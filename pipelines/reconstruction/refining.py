@@ -75,8 +75,9 @@ _FEWEST_LIMBS = 6
 _WORST = 75.0
 # People whose squared residuals exceed the first person's by this factor are doubted.
 _LARGEST_RATIO = 2.0
-# A window of this length and so many keypoints takes less than 1 GB.
+# The joint estimate of three minutes of two cameras takes less than 1 GB.
 MAX_WINDOW_S = 180.0
+# Memory grows with the keypoints, and these take less than 1 GB.
 MAX_KEYPOINTS = 280_000
 # The levels of errors cannot be learned from a shorter window, however many keypoints it has.
 MIN_WINDOW_S = 30.0
@@ -118,7 +119,7 @@ class RobustFlight:
     waiting: Waiting | None = None  # where the arrays wait meanwhile
 
     @cached_property
-    def windows(self) -> list[Window]:
+    def windows(self) -> list[FlightWindow]:
         """Windows of the flight; some of them to find clocks."""
         _, people, joints, cameras = self.observations.confidence.shape
         windows = windows_of(self.t_s, people * joints * cameras)
@@ -506,7 +507,7 @@ def _numbers_at(correction: tuple[Float, Float], t_s: Float) -> Float:
 
 
 @dataclass(frozen=True)
-class Window:
+class FlightWindow:
     """A stretch of a flight."""
 
     first: int  # of the skeleton's times
@@ -519,7 +520,7 @@ class Window:
         return _risen(t_s - self.begin_s) * (1.0 - _risen(t_s - self.end_s))
 
 
-def windows_of(t_s: Float, keypoints: int) -> list[Window]:
+def windows_of(t_s: Float, keypoints: int) -> list[FlightWindow]:
     """Divide the skeleton's times [T] into windows of equal length; a short flight is one.
 
     Args:
@@ -535,11 +536,11 @@ def windows_of(t_s: Float, keypoints: int) -> list[Window]:
     found = []
     for begin_s, end_s in pairwise(edges.tolist()):
         first, stop = np.searchsorted(t_s, (begin_s - reach_s, end_s + reach_s)).tolist()
-        found.append(Window(first, stop, begin_s, end_s))
+        found.append(FlightWindow(first, stop, begin_s, end_s))
     return found
 
 
-def spread(windows: Sequence[Window]) -> list[Window]:
+def spread(windows: Sequence[FlightWindow]) -> list[FlightWindow]:
     """Choose the windows that determine the clocks."""
     rows = np.linspace(0, len(windows) - 1, min(CLOCK_WINDOWS, len(windows))).round().astype(int)
     return [windows[row] for row in rows.tolist()]
@@ -557,7 +558,7 @@ class _Order:
     clock_sigma_s: Float
     measured: bool
 
-    def within(self, window: Window) -> _Order:
+    def within(self, window: FlightWindow) -> _Order:
         """Take the data of a window."""
         own = slice(window.first, window.stop)
         t_s = self.t_s[own]
@@ -580,7 +581,7 @@ def refine_in_windows(
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
     *,
-    windows: Sequence[Window],
+    windows: Sequence[FlightWindow],
     measured: bool = False,
     workers: int = 1,
     executor: Executor | None = None,
@@ -633,7 +634,7 @@ class _Joined:
         self._frames = [sighting.t_s for sighting in whole.sightings]
         self._numbers = [np.zeros((len(frames), 11)) for frames in self._frames]  # and their weight
 
-    def add(self, window: Window, found: Refined) -> None:
+    def add(self, window: FlightWindow, found: Refined) -> None:
         """Add the result of a window, unless it was refused."""
         if found.fallback is not None:
             return
