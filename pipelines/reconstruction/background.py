@@ -671,10 +671,6 @@ class _Stretch:
 
         A picture that was taken later than its stamp shows a camera that has turned farther than the log's.
         The position tells nothing of a clock: the background does not show where the whole path lies.
-
-        Args:
-            rotation: [T, 3, 3] as estimated.
-            prior: of the errors.
         """
         design = np.zeros((len(rotation), 6, len(_sigma_of_constants(prior))))
         design[:, :3, :3] = design[:, 3:, 3:6] = np.eye(3)
@@ -1096,30 +1092,4 @@ def _entry(found: Adjusted) -> dict[str, Any]:
             "log": float(np.degrees(prior.level[1])),
             "background": float(np.degrees(np.sqrt(np.median(turn)))) if used else None,
         },
-        "levels": {
-            "estimated": prior.estimated,
-            "white": _m_deg(prior.white),
-            "constant": _m_deg(prior.constant[:2]),
-            "slow": [_described(process) for process in prior.slow if process.rate or process.sigma0 > EXACT],
-        },
-        "left": None if found.left is None else _left(found.left),
-    }
-
-
-def _left(left: PoseErrors) -> dict[str, Any]:
-    """Describe the errors that remain."""
-    return {"white": _m_deg(left.white), "processes": [_described(process) for process in left.processes]}
-
-
-def _m_deg(sigma: tuple[float, float]) -> dict[str, float]:
-    return {"m": sigma[0], "deg": float(np.degrees(sigma[1]))}
-
-
-def _described(process: Process) -> dict[str, Any]:
-    """Describe an error over time: its standard deviation, its drift in a second, its memory."""
-    unit, scale = ("deg", np.degrees(1.0)) if process.number == ROTATION else ("m", 1.0)
-    return {
-        unit: float(scale * process.sigma0),
-        f"{unit}_per_sqrt_s": float(scale * process.rate),
-        "correlation_s": process.correlation_s if np.isfinite(process.correlation_s) else None,
     }

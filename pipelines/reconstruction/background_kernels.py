@@ -14,6 +14,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.compilation import cached, helper
+from pipelines.reconstruction.refinement.kernels import backward, factorise, forward
 
 # A direction of unit length with a smaller depth is not in front of the camera.
 _BEHIND = 0.05
@@ -89,19 +90,6 @@ def _hold(normal: Float) -> None:
 
 
 @helper
-def _factor3(a: Float) -> None:
-    """Replace a symmetric 3x3 matrix by its lower Cholesky factor."""
-    for j in range(3):
-        for k in range(j):
-            a[j, j] -= a[j, k] * a[j, k]
-        a[j, j] = math.sqrt(a[j, j])
-        for i in range(j + 1, 3):
-            for k in range(j):
-                a[i, j] -= a[i, k] * a[j, k]
-            a[i, j] /= a[j, j]
-
-
-@helper
 def _point_equations(
     n: int,
     seen: BackgroundSightings,
@@ -139,23 +127,7 @@ def _point_equations(
                 for k in range(3):
                     normal[i, k] += weight * by_point[a, i] * by_point[a, k]
     _hold(normal)
-    _factor3(normal)
-
-
-@helper
-def _solve3(factor: Float, force: Float) -> Float:
-    """Solve by a lower Cholesky factor."""
-    step = np.zeros(3)
-    for i in range(3):
-        step[i] = force[i]
-        for k in range(i):
-            step[i] -= factor[i, k] * step[k]
-        step[i] /= factor[i, i]
-    for i in range(2, -1, -1):
-        for k in range(i + 1, 3):
-            step[i] -= factor[k, i] * step[k]
-        step[i] /= factor[i, i]
-    return step
+    factorise(normal)
 
 
 @helper
@@ -180,21 +152,13 @@ def eliminate_points(
     missed: Float,
     kept: Float,
 ) -> None:
-    """Add the sightings to the normal equations of the poses, the points eliminated.
+    """Add the sightings to the normal equations of the poses, `band` and `force`; eliminate the points.
 
-    Args:
-        seen: the sightings.
-        points: where they are.
-        place: [T, 3] m.
-        turned: [T, 3, 3] world_from_camera.
-        loss: standard deviations at which a sighting counts half.
-        prior: [2] mean and precision of the inverse depth (1/m, m^2).
-        settle: times that a point is moved before to where the cameras see it, their poses held.
-        offset: [T] first of each picture's six unknowns.
-        band: [n, width] is added to.
-        force: [n] is added to.
-        missed: [K] receives the residuals in standard deviations; NaN behind the camera.
-        kept: [N, 12] receives each point's Cholesky factor (9) and whitened force (3).
+    `place` and `turned` are world_from_camera. A sighting counts half at `loss` standard deviations.
+    `prior` is mean and precision of an inverse depth. Before, points are moved `settle` times to where
+    the cameras see them. `offset` is the first of each picture's six unknowns. `missed` [K] receives the
+    residuals in standard deviations, NaN behind the camera; `kept` [N, 12] each point's Cholesky factor
+    and whitened force.
     """
     longest = 0
     for n in range(len(seen.first) - 1):
@@ -205,7 +169,9 @@ def eliminate_points(
         normal, pull = np.zeros((3, 3)), np.zeros(3)
         for _ in range(settle):
             _point_equations(n, seen, points, place, turned, loss, prior, normal, pull)
-            _move(points, n, _solve3(normal, pull))
+            forward(normal, pull)
+            backward(normal, pull)
+            _move(points, n, pull)
         _point_equations(n, seen, points, place, turned, loss, prior, normal, pull)
         for s in range(start, stop):
             t = seen.picture[s]
@@ -236,20 +202,14 @@ def eliminate_points(
                     for k in range(i + 1):
                         band[at + k, i - k] += share * by_pose[a, k]
         # Whitened: mixed F^-T, and F^-1 pull.
-        for i in range(3):
-            for k in range(i):
-                pull[i] -= normal[i, k] * pull[k]
-            pull[i] /= normal[i, i]
+        forward(normal, pull)
         kept[n, :9] = normal.copy().reshape(9)
         kept[n, 9:12] = pull
         for s in range(start, stop):
             mixed = half[s - start]
             at = offset[seen.picture[s]]
             for i in range(6):
-                for k in range(3):
-                    for m in range(k):
-                        mixed[i, k] -= normal[k, m] * mixed[i, m]
-                    mixed[i, k] /= normal[k, k]
+                forward(normal, mixed[i])
                 force[at + i] -= mixed[i, 0] * pull[0] + mixed[i, 1] * pull[1] + mixed[i, 2] * pull[2]
         for s in range(start, stop):
             later = half[s - start]
@@ -302,20 +262,11 @@ def move_points(
                 for i in range(3):
                     force[i] -= weight * by_point[a, i] * along
         factor = kept[n, :9].copy().reshape(3, 3)
+        forward(factor, force)
         for i in range(3):
-            for k in range(i):
-                force[i] -= factor[i, k] * force[k]
-            force[i] /= factor[i, i]
-            # force now holds F^-1 of the poses' part; the points' own part is added whitened
-        for i in range(3):
-            force[i] += kept[n, 9 + i]
-        moves = np.zeros(3)
-        for i in range(2, -1, -1):
-            moves[i] = force[i]
-            for k in range(i + 1, 3):
-                moves[i] -= factor[k, i] * moves[k]
-            moves[i] /= factor[i, i]
-        _move(points, n, moves)
+            force[i] += kept[n, 9 + i]  # the points' own part is kept whitened
+        backward(factor, force)
+        _move(points, n, force)
 
 
 @helper
@@ -338,19 +289,11 @@ def add_ties(
     corner: Float,
     pull: Float,
 ) -> None:
-    """Add the prior to the normal equations.
+    """Add the prior to the normal equations: `band` and `force` as in `eliminate_points`.
 
-    Args:
-        ties: the prior.
-        design: [T, 6, N] derivatives of the errors by the constant ones.
-        errors: [T, 6] estimates, of pictures.
-        knots: [N, 6].
-        constant: [N] shift in the world, rotation, shift in the camera, and the clock if it is unknown.
-        band: as in `eliminate_points`, as is `force`.
-        force: [n].
-        border: [n, N] entries of pictures and knots with constant errors; is added to.
-        corner: [N, N] of constant errors; is added to.
-        pull: [N] right side of these; is added to.
+    `design` [T, 6, N] has the derivatives of the errors by the constant ones, whose equations are
+    `corner` and `pull`; `border` has the entries of pictures and knots with them. `errors`, `knots` and
+    `constant` are the estimates.
     """
     count = len(constant)
     for t in range(len(ties.place)):

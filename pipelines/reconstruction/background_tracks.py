@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,46 +63,12 @@ class Followed:
             yield part()
 
 
-class _LazyPictures(Sequence[Bytes]):
-    """Grey pictures [H, W] in files, decoded one at a time."""
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self._paths = paths
-
-    def __len__(self) -> int:
-        """Count the pictures."""
-        return len(self._paths)
-
-    @overload
-    def __getitem__(self, index: int) -> Bytes: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Bytes]: ...
-
-    def __getitem__(self, index: int | slice) -> Bytes | Sequence[Bytes]:
-        """Decode a picture.
-
-        Raises:
-            DataError: it cannot be decoded.
-        """
-        import cv2
-
-        if isinstance(index, slice):
-            return _LazyPictures(self._paths[index])
-        picture = cv2.imdecode(np.frombuffer(self._paths[index].read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
-        if picture is None:
-            raise DataError(
-                self._paths[index], "cannot be decoded", "run `mocap reconstruct --force`", code="damaged"
-            )
-        return np.asarray(picture, dtype=np.uint8)
-
-
 @dataclass(frozen=True)
 class Stills:
     """Some grey pictures of one camera."""
 
     rows: Int64  # [S] of its frames
-    pictures: Sequence[Bytes]  # each is decoded when it is looked at
+    picture: Callable[[int], Bytes]  # decodes one of them
 
 
 def tracks_path(folder: Path) -> Path:
@@ -165,7 +131,17 @@ def load_stills(session: Path, camera: Camera) -> Stills | None:
     known[known] = camera.frame_number[row[known]] == numbers[known]
     if not known.any():
         return None
-    return Stills(row[known], _LazyPictures([paths[k] for k in np.flatnonzero(known)]))
+    shown = [paths[k] for k in np.flatnonzero(known)]
+    return Stills(row[known], lambda k: _decoded(shown[k]))
+
+
+def _decoded(path: Path) -> Bytes:
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise DataError(path, "cannot be decoded", "run `mocap reconstruct --force`", code="damaged")
+    return np.asarray(picture, dtype=np.uint8)
 
 
 def off_people(tracks: Tracks, boxes: Float) -> Tracks:

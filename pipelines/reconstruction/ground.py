@@ -144,12 +144,7 @@ class _View:
     boxes: Float  # [S, D, 4] px of people
 
     def seen(self, points: Float, normal: Float) -> tuple[Bool, Float, Float, Float]:
-        """Find where stills show points [N, 3] of ground: usable [S, N], pose [S, N, ...], and rays.
-
-        Returns:
-            Usable [S, N]; position [S, N, 3] and rotation [S, N, 3, 3] at the time of the points' rows; unit
-            rays [S, N, 3].
-        """
+        """Find where stills show points [N, 3] of ground: usable [S, N], poses at their rows, unit rays."""
         position, rotation = self._poses(np.zeros((len(self.still_t_ns), len(points))))
         pixels, depth = _pixels(points, position, rotation, self.camera)
         if self.camera.intrinsics.readout_s:
@@ -258,7 +253,7 @@ def _view(
             np.linspace(0, len(stills.rows) - 1, min(_MOST_STILLS, len(stills.rows))).astype(int)
         )
         rows = stills.rows[used]
-        pyramids = [_pyramid(stills.pictures[k]) for k in used.tolist()]
+        pyramids = [_pyramid(stills.picture(k)) for k in used.tolist()]
     points, covariance, by_turn = np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
     if isinstance(followed, Followed) and len(rows):
         points, covariance, by_turn = _cloud(camera, followed, rows, between)
@@ -293,11 +288,7 @@ def _readout(camera: Camera) -> tuple[float, float]:
 def _cloud(
     camera: Camera, followed: Followed, rows: Int64, between: Interpolation
 ) -> tuple[Float, Float, Float]:
-    """Triangulate the points that stills show.
-
-    Returns:
-        Place [N, 3], covariance [N, 3, 3], and derivative by a constant attitude error [N, 3, 3].
-    """
+    """Triangulate the points that stills show: places, covariances, derivatives by a constant turn."""
     tracks = _shown(followed, np.clip(np.searchsorted(followed.rows, rows), 0, len(followed.rows) - 1))
     xy, t_ns = tracks.xy, camera.frame_t_ns[followed.rows[tracks.picture]]
     delay_s = np.clip(row_delay_s(xy[:, 1], camera.intrinsics), *_readout(camera))
@@ -393,14 +384,7 @@ def _pixels(points: Float, position: Float, rotation: Float, camera: Camera) -> 
 def _compare(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], known: _Solution, most: int
 ) -> _Matches:
-    """Look for patches about points of the first camera of each pair in stills of the second.
-
-    Args:
-        views: all cameras.
-        pairs: first and second camera.
-        known: what is known of the errors: where to look, and how far around.
-        most: patches of a pair.
-    """
+    """Look for at most so many patches of the first camera of each pair in stills of the second."""
     cameras, pair = len(views), np.empty(0, dtype=np.int64)
     patch, covariance = [np.empty(0, dtype=np.int64)], [np.empty((0, 3, 3))]
     across, shift, design = [np.empty((0, 2, 3))], [np.empty((0, 3))], [np.empty((0, 3, 6 * cameras))]
@@ -565,18 +549,7 @@ def _axes(normal: Float, ray: Float) -> Float:
 
 
 def _displacements(a: _Cuts, b: _Cuts, places: _Places, expected: Float, reach_m: Float) -> Float:
-    """Find patches of stills in other stills.
-
-    Args:
-        a: the stills that the patches are cut out of.
-        b: the stills that are searched.
-        places: the patches.
-        expected: [K, 3] shifts at which the searches begin.
-        reach_m: [K, 2] how far they go along each axis.
-
-    Returns:
-        [K, 3] shifts in the planes, NaN where a still does not show enough or no place is clearly alike.
-    """
+    """Find patches of stills `a` in stills `b`, about expected shifts [K, 3]; NaN where nothing is clear."""
     half = np.full(reach_m.shape, _HALF_CELLS)
     reach = np.clip(np.ceil(reach_m / _CELL_M).astype(np.int64), _PEAK_CELLS + 2, _FARTHEST_REACH_CELLS)
     around = replace(places, centre=places.centre + expected)
@@ -656,13 +629,7 @@ def _bent(camera: Camera) -> float:
 
 
 def _solve(matches: _Matches, prior: Float, of_pairs_m: Float) -> tuple[_Solution, Bool]:
-    """Solve for constant errors; return also which patches [P] agree.
-
-    Args:
-        matches: the comparisons.
-        prior: standard deviations [6 C] of constant errors.
-        of_pairs_m: that of the error which all patches of a pair share.
-    """
+    """Solve for constant errors with a prior [6 C] and errors that pairs share; patches [P] that agree."""
     cut = matches.across
     spread = (
         cut @ (matches.covariance[matches.patch] + _MATCH_SIGMA_M**2 * np.eye(3)) @ np.swapaxes(cut, 1, 2)
@@ -767,8 +734,6 @@ def _bound(
             for c, camera in enumerate(cameras)
         },
         "moved_m": {cameras[c].name: (-position[c]).tolist() for c in group},
-        "turned_deg": {cameras[c].name: np.degrees(-turn[c]).tolist() for c in group},
-        "common_sigma_m": float(np.sqrt(np.trace(common) / 3)) if group else None,
         "reasons": reasons,
     }
     return GroundBinding(moved, tuple(cameras[c].name for c in group), reasons, common, entry)
@@ -796,12 +761,13 @@ def _with_position_level(cameras: Sequence[Camera], prior: Float, solution: _Sol
 
 def _largest_group(total: int, edges: Sequence[tuple[int, int]]) -> list[int]:
     """List the largest group of cameras that edges connect; empty without any."""
-    group = list(range(total))
-    for a, b in [*edges, *edges]:
-        low = min(group[a], group[b])
-        group = [low if each in (group[a], group[b]) else each for each in group]
-    best = max(range(total), key=lambda c: (group.count(c), -c), default=0)
-    members = [c for c in range(total) if group[c] == best]
+    from scipy.sparse.csgraph import connected_components
+
+    bound = np.zeros((total, total))
+    for a, b in edges:
+        bound[a, b] = 1.0
+    _, group = connected_components(bound, directed=False)
+    members = np.flatnonzero(group == np.bincount(group).argmax()).tolist()
     return members if len(members) > 1 else []
 
 

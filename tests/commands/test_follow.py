@@ -61,7 +61,7 @@ def test_tracks_and_stills_are_kept_for_other_methods_and_poses(session: Path) -
     assert stills is not None
     np.testing.assert_array_equal(stills.rows[[0, -1]], [0, FRAMES - 1])
     # JPEG of quality 85, and before it H.264, change smooth grey values by some steps.
-    assert np.abs(stills.pictures[1].astype(float) - textured(int(stills.rows[1]))[..., 0]).mean() < 5
+    assert np.abs(stills.picture(1).astype(float) - textured(int(stills.rows[1]))[..., 0]).mean() < 5
     found = load_tracks(session, camera)
     assert found is not None
     pictures = np.concatenate([part.picture for part in found.between(0, FRAMES)])

@@ -99,7 +99,7 @@ def camera(
             np.zeros(1, np.int64),
             [lambda: Tracks(picture, point, xy[picture, point])],
         ),
-        Stills(rows, [filmed(position[r], rotation[r], ground) for r in rows]),
+        Stills(rows, [filmed(position[r], rotation[r], ground) for r in rows].__getitem__),
     )
 
 

@@ -2,16 +2,14 @@
 
 The prior's levels (standard deviations of errors and motion) are learned from the data. A variance becomes
 the sum of the estimates' squares over the number of them that the data determine, sum of 1 - posterior /
-prior variance (MacKay, "Bayesian interpolation", 1992). Its fixed points are those of expectation
-maximisation (Dempster, Laird & Rubin 1977), which was measured to be too slow here: if pictures carry little
-information on a level, eight rounds left it near its start. All levels are estimated together: fitting a
-constant error alone to a drifting log was measured to be ten times worse than trusting the log.
+prior variance (MacKay, "Bayesian interpolation", 1992). All levels are estimated together: fitting a constant
+error alone to a drifting log was measured to be ten times worse than trusting the log.
 
 Keypoint errors have a memory. A detector is wrong for the same reasons in neighbouring pictures, so they
 carry less information than independent pictures: the mean of a stationary error falls as if only one in tau =
-1 + 2 sum of its autocorrelations had been taken. An estimate that ignores this treats keypoint errors as slow
-pose errors. A pose error moves all joints of a camera together. The memory is therefore measured on each
-joint's residual relative to the other joints. Residuals show only a part of the error, see `memory_of`.
+1 + 2 sum of its autocorrelations had been taken. A pose error moves all joints of a camera together. The
+memory is therefore measured on each joint's residual relative to the other joints. Residuals show only a part
+of the error, see `memory_of_whole_error`.
 """
 
 from __future__ import annotations
@@ -114,10 +112,8 @@ def learn(
     keypoints count less by that factor against slow pose errors. If it exceeds `REMEMBERED`, motion and image
     noise, which vary quickly, are no longer estimated.
 
-    New levels change an estimate little, except for the size of a nearly constant formation: two hovering
-    cameras moved by metres in a step, and the misfit was estimated as correlated image noise. Therefore the
-    size may change only a little in a step. More steps instead would let it diverge, because the data do not
-    determine it there.
+    New levels change an estimate little, except for the size of a nearly constant formation: it may change
+    only a little in a step, and more steps would let it diverge.
 
     Args:
         problem: stretches of the flight.
@@ -138,7 +134,7 @@ def learn(
         if memory and index == rounds // 2:
             tau = memory_of(system, state)
             if tau > REMEMBERED:
-                tau = memory_of_whole_error(tau, known.pixel_scale)
+                tau = memory_of_whole_error(max(tau, keypoints_that_last(problem)), known.pixel_scale)
             known = replace(known, memory=tau)
             if not poses and tau > REMEMBERED:
                 break  # nothing is left to be learned
@@ -307,6 +303,11 @@ def _process(process: Process, places: list[tuple[bool, int]], found: Moments, k
 
 # Correlations of keypoint errors over longer times cannot be told from motion.
 _LONGEST_S = 2.0
+LASTING_S = 10.0
+"""The part of keypoint errors that residuals do not show lasts as long: a detector is wrong for a view."""
+# Lasting errors of the joints of a person have this correlation: four times as many keypoints of 33 joints
+# are alike. With one or sixteen times, 14-dance is 6 and 18 % worse.
+_JOINTS_ALIKE = 0.1
 # A smaller autocorrelation is chance, and the sum stops there.
 _STOPS = 0.02
 # A longer memory cannot be measured in stretches of a hundred times.
@@ -349,17 +350,20 @@ def memory_of(system: System, state: State) -> float:
     return min(tau, _MOST)
 
 
+def keypoints_that_last(problem: Problem) -> float:
+    """Count the keypoints of a camera that err alike: those within `LASTING_S`, and of a person's joints."""
+    when_s = problem.pictures.when_s
+    share = min(LASTING_S / max(float(np.ptp(when_s)), 1e-9), 1.0)
+    joints = float(_bodies(problem).sum(axis=0).mean())
+    return share * len(when_s) / len(np.unique(problem.pictures.camera)) * (1 + (joints - 1) * _JOINTS_ALIKE)
+
+
 def memory_of_whole_error(memory: float, pixel_scale: float) -> float:
     """Compute the memory of image points if part of their error does not show in residuals.
 
     The error of a single point is known beforehand: for a detector, the measured one. Residuals show only
-    the share `pixel_scale` of it if the rest is correlated for so long that joints and cameras follow it. The
-    mean of N points has (s^2 + (1 - s^2) tau) / N times the stated variance, where s^2 / N was counted. For
-    errors without correlation, a small scale means that the points are better than stated.
-
-    Args:
-        memory: tau from `memory_of`.
-        pixel_scale: s, standard deviation of the residuals, as a share of the stated one.
+    the share s = `pixel_scale` of it if the rest lasts, and joints and cameras follow it. The mean of N
+    points has (s^2 + (1 - s^2) tau) / N times the stated variance, where s^2 / N was counted.
     """
     return max(memory, 1.0 + (pixel_scale**-2 - 1.0) * memory)
 

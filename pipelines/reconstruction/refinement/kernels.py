@@ -153,21 +153,11 @@ def linearise(
     by_joint: Float,
     by_number: Float,
 ) -> None:
-    """Compute the whitened residuals of a picture and their derivatives.
+    """Compute the whitened residuals of a picture, NaN for joints not seen, and their derivatives.
 
-    Args:
-        joints: [J, 3] m, world, at the picture's time.
-        velocity: [J, 3] m/s.
-        number: [10] the picture's corrections, see the module.
-        rays: [J, 2] normalised image points, NaN for joints not seen.
-        sharpness: [J] 1 / standard deviation of an image point.
-        position: [3] m, the logged pose at the uncorrected time.
-        rotation: [3, 3] world_from_camera.
-        speed: [3] m/s of the camera in the world.
-        turn: [3] rad/s of the camera, in its own frame.
-        residual: [J, 2] out; NaN for joints that are not seen or behind the camera.
-        by_joint: [J, 2, 3] out.
-        by_number: [J, 2, 10] out.
+    `joints` (m) and `velocity` (m/s) are of the picture's time, `number` its ten corrections.
+    `sharpness` is 1 / standard deviation of an image point. `position` and `rotation` are the logged
+    pose at the uncorrected time, `speed` (m/s, world) and `turn` (rad/s, camera) how it changes.
     """
     turned, left, shutter, unused = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     exponential(number[3:6], turned, left)

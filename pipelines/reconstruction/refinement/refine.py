@@ -71,6 +71,8 @@ _SETTLING = 4
 _LEVEL_ROUNDS = 3
 # Constant errors have this share of the usual level where the pictures let the scene grow.
 _HELD = 0.1
+# A joint that one camera alone shows follows its motion at other times by this (m).
+_FOLLOWED_M = 0.3
 # A constant error below this share of the usual level is known from the background.
 _UNDETERMINED = 0.3
 _UNINFORMATIVE_MEMORY = 30.0
@@ -213,20 +215,13 @@ class _Prior:
 
 
 def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refined:
-    """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails.
-
-    `measured` is True if the prior of the poses was measured.
-
-    Raises:
-        LinAlgError: its equations are singular.
-    """
+    """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails."""
     known, problem = prior.known, views.problem()
     whole = len(prior.state.position) == len(problem.t_s)
     state = prior.state if whole else initial_state(problem, known, views.start)
     clock_s, clock_left_s = _clocks(problem, known, state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)
-        state, whole = initial_state(problem, known, state.position), False
     bounds = (BOUND,) if whole else BOUNDS
     system, state, at = solve(problem, known, state, rounds=_ROUNDS, bounds=bounds)
     covariance = covariances(system, at)
@@ -238,8 +233,8 @@ def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refin
     slow = system, state  # determines the poses
     if known.memory > REMEMBERED:
         still = _without_slow_errors(system, state)
-        remembering, state = _joints_without_slow_errors(still, state.position, known, measured=measured)
-        covariance = _with_own(covariance, remembering, state)
+        own, state = _joints_without_slow_errors(still, state.position, known, measured=measured)
+        covariance = _with_own(covariance, own, state)
     joints = state.position
     fallback = doubts or _too_far(joints, views.start, prior.expected_m)
     as_logged = as_logged or prior.held_m > 0
@@ -295,36 +290,61 @@ def _white_only(problem: Problem, known: Knowledge) -> tuple[PoseErrors, ...]:
 
 def _joints_without_slow_errors(
     problem: Problem, start: Float, known: Knowledge, *, measured: bool
-) -> tuple[System, State]:
+) -> tuple[tuple[System, System], State]:
     """Estimate the joints after the removal of slow pose errors, with the full weight of keypoints.
 
     Slow errors were estimated with correlated keypoints weighted less. That is right for slow errors and
     wrong for limbs: their motion would be smoothed away. Clocks and the motion that depends on them stay
     unknowns.
 
-    Returns the estimate, and a system of the same poses in which correlated keypoints count less again.
+    Returns a system of the same poses in which correlated keypoints count less again, and the estimate.
     """
     known = replace(known, poses=_white_only(problem, known))
     faster = 1.0 if measured else _FAST_MOTION**2  # kicks would be smoothed
     weighted = replace(known, memory=1.0, acceleration=faster * known.acceleration)
     initial = initial_state(problem, weighted, start)
     solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
-    return System(problem, known, solved.layout, BOUND**2), found
+    return (System(problem, known, solved.layout, BOUND**2), solved), found
 
 
-def _with_own(covariance: Float, system: System, state: State) -> Float:
+def _with_own(covariance: Float, systems: tuple[System, System], state: State) -> Float:
     """Compute covariances [T, J, 3, 3] of joints: each has its own error, and one by slow pose errors.
 
-    Args:
-        covariance: [T, J, 3, 3] of the estimate of the joints and cameras together.
-        system: in it slow pose errors are removed, and correlated keypoints count less.
-        state: the estimate of this system.
+    A joint's own error is the part that varies, which motion averages, and the lasting part of its keypoints,
+    which residuals do not show and nothing averages. `systems` are without slow pose errors; in the first,
+    correlated keypoints count less, as in the estimate of joints and cameras together.
     """
-    own = covariances(system, eliminate(system, state))
-    by_poses = covariance - own
+    remembering, weighted = systems
+    by_poses = covariance - covariances(remembering, eliminate(remembering, state))
     variance, axes = np.linalg.eigh(0.5 * (by_poses + by_poses.swapaxes(-1, -2)))
-    both: Float = own + np.einsum("tjik,tjk,tjlk->tjil", axes, np.maximum(variance, 0.0), axes)
-    return both
+    by_poses = np.einsum("tjik,tjk,tjlk->tjil", axes, np.maximum(variance, 0.0), axes)
+    lasting = max(1.0 - weighted.knowledge.pixel_scale**2, 0.0)
+    own = covariances(weighted, eliminate(weighted, state))
+    return np.asarray(own + by_poses + lasting * _of_lasting_errors(weighted.problem, state.position))
+
+
+def _of_lasting_errors(problem: Problem, position: Float) -> Float:
+    """Compute covariances [T, J, 3, 3] of joints by the stated noise of each camera's nearest picture."""
+    pictures = problem.pictures
+    information = np.tile(np.eye(3) / _FOLLOWED_M**2, (*position.shape[:2], 1, 1))
+    for c in np.unique(pictures.camera):
+        (mine,) = np.nonzero(pictures.camera == c)
+        order = mine[np.argsort(pictures.when_s[mine], kind="stable")]
+        middle = (pictures.when_s[order][1:] + pictures.when_s[order][:-1]) / 2
+        own = order[np.searchsorted(middle, problem.t_s)]
+        rotation = pictures.rotation[own]
+        seen = np.einsum("tki,tjk->tji", rotation, position - pictures.position[own, None])
+        slant = np.stack(
+            [
+                rotation[:, None, :, a] - seen[..., a : a + 1] / seen[..., 2:] * rotation[:, None, :, 2]
+                for a in (0, 1)
+            ],
+            axis=2,
+        )
+        usable = np.isfinite(pictures.rays[own][..., 0]) & (seen[..., 2] > 0.1)
+        weight = np.where(usable, (pictures.sharpness[own] / seen[..., 2]) ** 2, 0.0)
+        information += weight[..., None, None] * np.einsum("tjai,tjak->tjik", slant, slant)
+    return np.asarray(np.linalg.inv(information))
 
 
 def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, Float]:
@@ -459,8 +479,11 @@ def _known_prior(
     if any(errors.assumed for errors in prior):
         levels_held = {kind: _HELD * sigma for kind, sigma in _usual_levels(guessed).items()}
         held = _of_levels(known, levels_held)
-        ray_m = _ray_sigma_m(PoseErrors(USUAL_CONSTANT, ()), range_m)
-        held_m = _spread_of(len(prior)) * ray_m / float(np.sqrt(3))
+        # The views disagree in some numbers, which say of the errors' level what they say beside usual ones.
+        shown = 2 * len(prior) - 3
+        usual2 = _ray_sigma_m(PoseErrors(USUAL_CONSTANT, ()), range_m) ** 2
+        ray2 = (USUAL_COUNT * usual2 + shown * disagreement_m**2) / (USUAL_COUNT + shown)
+        held_m = _spread_of(len(prior)) * float(np.sqrt(ray2 / 3))
         yield _Prior(held, state, False, (), expected_m, held_m)
 
 

@@ -1,7 +1,7 @@
 """Refinement problem: pictures, the skeleton's times, the priors of errors, and the cost of a state."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -188,62 +188,39 @@ def build(
         bones: [B, 2] joints with a nearly constant distance.
     """
     step = float(np.median(np.diff(t_s)))
-    covariances, logged = [np.empty((0, 6, 6))], 0
-    firsts, kepts = [], []
-    for sighting in sightings:
+    covariances, logged, parts = [np.empty((0, 6, 6))], 0, []
+    for camera, sighting in enumerate(sightings):
         first, near = _first_of_three(t_s, sighting.t_s, step)
         (kept,) = np.nonzero(near & sighting.range_of)
-        firsts.append(first[kept])
-        kepts.append(kept)
-    first = np.concatenate(firsts)
-    camera = np.repeat(np.arange(len(sightings)), [len(kept) for kept in kepts])
-    order = np.lexsort((camera, first))
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    pictures = _empty_pictures(len(order), sightings[0].rays.shape[1])
-    pictures.first[place], pictures.camera[place] = first, camera
-    for number, (sighting, kept) in enumerate(zip(sightings, kepts, strict=True)):
-        _fill(pictures, place[camera == number], sighting, kept, logged)
+        seen = ~np.isnan(sighting.rays[kept, :, 0]) & (sighting.confidence[kept] > 0)
+        speed, turn = _rates(sighting)
+        sharpness = sighting.focal_px / sighting.pixel_sigma
+        with_covariance = sighting.pose_covariance is not None
+        loosened = np.zeros((len(sighting.t_s), 2)) if sighting.loosened is None else sighting.loosened
+        part = Pictures(
+            first=first[kept],
+            camera=np.full(len(kept), camera),
+            logged=logged + kept if with_covariance else np.full(len(kept), -1),
+            when_s=sighting.t_s[kept],
+            rays=np.where(seen[..., None], sighting.rays[kept], np.nan),
+            sharpness=np.where(seen, sighting.confidence[kept], 0.0) * sharpness,
+            position=sighting.position[kept],
+            rotation=sighting.rotation[kept],
+            speed=speed[kept],
+            turn=turn[kept],
+            loosened=loosened[kept],
+        )
+        parts.append(part)
         if sighting.pose_covariance is not None:
             covariances.append(sighting.pose_covariance)
             logged += len(sighting.t_s)
+    names = [each.name for each in fields(Pictures)]
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    order = np.lexsort((joined["camera"], joined["first"]))
+    pictures = Pictures(**{name: values[order] for name, values in joined.items()})
     knots = max(int(np.ceil((t_s[-1] - t_s[0]) / KNOT_S)) + 1, 2)
     knot_t_s = np.linspace(t_s[0], t_s[-1], knots)
     return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances))
-
-
-def _empty_pictures(count: int, joints: int) -> Pictures:
-    """Make room for pictures."""
-    return Pictures(
-        first=np.empty(count, dtype=np.int64),
-        camera=np.empty(count, dtype=np.int64),
-        logged=np.full(count, -1),
-        when_s=np.empty(count),
-        rays=np.empty((count, joints, 2)),
-        sharpness=np.empty((count, joints)),
-        position=np.empty((count, 3)),
-        rotation=np.empty((count, 3, 3)),
-        speed=np.empty((count, 3)),
-        turn=np.empty((count, 3)),
-        loosened=np.zeros((count, 2)),
-    )
-
-
-def _fill(pictures: Pictures, place: Int64, sighting: Sighting, kept: Int64, logged: int) -> None:
-    """Write a camera's pictures to their places; its logged poses begin at row `logged`."""
-    speed, turn = _rates(sighting)
-    seen = ~np.isnan(sighting.rays[kept, :, 0]) & (sighting.confidence[kept] > 0)
-    sharpness = np.where(seen, sighting.confidence[kept], 0.0) * sighting.focal_px / sighting.pixel_sigma
-    if sighting.pose_covariance is not None:
-        pictures.logged[place] = logged + kept
-    pictures.when_s[place] = sighting.t_s[kept]
-    pictures.rays[place] = np.where(seen[..., None], sighting.rays[kept], np.nan)
-    pictures.sharpness[place] = sharpness
-    pictures.position[place] = sighting.position[kept]
-    pictures.rotation[place] = sighting.rotation[kept]
-    pictures.speed[place], pictures.turn[place] = speed[kept], turn[kept]
-    if sighting.loosened is not None:
-        pictures.loosened[place] = sighting.loosened[kept]
 
 
 def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:
