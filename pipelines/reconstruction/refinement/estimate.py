@@ -115,13 +115,7 @@ def learn(
     New levels change an estimate little, except for the size of a nearly constant formation: it may change
     only a little in a step, and more steps would let it diverge.
 
-    Args:
-        problem: stretches of the flight.
-        known: initial parameters of the prior.
-        state: initial estimate.
-        poses: True to estimate the levels of pose errors too.
-        memory: True to estimate the memory of keypoint errors.
-        rounds: number of rounds.
+    `poses` and `memory` are True to estimate the levels of pose errors and the memory of keypoint errors, too.
     """
     for index in range(rounds):
         if index == 0:

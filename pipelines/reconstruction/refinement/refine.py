@@ -500,12 +500,8 @@ def _with_constant_levels(
 ) -> Knowledge | None:
     """Estimate the level of assumed constant errors by MacKay's rule, pooled over the cameras.
 
-    Differences between cameras show in the pictures, their common error does not. A few numbers say little of
-    a level, so a level of usual size counts as `USUAL_COUNT` more of them. No level exceeds the one `guessed`
-    of its kind, which the disagreement of the views gives.
-
-    Returns None where the pictures do not determine the formation's scale, or the level exceeds what is
-    possible: the scene would grow to fit the detector's errors.
+    A few numbers say little of a level: a usual level counts as `USUAL_COUNT` more. None exceeds the one that
+    the views' disagreement gives. None is returned where the scene would grow to fit the detector's errors.
     """
     for _ in range(_LEVEL_ROUNDS):
         system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
