@@ -115,7 +115,7 @@ def learn(
     New levels change an estimate little, except for the size of a nearly constant formation: it may change
     only a little in a step, and more steps would let it diverge.
 
-    `poses` and `memory` are True to estimate the levels of pose errors and the memory of keypoint errors, too.
+    `poses` and `memory` are True to estimate the levels of pose errors, and the memory of keypoints.
     """
     for index in range(rounds):
         if index == 0:
