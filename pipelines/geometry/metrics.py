@@ -139,9 +139,9 @@ def world_errors(
             by_all.append(_aligned_as(own[rows], true[rows], len(rows)).ravel())
         # A straight way leaves its roll open: the motion is that of all joints.
         rigid = align_each(own[there].reshape(-1, 3), true[there].reshape(-1, 3), with_scale=False)
-        start, end = (_root(each[there, None], joints)[:, 0] for each in (own, true))
-        rooted.append(_length(rigid.apply(start) - end))
-        path_m += float(np.nansum(_length(np.diff(end, axis=0))))
+        root, true_root = (_root(each[there, None], joints)[:, 0] for each in (own, true))
+        rooted.append(_length(rigid.apply(root) - true_root))
+        path_m += float(np.nansum(_length(np.diff(true_root, axis=0))))
     feet = [index for index, name in enumerate(joints) if name.endswith(("ankle", "heel", "big_toe"))]
     speed = _length(_derivative(estimate[:, :, feet], t_ns, 1))
     stands = _length(_derivative(truth[:, :, feet], t_ns, 1)) < _STANDING_M_S

@@ -80,7 +80,7 @@ def estimates(rows: Sequence[Row], axis: str) -> list[dict[str, Any]]:
 
     Each has `metrics` by name: `mean`, `interval` (None where all trials are alike) and the number of
     `trials`, or None where none had the figure; `ratio` of `mpjpe_mm` to the first value of `axis` (of
-    `noise`: to the first method), trials paired, None where that mean is zero; and `per_joint` means.
+    `noise`: to the first method), trials paired, None where that mean is zero.
     """
     by_condition: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
@@ -95,14 +95,13 @@ def estimates(rows: Sequence[Row], axis: str) -> list[dict[str, Any]]:
                 **dict(zip(_CONDITION, condition, strict=True)),
                 "metrics": {name: _mean(own, name) for name in own[0] if _is_measured(name)},
                 "ratio": _ratio(own, others),
-                "per_joint": _per_joint(own),
             }
         )
     return made
 
 
 def _is_measured(name: str) -> bool:
-    return name not in {*_CONDITION, "trial", "per_joint"}
+    return name not in {*_CONDITION, "trial"}
 
 
 def _mean(rows: Sequence[Row], name: str) -> dict[str, Any] | None:
@@ -132,22 +131,10 @@ def _estimate(sums: Float, weights: Float) -> dict[str, Any]:
     return {"mean": float(sums.sum() / weights.sum()), "interval": interval, "trials": len(sums)}
 
 
-def _per_joint(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
-    means: dict[str, dict[str, float | None]] = {}
-    for joint, errors in rows[0]["per_joint"].items():
-        means[joint] = {}
-        for name in errors:
-            values = [row["per_joint"][joint][name] for row in rows]
-            there = [value for value in values if value is not None]
-            means[joint][name] = float(np.mean(there)) if there else None
-    return means
-
-
 def rows_csv(rows: Sequence[Row]) -> str:
     """Write one line for every row; empty where nothing could be measured."""
     text = io.StringIO()
-    columns = [name for name in rows[0] if name != "per_joint"]
-    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()

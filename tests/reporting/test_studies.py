@@ -33,7 +33,7 @@ def cell(mean_mm: float | None, **of: Any) -> dict[str, Any]:
     if mean_mm is not None:
         metrics["mpjpe_mm"] = metrics["root_mpjpe_mm"] = estimate(mean_mm, half=2.0)
     plain = {"tilt_deg": 15.0, "robots": 2, "noise": "none", "noise_model": "", "method": "dlt"}
-    return {**plain, "ratio": None, "metrics": metrics, "per_joint": {}, **of}
+    return {**plain, "ratio": None, "metrics": metrics, **of}
 
 
 def test_a_study_of_tilt_tells_its_ends_under_the_strongest_noise() -> None:
