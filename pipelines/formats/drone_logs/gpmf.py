@@ -119,17 +119,14 @@ class GoProFormat:
             telemetry = self.read_telemetry(path, TelemetryChoice())
         except DataError as error:
             return {**facts, "positions": 0, "why": error.problem}
-        facts["positions"] = len(telemetry.position.t_ns)
+        facts |= {"positions": len(telemetry.position.t_ns), "clock": telemetry.clock}
         facts["body_attitudes"] = len(telemetry.body.t_ns) if telemetry.body else 0
-        facts["clock"] = telemetry.clock
         if telemetry.fit and telemetry.video_began:
             facts["gps_time"] = describe_fit(telemetry.fit)
             facts["video_began_s"] = round(telemetry.video_began[0] / 1e9, 3)
-        for name, column in zip(
-            ("latitude_deg", "longitude_deg", "height_m"), telemetry.position.values.T, strict=True
-        ):
-            facts[name] = [round(float(column.min()), 7), round(float(column.max()), 7)]
-        return facts
+        names = ("latitude_deg", "longitude_deg", "height_m")
+        columns = zip(names, telemetry.position.values.T, strict=True)
+        return facts | {name: [round(v, 7) for v in (c.min(), c.max())] for name, c in columns}
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read a Karma's position and attitude, else the camera's GPS; in UTC where that is logged."""

@@ -27,11 +27,7 @@ _HEAD = 512 * 1024
 _SECOND_NS = 1_000_000_000
 # Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_TAG = re.compile(rb"(?<![\w/-])drone(?:-(?:dji|parrot|skydio))?:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
-_SKYDIO = re.compile(
-    rb"(?s)<drone-skydio:CameraOrientationNED\b(.{1,600}?)(?:/>|</drone-skydio:CameraOrientationNED)"
-)
-_ANGLE = re.compile(rb"[<\s][\w-]+:(Yaw|Pitch|Roll)(?:=\"|>)\s*([^\"<]{1,60})")
+_TAG = re.compile(rb"(?<![\w/-])drone(?:-dji)?:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
 _EXIF, _GPS = 0x8769, 0x8825
 _TAKEN, _OFFSET, _SUBSECOND = 36867, 36881, 37521
 NAMES = {
@@ -39,12 +35,12 @@ NAMES = {
     "longitude": ("GpsLongitude", "GpsLongtitude", "Longitude"),
     "relative": ("RelativeAltitude",),
     "absolute": ("AbsoluteAltitude",),
-    "gb_yaw": ("GimbalYawDegree", "CameraYawDegree"),
-    "gb_pitch": ("GimbalPitchDegree", "CameraPitchDegree"),
-    "gb_roll": ("GimbalRollDegree", "CameraRollDegree"),
-    "drone_yaw": ("FlightYawDegree", "DroneYawDegree"),
-    "drone_pitch": ("FlightPitchDegree", "DronePitchDegree"),
-    "drone_roll": ("FlightRollDegree", "DroneRollDegree"),
+    "gb_yaw": ("GimbalYawDegree",),
+    "gb_pitch": ("GimbalPitchDegree",),
+    "gb_roll": ("GimbalRollDegree",),
+    "drone_yaw": ("FlightYawDegree",),
+    "drone_pitch": ("FlightPitchDegree",),
+    "drone_roll": ("FlightRollDegree",),
     "rtk_flag": ("RtkFlag",),
     "rtk_std_latitude": ("RtkStdLat",),
     "rtk_std_longitude": ("RtkStdLon",),
@@ -121,11 +117,8 @@ def picture_times(tags: Sequence[Tags]) -> tuple[Int64, bool]:
 
 
 def _xmp(head: bytes) -> dict[str, str]:
-    """Return the text of each tag by its name without the maker; Skydio's angles under DJI's names."""
-    found = _TAG.findall(head)
-    if skydio := _SKYDIO.search(head):
-        found += [(b"Camera" + angle + b"Degree", text) for angle, text in _ANGLE.findall(skydio[1])]
-    return {name.decode(): text.decode("latin-1") for name, text in found}
+    """Return the text of each tag by its name without the maker."""
+    return {name.decode(): text.decode("latin-1") for name, text in _TAG.findall(head)}
 
 
 def _number(text: object) -> float | None:

@@ -31,29 +31,6 @@ XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GpsLatit
  drone-dji:RtkFlag="50" drone-dji:RtkStdLon="0.03" drone-dji:RtkStdLat="0.04"/></x:xmpmeta>"""
 
 
-# As OpenAthena (Theta-Limited) and OpenDroneMap read them: attributes, elements, and nested elements.
-OTHERS = {
-    "autel": """<rdf:Description rdf:about="DJI Meta Data" drone:GpsLatitude="{lat:.9f}"
- drone:GpsLongtitude="11.5" drone:AbsoluteAltitude="530.00" drone:RelativeAltitude="30.{k}"
- drone:GimbalYawDegree="90.0" drone:GimbalPitchDegree="-30.0" drone:GimbalRollDegree="0.0"/>""",
-    "parrot": """<drone-parrot:CameraRollDegree>0.0</drone-parrot:CameraRollDegree>
-<drone-parrot:CameraPitchDegree>-30.0</drone-parrot:CameraPitchDegree>
-<drone-parrot:CameraYawDegree>90.0</drone-parrot:CameraYawDegree>""",
-    "skydio, attributes": """<drone-skydio:Latitude="{lat:.9f}" drone-skydio:Longitude="11.5"
- drone-skydio:AbsoluteAltitude="530.0" drone-skydio:RelativeAltitude="30.{k}">
- <drone-skydio:VehicleOrientationNED drone-skydio:Roll="5" drone-skydio:Pitch="6" drone-skydio:Yaw="7"/>
- <drone-skydio:CameraOrientationNED drone-skydio:Roll="0" drone-skydio:Pitch="-30" drone-skydio:Yaw="90"/>""",
-    "skydio, elements": """<drone-skydio:Latitude>{lat:.9f}</drone-skydio:Latitude>
- <drone-skydio:Longitude>11.5</drone-skydio:Longitude>
- <drone-skydio:AbsoluteAltitude>530.0</drone-skydio:AbsoluteAltitude>
- <drone-skydio:RelativeAltitude>30.{k}</drone-skydio:RelativeAltitude>
- <drone-skydio:CameraOrientationNED rdf:parseType="Resource"><drone-skydio:Roll>0</drone-skydio:Roll>
- <drone-skydio:Pitch>-30</drone-skydio:Pitch><drone-skydio:Yaw>90</drone-skydio:Yaw>
- </drone-skydio:CameraOrientationNED><drone-skydio:CameraOrientationFLU rdf:parseType="Resource">
- <drone-skydio:Yaw>12</drone-skydio:Yaw></drone-skydio:CameraOrientationFLU>""",
-}
-
-
 def write(
     folder: Path,
     *,
@@ -114,17 +91,11 @@ def test_tags_of_dji_are_poses(tmp_path: Path) -> None:
     assert absolute.position.values[:, 2].tolist() == [530.0] * COUNT
 
 
-@pytest.mark.parametrize("maker", OTHERS)
-def test_tags_of_other_makers_are_poses(tmp_path: Path, maker: str) -> None:
-    folder = write(tmp_path / "film", xmp=OTHERS[maker], gps=maker == "parrot")
-    telemetry = TAGS.read_telemetry(folder, TelemetryChoice())
-    height = np.full(COUNT, 530.0) if maker == "parrot" else 30 + 0.1 * np.arange(COUNT)
-    expected = np.stack([48.1 + 1e-6 * np.arange(COUNT), np.full(COUNT, 11.5), height], axis=1)
+def test_places_in_exif_are_positions(tmp_path: Path) -> None:
+    telemetry = TAGS.read_telemetry(write(tmp_path / "film", xmp="", gps=True), TelemetryChoice())
+    expected = np.stack([48.1 + 1e-6 * np.arange(COUNT), np.full(COUNT, 11.5), np.full(COUNT, 530.0)], axis=1)
     np.testing.assert_allclose(telemetry.position.values, expected, rtol=0, atol=1e-7)  # EXIF has fractions
-    assert telemetry.gimbal is not None
-    assert telemetry.body is None
-    looks = rotate(telemetry.gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
-    np.testing.assert_allclose(looks, [[np.cos(np.pi / 6), 0, -0.5]] * COUNT, atol=1e-9)  # east, 30 deg down
+    assert telemetry.gimbal is telemetry.body is None
 
 
 def test_damaged_pictures_are_counted_and_missing_pictures_keep_the_numbers(tmp_path: Path) -> None:
