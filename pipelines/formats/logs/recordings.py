@@ -259,10 +259,13 @@ class ChunkedPart(LogPart):
         """Yield the bytes of messages, as views into their chunk."""
         table = self.table.rows(rows)
         places = (table.block, table.place, table.channel, table.stamp_ns)
+        last_of_block = dict(zip(table.block.tolist(), range(len(rows)), strict=True))
         for k, (block, place, channel, stamp_ns) in enumerate(
             zip(*(column.tolist() for column in places), strict=True)
         ):
             content = self._content(block)
+            if last_of_block[block] == k:
+                self._drop(block)
             try:
                 data = None if content is None else self.payload(content, place, channel, stamp_ns)
             except ValueError:
@@ -313,8 +316,11 @@ class ChunkedPart(LogPart):
             content = self._cache[number] = self._inflated(self.chunks[number])
             self._cached += len(content or b"") + _CACHED_CHUNK
             while len(self._cache) > 1 and self._cached > _CACHE:
-                self._cached -= len(self._cache.pop(next(iter(self._cache))) or b"") + _CACHED_CHUNK
+                self._drop(next(iter(self._cache)))
         return self._cache[number]
+
+    def _drop(self, number: int) -> None:
+        self._cached -= len(self._cache.pop(number) or b"") + _CACHED_CHUNK
 
     def _refuse_bombs(self) -> None:
         """Refuse a file whose chunks inflate beyond reason; none is inflated to more than it states."""
