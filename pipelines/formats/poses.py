@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.exporting import file_names_of_people, safe_file_name, tracks_of
-from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import (
     NANOSECONDS,
     NORM_TOLERANCE,
@@ -44,6 +44,7 @@ from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.records import Recording, Trajectory
+from pipelines.session.storage import read_text
 from pipelines.session.tables import COVARIANCE_COLUMNS
 
 POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")

@@ -128,6 +128,23 @@ def plain_text(content: bytes, errors: str = "replace") -> str:
     return content.decode(text_encoding(content), errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
+def read_text(path: Path, *, most_bytes: int | None = None) -> str:
+    r"""Read the whole file as UTF-8, or as UTF-16 that begins with its mark, lines ending in "\n".
+
+    DataError if it cannot be read, is no such text, or is larger than it may be.
+    """
+    refuse_special(path)
+    try:
+        if most_bytes is not None and path.stat().st_size > most_bytes:
+            raise DataError(path, f"is larger than {most_bytes} bytes", "name another file", code="too-large")
+        return plain_text(path.read_bytes(), errors="strict")
+    except OSError as error:
+        raise as_data_error(error, path) from error
+    except UnicodeDecodeError as error:
+        problem = f"is not UTF-8 text (byte {error.start})"
+        raise DataError(path, problem, "save it as UTF-8", code="damaged") from error
+
+
 def sha256_of(path: Path) -> str:
     """Hash the content of a file, or of a folder: the relative names and contents of its files, sorted.
 

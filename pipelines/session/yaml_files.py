@@ -20,7 +20,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from pipelines.session.errors import DataError
-from pipelines.session.storage import code_of, plain_text, refuse_special
+from pipelines.session.storage import read_text
 
 # A real file has a few thousand bytes, and a parser of YAML needs seconds for a million.
 MAX_FILE_BYTES = 1_000_000
@@ -123,7 +123,7 @@ def read_yaml_model(
             every problem that was found.
     """
     how = f" ({made})" if made else ""
-    raw = _read_yaml(path, noun, how)
+    raw = plain_yaml(path, read_text(path, most_bytes=MAX_FILE_BYTES))
     if not isinstance(raw, Mapping):
         raise DataError(path, f"is no {noun}", f"it must be {shape}{how}", code="wrong-kind")
     if isinstance(raw.get("schema"), int) and raw["schema"] > newest:
@@ -136,23 +136,6 @@ def read_yaml_model(
     except ValidationError as error:
         problems = [describe_problem(problem, model) for problem in error.errors()]
         raise DataError(path, "; ".join(dict.fromkeys(problems)), code="bad-value") from None
-
-
-def _read_yaml(path: Path, noun: str, how: str) -> object:
-    refuse_special(path)
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise DataError(
-                path, f"is larger than {MAX_FILE_BYTES} bytes", f"this is no {noun}", code="too-large"
-            )
-        text = plain_text(path.read_bytes(), errors="strict")
-    except OSError as error:
-        raise DataError(
-            path, f"cannot be read ({error.strerror})", f"give the path of a {noun}{how}", code=code_of(error)
-        ) from None
-    except UnicodeDecodeError:
-        raise DataError(path, "is no UTF-8 text", f"give the path of a {noun}{how}", code="damaged") from None
-    return plain_yaml(path, text)
 
 
 def describe_problem(

@@ -18,10 +18,11 @@ from pipelines.formats.calibrations.camera_matrices import (
     invert_rodrigues,
     unstated_size,
 )
-from pipelines.formats.common.files import numbers, read_text, read_yaml
+from pipelines.formats.common.files import numbers, read_yaml
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
+from pipelines.session.storage import read_text
 
 Cameras = dict[str, CalibratedCamera]
 

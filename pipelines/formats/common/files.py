@@ -8,7 +8,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error, code_of, is_special, plain_text, refuse_special
+from pipelines.session.storage import as_data_error, is_special, plain_text, read_text, refuse_special
 from pipelines.session.yaml_files import plain_yaml
 
 HEAD_BYTES = 64 * 1024
@@ -88,18 +88,6 @@ def numbers(source: Path, name: str, value: object) -> Float:
 def leads_out(stated: str) -> bool:
     """Return True if a relative path leads out of its folder; links may, as a file cannot bring any."""
     return Path(os.path.normpath(stated)).parts[:1] == (os.pardir,)
-
-
-def read_text(path: Path) -> str:
-    r"""Read the whole file as UTF-8, or as UTF-16 that begins with its mark, lines ending in "\n"."""
-    refuse_special(path)
-    try:
-        return plain_text(path.read_bytes(), errors="strict")
-    except OSError as error:
-        problem = f"cannot be read ({error.strerror})"
-        raise DataError(path, problem, "check the path and its permissions", code=code_of(error)) from error
-    except UnicodeDecodeError as error:
-        raise DataError(path, f"is not UTF-8 text (byte {error.start})", "save it as UTF-8") from error
 
 
 def read_head(path: Path, suffixes: Collection[str] = ()) -> str:

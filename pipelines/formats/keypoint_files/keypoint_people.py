@@ -12,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.files import read_head
+from pipelines.formats.common.files import read_bytes, read_head
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS, Skeleton, get_skeleton, joint_called, skeleton_with
 from pipelines.session.records import Detections
-from pipelines.session.storage import code_of
 
 # Tables of mice share a name or two with people, as nose and left_ear.
 LEAST_NAMED_JOINTS = 6
@@ -39,10 +38,7 @@ _LEAST_SHARE = 0.25
 
 def load_json(path: Path) -> object:
     """Read a JSON file; NaN and Infinity are accepted, as Python writes them."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DataError(path, f"cannot be opened ({error.strerror})", code=code_of(error)) from error
+    content = read_bytes(path)
     if not content.strip():
         raise DataError(path, "is empty", "export the keypoints again", code="empty")
     try:

@@ -37,7 +37,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.exporting import people_of
-from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.files import read_head
 from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.poses import (
@@ -50,6 +50,7 @@ from pipelines.geometry.poses import (
 from pipelines.session.errors import DataError
 from pipelines.session.people import take_joints, with_derived
 from pipelines.session.records import JointMotion, Recording, SkeletalMotion
+from pipelines.session.storage import read_text
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 _CMU_M = 0.0254 / 0.45

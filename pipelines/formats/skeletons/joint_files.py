@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.formats.common.exporting import write_tables
-from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import (
     Heading,
     TextTable,
@@ -31,6 +31,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS, joint_called
 from pipelines.session.progress import Progress
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording, Trajectory
+from pipelines.session.storage import read_text
 from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, pose_table, write_table
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.exporting import people_of
-from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import format_seconds, median_step_ns, parse_stamps
 from pipelines.formats.skeletons.joint_files import (
     METRES,
@@ -30,6 +30,7 @@ from pipelines.formats.skeletons.joint_files import (
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
+from pipelines.session.storage import read_text
 
 # Seven decimals of a metre are below any measurement error, and rows stay readable.
 _DECIMALS = 7

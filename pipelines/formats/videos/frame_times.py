@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import (
     Heading,
     describe_times,
@@ -19,6 +19,7 @@ from pipelines.formats.common.rows import (
 from pipelines.formats.drone_logs.dji_subtitles import parse_subtitles, read_subtitles
 from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
+from pipelines.session.storage import read_text
 
 _FRAME_NAMES = {"frame", "frame_id", "frame_index", "frame_number"}
 
