@@ -57,8 +57,10 @@ _CLOCK_STEP_S = 0.1
 _LEAST_CLOCK_S = 0.05
 # Beside a clock that scores worse than the stated one by more than this lies no better one.
 _REACH = 1.0
-# Focal lengths that are wrong by a smaller logarithm cannot be told from noise.
-_LEAST_ZOOM = 0.1
+# A stated error is questioned beyond so many of its standard deviations: errors have heavy tails.
+_LEAST_SIGMAS = 5.0
+# Smaller faults do not matter beside the errors of good poses, whatever is stated of these.
+_LEAST_SHIFT_M, _LEAST_TURN_RAD, _LEAST_ZOOM = 0.2, np.radians(2.0), 0.1
 # Focal lengths are wrong by at most this logarithm: a factor of twenty.
 _MOST_ZOOM = 3.0
 # The nose is this share of the stature above the ankles (Winter 2009).
@@ -665,13 +667,8 @@ def _expected(kind: str) -> list[float]:
 
 def of_all_numbers(trial: Trial) -> Iterator[Alternative]:
     """Fit numbers that all cameras have in common, and each log's own zero."""
-    least_rad = np.radians(max(3.0, 4 * float(np.degrees(trial.described.sigma[:, 1].max()))))
     for kind in _OF_ALL:
-        group = trial.every if kind == "focal" else trial.moving
-        if group:
-            alternative, number = _of_numbers(trial, kind, group)
-            if abs(number) >= (_LEAST_ZOOM if kind == "focal" else least_rad):
-                yield trial.scored(alternative)
+        yield from _of_numbers(trial, kind, trial.every if kind == "focal" else trial.moving)
     if len(trial.names) > 2 and trial.moving:
         yield trial.scored(of_origins(trial, "every log counts positions from a place of its own")[0])
 
@@ -684,11 +681,23 @@ def of_one_number(trial: Trial) -> Iterator[Alternative]:
             continue
         if kind in ("north", "zero") and len(trial.names) == 2 and index == 0 and not located:
             continue  # of two, one alone can be turned against the other
-        yield trial.scored(_of_numbers(trial, kind, [index])[0])
+        yield from _of_numbers(trial, kind, [index])
 
 
-def _of_numbers(trial: Trial, kind: str, group: list[int]) -> tuple[Alternative, float]:
-    found = fitted(trial, kind, group)
+def _matters(trial: Trial, kind: str, group: Sequence[int], numbers: Float) -> bool:
+    """Test if numbers are beyond what is stated of the errors of the poses, and large enough to matter."""
+    position_m, rotation_rad = _LEAST_SIGMAS * trial.described.sigma[list(group), :2].max(axis=0)
+    if kind == "focal":
+        return abs(float(numbers[0])) >= _LEAST_ZOOM
+    shift_m = float(np.linalg.norm(numbers[:3])) if NUMBERS[kind] >= 3 else 0.0
+    turn_rad = abs(float(numbers[-1])) if kind != "shift" else 0.0
+    return shift_m >= max(position_m, _LEAST_SHIFT_M) or turn_rad >= max(rotation_rad, _LEAST_TURN_RAD)
+
+
+def _of_numbers(trial: Trial, kind: str, group: list[int]) -> Iterator[Alternative]:
+    found = fitted(trial, kind, group) if group else None
+    if found is None or not _matters(trial, kind, group, found.numbers):
+        return
     cameras, whose, number = trial.cameras, trial.whose(group), float(found.numbers[-1])
     degrees = float(np.degrees(number)) if kind != "shift" else 0.0
     shift = found.numbers[:3] if NUMBERS[kind] >= 3 else np.zeros(3)
@@ -721,16 +730,18 @@ def _of_numbers(trial: Trial, kind: str, group: list[int]) -> tuple[Alternative,
         evidence["shift_sigma_m"] = round(float(np.sqrt(variance[:3].sum())), 2)
     if kind not in ("shift", "focal") and variance.size:
         evidence["turn_sigma_deg"] = round(float(np.degrees(np.sqrt(variance[-1]))), 2)
-    return Alternative(
-        code,
-        trial.named(group, of_pair=not mounted),
-        what,
-        remedy,
-        PRICE_OF_ONE if len(group) < len(trial.names) else PRICE_OF_ALL,
-        found.scene,
-        evidence=evidence,
-        cost=found.cost + _freedom(found, _expected(kind)),
-    ), number
+    yield trial.scored(
+        Alternative(
+            code,
+            trial.named(group, of_pair=not mounted),
+            what,
+            remedy,
+            PRICE_OF_ONE if len(group) < len(trial.names) else PRICE_OF_ALL,
+            found.scene,
+            evidence=evidence,
+            cost=found.cost + _freedom(found, _expected(kind)),
+        )
+    )
 
 
 def of_origins(trial: Trial, what: str) -> tuple[Alternative, bool]:
