@@ -559,6 +559,22 @@ NOISY = Flight(
 )
 
 
+def test_places_that_drift_are_named_as_places(flight: Described) -> None:
+    """Move each log by some 0.5 m in the course of the flight, as satellite positioning does."""
+
+    def drifting(mistaken: Mistaken) -> None:
+        draw = np.random.default_rng(3)
+        for name in mistaken.names:
+            stamps, (position, quaternion) = mistaken.poses[name]
+            part = np.linspace(0, 1, len(stamps))[:, None]
+            start, rate = 0.5 * draw.normal(size=(2, 3))
+            mistaken.poses[name] = (stamps, (position + start + rate * part, quaternion))
+
+    causes = [doubt["code"] for doubt in doubts_of(mistaken(flight, drifting)) if doubt["remedy"]]
+    assert causes
+    assert set(causes) <= {"noise", "origin"}
+
+
 def test_errors_far_larger_than_stated_are_noise(tmp_path: Path) -> None:
     def stated_small(mistaken: Mistaken) -> None:
         for camera in mistaken.manifest["cameras"].values():

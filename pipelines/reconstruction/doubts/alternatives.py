@@ -82,7 +82,7 @@ class Alternative:
     scene: SceneOfMoments | None = None  # None of what is seen directly
     same_scatter: bool = False
     evidence: Mapping[str, float] = field(default_factory=dict)
-    alike: tuple[float, float] | None = None  # of times of all cameras: seconds late, and factor between them
+    alike: bool = False  # of times of all cameras
     cost: float = np.inf  # of what is fitted: chi^2 of the rays, and what the numbers cost
     score: Score | None = None
     tried: tuple[float, float] = (np.nan, np.nan)  # the objective of the description, and with this change
@@ -156,12 +156,6 @@ class Trial:
         late[list(group)], factor[list(group)] = late_s, slower
         return scene_of(self.flight, self.described, late_s=late, slower=factor)
 
-    def as_stated(self, late_s: float, slower: float) -> tuple[Sampled, SceneOfMoments]:
-        """Look at the pictures that another time of all cameras shows, at the times that are stated."""
-        since = (self.flight.t_ns - self.flight.t_ns[0]) / slower - late_s * 1e9
-        flight = self.flight._replace(t_ns=self.flight.t_ns[0] + since.astype(np.int64), hips=None)
-        return flight, scene_of(flight)
-
     def with_pixels(self, group: Sequence[int], change: Callable[[Float, Filmed], Float]) -> SceneOfMoments:
         """Change the pixels [F, J, 2] of cameras."""
         pixels = [camera.pixels for camera in self.cameras]
@@ -196,7 +190,7 @@ def of_times(trial: Trial) -> Iterator[Alternative]:
                     remedies.frame_rate(trial.cameras, group, factor),
                     price,
                     trial.with_times(group, slower=factor),
-                    alike=(0.0, factor) if len(group) == len(trial.names) else None,
+                    alike=len(group) == len(trial.names),
                 )
             )
 
@@ -215,7 +209,7 @@ def of_clock(trial: Trial, group: list[int]) -> Iterator[Alternative]:
                 remedies.clock(trial.cameras, group, late_s),
                 1.0 + abs(late_s) / 2,
                 trial.with_times(group, late_s),
-                alike=(late_s, 1.0) if alike else None,
+                alike=alike,
             )
         )
 

@@ -223,7 +223,7 @@ class Compared(NamedTuple):
         the rays alone must tell it; of times of one camera, they must fit as well.
         """
         if alternative.code in TIMES:
-            least = -_ALIKE if alternative.alike is None else MARGIN
+            least = MARGIN if alternative.alike else -_ALIKE
         else:
             least = -np.inf if odd else MARGIN
         return self.gain >= MARGIN and self.rays_before - self.rays_after >= least
