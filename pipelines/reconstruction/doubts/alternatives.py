@@ -685,7 +685,7 @@ def _matters(trial: Trial, kind: str, group: Sequence[int], numbers: Float) -> b
         return abs(float(numbers[0])) >= _LEAST_ZOOM
     shift_m = float(np.linalg.norm(numbers[:3])) if NUMBERS[kind] >= 3 else 0.0
     turn_rad = abs(float(numbers[-1])) if kind != "shift" else 0.0
-    return shift_m >= max(position_m, _LEAST_SHIFT_M) or turn_rad >= max(rotation_rad, _LEAST_TURN_RAD)
+    return bool(shift_m >= max(position_m, _LEAST_SHIFT_M) or turn_rad >= max(rotation_rad, _LEAST_TURN_RAD))
 
 
 def _of_numbers(trial: Trial, kind: str, group: list[int]) -> Iterator[Alternative]:

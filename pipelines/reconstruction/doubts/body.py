@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +67,7 @@ class Oddity(NamedTuple):
 
 def stature_m(joints: Float) -> float:
     """Return a person's stature from their joints [T, J, 3]; NaN if too few limbs are seen."""
-    return median(Body(joints).statures())
+    return median(Body(joints).statures)
 
 
 def size_sigmas(joints: Float) -> float:
@@ -102,22 +103,24 @@ class Body:
         joint: Float = self.joints[:, _INDEX[name]]
         return joint
 
+    @cached_property
     def lengths(self) -> list[tuple[Float, float]]:
         """List the lengths [T] m of limbs and torso, and their usual shares of the stature."""
         limbs = [(np.linalg.norm(self[start] - self[end], axis=-1), share) for start, end, share in _LIMBS]
         return [*limbs, (np.linalg.norm(self.hips - self.shoulders, axis=-1), _TORSO)]
 
+    @cached_property
     def statures(self) -> Float:
         """Return the stature that each limb is usual for."""
-        statures: Float = np.array([median(length) / share for length, share in self.lengths()])
+        statures: Float = np.array([median(length) / share for length, share in self.lengths])
         return statures
 
     def proportions(self, stature: float) -> dict[str, Oddity]:
         """Measure the size, and the limbs' lengths over those that are usual for a stature in m."""
         names = [f"{start}_to_{end}" for start, end, _ in _LIMBS] + ["torso"]
-        off = np.abs(np.log(self.statures() / stature))  # infinite for a limb without length
+        off = np.abs(np.log(self.statures / stature))  # infinite for a limb without length
         worst = int(np.nanargmax(off))
-        length, share = self.lengths()[worst]
+        length, share = self.lengths[worst]
         measured = {f"{names[worst]}_m": median(length), "usual_m": share * stature}
         beyond = max(0.0, abs(np.log(stature / STATURE_M)) - _USUAL_SIZE)
         return {
@@ -138,7 +141,7 @@ class Body:
             "crossed": Oddity(max(0.0, 0.5 - same_sides) / 0.03, {"uncrossed_share": same_sides}),
             "bend": Oddity(max(0.0, 0.4 - bent) / 0.06, {"bent_forwards_share": bent}),
         }
-        forwards = self._forwards()
+        forwards = self._forwards
         nose = ((self["nose"] - (self["left_ear"] + self["right_ear"]) / 2) * forwards).sum(axis=-1)
         nose = nose[np.isfinite(nose)]
         if len(nose) > _FEWEST_MOMENTS:
@@ -154,7 +157,7 @@ class Body:
         """
         upwards, forwards = (
             each / np.linalg.norm(each, axis=-1, keepdims=True)
-            for each in (self.shoulders - self.hips, self._forwards())
+            for each in (self.shoulders - self.hips, self._forwards)
         )
         shares = []
         for root, middle, tip, sign in (("hip", "knee", "ankle", 1), ("shoulder", "elbow", "wrist", -1)):
@@ -187,6 +190,7 @@ class Body:
         ]
         return min((float((each > 0).mean()) for each in along if each.size > _FEWEST_MOMENTS), default=1.0)
 
+    @cached_property
     def _forwards(self) -> Float:
         """Return a vector [T, 3] to where the hips face, also of somebody who lies or is on their head."""
         upwards = self.shoulders - self.hips
@@ -230,7 +234,7 @@ class Body:
         first = np.arange(len(flight.t_ns))
         second = np.searchsorted(flight.t_ns, flight.t_ns + _WALK_NS, side="right") - 1
         step_s = (flight.t_ns[second] - flight.t_ns[first]) / 1e9
-        forwards = (self._forwards()[first] + self._forwards()[second])[:, :2]
+        forwards = (self._forwards[first] + self._forwards[second])[:, :2]
         forwards /= np.linalg.norm(forwards, axis=1, keepdims=True)
         moved = (self.hips[second] - self.hips[first])[:, :2]
         along = (moved * forwards).sum(axis=1)

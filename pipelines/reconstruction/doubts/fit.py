@@ -196,38 +196,46 @@ def _step(
     strain = float(((errors / sigma) ** 2).sum()) + extra + sized**2
     cost = float((np.where(used, huber, 0.0) / seen).sum()) + strain
 
+    root = np.where(used, np.sqrt(weight), 0.0)[..., None]
+
     def slope(changed: tuple[Float, Float]) -> Float:
-        return np.where(used[..., None], (changed[0] - missed) / _PROBE, 0.0)
+        return root * (changed[0] - missed) / _PROBE
+
+    def stacked(slopes: list[Float]) -> Float:
+        """Return weighted derivatives [C, T J, 3, n]."""
+        return np.stack(slopes, axis=-1).reshape(len(errors), -1, 3, len(slopes))
 
     probes = _PROBE * np.eye(3)
-    point = np.stack([slope(_misses(joints + each, place, solved.direction)) for each in probes], axis=-1)
+    point = stacked([slope(_misses(joints + each, place, solved.direction)) for each in probes])
     turned = np.cross(_PROBE * np.eye(3)[:, None, None, None], solved.direction)
-    own = [slope(_misses(joints, place + each, solved.direction)) for each in probes]
-    own += [slope(_misses(joints, place, solved.direction + each)) for each in turned]
-    own_rows = np.stack(own, axis=-1)  # [C, T, J, 3, 6]: each camera has its own errors
-    rows = np.zeros((*missed.shape, unknowns))
-    for camera in range(len(errors)):
-        rows[camera, ..., 6 * camera : 6 * camera + 6] = own_rows[camera]
-    of_size = np.zeros(unknowns)
+    moves = [slope(_misses(joints, place + each, solved.direction)) for each in probes]
+    own = stacked(moves + [slope(_misses(joints, place, solved.direction + each)) for each in turned])
+    of_numbers, of_size = [], np.zeros(unknowns)
     for k, probe in enumerate(_PROBE * np.eye(len(numbers))):
         probed = _with_errors(make(numbers + probe), errors)
         direction = np.where(used[..., None], _directions(probed), 0.0)
-        changed = _misses(joints, np.nan_to_num(probed.position), direction)
-        rows[..., errors.size + k] = slope(changed)
+        of_numbers.append(slope(_misses(joints, np.nan_to_num(probed.position), direction)))
         of_size[errors.size + k] = (size_sigmas(solve(probed).joints) - sized) / _PROBE
+    shared = stacked(of_numbers) if of_numbers else np.zeros((*own.shape[:3], 0))
 
-    root = np.sqrt(weight)[..., None]
-    flat, design, of_points = root * missed, root[..., None] * rows, root[..., None] * point
-    of_points = np.moveaxis(of_points, 0, 2).reshape(*joints.shape[:2], -1, 3)  # [T, J, 3 C, 3]
-    design = np.moveaxis(design, 0, 2).reshape(*joints.shape[:2], -1, unknowns)
-    flat = np.moveaxis(flat, 0, 2).reshape(*joints.shape[:2], -1, 1)
-    of_point = np.swapaxes(of_points, -1, -2) @ of_points + (placed[..., None, None] + _FIRM) * np.eye(3)
-    at_point = np.swapaxes(of_points, -1, -2) @ flat - pull[..., None]
-    both = np.swapaxes(of_points, -1, -2) @ design
-    solution = np.linalg.solve(of_point, np.concatenate([both, at_point], axis=-1))
-    tall, coupled = design.reshape(-1, unknowns), both.reshape(-1, unknowns)
-    normal = tall.T @ tall - coupled.T @ solution[..., :-1].reshape(-1, unknowns)
-    right = tall.T @ flat.ravel() - coupled.T @ solution[..., -1].ravel()
+    # Each camera has its own errors; the numbers are shared by all; the joints are eliminated.
+    left = (root * missed).reshape(*own.shape[:3], 1)
+    of_joint = np.swapaxes(point, -1, -2)
+    mixed = np.moveaxis(of_joint @ own, 0, 2).reshape(own.shape[1], 3, -1)
+    both = np.concatenate([mixed, (of_joint @ shared).sum(axis=0)], axis=-1)
+    at_joint = (of_joint @ left).sum(axis=0) - pull.reshape(-1, 3, 1)
+    firm = (placed.reshape(-1, 1, 1) + _FIRM) * np.eye(3)
+    joined = np.concatenate([both, at_joint], axis=-1)
+    solution = np.linalg.solve((of_joint @ point).sum(axis=0) + firm, joined).reshape(-1, unknowns + 1)
+    coupled = both.reshape(-1, unknowns).T @ solution
+    normal, right = -coupled[:, :-1], -coupled[:, -1]
+    for camera in range(len(errors)):
+        rows = np.concatenate([own[camera], shared[camera], left[camera]], axis=-1)
+        rows = rows.reshape(-1, rows.shape[-1])
+        product = rows[:, :-1].T @ rows
+        place_of = [*range(6 * camera, 6 * camera + 6), *range(errors.size, unknowns)]
+        normal[np.ix_(place_of, place_of)] += product[:, :-1]
+        right[place_of] += product[:, -1]
     free = np.asarray(loose, dtype=np.float64)
     inverse = np.concatenate([1 / sigma.ravel() ** 2, 1 / free**2])
     normal += np.diag(inverse + 1e-9) + np.outer(of_size, of_size)

@@ -104,7 +104,7 @@ def score(
         if total > limit:
             return Score(total, misfit, scatter, {"behind": behind}, np.nan)
     body = Body(solved.joints)
-    statures = body.statures()
+    statures = body.statures
     stature = median(statures)
     if np.isfinite(statures).sum() < 5 or not stature > 0:
         return Score(IMPOSSIBLE, misfit, np.inf, {}, np.nan)
@@ -226,7 +226,7 @@ def _place(
     stated_m, white_m = _moved_by(scene.sigma[:, :2], far_m), _moved_by(scene.sigma[:, 2:4], far_m)
     keypoint_m = float(np.sqrt(np.mean(pixel_variance(scene)) * np.mean((far_m / scene.focal_px) ** 2)))
     # The cameras that see a joint change, and with them the errors that they have in common.
-    limp = float(np.nanmedian([_spread(length) for length, _ in body.lengths()]))
+    limp = float(np.nanmedian([_spread(length) for length, _ in body.lengths]))
     odd = {"limp": Oddity(limp / (0.10 + 0.5 * stated_m), {"limb_spread": limp})}
     odd |= body.motion(flight, stature, white_m, keypoint_m)
     if not all(camera.static for camera in flight.cameras):
