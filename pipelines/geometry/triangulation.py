@@ -299,7 +299,8 @@ def _covariance(
     jacobian = (rotation.mT[..., :2, :] - image[..., None] * rotation.mT[..., 2:, :]) / depth[..., None, None]
     spread = (noise[0] + noise[1] / depth[..., None] ** 2)[..., [[0, 1], [1, 2]]]
     if method == "robust":
-        determinant = np.linalg.det(spread)[..., None, None]
+        xx, xy, yy = spread[..., 0, 0], spread[..., 0, 1], spread[..., 1, 1]
+        determinant = (xx * yy - xy**2)[..., None, None]
         by_view = spread[..., ::-1, ::-1] * [[1.0, -1.0], [-1.0, 1.0]] / determinant
     else:
         scale = depth**2 * (weight**2 if method == "midpoint" else 1.0)
@@ -307,11 +308,12 @@ def _covariance(
         by_view = scale[..., None, None] * (np.eye(2) - outer / length2[..., None, None])
     by_view = np.where(inlier[..., None, None], by_view, 0.0)
     weighted = by_view @ jacobian
-    normal = (jacobian.mT @ weighted).sum(axis=1)
+    rows = (len(jacobian), 2 * jacobian.shape[1], 3)  # those of all views
+    normal = jacobian.reshape(rows).mT @ weighted.reshape(rows)
     known: Bool = np.asarray(inlier.any(axis=1))
     inverse: Float = np.linalg.inv(np.where(known[:, None, None], normal, np.eye(3)))
     if method != "robust":
-        inverse = inverse @ (weighted.mT @ spread @ weighted).sum(axis=1) @ inverse
+        inverse = inverse @ (weighted.reshape(rows).mT @ (spread @ weighted).reshape(rows)) @ inverse
     return inverse
 
 
