@@ -297,17 +297,10 @@ def _radtan_radius(radius: Float, coefficients: tuple[float, ...]) -> tuple[Floa
 
 
 @lru_cache(maxsize=256)
-def _radtan_polynomials(
-    coefficients: tuple[float, ...],
-) -> tuple[np.polynomial.Polynomial, np.polynomial.Polynomial]:
-    k1, k2, _, _, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
-    return np.polynomial.Polynomial([1, k1, k2, k3]), np.polynomial.Polynomial([1, k4, k5, k6])
-
-
-@lru_cache(maxsize=256)
 def _radtan_limit(coefficients: tuple[float, ...]) -> float:
     """Find the radius up to which the distorted radius grows: its first maximum, or the first pole."""
-    above, below = _radtan_polynomials(coefficients)
+    k1, k2, _, _, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    above, below = np.polynomial.Polynomial([1, k1, k2, k3]), np.polynomial.Polynomial([1, k4, k5, k6])
     square = np.polynomial.Polynomial([0, 1])
     slope = above * below + 2 * square * (above.deriv() * below - above * below.deriv())
     return min(math.sqrt(min(_first_positive_root(slope), _first_positive_root(below))), _WIDEST)

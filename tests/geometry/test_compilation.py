@@ -96,34 +96,6 @@ def test_a_change_of_a_helper_in_another_file_is_seen(
     assert ask() == 3.0
 
 
-@pytest.mark.parametrize("left", [None, "# nothing any more"], ids=["no module", "no name"])
-def test_a_cache_whose_types_moved_to_another_module_is_compiled_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: str | None
-) -> None:
-    """Read a cache as after an update: its index names types in their old modules."""
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    kind = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    a: float\n    b: float\n"
-    outermost = "from pipelines.geometry.compilation import cached\n\n@cached\ndef add(pair):\n"
-
-    def add(module: str) -> float:
-        (tmp_path / f"{module}.py").write_text(kind)
-        body = f"from {module} import Pair\n{outermost}    return pair.a + pair.b\n"
-        (tmp_path / "adding.py").write_text(body)
-        for name in ("earlier_kinds", "later_kinds", "adding"):
-            sys.modules.pop(name, None)
-        importlib.invalidate_caches()
-        adding = importlib.import_module("adding")
-        total: float = adding.add(adding.Pair(1.0, 2.0))
-        return total
-
-    assert add("earlier_kinds") == 3.0
-    (tmp_path / "earlier_kinds.py").unlink()
-    if left is not None:
-        (tmp_path / "earlier_kinds.py").write_text(left)
-    assert add("later_kinds") == 3.0
-
-
 def test_a_function_without_a_place_for_its_cache_still_runs() -> None:
     space: dict[str, Callable[[float], float]] = {}
     exec("def double(x):\n    return 2.0 * x", space)  # noqa: S102  # no file, so numba knows no place
