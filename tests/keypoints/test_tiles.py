@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.keypoints.search import Tile, find_in, squares_about, tiles
+from pipelines.keypoints.search import Tile, find_in, tiles
 from tests.keypoints.bars import Bar, BarNetworks, draw
 
 
@@ -32,30 +32,6 @@ def test_a_body_of_a_third_of_a_tile_is_whole_in_one(
     y = body / 2 + place[1] * (height - body)
 
     assert any(_holds(tile, x, y, body) for tile in tiles(width, height) if tile.width == tile.height == side)
-
-
-@given(width=st.integers(1, 8000), height=st.integers(1, 8000))
-def test_tiles_lie_in_the_picture_and_start_with_the_whole(width: int, height: int) -> None:
-    cover = tiles(width, height) if max(width, height) < 20 * min(width, height) else tiles(width, width)
-    size = (cover[0].width, cover[0].height)
-
-    assert (cover[0].left, cover[0].top) == (0, 0)
-    assert len(set(cover)) == len(cover)
-    for tile in cover:
-        assert 0 <= tile.left <= size[0] - tile.width
-        assert 0 <= tile.top <= size[1] - tile.height
-
-
-@given(
-    margin=st.floats(0, 300),
-    offset=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
-)
-def test_squares_hold_a_body_anywhere_within_the_margin(margin: float, offset: tuple[float, float]) -> None:
-    # 100 px bodies: 3 x 3 squares are enough for a margin of three heights.
-    squares = squares_about((960, 540), 100, margin, 1920, 1080)
-
-    assert len(squares) <= 9
-    assert any(_holds(s, 960 + margin * offset[0], 540 + margin * offset[1], 100) for s in squares)
 
 
 def test_people_are_found_once_and_in_the_pixels_of_the_whole_picture() -> None:

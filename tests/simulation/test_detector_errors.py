@@ -16,14 +16,11 @@ from pipelines.simulation.detector_errors import (
     HIDDEN_ERROR,
     HIDDEN_MISSED_SHARE,
     KEPT_PER_FRAME,
-    MODELLED,
     OUTLIER_SHARES,
     SWAP_FRAMES,
     ErrorTable,
     detect_keypoints,
-    errors_of,
     read_errors,
-    view_of,
 )
 from pipelines.simulation.scenario import DetectorErrors
 from tests.synthetic.walk import COCO17
@@ -71,28 +68,7 @@ def lengths(xy: Float) -> Float:
 # --- the table -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("detector", MODELLED)
-def test_a_joint_is_found_worse_the_steeper_the_camera_looks(detector: str) -> None:
-    """As in the seed: alike up to 30 degrees, worse above; of all joints together."""
-    error, missed, confidence = read_errors(errors_of(detector)).at(
-        np.array([0.0, 15.0, 30.0, 45.0, 60.0]), ("*",)
-    )
-    assert (np.diff(error[1:, 0]) > 0).all()
-    assert (np.diff(missed[1:, 0]) > 0).all()
-    assert (np.diff(confidence[1:, 0]) < 0).all()
-    assert error[1, 0] == pytest.approx(error[0, 0], rel=0.1)
-
-
 # --- the view ------------------------------------------------------------------------------------------
-
-
-def test_tilt_and_apparent_height() -> None:
-    camera = np.array([[10.0, 0.0, 1.0], [0.0, 3.0, 5.0], [0.0, 0.0, 11.0], [3.0, 0.0, -3.0]])
-    tilt_deg, height_px = view_of(camera, np.array([0.0, 0.0, 1.0]), height_m=1.75, focal_px=800.0)
-    assert tilt_deg == pytest.approx(
-        [0.0, math.degrees(math.atan2(4, 3)), 90.0, math.degrees(math.atan2(-4, 3))]
-    )
-    assert height_px == pytest.approx([140.0, 280.0, 140.0, 280.0])
 
 
 # --- errors --------------------------------------------------------------------------------------------
@@ -177,15 +153,6 @@ def test_a_swap_exchanges_one_pair_of_limbs_for_a_few_frames() -> None:
     assert np.mean(np.array(runs) > SWAP_FRAMES[1]) < 0.1
 
 
-@pytest.mark.parametrize("share", [0.1])
-def test_as_many_frames_are_swapped_as_asked_for(share: float) -> None:
-    """Runs of 4 frames: 60,000 frames have 60,000 share / 4 of them, whose count scatters by its root."""
-    swaps = CLEAN.model_copy(update={"swap_share": share})
-    frames = 20_000
-    swapped = (detect(swaps, frames=frames)[0] != detect(CLEAN, frames=frames)[0]).any(axis=(1, 2))
-    assert swapped.mean() == pytest.approx(share, rel=4 / math.sqrt(frames * share / 4))
-
-
 # --- confidence ----------------------------------------------------------------------------------------
 
 
@@ -201,28 +168,4 @@ def test_confidence_has_the_measured_mean_and_falls_with_the_error(tilt_deg: flo
     assert tenths[0] - tenths[-1] > 0.9 * 0.14 - 0.01  # from the middle of the first to that of the last
 
 
-@pytest.mark.parametrize(
-    ("tilt_deg", "pck"), [(0.0, 0.96), (15.0, 0.97), (30.0, 0.91), (45.0, 0.81), (60.0, 0.61)]
-)
-def test_the_measured_share_of_correct_keypoints_comes_out(tilt_deg: float, pck: float) -> None:
-    """With the default shares, which add up to 0.03 beside the measured 0.028: 0.0576 H is 0.2 torso.
-
-    Missed joints and outliers are drawn apart, so that their shares overlap: at 60 degrees, where they
-    grow fivefold to 0.10 and 0.05 and a quarter of the rest errs as far by chance, that is 0.03.
-    """
-    xy, _ = detect(WITHOUT_SWAPS, tilt_deg=tilt_deg)
-    assert (lengths(xy) < 0.0576 * HEIGHT_PX).mean() == pytest.approx(pck, abs=0.04)
-
-
 # --- edges ---------------------------------------------------------------------------------------------
-
-
-def test_what_is_not_in_the_picture_is_never_found() -> None:
-    pixels = np.full((30, 17, 2), np.nan)
-    arguments = np.ones((30, 17), dtype=np.bool_), np.zeros(30), np.full(30, 200.0)
-    xy, confidence = detect_keypoints(
-        pixels, *arguments, DetectorErrors(outlier_share=0.5), np.random.default_rng(0), joints=COCO17
-    )
-    assert np.isnan(xy).all()
-    assert (confidence == 0).all()
-    assert np.isnan(pixels).all()

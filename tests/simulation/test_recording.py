@@ -17,7 +17,6 @@ from pipelines.simulation.flying import (
     estimate,
     fly,
     frame_times,
-    log_times,
     moments,
     poses_at,
     ring_slots,
@@ -42,20 +41,6 @@ def generator(seed: int = 0) -> np.random.Generator:
 
 
 # --- stamps --------------------------------------------------------------------------------------------
-
-
-def test_a_log_has_stamps_of_its_own() -> None:
-    t_ns = log_times(50.0, (-0.5, 9.5), generator())
-    assert t_ns.dtype == np.int64
-    assert abs(len(t_ns) - 500) <= 1
-    assert -0.5e9 <= t_ns[0] < -0.5e9 + 1.4 * 20e6
-    assert 9.5e9 - 1.4 * 20e6 < t_ns[-1] <= 9.5e9
-    # A step is the period with the difference of two jitters of 2 % of it; 499 give 3 % of their sigma.
-    steps_ms = np.diff(t_ns) / 1e6
-    assert steps_ms.mean() == pytest.approx(20.0, abs=0.02)
-    assert steps_ms.std() == pytest.approx(0.4 * math.sqrt(2), rel=0.12)
-    assert (t_ns == log_times(50.0, (-0.5, 9.5), generator())).all()
-    assert t_ns[0] != log_times(50.0, (-0.5, 9.5), generator(1))[0]
 
 
 def test_frames_are_even_but_for_those_that_were_lost() -> None:
@@ -125,19 +110,6 @@ def test_body_and_gimbal_make_the_camera(models: list[NoiseModel]) -> None:
 def many_poses() -> DronePoses:
     t_ns = np.arange(20_000) * 500_000
     return poses_at(PATHS, 0, t_ns)
-
-
-def test_logged_cameras_err_as_their_models_say() -> None:
-    """20,000 rows, three axes: a sigma is known to 1 / sqrt(2 * 60,000) = 0.3 %."""
-    truth = many_poses()
-    log = estimate(truth, [White(position_m=0.2, rotation_deg=1.5)], generator(2))
-    offset = log.camera.position - truth.camera_position
-    turned = multiply(conjugate(truth.camera_quaternion_xyzw), log.camera.quaternion_xyzw)
-    assert offset.std() == pytest.approx(0.2, rel=0.012)
-    assert rotation_vector_from_quaternion(turned).std() == pytest.approx(math.radians(1.5), rel=0.012)
-    assert log.camera.covariance is not None
-    expected = np.diag([0.04] * 3 + [math.radians(1.5) ** 2] * 3)
-    assert np.abs(log.camera.covariance - expected).max() < 1e-15
 
 
 def test_covariances_of_the_body_are_those_of_its_errors() -> None:

@@ -15,7 +15,6 @@ from pipelines.simulation.flight import (
     keypoints_of,
     visible_joints,
 )
-from pipelines.simulation.raster import hidden_by
 from pipelines.simulation.scenario import Scenario
 
 STANDING: dict[str, Any] = {"motion": [{"stand": {"seconds": 1}}]}
@@ -62,46 +61,6 @@ def test_who_stands_in_the_way_hides_whoever_is_behind() -> None:
     # Seven of ten hidden joints are missed: of 20 draws at least five, but for one case in ten thousand.
     assert np.isnan(pixels[:, trunk, 0]).sum() >= 5
     assert confidence[:, trunk].mean() < 0.5 * nearer[:, trunk].mean()
-
-
-def test_a_rolling_shutter_takes_everybody_at_the_time_of_each_joints_row() -> None:
-    """Somebody who jogs past hides a joint from where both and the camera are when the joint's row is read.
-
-    The time of the whole picture gives other answers: the jogger moves 16 cm from it to the first row's.
-    """
-    crossing = {
-        "anna": STANDING,
-        "ben": {"motion": [{"jog": {"distance_m": 8, "speed_mps": 3.5}}], "start": [-1.0, -0.5]},
-    }
-    drones = {
-        "camera": {"rate_hz": 10, "readout_ms": 90},
-        "count": 3,
-        "formation": {"radius_m": 4, "tilt_deg": 15, "yaw_rate_deg_per_s": 30},
-    }
-    flight = fly_scenario(scenario(crossing, duration_s=0.8, drones=drones), [])
-    hidden = otherwise = 0
-    for drone in flight.drones:
-        rows, height = flight.moments_of(drone), drone.intrinsics.height
-        for person, other in (flight.people, flight.people[::-1]):
-            pixels, visible = visible_joints(flight, drone, person)
-            frame, joint = np.nonzero(np.isfinite(pixels).all(axis=-1))
-            late_s = (np.clip(pixels[frame, joint, 1], 0, height - 1) / (height - 1) - 0.5) * 0.09
-            t_ns = drone.at_frames.t_ns[frame] + np.rint(1e9 * late_s).astype(np.int64)
-            order = np.argsort(t_ns)
-            frame, joint, t_ns = frame[order], joint[order], t_ns[order]
-            motion, eye = other.moving(t_ns / 1e9), drone.at(t_ns).camera_position
-            targets = person.person.keypoints(person.moving(t_ns / 1e9))
-            for k, (f, j) in enumerate(zip(frame.tolist(), joint.tolist(), strict=True)):
-                surface = other.person.surface(motion.root[k], motion.rotation[k])
-                expected = bool(hidden_by(surface, eye[k], targets[k, [j]])[0])
-                assert visible[f, j] == (not expected)
-                at_once = hidden_by(
-                    other.surface(rows[f]), drone.at_frames.camera_position[f], person.joints[rows[f], [j]]
-                )
-                hidden += expected
-                otherwise += bool(at_once[0]) != expected
-    assert hidden > 10
-    assert otherwise > 0
 
 
 def test_whoever_comes_along_leaves_the_first_actor_and_the_drones_as_they_were() -> None:

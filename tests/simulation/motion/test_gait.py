@@ -137,13 +137,3 @@ def test_a_jog_flies_and_bends_its_knees_as_published() -> None:
     assert 85 < knee.max() < 120
     height = motion.root[steady, 2]
     assert 0.04 < np.ptp(height) < 0.12
-
-
-@pytest.mark.parametrize("kind", ["walk", "jog"])
-@pytest.mark.parametrize("speed", [0.8, 1.4, 2.6])
-def test_the_speed_is_the_one_asked_for(kind: str, speed: float) -> None:
-    motion = performed({kind: {"distance_m": 14 * speed, "speed_mps": speed}}, seconds=12.0, step_s=0.02)
-    # Acceleration takes 3 s at most; the body sways by 6 mm at most: 2 x 6 mm over 4 s.
-    steady = (motion.t_s >= 4.0) & (motion.t_s < 8.001)
-    way = np.ptp(motion.root[steady, 0])
-    assert way / np.ptp(motion.t_s[steady]) == pytest.approx(speed, abs=0.004)

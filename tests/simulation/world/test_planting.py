@@ -44,9 +44,3 @@ def test_a_wood_that_does_not_fit_is_one_clear_line() -> None:
         build_world(spec(count=3, radius_m=5.0, clear_m=6.0), 5, keep_clear=WAY)
     with pytest.raises(DataError, match=r"^world\.wood: .*\b\d+ of 500\b.*\b8 m\b"):
         build_world(spec(count=500, radius_m=8.0, clear_m=0.0), 5, keep_clear=NOBODY)
-
-
-def test_a_wall_needs_a_length() -> None:
-    walls = [{"start": [0.0, 1.0], "end": [3.0, 1.0]}, {"start": [2.0, 2.0], "end": [2.0, 2.0]}]
-    with pytest.raises(DataError, match=r"^world\.walls\[1\]: .*\[2\.0, 2\.0\]"):
-        build_world(scenario.WorldSettings.model_validate({"walls": walls}), 1, keep_clear=NOBODY)
