@@ -25,6 +25,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.compilation import cached
+from pipelines.keypoints.bodies import meeting_points, rays_of
 from pipelines.session.people import mirrored
 from pipelines.session.records import Detections
 
@@ -53,8 +54,8 @@ _TAIL_VARIANCES = 16.0
 _MIN_NOISE_SHARE = 0.01
 # Walkers' legs cross every half second, so an exchange with one visible end is shorter.
 _MAX_EXCHANGE_S = 0.3
-# Nothing is predicted over longer gaps.
-_MAX_GAP_S = 0.5
+# Nothing is predicted over longer gaps: over 0.4 s legs that crossed were exchanged, sample 34 -> 52 mm.
+_MAX_GAP_S = 0.2
 # Pictures with a smaller share of the usual pairs are decided by the pictures beside them.
 _MIN_PAIRS_SHARE = 0.6
 # Left and right nearer to each other than this share of the body's size are crossing.
@@ -371,7 +372,7 @@ def _wrong_views(xy: Float, position: Float, rotation: Float, sigma: Float, pair
     """Find in which views a limb [T, 2 K, C, 2] (left, right, ...) is exchanged [T, C], or undecided [T]."""
     times, _, cameras, _ = xy.shape
     flipped, undecided = np.zeros((times, cameras), np.bool_), np.zeros(times, np.bool_)
-    rays = _world_rays(xy, rotation).reshape(times, pairs, 2, cameras, 3)
+    rays = np.moveaxis(rays_of(np.moveaxis(xy, 2, 1), rotation), 1, 2).reshape(times, pairs, 2, cameras, 3)
     posed = np.asarray(np.isfinite(position).all(-1))[:, None, None]
     seen: Bool = np.asarray(np.isfinite(rays).all(-1)) & posed
     both = np.asarray(np.all(seen, axis=2))
@@ -407,36 +408,21 @@ def _wrong_views(xy: Float, position: Float, rotation: Float, sigma: Float, pair
     return flipped, undecided
 
 
-def _world_rays(xy: Float, rotation: Float) -> Float:
-    """Compute the viewing rays as unit vectors [T, J, C, 3] in the world."""
-    camera = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
-    world: Float = np.einsum("tcik,tjck->tjci", rotation, camera)
-    unit: Float = world / np.linalg.norm(world, axis=-1, keepdims=True)
-    return unit
-
-
 def _misses(rays: Float, seen: Bool, position: Float, sigma: Float) -> Float:
     """Compute squared distances [T, K, 2, C] of rays from their common point, in variances; NaN if not seen.
 
-    The point is the least squares midpoint of the rays, weighed by their accuracy. A ray's error is its
-    angular error times the distance. Also NaN for fewer than two rays, or if all are parallel.
+    A ray's error is its angular error times the distance. Also NaN for fewer than two rays, or if all are
+    parallel.
     """
     weight = np.where(seen, 1 / sigma[:, None, None] ** 2, 0.0)
     rays = np.where(seen[..., None], rays, 0.0)
-    origin = np.nan_to_num(position)[:, None, None]
-    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
-    normal = np.einsum("tksc,tkscij->tksij", weight, across)
-    right = np.einsum("tksc,tkscij,tkscj->tksi", weight, across, np.broadcast_to(origin, rays.shape))
-    scale = np.maximum(np.trace(normal, axis1=-2, axis2=-1), np.finfo(float).tiny)[..., None, None]
-    fixed = (seen.sum(-1) >= 2) & (np.linalg.det(normal / scale) > 1e-9)
-    solvable = np.where(fixed[..., None, None], normal, np.eye(3))
-    point = np.linalg.solve(solvable, right[..., None])[..., 0]
-    sight = point[..., None, :] - origin
-    offset = np.einsum("tkscij,tkscj->tksci", across, sight)
-    depth = np.einsum("tksci,tksci->tksc", rays, sight)
+    origin = np.broadcast_to(np.nan_to_num(position)[:, None, None], rays.shape)
+    points, _ = meeting_points(rays, origin, weight)
+    sight = points[..., None, :] - origin
+    depth = (rays * sight).sum(axis=-1)
+    offset2 = ((sight - depth[..., None] * rays) ** 2).sum(axis=-1)
     variance = (np.maximum(depth, 1e-6) * sigma[:, None, None]) ** 2
-    misses: Float = np.where(seen & fixed[..., None], (offset**2).sum(-1) / variance, np.nan)
-    return misses
+    return np.where(seen & np.isfinite(points[..., :1]), offset2 / variance, np.nan)
 
 
 def _mean(misses: Float) -> Float:

@@ -47,22 +47,17 @@ def write_tum(path: Path, t_ns: Int64, position: Float, quaternion_xyzw: Float) 
     write_lines(path, lines)
 
 
-def write_joints(path: Path, t_ns: Int64, names: tuple[str, ...], joints: Float) -> None:
-    """Write joints [T, J, 3] of one person as a long CSV: t_ns, joint, x, y, z in metres, z up."""
-    lines = ["t_ns,joint,x,y,z"]
-    for stamp, points in zip(t_ns.tolist(), joints.tolist(), strict=True):
-        lines += [f"{stamp},{n},{x:.6f},{y:.6f},{z:.6f}" for n, (x, y, z) in zip(names, points, strict=True)]
-    write_lines(path, lines)
-
-
-def write_people(path: Path, t_ns: Int64, names: tuple[str, ...], people: Sequence[Float]) -> None:
-    """Joints [T, J, 3] of several people as a long CSV like that of one, with `person` 0, 1, ...."""
-    lines = ["t_ns,person,joint,x,y,z"]
+def write_joints(
+    path: Path, t_ns: Int64, names: tuple[str, ...], people: Sequence[Float], *, numbered: bool
+) -> None:
+    """Write joints [T, J, 3] of each person as a long CSV: t_ns, person if numbered, joint, x, y, z in m."""
+    lines = [f"t_ns,{'person,' if numbered else ''}joint,x,y,z"]
     for row, stamp in enumerate(t_ns.tolist()):
         for person, joints in enumerate(people):
+            begin = f"{stamp},{person}," if numbered else f"{stamp},"
             lines += [
-                f"{stamp},{person},{n},{x:.6f},{y:.6f},{z:.6f}"
-                for n, (x, y, z) in zip(names, joints[row].tolist(), strict=True)
+                f"{begin}{name},{x:.6f},{y:.6f},{z:.6f}"
+                for name, (x, y, z) in zip(names, joints[row].tolist(), strict=True)
             ]
     write_lines(path, lines)
 
@@ -112,10 +107,10 @@ def write_truth(folder: Path, flight: SimulatedFlight) -> None:
     truth = folder / "truth"
     truth.mkdir()
     stamps, joint_names = flight.t_ns + start_ns, flight.people[0].person.joints
-    if flight.scenario.actors is None:
-        write_joints(truth / "joints.csv", stamps, joint_names, flight.people[0].joints)
-    else:
-        write_people(truth / "joints.csv", stamps, joint_names, [each.joints for each in flight.people])
+    numbered = flight.scenario.actors is not None
+    joints = [each.joints for each in flight.people]
+    write_joints(truth / "joints.csv", stamps, joint_names, joints, numbered=numbered)
+    if numbered:
         write_json(truth / "people.json", {"people": [each.name for each in flight.people]})
     for drone in flight.drones:
         poses = drone.at_log

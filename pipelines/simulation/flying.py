@@ -185,11 +185,7 @@ def fly(slots: Float, aim: Float, t_s: Float, limits: Limits) -> DronePaths:
         aim: [T, 3] m, the point that the cameras look at.
         t_s: [T] seconds, strictly increasing (`moments`).
         limits: of speed and acceleration; neither is ever exceeded.
-
-    Raises:
-        ValueError: times that do not increase strictly, or numbers that are not finite.
     """
-    _check(t_s, slots, aim)
     velocity = np.gradient(slots, t_s, axis=1) if len(t_s) > 1 else np.zeros_like(slots)
     flight = _Flight.starting(slots[:, :1], velocity[:, :1], t_s, limits)
     flight.advance(0, slots, velocity)
@@ -218,12 +214,7 @@ def fly_with(
         limits: of speed and acceleration; neither is ever exceeded.
         actor_t_s: [M] seconds, increasing: times of the actor's position estimates.
         actor: [M, 3] m, the estimates.
-
-    Raises:
-        ValueError: times that do not increase strictly, numbers that are not finite, or slots of
-            another shape.
     """
-    _check(t_s, start, aim)
     flight = _Flight.starting(start[:, None], np.zeros_like(start[:, None]), t_s, limits)
     ticks = np.floor((t_s - t_s[:1]) * rate_hz + 1e-9)
     calls = np.flatnonzero(np.diff(ticks, prepend=-1.0)).tolist()
@@ -234,8 +225,6 @@ def fly_with(
         slot, slot_velocity = planner(
             Known(float(now), actor_t_s[:so_far], actor[:so_far], position, velocity)
         )
-        if slot.shape != start.shape or not np.isfinite([slot, slot_velocity]).all():
-            raise ValueError(f"the planner's slots at {now:g} s are not {start.shape} finite numbers")
         since = (t_s[first : following + 1] - now)[:, None]
         moving = slot[:, None] + slot_velocity[:, None] * since
         flight.advance(first, moving, np.broadcast_to(slot_velocity[:, None], moving.shape).copy())
@@ -292,13 +281,6 @@ class _Flight(NamedTuple):
         )
         camera_xyzw = multiply(gimbal, body_from_camera("forward"))
         return DronePaths(self.t_s, self.position, self.velocity, body_xyzw, camera_xyzw)
-
-
-def _check(t_s: Float, *places: Float) -> None:
-    if (np.diff(t_s) <= 0).any():
-        raise ValueError("times must increase strictly")
-    if not all(np.isfinite(values).all() for values in (t_s, *places)):
-        raise ValueError("times, slots and aim must be finite")
 
 
 def _leaning(acceleration: Float, velocity: Float, heading: Float) -> Float:
@@ -468,13 +450,8 @@ def poses_at(paths: DronePaths, drone: int, t_ns: Int64) -> DronePoses:
 
     Positions follow the cubic through the path's positions and velocities, attitudes turn evenly. The
     camera always sits at the lever arm's end.
-
-    Raises:
-        ValueError: a moment outside the path.
     """
     grid_ns = _nanoseconds(paths.t_s)
-    if len(t_ns) and not (len(grid_ns) and grid_ns[0] <= t_ns.min() and t_ns.max() <= grid_ns[-1]):
-        raise ValueError("poses are asked for before or after the flight")
     position = _hermite(grid_ns, paths.position[drone], paths.velocity[drone], t_ns)
     longest_ns = int(np.diff(grid_ns).max(initial=0))
     body_xyzw, camera_xyzw = (
@@ -495,11 +472,7 @@ def poses_at(paths: DronePaths, drone: int, t_ns: Int64) -> DronePoses:
 def sample_log(
     paths: DronePaths, drone: int, rate_hz: float, span_s: tuple[float, float], rng: np.random.Generator
 ) -> DronePoses:
-    """Interpolate one drone's true poses at the stamps of its log (`log_times`).
-
-    Raises:
-        ValueError: the span reaches beyond the path.
-    """
+    """Interpolate one drone's true poses at the stamps of its log (`log_times`)."""
     return poses_at(paths, drone, log_times(rate_hz, span_s, rng))
 
 
@@ -567,15 +540,10 @@ def estimate_actor(
 
     Returns:
         Stamps [M], ns since the flight's start, and positions [M, 3]; never NaN.
-
-    Raises:
-        ValueError: the span reaches beyond `t_s`, or the truth has gaps.
     """
     t_ns = log_times(rate_hz, span_s, rng)
     grid_ns = _nanoseconds(t_s)
     position = interpolate_points(grid_ns, hip, t_ns, max_gap_ns=int(np.ptp(grid_ns)) if len(grid_ns) else 0)
-    if np.isnan(position).any():
-        raise ValueError("the actor's hip is not known throughout the log")
     error = GaussMarkov(position_m=sigma_m, correlation_s=ACTOR_CORRELATION_S)
     level = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_ns), 1))
     return t_ns, position + error.errors(t_ns, position, level, rng)[:, :3]

@@ -35,13 +35,7 @@ class TriangleSurface:
 
 
 def joined(*surfaces: TriangleSurface) -> TriangleSurface:
-    """Join several surfaces of one kind to one.
-
-    Raises:
-        ValueError: they differ in `smooth` or `ground`, or there are none.
-    """
-    if len({(s.smooth, s.ground) for s in surfaces}) != 1:
-        raise ValueError("only surfaces of one kind can be joined")
+    """Join several surfaces of one kind, all smooth or none, to one."""
     first = np.cumsum([0, *(len(s.vertices) for s in surfaces[:-1])])
     return TriangleSurface(
         np.concatenate([s.vertices for s in surfaces]),

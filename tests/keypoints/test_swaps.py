@@ -29,9 +29,9 @@ def pixels(turn_deg: float, tilt_deg: float = 20.0, noise_px: float = NOISE_PX, 
     return xy + np.random.default_rng(seed).normal(0.0, noise_px, xy.shape)
 
 
-@pytest.mark.parametrize("noise_px", [0.0, 1.0, 2.0, 4.0])
-@pytest.mark.parametrize("turn_deg", [0.0, 120.0, 240.0])
-@pytest.mark.parametrize("tilt_deg", [0.0, 45.0, 80.0])
+@pytest.mark.parametrize("noise_px", [0.0, 2.0])
+@pytest.mark.parametrize("turn_deg", [0.0, 120.0])
+@pytest.mark.parametrize("tilt_deg", [0.0, 45.0])
 def test_what_is_not_exchanged_stays_to_the_last_bit(
     noise_px: float, turn_deg: float, tilt_deg: float
 ) -> None:
@@ -41,6 +41,13 @@ def test_what_is_not_exchanged_stays_to_the_last_bit(
     assert counts == {}
     np.testing.assert_array_equal(found, xy)
     np.testing.assert_array_equal(sure, confidence)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 60.0, 120.0])
+def test_nothing_is_exchanged_between_pictures_that_are_too_far_apart(turn_deg: float) -> None:
+    """Legs cross every half second, so nothing predicts them over 0.4 s."""
+    xy = pixels(turn_deg)[::12]
+    assert undo_swaps(T_S[::12], xy, np.ones(xy.shape[:2]), COCO17)[2] == {}
 
 
 def test_gaps_and_outliers_are_no_exchanges() -> None:

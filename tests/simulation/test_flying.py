@@ -135,12 +135,3 @@ def test_cameras_look_at_their_aim_and_stand_upright() -> None:
 
 
 # --- edges ---------------------------------------------------------------------------------------------
-
-
-def test_nonsense_is_refused() -> None:
-    slots = np.ones((1, 3, 3))
-    with pytest.raises(ValueError, match="increase"):
-        fly(slots, slots[0], np.array([0.0, 0.0, 1.0]), Limits())
-    slots[0, 1, 2] = np.nan
-    with pytest.raises(ValueError, match="finite"):
-        fly(slots, np.zeros((3, 3)), np.arange(3.0), Limits())

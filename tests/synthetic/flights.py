@@ -142,7 +142,7 @@ def write_flight(
 
     if static:
         (folder / "calibration.toml").write_text("\n".join(calibrations), encoding="utf-8")
-    write_joints(folder / "truth.csv", t_ns, COCO17, joints)
+    write_joints(folder / "truth.csv", t_ns, COCO17, [joints], numbered=False)
     truth = {"file": "truth.csv", "poses": {name: f"{name}_true.tum" for name in names}}
     settings = {
         "schema": 1,
