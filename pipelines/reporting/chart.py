@@ -405,6 +405,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     for mark in panel.marks:
         _draw_mark(axes, mark)
     axes.set_xlabel(panel.x_label)
+    if panel.x_label:
+        axes.tick_params(labelbottom=True)  # also above another row
     axes.set_ylabel(panel.y_label)
     if panel.rows is not None:
         axes.set_yticks(list(panel.rows), list(panel.rows.values()))
