@@ -12,17 +12,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from pipelines.formats.logs.messages import (
-    FAULTS,
     Stamps,
     all_samples,
     kind_of,
-    nanoseconds,
-    unreadable,
+    samples,
 )
 from pipelines.formats.logs.recordings import LogPart, OpenLog, open_parts
 from pipelines.formats.poses import clean_poses
@@ -526,31 +524,6 @@ def _clock_stepped(log: OpenLog, gap: StampGap, at_ns: int) -> bool | None:
 PATH = "nav_msgs/msg/Path"
 """Message type that is read here; setpoints that are poses (PoseStamped, Odometry) are read as poses."""
 
-_Point = tuple[int, float, float, float]
-
-
-class _CommandedWay:
-    """Points in the order of time; a later plan replaces all points from its beginning on."""
-
-    def __init__(self) -> None:
-        self._t_ns = array("q")
-        self._position = array("d")
-
-    def replace_from(self, points: list[_Point]) -> None:
-        """Add a plan: it replaces all earlier points from its first time on."""
-        kept = bisect_left(self._t_ns, points[0][0])
-        del self._t_ns[kept:], self._position[3 * kept :]
-        for t_ns, *place in points:
-            self._t_ns.append(t_ns)
-            self._position.extend(place)
-
-    def trajectory(self, source: str) -> Trajectory:
-        """Return the points as a clean trajectory; the rotation is the identity."""
-        position = np.frombuffer(self._position, dtype=np.float64).reshape(-1, 3)
-        level = np.tile([0.0, 0.0, 0.0, 1.0], (len(position), 1))
-        readable = np.ones(len(position), dtype=np.bool_)
-        return clean_poses(source, np.frombuffer(self._t_ns, dtype=np.int64), readable, position, level)
-
 
 def read_commands(recording: Log, source: str, topic: str, stamps: Stamps) -> Trajectory:
     """Read the positions that a topic of `PATH` commanded, in the axes of the log.
@@ -558,27 +531,30 @@ def read_commands(recording: Log, source: str, topic: str, stamps: Stamps) -> Tr
     By the stamps of receipt, a plan begins at the time of its receipt. Empty plans are counted. The rotation
     is the identity and has no meaning.
     """
-    way, empty = _CommandedWay(), 0
+    t_ns, position, empty = array("q"), array("d"), 0
     for message in recording.messages([topic]):
-        try:
-            points = [_point(pose.header.stamp, pose.pose.position) for pose in message.value.poses]
-        except FAULTS as error:
-            raise unreadable(message, source, error) from error
-        if not points:
-            empty += 1
-            continue
-        if any(later[0] <= earlier[0] for earlier, later in pairwise(points)):
+        points = [point for point in samples(message, source) if isinstance(point, PoseSample)]
+        empty += not points
+        if any(later.stamp_ns <= earlier.stamp_ns for earlier, later in pairwise(points)):
             raise DataError(
                 source,
                 f"topic {topic}: the points of a plan have no times of their own",
                 "name a topic of setpoints instead",
             )
-        late_ns = message.receive_ns - points[0][0] if stamps == "receive" or not points[0][0] else 0
-        way.replace_from([(t_ns + late_ns, x, y, z) for t_ns, x, y, z in points])
-    found = way.trajectory(f"{source} {topic}")
+        for number, point in enumerate(points):
+            late_ns = message.receive_ns - points[0].stamp_ns if stamps == "receive" else 0
+            if not number:  # a later plan replaces all earlier points from its first time on
+                kept = bisect_left(t_ns, point.stamp_ns + late_ns)
+                del t_ns[kept:], position[3 * kept :]
+            t_ns.append(point.stamp_ns + late_ns)
+            position.extend(point.position)
+    count = len(t_ns)
+    found = clean_poses(
+        f"{source} {topic}",
+        np.frombuffer(t_ns, dtype=np.int64),
+        np.ones(count, dtype=np.bool_),
+        np.frombuffer(position, dtype=np.float64).reshape(-1, 3),
+        np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+    )
     found.dropped.update(+Counter({"empty plan": empty}))
     return found
-
-
-def _point(stamp: Any, position: Any) -> _Point:
-    return nanoseconds(stamp), float(position.x), float(position.y), float(position.z)

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.maps import las
+from pipelines.formats.maps import point_files
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat, need, recognise
 from tests.formats.refusals import refuses
 
-READER: MapFormat = las.FORMAT
+READER: MapFormat = point_files.LAS
 # Two voxels of 0.5 m beside each other and one above, in UTM 32 north.
 POINTS = np.array([[500000.1, 5300000.1, 400.1], [500000.2, 5300000.2, 400.2], [500000.6, 5300000.1, 400.1],
                    [500000.1, 5300000.1, 400.9]])  # fmt: skip
@@ -86,6 +86,6 @@ def test_a_decompressor_that_ends_its_process_ends_no_other(
 ) -> None:
     path = write(tmp_path / "cloud.laz")
     script = "import os; os.abort()"
-    monkeypatch.setattr(las, "_decompressor", lambda *_: [sys.executable, "-c", script])
+    monkeypatch.setattr(point_files, "_decompressor", lambda *_: [sys.executable, "-c", script])
     with refuses(path):
         READER.read_map(path, resolution_m=0.5)
