@@ -332,7 +332,7 @@ PLY = PlyFormat()
 # Points that the file marks as noise (classes 7 and 18) or as withheld are left out and counted. Coordinates
 # are those of the file's reference system: usually a map projection, which the file may name.
 #
-# LAZ is decompressed into a temporary LAS by a process of its own, which runs this module as its main program:
+# LAZ is decompressed into a temporary LAS by a process of its own that runs this module as its main program:
 # the decompressor, which is compiled, aborts its process on some damaged files.
 
 # So many points are read at a time, which takes some 100 MB.
