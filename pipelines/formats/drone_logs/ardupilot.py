@@ -32,6 +32,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     pictures_on_gps_time,
     position_track,
     refuse_marks,
+    require_position,
     turned_as_stated,
     world_from_heading,
 )
@@ -220,17 +221,8 @@ def _position(
             f"write position: {others[0]}" if others else "leave `instance` out",
             code="no-such-name",
         )
-    if choice.position is not None and choice.position not in found:
-        raise DataError(
-            log.path,
-            f"has no {choice.position} position",
-            f"there is {', '.join(found) or 'none'}",
-            code="no-positions",
-        )
-    if not found:
-        raise DataError(
-            log.path, "has no POS, XKF1, NKF1 or GPS message", "log them (LOG_BITMASK)", code="no-positions"
-        )
+    lacking = "has no POS, XKF1, NKF1 or GPS message"
+    require_position(log.path, found, choice.position, lacking, "log them (LOG_BITMASK)")
     kind: str = choice.position or next(iter(found))
     rows = found[kind]
     of_several = f" (instance {instance})" if instance else ""

@@ -1,6 +1,6 @@
 """Cleaning of telemetry rows into tracks: one set of rules for every drone's log."""
 
-from collections.abc import Iterable, Mapping, MutableMapping
+from collections.abc import Collection, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -78,6 +78,17 @@ def position_track(
         height=height,
         origin=origin,
     )
+
+
+def require_position(
+    path: Path | str, found: Collection[str], wanted: str | None, lacking: str, remedy: str
+) -> None:
+    """Refuse a log without the position that is asked for, or without any (`lacking`)."""
+    if wanted is not None and wanted not in found:
+        problem = f"has no {wanted} position"
+        raise DataError(path, problem, f"there is {', '.join(found) or 'none'}", code="no-positions")
+    if not found:
+        raise DataError(path, lacking, remedy, code="no-positions")
 
 
 def attitude_track(

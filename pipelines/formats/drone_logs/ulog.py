@@ -28,6 +28,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     on_one_clock,
     pictures_on_gps_time,
     position_track,
+    require_position,
     whatever_from,
     world_from_heading,
 )
@@ -165,20 +166,13 @@ def _position(
     every = [topic for names in _POSITIONS.values() for topic in _there(topics, names)]
     if not found and choice.instance is not None and every:
         raise _no_instance(path, choice.instance, "a position", every)
-    if choice.position is not None and choice.position not in found:
-        raise DataError(
-            path,
-            f"has no {choice.position} position",
-            f"there is {', '.join(found) or 'none'}",
-            code="no-positions",
-        )
-    if not found:
-        raise DataError(
-            path,
-            "has no vehicle_local_position, vehicle_global_position or GPS",
-            "log them (SDLOG_PROFILE), or give the poses from elsewhere",
-            code="no-positions",
-        )
+    require_position(
+        path,
+        found,
+        choice.position,
+        "has no vehicle_local_position, vehicle_global_position or GPS",
+        "log them (SDLOG_PROFILE), or give the poses from elsewhere",
+    )
     kind = choice.position or _likeliest(found)
     topic = found[kind]
     notes.append(f"took the {kind} position from {topic}")
