@@ -86,7 +86,7 @@ def test_a_clock_set_anew_is_none() -> None:
     assert find_steps(header, receive) == []
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
     rate_hz=st.sampled_from([1.0, 5.0, 30.0, 200.0]),
