@@ -128,7 +128,7 @@ def learn(
         if memory and index == rounds // 2:
             tau = memory_of(system, state)
             if tau > REMEMBERED:
-                tau = memory_of_whole_error(max(tau, keypoints_that_last(problem)), known.pixel_scale)
+                tau = memory_of_whole_error(max(tau, pictures_that_last(problem)), known.pixel_scale)
             known = replace(known, memory=tau)
             if not poses and tau > REMEMBERED:
                 break  # nothing is left to be learned
@@ -299,9 +299,6 @@ def _process(process: Process, places: list[tuple[bool, int]], found: Moments, k
 _LONGEST_S = 2.0
 LASTING_S = 10.0
 """The part of keypoint errors that residuals do not show lasts as long: a detector is wrong for a view."""
-# Lasting errors of the joints of a person have this correlation: four times as many keypoints of 33 joints
-# are alike. With one or sixteen times, 14-dance is 6 and 18 % worse.
-_JOINTS_ALIKE = 0.1
 # A smaller autocorrelation is chance, and the sum stops there.
 _STOPS = 0.02
 # A longer memory cannot be measured in stretches of a hundred times.
@@ -344,12 +341,11 @@ def memory_of(system: System, state: State) -> float:
     return min(tau, _MOST)
 
 
-def keypoints_that_last(problem: Problem) -> float:
-    """Count the keypoints of a camera that err alike: those within `LASTING_S`, and of a person's joints."""
+def pictures_that_last(problem: Problem) -> float:
+    """Count the pictures of a camera within `LASTING_S`, or all of them."""
     when_s = problem.pictures.when_s
     share = min(LASTING_S / max(float(np.ptp(when_s)), 1e-9), 1.0)
-    joints = float(_bodies(problem).sum(axis=0).mean())
-    return share * len(when_s) / len(np.unique(problem.pictures.camera)) * (1 + (joints - 1) * _JOINTS_ALIKE)
+    return share * len(when_s) / len(np.unique(problem.pictures.camera))
 
 
 def memory_of_whole_error(memory: float, pixel_scale: float) -> float:
