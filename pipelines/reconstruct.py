@@ -590,7 +590,9 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
     refined = None
     calibrated = settings.method == "auto" and are_calibrated(cameras, observations)
     if settings.method in ("refined", "auto") and not calibrated:
-        refined = refine_flight(_robust_flight(flight, cameras, replace(made, result=result), clock_sigma_s))
+        robust = _robust_flight(flight, cameras, replace(made, result=result), clock_sigma_s)
+        refined = flight.waiting.put(refine_flight(robust))
+        flight.waiting.release()
         observations, views = refined.observations, refined.views
         result = refused_people(refined.result, observations, seen.anybody)
         if refined.cameras is None:  # refinement rejected: fall back to `robust`, with its own loss

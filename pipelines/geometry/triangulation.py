@@ -58,6 +58,8 @@ STATUS = ("ok", "filled", "few_views", "low_parallax", "rejected", "not_detected
 _MAX_PAIRS = 28
 # The intermediate arrays of this many joint-frames stay in a processor's cache.
 _BLOCK = 4096
+# Arrays that hold a pose for each of so many joint-frames, some minutes of a flight, take 200 MB.
+_ROWS_AT_ONCE = 1 << 18
 # A median over this many joint-frames is accurate to one per cent.
 _NOISE_SAMPLE = 20_000
 # The inliers of the first round set the gate of the second.
@@ -323,6 +325,9 @@ def reprojection_px(views: Views, points: Float) -> Float:
     Args:
         points: [N, 3] m; NaN gives NaN.
     """
+    if len(points) > _ROWS_AT_ONCE:
+        parts = [slice(first, first + _ROWS_AT_ONCE) for first in range(0, len(points), _ROWS_AT_ONCE)]
+        return np.concatenate([reprojection_px(_rows(views, part), points[part]) for part in parts])
     rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
     x, y, z = np.einsum("ncij,nci->jnc", rotation, points[:, None] - position)
     depth = np.where(z > 0, z, 1.0)
@@ -449,8 +454,6 @@ _MIN_JOINTS = 5
 
 # The second round has residuals of points without gross errors.
 _GROSS_ROUNDS = 2
-# Gross errors of so many joint-frames are judged at once: some minutes of a flight, in 200 MB.
-_ROWS_AT_ONCE = 1 << 18
 
 
 def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) -> Triangulation:

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 
 # The search for clock offsets uses at most so many times of the skeleton; more find no other offset.
 _SEARCHED = 300
-# In a long flight it uses more: means over `LASTING_S` need some times.
+# In a long flight it uses the middle: means over `LASTING_S` need times that are near each other.
 _LONGEST_SEARCH_STEP_S = 0.5
 # Detectors place joints to 1 % of a person's height (simulation/data/blazepose_errors.csv: a median error of
 # 1.3 % at a mean confidence of 0.8).
@@ -267,11 +267,11 @@ def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, refere
     none = np.zeros(len(held))
     offset_s, names = none.copy(), [camera.name for camera in flight.cameras]
     if held.sum() > 1:
-        views_at, every = _views_at(flight, np.ones_like(held))
+        views_at, rows = _views_at(flight, np.ones_like(held))
         beside = [name for name, kept in zip(names, held, strict=True) if kept]
         offset_s[held] = wrong_clocks(
             lambda shift_s: views_at(shift_s).of(held),
-            flight.t_s[::every],
+            flight.t_s[rows],
             questioned[held],
             flight.pixel_sigma,
             beside.index(reference) if reference in beside else 0,
@@ -294,22 +294,24 @@ def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, refere
 
 def _initial_clock_offsets_s(flight: RobustFlight) -> Float:
     """Find the initial offset [C] s of every clock from some times of the flight, see `initial_offsets_s`."""
-    views_at, every = _views_at(flight, flight.clock_sigma_s > 0)
-    return initial_offsets_s(views_at, len(flight.t_s[::every]), flight.clock_sigma_s)
+    views_at, rows = _views_at(flight, flight.clock_sigma_s > 0)
+    return initial_offsets_s(views_at, len(flight.t_s[rows]), flight.clock_sigma_s)
 
 
-def _views_at(flight: RobustFlight, moved: Bool) -> tuple[Callable[[float], Views], int]:
-    """Return a function from a shift (s) of some clocks [C] to views at every k-th time, and k."""
+def _views_at(flight: RobustFlight, moved: Bool) -> tuple[Callable[[float], Views], slice]:
+    """Return a function from a shift (s) of some clocks [C] to views at some times, and these."""
     times = len(flight.observations.t_ns)
     step_s = float(np.median(np.diff(flight.t_s))) if times > 1 else 1.0
     every = max(min(-(-times // _SEARCHED), int(_LONGEST_SEARCH_STEP_S / step_s)), 1)
+    left_out = max(times - every * _SEARCHED, 0)
+    rows = slice(left_out // 2, times - (left_out - left_out // 2), every)
 
     def views_at(shift_s: float) -> Views:
-        observed, views = _observe_with_offsets(flight, np.where(moved, shift_s, 0.0), every)
+        observed, views = _observe_with_offsets(flight, np.where(moved, shift_s, 0.0), rows)
         weight = np.where(flight.trusted[:, None, None], observed.confidence, 0.0)
         return replace(views, weight=weight.reshape(views.weight.shape))
 
-    return views_at, every
+    return views_at, rows
 
 
 def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Float]:
@@ -400,11 +402,11 @@ def _unsettled_clocks(refined: Refined, cameras: Sequence[Camera]) -> list[str]:
 
 
 def _observe_with_offsets(
-    flight: RobustFlight, offset_s: Float, every: int = 1
+    flight: RobustFlight, offset_s: Float, times: slice = slice(None)
 ) -> tuple[Observations, Views]:
-    """Observe with these clock offsets, at every k-th time of the skeleton."""
+    """Observe with these clock offsets, at some times of the skeleton."""
     cameras = shifted(flight.cameras, offset_s)
-    t_ns, sides = flight.observations.t_ns[::every], flight.sides[::every]
+    t_ns, sides = flight.observations.t_ns[times], flight.sides[times]
     observed = observe(cameras, flight.found, flight.choice, t_ns, flight.between)
     rays, confidence = on_sides(observed.rays, observed.confidence, sides)
     observed = replace(observed, rays=rays, confidence=confidence)
@@ -416,7 +418,7 @@ def _observe_with_offsets(
         pose_index=flight.views.pose_index[:rows],
         position=observed.position,
         rotation=observed.rotation,
-        pose_sigma=flight.views.pose_sigma[::every],
+        pose_sigma=flight.views.pose_sigma[times],
     )
 
 
