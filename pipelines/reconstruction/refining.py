@@ -65,11 +65,6 @@ if TYPE_CHECKING:
 _SEARCHED = 300
 # In a long flight it uses the middle: means over `LASTING_S` need times that are near each other.
 _LONGEST_SEARCH_STEP_S = 0.5
-# Detectors place joints to 1 % of a person's height (simulation/data/blazepose_errors.csv: a median error of
-# 1.3 % at a mean confidence of 0.8).
-KEYPOINT_SIGMA_M = 0.02
-# In small pictures pixels limit that.
-MIN_KEYPOINT_SIGMA_PX = 0.7
 # Clocks are moved at most so often; offsets of 0.2 s took one to five times.
 _MOST_SHIFTS = 6
 # A clock is determined if its posterior sigma is below this share of its prior sigma.
@@ -135,17 +130,6 @@ class RobustFlight:
         """Joints [J] of limbs, if enough of them have names; else all joints."""
         limbs = np.array([name.endswith(_OF_LIMBS) for name in self.observations.joints])
         return limbs if limbs.sum() >= _FEWEST_LIMBS else np.ones_like(limbs)
-
-    def keypoint_sigma_px(self, c: int) -> float:
-        """Compute the standard deviation (px) of a keypoint of confidence 1 in a camera, by its distance."""
-        points = self.result.points.reshape(len(self.t_s), -1, 3)
-        away_m = np.linalg.norm(points - self.observations.position[:, c, None], axis=2)
-        seen = away_m[np.isfinite(away_m)]
-        if not len(seen):
-            return self.pixel_sigma
-        return max(
-            KEYPOINT_SIGMA_M * self.cameras[c].focal_px / float(np.median(seen)), MIN_KEYPOINT_SIGMA_PX
-        )
 
     @property
     def t_s(self) -> Float:
@@ -477,7 +461,7 @@ def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
         position=position,
         rotation=rotation,
         focal_px=camera.focal_px,
-        pixel_sigma=flight.keypoint_sigma_px(c),
+        pixel_sigma=flight.pixel_sigma,
         pose_covariance=None if flight.prior is None else white_covariance(camera, flight.prior[c]),
         loosened=None if camera.loosened is None else camera.loosened_at(frame_t_ns),
     )

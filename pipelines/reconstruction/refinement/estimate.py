@@ -128,7 +128,7 @@ def learn(
         if memory and index == rounds // 2:
             tau = memory_of(system, state)
             if tau > REMEMBERED:
-                tau = memory_of_whole_error(max(tau, pictures_that_last(problem)), known.pixel_scale)
+                tau = memory_of_whole_error(tau, known.pixel_scale)
             known = replace(known, memory=tau)
             if not poses and tau > REMEMBERED:
                 break  # nothing is left to be learned
@@ -297,8 +297,6 @@ def _process(process: Process, places: list[tuple[bool, int]], found: Moments, k
 
 # Correlations of keypoint errors over longer times cannot be told from motion.
 _LONGEST_S = 2.0
-LASTING_S = 10.0
-"""The part of keypoint errors that residuals do not show lasts as long: a detector is wrong for a view."""
 # A smaller autocorrelation is chance, and the sum stops there.
 _STOPS = 0.02
 # A longer memory cannot be measured in stretches of a hundred times.
@@ -339,13 +337,6 @@ def memory_of(system: System, state: State) -> float:
             break
         tau += 2 * float(value) / shown
     return min(tau, _MOST)
-
-
-def pictures_that_last(problem: Problem) -> float:
-    """Count the pictures of a camera within `LASTING_S`, or all of them."""
-    when_s = problem.pictures.when_s
-    share = min(LASTING_S / max(float(np.ptp(when_s)), 1e-9), 1.0)
-    return share * len(when_s) / len(np.unique(problem.pictures.camera))
 
 
 def memory_of_whole_error(memory: float, pixel_scale: float) -> float:

@@ -71,6 +71,9 @@ _SETTLING = 4
 _LEVEL_ROUNDS = 3
 # Constant errors have this share of the usual level where the pictures let the scene grow.
 _HELD = 0.1
+# Detectors place joints to 1 % of a person's height (simulation/data/blazepose_errors.csv). What varies of
+# that is seen in residuals; the rest lasts.
+KEYPOINT_SIGMA_M, _LEAST_LASTING_M = 0.02, 0.005
 # A joint that one camera alone shows follows its motion at other times by this (m).
 _FOLLOWED_M = 0.3
 # A constant error below this share of the usual level is known from the background.
@@ -318,14 +321,13 @@ def _with_own(covariance: Float, systems: tuple[System, System], state: State) -
     by_poses = covariance - covariances(remembering, eliminate(remembering, state))
     variance, axes = np.linalg.eigh(0.5 * (by_poses + by_poses.swapaxes(-1, -2)))
     by_poses = np.einsum("tjik,tjk,tjlk->tjil", axes, np.maximum(variance, 0.0), axes)
-    lasting = max(1.0 - weighted.knowledge.pixel_scale**2, 0.0)
     own = covariances(weighted, eliminate(weighted, state))
-    return np.asarray(own + by_poses + lasting * _of_lasting_errors(weighted.problem, state.position))
+    return np.asarray(own + by_poses + _of_lasting_errors(weighted, state.position))
 
 
-def _of_lasting_errors(problem: Problem, position: Float) -> Float:
-    """Compute covariances [T, J, 3, 3] of joints by the stated noise of each camera's nearest picture."""
-    pictures = problem.pictures
+def _of_lasting_errors(system: System, position: Float) -> Float:
+    """Compute covariances [T, J, 3, 3] by lasting keypoint errors in the nearest picture of each camera."""
+    problem, pictures = system.problem, system.pictures
     information = np.tile(np.eye(3) / _FOLLOWED_M**2, (*position.shape[:2], 1, 1))
     for c in np.unique(pictures.camera):
         (mine,) = np.nonzero(pictures.camera == c)
@@ -342,7 +344,10 @@ def _of_lasting_errors(problem: Problem, position: Float) -> Float:
             axis=2,
         )
         usable = np.isfinite(pictures.rays[own][..., 0]) & (seen[..., 2] > 0.1)
-        weight = np.where(usable, (pictures.sharpness[own] / seen[..., 2]) ** 2, 0.0)
+        with np.errstate(divide="ignore"):
+            varying2 = (seen[..., 2] / pictures.sharpness[own]) ** 2
+        lasting2 = np.maximum(KEYPOINT_SIGMA_M**2 - varying2, _LEAST_LASTING_M**2)
+        weight = np.where(usable, 1 / lasting2, 0.0)
         information += weight[..., None, None] * np.einsum("tjai,tjak->tjik", slant, slant)
     return np.asarray(np.linalg.inv(information))
 
