@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
+from scipy.stats import t
 
 from mocap_cli.main import Mocap
 from mocap_cli.reconstruct import reconstruct_command
@@ -64,7 +65,8 @@ def test_disturbed_poses_err_as_their_model_says(clean: tuple[SyntheticFlight, P
     assert trials["mean"]["mpjpe_mm"] == pytest.approx(np.mean(errors))
     assert trials["std"]["mpjpe_mm"] == pytest.approx(np.std(errors, ddof=1))
     low, high = trials["intervals"]["mpjpe_mm"]
-    assert min(errors) <= low <= trials["mean"]["mpjpe_mm"] <= high <= max(errors)
+    half = t.ppf(0.975, 3) * np.std(errors, ddof=1) / 2  # Student's interval of the mean of four
+    assert (low, high) == pytest.approx((np.mean(errors) - half, np.mean(errors) + half))
     # Two rays at a right angle, 15 deg up, each off by 0.1 m per axis: RMS = 0.1 sqrt(2.51) = 158 mm (the
     # trace of docs/results.md). Four draws of three numbers scatter by 1 / sqrt(2 x 12) = 20 %.
     rms = np.sqrt(np.mean([each["e_recon_per_joint_frame_m2"] for each in trials["each"]]))

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import t
 
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.reconstruction.loading import PoseDisturbance, disturbed
@@ -93,8 +94,8 @@ def test_trials_together() -> None:
     assert [each["mpjpe_mm"] for each in said["each"]] == [100.0, None, 140.0]
     assert said["mean"]["mpjpe_mm"] == 120
     assert said["std"]["mpjpe_mm"] == pytest.approx(20 * np.sqrt(2))
-    # Of two values every resample's mean is one of them or their middle: the ends are both of them.
-    assert said["intervals"]["mpjpe_mm"] == [100, 140]
+    half = t.ppf(0.975, 1) * 20  # Student's interval of the mean of two
+    assert said["intervals"]["mpjpe_mm"] == pytest.approx([120 - half, 120 + half])
     assert said["mean"]["pa_mpjpe_mm"] is None
     assert said["std"]["reprojection_px_median"] == 0
     alone = summary_of_trials([metrics_of(100.0)], "white:position_m=1", 0)
