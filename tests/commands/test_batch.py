@@ -79,7 +79,8 @@ def scheduler() -> Iterator[str]:
     """Start a scheduler with a worker in a thread of this process; return its address."""
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as made:
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    with LocalCluster(**options) as made:  # type: ignore[no-untyped-call]
         yield str(made.scheduler_address)
 
 

@@ -158,6 +158,8 @@ def test_a_way_that_is_too_long_is_an_error_of_the_world() -> None:
     found = world_errors(truth + along[:, None, None], truth, JOINTS, stamps(101))
     assert found["rte_percent"] == pytest.approx(100 * 0.0048 * 101 / 4 / 4.8, rel=0.02)
     assert found["w_mpjpe_mm"] == pytest.approx(4.8 * 49.5, rel=0.1)  # of segments of 100 and of 1
+    assert found["w_mpjpe_mm"] is not None
+    assert found["wa_mpjpe_mm"] is not None
     assert found["wa_mpjpe_mm"] < found["w_mpjpe_mm"]
 
 
