@@ -10,8 +10,7 @@ Flights are checked against the analytic surfaces that the voxels were made from
 tuned on; those from 2000 on are kept aside.
 
 prediction: one posture of a walk, carried along by the actor, is measured by triangulation with modelled
-keypoints and white pose noise (0.02 m, 0.2 deg). The ray model predicts the error from the same noise. Arms
-whose "way is known" see the actor's whole way: they bound what a planner can reach.
+keypoints and white pose noise (0.02 m, 0.2 deg). The ray model predicts the error from the same noise.
 
 filming: the scenes of Hughes et al. 2024, four robots on a grid of 1 m, eight headings, 4 to 6 people who
 move. Their planners' solutions are scored with `view_quality`, frame by frame. Then every scene is planned

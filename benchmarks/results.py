@@ -62,8 +62,8 @@ SECTIONS = (
         " cameras share cannot be seen in pictures: it bounds what any method reaches. NEES of 3 is right.",
         (
             Part("sample-poses", "The sample flight", RENDERED, TUNED),
-            Part("corpus-model", "24 flights, pose noise stated", RENDERED, "both halves"),
-            Part("corpus-nothing", "24 flights, pose noise not stated", RENDERED, "both halves"),
+            Part("corpus-model", "The corpus, pose noise stated", RENDERED, "each half by its name"),
+            Part("corpus-nothing", "The corpus, pose noise not stated", RENDERED, "each half by its name"),
             Part("corpus-parts", "What each part of `auto` adds, one draw", RENDERED, "both halves"),
             Part("angles", "Joint angles", RENDERED, KEPT),
         ),

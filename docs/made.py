@@ -293,7 +293,7 @@ def figures() -> str:
     flights, touched = (sum(int(row[key]) for row in worlds.values()) for key in ("flights", "touched"))
     rows = [
         ("the sample flight, logged poses off by 0.05 m and 0.3 deg (rendered, tuned on)", *sample),
-        ("twelve flights with six kinds of pose errors (rendered, kept aside; an earlier estimate)", *kept),
+        ("twelve flights with six kinds of pose errors (rendered, kept aside; noise stated)", *kept),
         ("real pictures of cameras that turn, attitudes off by 0.5 deg (kept aside)", *real),
     ]
     said = (
