@@ -29,6 +29,7 @@ _SIGMA_PER_MAD = 1.4826
 _SEGMENT_SAMPLES = 100
 # A foot whose true speed is lower stands: 10 mm in a frame of 30 Hz (WHAM).
 _STANDING_M_S = 0.3
+# Foot sliding is stated in millimetres for each picture of a 30 Hz film (WHAM).
 _FIELD_RATE_HZ = 30.0
 
 WORLD_ERRORS = (

@@ -49,6 +49,7 @@ _SHIFT_HEIGHTS = 0.15
 _CLEAR_SHIFT = 0.5
 # Evidence of a picture that goes on: as much as two or three times at which all cameras agree.
 _CONTINUITY = 20.0
+# A picture that goes on without any rival counts five times as much as one with rivals.
 _CLEAR_CONTINUITY = 100.0
 # The mean of the better three quarters of squares of one right pair has about this median.
 _USUAL_CHI2 = 0.4

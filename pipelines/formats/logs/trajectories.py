@@ -45,10 +45,14 @@ Source = Path | str
 Edge = tuple[str, str]
 """Target and source of a transform."""
 
-_MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
-_MAY_JUMP_S = 1.0  # from one message to the next, in addition to the time that passed
-_MOST_JUMPS = 5  # more are not listed
-_SAME_VALUE = 1e-6  # m, and parts of a quaternion: rounding
+# Transport and decoding take less than this between the header and the receive stamp.
+_MAY_DISAGREE_S = 0.5
+# A clock that jumps by more between two messages is named.
+_MAY_JUMP_S = 1.0
+# More jumps than this are counted and not listed.
+_MOST_JUMPS = 5
+# Rounding to single precision changes positions and quaternions by less than this.
+_SAME_VALUE = 1e-6
 _FIXED_FRAMES = ("world", "map", "odom", "earth")  # names of fixed frames in REP 105
 
 _THE_WORLD = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]))

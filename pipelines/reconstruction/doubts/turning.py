@@ -36,7 +36,8 @@ _STEPS = 3
 _BASELINE_M = 1e-3
 # Points beyond this many standard deviations count linearly.
 _HUBER = 1.5
-_GRID_S = np.linspace(-1.0, 1.0, 21)  # clocks that are tried
+# Clocks are tried every 0.1 s, and then more finely around the best.
+_GRID_S = np.linspace(-1.0, 1.0, 21)
 _FINE_STEP_S, _FINE_STEPS = 0.02, 4  # around the best of them
 # Errors of attitudes that wander pass for smaller offsets of clocks.
 _LEAST_LATE_S = 0.2

@@ -46,6 +46,7 @@ from pipelines.reconstruction.refinement.system import (
 
 # The prior is learned from all of a flight of so many times, and from stretches of a longer one.
 _WHOLE_TIMES, _WINDOWS, _WINDOW = 400, 3, 100
+# Learning ends after this many rounds, converged or not.
 _LEARNING_ROUNDS = 8
 # Estimates converge in fewer rounds.
 _ROUNDS = 8
