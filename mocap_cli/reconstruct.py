@@ -198,7 +198,7 @@ def print_verdict(verdict: dict[str, Any], session: Path, *, reported: bool = Fa
         say(f"  {reason}")
     follows = verdict["next"]
     if reported and follows.startswith("mocap report"):
-        follows = "mocap export SESSION --to bvh"
+        follows = "mocap export SESSION --to trc,angles"
     say(f"next: {follows.replace('SESSION', str(session))}")
 
 
