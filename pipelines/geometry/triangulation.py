@@ -66,6 +66,8 @@ _NOISE_SAMPLE = 20_000
 _NOISE_ROUNDS = 2
 # A constant pose error gives few different pairs: undoubled, 2 % of draws of three cameras lost all joints.
 _START_WIDTH = 2.0
+# Rays that leave a direction open are taken to determine it by this share of what they determine in all.
+_LEAST_INFORMATION = 1e-12
 
 
 @dataclass(frozen=True)
@@ -257,8 +259,17 @@ def _midpoints(direction: Float, centre: Float, weight: Float, wanted: Bool) -> 
     across = weight[..., None, None] * (np.eye(3) - direction[..., :, None] * direction[..., None, :])
     normal = np.where(wanted[:, None, None], across.sum(axis=1), np.eye(3))
     right = (across @ centre[..., None]).sum(axis=1)
-    points: Float = np.linalg.solve(normal, right)[..., 0]
+    points: Float = np.linalg.solve(_closed(normal), right)[..., 0]
     return points
+
+
+def _closed(normal: Float) -> Float:
+    """Add a little information to normal matrices [N, 3, 3] of less than full rank."""
+    is_open = np.linalg.matrix_rank(normal, hermitian=True) < 3
+    trace = np.maximum(np.trace(normal, axis1=1, axis2=2), np.finfo(float).tiny ** 0.5)
+    more = np.where(is_open, _LEAST_INFORMATION * trace, 0.0)[:, None, None] * np.eye(3)
+    closed: Float = np.asarray(normal + more)
+    return closed
 
 
 def _image_covariance(views: Views, rays: Float, weight: Float) -> tuple[Float, Float]:
@@ -312,8 +323,10 @@ def _covariance(
     weighted = by_view @ jacobian
     rows = (len(jacobian), 2 * jacobian.shape[1], 3)  # those of all views
     normal = jacobian.reshape(rows).mT @ weighted.reshape(rows)
-    known: Bool = np.asarray(inlier.any(axis=1))
-    inverse: Float = np.linalg.inv(np.where(known[:, None, None], normal, np.eye(3)))
+    known: Bool = np.asarray(inlier.any(axis=1) & (np.trace(normal, axis1=1, axis2=2) > 0))
+    # Parallel rays leave a direction open: its variance is then huge, and finite.
+    chosen: Float = np.asarray(np.where(known[:, None, None], normal, np.eye(3)))
+    inverse: Float = np.linalg.inv(_closed(chosen))
     if method != "robust":
         inverse = inverse @ (weighted.reshape(rows).mT @ (spread @ weighted).reshape(rows)) @ inverse
     return inverse

@@ -13,6 +13,8 @@ from pipelines.geometry.triangulation import (
     STATUS,
     Method,
     Triangulation,
+    _closed,
+    _midpoints,
     _pair_table,
     estimate_noise,
     triangulate,
@@ -346,3 +348,18 @@ def test_nan_never_leaks(seed: int, method: Method, cameras: int) -> None:
     assert (result.views == result.inlier.sum(axis=1)).all()
     assert (result.views[ok] >= 2).all()
     assert ok[usable.sum(axis=1) < 2].sum() == 0
+
+
+def test_parallel_rays_leave_a_huge_and_finite_variance() -> None:
+    """Of two rays along z, one metre apart, the depth of the point between them is open."""
+    normal = np.diag([1.0, 1.0, 0.0])[None]
+    variance = np.linalg.inv(_closed(normal))[0]
+    assert variance[2, 2] > 1e11
+    assert np.isfinite(variance).all()
+    point = _midpoints(
+        np.array([[[0.0, 0, 1], [0, 0, 1]]]),
+        np.array([[[0.0, 0, 0], [1, 0, 0]]]),
+        np.ones((1, 2)),
+        np.ones(1, bool),
+    )
+    assert point[0, :2] == pytest.approx([0.5, 0.0])
