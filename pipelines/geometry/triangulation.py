@@ -325,8 +325,8 @@ def _covariance(
     normal = jacobian.reshape(rows).mT @ weighted.reshape(rows)
     known: Bool = np.asarray(inlier.any(axis=1) & (np.trace(normal, axis1=1, axis2=2) > 0))
     # Parallel rays leave a direction open: its variance is then huge, and finite.
-    chosen: Float = np.asarray(np.where(known[:, None, None], normal, np.eye(3)))
-    inverse: Float = np.linalg.inv(_closed(chosen))
+    chosen: Float = np.where(known[:, None, None], normal, np.eye(3)).astype(np.float64)
+    inverse: Float = np.asarray(np.linalg.inv(_closed(chosen)), dtype=np.float64)
     if method != "robust":
         inverse = inverse @ (weighted.reshape(rows).mT @ (spread @ weighted).reshape(rows)) @ inverse
     return inverse
