@@ -298,9 +298,9 @@ def figures() -> str:
     ]
     said = (
         f"`mocap check` names the mistake in {named['named first']} of {named['mistakes that count']}"
-        " flights that are described with one (modelled, three drones, kept aside).\n"
+        " flights that are described with one (modelled, three drones, kept aside; an earlier version).\n"
         f"In {flights} replays of planners in random worlds {touched or 'no'} drone touches anything"
-        " (simulated)."
+        " (simulated; an earlier version)."
     )
     header = ("mean error of a joint", "`mocap reconstruct`", "triangulation alone")
     return f"{table(header, rows)}\n{said}\n"

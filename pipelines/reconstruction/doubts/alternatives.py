@@ -587,7 +587,7 @@ def _keypoints(trial: Trial) -> Iterator[Alternative]:
 # --- alternatives with numbers, which are fitted ---------------------------------------------------------
 
 NUMBERS = {"shift": 3, "heading": 1, "north": 1, "zero": 4, "pitch": 1, "roll": 1, "focal": 1}
-"""What may be off by numbers, and by how many.
+"""Numbers of a description that may be wrong, and how many of them each alternative sets free.
 
 `shift`: the log has its zero elsewhere; `north`: it has its north elsewhere; `zero`: both. `heading`,
 `pitch`, `roll`: the camera is turned where it is, about the vertical or its own x and z axes. `focal`: its

@@ -1,4 +1,4 @@
-"""How much the people of a scene are people: size, limbs, posture and motion against what is published."""
+"""Oddity of people: their size, limbs, posture and motion, against published measurements of people."""
 
 from __future__ import annotations
 
