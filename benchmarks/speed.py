@@ -36,8 +36,8 @@ import yaml  # type: ignore[import-untyped]
 
 from benchmarks.flights import SAMPLE
 from benchmarks.results import keep, markdown_table
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.cameras import undistort
 from pipelines.geometry.noise import pose_errors
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.geometry.triangulation import Views, estimate_noise, triangulate

@@ -24,8 +24,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.arrays import Float, Intrinsics
+from pipelines.geometry.cameras import project
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.people import bones_of
 

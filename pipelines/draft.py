@@ -44,10 +44,9 @@ from pipelines.formats.poses import times_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
 from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
 from pipelines.formats.videos.video import created_ns, followed_points, index_video
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Float, Int64, Intrinsics, Place
 from pipelines.geometry.clocks import TrackedPoints, explain_motion
-from pipelines.geometry.geodesy import Place, enu_from_geodetic
+from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import interpolate_points, multiply
 from pipelines.session.errors import DataError

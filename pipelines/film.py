@@ -17,8 +17,7 @@ import numpy as np
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video import VideoReader
 from pipelines.formats.videos.video_writing import write_h264
-from pipelines.geometry.arrays import Float, Int64, Picture
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Float, Int64, Intrinsics, Picture
 from pipelines.geometry.noise import NoiseModel
 from pipelines.keypoints.search import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
 from pipelines.keypoints.tracking import FollowedPeople

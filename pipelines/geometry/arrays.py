@@ -1,4 +1,4 @@
-"""The arrays that functions take and return, by what they hold, and small types beside them."""
+"""Arrays by what they hold, and the plain types that every other module shares: lens, place, clock."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,6 +18,67 @@ Picture = NDArray[np.uint8]  # [height, width, 3], blue, green, red; or [height,
 
 RelativeTo = Literal["world", "body", "heading"]
 """The reference of a gimbal's angles. Heading: yaw from the nose, pitch and roll from the horizon."""
+
+
+DistortionModel = Literal["none", "radtan", "fisheye"]
+
+COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "fisheye": (4,)}
+"""The allowed numbers of distortion coefficients of each model."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """The intrinsic parameters of a camera, in pixels of a `width` x `height` picture.
+
+    `radtan` is OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6]], `fisheye` is OpenCV's k1 k2 k3 k4
+    (equidistant). The centre of the top left pixel is (0, 0). `readout_s` is the time a rolling
+    shutter takes from the first (top) to the last row, 0 for a global shutter or when unknown; a
+    picture's stamp is its middle row's.
+
+    Raises:
+        ValueError: sizes or focal lengths that are not positive, numbers that are not finite, an unknown
+            model or a number of coefficients that the model does not have; all problems in one message.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    model: DistortionModel = "none"
+    distortion: tuple[float, ...] = ()
+    readout_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        problems = []
+        if not all(float(size).is_integer() and size > 0 for size in (self.width, self.height)):
+            problems.append(f"picture size {self.width} x {self.height} is not positive whole numbers")
+        if not all(np.isfinite(focal) and focal > 0 for focal in (self.fx, self.fy)):
+            problems.append(f"focal lengths {self.fx}, {self.fy} px are not positive")
+        if not np.isfinite([self.cx, self.cy]).all():
+            problems.append(f"principal point {self.cx}, {self.cy} px is not finite")
+        if not (np.isfinite(self.readout_s) and self.readout_s >= 0):
+            problems.append(f"readout time {self.readout_s} s is not a time")
+        counts = COEFFICIENT_COUNTS.get(self.model)
+        if counts is None:
+            problems.append(f"distortion model {self.model} is none of {', '.join(COEFFICIENT_COUNTS)}")
+        elif len(self.distortion) not in counts:
+            expected = " or ".join(str(count) for count in counts)
+            problems.append(f"{self.model} has {len(self.distortion)} coefficients instead of {expected}")
+        if not np.isfinite(self.distortion).all():
+            problems.append(f"distortion coefficients {list(self.distortion)} are not all finite")
+        if problems:
+            raise ValueError("; ".join(problems))
+
+
+@dataclass(frozen=True)
+class Place:
+    """A point on Earth, WGS84."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
 
 
 @dataclass(frozen=True)

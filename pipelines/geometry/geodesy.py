@@ -9,11 +9,9 @@ Heights are metres above the ellipsoid. Heights above sea level may be given whe
 everything up or down together, and stretch horizontal distances by less than 2e-5.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Place
 
 # WGS 84 defines its ellipsoid by this semi-major axis.
 _SEMI_MAJOR_M = 6_378_137.0
@@ -21,15 +19,6 @@ _SEMI_MAJOR_M = 6_378_137.0
 _FLATTENING = 1 / 298.257223563
 # The eccentricity of an ellipse follows from its flattening.
 _ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
-
-
-@dataclass(frozen=True)
-class Place:
-    """A point on Earth, WGS84."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
 
 
 def ecef_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Float) -> Float:

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float, Int64, Picture
-from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.arrays import Float, Int64, Intrinsics, Picture
+from pipelines.geometry.cameras import project
 from pipelines.geometry.poses import invert, transform
 from pipelines.session.camera_poses import poses_at, stated_noise
 from pipelines.session.description import CameraEntry, Interpolation

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Float32, Int64
-from pipelines.geometry.cameras import Intrinsics, project, undistort
+from pipelines.geometry.arrays import Bool, Float, Float32, Int64, Intrinsics
+from pipelines.geometry.cameras import project, undistort
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import invert, look_at, matrix_from_quaternion, rates, transform
 from pipelines.geometry.triangulation import Views, triangulate

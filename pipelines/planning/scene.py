@@ -9,8 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
 from pipelines.geometry.noise import NoiseModel, White, sum_sigma
 from pipelines.geometry.poses import gaps, interpolate_points, rates
 from pipelines.planning.config import ErrorModel, PlannerConfig, planner_config

@@ -16,8 +16,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.cameras import Intrinsics, row_delay_s, undistort
+from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
+from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion, velocities
 from pipelines.session.camera_poses import poses_at

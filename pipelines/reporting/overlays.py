@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Int64, Picture
-from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics, Picture
+from pipelines.geometry.cameras import project
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import (

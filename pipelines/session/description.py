@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from pipelines.geometry.cameras import DistortionModel, Intrinsics
+from pipelines.geometry.arrays import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 from pipelines.session.storage import hash_of, read_json, refuse_camera_names, refuse_newer
@@ -26,7 +26,7 @@ class Entry(BaseModel):
 
 
 class IntrinsicsEntry(Entry):
-    """`geometry.cameras.Intrinsics`, as it is stored."""
+    """`geometry.arrays.Intrinsics`, as it is stored."""
 
     width: int
     height: int

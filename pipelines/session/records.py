@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import ClockFit, Float, Int64, RelativeTo
-from pipelines.geometry.cameras import Intrinsics
-from pipelines.geometry.geodesy import Place
+from pipelines.geometry.arrays import ClockFit, Float, Int64, Intrinsics, Place, RelativeTo
 from pipelines.session.progress import Progress, Silent
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from typing import get_args
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float
-from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.arrays import Bool, Float, Intrinsics
+from pipelines.geometry.cameras import project
 from pipelines.geometry.poses import invert, transform
 from pipelines.session.people import mirrored
 from pipelines.simulation.scenario import DetectorErrors, ModelledDetector

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.cameras import Intrinsics, project, row_delay_s, undistort
+from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
+from pipelines.geometry.cameras import project, row_delay_s, undistort
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.poses import invert, transform
 from pipelines.session.errors import DataError

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Bytes, Float, Float32, Int32
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Bool, Bytes, Float, Float32, Int32, Intrinsics
 from pipelines.geometry.compilation import cached
 
 

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bytes, Float, Float32, Int32
-from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.arrays import Bytes, Float, Float32, Int32, Intrinsics
+from pipelines.geometry.cameras import undistort
 from pipelines.geometry.compilation import cached, helper
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.simulation.raster import (

@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from pipelines.geometry.cameras import COEFFICIENT_COUNTS, Intrinsics
+from pipelines.geometry.arrays import COEFFICIENT_COUNTS, Intrinsics
 from pipelines.session.yaml_files import SecondsAsNs, YamlModel, read_yaml_model
 
 # Files with a larger number come from a later version.

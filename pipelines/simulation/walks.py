@@ -15,8 +15,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.cameras import undistort
 from pipelines.geometry.metrics import common, measure
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import matrix_from_quaternion, rates

@@ -12,8 +12,8 @@ import numpy as np
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
 from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED, taken_ns
 from pipelines.formats.videos.video import black_bars, created_ns, followed_points
-from pipelines.geometry.arrays import Int64
-from pipelines.geometry.cameras import Intrinsics, fit_to_size, is_resized
+from pipelines.geometry.arrays import Int64, Intrinsics
+from pipelines.geometry.cameras import fit_to_size, is_resized
 from pipelines.geometry.clocks import fit_start
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Bool, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections
 from pipelines.sources.parts import CameraFrames

@@ -41,8 +41,7 @@ from pipelines.formats.logs.trajectories import (
     read_commands,
     transforms_in,
 )
-from pipelines.geometry.arrays import Int64
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Int64, Intrinsics
 from pipelines.geometry.clocks import ClockStep, find_steps, without_steps
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, LogSource, Manifest, MapSource

@@ -7,8 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.geometry.arrays import ClockFit, Int64
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import ClockFit, Int64, Intrinsics
 from pipelines.geometry.poses import gaps
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import (

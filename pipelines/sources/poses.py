@@ -15,8 +15,8 @@ import numpy as np
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
 from pipelines.formats.logs.positions import FIXES, read_pair, read_positions
 from pipelines.formats.maps.voxel_grids import placed
-from pipelines.geometry.arrays import ClockFit, Float, Int64
-from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
+from pipelines.geometry.arrays import ClockFit, Float, Int64, Place
+from pipelines.geometry.geodesy import enu_from_enu, enu_from_geodetic
 from pipelines.geometry.mounting import (
     attitude_in_enu,
     compose_gimbal,

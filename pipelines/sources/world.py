@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.maps.voxel_grids import placed
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.geodesy import Place, enu_from_geodetic
+from pipelines.geometry.arrays import Float, Int64, Place
+from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import FLU_FROM_FRD, body_from_camera
 from pipelines.geometry.poses import (
     ENU_FROM_NED,

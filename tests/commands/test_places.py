@@ -10,8 +10,8 @@ import pytest
 
 from pipelines.formats.maps.point_files import PCD
 from pipelines.formats.poses import write_tum as write_trajectory
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.geodesy import Place, enu_from_geodetic, place_at
+from pipelines.geometry.arrays import Float, Place
+from pipelines.geometry.geodesy import enu_from_geodetic, place_at
 from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector
 from pipelines.ingest import ingest
 from pipelines.session.maps import read_grid, write_grid

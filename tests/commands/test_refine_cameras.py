@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from pipelines.formats.videos.video import VideoReader
-from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.arrays import Intrinsics
+from pipelines.geometry.cameras import undistort
 from pipelines.geometry.noise import pose_errors
 from pipelines.geometry.poses import (
     conjugate,

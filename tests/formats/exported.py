@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Intrinsics
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.records import JointMotion, Occupancy, Recording, Trajectory
 from tests.synthetic.walk import COCO17, walk

@@ -18,7 +18,7 @@ from pipelines.formats.logs import mcap_log
 from pipelines.formats.scenes.mcap_writing import Ros2Recording
 from pipelines.formats.videos import video
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Intrinsics
 from tests.synthetic.videos import SIZE, bar_code, read_bar_code
 
 HALF_TICK_NS = float(TICK_S) / 2 * 1e9

@@ -10,16 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import (
-    Intrinsics,
-    camera_matrix,
-    fit_to_size,
-    project,
-    rescaled,
-    row_delay_s,
-    undistort,
-)
+from pipelines.geometry.arrays import Float, Intrinsics
+from pipelines.geometry.cameras import camera_matrix, fit_to_size, project, rescaled, row_delay_s, undistort
 
 PINHOLE = Intrinsics(width=1280, height=720, fx=900.0, fy=910.0, cx=640.5, cy=355.25)
 BARREL = replace(PINHOLE, model="radtan", distortion=(-0.28, 0.07, 0.0008, -0.0005))

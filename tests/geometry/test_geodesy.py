@@ -5,14 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.geodesy import (
-    Place,
-    ecef_from_geodetic,
-    enu_from_enu,
-    enu_from_geodetic,
-    geodetic_from_ecef,
-)
+from pipelines.geometry.arrays import Float, Place
+from pipelines.geometry.geodesy import ecef_from_geodetic, enu_from_enu, enu_from_geodetic, geodetic_from_ecef
 
 # IOGP Guidance Note 7-2, method 9837: the topocentric origin of the worked example.
 NORTH_SEA = Place(55.0, 5.0, 200.0)

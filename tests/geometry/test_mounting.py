@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.arrays import Float, Intrinsics
+from pipelines.geometry.cameras import project
 from pipelines.geometry.mounting import (
     Looks,
     Pose,

@@ -10,8 +10,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Float, Intrinsics
 from pipelines.geometry.poses import look_at
 from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight_files import write_tum

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Intrinsics
 from pipelines.keypoints.search import Hint, project_actor
 
 CAMERA = Intrinsics(width=1280, height=720, fx=800.0, fy=800.0, cx=639.5, cy=359.5)

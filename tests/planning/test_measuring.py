@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Bool, Float, Intrinsics
 from pipelines.geometry.noise import White
 from pipelines.geometry.poses import look_at
 from pipelines.planning.distance_field import open_space

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics, row_delay_s
+from pipelines.geometry.arrays import Float, Intrinsics
+from pipelines.geometry.cameras import row_delay_s
 from pipelines.geometry.noise import (
     ROTATION,
     SHIFT_IN_WORLD,

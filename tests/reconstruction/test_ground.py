@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics, camera_matrix
+from pipelines.geometry.arrays import Float, Intrinsics
+from pipelines.geometry.cameras import camera_matrix
 from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, UNKNOWN_SIGMA, PoseErrors, Process
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Intrinsics
 from pipelines.reconstruction.loading import PoseDisturbance, disturbed
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.results import summary_of_trials

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Float, Int64, Intrinsics
 from pipelines.geometry.noise import Drift, pose_errors
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.reconstruction.background import clocks_of_backgrounds

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.arrays import Intrinsics
+from pipelines.geometry.cameras import project
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import SessionContent, motion_from_skeleton
 from pipelines.reporting.overlays import (

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Picture
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Intrinsics, Picture
 from pipelines.reporting.overlays import OverlayView
 from pipelines.reporting.pictures import (
     CHI2_95,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Intrinsics
 from pipelines.session.records import Detections
 from pipelines.sources.keypoints import doubt_numbers, in_pixels, without_repeats, without_zeros
 from pipelines.sources.parts import CameraFrames

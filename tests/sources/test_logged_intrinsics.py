@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Manifest
 from pipelines.sources.logs import FlightLogs

@@ -15,8 +15,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.geodesy import Place, place_at
+from pipelines.geometry.arrays import Float, Place
+from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import (
     matrix_from_quaternion,
     multiply,

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics, camera_matrix
+from pipelines.geometry.arrays import Float, Intrinsics
+from pipelines.geometry.cameras import camera_matrix
 from pipelines.geometry.noise import disturb
 from pipelines.geometry.poses import invert, look_at, rotation_vector_from_quaternion
 from pipelines.session.registries import noise_models

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import DistortionModel, Intrinsics
+from pipelines.geometry.arrays import DistortionModel, Float, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 

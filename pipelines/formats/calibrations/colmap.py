@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.calibrations.camera_matrices import build_intrinsics, describe_cameras, invert_pose
-from pipelines.geometry.cameras import DistortionModel, Intrinsics
+from pipelines.geometry.arrays import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 

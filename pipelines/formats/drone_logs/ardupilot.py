@@ -36,8 +36,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     turned_as_stated,
     world_from_heading,
 )
-from pipelines.geometry.arrays import ClockFit, Float, Int64, RelativeTo
-from pipelines.geometry.geodesy import Place
+from pipelines.geometry.arrays import ClockFit, Float, Int64, Place, RelativeTo
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry

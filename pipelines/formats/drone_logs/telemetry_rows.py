@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 
 from pipelines.formats.common.rows import NORM_TOLERANCE, kept_rows
-from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64, RelativeTo
+from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64, Place, RelativeTo
 from pipelines.geometry.clocks import fit_clock
-from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import attitude_from_angles, attitude_in_enu, level_heading
 from pipelines.geometry.poses import (
     interpolate_points,

@@ -32,8 +32,8 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     whatever_from,
     world_from_heading,
 )
-from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64
-from pipelines.geometry.geodesy import Place, enu_from_enu
+from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64, Place
+from pipelines.geometry.geodesy import enu_from_enu
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry

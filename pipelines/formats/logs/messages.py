@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.camera_matrices import intrinsics
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Float, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
     AngleSample,

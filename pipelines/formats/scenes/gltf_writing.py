@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.exporting import safe_file_name, thinned
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Float, Int64, Intrinsics
 from pipelines.geometry.poses import multiply
 from pipelines.session.errors import DataError
 from pipelines.session.people import bones_of, with_derived

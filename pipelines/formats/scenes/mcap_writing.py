@@ -44,8 +44,8 @@ from pipelines.formats.common.exporting import (
     thinned,
 )
 from pipelines.formats.videos.video_writing import H264Stream
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics, rescaled
+from pipelines.geometry.arrays import Float, Intrinsics
+from pipelines.geometry.cameras import rescaled
 from pipelines.session.errors import DataError
 from pipelines.session.people import bones_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory

@@ -31,8 +31,8 @@ from pipelines.formats.common.exporting import (
     thinned,
 )
 from pipelines.formats.videos.video_writing import H264Stream
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.cameras import Intrinsics, camera_matrix, rescaled
+from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.cameras import camera_matrix, rescaled
 from pipelines.session.errors import DataError
 from pipelines.session.people import bones_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory

@@ -22,8 +22,8 @@ import numpy as np
 
 from pipelines.formats.common.rows import describe_times
 from pipelines.formats.videos.picture_folder import UNTIMED, FolderPictures
-from pipelines.geometry.arrays import Float, Float32, Int64, Picture
-from pipelines.geometry.cameras import Intrinsics, rescaled, undistort
+from pipelines.geometry.arrays import Float, Float32, Int64, Intrinsics, Picture
+from pipelines.geometry.cameras import rescaled, undistort
 from pipelines.geometry.clocks import TrackedPoints
 from pipelines.session.errors import DataError
 from pipelines.session.records import VideoIndex

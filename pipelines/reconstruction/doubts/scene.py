@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.cameras import undistort
 from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.reconstruction.observations import Camera

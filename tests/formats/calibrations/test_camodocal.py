@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.arrays import Intrinsics
+from pipelines.geometry.cameras import project
 from pipelines.session.registries import FORMATS, CalibrationFormat, recognise
 from tests.raising import refused
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pipelines.formats.calibrations import calibration_files
-from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.arrays import Intrinsics
+from pipelines.geometry.cameras import project
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, CalibrationFormat
 from tests.real_data import real_data

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from pipelines.formats.drone_logs.dji_records import FORMAT, recordings_of
-from pipelines.geometry.geodesy import Place, enu_from_geodetic
+from pipelines.geometry.arrays import Place
+from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import rotate
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import FORMATS, TelemetryChoice

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.formats.logs.messages import all_samples, samples
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
     AngleSample,

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipelines.formats.videos.video import followed_points
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics, camera_matrix
+from pipelines.geometry.arrays import Float, Intrinsics
+from pipelines.geometry.cameras import camera_matrix
 from pipelines.geometry.poses import look_at
 from pipelines.simulation.flight_files import write_tum
 from tests.commands.runner import succeeds

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float
-from pipelines.geometry.cameras import Intrinsics, project, row_delay_s, undistort
+from pipelines.geometry.arrays import Bool, Float, Intrinsics
+from pipelines.geometry.cameras import project, row_delay_s, undistort
 from pipelines.geometry.poses import (
     invert,
     multiply,
