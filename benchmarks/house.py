@@ -245,7 +245,7 @@ def manifest_keys() -> tuple[str, ...]:
     from pydantic import BaseModel
 
     from pipelines.session import manifest, source_options
-    from pipelines.session.yaml_files import YamlModel
+    from pipelines.session.yaml_models import YamlModel
 
     def named(annotation: Any) -> Iterator[type[BaseModel]]:
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):

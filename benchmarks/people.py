@@ -35,8 +35,8 @@ from benchmarks.results import fixed, markdown_table
 from pipelines.geometry.arrays import Bool
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
+from pipelines.session.camera_poses import noise_models
 from pipelines.session.people import true_joints_at
-from pipelines.session.registries import noise_models
 from pipelines.session.tables import KEYPOINTS, SKELETON, TRUTH, motion_from, read_table
 from pipelines.simulate import simulate
 from pipelines.simulation.detector_errors import see

@@ -27,7 +27,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 
 from pipelines.planning.config import PlannerConfig
-from pipelines.session import registries, tables
+from pipelines.session import camera_poses, registries, tables
 from pipelines.session.description import DOUBT_CODES
 from pipelines.session.manifest import FileSource, Manifest
 from pipelines.session.source_options import option_models
@@ -231,7 +231,7 @@ _KIND_OF_TYPE: dict[object, str] = {
 def noise() -> str:
     """List the models of pose noise with their parameters."""
     rows = []
-    for name, model in zip(registries.NOISE_MODELS.names(), registries.NOISE_MODELS.all(), strict=True):
+    for name, model in zip(camera_poses.NOISE_MODELS.names(), camera_poses.NOISE_MODELS.all(), strict=True):
         parameters = ", ".join(f"`{field.name}`" for field in dataclasses.fields(model))
         rows.append((f"`{name}`", parameters, (inspect.getdoc(model) or "").split("\n")[0]))
     return table(("model", "parameters", "is"), rows)

@@ -53,6 +53,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.maps import MapSizeError
 from pipelines.session.progress import Progress, Silent
+from pipelines.session.recognition import EXPECTED, describe_unknown, recognise
 from pipelines.session.records import PoseSample
 from pipelines.session.registries import (
     FORMATS,
@@ -68,10 +69,8 @@ from pipelines.session.registries import (
     TelemetryFormat,
     TrajectoryFormat,
     VideoFormat,
-    recognise,
 )
 from pipelines.session.storage import as_data_error, drop_link
-from pipelines.session.unknown_files import EXPECTED, describe_unknown
 
 # Coordinates beyond it are those of a map projection, m.
 MAX_LOCAL_M = 100_000.0

@@ -19,6 +19,7 @@ from pipelines.formats.common.files import leads_out
 from pipelines.formats.logs.messages import kind_of
 from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.doubts.logs import doubts_of_logs, doubts_of_places
+from pipelines.session.camera_poses import noise_models
 from pipelines.session.description import (
     ActorEntry,
     CameraEntry,
@@ -36,8 +37,9 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, CameraSources, Manifest, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
+from pipelines.session.recognition import recognise
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
-from pipelines.session.registries import MapFormat, noise_models, recognise
+from pipelines.session.registries import MapFormat
 from pipelines.session.stages import Run, Stage, StageRecord, locked, note_sources
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.tables import (

@@ -24,10 +24,10 @@ from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.config import planner_config
 from pipelines.planning.distance_field import distance_field
 from pipelines.planning.replay import Pilot, Start
+from pipelines.session.camera_poses import noise_models
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Occupancy, SkeletalMotion
-from pipelines.session.registries import noise_models
 from pipelines.session.storage import (
     SIMULATION_MARK,
     hash_of,

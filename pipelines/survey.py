@@ -12,11 +12,11 @@ from pipelines.planning.scene import replan_settings
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Manifest, read_flight
+from pipelines.session.recognition import EXPECTED, describe_unknown
 from pipelines.session.registries import FORMATS
 from pipelines.session.stages import STAGES, open_session, outdated
 from pipelines.session.storage import SCHEMA, SIMULATION_MARK, STUDY_MARK, read_json, refuse_special
-from pipelines.session.unknown_files import EXPECTED, describe_unknown
-from pipelines.session.yaml_files import YamlModel, keys_of
+from pipelines.session.yaml_models import YamlModel, keys_of
 from pipelines.simulation.scenario import Scenario, read_scenario
 
 

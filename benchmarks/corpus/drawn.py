@@ -37,9 +37,9 @@ from pipelines.geometry.poses import (
 )
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import still_name
+from pipelines.session.camera_poses import noise_models
 from pipelines.session.maps import write_grid
 from pipelines.session.parallel import contents_of
-from pipelines.session.registries import noise_models
 from pipelines.session.storage import write_json
 from pipelines.session.tables import KEYPOINTS, TRACKS, write_table
 from pipelines.simulate import _planner

@@ -31,7 +31,7 @@ from pipelines.drafting.found import (
 )
 from pipelines.drafting.matching import CameraDraft, FlightDraft
 from pipelines.session.manifest import SCHEMA, CameraSources, Manifest
-from pipelines.session.yaml_files import YamlModel
+from pipelines.session.yaml_models import YamlModel
 
 # Most cameras of drones film at 30 pictures a second unless asked otherwise.
 ASSUMED_FPS = 30

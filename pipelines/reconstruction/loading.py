@@ -23,11 +23,10 @@ from pipelines.geometry.noise import (
 )
 from pipelines.reconstruction.log_stretches import Mended, mend, said_stretches
 from pipelines.reconstruction.observations import Camera
-from pipelines.session.camera_poses import stated_models, stated_noise
+from pipelines.session.camera_poses import parsed_noise_models, stated_models, stated_noise
 from pipelines.session.description import Description
 from pipelines.session.errors import DataError, NoViewsError
 from pipelines.session.records import JointMotion
-from pipelines.session.registries import parsed_noise_models
 from pipelines.session.stages import StageRecord
 from pipelines.session.tables import (
     FRAMES,

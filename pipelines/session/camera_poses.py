@@ -4,17 +4,19 @@ Poses are interpolated as far as the manifest trusts the logs. Their uncertainty
 line, flight.yaml, or the log itself; the first of these that states one is used, and all three may be silent.
 """
 
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.noise import NoiseModel, sum_sigma
+from pipelines.geometry.noise import NoiseModel, build, parse, sum_sigma
 from pipelines.geometry.poses import interpolate_poses, rates
 from pipelines.session.description import CameraEntry, Interpolation
+from pipelines.session.errors import DataError
 from pipelines.session.records import Trajectory
-from pipelines.session.registries import noise_models, parsed_noise_models
+from pipelines.session.registries import Registry
 
 
 def poses_at(
@@ -44,6 +46,9 @@ MAX_KNOWN_VARIANCE_M2_RAD2 = (100.0, np.pi**2)
 MAX_ROUNDING_OF_EIGENVALUE = 1e-6
 
 
+NOISE_MODELS: Registry[type[NoiseModel]] = Registry("mocap.noise_models", "pose noise model")
+
+
 class StatedNoise(NamedTuple):
     """The standard deviations of N logged poses; None where no source states them."""
 
@@ -58,6 +63,31 @@ def stated_models(name: str, entry: CameraEntry, pose_noise: str | None) -> list
     if entry.pose_noise:
         return noise_models(f"pose_noise of {name}", entry.pose_noise)
     return None
+
+
+def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[NoiseModel]:
+    """Build the pose noise models that a manifest names; DataError about `place` for unknown or bad ones."""
+    return _built(place, parts.items())
+
+
+def parsed_noise_models(place: str, text: str) -> list[NoiseModel]:
+    """Build the pose noise models of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
+
+    DataError about `place` if the text has another form, or names an unknown model or parameter.
+    """
+    try:
+        parts = parse(text)
+    except ValueError as error:
+        remedy = "write white:position_m=0.3,rotation_deg=1"
+        raise DataError(place, str(error), remedy, code="bad-value") from None
+    return _built(place, parts)
+
+
+def _built(place: str, parts: Iterable[tuple[str, Mapping[str, object]]]) -> list[NoiseModel]:
+    try:
+        return build(parts, dict(zip(NOISE_MODELS.names(), NOISE_MODELS.all(), strict=True)))
+    except ValueError as error:
+        raise DataError(place, str(error), code="bad-value") from None
 
 
 def stated_noise(

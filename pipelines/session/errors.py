@@ -44,7 +44,6 @@ CODES = {
     "not-a-folder": "a file lies where a folder belongs, or a folder where a file does",
     "not-a-session": "a folder is no session, or no whole one",
     "nothing-reconstructed": "no joint could be reconstructed",
-    "old-spelling": "a key of flight.yaml has another name today",
     "out-of-memory": "the memory does not suffice",
     "outside-folder": "a relative path leads out of its folder",
     "place-unknown": "a place on Earth cannot be brought into the world",

@@ -18,16 +18,10 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_v
 
 from pipelines.geometry.arrays import RelativeTo
 from pipelines.geometry.mounting import Looks
-from pipelines.session.errors import DataError
-from pipelines.session.old_spellings import old_spellings
 from pipelines.session.source_options import option_names
 from pipelines.session.storage import refuse_camera_names, refuse_names_of_people
-from pipelines.session.yaml_files import (
-    SecondsAsNs,
-    YamlModel,
-    read_yaml_model,
-    unknown_key,
-)
+from pipelines.session.yaml_files import read_yaml_model
+from pipelines.session.yaml_models import SecondsAsNs, YamlModel, unknown_key
 
 # The first version of flight.yaml is the only one so far.
 SCHEMA = 1
@@ -561,11 +555,5 @@ def read_flight(path: Path) -> Manifest:
         newest=SCHEMA,
         shape="a mapping with `schema: 1` and `cameras:`",
         made="`mocap init FOLDER` drafts one",
-        refuse=_refuse_old_spellings,
     )
     return flight if flight.name else flight.model_copy(update={"name": path.stem})
-
-
-def _refuse_old_spellings(path: Path, stated: Mapping[object, object]) -> None:
-    if old := old_spellings(stated):
-        raise DataError(path, "; ".join(old), "docs/flight.md explains every key", code="old-spelling")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.noise import NoiseModel, build, parse
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
     Attitudes,
@@ -37,9 +36,8 @@ from pipelines.session.records import (
     Trajectory,
     VideoIndex,
 )
-from pipelines.session.storage import refuse_special, sha256_of
-from pipelines.session.unknown_files import describe_unknown
-from pipelines.session.yaml_files import YamlModel
+from pipelines.session.storage import sha256_of
+from pipelines.session.yaml_models import YamlModel
 
 T = TypeVar("T")
 
@@ -357,9 +355,6 @@ class Registry(Generic[T]):
 FORMATS: Registry[Format] = Registry("mocap.formats", "format")
 EXPORTS: Registry[Export] = Registry("mocap.exports", "export format")
 DETECTORS: Registry[Detector | DetectorFamily] = Registry("mocap.detectors", "detector")
-NOISE_MODELS: Registry[type[NoiseModel]] = Registry("mocap.noise_models", "pose noise model")
-
-F = TypeVar("F")
 
 
 def find_detector(text: str) -> Detector:
@@ -418,81 +413,6 @@ def advice_on(detector: Detector) -> list[str]:
 def hashes_of_models(detector: Detector) -> dict[str, str]:
     """Hash the existing files of a detector; return their SHA-256 by name."""
     return {name: sha256_of(path) for name, path in detector.models().items() if path is not None}
-
-
-def recognise(path: Path, protocol: type[F], noun: str, *, name: str | None = None) -> F:
-    """Find the one registered format of a kind that recognises a file; arguments as `recognise_any` has."""
-    found: Any = recognise_any(path, (protocol,), noun, name=name)
-    read: F = found
-    return read
-
-
-def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: str | None = None) -> Format:
-    """Find the one registered format of some kinds that recognises a file; the user may state its name.
-
-    DataError if the path is missing, no format of the kinds knows it, several do, or the stated format is of
-    another kind. `noun` names such a file in messages.
-    """
-    if name is not None:
-        stated = FORMATS.get(name)
-        if isinstance(stated, protocols):
-            return stated
-        raise DataError(path, f"{name} is no format of a {noun}", "leave `format:` out", code="wrong-kind")
-    if not path.exists():
-        remedy = "check the path; paths are relative to the file that names them"
-        raise DataError(path, "does not exist", remedy, code="no-such-file")
-    refuse_special(path)
-    candidates = [f for f in FORMATS.all() if isinstance(f, protocols)]
-    matches = [f for f in candidates if f.recognises(path)]
-    if len(matches) == 1:
-        return matches[0]
-    if not matches:
-        likely = [f for f in candidates if path.suffix and path.suffix.lower() in f.suffixes]
-        if len(likely) == 1 and path.is_file():
-            return likely[0]  # its reader says exactly what is wrong
-        raise _unrecognised(path, noun, sorted(f.name for f in candidates))
-    problem = f"could be {' or '.join(sorted(f.name for f in matches))}"
-    raise DataError(path, problem, "say which with `format:`", code="ambiguous")
-
-
-def _unrecognised(path: Path, noun: str, known: list[str]) -> DataError:
-    """Report a file that is of another kind than expected, or of none."""
-    others = [f.title for f in FORMATS.all() if f.recognises(path)]
-    remedy = f"a {noun} is expected here: {', '.join(known)}"
-    if others:
-        return DataError(path, f"is no {noun} but {' or '.join(others)}", remedy, code="wrong-kind")
-    like = describe_unknown(path)
-    return DataError(
-        path,
-        f"{like.problem} and no {noun}",
-        "; ".join(filter(None, [like.remedy, remedy])),
-        code="wrong-kind",
-    )
-
-
-def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[NoiseModel]:
-    """Build the pose noise models that a manifest names; DataError about `place` for unknown or bad ones."""
-    return _built(place, parts.items())
-
-
-def parsed_noise_models(place: str, text: str) -> list[NoiseModel]:
-    """Build the pose noise models of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
-
-    DataError about `place` if the text has another form, or names an unknown model or parameter.
-    """
-    try:
-        parts = parse(text)
-    except ValueError as error:
-        remedy = "write white:position_m=0.3,rotation_deg=1"
-        raise DataError(place, str(error), remedy, code="bad-value") from None
-    return _built(place, parts)
-
-
-def _built(place: str, parts: Iterable[tuple[str, Mapping[str, object]]]) -> list[NoiseModel]:
-    try:
-        return build(parts, dict(zip(NOISE_MODELS.names(), NOISE_MODELS.all(), strict=True)))
-    except ValueError as error:
-        raise DataError(place, str(error), code="bad-value") from None
 
 
 _OF_EXTRA = re.compile(r"(?P<requirement>[^;]+?)\s*;\s*extra == ['\"](?P<extra>[^'\"]+)['\"]")

@@ -21,7 +21,7 @@ from pipelines.session.registries import (
     TelemetryFormat,
     TrajectoryFormat,
 )
-from pipelines.session.yaml_files import YamlModel, describe_problem
+from pipelines.session.yaml_models import YamlModel, describe_problem
 
 O = TypeVar("O", bound=YamlModel)
 

@@ -22,7 +22,8 @@ from pydantic import (
 )
 
 from pipelines.geometry.arrays import COEFFICIENT_COUNTS, Intrinsics
-from pipelines.session.yaml_files import SecondsAsNs, YamlModel, read_yaml_model
+from pipelines.session.yaml_files import read_yaml_model
+from pipelines.session.yaml_models import SecondsAsNs, YamlModel
 
 # Files with a larger number come from a later version.
 SCHEMA = 2

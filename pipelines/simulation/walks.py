@@ -27,8 +27,8 @@ from pipelines.geometry.triangulation import (
     reprojection_px,
     triangulate_pictures,
 )
+from pipelines.session.camera_poses import parsed_noise_models
 from pipelines.session.errors import DataError
-from pipelines.session.registries import parsed_noise_models
 from pipelines.simulation.body import PosablePerson, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
 from pipelines.simulation.flight import Performer

@@ -14,6 +14,7 @@ from pipelines.formats.videos.frame_times import FrameTimesFormat
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import CameraSources, FileSource, KeypointSource, Manifest, TruthSource
 from pipelines.session.progress import Progress
+from pipelines.session.recognition import recognise, recognise_any
 from pipelines.session.records import CalibratedCamera, Detections, JointMotion, VideoIndex
 from pipelines.session.registries import (
     AttitudeFormat,
@@ -27,13 +28,11 @@ from pipelines.session.registries import (
     TrajectoryFormat,
     TriggerFormat,
     VideoFormat,
-    recognise,
-    recognise_any,
 )
 from pipelines.session.source_options import CameraOfCalibration, DetectorOutput, options_of
 from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
 from pipelines.session.urls import fetched, located, named, source_url
-from pipelines.session.yaml_files import YamlModel
+from pipelines.session.yaml_models import YamlModel
 from pipelines.sources.world import UP_ROWS, losses
 
 # In any flight a person's joints are closer to their median than this.

@@ -13,8 +13,9 @@ from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.arrays import Picture
 from pipelines.session.description import Description, MediaEntry
 from pipelines.session.errors import DataError
+from pipelines.session.recognition import recognise
 from pipelines.session.records import PictureSample
-from pipelines.session.registries import Log, LogFormat, recognise
+from pipelines.session.registries import Log, LogFormat
 from pipelines.session.stages import noted_stamps
 from pipelines.session.storage import file_stamp, sha256_of
 from pipelines.session.urls import located

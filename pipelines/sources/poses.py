@@ -46,6 +46,7 @@ from pipelines.session.manifest import (
     PlanSource,
     PoseSource,
 )
+from pipelines.session.recognition import recognise
 from pipelines.session.records import AttitudeTrack, Occupancy, PositionTrack, Telemetry, Trajectory
 from pipelines.session.registries import (
     AttitudeFormat,
@@ -54,7 +55,6 @@ from pipelines.session.registries import (
     TelemetryFormat,
     TrajectoryFormat,
     TriggerFormat,
-    recognise,
 )
 from pipelines.session.source_options import FiledPose, LoggedAngles, LoggedPose
 from pipelines.session.urls import located

@@ -23,8 +23,8 @@ from pipelines.geometry.poses import (
 )
 from pipelines.reconstruction.background import Background, PosePrior, SeenPoints, adjust
 from pipelines.reconstruction.background_tracks import follow, off_people
+from pipelines.session.camera_poses import noise_models
 from pipelines.session.description import read_description
-from pipelines.session.registries import noise_models
 from tests.commands.runner import succeeds
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"

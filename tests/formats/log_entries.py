@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.session.errors import DataError
-from pipelines.session.registries import FORMATS, LogFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import FORMATS, LogFormat
 from tests.synthetic.logs import Entry
 
 START_NS = 1_700_000_000_000_000_000

@@ -10,8 +10,9 @@ import pytest
 
 from pipelines.formats.logs.positions import read_pair
 from pipelines.session.manifest import LogSource, Manifest
+from pipelines.session.recognition import recognise
 from pipelines.session.records import Trajectory
-from pipelines.session.registries import LogFormat, recognise
+from pipelines.session.registries import LogFormat
 from pipelines.sources.logs import FlightLogs
 from tests.synthetic.logs import Container, Entry, write_log
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,8 +11,7 @@ from pipelines.session import manifest as manifest_module
 from pipelines.session import source_options
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import FileSource, read_flight
-from pipelines.session.old_spellings import OLD_SPELLINGS
-from pipelines.session.yaml_files import YamlModel
+from pipelines.session.yaml_models import YamlModel
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.poses import FlightPoses
@@ -66,24 +64,16 @@ def test_a_manifest_has_few_keys() -> None:
     assert len(own) + 1 <= 90  # and `assumed`
 
 
-@pytest.mark.parametrize("old", OLD_SPELLINGS)
+@pytest.mark.parametrize(
+    ("part", "old", "new"), [("pose", "ulog", "file"), ("mount", "body_from_camera", "rotation_xyzw")]
+)
 def test_an_old_spelling_is_refused_with_the_new_one(
-    flight: SyntheticFlight, tmp_path: Path, old: str
+    flight: SyntheticFlight, part: str, old: str, new: str
 ) -> None:
-    place = [{"cameras.*": "drone1"}.get(part, part) for part in old.split(".")]
-    names = iter(["drone1"])
-    keys = [next(names) if part == "*" else part for part in place]
-    stated: Any = "x"
-    for key in reversed(keys):
-        stated = {key: stated}
-    path = tmp_path / "flight.yaml"
-    other = SyntheticFlight(path, stated, *list(vars(flight).values())[2:])
-    other.save()
     with pytest.raises(DataError) as caught:
-        read_flight(path)
-    last = OLD_SPELLINGS[old].rpartition(".")[2]
-    assert f"{'.'.join(keys)}: is now" in caught.value.problem
-    assert last.replace("*", "drone1") in caught.value.problem
+        checked(flight, {part: {old: "x"}})
+    assert f"cameras.drone1.{part}" in caught.value.problem
+    assert new in caught.value.problem
 
 
 def checked(flight: SyntheticFlight, change: dict[str, Any]) -> None:

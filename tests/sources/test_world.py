@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps, write_grid
+from pipelines.session.recognition import recognise
 from pipelines.session.records import Occupancy
-from pipelines.session.registries import CalibrationFormat, recognise
+from pipelines.session.registries import CalibrationFormat
 from pipelines.simulation.flight_files import write_tum
 from pipelines.sources.world import UP_ROWS
 from tests.raising import refused

@@ -16,7 +16,7 @@ from pipelines.geometry.arrays import Float, Intrinsics
 from pipelines.geometry.cameras import camera_matrix
 from pipelines.geometry.noise import disturb
 from pipelines.geometry.poses import invert, look_at, rotation_vector_from_quaternion
-from pipelines.session.registries import noise_models
+from pipelines.session.camera_poses import noise_models
 from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight_files import TrackedKeypoints, write_alphapose, write_joints, write_tum
 from pipelines.simulation.flying import orbit

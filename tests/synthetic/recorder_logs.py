@@ -21,7 +21,8 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 
 from pipelines.formats.scenes.mcap_writing import build
 from pipelines.ingest import ingest
-from pipelines.session.registries import LogFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import LogFormat
 from tests.synthetic.logs import ROS1, ROS2
 
 POSE, PICTURE = "/drone1/odometry", "/drone1/camera/image/compressed"

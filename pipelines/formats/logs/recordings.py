@@ -24,9 +24,9 @@ from pipelines.formats.common.files import first_bytes
 from pipelines.formats.logs.message_decoders import Schema, decoder, inflate
 from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
+from pipelines.session.recognition import describe_lfs_pointer
 from pipelines.session.records import Message, Topic
 from pipelines.session.storage import as_data_error, refuse_special
-from pipelines.session.unknown_files import describe_lfs_pointer
 
 # Causes of losses, as sessions and `mocap info` state them.
 UNDEFINED = "messages without a usable definition"

@@ -10,7 +10,8 @@ import pytest
 
 from pipelines.geometry.arrays import Intrinsics
 from pipelines.geometry.cameras import project
-from pipelines.session.registries import FORMATS, CalibrationFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import FORMATS, CalibrationFormat
 from tests.raising import refused
 
 # Rays up to 45 degrees from the optical axis.

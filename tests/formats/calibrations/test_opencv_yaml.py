@@ -11,8 +11,9 @@ import pytest
 from pipelines.formats.calibrations import calibration_files
 from pipelines.geometry.cameras import project
 from pipelines.session.errors import DataError
+from pipelines.session.recognition import recognise
 from pipelines.session.records import CalibratedCamera
-from pipelines.session.registries import CalibrationFormat, recognise
+from pipelines.session.registries import CalibrationFormat
 
 READER: CalibrationFormat = calibration_files.OPENCV
 K = np.array([[800.0, 0, 330.5], [0, 790.0, 241.25], [0, 0, 1]])

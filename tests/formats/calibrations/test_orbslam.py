@@ -10,7 +10,8 @@ import pytest
 
 from pipelines.formats.calibrations import calibration_files
 from pipelines.geometry.cameras import project
-from pipelines.session.registries import CalibrationFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import CalibrationFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 

@@ -19,8 +19,9 @@ from pipelines.geometry.poses import (
     rotate,
     rotation_vector_from_quaternion,
 )
+from pipelines.session.recognition import recognise
 from pipelines.session.records import Telemetry
-from pipelines.session.registries import TelemetryChoice, VideoFormat, recognise
+from pipelines.session.registries import TelemetryChoice, VideoFormat
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import DroneTruth, drone_of
 from tests.synthetic.flights import write_flight

@@ -11,7 +11,8 @@ import pytest
 from pipelines.formats.keypoint_files.result_files import COCO as FORMAT
 from pipelines.session.errors import DataError
 from pipelines.session.people import get_skeleton
-from pipelines.session.registries import KeypointFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import KeypointFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 

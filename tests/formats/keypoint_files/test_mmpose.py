@@ -10,7 +10,8 @@ import pytest
 
 from pipelines.formats.keypoint_files.result_files import MMPOSE as FORMAT
 from pipelines.session.people import get_skeleton
-from pipelines.session.registries import FORMATS, KeypointFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import FORMATS, KeypointFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 

@@ -10,7 +10,8 @@ import pytest
 
 from pipelines.formats.keypoint_files.result_files import OPENPOSE as FORMAT
 from pipelines.session.people import take_joints
-from pipelines.session.registries import KeypointFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import KeypointFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from pipelines.session.people import get_skeleton
+from pipelines.session.recognition import recognise
 from pipelines.session.records import Detections
-from pipelines.session.registries import KeypointFormat, recognise
+from pipelines.session.registries import KeypointFormat
 from tests.raising import refused
 from tests.real_data import real_data
 

@@ -10,8 +10,9 @@ import pytest
 
 from pipelines.formats.logs.trajectories import PATH, read_commands
 from pipelines.session.errors import DataError
+from pipelines.session.recognition import recognise
 from pipelines.session.records import Trajectory
-from pipelines.session.registries import LogFormat, recognise
+from pipelines.session.registries import LogFormat
 from tests.formats.refusals import refuses
 from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
 

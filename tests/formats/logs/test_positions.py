@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from pipelines.formats.logs.positions import axes_of_topic, pairs_of, read_pair, read_positions
+from pipelines.session.recognition import recognise
 from pipelines.session.records import Telemetry, Topic
-from pipelines.session.registries import LogFormat, recognise
+from pipelines.session.registries import LogFormat
 from tests.real_data import real_data
 from tests.synthetic.logs import Entry, write_mcap
 

@@ -9,7 +9,8 @@ import pytest
 
 from pipelines.formats.logs import recordings
 from pipelines.formats.logs.messages import bytes_of
-from pipelines.session.registries import FORMATS, LogFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import FORMATS, LogFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 

@@ -12,7 +12,8 @@ import pytest
 from pipelines.formats.maps import point_files
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.registries import MapFormat, need, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import MapFormat, need
 from tests.formats.refusals import refuses
 
 READER: MapFormat = point_files.LAS

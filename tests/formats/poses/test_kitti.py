@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.formats import poses as trajectory_files
 from pipelines.geometry.arrays import Float
-from pipelines.session.registries import TrajectoryFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import TrajectoryFormat
 from tests.formats.refusals import refuses
 
 READER: TrajectoryFormat = trajectory_files.KITTI

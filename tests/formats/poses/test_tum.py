@@ -12,8 +12,9 @@ from hypothesis import given
 
 from pipelines.formats import poses as trajectory_files
 from pipelines.geometry.poses import rotate
+from pipelines.session.recognition import recognise
 from pipelines.session.records import Trajectory
-from pipelines.session.registries import Export, TrajectoryFormat, recognise
+from pipelines.session.registries import Export, TrajectoryFormat
 from tests.formats.exported import flown, recording
 from tests.formats.trajectories import trajectories
 from tests.real_data import real_data

@@ -12,8 +12,9 @@ from hypothesis import given
 from pipelines.formats import poses as trajectory_files
 from pipelines.formats.skeletons import joint_files
 from pipelines.session.errors import DataError
+from pipelines.session.recognition import recognise
 from pipelines.session.records import JointMotion, Recording, Trajectory
-from pipelines.session.registries import Export, JointFormat, recognise
+from pipelines.session.registries import Export, JointFormat
 from tests.formats.motions import motions
 from tests.formats.refusals import refuses
 from tests.raising import refused

@@ -17,7 +17,8 @@ from pipelines.formats.videos.picture_folder import (
     picture_times,
 )
 from pipelines.geometry.poses import rotate
-from pipelines.session.registries import TelemetryChoice, VideoFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import TelemetryChoice, VideoFormat
 from tests.commands.runner import succeeds
 
 READER: VideoFormat = picture_folder.PICTURES

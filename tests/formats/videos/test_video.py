@@ -16,7 +16,8 @@ from pipelines.formats.videos import video
 from pipelines.formats.videos.picture_folder import UNTIMED
 from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames, index_video
 from pipelines.geometry.arrays import Picture
-from pipelines.session.registries import VideoFormat, recognise
+from pipelines.session.recognition import recognise
+from pipelines.session.registries import VideoFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.videos import (

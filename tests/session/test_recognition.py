@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipelines.session.errors import DataError
-from pipelines.session.registries import CalibrationFormat, MapFormat, recognise
-from pipelines.session.unknown_files import EXPECTED, describe_unknown
+from pipelines.session.recognition import EXPECTED, describe_unknown, recognise
+from pipelines.session.registries import CalibrationFormat, MapFormat
 from pipelines.survey import survey
 from tests.real_data import real_data
 

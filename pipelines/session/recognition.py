@@ -1,4 +1,4 @@
-"""Description of files that no format recognises: their likely kind, and the step that makes them usable."""
+"""Recognition of files by the registered formats, and what other files seem to be."""
 
 import json
 import re
@@ -7,9 +7,13 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from pipelines.session.storage import plain_text, text_encoding
+from pipelines.session.errors import DataError
+from pipelines.session.registries import FORMATS, Format
+from pipelines.session.storage import plain_text, refuse_special, text_encoding
+
+F = TypeVar("F")
 
 # Every kind is known by less than its first 64 kB.
 HEAD_BYTES = 64 * 1024
@@ -24,6 +28,56 @@ EXPECTED = (
     "docs/formats.md lists the formats"
 )
 """Remedy for a file of which nothing better is known."""
+
+
+def recognise(path: Path, protocol: type[F], noun: str, *, name: str | None = None) -> F:
+    """Find the one registered format of a kind that recognises a file; arguments as `recognise_any` has."""
+    found: Any = recognise_any(path, (protocol,), noun, name=name)
+    read: F = found
+    return read
+
+
+def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: str | None = None) -> Format:
+    """Find the one registered format of some kinds that recognises a file; the user may state its name.
+
+    DataError if the path is missing, no format of the kinds knows it, several do, or the stated format is of
+    another kind. `noun` names such a file in messages.
+    """
+    if name is not None:
+        stated = FORMATS.get(name)
+        if isinstance(stated, protocols):
+            return stated
+        raise DataError(path, f"{name} is no format of a {noun}", "leave `format:` out", code="wrong-kind")
+    if not path.exists():
+        remedy = "check the path; paths are relative to the file that names them"
+        raise DataError(path, "does not exist", remedy, code="no-such-file")
+    refuse_special(path)
+    candidates = [f for f in FORMATS.all() if isinstance(f, protocols)]
+    matches = [f for f in candidates if f.recognises(path)]
+    if len(matches) == 1:
+        return matches[0]
+    if not matches:
+        likely = [f for f in candidates if path.suffix and path.suffix.lower() in f.suffixes]
+        if len(likely) == 1 and path.is_file():
+            return likely[0]  # its reader says exactly what is wrong
+        raise _unrecognised(path, noun, sorted(f.name for f in candidates))
+    problem = f"could be {' or '.join(sorted(f.name for f in matches))}"
+    raise DataError(path, problem, "say which with `format:`", code="ambiguous")
+
+
+def _unrecognised(path: Path, noun: str, known: list[str]) -> DataError:
+    """Report a file that is of another kind than expected, or of none."""
+    others = [f.title for f in FORMATS.all() if f.recognises(path)]
+    remedy = f"a {noun} is expected here: {', '.join(known)}"
+    if others:
+        return DataError(path, f"is no {noun} but {' or '.join(others)}", remedy, code="wrong-kind")
+    like = describe_unknown(path)
+    return DataError(
+        path,
+        f"{like.problem} and no {noun}",
+        "; ".join(filter(None, [like.remedy, remedy])),
+        code="wrong-kind",
+    )
 
 
 class Likeness(NamedTuple):

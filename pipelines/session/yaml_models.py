@@ -1,0 +1,139 @@
+"""Models of users' YAML files: an unknown key is refused with the nearest known one."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from typing import Annotated, Any, ClassVar, get_args, get_origin
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationInfo, field_validator, model_validator
+from pydantic.fields import FieldInfo
+
+# Differences of two such times still fit into 64 bits.
+LATEST_NS = 2**62
+
+
+def nanoseconds(value: object) -> int:
+    """Convert seconds, a number or text, to exact nanoseconds; ValueError for no time before 2116."""
+    try:
+        exact = Decimal(str(value)) * 1_000_000_000
+        is_near = abs(exact) <= LATEST_NS  # before it becomes an integer of as many digits
+    except ArithmeticError:
+        raise ValueError("is no time in seconds") from None
+    if not is_near:
+        raise ValueError("is no time in seconds: it lies beyond the year 2116 (are these ms or ns?)")
+    return int(exact.to_integral_value())
+
+
+SecondsAsNs = Annotated[int, BeforeValidator(nanoseconds)]
+"""Seconds in the file (number or text), exact nanoseconds in the program."""
+
+
+class YamlModel(BaseModel):
+    """A mapping of the manifest: unknown keys are refused, numbers are finite."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+    shorthand: ClassVar[str | None] = None
+    """The key that a bare text (or list) stands for: `map: site.bt` means `map: {file: site.bt}`."""
+    one_of: ClassVar[tuple[str, ...]] = ()
+    """The keys that exclude each other; exactly one of them must be there."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_shorthand(cls, value: object) -> object:
+        return {cls.shorthand: value} if cls.shorthand and isinstance(value, str | list) else value
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _true_is_no_number(cls, value: object, info: ValidationInfo) -> object:
+        annotation = cls.model_fields[info.field_name or ""].annotation
+        if _holds_truth_value(value) and not _allows_truth_value(annotation):
+            raise ValueError("is true or false where a number or text belongs")
+        return value
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> YamlModel:
+        stated = [name for name in self.one_of if getattr(self, name) not in (None, "")]
+        if self.one_of and len(stated) != 1:
+            raise ValueError(f"needs exactly one of {', '.join(self.one_of)}" + f" (has {len(stated)})")
+        return self
+
+
+def _holds_truth_value(value: object) -> bool:
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    return any(map(_holds_truth_value, value)) if isinstance(value, list) else isinstance(value, bool)
+
+
+def _allows_truth_value(annotation: object) -> bool:
+    """Return True for a type that is or contains `bool`, anything, or a model with fields of its own."""
+    is_model = isinstance(annotation, type) and issubclass(annotation, BaseModel)
+    if annotation in (bool, Any, object) or isinstance(annotation, bool) or is_model:
+        return True
+    return any(map(_allows_truth_value, get_args(annotation)))
+
+
+def keys_of(model: type[YamlModel]) -> set[str]:
+    """Return the keys that a mapping of this kind may have, as users write them."""
+    return {field.alias or name for name, field in model.model_fields.items()}
+
+
+def describe_problem(
+    problem: Any, model: type[YamlModel]
+) -> str:  # ErrorDetails, whose ctx has no fixed shape
+    """Describe a problem that pydantic found, with its place."""
+    place = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        known = list(_fields_at(model, problem["loc"][:-1]))
+        return f"{place}: {unknown_key(str(problem['loc'][-1]), known)}"
+    if problem["type"] == "missing":
+        examples = _fields_at(model, problem["loc"][:-1])[problem["loc"][-1]].examples
+        return f"{place}: is missing" + (f", for example {examples[0]}" if examples else "")
+    if problem["type"] in {"model_type", "model_attributes_type", "dict_type"}:
+        return f"{place}: must be a mapping (key: value), not {str(problem['input'])[:60]!r}"
+    if problem["type"] == "too_short" and problem["ctx"]["min_length"] == 1:
+        return f"{place}: needs at least one"
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"{place}: {message}" if place else message
+
+
+_RENAMED = {
+    **dict.fromkeys(("path", "log", "csv", "srt", "tum", "static", "dji", "ulog", "ardupilot"), "file"),
+    **dict.fromkeys(("tlog", "gopro", "joints"), "file"),
+    "fixed": "yaw_deg",
+    "body_from_camera": "rotation_xyzw",
+    "world_from_log": "world_from_source",
+}
+"""Keys of earlier versions of flight.yaml, with their names today."""
+
+
+def unknown_key(key: str, known: Sequence[str]) -> str:
+    """Describe a key that nothing knows, with the nearest known one."""
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    if (renamed := _RENAMED.get(key)) in known:
+        return f"unknown key, it is called {renamed!r} now"
+    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+    return f"unknown key, {hint}"
+
+
+def _fields_at(model: type[YamlModel], place: tuple[str | int, ...]) -> dict[str, FieldInfo]:
+    """Return the fields by key that the schema allows at a place, by walking the types of the fields."""
+    kind: Any = model
+    for part in place:
+        if isinstance(kind, type) and issubclass(kind, YamlModel):
+            fields = {field.alias or name: field for name, field in kind.model_fields.items()}
+            kind = _plain(fields[str(part)].annotation)
+        else:  # a list or a dict
+            kind = _plain(get_args(kind)[-1])
+    return {field.alias or name: field for name, field in kind.model_fields.items()}
+
+
+def _plain(annotation: Any) -> Any:
+    """Return a type without `None` and without its `Annotated` metadata."""
+    if get_origin(annotation) is Annotated:
+        return _plain(get_args(annotation)[0])
+    if type(None) in get_args(annotation):
+        return _plain(next(a for a in get_args(annotation) if a is not type(None)))
+    return annotation
