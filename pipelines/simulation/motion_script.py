@@ -8,6 +8,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply, rotate
+from pipelines.geometry.rig import BONE, BONES, SIDES, BodyMotion, Rig, about, from_axes, partly, unit
 from pipelines.simulation.motion_plan import (
     FASTEST_WALK_MPS,
     JOG_SPEED_MPS,
@@ -27,7 +28,6 @@ from pipelines.simulation.motion_plan import (
     steps_per_s,
     swing_steps,
 )
-from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig, about, from_axes, partly, unit
 from pipelines.simulation.scenario import Step, Travel
 
 Heights = Callable[[Float], Float]

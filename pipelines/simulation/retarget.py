@@ -9,10 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply, rotate
-from pipelines.session.errors import DataError
-from pipelines.session.records import SkeletalMotion
-from pipelines.simulation.motion_script import two_bones
-from pipelines.simulation.rig import (
+from pipelines.geometry.rig import (
     BONE,
     BONES,
     SIDES,
@@ -24,6 +21,9 @@ from pipelines.simulation.rig import (
     partly,
     sole_points,
 )
+from pipelines.session.errors import DataError
+from pipelines.session.records import SkeletalMotion
+from pipelines.simulation.motion_script import two_bones
 
 # Names of a bone without side, prefix and separators; the first one that is there is taken.
 _SIDED = {

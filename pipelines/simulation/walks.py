@@ -20,6 +20,7 @@ from pipelines.geometry.cameras import undistort
 from pipelines.geometry.metrics import common, measure
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import matrix_from_quaternion, rates
+from pipelines.geometry.rig import BodyMotion
 from pipelines.geometry.triangulation import (
     Method,
     Views,
@@ -34,7 +35,6 @@ from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
 from pipelines.simulation.flight import Performer
 from pipelines.simulation.flying import orbit
 from pipelines.simulation.motion_script import perform
-from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Body, DetectorErrors, Lens, Scenario, Step, Travel
 
 RANGE_M = 10.0

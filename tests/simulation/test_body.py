@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.poses import quaternion_from_rotation_vector
-from pipelines.simulation.body import PosablePerson, make_body, moving_weights
-from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, BodyMotion, joint_centres
+from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES, BodyMotion, joint_centres
+from pipelines.geometry.skinning import moving_weights
+from pipelines.simulation.body import PosablePerson, make_body
 from pipelines.simulation.scenario import Body
 
 SEXES, BUILDS = ("female", "male"), ("slim", "average", "heavy")

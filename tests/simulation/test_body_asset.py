@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.simulation import body
-from pipelines.simulation.body import PARTS
+from pipelines.geometry import body_model
+from pipelines.geometry.body_model import PARTS
 
-ASSET = Path(body.__file__).parent / "data" / "body.npz"
+ASSET = Path(body_model.__file__).parent / "data" / "body.npz"
 
 
 def test_the_asset_is_small_and_sound() -> None:

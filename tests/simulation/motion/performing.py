@@ -9,8 +9,8 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply
+from pipelines.geometry.rig import BONE, BONES, SIDES, BodyMotion, Rig, joint_centres, sole_points
 from pipelines.simulation.motion_script import perform
-from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig, joint_centres, sole_points
 from pipelines.simulation.scenario import Step
 
 

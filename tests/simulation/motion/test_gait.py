@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float
+from pipelines.geometry.rig import BONES, BodyMotion, Rig
 from pipelines.simulation.body import make_body
-from pipelines.simulation.rig import BONES, BodyMotion, Rig
 from pipelines.simulation.scenario import Body
 from tests.simulation.motion.performing import (
     RIG,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.poses import conjugate, multiply, rotate
+from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES, joint_centres
 from pipelines.session.records import SkeletalMotion
 from pipelines.simulation.retarget import retarget
-from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, joint_centres
 from tests.simulation.motion.performing import RIG, clearance_m, flat, mound, performed
 
 OURS = ("pelvis", "spine", "back", "chest", "neck", "head")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import rotate
-from pipelines.simulation.rig import BONE, BONES, joint_centres
+from pipelines.geometry.rig import BONE, BONES, joint_centres
 from tests.simulation.motion.performing import RIG, bent_deg, clearance_m, mound, performed
 
 SWAY_M = 0.012  # of somebody standing, both axes together

@@ -1,4 +1,4 @@
-"""The bones of a simulated person, used by motions and by the body's mesh.
+"""The bones of a person, used by motions and by the body's mesh.
 
 Every bone is turned from a neutral pose: standing upright, arms hanging, legs straight, feet pointing
 ahead, soles flat on the ground. Body axes are x forward, y left, z up, so that a person whose bones are
