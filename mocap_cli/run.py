@@ -15,6 +15,7 @@ from mocap_cli.terminal import one_line, print_json, say, say_warnings, watching
 from pipelines.session.errors import DataError
 
 if TYPE_CHECKING:
+    from pipelines.drafting.matching import Answer, Ask, Question
     from pipelines.session.description import Description
     from pipelines.session.progress import Progress
 
@@ -48,10 +49,11 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
 
     manifest = folder if folder.suffix in {".yaml", ".yml"} else folder / MANIFEST
     asks = not (yes or shown.as_json or shown.quiet) and sys.stdin.isatty() and sys.stderr.isatty()
-    with watching(shown.level) as progress:
-        assumed = [] if manifest.exists() else _draft(folder, manifest, progress)
-    for remark in assumed[:MAX_QUESTIONS] if asks else ():
-        _ask(manifest, remark)
+    questions = _Questions(asks, takes=yes)
+    with watching(-1 if asks else shown.level) as progress:
+        assumed = [] if manifest.exists() else _draft(folder, manifest, questions.choose, progress)
+    for remark in assumed[: questions.left]:
+        questions.confirm(manifest, remark)
     with watching(shown.level) as progress:
         ingested = ingest(manifest, progress=progress)
         session = ingested.folder
@@ -80,7 +82,43 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
     print_verdict(verdict, session, reported=True)
 
 
-def _draft(folder: Path, manifest: Path, progress: Progress) -> list[str]:
+class _Questions:
+    """Questions to somebody at a terminal; elsewhere the likely answer is taken where that was asked for."""
+
+    def __init__(self, asks: bool, *, takes: bool) -> None:
+        self.left = MAX_QUESTIONS if asks else 0
+        self._takes = takes
+
+    def choose(self, question: Question) -> Answer | None:
+        """Let somebody choose an option; none is chosen after too many questions, and where nobody is."""
+        from pipelines.drafting.matching import Answer
+
+        if not self.left:
+            return Answer(0, stated=False) if self._takes else None
+        self.left -= 1
+        say(f"cameras.{question.camera}.{question.key}: no file tells it. It may be", err=True)
+        for number, option in enumerate(question.options, 1):
+            say(f"  {number}: {one_line(option)}", err=True)
+        numbers = click.IntRange(0, len(question.options))
+        chosen = click.prompt("Which (0: none of these)?", default=1, type=numbers, err=True)
+        return Answer(chosen - 1, stated=True) if chosen else None
+
+    def confirm(self, manifest: Path, remark: str) -> None:
+        """Ask if an assumption is right.
+
+        Raises:
+            DataError: it is not; the manifest says what can be written instead.
+        """
+        if not click.confirm(f"assumed: {one_line(remark)}. Is that right?", default=True, err=True):
+            raise DataError(
+                manifest,
+                f"assumes what is not right: {one_line(remark)}",
+                "correct the line, take `assumed: true` away, and run the same command again",
+                code="incomplete",
+            )
+
+
+def _draft(folder: Path, manifest: Path, ask: Ask, progress: Progress) -> list[str]:
     """Write the manifest of a folder's files; return what it assumes.
 
     Raises:
@@ -88,7 +126,7 @@ def _draft(folder: Path, manifest: Path, progress: Progress) -> list[str]:
     """
     from pipelines.draft import draft
 
-    drafted = draft([folder], manifest, progress=progress)
+    drafted = draft([folder], manifest, ask=ask, progress=progress)
     progress.note(f"{manifest}: drafted, with {len(drafted.cameras)} cameras")
     if drafted.missing:
         raise DataError(
@@ -98,21 +136,6 @@ def _draft(folder: Path, manifest: Path, progress: Progress) -> list[str]:
             code="incomplete",
         )
     return drafted.assumed
-
-
-def _ask(manifest: Path, remark: str) -> None:
-    """Ask if an assumption is right.
-
-    Raises:
-        DataError: it is not; the manifest says what can be written instead.
-    """
-    if not click.confirm(f"assumed: {one_line(remark)}. Is that right?", default=True, err=True):
-        raise DataError(
-            manifest,
-            f"assumes what is not right: {one_line(remark)}",
-            "correct the line, take `assumed: true` away, and run the same command again",
-            code="incomplete",
-        )
 
 
 def _may_replan(description: Description) -> bool:

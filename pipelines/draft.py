@@ -31,24 +31,24 @@ from pipelines.drafting.found import (
     label_of_place,
 )
 from pipelines.drafting.manifest_text import write_manifest
-from pipelines.drafting.matching import MotionMatch, match
+from pipelines.drafting.matching import Ask, MotionMatch, match
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
 from pipelines.formats.drone_logs.tlog import FORMAT as TLOG
 from pipelines.formats.logs.maps import MAP_TYPES, frame_of
-from pipelines.formats.logs.messages import header_ns, kind_of, samples
+from pipelines.formats.logs.messages import all_samples, header_ns, kind_of, samples
 from pipelines.formats.logs.positions import FIXES, pairs_of
-from pipelines.formats.logs.trajectories import poses_of
+from pipelines.formats.logs.trajectories import attitudes_of, poses_of
 from pipelines.formats.poses import times_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
 from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
 from pipelines.formats.videos.video import created_ns, followed_points, index_video
-from pipelines.geometry.arrays import Float, Int64, Intrinsics, Place
+from pipelines.geometry.arrays import Float, Int64, Intrinsics, Place, RelativeTo
 from pipelines.geometry.clocks import TrackedPoints, explain_motion
 from pipelines.geometry.geodesy import enu_from_geodetic
-from pipelines.geometry.mounting import body_from_camera
-from pipelines.geometry.poses import interpolate_points, multiply
+from pipelines.geometry.mounting import body_from_camera, level_heading
+from pipelines.geometry.poses import interpolate_points, interpolate_poses, multiply
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.maps import MapSizeError
@@ -126,6 +126,7 @@ def draft(
     output: Path | None = None,
     *,
     overwrite: bool = False,
+    ask: Ask = lambda _: None,
     progress: Progress | None = None,
 ) -> Drafted:
     """Examine files and folders and write the manifest of their flight.
@@ -136,6 +137,7 @@ def draft(
     Args:
         output: the manifest; by default flight.yaml in the folder that all paths share.
         overwrite: replace an existing file.
+        ask: decides what neither names nor contents do; without it, that is missing.
 
     Raises:
         DataError: nothing was recognised, a path is missing, or the output exists or cannot be written.
@@ -167,7 +169,7 @@ def draft(
 
     candidates = [each for each in found if isinstance(each, Proposal)]
     logs = [each for each in found if isinstance(each, FoundLog)]
-    flight = match(candidates, logs, _MotionComparison(), _distance_m)
+    flight = match(candidates, logs, _MotionComparison(), _distance_m, ask)
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
     problem = _write(target, manifest.text)
     return Drafted(
@@ -509,11 +511,11 @@ class _MotionComparison:
     def __init__(self) -> None:
         self._followed: dict[Path, TrackedPoints] = {}
 
-    def __call__(self, film: FoundFilm, found: Proposal) -> MotionMatch | None:
+    def __call__(self, film: FoundFilm, found: Proposal, gimbals: Sequence[Proposal]) -> MotionMatch | None:
         """Return how well poses explain the motion in a video's pictures; None without poses.
 
-        The lens is taken to have an ordinary angle of view. The camera on a body without a gimbal is taken to
-        look forward and down by the angle that explains most.
+        The lens is taken to have an ordinary angle of view. The camera on a body is turned by the gimbal, and
+        in the way, that explain most; without a gimbal it is taken to look forward and down by such an angle.
         """
         poses = _poses_in(found)
         if poses is None:
@@ -525,24 +527,43 @@ class _MotionComparison:
             lens = Intrinsics(index.width, index.height, focal_px, focal_px, *middle)
             watched_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
             self._followed[film.path] = followed_points(film.path, lens, watched_ns)
-        t_ns, position, turned = poses
-        rows = np.isfinite(position).all(axis=1)
+        t_ns, position, body = poses
+        within = np.isfinite(position).all(axis=1)
         if film.made_ns is not None and found.span and found.span.first_ns > NO_DATE_NS:
-            rows &= np.abs(t_ns - film.made_ns) <= 2 * film.length_ns + MADE_WITHIN_NS
+            within &= np.abs(t_ns - film.made_ns) <= 2 * film.length_ns + MADE_WITHIN_NS
+        ahead = body_from_camera("forward")
+        tried: list[tuple[Float, Proposal | None, RelativeTo]] = [
+            (multiply(attitude, ahead), gimbal, relative_to)
+            for gimbal in gimbals
+            for relative_to, attitude in _turned_by(gimbal, t_ns, body)
+        ]
+        if not tried and found.of_body:
+            downs = (body_from_camera("forward", deg) for deg in TRIED_DOWN_DEG)
+            tried = [(multiply(body, mount), None, "world") for mount in downs]
         matches: list[MotionMatch] = []
-        for mount in (
-            [body_from_camera("forward", deg) for deg in TRIED_DOWN_DEG] if found.of_body else [None]
-        ):
+        for turned, gimbal, relative_to in tried or [(body, None, "world")]:
+            rows = within & np.isfinite(turned).all(axis=1)
             explained = explain_motion(
-                t_ns[rows],
-                position[rows],
-                turned[rows] if mount is None else multiply(turned[rows], mount),
-                self._followed[film.path],
-                max_gap_ns=MAX_GAP_NS,
+                t_ns[rows], position[rows], turned[rows], self._followed[film.path], max_gap_ns=MAX_GAP_NS
             )
             if explained is not None:
-                matches.append(MotionMatch(*explained))
+                matches.append(MotionMatch(*explained, gimbal, relative_to))
         return max(matches, key=lambda alike: float(np.nansum(alike.gain)), default=None)
+
+
+def _turned_by(gimbal: Proposal, t_ns: Int64, body: Float) -> Iterator[tuple[RelativeTo, Float]]:
+    """Yield the world attitudes [N, 4] of a gimbal on a body, by what its angles can be relative to."""
+    with suppress(DataError):
+        with recognise(gimbal.path, LogFormat, "log").open_log([gimbal.path]) as log:
+            logged = all_samples(log.messages([gimbal.topic]), gimbal.path)
+            found = attitudes_of(logged, gimbal.path, stamps="header").trajectory
+        nowhere = np.zeros((len(found.t_ns), 3))
+        attitude = interpolate_poses(
+            found.t_ns, nowhere, found.quaternion_xyzw, t_ns, max_gap_ns=MAX_GAP_NS, max_extrapolation_ns=0
+        )[1]
+        yield "world", attitude
+        yield "body", multiply(body, attitude)
+        yield "heading", multiply(level_heading(body), attitude)
 
 
 def _poses_in(found: Proposal) -> tuple[Int64, Float, Float] | None:

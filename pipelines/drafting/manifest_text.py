@@ -29,7 +29,7 @@ from pipelines.drafting.found import (
     TimeSpan,
     VideoStart,
 )
-from pipelines.drafting.matching import CameraDraft, FlightDraft
+from pipelines.drafting.matching import CameraDraft, Chosen, FlightDraft
 from pipelines.session.manifest import SCHEMA, CameraSources, Manifest
 from pipelines.session.yaml_models import YamlModel
 
@@ -306,13 +306,7 @@ class _ManifestWriter:
         if not (taken.of_body or taken.unturned):
             return {"mount": lever} if isinstance(taken, FlownPoses) else {}
         if gimbal is not None:
-            what = "relative_to, what its angles are relative to; order and units if not ypr and deg"
-            turned = self.stated({**gimbal.taken.settings, "relative_to": "world"})
-            remarks = [gimbal.taken.about, self.miss(camera, "gimbal", what)]
-            return {
-                "gimbal": DraftedKey(None, remarks, self.others("gimbal", gimbal.others), turned),
-                "mount": lever,
-            }
+            return {"gimbal": self._gimbal(camera, gimbal), "mount": lever}
         if own is not None and own.knows_north:
             return {"gimbal": DraftedKey(self.stated(own.settings), [own.about]), "mount": lever}
         if own is not None:
@@ -331,6 +325,18 @@ class _ManifestWriter:
             fixed = {"yaw_deg": 90, "pitch_deg": -30}
             return {"gimbal": DraftedKey(None, [self.miss(camera, "gimbal", what)], example=fixed)}
         return {"mount": self._fixed_mount(camera)}
+
+    def _gimbal(self, camera: CameraDraft, gimbal: Chosen) -> DraftedKey:
+        """Return the angles of a gimbal in a log; its pictures say what they are relative to, or the user."""
+        others, reference = self.others("gimbal", gimbal.others), camera.gimbal_reference
+        if reference is None:
+            what = "relative_to, what its angles are relative to; order and units if not ypr and deg"
+            turned = self.stated({**gimbal.taken.settings, "relative_to": "world"})
+            return DraftedKey(None, [gimbal.taken.about, self.miss(camera, "gimbal", what)], others, turned)
+        what = f"angles relative to the {reference}, which fits its pictures best or is the likeliest"
+        stated = {**gimbal.taken.settings, "relative_to": reference}
+        remarks = [gimbal.taken.about, self.assume(camera, "gimbal", what)]
+        return DraftedKey(self.guessed(stated), remarks, others)
 
     def _fixed_mount(self, camera: CameraDraft) -> DraftedKey:
         remark = self.assume(camera, "mount", "the camera looks forward, level, from the body's origin")

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -42,7 +43,7 @@ from pipelines.drafting.found import (
     order,
     unique,
 )
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, RelativeTo
 from pipelines.geometry.clocks import explains_better
 
 # Two receivers on one drone state places that differ by less, m.
@@ -61,12 +62,34 @@ class MotionMatch:
 
     gain: Float  # [S] log-likelihood of each stretch of the video, over a camera that stands still
     start_ns: int  # of the video, on the log's clock
+    gimbal: Proposal | None = None  # the angles that turn the camera, if any do
+    relative_to: RelativeTo = "world"  # what these angles are relative to
 
 
-Compare = Callable[[FoundFilm, Proposal], MotionMatch | None]
-"""Comparison of a video with poses; None if one of them shows no motion."""
+Compare = Callable[[FoundFilm, Proposal, Sequence[Proposal]], MotionMatch | None]
+"""Comparison of a video with poses, and with angles of gimbals; None if one of them shows no motion."""
 Distance = Callable[[FlownPoses, FlownPoses], float | None]
 """Median distance across (m) of the positions in two drones' logs; None if they share no time or place."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What no file tells of a camera: a key of the manifest, and its possible values, the likeliest first."""
+
+    camera: str
+    key: str
+    options: tuple[str, ...]
+
+
+class Answer(NamedTuple):
+    """An option of a question; `stated` if a person chose it, else it is an assumption."""
+
+    option: int
+    stated: bool
+
+
+Ask = Callable[[Question], Answer | None]
+"""Answer to a question; None leaves it open."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +113,7 @@ class CameraDraft:
     paired: bool = False  # video and keypoints are matched only because nothing else is left
     choices: dict[str, Chosen] = field(default_factory=dict)
     angles: FoundAngles | None = None  # attitudes in its own video
+    gimbal_reference: RelativeTo | None = None  # what its gimbal's angles are relative to, by its pictures
     true_poses: Chosen | None = None
 
     @property
@@ -130,7 +154,11 @@ class FlightDraft:
 
 
 def match(
-    found: Sequence[Proposal], recordings: Sequence[FoundLog], compare: Compare, distance: Distance
+    found: Sequence[Proposal],
+    recordings: Sequence[FoundLog],
+    compare: Compare,
+    distance: Distance,
+    ask: Ask,
 ) -> FlightDraft:
     """Find the cameras, and what belongs to each.
 
@@ -139,6 +167,7 @@ def match(
         recordings: logs of topics.
         compare: decides where neither names nor times do.
         distance: decides between logs of one time, for cameras whose own positions lack attitudes.
+        ask: decides what nothing else does.
     """
     logs = choose_stamps(join_parts(recordings))
     every = [*found, *(candidate for log in logs for candidate in log.candidates())]
@@ -173,8 +202,10 @@ def match(
         film = camera.film
         own = [c for c in of.get("angles", []) if isinstance(c, FoundAngles) and film and c.path == film.path]
         camera.angles = own[0] if own else None
-    _pair_by_content(cameras, moving, compare)
+    _pair_by_content(cameras, moving, gimbals, of.get("intrinsics", []), compare)
     _prefer_attitudes(cameras, moving, distance)
+    for camera in cameras:
+        _ask_for_the_rest(camera, cameras, moving, of.get("intrinsics", []), ask)
     if any("pose" in c.choices and c.choices["pose"].taken.by_gps for c in cameras):
         actors += [c for c in of.get("fixes", []) if is_called(f"{c.topic} {c.place[-1]}", ACTOR)]
     maps = _maps(of.get("map", []), cameras)
@@ -307,8 +338,18 @@ def _are_two(one: Label, other: Label) -> bool:
 # --- what belongs to a camera ---------------------------------------------------------------------------
 
 
-def _pair_by_content(cameras: Sequence[CameraDraft], moving: Sequence[Proposal], compare: Compare) -> None:
-    """Give videos without poses those that no camera has: by time, else by motion."""
+def _pair_by_content(
+    cameras: Sequence[CameraDraft],
+    moving: Sequence[Proposal],
+    gimbals: Sequence[Proposal],
+    intrinsics: Sequence[Proposal],
+    compare: Compare,
+) -> None:
+    """Give videos without poses those that no camera has: by time, else by motion.
+
+    What a log has of the same name as the poses is then the camera's too. Motion also tells what the angles
+    of a gimbal are relative to.
+    """
     taken = _taken(cameras)
     likeliest: dict[object, Proposal] = {}  # of several topics of one drone
     for candidate in moving:
@@ -323,13 +364,61 @@ def _pair_by_content(cameras: Sequence[CameraDraft], moving: Sequence[Proposal],
         logs = possible[camera.name]
         if len(logs) == 1 and uses[id(logs[0])] == 1:
             camera.choices["pose"] = Chosen(logs[0], named=False, why="by the times of video and log")
-        elif (own := _own_by_motion(film, logs, compare)) is not None:
+            if turning := _beside_pose(logs[0], gimbals):
+                camera.choices["gimbal"] = Chosen(turning[0], tuple(turning[1:]))
+        elif (own := _own_by_motion(film, logs, gimbals, compare)) is not None:
             found[camera.name] = own
     for camera, _ in filmed:
         motion = found.get(camera.name)
         if motion is not None and sum(motion[0] is log for log, _ in found.values()) == 1:
             log, alike = motion
             camera.choices["pose"] = Chosen(log, named=False, why="by their motion", start_ns=alike.start_ns)
+            if alike.gimbal is not None:
+                camera.choices["gimbal"] = Chosen(alike.gimbal)
+                camera.gimbal_reference = alike.relative_to
+    for camera, _ in filmed:
+        pose, lenses = camera.choices.get("pose"), camera.choices.get("intrinsics")
+        if pose is not None and lenses is None and (beside := _beside_pose(pose.taken, intrinsics)):
+            camera.choices["intrinsics"] = Chosen(beside[0], tuple(beside[1:]))
+    for camera in cameras:
+        pose, turned, film = (camera.choices.get("pose"), camera.choices.get("gimbal"), camera.film)
+        if pose is not None and turned is not None and film is not None and camera.gimbal_reference is None:
+            fit = compare(film, pose.taken, [turned.taken])
+            if fit is not None and fit.gimbal and explains_better(fit.gain, np.zeros_like(fit.gain)):
+                camera.gimbal_reference = fit.relative_to
+
+
+def _ask_for_the_rest(
+    camera: CameraDraft,
+    cameras: Sequence[CameraDraft],
+    moving: Sequence[Proposal],
+    intrinsics: Sequence[Proposal],
+    ask: Ask,
+) -> None:
+    """Ask for poses, intrinsics and the reference of a gimbal that neither names nor contents tell."""
+    film, taken = camera.film, [c.choices["pose"].taken for c in cameras if "pose" in c.choices]
+    free = [c for c in moving if c not in taken and (film is None or _may_be_of(film, c))]
+    for key, candidates in (("pose", free), ("intrinsics", intrinsics)):
+        listed = sorted(candidates, key=lambda each: (each.rank, each.place))
+        if key in camera.choices or not listed:
+            continue
+        options = tuple(f"{' '.join(filter(None, (c.path.name, c.topic)))} ({c.about})" for c in listed)
+        if (answer := ask(Question(camera.name, key, options))) is not None:
+            others = tuple(c for k, c in enumerate(listed) if k != answer.option)
+            why = "for nothing else is as likely"
+            camera.choices[key] = Chosen(listed[answer.option], others, answer.stated, why)
+    if "gimbal" in camera.choices and camera.gimbal_reference is None:
+        references: tuple[RelativeTo, ...] = get_args(RelativeTo)
+        options = tuple(f"angles relative to the {each}" for each in references)
+        if (answer := ask(Question(camera.name, "gimbal", options))) is not None:
+            camera.gimbal_reference = references[answer.option]
+
+
+def _beside_pose(pose: Proposal, candidates: Sequence[Proposal]) -> list[Proposal]:
+    """List what a log has of the same name as a topic of poses in it."""
+    alike = [(_likeness(c, pose.labels[0]), c) for c in candidates if c.topic and c.path == pose.path]
+    own = [(likeness, c) for likeness, c in alike if likeness >= NUMBER]
+    return [c for _, c in sorted(own, key=lambda each: (-each[0], each[1].rank))]
 
 
 def _taken(cameras: Sequence[CameraDraft]) -> list[Proposal]:
@@ -402,10 +491,11 @@ def _share_time(log: Proposal, other: Proposal) -> bool:
 
 
 def _own_by_motion(
-    film: FoundFilm, logs: Sequence[Proposal], compare: Compare
+    film: FoundFilm, logs: Sequence[Proposal], gimbals: Sequence[Proposal], compare: Compare
 ) -> tuple[Proposal, MotionMatch] | None:
     """Return the log that explains a video's motion clearly, and clearly better than all others."""
-    known = [(log, alike) for log in logs if (alike := compare(film, log)) is not None]
+    compared = ((log, compare(film, log, _beside_pose(log, gimbals))) for log in logs)
+    known = [(log, alike) for log, alike in compared if alike is not None]
     for log, alike in known:
         others = [other.gain for each, other in known if each is not log]
         if all(explains_better(alike.gain, other) for other in (np.zeros_like(alike.gain), *others)):

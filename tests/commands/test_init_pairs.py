@@ -13,6 +13,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipelines.draft import draft
+from pipelines.drafting.matching import Answer, Question
 from pipelines.formats.poses import TUM
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import matrix_from_quaternion
@@ -102,6 +103,28 @@ def test_recorders_names_leave_the_choice_between_topics_and_no_calibration(tmp_
         assert result.text.count(f"# or pose: {{file: rec_2023_A.mcap, topic: {line}, of: ") == 2
     assert "pose: cam_" not in result.text
     assert result.text.count("# or intrinsics: cam_left.toml") == 2
+    assert len(result.missing) == 2
+
+    asked: list[Question] = []
+
+    def ask(question: Question) -> Answer:
+        asked.append(question)
+        second_lens = question.camera == "DJI_0008" and question.key == "intrinsics"
+        return Answer(int(second_lens), stated=question.key == "intrinsics")
+
+    result = draft([tmp_path], overwrite=True, ask=ask)
+    assert [(each.camera, each.key) for each in asked] == [
+        (camera, key) for camera in ("DJI_0007", "DJI_0008") for key in ("pose", "intrinsics")
+    ]
+    assert [len(each.options) for each in asked] == [2, 2, 1, 2]  # one topic is taken
+    assert not result.missing
+    cameras = YAML(typ="safe", pure=True).load(result.text)["cameras"]
+    assert [cameras[name]["intrinsics"] for name in cameras] == ["cam_left.toml", "cam_right.toml"]
+    assert [cameras[name]["pose"]["topic"] for name in cameras] == [
+        "/drone1/camera_pose",
+        "/drone2/camera_pose",
+    ]
+    assert all(cameras[name]["pose"]["assumed"] for name in cameras)
 
 
 def test_a_folder_without_a_camera_is_drafted_with_exit_status_1(tmp_path: Path) -> None:
@@ -117,12 +140,19 @@ def test_a_folder_without_a_camera_is_drafted_with_exit_status_1(tmp_path: Path)
 def test_videos_and_logs_of_one_flight_are_paired_by_motion(tmp_path: Path) -> None:
     shutil.copyfile(SAMPLE / "drone1.mp4", tmp_path / "north.mp4")
     shutil.copyfile(SAMPLE / "drone2.mp4", tmp_path / "lake.mp4")
-    write_topics(tmp_path / "rec_2023_A.mcap", ["drone2"])
+    shutil.copyfile(SAMPLE / "drone2.mcap", tmp_path / "rec_2023_A.mcap")
     write_dataflash(tmp_path / "00000042.bin", drone_of_sample("drone1"))
     cameras = cameras_of(tmp_path)
     assert cameras["north"]["pose"] == {"file": "00000042.bin", "assumed": True}
-    logged = {"file": "rec_2023_A", "topic": "/drone2/camera_pose", "of": "camera", "assumed": True}
+    logged = {"file": "rec_2023_A", "topic": "/drone2/odometry", "of": "body", "assumed": True}
     assert cameras["lake"]["pose"] == logged
+    assert cameras["lake"]["gimbal"] == {
+        "file": "rec_2023_A",
+        "topic": "/drone2/gimbal",
+        "relative_to": "world",
+        "assumed": True,
+    }
+    assert cameras["lake"]["intrinsics"]["topic"] == "/drone2/camera/camera_info"
     true = YAML(typ="safe", pure=True).load((SAMPLE / "flight.yaml").read_text())["cameras"]
     for name, drone in (("north", "drone1"), ("lake", "drone2")):
         start_s = float(cameras[name]["frame_times"]["start"])
