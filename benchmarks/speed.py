@@ -294,7 +294,7 @@ def planner() -> Iterator[Row]:
                 walked = 0.2 * k + 1.2 * config.tuning.knot_s * np.arange(1, knots + 1)
                 actor: Float = np.stack([walked, 0 * walked, 0 * walked + 1], axis=1)
                 started = time.thread_time()
-                plans.plan(1.0 + k, slots[0], Forecast(actor, np.zeros(knots)), field)  # each is due
+                plans.plan(1.0 + k, slots[0], Forecast(actor), field)  # each is due
                 took_ms.append(1e3 * (time.thread_time() - started))
             size = f"{horizon_s:g} s ahead, {drones} drones"
             said = "Ho et al. 2021: 1.3 ms" if drones == 5 else ""

@@ -43,7 +43,7 @@ _settings_options = grouped(
         multiple=True,
         metavar="PLANNER.yaml|KEY=VALUE",
         help="Settings (docs/planner.md) of a file, or one of them: radius_m=8, tilt_deg=20, horizon_s=7,"
-        " yaw_deg=45, yaw_frame=heading, ...; repeat it for several, the last one counts.",
+        " yaw_deg=45, ...; repeat it for several, the last one counts.",
     ),
     click.option(
         "--trials",

@@ -1,11 +1,12 @@
 """Stage `film`: rendered films of a comparison's arms, with a real detector on the pictures.
 
 Build the scenario's world and actor again; render what every camera of an arm would have seen; run the
-detector; reconstruct, and measure errors against the truth; draw the skeletons over the pictures. The
+detector; reconstruct, and measure errors against the truth. The
 pictures are simulated, the detector is real. Which of several people a detection shows is taken from the
 truth. `replan` is only read.
 """
 
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -15,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.skeletons.bvh import read_motion
-from pipelines.formats.videos.video import VideoReader
 from pipelines.formats.videos.video_writing import write_h264
-from pipelines.geometry.arrays import Float, Int64, Intrinsics, Picture
+from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.geometry.noise import NoiseModel
 from pipelines.keypoints.search import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
 from pipelines.keypoints.tracking import FollowedPeople
@@ -25,8 +25,6 @@ from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.replay import poses_from
 from pipelines.planning.scene import LoggedFlight, load_flight
 from pipelines.reconstruction.refining import refined_points
-from pipelines.reporting.overlays import OverlayView
-from pipelines.reporting.pictures import draw_frame
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import LoggedActor, logged_people
@@ -49,12 +47,10 @@ from pipelines.simulation.walks import (
     views_of,
 )
 
-FILM = Stage("film", revision=5)
+FILM = Stage("film", revision=6)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
-# The videos are drawn on and encoded again, so that the first encoding has to be better.
-VIDEO_QUALITY = 20
 # A detection whose joints lie farther than this from a person's, in the median, shows somebody else.
 MAX_MEDIAN_OFF_M = 0.25
 
@@ -189,7 +185,7 @@ def film(
             points = np.stack([own for own, _ in measured], axis=1)
             reconstructed[name] = points.reshape(len(points), -1, 3)
             metrics[name] = _over_people([who.name for who in setting.people], [own for _, own in measured])
-            _write_arm(run.folder / name, arm, sightings, points, parts)
+            _write_arm(run.folder / name, arm, points, parts)
         true_joints = {
             name: np.concatenate([of.joints for of in arm.people], axis=1) for name, arm in arms.items()
         }
@@ -349,13 +345,11 @@ def _film_camera(
             yield picture
             progress.advance()
 
-    _write_video(folder / "pictures.mp4", pictures(), arm.t_ns, lens)
+    write_h264(
+        folder / "pictures.mp4", pictures(), arm.t_ns - arm.t_ns[0], width=lens.width, height=lens.height
+    )
     xy, confidence = (np.stack(part) for part in zip(*found, strict=True))
     np.savez(folder / "keypoints.npz", xy=xy, confidence=confidence)
-
-
-def _write_video(path: Path, pictures: Iterator[Picture], t_ns: Int64, lens: Intrinsics) -> None:
-    write_h264(path, pictures, t_ns - t_ns[0], width=lens.width, height=lens.height, quality=VIDEO_QUALITY)
 
 
 def _whose(
@@ -442,70 +436,10 @@ def _means(each: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-# --- drawing -------------------------------------------------------------------------------------------
-
-
-def _write_arm(
-    folder: Path, arm: _Arm, sightings: Sequence[SimulatedKeypoints], points: Float, parts: Sequence[Path]
-) -> None:
-    """Write the skeletons [T, P, J, 3] of an arm, and each camera's pictures with them drawn over them."""
+def _write_arm(folder: Path, arm: _Arm, points: Float, parts: Sequence[Path]) -> None:
+    """Write the skeletons [T, P, J, 3] of an arm, and each camera's pictures."""
     folder.mkdir()
     motion = JointMotion(arm.t_ns, arm.people[0].person.joints, points)
     write_table(folder / "skeleton.parquet", motion_table(motion), TRUTH)
-    for k, part in enumerate(parts):
-        _draw(arm, k, sightings, points, part / "pictures.mp4", folder)
-
-
-def _draw(
-    arm: _Arm,
-    camera: int,
-    sightings: Sequence[SimulatedKeypoints],
-    points: Float,
-    pictures: Path,
-    folder: Path,
-) -> None:
-    """Write <camera>.mp4: the skeletons over the pictures, with the tilt over the person in the middle."""
-    lens, name = arm.seen_by.lens, arm.names[camera]
-    poses = arm.seen_by.position[camera], arm.seen_by.quaternion_xyzw[camera]
-    true = np.stack([of.joints for of in arm.people], axis=1)
-    drawn_px = see(points.reshape(len(points), -1, 3), *poses, lens).reshape(*points.shape[:3], 2)
-    middles_px = [see(of.motion.root[:, None], *poses, lens)[:, 0] for of in arm.people]
-    off_px = [np.linalg.norm(px - (lens.width / 2, lens.height / 2), axis=-1) for px in middles_px]
-    enlarged = int(np.argmin([np.nan_to_num(off, nan=lens.width).mean() for off in off_px]))
-    nearest = arm.people[enlarged]
-    slots = slot_of(poses[0] - nearest.motion.root)
-    tilt_rad = slots[..., TILT] if arm.tilt_rad is None else arm.tilt_rad[camera]
-
-    def drawn() -> Iterator[Picture]:
-        with VideoReader(pictures) as video:
-            for k, t_ns in enumerate(arm.t_ns.tolist()):
-                picture = video.read(k)
-                if picture is None:
-                    raise ValueError(f"{pictures}: picture {k} cannot be decoded")
-                found = np.stack([own.xy[camera, k] for own in sightings])
-                known, seen = np.isfinite(points[k, ..., 0]), np.isfinite(found[..., 0])
-                view = OverlayView(
-                    camera=name,
-                    intrinsics=lens,
-                    joints=nearest.person.joints,
-                    frame=k,
-                    t_s=(t_ns - int(arm.t_ns[0])) / 1e9,
-                    found=found,
-                    reprojected=drawn_px[k],
-                    rejected=np.zeros(known.shape, np.bool_),
-                    unmeasured=seen & ~known,
-                    others=np.empty((0, known.shape[1], 2)),
-                    has_pose=True,
-                    picture=None,
-                )
-                error = np.linalg.norm(points[k] - true[k], axis=-1)
-                error_text = (
-                    f"{1e3 * np.nanmean(error):.0f} mm off" if known.any() else "nothing reconstructed"
-                )
-                caption = (
-                    f"{name}   {view.t_s:.2f} s   tilt {np.degrees(tilt_rad[k]):.0f} deg",
-                    f"{int(seen.sum())} joints found, {int(known.sum())} reconstructed, {error_text}",
-                )
-                yield draw_frame(picture, view, caption)
-
-    _write_video(folder / f"{name}.mp4", drawn(), arm.t_ns, lens)
+    for name, part in zip(arm.names, parts, strict=True):
+        shutil.copyfile(part / "pictures.mp4", folder / f"{name}.mp4")

@@ -396,7 +396,6 @@ def _counts(metrics: Mapping[str, Any], attempt: Attempt, swaps: Mapping[str, ob
     events = ("views", "refused", "resumed")
     return {
         **metrics["status_counts"],
-        "no_people": metrics["people"]["no_people"],
         "association": {name: getattr(attempt.association, name).tolist() for name in events},
         "left_right_swaps": {"undone_over_time": swaps, "between_views": attempt.between_views},
         "filled": metrics["filled"],
@@ -869,10 +868,6 @@ def _people_seen(
         "times": len(association.people),
         "times_with_more": int((association.people > asked).sum()),
         "detections_not_used": dict(zip(cameras, association.unused.tolist(), strict=True)),
-        "no_people": {
-            cause: {name: count for name, count in zip(cameras, of.tolist(), strict=True) if count}
-            for cause, of in association.no_people.items()
-        },
     }
 
 

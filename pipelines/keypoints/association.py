@@ -17,7 +17,6 @@ from pipelines.keypoints.no_people import (
     PossiblePerson,
     Surroundings,
     level_of_most_seen,
-    tell_no_people,
     why_no_body,
     why_no_person,
 )
@@ -52,9 +51,6 @@ class Association:
     resumed: Int64  # [P] times the person was lost by all and taken up again
     people: Int64  # [T] people whom at least two cameras see
     unused: Int64  # [C] usable detections, over all times, that belong to none of the chosen people
-    no_people: dict[
-        str, Int64
-    ]  # [C] detections by the causes of `NoPeople`, which are not used; and those kept
     phantoms: dict[str, int]  # bodies that two cameras see and that are left out, by `why_no_person`
     doubts: tuple[str, ...]  # [P] why each of the people may be nobody, by `why_no_body`; "" without a doubt
     unseen: tuple[int, ...]  # of several logged people, those near whose logs nobody is seen
@@ -109,7 +105,7 @@ def associate(
             logged, whose noise is estimated from bodies that three cameras place.
         people: number of people to choose; None: those who were logged and whoever else is a person as far
             as two cameras or more can tell (`why_no_person`), at least one.
-        scene: the surroundings, by which things that are no people are dropped; by default nothing is.
+        scene: the surroundings, by which bodies that are nobody are left out.
 
     Returns:
         The choice and its counts. A lone view is kept where its picture continues the person's last one.
@@ -123,21 +119,12 @@ def associate(
         logs = np.stack([np.c_[log, np.full(len(log), actor_sigma_m)] for log in logged], axis=1)
     views = SightLines(xy, confidence, position, rotation, sigma)
     seen = find_bodies(time_s, views, logs)
-    dropped: dict[str, Int64] = {}
-    kept = seen.track >= 0
-    if scene is not None:
-        things = tell_no_people(seen, *views, scene)
-        dropped = {cause: which.sum((0, 2)) for cause, which in things._asdict().items()}
-        kept &= ~(things.ground | things.alone)
-    again = bool((kept != (seen.track >= 0)).any())
-    if again:
-        views = views._replace(confidence=np.where(kept[..., None], confidence, 0.0))
-    several = bool((kept.sum(axis=-1) > 1).any())
+    again = False
     if logs is not None and len(logged) > 1:
         noise_m = _noise_of_logs_m(seen, logs[..., :3], actor_sigma_m)
         logs[..., 3] = noise_m
-        again |= noise_m < actor_sigma_m
-    if several:
+        again = noise_m < actor_sigma_m
+    if ((seen.track >= 0).sum(axis=-1) > 1).any():
         views, before = without_common_errors(time_s, views, seen), views
         again |= views is not before
     if again:
@@ -159,7 +146,7 @@ def associate(
     resumed = np.array([max(0, len(chain.taken) - 1) for chain in chains], np.int64)
     if not np.any(chosen >= 0):
         reasons.append("no two cameras agree on anybody: check poses, clocks and the stated noise")
-    return _counted(chosen, seen, resumed, dropped, refused, doubts, unseen, tuple(reasons))
+    return _counted(chosen, seen, resumed, refused, doubts, unseen, tuple(reasons))
 
 
 def _noise_of_logs_m(seen: Bodies, logs: Float, most_m: float) -> float:
@@ -394,7 +381,6 @@ def _counted(
     chosen: Int64,
     seen: Bodies,
     resumed: Int64,
-    dropped: dict[str, Int64],
     phantoms: Mapping[str, int],
     doubts: tuple[str, ...],
     unseen: tuple[int, ...],
@@ -414,7 +400,6 @@ def _counted(
         resumed=resumed,
         people=np.rint(standing.sum((1, 2))).astype(np.int64),
         unused=(seen.track >= 0).sum((0, 2)) - present.sum((0, 1)),
-        no_people=dropped,
         phantoms=dict(sorted(phantoms.items())),
         doubts=doubts,
         unseen=unseen,

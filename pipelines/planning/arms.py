@@ -25,14 +25,12 @@ from pipelines.planning.formation import (
     FormationPath,
     Formations,
     Lattice,
-    SlotCosts,
     TeamViews,
     TeamWeights,
     best_sequence,
     best_teams,
     cheapest_slots,
     cost_map,
-    costs_in_frame,
     costs_of_slots,
     formation_slots,
     lattice,
@@ -70,9 +68,6 @@ class FormationPlanner(Protocol):
 
     def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
         """Plan anew.
-
-        All yaws, those of the path as well, count from `actor.heading_rad`: 0, which is east, unless
-        `yaw_frame` is `heading`. A planner that samples the field must add it; others can ignore it.
 
         Args:
             commanded: [n, 3] the slots that are commanded now (yaw rad, tilt rad, range m).
@@ -140,24 +135,15 @@ class _AdaptivePlanner:
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
         yaws = yaw_set(config.tuning.yaws, yaw_rad)
         states = _all_states(yaws, np.array([config.tilt_rad]), np.array([config.radius_m]))
-        self._slots = states[:, None] + formation_slots(
-            np.zeros(len(states)), drones, tilt_rad=0.0, range_m=0.0
-        )
+        slots = states[:, None] + formation_slots(np.zeros(len(states)), drones, tilt_rad=0.0, range_m=0.0)
         self._lattice = _lattice_of(states, config)
-        self._formations = Formations(self._lattice, self._slots, slot_offsets(self._slots))
+        self._formations = Formations(self._lattice, slots, slot_offsets(slots))
         self._config, self._rates = config, np.array(config.slot_rates)
 
     def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
-        config = self._config
-        if config.yaw_frame == "heading":
-            cost = cost_map(costs_in_frame(field, actor, self._slots, config), config)
-            sequence, _ = best_sequence(cost, self._lattice, commanded[0])
-            through = _through(commanded, self._slots[sequence])
-        else:  # the same in one call: calls between small parts took most of the time
-            position = np.ascontiguousarray(actor.position)
-            through = cheapest_slots(
-                field.grid, field.sight, position, self._formations, slot_weights(config), commanded
-            )
+        position = np.ascontiguousarray(actor.position)
+        weights = slot_weights(self._config)
+        through = cheapest_slots(field.grid, field.sight, position, self._formations, weights, commanded)
         return FormationPath(_knots(t_s, through, self._lattice), through, self._rates)
 
 
@@ -223,7 +209,7 @@ class _JointPlanner(_TeamPlanner):
 
     def _planned(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
         states = self._lattice.states
-        slots = _look(field, actor, states[:, None], self._offsets[:, None], self._config)
+        slots = costs_of_slots(field, actor.position, self._offsets[:, None], self._config)
         free = (slots.occluded[..., 0] == 0.0).astype(np.float64)
         free = (free + self._beside(free)) / 2.0  # drones are not exactly in their slots
         price = cost_map(slots, self._config) + self._config.tuning.w_hidden * (1.0 - free)
@@ -266,13 +252,6 @@ class _JointPlanner(_TeamPlanner):
         return mean
 
 
-def _from_east(slots: Float, heading_rad: Float) -> Float:
-    """Return slots [..., 3] whose yaws count from headings [T] with yaws from east, [T, ..., 3]."""
-    found = np.repeat(slots[None], len(heading_rad), axis=0)
-    found[..., YAW] += heading_rad.reshape(-1, *[1] * (slots.ndim - 1))
-    return found
-
-
 def _in_a_turn(drones: int) -> int:
     """Return how many neighbours of a formation fill a turn: so many equal parts of it hold their yaws."""
     return 4 if drones == 2 else drones
@@ -296,15 +275,6 @@ def _lattice_of(states: Float, config: PlannerConfig) -> Lattice:
         knot_s=config.tuning.knot_s,
         w_turn=config.tuning.w_turn,
     )
-
-
-def _look(
-    field: DistanceField, actor: Forecast, slots: Float, offsets: Float, config: PlannerConfig
-) -> SlotCosts:
-    """Compute the costs of slots [S, n, 3]; `offsets` [S, n, 3] are valid if yaws count from east."""
-    if config.yaw_frame == "heading":
-        return costs_in_frame(field, actor, slots, config)
-    return costs_of_slots(field, actor.position, offsets, config)
 
 
 def _through(commanded: Float, slots: Float) -> Float:
@@ -417,16 +387,16 @@ class _GroupPlanner(_TeamPlanner):
         weight = np.ones(len(people)) if actor.weight is None else actor.weight
         shares = weight / weight.sum()
         aims = [*np.eye(len(people))[weight > 0.0], *([shares] if len(people) > 1 else [])]
-        views = [self._views(aim, people, actor.heading_rad, field) for aim in aims]
+        views = [self._views(aim, people, field) for aim in aims]
         choices, kept = [], []
         for slot, before in zip(commanded, self._aims or [shares] * len(commanded), strict=True):
-            place = before @ people[:, 0] + slot_offsets(_from_east(slot, actor.heading_rad[:1])[0])
+            place = before @ people[:, 0] + slot_offsets(slot)
             kept.append([np.array_equal(aim, before) for aim in aims])
             choices.append(
                 [
                     view._replace(start=slot)
                     if same
-                    else self._from_elsewhere(view, place, aim @ people[:, 0], actor)
+                    else self._from_elsewhere(view, place, aim @ people[:, 0])
                     for aim, view, same in zip(aims, views, kept[-1], strict=True)
                 ]
             )
@@ -447,12 +417,14 @@ class _GroupPlanner(_TeamPlanner):
         through = _through(np.where(stays[:, None], commanded, slots[0]), slots)
         return FormationPath(_knots(t_s, through, self._lattice), through, self._rates, np.stack(self._aims))
 
-    def _views(self, aim: Float, people: Float, heading_rad: Float, field: DistanceField) -> SlotChoice:
+    def _views(self, aim: Float, people: Float, field: DistanceField) -> SlotChoice:
         """Compute prices and views of all slots about a place among people [P, T, 3]."""
         config = self._config
         place = aim @ people.swapaxes(0, 1)  # [T, 3]
-        slots = _from_east(self._lattice.states, heading_rad)  # [T, S, 3]
-        position, looks_rad = place[:, None] + slot_offsets(slots), slots[..., YAW] + np.pi
+        states = self._lattice.states
+        offsets = slot_offsets(states)
+        position = place[:, None] + offsets  # [T, S, 3]
+        looks_rad = np.tile(states[:, YAW] + np.pi, (len(place), 1))
         at_knots = people.swapaxes(0, 1)[:, None]  # [T, 1, P, 3]
         eyes = position[:, :, None]
         seen = visible(field, eyes, at_knots, start_m=config.tuning.sight_start_m)
@@ -465,21 +437,21 @@ class _GroupPlanner(_TeamPlanner):
             position, looks_rad, at_knots, np.zeros(at_knots.shape[:-1]), fov_rad=config.tuning.errors.fov_rad
         )
         offset = eyes - at_knots
-        costs = costs_in_frame(field, Forecast(place, heading_rad), self._lattice.states[:, None], config)
+        costs = costs_of_slots(field, place, offsets[:, None], config)
         near = (
             np.linalg.norm(offset, axis=-1).min(axis=-1)
             < config.actor_distance_m + config.tuning.group_margin_m
         )
         return SlotChoice(
             lattice=self._lattice,
-            start=self._lattice.states[0],
+            start=states[0],
             price=cost_map(costs, config) + np.where(near, TOO_NEAR, 0.0),
             position=position,
             covered=covered * seen[..., None],
             information=ray_information(offset, config.tuning.errors) * seen[..., None, None],
         )
 
-    def _from_elsewhere(self, view: SlotChoice, place: Float, about: Float, actor: Forecast) -> SlotChoice:
+    def _from_elsewhere(self, view: SlotChoice, place: Float, about: Float) -> SlotChoice:
         """Return the views of a drone that begins to film somebody else: none before it can have arrived."""
         config = self._config
         way = np.linalg.norm(view.position - place, axis=-1)
@@ -490,9 +462,8 @@ class _GroupPlanner(_TeamPlanner):
             (way + most_m) / config.speed_mps,
         )
         there = takes_s <= config.tuning.knot_s * np.arange(1, len(way) + 1)[:, None]
-        start = _from_east(slot_of(place - about), -actor.heading_rad[:1])[0]
         return view._replace(
-            start=start,
+            start=slot_of(place - about),
             covered=view.covered * there[..., None, None],
             information=None if view.information is None else view.information * there[..., None, None, None],
         )

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -48,8 +48,6 @@ class PlannerTuning:
     yaws: int = 32
     # Knots of 2 s leave obstacles between two knots untested.
     knot_s: float = 1.0
-    # A slower actor counts as standing, and keeps the last heading.
-    heading_speed_mps: float = 0.5
     # Slow changes of tilt and range leave the pictures steady.
     tilt_rate_deg_per_s: float = 5.0
     range_rate_mps: float = 1.0
@@ -189,8 +187,6 @@ class PlannerConfig:
     tilt_deg: Annotated[float, Field(ge=-10, le=85, strict=True)] = 15.0
     # The arm `joint` chooses ranges between the least and the largest of these.
     ranges_m: Annotated[tuple[Positive, ...], Field(min_length=1)] = (8.0, 10.0, 12.0)
-    # Yaws count from east, or from the actor's heading.
-    yaw_frame: Literal["world", "heading"] = "world"
     # Formations turn no faster than this.
     yaw_rate_deg_per_s: Positive = 22.5
     # The formation search looks so far ahead.

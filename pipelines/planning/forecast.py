@@ -1,29 +1,22 @@
-"""Estimate and forecast of the actor (a Kalman filter with constant velocity), and the zero of yaws."""
+"""Estimate and forecast of the actor: a Kalman filter with constant velocity."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.planning.config import PlannerConfig
 
 # People run: the standard deviation per axis of the speed before a second measurement.
 FIRST_SPEED_SIGMA_MPS = 3.0
-# A direction is used only where the speed is beyond this many of its standard deviations.
-MIN_SPEED_SIGMAS = 3.0
-# Hips sway by less than a metre, so that a way of a metre has a direction.
-MIN_FIRST_WAY_M = 1.0
 
 
 class Forecast(NamedTuple):
     """The actor at the T knots of a plan; of several people their weighted middle, and each of the P."""
 
     position: Float  # [T, 3] metres, world
-    heading_rad: Float  # [T] zero of yaws, counterclockwise from east: 0 in the world frame
     people: Float | None = None  # [P, T, 3] metres, world; None: the actor alone
     weight: Float | None = None  # [P]; None: all alike
 
@@ -111,12 +104,6 @@ class PeopleFilter:
         """Update with a measured position [3] of a person; see `ActorFilter.measure`."""
         self._filters[person].measure(t_s, position)
 
-    def at(self, t_s: float) -> tuple[Float, Float, Float]:
-        """Predict the state of the middle; errors of people are independent. See `ActorFilter.at`."""
-        position, velocity, covariance = zip(*(each.at(t_s) for each in self._filters), strict=True)
-        middle, moving = (np.tensordot(self._weight, np.stack(part), 1) for part in (position, velocity))
-        return middle, moving, np.tensordot(self._weight**2, np.stack(covariance), 1)
-
     def middle(self, people: Float) -> Float:
         """Return the weighted middle [T, 3] of people [P, T, 3]."""
         middle: Float = self._weight @ people.reshape(len(people), -1)
@@ -135,46 +122,3 @@ def positions_at(t_ns: Int64, people: Float, at_ns: Int64) -> Float:
         for axis in range(3):
             found[p, :, axis] = np.interp(at_ns, t_ns[own], people[own, p, axis])
     return found
-
-
-class YawZero:
-    """The direction that yaws count from, over time: east, or with `yaw_frame` `heading` the actor's.
-
-    The heading is the level direction of the filtered velocity. The actor stands below `heading_speed_mps`,
-    or below three standard deviations of the speed; then the last heading holds, and before the first one
-    `heading_rad`. The zero follows the heading the shorter way, no faster than a formation turns: an actor
-    who turns on the spot must not send drones through the middle.
-    """
-
-    def __init__(self, config: PlannerConfig, heading_rad: float = 0.0) -> None:
-        self._least_mps, self._rate = config.tuning.heading_speed_mps, config.slot_rates[0]
-        self._from_s = 0.0
-        self._from = self._goal = heading_rad if config.yaw_frame == "heading" else 0.0
-
-    def follow(self, t_s: float, velocity: Float, covariance: Float) -> None:
-        """Update the zero at a time with the actor's velocity [3] and its covariance [2, 2] per axis."""
-        self._from, self._from_s = float(self.at(np.array([t_s]))[0]), t_s
-        speed_mps = math.hypot(velocity[0], velocity[1])
-        if speed_mps >= max(self._least_mps, MIN_SPEED_SIGMAS * math.sqrt(covariance[1, 1])):
-            way = math.atan2(velocity[1], velocity[0]) - self._from
-            self._goal = self._from + math.remainder(way, 2 * math.pi)
-
-    def at(self, t_s: Float) -> Float:
-        """Return angles [T] from east, without jumps, at times [T] from the last `follow` on."""
-        most = self._rate * np.maximum(t_s - self._from_s, 0.0)
-        zero: Float = self._from + np.clip(self._goal - self._from, -most, most)
-        return zero
-
-
-def first_heading(actor: Float) -> float:
-    """Find the direction in which a logged actor [A, 3] m first walks, counterclockwise from east.
-
-    Rows with NaN were not measured. 0 for an actor who never comes a metre away from the first position.
-    """
-    level = actor[np.isfinite(actor).all(axis=1), :2]
-    away = level - level[:1]
-    far = np.hypot(away[:, 0], away[:, 1]) >= MIN_FIRST_WAY_M
-    if not far.any():
-        return 0.0
-    east_m, north_m = away[far.argmax()]
-    return math.atan2(north_m, east_m)

@@ -26,7 +26,6 @@ from pipelines.planning.distance_field import (
     occupied_samples,
     sampling,
 )
-from pipelines.planning.forecast import Forecast
 
 # A slot too near to another drone's costs more than any gain.
 TOO_NEAR = 100.0
@@ -61,13 +60,6 @@ def slot_offsets(slots: Float) -> Float:
     yaw, tilt, distance = np.moveaxis(slots, -1, 0)
     level = distance * np.cos(tilt)
     return np.stack([level * np.cos(yaw), level * np.sin(yaw), distance * np.sin(tilt)], axis=-1)
-
-
-def turned(slots: Float, angle_rad: Float) -> Float:
-    """Convert slots [..., n, 3] whose yaws count from angles [...] to yaws from east."""
-    result = np.array(slots)
-    result[..., YAW] += angle_rad[..., None]
-    return result
 
 
 def slot_of(offset: Float) -> Float:
@@ -563,17 +555,6 @@ def costs_of_slots(field: DistanceField, actor: Float, offsets: Float, config: P
     actor = np.ascontiguousarray(actor)
     eps_m, start_m = config.tuning.eps_obs_m, config.tuning.sight_start_m
     return SlotCosts(*_slot_costs(field.grid, field.sight, actor, offsets, eps_m, start_m))
-
-
-def costs_in_frame(field: DistanceField, actor: Forecast, slots: Float, config: PlannerConfig) -> SlotCosts:
-    """Compute the costs of slots [S, n, 3] whose yaws count from the actor's heading at each time."""
-    looks = [
-        costs_of_slots(
-            field, position[None], slot_offsets(turned(slots, np.full(slots.shape[:-2], heading))), config
-        )
-        for position, heading in zip(actor.position, actor.heading_rad, strict=True)
-    ]
-    return SlotCosts(*(np.concatenate(parts) for parts in zip(*looks, strict=True)))
 
 
 def cost_map(costs: SlotCosts, config: PlannerConfig) -> Float:

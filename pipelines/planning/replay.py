@@ -29,7 +29,7 @@ from pipelines.planning.distance_field import (
     visible,
     zone_edges,
 )
-from pipelines.planning.forecast import ActorFilter, Forecast, PeopleFilter, YawZero, positions_at
+from pipelines.planning.forecast import ActorFilter, Forecast, PeopleFilter, positions_at
 from pipelines.planning.formation import (
     TILT,
     YAW,
@@ -37,7 +37,6 @@ from pipelines.planning.formation import (
     formation_slots,
     slot_of,
     slot_offsets,
-    turned,
 )
 from pipelines.planning.guard import FlownMotion, Guard
 from pipelines.planning.local import DronePlan, LocalPlanner, tracking_times
@@ -57,7 +56,6 @@ class Start(NamedTuple):
 
     drones: int  # 1 to 16
     yaw_rad: float = 0.0  # of the first camera, counterclockwise from east
-    heading_rad: float = 0.0  # the actor's before walking, from east, if `yaw_frame` is `heading`
 
 
 @dataclass(frozen=True)
@@ -112,9 +110,7 @@ class Pilot:
         if not 1 <= start.drones <= MOST_DRONES:
             raise ValueError(f"{start.drones} drones: 1 to {MOST_DRONES} can be planned for")
         self._config = config
-        self._zero = YawZero(config, start.heading_rad)
-        yaw_rad = start.yaw_rad - float(self._zero.at(np.zeros(1))[0])
-        self._formation_planner = arm.start(config, drones=start.drones, yaw_rad=yaw_rad)
+        self._formation_planner = arm.start(config, drones=start.drones, yaw_rad=start.yaw_rad)
         planner = self._formation_planner
         self._rolling_out = planner if isinstance(planner, RollingOut) else None
         self._local_planner = LocalPlanner(config)
@@ -123,7 +119,7 @@ class Pilot:
         people = [ActorFilter(q=config.actor_q, sigma_m=config.tuning.actor_sigma_m) for _ in weights]
         self._filter = PeopleFilter(people, self._weight)
         slots = formation_slots(
-            np.array([yaw_rad]), start.drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
+            np.array([start.yaw_rad]), start.drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
         )
         self._formation = FormationPath(np.zeros(1), slots, np.array(config.slot_rates))
         self._plans: list[DronePlan | None] = [None] * start.drones
@@ -167,7 +163,7 @@ class Pilot:
 
     def wanted(self, t_s: Float) -> tuple[Float, Float]:
         """Return commanded slots [T, N, 3], yaw from east, and the places [N, T, 3] that cameras aim at."""
-        return self._slots_at(t_s, self._formation), self._aimed(t_s)
+        return self._formation.at(t_s), self._aimed(t_s)
 
     def reference(self, t_s: float) -> tuple[Float, Float, Float]:
         """Return position, velocity, acceleration [N, 3] of the latest local plans, after `replan`."""
@@ -181,19 +177,12 @@ class Pilot:
         aimed: Float = self.aim @ people.reshape(len(people), -1)
         return aimed.reshape(-1, *people.shape[1:])
 
-    def _slots_at(self, t_s: Float, path: FormationPath) -> Float:
-        """Return the slots of a path, [T, N, 3], their yaws from east."""
-        slots = path.at(t_s)
-        return turned(slots, self._zero.at(t_s)) if self._config.yaw_frame == "heading" else slots
-
     def _plan_formation(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
         config = self._config
         knots = t_s + config.tuning.knot_s * np.arange(1, config.horizon_knots + 1, dtype=np.float64)
         commanded = self._formation.at(np.array([t_s]))[0]
-        if config.yaw_frame == "heading":
-            self._zero.follow(t_s, *self._filter.at(t_s)[1:])
         people = self._filter.each(knots)
-        actor = Forecast(self._filter.middle(people), self._zero.at(knots), people, self._weight)
+        actor = Forecast(self._filter.middle(people), people, self._weight)
         if self._rolling_out is not None:
             self._rolling_out.roll_out = partial(
                 self._roll_out, t_s=t_s, position=position, velocity=velocity, field=field
@@ -205,7 +194,7 @@ class Pilot:
         config = self._config
         times = t_s + config.tuning.waypoint_s * np.arange(1, config.tuning.waypoints + 1, dtype=np.float64)
         aimed = self._aimed(times)
-        return aimed.swapaxes(0, 1) + slot_offsets(self._slots_at(times, path)), aimed
+        return aimed.swapaxes(0, 1) + slot_offsets(path.at(times)), aimed
 
     def _roll_out(
         self, path: FormationPath, *, t_s: float, position: Float, velocity: Float, field: DistanceField
@@ -417,7 +406,7 @@ def fly_arm(scene: ReplayScene, arm: Arm) -> ArmFlight:
         scene.flight.actor_t_ns,
         scene.flight.actor,
         scene.fields,
-        Start(scene.drones, scene.yaw_rad, scene.heading_rad),
+        Start(scene.drones, scene.yaw_rad),
         config=scene.config,
         weights=scene.flight.weights,
     )

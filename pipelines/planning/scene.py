@@ -21,7 +21,7 @@ from pipelines.planning.distance_field import (
     in_turn,
     zone_edges,
 )
-from pipelines.planning.forecast import first_heading, positions_at
+from pipelines.planning.forecast import positions_at
 from pipelines.planning.formation import (
     YAW,
     formation_slots,
@@ -427,7 +427,7 @@ class ReplanSettings:
         None  # adaptive and fixed, flown if cameras moved, planned if commands are logged
     )
     drones: int | None = None  # the number of cameras, 2 to 8
-    yaw_deg: float | None = None  # of the first camera at the start, from the zero of yaws
+    yaw_deg: float | None = None  # of the first camera at the start, from east
     trials: int = 100
     seed: int = 0
     pose_noise: str | None = None
@@ -457,7 +457,6 @@ class ReplayScene:
     settings: ReplanSettings
     drones: int
     yaw_rad: float  # of the first camera at the start, from east
-    heading_rad: float  # of the actor's first way, from east; 0 where yaws count from east
     t_ns: Int64  # [T]
     people: Float  # [P, T, 3] reference of the scores
     actor_source: Source
@@ -564,12 +563,8 @@ def build_scene(
     drones = settings.drones or min(max(len(flight.cameras), 2), MOST_DRONES)
     if settings.drones is None and drones != len(flight.cameras):
         notes.append(f"{drones} drones are replayed, the session has {len(flight.cameras)} cameras")
-    heading_rad = 0.0
-    if settings.planner.yaw_frame == "heading":
-        heading_rad = first_heading(np.average(flight.actor, axis=1, weights=flight.weights))
-        notes.append(f"yaws count from where the actor heads, {np.degrees(heading_rad):.1f} deg at first")
     if settings.yaw_deg is not None:
-        yaw_rad = float(np.radians(settings.yaw_deg)) + heading_rad
+        yaw_rad = float(np.radians(settings.yaw_deg))
     else:
         yaw_rad = float(slot_of(flown[0][0, 0] - actor[0])[YAW])
         first = flight.cameras[0].name
@@ -579,7 +574,6 @@ def build_scene(
         settings=settings,
         drones=drones,
         yaw_rad=yaw_rad,
-        heading_rad=heading_rad,
         t_ns=t_ns,
         people=people,
         actor_source=actor_source,

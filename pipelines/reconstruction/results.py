@@ -277,26 +277,15 @@ _NO_BODY = {
     "same": "a second image of a person",
     "bystander": "beyond the cameras and never in all of their pictures, a bystander",
 }
-_LEFT_OUT = {
-    "ground": "detections left out, because nobody of their size could stand on the ground there: {}",
-    "alone": "detections left out, because no other camera sees them although one shows every place"
-    " where they could stand: {}",
-    "kept": "nobody of their size could stand on the ground there, but this holds for the camera's most"
-    " confident person, too: the detections are kept, and the poses or the ground may be wrong: {}",
-}
 
 
 def people_warnings(people: Mapping[str, Any]) -> list[str]:
-    """Write warnings on things that are no people, unused detections, and more people than requested.
+    """Write warnings on bodies that are nobody, unused detections, and more people than requested.
 
     Args:
         people: the counts that metrics.json has of people.
     """
-    warnings = [
-        _LEFT_OUT[cause].format(", ".join(f"{name} {count}" for name, count in of.items()))
-        for cause, of in people["no_people"].items()
-        if of
-    ]
+    warnings = []
     causes = ", ".join(f"{count} {_NO_BODY[cause]}" for cause, count in people["phantoms"].items())
     if causes:
         warnings.append(f"bodies that --persons auto left out: {causes}")

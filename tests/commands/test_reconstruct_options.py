@@ -103,7 +103,6 @@ def test_people_beyond_those_asked_for_are_counted_and_said(tmp_path: Path) -> N
         "times": times,
         "times_with_more": times,
         "detections_not_used": passing,
-        "no_people": {"ground": {}, "alone": {}, "kept": {}},
     }
     (line,) = [line for line in stage(session)["warnings"] if "--persons" in line]
     assert f"drone1 {passing['drone1']}, drone2 {passing['drone2']}" in line

@@ -38,9 +38,7 @@ def test_a_plan_is_the_cheapest_sequence_through_the_cost_map(seed: int, drones:
     form = {"tilt_rad": config.tilt_rad, "range_m": config.radius_m}
     commanded = formation_slots(np.array([start + rng.uniform(-20, 20)]), drones, **form)[0]
 
-    path = ADAPTIVE.start(config, drones=drones, yaw_rad=start).plan(
-        7.0, commanded, Forecast(actor, np.zeros(len(actor))), WORLD
-    )
+    path = ADAPTIVE.start(config, drones=drones, yaw_rad=start).plan(7.0, commanded, Forecast(actor), WORLD)
 
     yaws = yaw_set(config.tuning.yaws, start)
     states = np.stack([yaws, 0 * yaws + config.tilt_rad, 0 * yaws + config.radius_m], axis=1)
@@ -70,9 +68,7 @@ def test_nobody_of_a_joint_plan_stays_behind_a_wall(drones: int) -> None:
     fewest = (equal.occluded[0] > 0).sum(axis=-1).min()
     assert (fewest > 0) == (drones == 5)
 
-    path = JOINT.start(config, drones=drones, yaw_rad=0.4).plan(
-        0.0, commanded, Forecast(actor, np.zeros(len(actor))), field
-    )
+    path = JOINT.start(config, drones=drones, yaw_rad=0.4).plan(0.0, commanded, Forecast(actor), field)
 
     offsets = slot_offsets(path.slots[-1])
     costs = costs_of_slots(field, actor[:1], offsets[None], config)
@@ -91,7 +87,7 @@ def test_a_joint_plan_is_the_one_that_measures_best_as_it_would_be_flown(nearest
     config = PlannerConfig()
     planner = JOINT.start(config, drones=2, yaw_rad=0.0)
     commanded = formation_slots(np.zeros(1), 2, tilt_rad=config.tilt_rad, range_m=config.radius_m)[0]
-    actor = Forecast(np.tile([12.0, 0.0, 1.0], (config.horizon_knots, 1)), np.zeros(config.horizon_knots))
+    actor = Forecast(np.tile([12.0, 0.0, 1.0], (config.horizon_knots, 1)))
     walked = np.tile([100.0, 0.0, 1.0], (config.tuning.waypoints, 1))  # nothing is there
     asked: list[FormationPath] = []
 

@@ -29,7 +29,6 @@ def test_what_is_not_mentioned_keeps_its_default() -> None:
         ({"radius_m": 0}, "radius_m"),
         ({"l_occ": -1}, "l_occ"),
         ({"tilt_deg": 88}, "tilt_deg"),
-        ({"yaw_frame": "body"}, "yaw_frame"),
         ({"tuning": {}}, "tuning"),
         ({"zones": {"box": []}}, "zones"),
         ({"zones": [{"name": "roof"}]}, "zone 1"),

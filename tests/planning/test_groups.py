@@ -47,7 +47,7 @@ def test_a_group_is_shared_out_by_weight(weights: tuple[float, float], filming: 
     people = np.array([[[9.0, 0.0, 1.0]], [[-9.0, 0.0, 1.0]]]).repeat(CONFIG.horizon_knots, axis=1)
     middle = np.average(people, axis=0, weights=weights)
     slots = formation_slots(np.zeros(1), 4, tilt_rad=CONFIG.tilt_rad, range_m=CONFIG.radius_m)[0]
-    actor = Forecast(middle, np.zeros(len(middle)), people, np.array(weights))
+    actor = Forecast(middle, people, np.array(weights))
 
     path = GROUP.start(CONFIG, drones=4, yaw_rad=0.0).plan(0.0, slots, actor, FIELD)
 

@@ -71,9 +71,8 @@ def test_the_same_motion_is_compared_moment_by_moment(content: SessionContent) -
     assert (found.first, found.other) == pytest.approx((OFF_MM, 2 * OFF_MM))
     assert content.skeleton is not None
     assert found.pairs == int((content.skeleton["status"] == "ok").sum())
-    assert (found.lower, found.joints) == (0, len(JOINTS))
     # What does not see where the skeleton is does not differ.
-    for key in ("root_mpjpe", "pa_mpjpe", "share", "predicted", "reprojection"):
+    for key in ("root_mpjpe", "pa_mpjpe", "share", "reprojection"):
         assert abs(pair.differences[key].estimate.value) < 1e-6, key
 
 
@@ -94,13 +93,13 @@ def test_pairs_are_what_both_measured(content: SessionContent) -> None:
     assert comparison.pairs[0].differences["share"].estimate.is_clear
 
 
-def test_other_times_are_compared_joint_by_joint(content: SessionContent) -> None:
+def test_other_times_are_compared_by_their_means(content: SessionContent) -> None:
     other = _later(_moved(content, 2), 3600)
     (pair,) = compare({"a": content, "b": other}).pairs
     assert not pair.by_time
     found = pair.differences["mpjpe"]
     assert found.estimate.value == pytest.approx(OFF_MM, abs=1e-6)
-    assert (found.pairs, found.lower) == (len(JOINTS), 0)
+    assert (found.first, found.other) == pytest.approx((OFF_MM, 2 * OFF_MM))
 
 
 @pytest.mark.parametrize("apart", [False, True])
@@ -154,17 +153,14 @@ def page(content: SessionContent) -> str:
 
 def test_three_sessions_are_set_against_the_first(content: SessionContent, page: str) -> None:
     outline = Outline(page)
-    said = _lead(_three(content))
-    assert "“c”" in said
-    assert numbers(said)[:2] == [3, 22.4]
-    assert plain(said) in outline.text
+    assert plain(_lead(_three(content))) in outline.text
     assert "“b” less “a”" in outline.text
     assert "“c” less “a”" in outline.text
     assert outline.count("figure") == 2
     # 67.1 mm and 44.7 mm are three and two times sqrt(500) mm; every joint of the second is nearer.
     row = next(row for row in outline.rows("MPJPE, mm") if len(row) > 5)
     assert row[1:4] == ["67.1", "44.7", "−22.4 −22.4 to −22.4"]
-    assert row[5:] == [f"{len(JOINTS)} of {len(JOINTS)}", "better"]
+    assert row[5:] == ["better"]
 
 
 def test_figures_come_with_their_numbers(content: SessionContent, page: str) -> None:

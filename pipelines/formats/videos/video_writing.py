@@ -28,6 +28,8 @@ _WIDEST_PX, _SEEK_EVERY = 960, 10
 _STATED_HZ = 60
 # The edit list that shifts a part to its start counts in the movie's own unit, by default 1 ms.
 _KEY_EVERY = 60  # frames from one key frame to the next; a seek goes to a key frame
+# x264's constant rate factor: 18 looks lossless, 28 poor.
+_QUALITY = "23"
 _OPTIONS = {"movflags": "faststart", "movie_timescale": str(TICK_S.denominator)}
 
 
@@ -38,7 +40,6 @@ def write_h264(
     *,
     width: int,
     height: int,
-    quality: int = 23,
     bits_per_s: int | None = None,
 ) -> None:
     """Encode pictures [height, width, 3] BGR as an H.264 MP4, 4:2:0, in one thread.
@@ -48,8 +49,7 @@ def write_h264(
         pts_ns: [N] strictly increasing times of showing, at least 0.
         width: of the pictures, even.
         height: of the pictures, even.
-        quality: x264's constant rate factor; 18 looks lossless, 28 poor.
-        bits_per_s: a mean rate over a second, kept in place of the quality.
+        bits_per_s: a mean rate over a second; by default the quality is constant.
     """
     import av
 
@@ -59,7 +59,7 @@ def write_h264(
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.time_base = stream.codec_context.time_base = TICK_S
         stream.codec_context.thread_count = 1
-        rate = {"crf": str(quality)}
+        rate = {"crf": _QUALITY}
         if bits_per_s is not None:
             rate = {name: str(bits_per_s) for name in ("b", "maxrate", "bufsize")}
         stream.codec_context.options = {**rate, "preset": "fast", "g": str(_KEY_EVERY), "bf": "0"}
