@@ -11,7 +11,7 @@ from mocap_cli.options import any_path, json_option
 from mocap_cli.terminal import print_json, print_table, say
 
 if TYPE_CHECKING:
-    from pipelines.session.registries import FetchesModels
+    from pipelines.session.registries import Detector
 
 
 @click.group("models", invoke_without_command=True, short_help="List and fetch keypoint detectors.")
@@ -39,9 +39,8 @@ def list_command(context: click.Context, as_json: bool) -> None:
 
 def _list(as_json: bool) -> None:
     """Print the registered detectors with their files, and the families for users' own models."""
-    from pipelines.session.registries import DETECTORS, EXPORTS, DetectorFamily, FetchesModels
+    from pipelines.session.registries import DETECTORS, DetectorFamily
 
-    exports = [export for export in EXPORTS.all() if isinstance(export, FetchesModels)]
     registered = DETECTORS.all()
     families = [d for d in registered if isinstance(d, DetectorFamily)]
     detectors = [d for d in registered if not isinstance(d, DetectorFamily)]
@@ -49,7 +48,6 @@ def _list(as_json: bool) -> None:
         print_json(
             {
                 "detectors": [_listed(d) for d in detectors],
-                "exports": [_listed(export) for export in exports],
                 "families": [{"name": f.name, "title": f.title, "usage": f.usage} for f in families],
             }
         )
@@ -65,9 +63,6 @@ def _list(as_json: bool) -> None:
     for detector in detectors:
         if None in detector.models().values():
             say(f"Get what is missing with `mocap models fetch {detector.name}`.")
-    for export in exports:
-        if None in export.models().values():
-            say(f"Get what the export {export.name} needs with `mocap models fetch {export.name}`.")
     for family in families:
         first, *more = family.usage.splitlines()
         say()
@@ -86,10 +81,10 @@ def _list(as_json: bool) -> None:
 )
 @json_option
 def fetch_command(name: str, source: Path | None, as_json: bool) -> None:
-    """Get the model files of a detector, or of the export osim."""
-    from pipelines.session.registries import find_models
+    """Get the model files of a detector."""
+    from pipelines.session.registries import find_detector
 
-    detector = find_models(name)
+    detector = find_detector(name)
     detector.fetch(source)
     if as_json:
         print_json(_listed(detector))
@@ -98,12 +93,12 @@ def fetch_command(name: str, source: Path | None, as_json: bool) -> None:
         say(f"ready: {path}")
 
 
-def _listed(detector: FetchesModels) -> dict[str, object]:
+def _listed(detector: Detector) -> dict[str, object]:
     files = {file: None if path is None else str(path) for file, path in detector.models().items()}
     return {"name": detector.name, "title": detector.title, **_figures(detector), "files": files}
 
 
-def _figures(detector: FetchesModels) -> dict[str, float | None]:
+def _figures(detector: Detector) -> dict[str, float | None]:
     """Return the accuracy and the time of a detector; None if they were not measured."""
     from pipelines.session.registries import MeasuredDetector
 

@@ -16,7 +16,6 @@ from pipelines.drafting.found import (
     OPTICAL,
     POSE_TYPES,
     FlownPoses,
-    FoundAngles,
     FoundFilm,
     FoundFrames,
     FoundLink,
@@ -57,7 +56,6 @@ from pipelines.session.recognition import EXPECTED, describe_unknown, recognise
 from pipelines.session.records import PoseSample
 from pipelines.session.registries import (
     FORMATS,
-    AttitudeFormat,
     CalibrationFormat,
     Format,
     JointFormat,
@@ -431,37 +429,12 @@ def _span(t_ns: Int64) -> TimeSpan:
 def _drone_logs(path: Path, place: NamePlace, format_: TelemetryFormat) -> Iterator[Proposal]:
     """Describe the poses in a drone's own log, with or without attitudes; those of each vehicle in it.
 
-    Attitudes that come without positions, or without north, are a thing of their own.
-
     Raises:
-        DataError: it cannot be read, or holds neither positions nor attitudes.
+        DataError: it cannot be read, or holds no positions.
     """
     vehicles = TLOG.vehicles(path) if format_.name == TLOG.name else []
-    angles = list(_angles(path, place, format_))
-    try:
-        logs = [
-            _drone_log(path, place, format_, instance)
-            for instance in (vehicles if len(vehicles) > 1 else [None])
-        ]
-    except DataError:
-        if not angles:
-            raise
-        logs = []
-    yield from logs
-    if not any(log.telemetry and log.telemetry.gimbal for log in logs):
-        yield from angles
-
-
-def _angles(path: Path, place: NamePlace, format_: Format) -> Iterator[FoundAngles]:
-    """Describe the camera's attitudes in a log that can be used for them alone."""
-    if isinstance(format_, AttitudeFormat):
-        with suppress(DataError):
-            found = format_.read_attitudes(path)
-            about = f"{len(found.camera.t_ns)} attitudes of the camera in its video"
-            label = label_of_place(place)
-            yield FoundAngles(
-                "angles", path, place, about, {"file": path}, (label,), knows_north=found.knows_north
-            )
+    for instance in vehicles if len(vehicles) > 1 else [None]:
+        yield _drone_log(path, place, format_, instance)
 
 
 def _drone_log(path: Path, place: NamePlace, format_: TelemetryFormat, instance: int | None) -> FlownPoses:

@@ -302,13 +302,6 @@ class FlownPoses(Proposal):
         return alike[0] if len(alike) == 1 else None
 
 
-@dataclass(frozen=True, eq=False)
-class FoundAngles(Proposal):
-    """Attitudes of a camera in a log, for the positions of another one."""
-
-    knows_north: bool = True
-
-
 # --- logs ------------------------------------------------------------------------------------------------
 
 

@@ -297,7 +297,7 @@ class _ManifestWriter:
 
     def _mount(self, camera: CameraDraft) -> dict[str, DraftedKey]:
         """Return the mount or the gimbal of a camera whose poses are not its own."""
-        choice, gimbal, own = camera.choices.get("pose"), camera.choices.get("gimbal"), camera.angles
+        choice, gimbal = camera.choices.get("pose"), camera.choices.get("gimbal")
         if choice is None or choice.taken.kind == "still":
             return {}
         taken = choice.taken
@@ -307,19 +307,6 @@ class _ManifestWriter:
             return {"mount": lever} if isinstance(taken, FlownPoses) else {}
         if gimbal is not None:
             return {"gimbal": self._gimbal(camera, gimbal), "mount": lever}
-        if own is not None and own.knows_north:
-            return {"gimbal": DraftedKey(self.stated(own.settings), [own.about]), "mount": lever}
-        if own is not None:
-            heading = "yaw_deg, where its first picture looks from north to east"
-            turned = self.stated({**own.settings, "yaw_deg": 90})
-            if taken.of_body:
-                remark = f"if it turned in a gimbal: {heading}"
-                return {
-                    "mount": self._fixed_mount(camera),
-                    "gimbal": DraftedKey(None, [remark], example=turned),
-                }
-            remark = self.miss(camera, "gimbal", f"{heading}, which a GoPro does not log")
-            return {"gimbal": DraftedKey(None, [remark, own.about], example=turned), "mount": lever}
         if taken.unturned:
             what = "constant angles, from north to east and up, or a file and topic of angles"
             fixed = {"yaw_deg": 90, "pitch_deg": -30}

@@ -27,7 +27,6 @@ from pipelines.drafting.found import (
     TRUTH_WORDS,
     UNNAMED,
     FlownPoses,
-    FoundAngles,
     FoundFilm,
     FoundFrames,
     FoundLog,
@@ -112,7 +111,6 @@ class CameraDraft:
     pictures: dict[str, list[Proposal]] = field(default_factory=lambda: {"video": [], "keypoints": []})
     paired: bool = False  # video and keypoints are matched only because nothing else is left
     choices: dict[str, Chosen] = field(default_factory=dict)
-    angles: FoundAngles | None = None  # attitudes in its own video
     gimbal_reference: RelativeTo | None = None  # what its gimbal's angles are relative to, by its pictures
     true_poses: Chosen | None = None
 
@@ -134,7 +132,6 @@ class CameraDraft:
         listed = [
             *self.pictures["video"],
             *self.pictures["keypoints"],
-            *([self.angles] if self.angles else []),
         ]
         return listed + [c for choice in choices for c in (choice.taken, *choice.others)]
 
@@ -180,7 +177,7 @@ def match(
     moving = [c for c in poses if not _is_true(c) and not (c.topic and is_called(c.topic, ACTOR | COMMANDED))]
     joints = [c for c in of.get("joints", []) if _is_true(c)]
     joints.sort(key=lambda c: (-_shared([c.span], _spans(moving)), c.place))
-    # FoundAngles of other names are magnetic fields, velocities, attitudes.
+    # Angles of other names are magnetic fields, velocities, attitudes.
     gimbals = [c for c in of.get("gimbal", []) if is_called(c.topic, GIMBAL)]
     cameras = _cameras(of, moving)
     anchors = [*moving, *of.get("joints", [])]
@@ -199,9 +196,6 @@ def match(
             "gimbal": turned,
         }
         camera.choices = {part: choice for part, choice in found_choices.items() if choice is not None}
-        film = camera.film
-        own = [c for c in of.get("angles", []) if isinstance(c, FoundAngles) and film and c.path == film.path]
-        camera.angles = own[0] if own else None
     _pair_by_content(cameras, moving, gimbals, of.get("intrinsics", []), compare)
     _prefer_attitudes(cameras, moving, distance)
     for camera in cameras:

@@ -286,7 +286,7 @@ class GimbalSource(OwnAxes, FileSource):
     needs_file = False
     part = "gimbal"
     yaw_deg: float | None = Field(None, ge=-360, le=360)
-    """Constant yaw from north to east, degrees; beside a file without north, that of the first picture."""
+    """Constant yaw from north to east, degrees."""
     pitch_deg: float | None = Field(None, ge=-180, le=180)
     """Constant pitch, up, degrees."""
     roll_deg: float = Field(0.0, ge=-180, le=180)

@@ -330,10 +330,8 @@ class Telemetry:
 
 @dataclass(frozen=True)
 class Attitudes:
-    """Attitudes of a camera by the telemetry of its video, or by another log, which may lack positions."""
+    """Attitudes of a camera by a log that may lack positions."""
 
     camera: AttitudeTrack  # relative to the world
     clock: str  # as in `Telemetry`
-    knows_north: bool = True  # False: it looks north in the first picture, and only its turns are known
-    video_began_ns: int | None = None  # by the clock of the times; None for a log that is no video
     notes: tuple[str, ...] = ()

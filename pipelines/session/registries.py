@@ -214,13 +214,12 @@ class KeypointNetworks(Protocol):
         """Locate the joints of one person in each region; `presence` says if there is one at all."""
 
 
-@runtime_checkable
-class FetchesModels(Protocol):
-    """A detector or an export that needs model files, which `mocap models fetch` gets."""
+class Detector(Protocol):
+    """A keypoint detector."""
 
     @property
     def name(self) -> str:
-        """The name that the user writes after `fetch`."""
+        """The text after `--detector`, without paths. Name and model files together determine the results."""
 
     @property
     def title(self) -> str:
@@ -231,14 +230,6 @@ class FetchesModels(Protocol):
 
     def fetch(self, source: Path | None = None) -> None:
         """Get the missing files, from `source` if that holds them. A DataError says what to do."""
-
-
-class Detector(FetchesModels, Protocol):
-    """A keypoint detector."""
-
-    @property
-    def name(self) -> str:
-        """The text after `--detector`, without paths. Name and model files together determine the results."""
 
     def load(self, *, threads: int) -> KeypointNetworks:
         """Load the networks. Raise DataError if a file is missing or is not the expected one."""
@@ -389,19 +380,6 @@ def find_export(text: str) -> Export:
 def _refuse_argument(text: str, name: str, colon: str) -> None:
     if colon:
         raise DataError(text, f"{name} takes nothing behind its name", f"write {name}", code="bad-option")
-
-
-def find_models(text: str) -> FetchesModels:
-    """Find what has model files: an export that needs some, else the detector of a user's text."""
-    exports = {export.name: export for export in EXPORTS.all() if isinstance(export, FetchesModels)}
-    if text in exports:
-        return exports[text]
-    if text.partition(":")[0] not in DETECTORS.names():
-        names = ", ".join([*DETECTORS.names(), *exports])
-        raise DataError(
-            text, "nothing of that name has model files", f"there are {names}", code="no-such-name"
-        )
-    return find_detector(text)
 
 
 def advice_on(detector: Detector) -> list[str]:

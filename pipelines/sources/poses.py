@@ -29,7 +29,6 @@ from pipelines.geometry.poses import (
     mounted_covariance,
     multiply,
     quaternion_from_matrix,
-    quaternion_from_rotation_vector,
     rotate,
 )
 from pipelines.session.description import Doubt
@@ -85,8 +84,7 @@ SAME_PLACE_M = 1.0
 
 _ABOVE_TAKE_OFF = ("take-off", "stated")
 _ADD_ANGLES = (
-    "add gimbal: {file, topic, relative_to: world} with the angles of another log,"
-    " gimbal: {file, yaw_deg: 90} with those in a GoPro's video and its first heading, or"
+    "add gimbal: {file, topic, relative_to: world} with the angles of another log, or"
     " gimbal: {yaw_deg: 90, pitch_deg: -30} if the camera never turned"
 )
 _ADD_MOUNT = "say how the camera sits on the body, mount: {looks: forward, down_deg: 0}, or add a gimbal"
@@ -154,7 +152,7 @@ class FlightPoses:
             first_ns = int(frames.t_ns[0]) if frames is not None else 0
             placed = in_world(self._local(source, still), pose.world_from_source)
             return replace(placed, t_ns=np.array([first_ns]))
-        angles = None if camera.gimbal is None else self._stated_angles(name, camera, frames)
+        angles = self._stated_angles(name, camera.gimbal)
         if self._is_joined(pose):
             return in_world(self._joined_trajectory(name, camera, angles), pose.world_from_source)
         source, stated = self._stated_poses(name, camera)
@@ -333,14 +331,11 @@ class FlightPoses:
             lost["pose without gimbal angles"] = without
         return position, quaternion, lost
 
-    def _stated_angles(
-        self, name: str, camera: CameraSources, frames: CameraFrames | None
-    ) -> AttitudeTrack | None:
+    def _stated_angles(self, name: str, gimbal: GimbalSource | None) -> AttitudeTrack | None:
         """Return the attitude of a gimbal by the source that the manifest names, in our axes at world times.
 
         None if it names none: the angles are those of the drone's own log that gives the pose.
         """
-        gimbal = camera.gimbal
         if gimbal is None or gimbal.is_of_pose:
             return None
         relative_to = gimbal.relative_to or "world"
@@ -349,7 +344,7 @@ class FlightPoses:
             turned = turned_as_stated(angles, relative_to=relative_to)
             return AttitudeTrack(_FIXED, np.zeros(1, dtype=np.int64), turned, relative_to)
         if not self._files.is_log("gimbal", gimbal):
-            return self._angles_alone(name, camera, gimbal, frames)
+            return self._angles_alone(name, gimbal)
         log, topic = gimbal.file, gimbal.topic or ""
         options = self._files.options("gimbal", gimbal, LoggedAngles)
         logged = self._logs.attitudes(log, topic, order=options.order, units=options.units)
@@ -360,13 +355,8 @@ class FlightPoses:
         lost = {f"gimbal angles: {cause}": count for cause, count in logged.dropped.items()}
         return AttitudeTrack(topic, logged.t_ns, turned, relative_to, dropped=lost)
 
-    def _angles_alone(
-        self, name: str, camera: CameraSources, gimbal: GimbalSource, frames: CameraFrames | None
-    ) -> AttitudeTrack:
+    def _angles_alone(self, name: str, gimbal: GimbalSource) -> AttitudeTrack:
         """Read the camera's attitudes from a log whose positions are not used.
-
-        Those inside the camera's own video are at the times of its pictures, those of another log by its
-        clock.
 
         Raises:
             DataError: there are none, or nothing places them in time.
@@ -377,31 +367,19 @@ class FlightPoses:
         if not isinstance(reader, AttitudeFormat):
             raise TypeError(f"{reader.name} reads no attitudes")
         found = reader.read_attitudes(path)
-        _refuse_heading(place, found.knows_north, gimbal)
-        track = found.camera
-        own = self._files.video_file(camera)
-        if found.video_began_ns is not None and own and own.samefile(path):
-            if frames is None:
-                problem = (
-                    "its attitudes are at the times of its pictures, which start_from: motion cannot find by"
-                    " them"
-                )
-                raise DataError(place, problem, "state frame_times: {start: SECONDS}", code="clock-unknown")
-            track = replace(track, t_ns=_at_pictures(track.t_ns - found.video_began_ns, frames))
-            clock = "at the times of its pictures"
-        elif found.clock == "the video's start":
+        if gimbal.yaw_deg is not None:
+            problem = "yaw_deg: the angles of this file know where north is"
+            raise DataError(place, problem, "leave it out", code="wrong-option")
+        if found.clock == "the video's start":
             problem = "has angles that count from its own start, and is not the camera's video"
             raise DataError(path, problem, "name that video, if they are in it", code="clock-unknown")
-        else:
-            track = replace(track, t_ns=self._world_times(stated, track.t_ns, int(track.t_ns[0])))
-            clock = f"by {found.clock}"
+        track = replace(
+            found.camera, t_ns=self._world_times(stated, found.camera.t_ns, int(found.camera.t_ns[0]))
+        )
         track = _turned_as_named(place, stated, track, gimbal)
-        if not found.knows_north:
-            heading = quaternion_from_rotation_vector(np.array([0.0, 0.0, -np.radians(gimbal.yaw_deg or 0)]))
-            track = replace(track, quaternion_xyzw=multiply(heading, track.quaternion_xyzw))
         for note in found.notes:
             self._note(note)
-        self._note(f"{name}: its camera is turned by {track.name} of {stated}, {clock}")
+        self._note(f"{name}: its camera is turned by {track.name} of {stated}, by {found.clock}")
         lost = {f"gimbal angles: {cause}": count for cause, count in track.dropped.items()}
         return replace(track, dropped=lost)
 
@@ -797,18 +775,6 @@ class FlightPoses:
             )
 
 
-def _refuse_heading(place: str, knows_north: bool, gimbal: GimbalSource) -> None:
-    """Refuse a stated heading of angles that know north, and its absence where they do not."""
-    if knows_north and gimbal.yaw_deg is not None:
-        raise DataError(
-            place, "yaw_deg: the angles of this file know where north is", "leave it out", code="wrong-option"
-        )
-    if not knows_north and gimbal.yaw_deg is None:
-        problem = "lacks yaw_deg: the file says how the camera turned, not where it looked at first"
-        remedy = "add the heading of its first picture from north to east: yaw_deg: 90"
-        raise DataError(place, problem, remedy, code="no-attitude")
-
-
 def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: GimbalSource) -> AttitudeTrack:
     """Return logged angles of a gimbal relative to what the manifest names, by default what the log means.
 
@@ -823,14 +789,6 @@ def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: Gimb
         raise DataError(place, problem, f"write relative_to: {track.relative_to}", code="wrong-option")
     turned = attitude_in_enu(track.stated[meant], relative_to=meant, axes="ned")
     return replace(track, quaternion_xyzw=turned, relative_to=meant)
-
-
-def _at_pictures(since_ns: Int64, frames: CameraFrames) -> Int64:
-    """Return world times [N] of times in a video [N], by its pictures; at their rate beyond them."""
-    inside = np.interp(since_ns, frames.pts_ns, frames.t_ns - frames.t_ns[0])
-    beyond = np.minimum(since_ns - frames.pts_ns[0], 0) + np.maximum(since_ns - frames.pts_ns[-1], 0)
-    at_ns: Int64 = np.rint(inside).astype(np.int64) + beyond + frames.t_ns[0]
-    return at_ns
 
 
 def _first_place(track: PositionTrack) -> Place:

@@ -10,12 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.formats.poses import write_tum as write_trajectory
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
-from pipelines.session.records import Trajectory
 from tests.commands.runner import succeeds
 from tests.synthetic.drone_logs import (
     HOME,
@@ -33,8 +31,6 @@ from tests.synthetic.drone_logs import (
 from tests.synthetic.flights import SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log
-from tests.synthetic.video_tracks import gopro_turns, write_gopro
-from tests.synthetic.videos import SIZE
 
 WORLD = {
     "origin": {
@@ -354,40 +350,3 @@ def test_a_video_starts_at_the_time_of_its_container(tmp_path: Path) -> None:
     described = ingest(flight.manifest).description
     assert described.cameras["drone1"].frames.first_t_ns == int(flight.t_ns[0]) + 250_000_000
     assert any("say clock: {sigma_s: 1}" in line for line in described.warnings)
-
-
-def _of_gopro(folder: Path, name: str, truth: DroneTruth, picture: Any) -> dict[str, Any]:
-    turns = gopro_turns(truth.t_ns.tolist(), picture)
-    write_gopro(folder / f"{name}_own.mp4", truth, turned=turns, places=False, pictures=30)
-    return {"file": f"{name}_own.mp4", "yaw_deg": float(truth.gimbal_ypr_deg[0, 0])}
-
-
-@pytest.mark.parametrize("kind", ["srt", "tum"])
-def test_attitudes_in_a_video_turn_the_camera_of_another_log(tmp_path: Path, kind: str) -> None:
-    """Positions of subtitles, or of a body whose attitude is that of its log; the camera turns by itself."""
-
-    def write(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
-        if kind == "srt":
-            write_srt(folder / f"{name}.SRT", truth, gimbal=False)
-            return {"file": f"{name}.SRT", "altitude": "absolute"}
-        write_trajectory(folder / f"{name}_body.tum", Trajectory(truth.t_ns, truth.enu, truth.body))
-        return {"file": f"{name}_body.tum", "of": "body"}
-
-    flight = with_poses(tmp_path, write)
-    for k, name in enumerate(flight.cameras):
-        camera = flight.settings["cameras"][name]
-        truth = drone_of(flight, k)
-        camera["gimbal"] = _of_gopro(tmp_path, name, truth, flight.camera_quaternion[k])
-        # The telemetry is at the times of the camera's own pictures, whatever zero they have.
-        path = next(value for key, value in camera["gimbal"].items() if key != "yaw_deg")
-        camera |= {"video": path, "frame_times": {"start": float(truth.t_ns[0]) / 1e9}, "keypoints": None}
-        camera["intrinsics"] = {"width": SIZE[0], "height": SIZE[1], "fx": 300, "fy": 300, "cx": 80, "cy": 60}
-    flight.save()
-    ingest(flight.manifest)
-    for k in range(2):
-        poses = poses_of(flight, flight.cameras[k])
-        nearest = np.abs(flight.t_ns[:, None] - poses["t_ns"].to_numpy()[None]).argmin(axis=0)
-        turned = multiply(
-            conjugate(flight.camera_quaternion[k][nearest]), poses[["qx", "qy", "qz", "qw"]].to_numpy()
-        )
-        assert float(np.degrees(2 * np.abs(turned[:, :3])).max()) < 0.02

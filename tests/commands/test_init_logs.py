@@ -29,7 +29,7 @@ from tests.synthetic.flights import LENS, START_NS, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log, write_mcap
 from tests.synthetic.map_logs import grid_entry
-from tests.synthetic.video_tracks import gopro_turns, write_gopro
+from tests.synthetic.video_tracks import write_gopro
 from tests.synthetic.videos import SIZE, even_ticks, write_video
 
 FRAMES = 30
@@ -172,32 +172,6 @@ def test_a_video_begins_when_the_telemetry_in_it_says(tmp_path: Path) -> None:
     assert "gimbal: {yaw_deg:" in refused("ingest", result.path)
     text = result.path.read_text(encoding="utf-8").replace("# gimbal: {yaw_deg", "gimbal: {yaw_deg")
     result.path.write_text(text, encoding="utf-8")
-    assert frames_with_poses(result.path) == 33
-
-
-def _uncommented(path: Path, line: str) -> None:
-    text = path.read_text(encoding="utf-8")
-    assert f"# {line}" in text
-    path.write_text(text.replace(f"# {line}", line), encoding="utf-8")
-
-
-@pytest.mark.parametrize("places", [True, False])
-def test_a_gopros_turns_are_drafted_without_a_heading(tmp_path: Path, places: bool) -> None:
-    """Nothing but the user knows where it looked first: the flight is complete with that alone."""
-    flight = write_flight(tmp_path / "x", cameras=1, seconds=1.1, clean=True)
-    truth = drone_of(flight, 0)
-    shutil.rmtree(tmp_path / "x")
-    turns = gopro_turns(truth.t_ns.tolist(), flight.camera_quaternion[0])
-    write_gopro(tmp_path / "GX010001.MP4", truth, pictures=33, turned=turns, places=places)
-    write_lens(tmp_path)
-    if not places:
-        write_srt(tmp_path / "GX010001.SRT", truth, gimbal=False)
-    result, _ = drafted(tmp_path)
-    assert len(result.missing) == 1
-    assert "yaw_deg" in result.missing[0]
-    said = refused("ingest", result.path)
-    assert ("yaw_deg" if places else "gimbal:") in said
-    _uncommented(result.path, "gimbal: {file: GX010001.MP4, yaw_deg: 90}")
     assert frames_with_poses(result.path) == 33
 
 

@@ -75,4 +75,3 @@ def test_heavy_from_a_tarball_of_something_else_is_refused(empty_cache: Path, tm
 def test_fetching_an_unknown_name_lists_what_has_models(empty_cache: Path) -> None:
     line = refused("models", "fetch", "openpose2")
     assert "blazepose" in line
-    assert "osim" in line

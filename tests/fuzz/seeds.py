@@ -120,13 +120,6 @@ def _map_log(folder: Path) -> None:
     logs.write_mcap(folder / "maps.mcap", maps, "cdr", compression="none")
 
 
-def _turned_gopro(folder: Path) -> None:
-    truth = _truth(folder)
-    still = [[1.0, 0.0, 0.0, 0.0]] * len(truth.t_ns)
-    turns = video_tracks.gopro_turns(truth.t_ns.tolist(), still)
-    video_tracks.write_gopro(folder / "a.mp4", truth, turned=turns)
-
-
 SEEDS: dict[str, Writer] = {
     "airsim": _text(
         "airsim_rec.txt",
@@ -156,7 +149,6 @@ SEEDS: dict[str, Writer] = {
     "flight from logs": _logged_flight,
     "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),
     "gopro": lambda folder: video_tracks.write_gopro(folder / "a.mp4", _truth(folder)),
-    "gopro with attitudes": _turned_gopro,
     "gopro without telemetry": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
     "joints_csv": lambda folder: joint_files.write_joints(folder / "joints.csv", walking(4)),
     "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),

@@ -12,7 +12,6 @@ from typing import Any
 import av
 import numpy as np
 
-from pipelines.geometry.poses import conjugate, multiply, rotate
 from tests.synthetic.drone_logs import DroneTruth
 from tests.synthetic.videos import bar_code
 
@@ -105,59 +104,7 @@ def gopro_packets(truth: DroneTruth, per_packet: int = 10) -> list[tuple[int, by
     return packets
 
 
-def write_gopro(
-    path: Path, truth: DroneTruth, *, pictures: int = 0, turned: Sequence[bytes] = (), places: bool = True
-) -> Path:
-    """Write a video of a GoPro whose pictures begin with the first row.
-
-    `turned` are further streams for each packet; without `places` there is no GPS.
-    """
+def write_gopro(path: Path, truth: DroneTruth, *, pictures: int = 0) -> Path:
+    """Write a video of a GoPro whose pictures begin with the first row."""
     made_s = int(truth.t_ns[0]) // 10**9
-    packets = gopro_packets(truth)
-    if turned:
-        packets = [
-            (at_ns, gpmf_nested("DEVC", more, *([content[8:]] if places else [])))
-            for (at_ns, content), more in zip(packets, turned, strict=True)
-        ]
-    return write_track(path, packets, made_s=made_s, pictures=pictures, last_s=PACKET_S)
-
-
-def gopro_turns(
-    t_ns: Sequence[int], picture: Any, camera: Any = None, *, gravity: bool = True, per_packet: int = 30
-) -> list[bytes]:
-    """Encode a Hero 9's CORI, IORI and GRAV for packets of a second, from turns over time.
-
-    CORI takes a vector in the axes of the camera when filming began into those of the camera now, IORI from
-    these into those of the picture; the axes are right, down and forward.
-
-    Args:
-        t_ns: [N] times of the turns.
-        picture: [N, 4] world_from_picture, ENU.
-        camera: [N, 4] world_from_camera, which the stabilisation turned; that of the picture by default.
-        gravity: False for the zeros of a Hero 8.
-        per_packet: number of rows in a second.
-    """
-    since_ns = np.asarray(t_ns) - t_ns[0]
-    packets = []
-    for k in range(int(since_ns[-1]) // 10**9 // PACKET_S + 1):
-        at_ns = k * PACKET_S * 10**9 + np.arange(per_packet) * PACKET_S * 10**9 // per_packet
-        rows = np.minimum(np.searchsorted(since_ns, at_ns), len(since_ns) - 1)
-        seen = np.asarray(picture)
-        held = seen if camera is None else np.asarray(camera)
-        turned = multiply(conjugate(held[rows]), held[0])
-        steadied = multiply(conjugate(seen[rows]), held[rows])
-        down = rotate(conjugate(held[rows]), np.array([0.0, 0.0, -1.0])) * (1.0 if gravity else 0.0)
-        streams = [
-            gpmf_nested(
-                "STRM",
-                gpmf_numbers("SCAL", "s", [[32767]]),
-                gpmf_numbers(key, "s", np.rint(values * 32767).astype(int).tolist()),
-            )
-            for key, values in (
-                ("CORI", turned[:, [3, 0, 1, 2]]),
-                ("IORI", steadied[:, [3, 0, 1, 2]]),
-                ("GRAV", down),
-            )
-        ]
-        packets.append(b"".join(streams))
-    return packets
+    return write_track(path, gopro_packets(truth), made_s=made_s, pictures=pictures, last_s=PACKET_S)

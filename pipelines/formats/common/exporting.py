@@ -1,7 +1,6 @@
 """Parts that exports share: names of files, tables, chosen times, maps and covariances for viewers."""
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,32 +65,6 @@ def note_no_skeleton(recording: Recording, export: str) -> None:
         recording.progress.note(
             f"{export}: no skeleton yet, the cameras alone are written: run `mocap reconstruct` first"
         )
-
-
-def write_tables(
-    recording: Recording,
-    folder: Path,
-    suffix: str,
-    write_joints: Callable[[Path, JointMotion], None],
-    write_poses: Callable[[Path, Trajectory], None],
-) -> list[Path]:
-    """Write a recording's tables: `<name>` with the joints, `<name>_<camera>` with a camera's poses.
-
-    A note says if there are no joints.
-    """
-    name = safe_file_name(recording.name)
-    paths: list[Path] = []
-    if recording.motion is not None and recording.motion.position.size:
-        paths.append(folder / f"{name}{suffix}")
-        write_joints(paths[-1], recording.motion)
-    else:
-        note_no_skeleton(recording, suffix[1:])
-    for camera, trajectory in tracks_of(recording).items():
-        paths.append(folder / f"{name}_{safe_file_name(camera)}{suffix}")
-        write_poses(paths[-1], trajectory)
-    if not paths:
-        raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
-    return sorted(paths)
 
 
 def ellipsoids_95(covariance: Float) -> tuple[Float, Float]:

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
     Boots,
+    DroneLog,
     attitude_track,
     damaged,
-    describe_fit,
     find_boots,
     fit_gps_time,
     fixes_track,
@@ -134,7 +134,7 @@ class _MessageRows:
         return self
 
 
-class ArduPilotFormat:
+class ArduPilotFormat(DroneLog):
     """Reader of the DataFlash logs of ArduPilot autopilots."""
 
     name = "ardupilot"
@@ -146,25 +146,6 @@ class ArduPilotFormat:
         """Return True if the file begins with the FMT message that defines FMT itself."""
         head = first_bytes(path, 11)
         return head.startswith(_START) and head[5:9].rstrip(b"\0") == b"FMT"
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe messages by name, times, GPS, and lost messages."""
-        log = _DataFlash(path)
-        timed = [rows for name in log.counts if (rows := log.rows(name)) is not None and rows.clock]
-        every = np.concatenate([np.zeros(0, np.int64), *(rows.t_ns() for rows in timed)])
-        facts: dict[str, object] = {"messages": sum(log.counts.values())}
-        facts["span_s"] = round(int(np.ptp(every)) / 1e9, 6) if len(every) else 0.0
-        gps = log.rows("GPS")
-        if gps is not None and len(gps):
-            facts["gps_fixes"] = int(np.count_nonzero(gps.numbers("Status") >= _3D_FIX))
-        if (fit := _gps_time(log)) is not None:
-            facts["gps_time"] = describe_fit(fit)
-        if log.boots is not None and len(log.boots.places):
-            facts["restarts"] = len(log.boots.places)
-        if lost := sum(rows.lost for rows in timed):
-            facts["dropped: cut off"] = lost
-        facts["topics"] = [f"{name} {count}" for name, count in sorted(log.counts.items())]
-        return facts
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position, attitude and mount.
@@ -328,7 +309,6 @@ class _DataFlash:
         self._places = {
             name: np.asarray(reader.offsets[f.type], np.int64) for name, f in self._formats.items()
         }
-        self.counts = {name: len(places) for name, places in self._places.items() if len(places)}
         self.boots: Boots | None = None
         frequent = self.first(["ATT", "GPS", "POS"])
         if frequent is not None:

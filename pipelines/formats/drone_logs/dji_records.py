@@ -28,9 +28,9 @@ from pipelines.formats.drone_logs.dji_subtitles import (
     DjiRows,
     any_finite,
     attitudes_of_rows,
-    describe_rows,
     telemetry_of_rows,
 )
+from pipelines.formats.drone_logs.telemetry_rows import DroneLog
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Attitudes, Telemetry
@@ -78,7 +78,7 @@ _MARK = re.compile(r"[.,](?=\d)")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-class DjiRecordFormat:
+class DjiRecordFormat(DroneLog):
     """Reader of a flight record as CSV; every column but times and positions may be absent."""
 
     name = "dji_record"
@@ -89,15 +89,6 @@ class DjiRecordFormat:
     def recognises(self, path: Path) -> bool:
         """Return True if the heading names times, positions on Earth, and heights or angles."""
         return _find_heading(read_head(path, self.suffixes)) is not None
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe rows, times, ranges of the positions, heights and angles, recordings, and losses."""
-        record = _read(path)
-        t_ns, _ = record.times
-        facts = {"rows": len(t_ns)} | describe_rows(record.rows)
-        if record.films:
-            facts["videos_started_s"] = [round(int(t_ns[first]) / 1e9, 3) for first, _ in record.films]
-        return facts | {f"dropped: {cause}": count for cause, count in record.dropped.items()}
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read positions, and the angles of body and gimbal if the record has them.

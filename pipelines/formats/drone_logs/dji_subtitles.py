@@ -24,8 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
-from pipelines.formats.common.rows import describe_times, longest_rising
+from pipelines.formats.common.rows import longest_rising
 from pipelines.formats.drone_logs.telemetry_rows import (
+    DroneLog,
     attitude_track,
     between_refreshed_angles,
     between_repeats,
@@ -188,37 +189,9 @@ def angles_track(
     return attitude_track(name, t_ns[kept], turned_as_stated(between), dropped, stated=as_logged)
 
 
-def describe_rows(found: DjiRows) -> dict[str, object]:
-    """Describe positions, times, ranges of places, heights and angles."""
-    columns = found.columns
-    facts: dict[str, object] = {
-        "positions": int(np.count_nonzero(np.isfinite(columns["latitude"]))),
-        **describe_times(np.unique(found.t_ns[found.timed])),
-        "clock": found.clock,
-    }
-    ranges = {"latitude_deg": "latitude", "longitude_deg": "longitude"}
-    ranges |= {"height_above_take_off_m": "relative", "height_absolute_m": "absolute", "height_m": "altitude"}
-    facts |= {
-        label: range_of(columns[name], 7 if label.endswith("deg") else 3)
-        for label, name in ranges.items()
-        if any_finite(columns[name])
-    }
-    for label, angles in (("gimbal", found.gimbal), ("body", found.body)):
-        if any_finite(angles):
-            facts[f"{label}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
-            facts[f"{label}_pitch_deg"] = range_of(angles[:, 1], 2)
-    return facts
-
-
 def any_finite(values: Float) -> bool:
     """Return True if there is any number."""
     return bool(np.isfinite(values).any())
-
-
-def range_of(values: Float, decimals: int) -> list[float]:
-    """Return the smallest and the largest number, rounded; empty without any."""
-    finite = values[np.isfinite(values)]
-    return [round(float(v), decimals) for v in (finite.min(), finite.max())] if len(finite) else []
 
 
 _TIMECODE = r"(\d+):([0-5]\d):([0-6]\d)[,.](\d{3})"  # a Matrice 300 ends its 60th second at :60
@@ -353,7 +326,7 @@ _COLUMNS = (
 _HEIGHTS = {"rel_alt": "relative", "abs_alt": "absolute"}
 
 
-class DjiSrtFormat:
+class DjiSrtFormat(DroneLog):
     """Reader of subtitles that hold the drone's position."""
 
     name = "dji"
@@ -366,14 +339,6 @@ class DjiSrtFormat:
         return bool(
             np.isfinite(_columns(parse_subtitles(read_head(path, self.suffixes)).texts)["latitude"]).any()
         )
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe subtitles, times, ranges of the positions, heights and angles."""
-        subtitles = read_subtitles(path)
-        facts = {"subtitles": len(subtitles.texts)} | describe_rows(_rows(subtitles))
-        if not any(name.endswith("_angles") for name in facts):
-            facts["orientation"] = "none: state a gimbal in the manifest"
-        return facts
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read positions, and the angles of body and gimbal if the subtitles have them.

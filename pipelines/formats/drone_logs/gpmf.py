@@ -8,10 +8,6 @@ its streams, in which `SCAL` divides the values, and `TYPE` lists the types of a
   `GPS9` (since Hero 11) has the time and the fix in each row. Rows of a packet are evenly spaced.
 - A Karma logs `GLPI` (position), `ATTD` (roll, pitch, yaw, as MAVLink counts them) and `SYST` (time since
   boot and UTC). What its `CYTS` means for the gimbal is not public.
-- Since Hero 8: `CORI` turns the axes of the first picture into those of the camera, for each picture, and
-  `IORI` those of the camera into those of the stabilised picture (quaternions w, x, y, z; axes right, down,
-  forward). `GRAV` is the direction of gravity in the axes of the camera; a Hero 8 leaves it 0. GoPro's table
-  does not name the axes: these are the ones of its answers (gpmf-parser, issues 100 and 170) and of Gyroflow.
 """
 
 from __future__ import annotations
@@ -19,7 +15,6 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,22 +23,18 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
-from pipelines.formats.common.rows import NORM_TOLERANCE
 from pipelines.formats.drone_logs.telemetry_rows import (
+    DroneLog,
     attitude_track,
-    describe_fit,
     fit_gps_time,
-    of_angles,
     on_gps_time,
     on_one_clock,
     position_track,
     turned_as_stated,
 )
 from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64
-from pipelines.geometry.mounting import attitude_in_enu
-from pipelines.geometry.poses import conjugate, interpolate_points, multiply, rotate
 from pipelines.session.errors import DataError
-from pipelines.session.records import Attitudes, Height, Telemetry
+from pipelines.session.records import Height, Telemetry
 from pipelines.session.registries import TelemetryChoice
 
 _KINDS = {
@@ -62,12 +53,7 @@ _KINDS = {
 _FIX_3D = 3
 # A packet of a second has one time only, so its rows are known to about this.
 _PACKET_S = 0.2
-# Rows of gravity and of the stabilisation further apart than this are a gap.
-_BRIDGED_NS = 1_000_000_000
-# Accelerations turn the measured gravity by some degrees, a wrong axis by more.
-_LARGEST_TILT_DEG = 20.0
 _DAYS_TO_2000 = (datetime(2000, 1, 1, tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)).days
-_KNOWN = ("GPS5", "GPS9", "GLPI", "ATTD", "SYST", "ACCL", "GYRO", "CORI", "IORI", "GRAV")
 
 
 @dataclass
@@ -76,7 +62,6 @@ class _Track:
 
     rows: dict[str, list[Float]] = field(default_factory=dict)
     at_ns: dict[str, list[Int64]] = field(default_factory=dict)  # since the video's start
-    names: dict[str, str] = field(default_factory=dict)
     heights: Height = "ellipsoid"  # of GPS5 and GPS9, unless the file says sea level
     dropped: Counter[str] = field(default_factory=Counter)
 
@@ -91,8 +76,8 @@ class _Track:
         )
 
 
-class GoProFormat:
-    """Reader of positions and of the camera's turns in a GoPro's video, and of the flight of a Karma."""
+class GoProFormat(DroneLog):
+    """Reader of positions in a GoPro's video, and of the flight of a Karma."""
 
     name = "gopro"
     title = "GoPro telemetry (GPMF)"
@@ -104,29 +89,6 @@ class GoProFormat:
             return path.is_file() and next(_packets(path), None) is not None
         except (DataError, OSError):
             return False
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe the streams by their rows, the positions, and the clock."""
-        track = _read(path)
-        facts: dict[str, object] = {
-            "streams": [f"{key} {sum(map(len, rows))}" for key, rows in sorted(track.rows.items())],
-            **{f"dropped: {cause}": count for cause, count in track.dropped.items()},
-        }
-        with suppress(DataError):
-            attitudes = self.read_attitudes(path)
-            facts["camera_attitudes"] = f"{len(attitudes.camera.t_ns)}, from the first picture's heading on"
-        try:
-            telemetry = self.read_telemetry(path, TelemetryChoice())
-        except DataError as error:
-            return {**facts, "positions": 0, "why": error.problem}
-        facts |= {"positions": len(telemetry.position.t_ns), "clock": telemetry.clock}
-        facts["body_attitudes"] = len(telemetry.body.t_ns) if telemetry.body else 0
-        if telemetry.fit and telemetry.video_began:
-            facts["gps_time"] = describe_fit(telemetry.fit)
-            facts["video_began_s"] = round(telemetry.video_began[0] / 1e9, 3)
-        names = ("latitude_deg", "longitude_deg", "height_m")
-        columns = zip(names, telemetry.position.values.T, strict=True)
-        return facts | {name: [round(v, 7) for v in (c.min(), c.max())] for name, c in columns}
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read a Karma's position and attitude, else the camera's GPS; in UTC where that is logged."""
@@ -159,98 +121,6 @@ class GoProFormat:
         telemetry = on_one_clock(path, position, None, None, fit=fit, notes=notes, dropped=dropped)
         return replace(telemetry, video_began=(0, 0.0) if fit is None else (_on(fit, 0), _PACKET_S))
 
-    def read_attitudes(self, path: Path) -> Attitudes:
-        """Read how the camera turned, level by gravity, with the first picture looking north."""
-        track = _read(path)
-        at_ns, from_camera, from_picture = _orientations(path, track)
-        dropped: dict[str, int] = dict(track.dropped)
-        gravity, off_deg = _gravity(path, track, at_ns, from_camera)
-        first = conjugate(from_picture[0])
-        # In the axes of gimbals (forward, right, down) the first picture is turned by pitch and roll alone.
-        x, y, z, w = multiply(first, from_picture).T
-        right, down, forward = rotate(first, gravity)
-        tilt = [0.0, -np.arcsin(np.clip(forward, -1, 1)), np.arctan2(right, down)]
-        turned = multiply(of_angles(np.degrees([tilt])), np.stack([z, x, y, w], axis=1))
-        name = "its camera's orientation (CORI)"
-        in_enu = attitude_in_enu(turned, relative_to="world", axes="ned")
-        camera = attitude_track(name, at_ns, in_enu, dropped)
-        if camera is None:
-            raise DataError(path, f"{name} holds no usable attitude", _OTHER_ANGLES, code="no-attitude")
-        fit = _gps_fit(path, track)
-        return Attitudes(
-            replace(camera, t_ns=camera.t_ns if fit is None else fit.other_ns(camera.t_ns), dropped=dropped),
-            "the video's start" if fit is None else "UTC by GPS",
-            knows_north=False,
-            video_began_ns=0 if fit is None else _on(fit, 0),
-            notes=(
-                f"{path}: {name} is level to {off_deg:.2g} deg (the median of its gravity), and its heading"
-                " drifts: a gyroscope carries it on from the first picture",
-            ),
-        )
-
-
-_OTHER_ANGLES = "name gimbal angles of another log, or fixed ones"
-
-
-def _orientations(path: Path, track: _Track) -> tuple[Int64, Float, Float]:
-    """Return video times [N], and the axes of the first picture from those of camera and picture [N, 4]."""
-    found = track.stream("CORI", 4)
-    if found is None:
-        known = ", ".join(sorted(set(track.rows) & set(_KNOWN))) or "none that is known"
-        problem = f"its telemetry holds no orientation of the camera (streams: {known})"
-        raise DataError(path, problem, _OTHER_ANGLES)
-    at_ns, turns = found
-    of_camera = turns[:, [1, 2, 3, 0]]
-    of_picture = of_camera
-    if (stabilised := track.stream("IORI", 4)) is not None:
-        # One row for each picture, as CORI; the next one where some are lost.
-        nearest = np.searchsorted(stabilised[0], at_ns).clip(0, len(stabilised[0]) - 1)
-        of_picture = multiply(stabilised[1][nearest][:, [1, 2, 3, 0]], of_camera)
-    norms = np.linalg.norm(of_camera, axis=1), np.linalg.norm(of_picture, axis=1)
-    usable = np.abs(np.stack(norms) - 1).max(axis=0) < NORM_TOLERANCE
-    usable[1:] &= np.diff(at_ns) > 0
-    if lost := int(np.count_nonzero(~usable)):
-        track.dropped["orientation of the camera that is none"] += lost
-    if not usable.any():
-        raise DataError(path, "holds no usable orientation of the camera", _OTHER_ANGLES, code="no-attitude")
-    of_camera, of_picture = (
-        each[usable] / norm[usable, None] for each, norm in zip((of_camera, of_picture), norms, strict=True)
-    )
-    return at_ns[usable], conjugate(of_camera), conjugate(of_picture)
-
-
-def _gravity(path: Path, track: _Track, at_ns: Int64, from_camera: Float) -> tuple[Float, float]:
-    """Return the direction of gravity [3] in the axes of the first picture, and its median deviation, deg."""
-    found = track.stream("GRAV", 3)
-    if found is None or not found[1].any():
-        problem = "its telemetry states no direction of gravity, so nothing says which way is down"
-        raise DataError(path, problem, _OTHER_ANGLES)
-    keep = np.concatenate([[True], np.diff(found[0]) > 0])
-    there = interpolate_points(found[0][keep], found[1][keep], at_ns, max_gap_ns=_BRIDGED_NS)
-    length = np.linalg.norm(there, axis=1)
-    known = np.nan_to_num(length) > 0.5
-    if not known.any():
-        raise DataError(
-            path, "its orientations and its gravity share no time", _OTHER_ANGLES, code="no-overlap"
-        )
-    down = rotate(from_camera[known], there[known] / length[known, None])
-    mean = down.mean(axis=0)
-    mean /= max(float(np.linalg.norm(mean)), 1e-9)
-    off_deg = float(np.degrees(np.median(np.arccos(np.clip(down @ mean, -1, 1)))))
-    if off_deg > _LARGEST_TILT_DEG:
-        raise DataError(
-            path,
-            f"its orientations (CORI) and its gravity (GRAV) contradict each other by {off_deg:.0f} deg",
-            _OTHER_ANGLES,
-        )
-    return mean, off_deg
-
-
-def _gps_fit(path: Path, track: _Track) -> ClockFit | None:
-    with suppress(DataError):
-        return _fixes(path, track)[3]
-    return None
-
 
 def _on(fit: ClockFit, t_ns: int) -> int:
     return int(fit.other_ns(np.array([t_ns], dtype=np.int64))[0])
@@ -269,8 +139,7 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
         fit = fit_gps_time(at_ns[fixed], utc_ns[fixed]) if fixed.any() else None
         return at_ns, rows[:, :3], np.asarray(fixed), fit
     if (found := track.stream("GPS5", 3)) is None:
-        known = ", ".join(sorted(set(track.rows) & set(_KNOWN))) or "none that is known"
-        problem = f"its telemetry holds no position (streams: {known})"
+        problem = f"its telemetry holds no position (streams: {', '.join(sorted(track.rows))[:100]})"
         raise DataError(path, problem, "name another log of poses", code="no-positions")
     at_ns, rows = found
     fixed = np.concatenate([each[:, 0] for each in track.rows["fixed"]]) >= _FIX_3D
@@ -366,7 +235,6 @@ def _take_stream(track: _Track, start_ns: int, length_ns: int, content: bytes) -
         at_ns = start_ns + np.arange(len(rows), dtype=np.int64) * length_ns // max(len(rows), 1)
         track.rows.setdefault(key, []).append(rows)
         track.at_ns.setdefault(key, []).append(at_ns)
-        track.names.setdefault(key, about.get("STNM", ""))
         if about.get("GPSA", "").startswith("MSL"):
             track.heights = "sea level"
         if key == "GPS5":

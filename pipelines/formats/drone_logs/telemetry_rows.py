@@ -1,5 +1,6 @@
 """Cleaning of telemetry rows into tracks: one set of rules for every drone's log."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -8,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.common.rows import NORM_TOLERANCE, kept_rows
+from pipelines.formats.common.rows import NORM_TOLERANCE, describe_times, kept_rows
 from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64, Place, RelativeTo
 from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_from_angles, attitude_in_enu, level_heading
@@ -36,6 +37,46 @@ _LEAST_FIXES = 5
 _STEADY_NS = 200_000_000
 # Fewer intervals between changes do not show if they are regular.
 _LEAST_REFRESHES = 4
+
+
+class DroneLog(ABC):
+    """Base of the readers of drones' own logs: they are described alike, by what is taken of them."""
+
+    @abstractmethod
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Read positions and attitudes, as `registries.TelemetryFormat` says."""
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe positions, times, ranges, attitudes, clock and losses; or why nothing is taken."""
+        try:
+            found = self.read_telemetry(path, TelemetryChoice())
+        except DataError as error:
+            if error.code not in _DESCRIBED:
+                raise
+            return {"positions": 0, "why": f"{error.problem}; {error.remedy}"}
+        track = found.position
+        facts: dict[str, object] = {
+            "positions": f"{len(track.t_ns)} of {track.name}",
+            **describe_times(track.t_ns),
+            "clock": found.clock,
+        }
+        columns = ("latitude_deg", "longitude_deg", "height_m") if track.on_earth else ("x_m", "y_m", "z_m")
+        for name, values in zip(columns, track.values.T, strict=True):
+            facts[name] = [round(float(value), 7) for value in (values.min(), values.max())]
+        if track.on_earth:
+            facts["heights"] = track.height
+        for name, turned in (("body", found.body), ("gimbal", found.gimbal)):
+            facts[f"{name}_attitudes"] = f"{len(turned.t_ns)} of {turned.name}" if turned else "none"
+        if found.video_began is not None:
+            facts["video_began_s"] = found.video_began[0] / 1e9
+        return facts | {
+            "notes": [note.removeprefix(f"{path}: ") for note in found.notes],
+            **{f"dropped: {cause}": count for cause, count in found.dropped.items()},
+        }
+
+
+# A log without positions, or of several vehicles, is described by what it lacks.
+_DESCRIBED = ("no-positions", "clock-unknown", "ambiguous")
 
 
 def position_track(

@@ -23,8 +23,8 @@ import numpy as np
 from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
     Boots,
+    DroneLog,
     damaged,
-    describe_fit,
     find_boots,
     fit_gps_time,
     of_angles,
@@ -73,7 +73,7 @@ _WANTED = frozenset(
 )
 
 
-class TlogFormat:
+class TlogFormat(DroneLog):
     """Reader of ground stations' logs of MAVLink (Mission Planner, QGroundControl, MAVProxy)."""
 
     name = "tlog"
@@ -90,25 +90,6 @@ class TlogFormat:
             return True
         head = first_bytes(path, _SEARCHED, suffixes=self.suffixes)
         return any(_are_packets(head, match.start()) for match in _LIKE_PACKETS.finditer(head))
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe messages by name, vehicles, times, GPS time, losses of the radio link and damage."""
-        log = _read(path)
-        facts: dict[str, object] = {"messages": sum(log.counts.values())}
-        facts["span_s"] = round((log.last_us - log.first_us) / 1e6, 6)
-        facts["first_ns"] = log.first_us * 1000
-        facts["vehicles"] = [f"system {system}" for system in log.vehicles()]
-        for system in log.vehicles()[:1]:
-            if (fit := log.gps_time(system)) is not None:
-                facts["gps_time"] = describe_fit(fit)
-            if len(restarts := log.boots(system).places):
-                facts["restarts"] = [
-                    f"at {(place - log.first_us) / 1e6:.1f} s" for place in restarts.tolist()
-                ]
-        facts["packets_missing"] = log.lost
-        facts |= {f"dropped: {cause}": count for cause, count in log.dropped.items()}
-        facts["topics"] = [f"{name} {count}" for name, count in sorted(log.named().items())]
-        return facts
 
     def vehicles(self, path: Path) -> list[int]:
         """List the numbers of the systems that say where they are; errors as for `read_telemetry`."""
@@ -185,9 +166,8 @@ def _vehicle(path: Path, log: _Packets, stated: int | None, messages: frozenset[
     if not vehicles:
         raise DataError(path, f"has no {names}", "give another log")
     if len(vehicles) > 1:
-        raise DataError(
-            path, f"holds {len(vehicles)} vehicles (systems {listed})", "say which with `instance:`"
-        )
+        problem = f"holds {len(vehicles)} vehicles (systems {listed})"
+        raise DataError(path, problem, "say which with `instance:`", code="ambiguous")
     return vehicles[0]
 
 
@@ -262,30 +242,20 @@ def _quaternion(wxyz: Float) -> dict[str, Float]:
 class _MavlinkPacket(NamedTuple):
     stamp_us: int
     system: int
-    component: int
-    sequence: int
     message: int
     payload: bytes
 
 
 @dataclass
 class _Packets:
-    """Packets of a log: the wanted ones, and counts of all."""
+    """Wanted packets of a log, and the number of all."""
 
     dialect: Any
-    first_us: int = 0
-    last_us: int = 0
-    lost: int = 0  # packets between those that arrived, by their numbers
-    counts: Counter[int] = field(default_factory=Counter)
+    count: int = 0
     payloads: dict[tuple[int, int], bytearray] = field(default_factory=dict)  # by system and message
     stamps_us: dict[tuple[int, int], array[int]] = field(default_factory=dict)
     dropped: dict[str, int] = field(default_factory=dict)
     _boots: dict[int, Boots] = field(default_factory=dict)  # by system
-
-    def named(self) -> dict[str, int]:
-        """Count the messages by name."""
-        names = self.dialect.mavlink_map
-        return {names[k].msgname if k in names else f"message {k}": n for k, n in self.counts.items()}
 
     def vehicles(self, messages: frozenset[int] = _POSITIONS) -> list[int]:
         """List the systems that sent any of the messages; by default, those that say where they are."""
@@ -346,7 +316,6 @@ class _Packets:
 def _read(path: Path) -> _Packets:
     """Read all packets."""
     found = _Packets(need("pymavlink.dialects.v20.ardupilotmega", "drones"))
-    last: dict[tuple[int, int], int] = {}
     try:
         refuse_marks(path, b"\xfe", b"\xfd")
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -354,13 +323,7 @@ def _read(path: Path) -> _Packets:
                 if packet.stamp_us > _LARGEST_US:
                     found.dropped["absurd stamp"] = found.dropped.get("absurd stamp", 0) + 1
                     continue
-                found.first_us = min(found.first_us or packet.stamp_us, packet.stamp_us)
-                found.last_us = max(found.last_us, packet.stamp_us)
-                found.counts[packet.message] += 1
-                sender = packet.system, packet.component
-                if sender in last:
-                    found.lost += (packet.sequence - last[sender] - 1) % 256
-                last[sender] = packet.sequence
+                found.count += 1
                 if packet.message in _WANTED:
                     key = packet.system, packet.message
                     size = found.dialect.mavlink_map[packet.message].unpacker.size
@@ -371,7 +334,7 @@ def _read(path: Path) -> _Packets:
                     found.stamps_us.setdefault(key, array("q")).append(packet.stamp_us)
     except (OSError, ValueError) as error:  # ValueError: an empty file cannot be mapped
         raise damaged(path, error) from error
-    if not found.counts:
+    if not found.count:
         raise DataError(
             path,
             "holds no packet of MAVLink",
@@ -417,9 +380,9 @@ def _packet(content: mmap.mmap, place: int, definitions: Mapping[int, Any]) -> _
         return None
     packet = content[start : start + size]
     if packet[0] == 0xFE:
-        head, (sequence, system, component, message) = 6, packet[2:6]
+        head, system, message = 6, packet[3], packet[5]
     else:
-        head, (sequence, system, component), message = 10, packet[4:7], int.from_bytes(packet[7:10], "little")
+        head, system, message = 10, packet[5], int.from_bytes(packet[7:10], "little")
     end = head + packet[1]
     if message in definitions:
         stated = int.from_bytes(packet[end : end + 2], "little")
@@ -428,7 +391,7 @@ def _packet(content: mmap.mmap, place: int, definitions: Mapping[int, Any]) -> _
     elif start + size + _STAMP < len(content) and content[start + size + _STAMP] not in {0xFD, 0xFE}:
         return None  # of an unknown message only its length can be tested
     stamp_us = int.from_bytes(content[place:start], "big")
-    return _MavlinkPacket(stamp_us, system, component, sequence, message, packet[head:end])
+    return _MavlinkPacket(stamp_us, system, message, packet[head:end])
 
 
 def _are_packets(head: bytes, place: int) -> bool:

@@ -19,9 +19,9 @@ import numpy as np
 
 from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
+    DroneLog,
     attitude_track,
     damaged,
-    describe_fit,
     fit_gps_time,
     fixes_track,
     on_gps_time,
@@ -39,8 +39,6 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice, need
 
-# A stamp so far from nearly all others is wrong.
-_FAR_OFF_NS = 5_000_000_000
 _3D_FIX = 3
 _GPS = ("vehicle_gps_position", "sensor_gps")
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64  # GIMBAL_DEVICE_FLAGS of MAVLink
@@ -65,7 +63,7 @@ _MOST_FIELDS = 20_000
 Columns = Mapping[str, Any]  # by field name, arrays [N] in the log's own number types
 
 
-class UlogFormat:
+class UlogFormat(DroneLog):
     """Reader of the logs of PX4 autopilots."""
 
     name = "ulog"
@@ -77,54 +75,20 @@ class UlogFormat:
         """Return True if the file begins with ULog's magic bytes."""
         return first_bytes(path, len(MAGIC)) == MAGIC
 
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe topics and their messages, times, GPS, valid estimates, and damage."""
-        log = open_ulog(path, None)
-        topics = topics_of(log)
-        stamps = [np.asarray(topic.columns["timestamp"]).astype(np.int64) for topic in topics]
-        every = np.concatenate([np.zeros(0, dtype=np.int64), *stamps]) * 1000
-        since_start = every >= log.start_timestamp * 1000
-        near = since_start & ~_far_off(every, since_start)
-        facts: dict[str, object] = {
-            "hardware": str(log.msg_info_dict.get("ver_hw", "")),
-            "messages": len(every),
-            "span_s": round(float(np.ptp(every[near])) / 1e9, 6) if near.any() else 0.0,
-        }
-        if early := int(np.count_nonzero(~since_start)):
-            facts["messages_stamped_before_the_log_began"] = early
-        if stray := int(np.count_nonzero(since_start & ~near)):
-            facts["messages_stamped_far_off"] = stray
-        facts["dropouts"] = len(log.dropouts)
-        if log.file_corruption:
-            facts["damaged"] = "yes"
-        by_name = {f"{topic.name}:{topic.instance}": topic for topic in topics}
-        if local := by_name.get("vehicle_local_position:0"):
-            facts["local_positions_valid"] = int(np.count_nonzero(_local_is_valid(local)))
-        for name in _GPS:
-            if gps := by_name.get(f"{name}:0"):
-                values, fixed = _fixes(gps)
-                facts["gps_fixes"] = int(np.count_nonzero(fixed))
-                facts["first_position"] = [round(v, 7) for v in values[0].tolist()]
-                break
-        if (fit := _gps_time(topics)) is not None:
-            facts["gps_time"] = describe_fit(fit)
-        facts["topics"] = [f"{name} {len(topic)}" for name, topic in sorted(by_name.items())]
-        return facts
-
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position, attitude and gimbal.
 
         The position is the estimator's local one (`local`) if the estimator ever marks it valid, else its
         global one, else that of GPS. A local position that is never valid is the last choice, with a note.
         """
-        topics = topics_of(open_ulog(path, _WANTED))
+        topics = read_topics(path, _WANTED)
         notes: list[str] = []
         fit = on_gps_time(path, _gps_time(topics), choice.time, notes)
         return telemetry_of(path, topics, choice, fit, notes)
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
         """Read the times of pictures: by the camera's feedback, else by the trigger."""
-        topics = topics_of(open_ulog(path, {"camera_capture", "camera_trigger", *_GPS}))
+        topics = read_topics(path, {"camera_capture", "camera_trigger", *_GPS})
         for name in ("camera_capture", "camera_trigger"):
             if found := [topic for topic in topics if topic.name == name and len(topic)]:
                 return pictures_on_gps_time(path, found[0].t_ns(), _gps_time(topics), choice)
@@ -353,14 +317,6 @@ def _no_instance(path: Path | str, instance: int, what: str, there: Sequence[Ulo
     )
 
 
-def _far_off(t_ns: Int64, among: Bool) -> Bool:
-    """Return True for stamps later than nearly all `among`, by a tenth of their span plus `_FAR_OFF_NS`."""
-    if not among.any():
-        return np.zeros(len(t_ns), dtype=np.bool_)
-    first, last = np.percentile(t_ns[among], [0, 99.5])
-    return np.asarray(t_ns > last + (last - first) / 10 + _FAR_OFF_NS)
-
-
 @dataclass(frozen=True)
 class UlogTopic:
     """One instance of a topic."""
@@ -403,21 +359,15 @@ class UlogTopic:
         return stamps
 
 
-def open_ulog(path: Path, wanted: Collection[str] | None) -> Any:
-    """Open a log with some topics, or all of them."""
+def read_topics(path: Path, wanted: Collection[str]) -> list[UlogTopic]:
+    """Read the topics of some names that have a stamp, sorted by name and instance."""
     core = need("pyulog", "drones")
     _refuse_bombs(path)
     try:
         with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # pyulog prints warnings
-            return core.ULog(file, None if wanted is None else sorted(wanted))
-    except DataError:
-        raise
+            log = core.ULog(file, sorted(wanted))
     except Exception as error:  # damaged files raise many kinds of errors in this parser
         raise damaged(path, error) from error
-
-
-def topics_of(log: Any) -> list[UlogTopic]:
-    """Return the topics with a stamp, sorted by name and instance."""
     found = [UlogTopic(str(d.name), int(d.multi_id), d.data) for d in log.data_list if "timestamp" in d.data]
     return sorted(found, key=lambda topic: (topic.name, topic.instance))
 

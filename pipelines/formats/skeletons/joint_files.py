@@ -1,6 +1,6 @@
 """Files of joints: their unit and axes, the names of their markers, and a constant rate.
 
-Joints as CSV, read and written, and as Parquet, written.
+Joints as CSV, read and written.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.formats.common.exporting import write_tables
+from pipelines.formats.common.exporting import note_no_skeleton, safe_file_name, tracks_of
 from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import (
     Heading,
@@ -30,9 +30,8 @@ from pipelines.geometry.poses import interpolate_points
 from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS, joint_called
 from pipelines.session.progress import Progress
-from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording, Trajectory
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording
 from pipelines.session.storage import read_text
-from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, pose_table, write_table
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -77,18 +76,6 @@ def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float
 def to_y_up(position: Float) -> Float:
     """Convert world positions [..., 3] to OpenSim's axes, y up: (y, z, x) of the world."""
     return position[..., [1, 2, 0]]
-
-
-def joint_columns(motion: JointMotion) -> dict[str, object]:
-    """Return t_ns, person, joint, x, y, z as columns of a long table, with a row for each of [T, P, J]."""
-    times, people, joints = motion.position.shape[:3]
-    t_ns, person, joint = np.meshgrid(motion.t_ns, np.arange(people), np.arange(joints), indexing="ij")
-    return {
-        "t_ns": t_ns.ravel(),
-        "person": person.ravel(),
-        "joint": np.array(motion.joints, dtype=object)[joint.ravel()],
-        **dict(zip("xyz", motion.position.reshape(times * people * joints, 3).T, strict=True)),
-    }
 
 
 @dataclass(frozen=True)
@@ -396,19 +383,23 @@ def write_joints(path: Path, motion: JointMotion) -> None:
     """Write `t_ns,person,joint,x,y,z` and all other known values (covariance in m^2); NaN is blank."""
     import pandas as pd
 
+    people, joints = motion.position.shape[1:3]
     with path.open("w", encoding="utf-8", newline="") as file:
         for first in range(0, max(len(motion.t_ns), 1), _TIMES_AT_ONCE):
             some = slice(first, first + _TIMES_AT_ONCE)
-            columns = joint_columns(replace(motion, t_ns=motion.t_ns[some], position=motion.position[some]))
+            times = len(motion.t_ns[some])
+            columns: dict[str, object] = {
+                "t_ns": np.repeat(motion.t_ns[some], people * joints),
+                "person": np.tile(np.repeat(np.arange(people), joints), times),
+                "joint": np.tile(np.array(motion.joints, dtype=object), times * people),
+                **dict(zip("xyz", motion.position[some].reshape(-1, 3).T, strict=True)),
+            }
             if motion.covariance is not None:
                 upper = motion.covariance[some].reshape(-1, 6).T
                 columns |= dict(zip(POINT_COVARIANCE_COLUMNS, upper, strict=True))
-            if motion.views is not None:
-                columns["views"] = motion.views[some].ravel()
-            if motion.status is not None:
-                columns["status"] = motion.status[some].ravel()
-            if motion.reprojection_px is not None:
-                columns["reprojection_px"] = motion.reprojection_px[some].ravel()
+            for name in ("views", "status", "reprojection_px"):
+                if (values := getattr(motion, name)) is not None:
+                    columns[name] = values[some].ravel()
             pd.DataFrame(columns).to_csv(file, index=False, header=not first, lineterminator="\n")
 
 
@@ -416,56 +407,23 @@ class CsvExport:
     """Writer of `<name>.csv`, the skeleton as a long table, and `<name>_<camera>.csv`, a camera's poses."""
 
     name = "csv"
-    title = "long tables of the skeleton and of each camera's poses, as text"
+    title = "long tables of the skeleton and of each camera's poses"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write all tables of the recording."""
-        return write_tables(recording, folder, ".csv", write_joints, write_pose_csv)
+        """Write the joints, if there are any, and the poses of every camera."""
+        name, motion, paths = safe_file_name(recording.name), recording.motion, []
+        if motion is not None and motion.position.size:
+            paths.append(folder / f"{name}.csv")
+            write_joints(paths[-1], motion)
+        else:
+            note_no_skeleton(recording, "csv")
+        for camera, trajectory in tracks_of(recording).items():
+            paths.append(folder / f"{name}_{safe_file_name(camera)}.csv")
+            write_pose_csv(paths[-1], trajectory)
+        if not paths:
+            raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
+        return sorted(paths)
 
 
 JOINTS_CSV = JointsCsvFormat()
 CSV_EXPORT = CsvExport()
-
-
-class ParquetExport:
-    """Writer of `<name>.parquet` (the session's skeleton table) and `<name>_<camera>.parquet` (its poses).
-
-    Metres, z up; one row for each time, person and joint, with NaN and a status if it is missing. The same
-    recording gives the same bytes.
-    """
-
-    name = "parquet"
-    title = "the same tables, typed and small, for pandas"
-
-    def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write all tables of the recording."""
-        return write_tables(recording, folder, ".parquet", write_parquet, write_poses)
-
-
-def write_poses(path: Path, trajectory: Trajectory) -> None:
-    """Write `tables.POSES`, with covariances if the trajectory has them."""
-    schema = POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE
-    write_table(path, pose_table(trajectory), schema)
-
-
-def write_parquet(path: Path, motion: JointMotion) -> None:
-    """Write `tables.SKELETON`; unknown values become NaN, 0 views or an empty status."""
-    import pandas as pd
-
-    shape = motion.position.shape[:3]
-    unknown = np.full(shape, np.nan)
-    covariance = np.full((*shape, 6), np.nan) if motion.covariance is None else motion.covariance
-    reprojection = unknown if motion.reprojection_px is None else motion.reprojection_px
-    views = np.zeros(shape, np.int64) if motion.views is None else motion.views
-    status = np.full(shape, "") if motion.status is None else motion.status
-    columns: dict[str, object] = {
-        **joint_columns(motion),
-        **dict(zip(POINT_COVARIANCE_COLUMNS, covariance.reshape(-1, 6).T, strict=True)),
-        "views": views.ravel(),
-        "reprojection_px": reprojection.ravel(),
-        "status": status.ravel().astype(object),
-    }
-    write_table(path, pd.DataFrame(columns), SKELETON)
-
-
-PARQUET_EXPORT = ParquetExport()

@@ -14,7 +14,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from pipelines.formats.drone_logs.dji_subtitles import DjiRows, any_finite, telemetry_of_rows
+from pipelines.formats.drone_logs.dji_subtitles import DjiRows, telemetry_of_rows
+from pipelines.formats.drone_logs.telemetry_rows import DroneLog
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import Telemetry, VideoIndex
@@ -288,7 +289,7 @@ _RTK_FIXED = 50
 SHARED = "several of its pictures share a second: they are spread evenly over it: let clock.sigma_s be 1"
 
 
-class PictureTags:
+class PictureTags(DroneLog):
     """Reader of the poses of drones in the pictures of a folder, one for each picture."""
 
     name = "picture_tags"
@@ -300,20 +301,6 @@ class PictureTags:
         """Return True for a folder of pictures whose first says where it was taken."""
         files = picture_files(path) if path.is_dir() else []
         return "latitude" in (read_tags(files[0]) if files else Tags(None)).values
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe places, heights, angles and RTK."""
-        t_ns, _, columns = _columns(path)
-        ranged = [name for name in columns if any_finite(columns[name])]
-        return {
-            "times": int(np.count_nonzero(t_ns)),
-            "positions": int(np.count_nonzero(np.isfinite(columns["latitude"]))),
-            "rtk_fixed": int(np.count_nonzero(columns["rtk_flag"] == _RTK_FIXED)),
-            **{
-                name: [round(float(np.nanmin(columns[name])), 7), round(float(np.nanmax(columns[name])), 7)]
-                for name in ranged
-            },
-        }
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position, and the angles of body and gimbal, of each picture."""

@@ -91,22 +91,14 @@ def test_a_log_from_2014_as_pymavlink_reads_it() -> None:
     path = real_data("second/erle_25.bin")
     mavutil = pytest.importorskip("pymavlink.mavutil")
     theirs = mavutil.mavlink_connection(str(path))
-    stamps, fixes, turned = [], [], []
+    fixes, turned = [], []
     while (message := theirs.recv_msg()) is not None:
         kind = message.get_type()
-        stamps += [
-            getattr(message, field)
-            for field in ("T" if kind == "GPS" else "TimeMS",)
-            if field in message.get_fieldnames()
-        ]
         if kind == "ATT":
             turned.append((message.TimeMS * 1_000_000, message.Yaw))
         elif kind == "GPS" and message.Status >= 3:
             fixes.append((message.T * 1_000_000, message.Lat, message.Lng, message.Alt, message.TimeMS))
     theirs.close()
-    described = FORMAT.describe(path)
-    assert described["span_s"] == (max(stamps) - min(stamps)) / 1e3 == 212.894
-    assert described["gps_fixes"] == len(fixes)
 
     telemetry = read(path, time="boot")
     assert telemetry.dropped == {"no 3D fix": 658 - len(fixes)}

@@ -82,7 +82,7 @@ def test_a_real_record_has_the_numbers_of_its_metric_columns() -> None:
     assert [f.name for f in FORMATS.all() if f.recognises(path)] == ["dji_record"]
     telemetry = read(path)
     track = telemetry.position
-    assert len(track.t_ns) == len(rows) == FORMAT.describe(path)["rows"] == 2598
+    assert len(track.t_ns) == len(rows) == 2598
     assert (telemetry.dropped, telemetry.gimbal, track.height) == ({}, None, "take-off")
     for name, values in (("Altitude(meters)", track.values[:, 2]), ("Time(seconds)", track.t_ns / 1e9)):
         stated = np.array([float(row[name]) for row in rows])
@@ -158,7 +158,6 @@ def test_damage_is_counted(tmp_path: Path) -> None:
     telemetry = read(path)
     assert len(telemetry.position.t_ns) == 56
     assert list(telemetry.dropped.values()) == [2, 1, 1]
-    assert FORMAT.describe(path)["rows"] == 58
 
 
 def test_a_real_binary_record_is_refused_with_the_way_to_a_csv() -> None:

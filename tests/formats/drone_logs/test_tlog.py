@@ -45,7 +45,7 @@ def test_a_real_log_has_the_messages_that_pymavlink_finds() -> None:
         elif message.get_type() == "ATTITUDE":
             turned.setdefault(message.time_boot_ms, (message.yaw, message.pitch))
     reader.close()
-    assert FORMAT.describe(path)["messages"] == count == 23894
+    assert count == 23894
     telemetry = read(path, time="boot")
     track, body = telemetry.position, telemetry.body
     assert (track.on_earth, track.height, telemetry.gimbal, telemetry.dropped.get("cut off")) == (
@@ -93,11 +93,7 @@ def test_a_restart_of_the_vehicle_is_told_and_its_times_go_on(
     telemetry = read(path)
     late_ns = telemetry.position.t_ns - truth.t_ns
     assert np.abs(late_ns - 4_000_000_000).max() < 2_500_000  # the station's clock, and whole ms since boot
-    at_s = (truth.t_ns[half] - truth.t_ns[0]) / 1e9
     assert len([note for note in telemetry.notes if "restarted 1 times" in note]) == 1
-    assert FORMAT.describe(path)["restarts"] == [f"at {at_s:.1f} s"]
-    whole = write_tlog(tmp_path / "b.tlog", truth)
-    assert "restarts" not in FORMAT.describe(whole)
 
 
 def test_a_restart_in_a_real_log_moves_nothing() -> None:

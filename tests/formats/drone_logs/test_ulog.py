@@ -51,10 +51,6 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> DroneTruth:
 def test_real_logs_are_read_as_their_facts_state(name: str) -> None:
     path, told = real_data(f"logs/ulog/{name}"), facts(name)
     assert FORMAT.recognises(path)
-    described = FORMAT.describe(path)
-    assert described["messages"] == told["messages"]
-    assert described["dropouts"] == told["dropouts"]
-    assert described["topics"] == [f"{topic} {count}" for topic, count in sorted(told["topics"].items())]
     telemetry = read(path)
     assert telemetry.body is not None
     assert len(telemetry.body.t_ns) == told["attitude_samples"]
@@ -64,7 +60,8 @@ def test_real_logs_are_read_as_their_facts_state(name: str) -> None:
     if "gps_samples" in told:
         gps = read(path, position="gps")
         assert len(gps.position.t_ns) + sum(gps.dropped.values()) == told["gps_samples"]
-        assert described["first_position"] == told["gps_lat_lon_alt_first"]
+        off = np.abs(gps.position.values[0] - told["gps_lat_lon_alt_first"])
+        assert (off < [1e-6, 1e-6, 0.02]).all()  # the very first one may be no 3D fix
 
 
 def test_axes_and_times(tmp_path: Path, truth: DroneTruth) -> None:
@@ -127,7 +124,7 @@ def test_definitions_that_unfold_without_end_are_refused(tmp_path: Path) -> None
     bomb = tmp_path / "bomb.ulg"
     bomb.write_bytes(head + b"".join(ulog_record("F", text.encode()) for text in nested))
     with refuses(bomb, "fields"):
-        FORMAT.describe(bomb)
+        read(bomb)
     bomb.write_bytes(head + ulog_record("F", b"loop:loop a;"))
     with refuses(bomb, "loop"):
-        FORMAT.describe(bomb)
+        read(bomb)
