@@ -15,14 +15,10 @@ from mocap_cli.terminal import one_line, print_json, say, say_warnings, watching
 from pipelines.session.errors import DataError
 
 if TYPE_CHECKING:
-    from pipelines.drafting.matching import Answer, Ask, Question
-    from pipelines.session.description import Description
-    from pipelines.session.progress import Progress
+    from pipelines.drafting.matching import Answer, Question
 
 # More questions are not answered with care, and the report lists every assumption.
 MAX_QUESTIONS = 3
-
-MANIFEST = "flight.yaml"
 
 
 @click.command("run", short_help="Go from a folder to the verdict in one command.")
@@ -40,46 +36,37 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
     """Draft the flight.yaml of a folder, then ingest, reconstruct, replan and report the flight.
 
     A flight.yaml that is there is taken as it is. What no file tells is asked in a terminal, at most three
-    questions with the likely answer first, and assumed elsewhere. Planners are compared where the flight has
-    a map and an actor. The same command again continues: what is finished is skipped.
+    questions with the likely answer first. Elsewhere --yes takes the likely answer. Planners are compared
+    where the flight has a map and an actor. The same command again continues: what is finished is skipped.
     """
-    from pipelines.ingest import ingest
-    from pipelines.reconstruct import reconstruct
-    from pipelines.report import report
+    from pipelines.run import drafted, run
 
-    manifest = folder if folder.suffix in {".yaml", ".yml"} else folder / MANIFEST
     asks = not (yes or shown.as_json or shown.quiet) and sys.stdin.isatty() and sys.stderr.isatty()
     questions = _Questions(asks, takes=yes)
     with watching(-1 if asks else shown.level) as progress:
-        assumed = [] if manifest.exists() else _draft(folder, manifest, questions.choose, progress)
+        manifest, assumed = drafted(folder, ask=questions.choose, progress=progress)
     for remark in assumed[: questions.left]:
         questions.confirm(manifest, remark)
     with watching(shown.level) as progress:
-        ingested = ingest(manifest, progress=progress)
-        session = ingested.folder
-        result = reconstruct(session, workers=workers, progress=progress)
-        if _may_replan(ingested.description):
-            _replan(session, progress)
-        page = report(session)
-    verdict: dict[str, Any] = result.metrics["verdict"]
+        result = run(manifest, workers=workers, progress=progress)
+    verdict: dict[str, Any] = result.reconstructed.metrics["verdict"]
     if shown.as_json:
         print_json(
             {
                 "flight": str(manifest),
-                "session": str(session),
+                "session": str(result.session),
                 "assumed": assumed,
                 "verdict": verdict,
-                "page": str(page.place),
+                "page": str(result.page),
             }
         )
         return
-    say_warnings(list(dict.fromkeys([*ingested.description.warnings, *result.record.warnings])), shown.quiet)
+    say_warnings(result.warnings, shown.quiet)
     if assumed:
-        say(
-            f"{len(assumed)} assumptions, marked in {manifest}: {'; '.join(map(one_line, assumed))}", err=True
-        )
-    say(f"page: {page.place}")
-    print_verdict(verdict, session, reported=True)
+        listed = "; ".join(map(one_line, assumed))
+        say(f"{len(assumed)} assumptions, marked in {manifest}: {listed}", err=True)
+    say(f"page: {result.page}")
+    print_verdict(verdict, result.session, reported=True)
 
 
 class _Questions:
@@ -116,38 +103,3 @@ class _Questions:
                 "correct the line, take `assumed: true` away, and run the same command again",
                 code="incomplete",
             )
-
-
-def _draft(folder: Path, manifest: Path, ask: Ask, progress: Progress) -> list[str]:
-    """Write the manifest of a folder's files; return what it assumes.
-
-    Raises:
-        DataError: the folder holds no flight, or something is missing that only the user knows.
-    """
-    from pipelines.draft import draft
-
-    drafted = draft([folder], manifest, ask=ask, progress=progress)
-    progress.note(f"{manifest}: drafted, with {len(drafted.cameras)} cameras")
-    if drafted.missing:
-        raise DataError(
-            manifest,
-            f"was drafted and lacks {'; '.join(map(one_line, drafted.missing))}",
-            "write it there, where a comment marks the place, and run the same command again",
-            code="incomplete",
-        )
-    return drafted.assumed
-
-
-def _may_replan(description: Description) -> bool:
-    """Return True if a flight has what planners are compared on: a map, and somebody who was logged."""
-    return description.map is not None and description.actor is not None
-
-
-def _replan(session: Path, progress: Progress) -> None:
-    """Compare planners; note why, where the flight does not allow it."""
-    from pipelines.replan import replan
-
-    try:
-        progress.note(f"planners: {replan(session, progress=progress).metrics['verdict']}")
-    except DataError as error:
-        progress.note(f"planners were not compared: {error}")

@@ -341,8 +341,8 @@ def _pair_by_content(
 ) -> None:
     """Give videos without poses those that no camera has: by time, else by motion.
 
-    What a log has of the same name as the poses is then the camera's too. Motion also tells what the angles
-    of a gimbal are relative to.
+    What a log has of the same name as the poses is then the camera's too. Motion also tells when a
+    video began, and what the angles of a gimbal are relative to.
     """
     taken = _taken(cameras)
     likeliest: dict[object, Proposal] = {}  # of several topics of one drone
@@ -375,11 +375,25 @@ def _pair_by_content(
         if pose is not None and lenses is None and (beside := _beside_pose(pose.taken, intrinsics)):
             camera.choices["intrinsics"] = Chosen(beside[0], tuple(beside[1:]))
     for camera in cameras:
-        pose, turned, film = (camera.choices.get("pose"), camera.choices.get("gimbal"), camera.film)
-        if pose is not None and turned is not None and film is not None and camera.gimbal_reference is None:
-            fit = compare(film, pose.taken, [turned.taken])
-            if fit is not None and fit.gimbal and explains_better(fit.gain, np.zeros_like(fit.gain)):
-                camera.gimbal_reference = fit.relative_to
+        _settle_by_motion(camera, compare)
+
+
+def _settle_by_motion(camera: CameraDraft, compare: Compare) -> None:
+    """Find the start of a video with known poses, and what the angles of its gimbal are relative to."""
+    choices, film = camera.choices, camera.film
+    if film is None or "pose" not in choices or choices["pose"].start_ns is not None:
+        return
+    pose, gimbal = choices["pose"], choices.get("gimbal")
+    timed = "frame_times" in choices or pose.taken.path == film.path
+    if timed and gimbal is None:
+        return
+    alike = compare(film, pose.taken, [gimbal.taken] if gimbal else [])
+    if alike is None or not explains_better(alike.gain, np.zeros_like(alike.gain)):
+        return
+    if alike.gimbal is not None:
+        camera.gimbal_reference = alike.relative_to
+    if not timed:
+        choices["pose"] = replace(pose, start_ns=alike.start_ns)
 
 
 def _ask_for_the_rest(

@@ -1,0 +1,81 @@
+"""From the folder of a flight to its report: draft the manifest, then run every stage."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipelines.draft import draft
+from pipelines.drafting.manifest_text import one_line
+from pipelines.drafting.matching import Ask
+from pipelines.ingest import ingest
+from pipelines.reconstruct import Reconstructed, reconstruct
+from pipelines.replan import replan
+from pipelines.report import report
+from pipelines.session.errors import DataError
+from pipelines.session.progress import Progress, Silent
+
+MANIFEST = "flight.yaml"
+
+
+@dataclass(frozen=True)
+class Ran:
+    """The results of all stages of a flight."""
+
+    manifest: Path
+    assumed: list[str]  # what the manifest assumes, if it was drafted now
+    session: Path
+    reconstructed: Reconstructed
+    page: Path
+    warnings: list[str]
+
+
+def run(
+    folder: Path, *, ask: Ask = lambda _: None, workers: int = 1, progress: Progress | None = None
+) -> Ran:
+    """Draft the manifest of a folder if it has none, then ingest, reconstruct, replan and report the flight.
+
+    Planners are compared where the flight has a map and somebody who was logged. What is finished already
+    is skipped.
+
+    Args:
+        folder: the files of the flight, or its manifest.
+        ask: decides what no file tells (see `draft`).
+        workers: the number of processes; the result does not depend on it.
+
+    Raises:
+        DataError: the folder holds no flight, something is missing that only the user knows, or a stage
+            cannot do its work.
+    """
+    progress = progress or Silent()
+    manifest, assumed = drafted(folder, ask=ask, progress=progress)
+    ingested = ingest(manifest, progress=progress)
+    session, description = ingested.folder, ingested.description
+    reconstructed = reconstruct(session, workers=workers, progress=progress)
+    if description.map is not None and description.actor is not None:
+        try:
+            progress.note(f"planners: {replan(session, progress=progress).metrics['verdict']}")
+        except DataError as error:
+            progress.note(f"planners were not compared: {error}")
+    page = report(session).place
+    warnings = list(dict.fromkeys([*description.warnings, *reconstructed.record.warnings]))
+    return Ran(manifest, assumed, session, reconstructed, page, warnings)
+
+
+def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[str]]:
+    """Return the manifest of a folder, drafted if there is none, and what it assumes if it was drafted.
+
+    Raises:
+        DataError: the folder holds no flight, or something is missing that only the user knows.
+    """
+    manifest = folder if folder.suffix in {".yaml", ".yml"} else folder / MANIFEST
+    if manifest.exists():
+        return manifest, []
+    found = draft([folder], manifest, ask=ask, progress=progress)
+    progress.note(f"{manifest}: drafted, with {len(found.cameras)} cameras")
+    if found.missing:
+        raise DataError(
+            manifest,
+            f"was drafted and lacks {'; '.join(map(one_line, found.missing))}",
+            "write it there, where a comment marks the place, and run the same command again",
+            code="incomplete",
+        )
+    return manifest, found.assumed
