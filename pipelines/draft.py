@@ -31,6 +31,7 @@ from pipelines.drafting.found import (
 )
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import Ask, MotionMatch, match
+from pipelines.drafting.motion import TrackedPoints, explain_motion
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
@@ -41,19 +42,19 @@ from pipelines.formats.logs.positions import FIXES, pairs_of
 from pipelines.formats.logs.trajectories import attitudes_of, poses_of
 from pipelines.formats.poses import times_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
-from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED
-from pipelines.formats.videos.video import created_ns, followed_points, index_video
-from pipelines.geometry.arrays import Float, Int64, Intrinsics, Place, RelativeTo
-from pipelines.geometry.clocks import TrackedPoints, explain_motion
+from pipelines.formats.videos.picture_folder import FolderPictures
+from pipelines.formats.videos.video import VideoReader, created_ns, index_video
+from pipelines.geometry.arrays import Float, Int64, Place, RelativeTo
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera, level_heading
 from pipelines.geometry.poses import interpolate_points, interpolate_poses, multiply
+from pipelines.reconstruction.background_tracks import Follower
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.maps import MapSizeError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.recognition import EXPECTED, describe_unknown, recognise
-from pipelines.session.records import PoseSample
+from pipelines.session.records import SHARED_SECONDS, UNTIMED, PoseSample
 from pipelines.session.registries import (
     FORMATS,
     CalibrationFormat,
@@ -75,6 +76,15 @@ MAX_LOCAL_M = 100_000.0
 
 # One minute of a video is enough to compare its motion with logs.
 WATCHED_NS = 60_000_000_000
+
+# Motion is still visible in pictures reduced to this width.
+WATCHED_WIDTH_PX = 320
+
+# Points are lost and found again after a fifth of a second.
+STRETCH_NS = 200_000_000
+
+# Fewer points may all lie on one thing that moves.
+MIN_POINTS_OF_A_STRETCH = 12
 
 # A picture is 1.25 focal lengths wide at an ordinary angle of view, 64 deg.
 NOMINAL_FOCAL = 0.8
@@ -494,12 +504,7 @@ class _MotionComparison:
         if poses is None:
             return None
         if film.path not in self._followed:
-            index = index_video(film.path)
-            focal_px = NOMINAL_FOCAL * index.width
-            middle = (index.width - 1) / 2, (index.height - 1) / 2
-            lens = Intrinsics(index.width, index.height, focal_px, focal_px, *middle)
-            watched_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
-            self._followed[film.path] = followed_points(film.path, lens, watched_ns)
+            self._followed[film.path] = _followed_points(film.path)
         t_ns, position, body = poses
         within = np.isfinite(position).all(axis=1)
         if film.made_ns is not None and found.span and found.span.first_ns > NO_DATE_NS:
@@ -537,6 +542,42 @@ def _turned_by(gimbal: Proposal, t_ns: Int64, body: Float) -> Iterator[tuple[Rel
         yield "world", attitude
         yield "body", multiply(body, attitude)
         yield "heading", multiply(level_heading(body), attitude)
+
+
+def _followed_points(path: Path) -> TrackedPoints:
+    """Follow points through the first pictures of a video, each for a fifth of a second."""
+    import cv2
+
+    index = index_video(path)
+    pts_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
+    height = round(index.height * WATCHED_WIDTH_PX / index.width)
+    follower = Follower()
+    with FolderPictures(path) if path.is_dir() else VideoReader(path) as reader:
+        for number, picture in reader.frames(0, len(pts_ns)):
+            grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+            small = cv2.resize(grey, (WATCHED_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+            follower.step(number, np.asarray(small, np.uint8))
+    tracks = follower.tracks()
+    rays = (tracks.xy - [(WATCHED_WIDTH_PX - 1) / 2, (height - 1) / 2]) / (NOMINAL_FOCAL * WATCHED_WIDTH_PX)
+    spans, begins, ends = [], [], []
+    first = 0
+    while (last := int(np.searchsorted(pts_ns, pts_ns[first] + STRETCH_NS))) < len(pts_ns):
+        rows = [slice(*np.searchsorted(tracks.picture, (k, k + 1))) for k in (first, last)]
+        _, begin, end = np.intersect1d(*(tracks.point[each] for each in rows), return_indices=True)
+        if len(begin) >= MIN_POINTS_OF_A_STRETCH:
+            spans.append((first, last))
+            begins.append(rays[rows[0]][begin])
+            ends.append(rays[rows[1]][end])
+        first = last
+    pictures = np.array(spans, np.int64).reshape(-1, 2)
+    nothing = np.zeros((0, 2))
+    return TrackedPoints(
+        pts_ns[pictures[:, 0]],
+        pts_ns[pictures[:, 1]],
+        np.repeat(np.arange(len(begins)), [len(points) for points in begins]),
+        np.concatenate([nothing, *begins]),
+        np.concatenate([nothing, *ends]),
+    )
 
 
 def _poses_in(found: Proposal) -> tuple[Int64, Float, Float] | None:

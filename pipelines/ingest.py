@@ -206,9 +206,7 @@ class _FlightReader:
         self._logs = FlightLogs(flight, base, note)
         self._files = FlightFiles(flight, flight_path)
         self._poses = FlightPoses(flight, flight_path, self._logs, self._files, max_gap_ns=gap_ns, note=note)
-        self._cameras = FlightCameras(
-            flight_path, self._logs, self._files, self._poses, max_gap_ns=gap_ns, note=note
-        )
+        self._cameras = FlightCameras(flight_path, self._logs, self._files, self._poses.triggers, note)
         self.map_box: tuple[Float, Float] | None = None  # of the first map, once it is stored
 
     def __enter__(self) -> Self:
@@ -281,7 +279,7 @@ class _FlightReader:
                 detections = in_pixels(detections, intrinsics, camera.keypoints.file)
                 detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics)
             detections = near_picture(detections, intrinsics)
-        frames = self._cameras.frames(name, camera, video, detections, intrinsics)
+        frames = self._cameras.frames(name, camera, video, detections)
         trajectory = self._poses.trajectory(name, camera, frames)
         if camera.pose_noise:
             noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", camera.pose_noise)

@@ -42,8 +42,8 @@ from pipelines.drafting.found import (
     order,
     unique,
 )
+from pipelines.drafting.motion import explains_better
 from pipelines.geometry.arrays import Float, RelativeTo
-from pipelines.geometry.clocks import explains_better
 
 # Two receivers on one drone state places that differ by less, m.
 SAME_DRONE_M = 30.0

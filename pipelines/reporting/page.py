@@ -1,17 +1,10 @@
-"""The pages: of one session, and the table of many flights, each as one self-contained file.
-
-A page is a list of sections, and a section is a list of blocks: texts, tables, figures, lists and what is
-folded away. One template shows them all.
-"""
+"""The pages: of one session, and the table of many flights, each as one self-contained file."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from importlib.resources import files
+from dataclasses import dataclass
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -22,6 +15,7 @@ from pipelines.reporting.arms import Replan, draw_arms, summarise_replan
 from pipelines.reporting.chart import MOST_BINS, Figure
 from pipelines.reporting.content import SessionContent, as_reconstructed, items, number, section, text
 from pipelines.reporting.figures import draw_all
+from pipelines.reporting.layout import Block, Bullets, Fold, Page, Section
 from pipelines.reporting.overlays import ReadFrame, collect_moments, residuals_over_time
 from pipelines.reporting.pictures import Video, draw_overlays, make_strips, panel_source, panel_width
 from pipelines.reporting.studies import draw_study, study_blocks
@@ -35,77 +29,8 @@ from pipelines.reporting.summary import (
     table_of_quality,
     tables_of_errors,
 )
-from pipelines.reporting.viewer import ViewerScene, make_scene
+from pipelines.reporting.viewer import make_scene
 from pipelines.reporting.wording import Column, Table, environment
-
-
-@dataclass(frozen=True)
-class Fold:
-    """Blocks that a click unfolds."""
-
-    title: str
-    blocks: Sequence[Block]
-
-
-@dataclass(frozen=True)
-class Bullets:
-    """A list: sentences, by how much they matter: `wrong`, `doubt` or `note`."""
-
-    sentences: Sequence[tuple[str, str]]
-
-
-Block = str | Table | Figure | Fold | Bullets
-"""Part of a section; a `Markup` is shown as it is, another text as a paragraph."""
-
-
-@dataclass(frozen=True)
-class Section:
-    """Part of a page; sections of another `tab` than the first one are shown when it is chosen."""
-
-    key: str
-    title: str
-    blocks: Sequence[Block]
-    lead: str = ""
-    tab: str = ""
-
-
-@dataclass(frozen=True)
-class Page:
-    """All that a page shows."""
-
-    generator: str  # of the page; it marks pages of ours, which may be overwritten
-    kicker: str
-    title: str
-    sections: Sequence[Section]
-    facts: Sequence[str] = ()
-    footer: str = ""
-    scene: ViewerScene | None = None
-    pictures: bool = field(default=False)  # whether the page holds any
-
-    def render(self) -> str:
-        """Return the complete HTML.
-
-        The same page gives the same bytes. All text is escaped. The page loads nothing; it runs the one
-        script of its 3D viewer if it has one, which its policy names by hash, and nothing else.
-        """
-        script = (files("pipelines.reporting") / "templates" / "viewer.js").read_text(encoding="utf-8")
-        rules = ["default-src 'none'", "style-src 'unsafe-inline'"]
-        if self.scene is not None:
-            digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-            rules.append(f"script-src 'sha256-{digest}'")
-        rules += ["img-src data:"] * self.pictures
-        sections = [section for section in self.sections if section.blocks or section.lead]
-        return (
-            environment()
-            .get_template("page.html.j2")
-            .render(
-                page=self,
-                sections=sections,
-                tabs=list(dict.fromkeys(section.tab for section in sections)),
-                policy="; ".join(rules),
-                script=Markup(script),  # noqa: S704 - our own file
-            )
-        )
 
 
 def _template(name: str, **context: object) -> Markup:

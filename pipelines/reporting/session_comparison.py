@@ -38,7 +38,7 @@ from pipelines.reporting.chart import (
     time_bins,
 )
 from pipelines.reporting.content import SessionContent, middles, section, text
-from pipelines.reporting.page import Block, Bullets, Page, Section
+from pipelines.reporting.layout import Block, Bullets, Page, Section
 from pipelines.reporting.summary import Summary, doubts_of_flight, summarise
 from pipelines.reporting.wording import (
     ABSENT,

@@ -228,8 +228,8 @@ class FrameTimes(FileSource):
     needs_file = False
     start_ns: SecondsAsNs = Field(0, alias="start")
     """Time of the first picture, s."""
-    start_from: Literal["container", "motion"] | None = None
-    """Source of the time of the first picture: the video's metadata, or the motion in the pictures."""
+    start_from: Literal["container"] | None = None
+    """Source of the time of the first picture: the video's metadata."""
     fps: Fps | None = None
     """Frame rate, which replaces the stamps of the video: 30, 29.97 or 30000/1001."""
 
@@ -408,13 +408,6 @@ class CameraSources(YamlModel):
             raise ValueError("pose is of the body: say how the camera sits on it with `mount` or `gimbal`")
         if self.pose.of == "camera" and self.is_carried:
             raise ValueError("a mount or gimbal needs the pose of the body: add `of: body` to `pose`")
-        times = self.frame_times
-        found = times is not None and times.start_from == "motion" and not times.has_start
-        if found and self.clock is not None and self.clock.offset_ns:
-            raise ValueError(
-                "clock.offset_s: start_from: motion finds the start in world time: leave the offset out, or"
-                " state the start that it is added to"
-            )
         return self
 
     @property

@@ -223,6 +223,10 @@ class PictureSample:
 Sample = PoseSample | AngleSample | IntrinsicsSample | PictureSample
 
 
+UNTIMED, SHARED_SECONDS = "pictures without times", "pictures of whole seconds"
+"""Codecs of pictures that have no times of their own, and of those whose times are spread over a second."""
+
+
 @dataclass(frozen=True)
 class VideoIndex:
     """Presentation times of the frames of a video. Frame k is the k-th in presentation order, from 0.

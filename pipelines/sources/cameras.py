@@ -5,20 +5,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
-from pipelines.formats.videos.picture_folder import SHARED_SECONDS, UNTIMED, taken_ns
-from pipelines.formats.videos.video import black_bars, created_ns, followed_points
+from pipelines.formats.videos.picture_folder import taken_ns
+from pipelines.formats.videos.video import black_bars, created_ns
 from pipelines.geometry.arrays import Int64, Intrinsics
 from pipelines.geometry.cameras import fit_to_size, is_resized
-from pipelines.geometry.clocks import fit_start
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import CameraSources, FrameTimes, IntrinsicsSource
-from pipelines.session.records import Detections, Trajectory, VideoIndex
+from pipelines.session.records import SHARED_SECONDS, UNTIMED, Detections, VideoIndex
 from pipelines.session.urls import media_path
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs, Frames
@@ -26,9 +24,6 @@ from pipelines.sources.parts import CameraFrames
 
 # So many frames last 18 hours at 30 Hz: a larger number was misread from a date.
 MAX_FRAMES = 2_000_000
-
-# Two minutes of a video determine when it began.
-WATCHED_NS = 120 * 10**9
 
 # Of half the picture's size: cameras' principal points lie nearer to the middle (a few per cent), while
 # pictures of another usual size (3/4, 2/3, 1/2 of it) have their middle further off.
@@ -42,25 +37,15 @@ MAX_SHARE_BEYOND = 0.2
 MAX_SHARE_OUTSIDE = 0.5
 
 
-class PosesOfCameras(Protocol):
-    """Reader of the poses of cameras, for videos whose start is estimated, and of trigger times."""
-
-    def is_still(self, camera: CameraSources) -> bool:
-        """Return True for a camera that stands still."""
-
-    def trajectory(self, name: str, camera: CameraSources, frames: CameraFrames | None) -> Trajectory:
-        """Read world_from_camera over time."""
-
-    def triggers(self, times: FrameTimes) -> Int64 | None:
-        """Read the trigger times of pictures from a drone's own log, at world times; None if it is none."""
+TriggerTimes = Callable[[FrameTimes], Int64 | None]
+"""Reader of the trigger times of pictures in a drone's own log, at world times; None if it is none."""
 
 
 class FlightCameras:
     """Reader of the frame times and the intrinsics of one flight.
 
     Args:
-        poses: read the poses of a camera, and trigger times from a drone's own log.
-        max_gap_ns: the longest gap between two poses that is interpolated.
+        triggers: reads trigger times from a drone's own log.
         note: receives each choice and each doubt, one line each.
     """
 
@@ -69,46 +54,29 @@ class FlightCameras:
         manifest: Path,
         logs: FlightLogs,
         files: FlightFiles,
-        poses: PosesOfCameras,
-        *,
-        max_gap_ns: int,
+        triggers: TriggerTimes,
         note: Callable[[str], None],
     ) -> None:
         self._manifest = manifest
         self._base = manifest.parent
         self._logs = logs
         self._files = files
-        self._poses = poses
-        self._max_gap_ns = max_gap_ns
+        self._triggers = triggers
         self._note = note
 
     # --- frame times -----------------------------------------------------------------------------------
 
     def frames(
-        self,
-        name: str,
-        camera: CameraSources,
-        video: VideoIndex | None,
-        detections: Detections | None,
-        intrinsics: Intrinsics,
+        self, name: str, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
     ) -> CameraFrames:
         """Read the time at which each picture was taken.
 
         The source is the one that the manifest states: `fps` from `start` on, a file or topic of frame times,
         the stamps of pictures in a log, or the container's own stamps from `start` on. The offset of the
-        camera's clock is added. If the start is estimated by motion, it is the time at which the motion in
-        the pictures fits the poses. That is world time, so no offset is added. A stated start, with the
-        offset, then only says where to search.
-
-        Raises:
-            DataError: there is no source of frame times, or it is unusable.
+        camera's clock is added. DataError: there is no source of frame times, or it is unusable.
         """
         offset_ns = camera.clock.offset_ns if camera.clock else 0
         unclocked = self._unclocked_frames(name, camera, video, detections)
-        times = camera.frame_times
-        if times is not None and times.start_from == "motion":
-            near_ns = times.start_ns + offset_ns if times.has_start else None
-            return self._started_by_motion(name, camera, unclocked, intrinsics, near_ns)
         return replace(unclocked, t_ns=unclocked.t_ns + offset_ns)
 
     def _unclocked_frames(
@@ -129,7 +97,7 @@ class FlightCameras:
             stamped = self._logs.frames(times.file, times.topic)
             return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
         if times.file:
-            triggered = self._poses.triggers(times)
+            triggered = self._triggers(times)
             if triggered is not None:
                 return self._frames_by_stamps(triggered, {}, pictures)
             return self._frames_of_file(self._files.path(times.file), pictures)
@@ -152,7 +120,7 @@ class FlightCameras:
             )
         if logged is None:
             return replace(pictures, t_ns=self._start_ns(name, camera, times) + pictures.pts_ns)
-        if times.has_start or times.start_from == "container":
+        if times.has_start or times.start_from:
             key = "start" if times.has_start else "start_from"
             problem = f"cameras.{name}.frame_times: {key} has no use, the log stamps its pictures"
             remedy = "leave it out, or correct the log's clock with logs: {...: {clock: ...}}"
@@ -191,8 +159,6 @@ class FlightCameras:
 
     def _start_ns(self, name: str, camera: CameraSources, times: FrameTimes) -> int:
         """Return the start of a video that has stamps of its own."""
-        if times.start_from == "motion":
-            return 0  # estimated later, from the pictures and the poses
         if times.start_from is None:
             return times.start_ns
         path = self._files.video_file(camera)
@@ -207,43 +173,6 @@ class FlightCameras:
                 " say clock: {sigma_s: 1}"
             )
         return times.start_ns + made_ns
-
-    def _started_by_motion(
-        self,
-        name: str,
-        camera: CameraSources,
-        frames: CameraFrames,
-        intrinsics: Intrinsics,
-        near_ns: int | None,
-    ) -> CameraFrames:
-        """Shift the frames of a video in time so that the motion in its pictures fits the poses."""
-        place = f"{self._manifest}: cameras.{name}.frame_times"
-        remedy = "say start: SECONDS instead, or give the stamps of a log"
-        video = self._files.video_file(camera)
-        if video is None or self._poses.is_still(camera):
-            raise DataError(
-                place, "start_from: motion needs a video and poses that move", remedy, code="no-pictures"
-            )
-        poses = self._poses.trajectory(name, camera, None)
-        some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + WATCHED_NS))
-        try:
-            fit = fit_start(
-                poses.t_ns,
-                poses.position,
-                poses.quaternion_xyzw,
-                followed_points(video, intrinsics, frames.pts_ns[:some]),
-                max_gap_ns=self._max_gap_ns,
-                near_ns=near_ns,
-            )
-        except ValueError as error:
-            problem = f"its pictures do not say when the video began: {error}"
-            raise DataError(place, problem, remedy, code="clock-unknown") from None
-        self._note(
-            f"{name}: its video begins at {fit.start_ns / 1e9:.3f} s +- {1e3 * fit.sigma_s:.1f} ms, by the"
-            f" motion in its pictures (points move by {1e3 * fit.moved:.2g} mrad in a fifth of a second, and"
-            f" end {1e3 * fit.beside:.2g} mrad from where the poses lead them)"
-        )
-        return replace(frames, t_ns=fit.start_ns + frames.pts_ns, start_sigma_s=fit.sigma_s)
 
     def _frames_by_stamps(
         self, t_ns: Int64, dropped: dict[str, int], pictures: CameraFrames | None

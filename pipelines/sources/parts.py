@@ -57,7 +57,6 @@ class CameraFrames:
     pts_ns: Int64  # [F] since the first picture of the video
     topic: str | None = None  # the topic of the log that holds the pictures themselves
     dropped: dict[str, int] = field(default_factory=dict)  # pictures that were left out, by cause
-    start_sigma_s: float = 0.0  # sigma of the common offset of all times, if it was estimated
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ def camera_entry(
         keypoints=_keypoints_entry(camera, data),
         clock=ClockEntry(
             offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
-            sigma_s=_clock_sigma_s(camera, frames),
+            sigma_s=camera.clock.sigma_s if camera.clock else 0.0,
             start=_clock_start(camera, frames),
         ),
         log_clock=LogClockEntry(**asdict(data.log_clock)) if data.log_clock else None,
@@ -228,14 +227,6 @@ def _keypoints_entry(camera: CameraSources, data: CameraData) -> KeypointsEntry 
         adjusted=detections.adjusted,
         mirrored=camera.keypoints.mirrored,
     )
-
-
-def _clock_sigma_s(camera: CameraSources, frames: CameraFrames) -> float:
-    """Return the clock sigma of the manifest; one estimated by motion comes before the manifest's default."""
-    clock = camera.clock
-    if clock is None or (frames.start_sigma_s and "sigma_s" not in clock.model_fields_set):
-        return frames.start_sigma_s
-    return clock.sigma_s
 
 
 def _clock_start(camera: CameraSources, frames: CameraFrames) -> Literal["stated", "assumed", "none"]:

@@ -135,13 +135,13 @@ class FlightPoses:
 
     # --- cameras ---------------------------------------------------------------------------------------
 
-    def trajectory(self, name: str, camera: CameraSources, frames: CameraFrames | None) -> Trajectory:
+    def trajectory(self, name: str, camera: CameraSources, frames: CameraFrames) -> Trajectory:
         """Read world_from_camera over time; a static camera has one row, at its first frame.
 
         Args:
             name: name of the camera.
             camera: its description.
-            frames: times of its pictures; None if they follow from the poses.
+            frames: times of its pictures.
 
         Raises:
             DataError: nothing usable, or the manifest does not state the camera's mount on the body.
@@ -149,7 +149,7 @@ class FlightPoses:
         pose = camera.pose
         if self.is_still(camera):
             source, still = self._stated_poses(name, camera)
-            first_ns = int(frames.t_ns[0]) if frames is not None else 0
+            first_ns = int(frames.t_ns[0])
             placed = in_world(self._local(source, still), pose.world_from_source)
             return replace(placed, t_ns=np.array([first_ns]))
         angles = self._stated_angles(name, camera.gimbal)

@@ -192,7 +192,7 @@ def test_true_poses_that_are_left_out_are_counted(flight: SyntheticFlight, tmp_p
     [
         ({"fps": 30, "file": "a.csv"}, "file, fps"),
         ({"start": 0, "file": "a.srt"}, "file, start"),
-        ({"start_from": "motion", "file": "d1.bin"}, "file, start_from"),
+        ({"start_from": "container", "file": "d1.bin"}, "file, start_from"),
     ],
 )
 def test_frame_times_from_several_places_are_refused(

@@ -19,7 +19,6 @@ from pipelines.session.records import Detections
 from pipelines.sources.cameras import FlightCameras
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
-from pipelines.sources.poses import FlightPoses
 from tests.commands.runner import refused, succeeds
 from tests.synthetic.flights import LENS, SyntheticFlight, write_flight
 
@@ -38,8 +37,7 @@ def check(xy: Float, confidence: Float) -> None:
         FlightFiles(flight, Path()),
         FlightLogs(flight, Path(), print),
     )
-    poses = FlightPoses(flight, manifest, logs, files, max_gap_ns=0, note=print)
-    cameras = FlightCameras(manifest, logs, files, poses, max_gap_ns=0, note=print)
+    cameras = FlightCameras(manifest, logs, files, lambda _: None, print)
     number = np.arange(len(xy))
     seen = Detections(("nose",), number, number * 0, xy[:, None], confidence[:, None], number)
     cameras.intrinsics("drone1", CAMERA, None, seen)

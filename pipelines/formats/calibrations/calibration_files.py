@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.formats.calibrations.camera_matrices import (
-    CalibrationFile,
+    describe_cameras,
     intrinsics,
     invert_matrix,
     invert_rodrigues,
     unstated_size,
 )
-from pipelines.formats.common.files import numbers, read_yaml
+from pipelines.formats.common.files import numbers, read_head, read_yaml
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
@@ -30,6 +30,29 @@ _YAML = (".yaml", ".yml")
 _WRITE_AGAIN = "write the calibration again"
 # ROS's and OpenCV's names of a fisheye.
 _FISHEYE = {"equidistant", "fisheye"}
+
+
+@dataclass(frozen=True)
+class CalibrationFile:
+    """Reader of the cameras of a file: `is_known` recognises its beginning, `read` returns them by name."""
+
+    name: str
+    title: str
+    suffixes: tuple[str, ...]
+    is_known: Callable[[str], bool]
+    read: Callable[[Path], Cameras]
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if the file begins as such files do."""
+        return self.is_known(read_head(path, self.suffixes))
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe every camera."""
+        return describe_cameras(self.read(path))
+
+    def read_calibration(self, path: Path) -> Cameras:
+        """Read every camera."""
+        return self.read(path)
 
 
 def _has_keys(head: str, keys: Sequence[str]) -> bool:

@@ -6,13 +6,11 @@ Readers of files that count otherwise (COLMAP) shift (cx, cy) before.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.files import read_head
 from pipelines.geometry.arrays import DistortionModel, Float, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
@@ -110,29 +108,6 @@ def invert_matrix(source: Path, camera: str, rotation: Float, translation: Float
     if not is_rotation:
         raise DataError(source, f"camera {camera}: R is not a rotation matrix")
     return invert_pose(source, camera, Rotation.from_matrix(rotation).as_quat(), translation)
-
-
-@dataclass(frozen=True)
-class CalibrationFile:
-    """Reader of the cameras of a file: `is_known` recognises its beginning, `read` returns them by name."""
-
-    name: str
-    title: str
-    suffixes: tuple[str, ...]
-    is_known: Callable[[str], bool]
-    read: Callable[[Path], dict[str, CalibratedCamera]]
-
-    def recognises(self, path: Path) -> bool:
-        """Return True if the file begins as such files do."""
-        return self.is_known(read_head(path, self.suffixes))
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe every camera."""
-        return describe_cameras(self.read(path))
-
-    def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
-        """Read every camera."""
-        return self.read(path)
 
 
 def describe_cameras(cameras: dict[str, CalibratedCamera]) -> dict[str, object]:

@@ -8,7 +8,8 @@ comes from a message without a header stamp: it has only the time of its receipt
 import base64
 import operator
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.camera_matrices import intrinsics
-from pipelines.geometry.arrays import Float, Intrinsics
+from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.clocks import ClockStep, find_steps, fit_clock, without_steps
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
     AngleSample,
@@ -31,6 +33,8 @@ from pipelines.session.records import (
 Kind = Literal["poses", "transforms", "angles", "intrinsics", "pictures"]
 Stamps = Literal["header", "receive"]
 Source = Path | str
+Edge = tuple[str, str]
+"""Target and source of a transform."""
 
 # Larger stamps (after the year 2116) are no times, and their differences would not fit int64.
 LATEST_NS = 2**62
@@ -377,3 +381,67 @@ _READERS: dict[str, tuple[Kind, _Reader]] = {
     **{f"foxglove.{name}": reader for name, reader in _FOXGLOVE_READERS.items()},
     **{f"foxglove_msgs/msg/{name}": reader for name, reader in _FOXGLOVE_READERS.items()},
 }
+
+
+# --- numbers of one body -------------------------------------------------------------------------------
+
+# Transport and decoding take less than this between the header and the receive stamp.
+_MAY_DISAGREE_S = 0.5
+# A clock that jumps by more between two messages is named.
+_MAY_JUMP_S = 1.0
+# More jumps than this are counted and not listed.
+_MOST_JUMPS = 5
+
+
+@dataclass(frozen=True)
+class LoggedRows:
+    """Numbers of one body as logged, in the order of receipt, with both stamps of each row."""
+
+    header_ns: Int64  # [N]; 0 without one
+    receive_ns: Int64  # [N]
+    values: Float  # [N, W]; of poses position, then quaternion xyzw
+    covariance: Float | None = None  # [N, 36], for poses that have one
+    frames: Edge = ("", "")  # as the log names them; empty if it names none
+
+    @cached_property
+    def steps(self) -> list[ClockStep]:
+        """Steps of the header's clock."""
+        return find_steps(self.header_ns, self.receive_ns)
+
+    def times(self, stamps: Stamps) -> Int64:
+        """Return the stamps asked for [N], without steps; without a header stamp, that of receipt."""
+        if stamps == "receive":
+            return self.receive_ns
+        header_ns = without_steps(self.header_ns, self.steps)
+        return np.where(header_ns == 0, self.receive_ns, header_ns)
+
+    def notes(self, place: Source, stamps: Stamps) -> list[str]:
+        """Describe steps of the header's clock that are used, and how header and receipt disagree."""
+        notes = [str(step) for step in self.steps if stamps == "header"]
+        (stamped,) = np.nonzero(self.header_ns)
+        used = f"{stamps} stamps are used"
+        if without := len(self.header_ns) - len(stamped):
+            notes.append(
+                f"{without} of {len(self.header_ns)} messages have no header stamp, their time of receipt is"
+                " taken"
+            )
+        header_ns, receive_ns = without_steps(self.header_ns, self.steps)[stamped], self.receive_ns[stamped]
+        lead_s = (header_ns - receive_ns) / 1e9
+        if disagreeing := int(np.count_nonzero(np.abs(lead_s) > _MAY_DISAGREE_S)):
+            largest_s = float(lead_s[np.argmax(np.abs(lead_s))])
+            notes.append(
+                f"header and receive stamps disagree by up to {largest_s:.3g} s in"
+                f" {disagreeing} of {len(self.header_ns)} messages; {used}"
+            )
+        jumps_s = np.diff(lead_s)
+        jumps = np.flatnonzero(np.abs(jumps_s) > _MAY_JUMP_S)[:_MOST_JUMPS].tolist()
+        notes += [
+            f"the clock jumps by {jumps_s[k]:.3g} s at {header_ns[k + 1] / 1e9:.3f} s; {used}" for k in jumps
+        ]
+        drift = fit_clock(receive_ns, header_ns) if lead_s.any() and not jumps else None
+        if drift is not None and drift.drift_ppm:
+            notes.append(
+                f"header stamps drift {drift.drift_ppm:.1f} ppm (+- {drift.drift_sigma_ppm:.1g}) against"
+                f" those of receipt; {used}, not corrected (logs: clock: drift_ppm does)"
+            )
+        return [f"{place}: {note}" for note in notes]

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import attitude_track, position_track
-from pipelines.formats.logs.messages import FAULTS, Stamps, nanoseconds, unreadable
-from pipelines.formats.logs.trajectories import LoggedRows
+from pipelines.formats.logs.messages import FAULTS, LoggedRows, Stamps, nanoseconds, unreadable
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes

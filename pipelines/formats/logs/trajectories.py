@@ -9,7 +9,6 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -17,6 +16,9 @@ from typing import Literal
 import numpy as np
 
 from pipelines.formats.logs.messages import (
+    Edge,
+    LoggedRows,
+    Source,
     Stamps,
     all_samples,
     kind_of,
@@ -24,16 +26,12 @@ from pipelines.formats.logs.messages import (
 )
 from pipelines.formats.logs.recordings import LogPart, OpenLog, open_parts
 from pipelines.formats.poses import clean_poses
-from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.arrays import Int64
 from pipelines.geometry.clocks import (
     MAX_STEP_S,
-    ClockStep,
     StampGap,
     find_gaps,
-    find_steps,
-    fit_clock,
     time_passed,
-    without_steps,
 )
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.geometry.poses import Link, chain, continuous_signs, find_route, pose_covariance_in_body
@@ -41,16 +39,6 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import AngleSample, PoseSample, Sample, Trajectory
 from pipelines.session.registries import Log
 
-Source = Path | str
-Edge = tuple[str, str]
-"""Target and source of a transform."""
-
-# Transport and decoding take less than this between the header and the receive stamp.
-_MAY_DISAGREE_S = 0.5
-# A clock that jumps by more between two messages is named.
-_MAY_JUMP_S = 1.0
-# More jumps than this are counted and not listed.
-_MOST_JUMPS = 5
 # Rounding to single precision changes positions and quaternions by less than this.
 _SAME_VALUE = 1e-6
 _FIXED_FRAMES = ("world", "map", "odom", "earth")  # names of fixed frames in REP 105
@@ -68,75 +56,22 @@ class Gathered:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class LoggedRows:
-    """Numbers of one body as logged, in the order of receipt, with both stamps of each row."""
-
-    header_ns: Int64  # [N]; 0 without one
-    receive_ns: Int64  # [N]
-    values: Float  # [N, W]; of poses position, then quaternion xyzw
-    covariance: Float | None = None  # [N, 36], for poses that have one
-    frames: Edge = ("", "")  # as the log names them; empty if it names none
-
-    @cached_property
-    def steps(self) -> list[ClockStep]:
-        """Steps of the header's clock."""
-        return find_steps(self.header_ns, self.receive_ns)
-
-    def times(self, stamps: Stamps) -> Int64:
-        """Return the stamps asked for [N], without steps; without a header stamp, that of receipt."""
-        if stamps == "receive":
-            return self.receive_ns
-        header_ns = without_steps(self.header_ns, self.steps)
-        return np.where(header_ns == 0, self.receive_ns, header_ns)
-
-    def notes(self, place: Source, stamps: Stamps) -> list[str]:
-        """Describe steps of the header's clock that are used, and how header and receipt disagree."""
-        notes = [str(step) for step in self.steps if stamps == "header"]
-        (stamped,) = np.nonzero(self.header_ns)
-        used = f"{stamps} stamps are used"
-        if without := len(self.header_ns) - len(stamped):
-            notes.append(
-                f"{without} of {len(self.header_ns)} messages have no header stamp, their time of receipt is"
-                " taken"
-            )
-        header_ns, receive_ns = without_steps(self.header_ns, self.steps)[stamped], self.receive_ns[stamped]
-        lead_s = (header_ns - receive_ns) / 1e9
-        if disagreeing := int(np.count_nonzero(np.abs(lead_s) > _MAY_DISAGREE_S)):
-            largest_s = float(lead_s[np.argmax(np.abs(lead_s))])
-            notes.append(
-                f"header and receive stamps disagree by up to {largest_s:.3g} s in"
-                f" {disagreeing} of {len(self.header_ns)} messages; {used}"
-            )
-        jumps_s = np.diff(lead_s)
-        jumps = np.flatnonzero(np.abs(jumps_s) > _MAY_JUMP_S)[:_MOST_JUMPS].tolist()
-        notes += [
-            f"the clock jumps by {jumps_s[k]:.3g} s at {header_ns[k + 1] / 1e9:.3f} s; {used}" for k in jumps
-        ]
-        drift = fit_clock(receive_ns, header_ns) if lead_s.any() and not jumps else None
-        if drift is not None and drift.drift_ppm:
-            notes.append(
-                f"header stamps drift {drift.drift_ppm:.1f} ppm (+- {drift.drift_sigma_ppm:.1g}) against"
-                f" those of receipt; {used}, not corrected (logs: clock: drift_ppm does)"
-            )
-        return [f"{place}: {note}" for note in notes]
-
-    def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
-        """Return the poses, cleaned, with covariances whose rotation is in the body's axes."""
-        covariance = self.covariance
-        if covariance is not None and not covariance.any():
-            covariance = None  # zero throughout means unknown
-        poses = clean_poses(
-            source,
-            self.times(stamps),
-            np.ones(len(self.header_ns), dtype=np.bool_),
-            self.values[:, :3],
-            self.values[:, 3:],
-            None if covariance is None else covariance.reshape(-1, 6, 6),
-        )
-        if poses.covariance is None:
-            return poses
-        return replace(poses, covariance=pose_covariance_in_body(poses.covariance, poses.quaternion_xyzw))
+def trajectory_of(rows: LoggedRows, source: Source, stamps: Stamps) -> Trajectory:
+    """Return the poses, cleaned, with covariances whose rotation is in the body's axes."""
+    covariance = rows.covariance
+    if covariance is not None and not covariance.any():
+        covariance = None  # zero throughout means unknown
+    poses = clean_poses(
+        source,
+        rows.times(stamps),
+        np.ones(len(rows.header_ns), dtype=np.bool_),
+        rows.values[:, :3],
+        rows.values[:, 3:],
+        None if covariance is None else covariance.reshape(-1, 6, 6),
+    )
+    if poses.covariance is None:
+        return poses
+    return replace(poses, covariance=pose_covariance_in_body(poses.covariance, poses.quaternion_xyzw))
 
 
 @dataclass(frozen=True)
@@ -192,7 +127,7 @@ def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gath
     """
     place = f"{source} {topic}"
     rows = logged_poses(all_samples(recording.messages([topic]), source), place)
-    return Gathered(rows.trajectory(place, stamps), rows.frames, tuple(rows.notes(place, stamps)))
+    return Gathered(trajectory_of(rows, place, stamps), rows.frames, tuple(rows.notes(place, stamps)))
 
 
 def logged_poses(samples: Iterable[Sample], source: Source) -> LoggedRows:
@@ -311,7 +246,7 @@ def chained(
             rows = _published_values(
                 [log[edge] for log in (transforms.static, transforms.moving) if edge in log]
             )
-        poses = rows.trajectory(f"{source}: {_named(edge)}", stamps)
+        poses = trajectory_of(rows, f"{source}: {_named(edge)}", stamps)
         links[edge] = Link(poses.t_ns, poses.position, poses.quaternion_xyzw, is_static)
         if is_static and len(poses.t_ns) > 1:
             apart_m = float(np.linalg.norm(np.diff(poses.position, axis=0), axis=1).max())

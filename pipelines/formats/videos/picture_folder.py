@@ -18,7 +18,7 @@ from pipelines.formats.drone_logs.dji_subtitles import DjiRows, telemetry_of_row
 from pipelines.formats.drone_logs.telemetry_rows import DroneLog
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.session.errors import DataError
-from pipelines.session.records import Telemetry, VideoIndex
+from pipelines.session.records import SHARED_SECONDS, UNTIMED, Telemetry, VideoIndex
 from pipelines.session.registries import TelemetryChoice
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -163,10 +163,6 @@ def _from_gps(gps: Mapping[int, Any]) -> dict[str, float]:
 
 # A larger size in a header is damage and would exhaust the memory, as in videos.
 _MOST_PIXELS = 1 << 27
-UNTIMED = "pictures without times"
-"""Codec of an index whose stamps only count the pictures, because EXIF has no times or they do not rise."""
-SHARED_SECONDS = "pictures of whole seconds"
-"""Codec of an index with several pictures in each second of EXIF, which are spread evenly over it."""
 _SAID = {
     UNTIMED: "none in EXIF",
     SHARED_SECONDS: "EXIF, whole seconds; pictures of one second are spread evenly over it",

@@ -18,6 +18,7 @@ from pipelines.formats.logs.trajectories import (
     attitudes_of,
     chained,
     logged_poses,
+    trajectory_of,
     transforms_of,
 )
 from pipelines.geometry.poses import matrix_from_quaternion
@@ -30,9 +31,9 @@ EPOCH = 1_700_000_000 * S
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
-def trajectory_of(samples: Iterable[Sample], source: Source, *, stamps: Stamps) -> Gathered:
+def gathered_from(samples: Iterable[Sample], source: Source, *, stamps: Stamps) -> Gathered:
     rows = logged_poses(samples, source)
-    return Gathered(rows.trajectory(source, stamps), rows.frames, tuple(rows.notes(source, stamps)))
+    return Gathered(trajectory_of(rows, source, stamps), rows.frames, tuple(rows.notes(source, stamps)))
 
 
 def flown(
@@ -46,8 +47,8 @@ def flown(
 
 
 def test_the_stamp_of_header_or_of_receipt() -> None:
-    header = trajectory_of(flown(), "d1", stamps="header")
-    receive = trajectory_of(flown(), "d1", stamps="receive")
+    header = gathered_from(flown(), "d1", stamps="header")
+    receive = gathered_from(flown(), "d1", stamps="receive")
     np.testing.assert_array_equal(header.trajectory.t_ns, EPOCH + np.arange(10) * S // 10)
     np.testing.assert_array_equal(receive.trajectory.t_ns - header.trajectory.t_ns, 2_000_000)
     np.testing.assert_allclose(header.trajectory.position[:, 0], np.arange(10) / 10, atol=1e-15)
@@ -59,7 +60,7 @@ def test_the_stamp_of_header_or_of_receipt() -> None:
 def test_a_missing_header_stamp_takes_the_one_of_receipt_and_is_counted() -> None:
     stated = flown()
     stated[3:5] = [replace(sample, stamp_ns=0) for sample in stated[3:5]]
-    found = trajectory_of(stated, "d1", stamps="header")
+    found = gathered_from(stated, "d1", stamps="header")
     assert found.trajectory.t_ns[3] == stated[3].receive_ns
     assert ["2 of 10" in note for note in found.notes] == [True]
 
@@ -69,7 +70,7 @@ def test_a_clock_jump_is_told_with_its_place_and_size(jump_s: float) -> None:
     stated = flown(20)
     stated[12:] = [replace(sample, stamp_ns=sample.stamp_ns + round(jump_s * S)) for sample in stated[12:]]
     stated[5] = replace(stated[5], stamp_ns=0)  # a row without a stamp is no jump
-    found = trajectory_of(stated, "d1", stamps="header")
+    found = gathered_from(stated, "d1", stamps="header")
     told = f"jumps by {jump_s:.3g} s at {stated[12].stamp_ns / 1e9:.3f} s"
     assert [told in note for note in found.notes] == [False, False, True]
     assert f"up to {jump_s - 0.002:.3g} s in 8 of 20" in found.notes[1]
@@ -84,11 +85,11 @@ def test_covariances_turn_with_the_body() -> None:
     north = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
     covariance = np.diag([1.0, 2, 3, 4, 5, 6])
     stated = [replace(s, quaternion_xyzw=north, covariance=covariance) for s in flown()]
-    found = trajectory_of(stated, "d1", stamps="header").trajectory.covariance
+    found = gathered_from(stated, "d1", stamps="header").trajectory.covariance
     assert found is not None
     np.testing.assert_allclose(found, np.tile(np.diag([1.0, 2, 3, 5, 4, 6]), (10, 1, 1)), atol=1e-14)
     unknown = [replace(s, covariance=np.zeros((6, 6))) for s in flown()]
-    assert trajectory_of(unknown, "d1", stamps="header").trajectory.covariance is None
+    assert gathered_from(unknown, "d1", stamps="header").trajectory.covariance is None
 
 
 # --- gimbals -------------------------------------------------------------------------------------------
@@ -190,7 +191,7 @@ def real_messages(path: Path, topics: Sequence[str]) -> Iterator[Message]:
 def test_the_odometry_of_a_real_robot() -> None:
     path = real_data("logs/ros1/husky_gps_imu_odom.bag")
     messages = real_messages(path, ["/husky_velocity_controller/odom"])
-    found = trajectory_of(all_samples(messages, path), path, stamps="header")
+    found = gathered_from(all_samples(messages, path), path, stamps="header")
     assert len(found.trajectory.t_ns) == 3952
     assert found.trajectory.dropped == {}
     assert found.frames == ("odom", "base_link")
