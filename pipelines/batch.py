@@ -120,9 +120,8 @@ def batch(
         scheduler: the address of a Dask cluster, which reads and writes the same folders by the same paths.
         overwrite: replace files that have the names of the summary's but are not of a batch.
 
-    Raises:
-        DataError: Dask is not installed, no scheduler answers, sessions would have the same name, or the
-            summary cannot be written. Errors of a flight are in its row.
+    DataError: Dask is not installed, no scheduler answers, sessions would have the same name, or the summary
+    cannot be written. Errors of a flight are in its row.
     """
     settings, progress = settings or BatchSettings(), progress or Silent()
     unknown = [stage for stage in settings.stages if stage not in STAGES]

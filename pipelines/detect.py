@@ -143,9 +143,8 @@ def detect(
     Returns:
         The record of the stage; None if every camera has imported keypoints.
 
-    Raises:
-        DataError: the detector's files are missing, pictures are gone or not those that were ingested, a
-            table of the session was changed, or nobody was found in any picture.
+    DataError: the detector's files are missing, pictures are gone or not those that were ingested, a table of
+    the session was changed, or nobody was found in any picture.
     """
     progress = progress or Silent()
     description = read_description(session.folder)
@@ -416,8 +415,7 @@ class _DetectionOrder:
 def detect_block(order: _DetectionOrder) -> tuple[dict[str, bytes], dict[str, bytes] | None]:
     """Detect on a worker; return the files of the block, and those of its background.
 
-    Raises:
-        DataError: the worker has no such session, pictures or models, or others.
+    DataError: the worker has no such session, pictures or models, or others.
     """
     folder = order.session.opened()
     if hashes_of_models(order.detector) != order.models:
@@ -642,8 +640,7 @@ class FollowedPart:
 def follow_block(order: tuple[SharedSession, FollowedBlock]) -> dict[str, bytes]:
     """Follow through the pictures of a block on a worker; return its files.
 
-    Raises:
-        DataError: the worker has no such session or pictures, or others.
+    DataError: the worker has no such session or pictures, or others.
     """
     session, block = order
     folder = session.opened()
@@ -666,8 +663,7 @@ class Following:
         span_s: times between which the detector looks at pictures, None for no bound.
         force: run it again even if nothing changed.
 
-    Raises:
-        DataError: no moving camera has pictures, or these are not those that were ingested.
+    DataError: no moving camera has pictures, or these are not those that were ingested.
     """
 
     def __init__(
@@ -718,8 +714,7 @@ class Following:
             executor: works on the blocks instead of these processes.
             progress: receives the progress.
 
-        Raises:
-            DataError: pictures are gone or not those that were ingested.
+        DataError: pictures are gone or not those that were ingested.
         """
         progress = progress or Silent()
         if self._run.finished:

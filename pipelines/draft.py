@@ -147,8 +147,7 @@ def draft(
         overwrite: replace an existing file.
         ask: decides what neither names nor contents do; without it, that is missing.
 
-    Raises:
-        DataError: nothing was recognised, a path is missing, or the output exists or cannot be written.
+    DataError: nothing was recognised, a path is missing, or the output exists or cannot be written.
     """
     search = _FileSearch()
     things, home = search.look([_absolute(path) for path in paths])
@@ -233,11 +232,7 @@ class _FileSearch:
         self._seen: set[Path] = set()
 
     def look(self, paths: Sequence[Path]) -> tuple[list[Thing], Path]:
-        """Find everything that is recognised, each thing once, and the folder that all paths share.
-
-        Raises:
-            DataError: a path does not exist.
-        """
+        """Find everything that is recognised, each thing once, and the folder that all paths share."""
         things: list[Thing] = []
         bases: list[Path] = []
         for path in paths:
@@ -287,11 +282,7 @@ class _FileSearch:
                     yield child, others
 
     def _is_whole(self, folder: Path, children: Sequence[Path], format_: Format) -> bool:
-        """Test if a folder that a format recognises is one thing, not a folder with several such things.
-
-        A folder is also recognised if it holds keypoint files, one for each camera, or a single log, or the
-        files of a bag beside the videos of its flight.
-        """
+        """Test if a folder that a format recognises is one thing, not a folder with several such things."""
         if isinstance(format_, LogFormat):
             inside = [_kind_of_format(f) for child in children for f in self._recognising(child)]
             alone = len(inside) == 1 and not (folder / "metadata.yaml").exists()
@@ -328,10 +319,7 @@ def _why_left_out(path: Path) -> str:
 
 
 def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Proposal | FoundLog], str]:
-    """Read a thing as every kind that it can be; of several formats of a kind, the first that works is used.
-
-    Return also the reason if it is of no kind, or if one of its kinds cannot be read.
-    """
+    """Read a thing as every kind that it can be; of several formats of a kind the first that works counts."""
     *folders, name = path.relative_to(home).parts or (path.name,)
     place = (*folders, name if path.is_dir() else Path(name).stem)
     found: dict[type | None, list[Proposal | FoundLog]] = {}
@@ -360,11 +348,7 @@ def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Propo
 def _described(
     path: Path, place: NamePlace, format_: Format, ambiguous: bool
 ) -> Iterator[Proposal | FoundLog]:
-    """Describe a thing by the kind of its format.
-
-    Raises:
-        DataError: it cannot be read.
-    """
+    """Describe a thing by the kind of its format."""
     file: dict[str, object] = {"file": path}
     head, labels, title = (path, place), (label_of_place(place),), format_.title
     if isinstance(format_, KeypointFormat):
@@ -437,11 +421,7 @@ def _span(t_ns: Int64) -> TimeSpan:
 
 
 def _drone_logs(path: Path, place: NamePlace, format_: TelemetryFormat) -> Iterator[Proposal]:
-    """Describe the poses in a drone's own log, with or without attitudes; those of each vehicle in it.
-
-    Raises:
-        DataError: it cannot be read, or holds no positions.
-    """
+    """Describe the poses in a drone's own log, with or without attitudes; those of each vehicle in it."""
     vehicles = TLOG.vehicles(path) if format_.name == TLOG.name else []
     for instance in vehicles if len(vehicles) > 1 else [None]:
         yield _drone_log(path, place, format_, instance)
@@ -495,11 +475,7 @@ class _MotionComparison:
         self._followed: dict[Path, TrackedPoints] = {}
 
     def __call__(self, film: FoundFilm, found: Proposal, gimbals: Sequence[Proposal]) -> MotionMatch | None:
-        """Return how well poses explain the motion in a video's pictures; None without poses.
-
-        The lens is taken to have an ordinary angle of view. The camera on a body is turned by the gimbal, and
-        in the way, that explain most; without a gimbal it is taken to look forward and down by such an angle.
-        """
+        """Return how well poses explain the motion in a video's pictures; None without poses."""
         poses = _poses_in(found)
         if poses is None:
             return None

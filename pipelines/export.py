@@ -103,10 +103,9 @@ def export(
         pictures_hz: pictures of each camera per second, for recordings that hold pictures; 0 is none.
         overwrite: replace existing files that no export wrote, or that were changed since.
 
-    Raises:
-        DataError: no such format, a format without a choice of unit, axes or time, nothing to export,
-            tables or pictures that were changed, or a file would be overwritten.
-        BusyError: another process exports to the same folder.
+    DataError: no such format, a format without a choice of unit, axes or time, nothing to export, tables or
+    pictures that were changed, or a file would be overwritten. BusyError: another process exports to the same
+    folder.
     """
     progress = progress or Silent()
     exports = [find_export(name) for name in dict.fromkeys(formats)]
@@ -282,11 +281,7 @@ class _Overlays:
     def film(
         self, camera: str, angles: Sequence[str], progress: Progress
     ) -> tuple[Int64, Iterator[Picture]] | None:
-        """Return the times of all pictures of a camera, and these; None without pictures.
-
-        Pictures that cannot be decoded are grey, and counted in a note. DataError if they are not those
-        ingested.
-        """
+        """Return the times of all pictures of a camera, and these; None without pictures."""
         media = self.description.cameras[camera].media
         if media is None:
             return None

@@ -113,9 +113,8 @@ def ingest(
         overwrite: write also to a target that holds something else.
         force: read everything again even if nothing changed.
 
-    Raises:
-        DataError: something cannot be used, or was changed while it was read; the session stays as it was.
-        BusyError: another process writes the session.
+    DataError: something cannot be used, or was changed while it was read; the session stays as it was.
+    BusyError: another process writes the session.
     """
     progress = progress or Silent()
     flight = read_flight(flight_path)

@@ -448,11 +448,7 @@ def _settings(candidate: Proposal) -> dict[str, object]:
 
 
 def _known_start(camera: CameraDraft) -> VideoStart | None:
-    """Return a video's start by the log of its poses, or by its own metadata if the log covers it then.
-
-    A log inside the video knows it exactly, and motion that a log explains determines it well. Subtitles with
-    whole seconds know it to a second, and so does a record of one video of about this length.
-    """
+    """Return a video's start by the log of its poses, or by its own metadata if the log covers it then."""
     film, choice = camera.film, camera.choices.get("pose")
     if film is None or choice is None:
         return None

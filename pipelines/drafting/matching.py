@@ -230,10 +230,7 @@ def _is_true(candidate: Proposal) -> bool:
 
 
 def _own_stamps(camera: CameraDraft, choice: Chosen | None, moving: Sequence[Proposal]) -> Chosen | None:
-    """Leave out frame times of a video that are not clearly its own: one without its name, or subtitles.
-
-    Subtitles without the video's name have about as many frames as it, and no log in it knows its start.
-    """
+    """Leave out frame times of a video that are not clearly its own: one without its name, or subtitles."""
     film = camera.film
     if choice is None or camera.logged_film is not None or film is None:
         return None if camera.logged_film is not None else choice
@@ -435,11 +432,7 @@ def _taken(cameras: Sequence[CameraDraft]) -> list[Proposal]:
 
 
 def _prefer_attitudes(cameras: Sequence[CameraDraft], moving: Sequence[Proposal], distance: Distance) -> None:
-    """Give cameras whose poses lack attitudes the log that has them at that time, if just one does.
-
-    Subtitles or a GoPro's GPS have the camera's name, but a flight record or an autopilot's log has more. Of
-    several, that of the same drone was where its positions are. The others become alternatives.
-    """
+    """Give cameras whose poses lack attitudes the log that has them at that time, if just one does."""
     taken = _taken(cameras)
     free: dict[object, Proposal] = {}
     for candidate in moving:
@@ -531,12 +524,7 @@ class _Chooser:
         self._anchors = anchors
 
     def __call__(self, candidates: Sequence[Proposal], *, shared: bool = False) -> Chosen | None:
-        """Choose the best candidate with the camera's name; or the only one, for the only camera.
-
-        Args:
-            candidates: of one kind.
-            shared: True if one candidate without a matching name may serve several cameras.
-        """
+        """Choose the best candidate with the camera's name; or the only one, for the only camera."""
         likeness = {id(c): _likeness(c, self._camera.label) for c in candidates}
         least = UNNAMED if self._lone or shared else NUMBER
         rivals = [c for c in candidates if likeness[id(c)] >= least]

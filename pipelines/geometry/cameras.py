@@ -119,8 +119,7 @@ def fit_to_size(
     Returns:
         The intrinsics to use, and a note if the sizes differ.
 
-    Raises:
-        ValueError: the sizes differ by more than that.
+    ValueError: the sizes differ by more than that.
     """
     if (width, height) == (intrinsics.width, intrinsics.height):
         return intrinsics, None

@@ -85,8 +85,7 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 def _with_cache(function: Callable[Arguments, Result], options: dict[str, Any]) -> Any:
     """Make numba's compiler of a function with a cache, for temporary files if need be.
 
-    Raises:
-        RuntimeError: there is no place for a cache.
+    RuntimeError: there is no place for a cache.
     """
     try:
         return numba.njit(function, cache=True, **options)

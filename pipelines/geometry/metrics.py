@@ -91,8 +91,7 @@ def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -
         `pa_frames_left_out` (person-frames whose common joints are fewer than 3 or lie on a line) and
         `per_joint`: name to the same fields.
 
-    Raises:
-        ValueError: the shapes disagree, or the stamps do not increase strictly.
+    ValueError: the shapes disagree, or the stamps do not increase strictly.
     """
     distances = _distances(estimate, truth, joints, t_ns)
     shared = np.isfinite(distances.absolute).any(axis=-1)
@@ -124,8 +123,7 @@ def world_errors(
         `foot_sliding_mm`: motion of standing feet in 1/30 s; `shifted_mpjpe_mm`: MPJPE after one shift of the
         whole flight. None for what could not be measured.
 
-    Raises:
-        ValueError: the shapes disagree, or the stamps do not increase strictly.
+    ValueError: the shapes disagree, or the stamps do not increase strictly.
     """
     _check_shapes(estimate, truth, joints, t_ns)
     by_first: list[Float] = [np.empty(0)]
@@ -173,8 +171,7 @@ def error_series(
     Returns:
         The series over all joints, by the names of `JointErrors`; and the same per joint.
 
-    Raises:
-        ValueError: as `measure`.
+    ValueError: as `measure`.
     """
     distances = _distances(estimate, truth, joints, t_ns)
     per_joint = {name: distances.series(slice(j, j + 1)) for j, name in enumerate(joints)}
@@ -206,8 +203,7 @@ def common(*estimates: Float) -> Bool:
 def bone_lengths(position: Float, joints: Sequence[str], bones: Sequence[tuple[str, str]]) -> Float:
     """Compute lengths [T, P, B] in m of bones between named joints; NaN where either end is missing.
 
-    Raises:
-        ValueError: a bone ends at a joint that is not in `joints`.
+    ValueError: a bone ends at a joint that is not in `joints`.
     """
     unknown = sorted({end for bone in bones for end in bone} - set(joints))
     if unknown:
@@ -234,8 +230,7 @@ def measure_shape(
         side ("hip-knee") to the distance between the left and right medians, mean over people;
         `jerk_m_s3`: the median length of the third derivative, over four consecutive samples.
 
-    Raises:
-        ValueError: the shapes disagree, a joint of a bone is missing, or the stamps do not increase.
+    ValueError: the shapes disagree, a joint of a bone is missing, or the stamps do not increase.
     """
     _check_shapes(position, position, joints, t_ns)
     lengths = bone_lengths(position, joints, bones) * 1e3

@@ -41,8 +41,7 @@ def body_from_camera(looks: Looks, down_deg: float = 0.0) -> Float:
         looks: the direction of the optical axis before the tilt.
         down_deg: the angle of the axis below the horizon, -90 to 90.
 
-    Raises:
-        ValueError: a tilt beyond 90 degrees, or one on top of down or up.
+    ValueError: a tilt beyond 90 degrees, or one on top of down or up.
     """
     if looks in _STRAIGHT_DEG and down_deg != 0:
         raise ValueError(

@@ -40,8 +40,7 @@ Frame = Literal["world", "body"]
 class NoiseModel(ABC):
     """One kind of pose error; the fields are the parameters that users write.
 
-    Raises:
-        ValueError: a number is negative or not finite, or `frame` is neither world nor body.
+    ValueError: a number is negative or not finite, or `frame` is neither world nor body.
     """
 
     def __post_init__(self) -> None:
@@ -354,9 +353,7 @@ def pose_errors(models: Sequence[NoiseModel]) -> PoseErrors:
     """Convert stated noise models to a prior.
 
     Latency is left to the clock: a delayed log and a clock offset differ only where cameras accelerate.
-
-    Raises:
-        ValueError: a model is not one of flight.yaml's.
+    ValueError: a model is not one of flight.yaml's.
     """
     white = np.zeros(2)
     merged: dict[int, tuple[float, float]] = {}
@@ -422,9 +419,8 @@ def build(
         parts: (name, parameters) of each model: `pose_noise.items()` of a flight, or `parse(text)`.
         classes: every known model by its registered name.
 
-    Raises:
-        ValueError: an unknown model or parameter (the message lists the known ones), a missing
-            parameter, or a value that is out of range.
+    ValueError: an unknown model or parameter (the message lists the known ones), a missing parameter, or a
+    value that is out of range.
     """
     return [_build_one(name, parameters, classes) for name, parameters in parts]
 
@@ -432,8 +428,7 @@ def build(
 def parse(text: str) -> list[tuple[str, dict[str, object]]]:
     """Parse names and parameters of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
 
-    Raises:
-        ValueError: the text does not have that form.
+    ValueError: the text does not have that form.
     """
     # The sign of an exponent (1e+3) does not start another model: a digit follows directly.
     return [_parse_one(part.strip()) for part in re.split(r"\+(?!\d)", text)]

@@ -174,8 +174,7 @@ def interpolate_poses(
         Position [M, 3] and quaternion [M, 4], NaN where the log has no pose. Signs are those of the log, made
         continuous from its first row on.
 
-    Raises:
-        ValueError: the stamps do not increase strictly.
+    ValueError: the stamps do not increase strictly.
     """
     between = _bracket(t_ns, at_ns, max_gap_ns, max_extrapolation_ns)
     if not len(t_ns):
@@ -200,8 +199,7 @@ def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: 
     Returns:
         [M, ...]; NaN where a neighbour is missing. Exactly at a stamp, the result is that sample.
 
-    Raises:
-        ValueError: the stamps do not increase strictly.
+    ValueError: the stamps do not increase strictly.
     """
     between = _bracket(t_ns, at_ns, max_gap_ns, 0)
     if not len(t_ns):
@@ -460,9 +458,8 @@ def chain(
         max_extrapolation_ns: the longest time before its first and after its last stamp for which a link is
             held.
 
-    Raises:
-        ValueError: an unknown frame (the message gives the nearest known names), no path between the two,
-            or the same frame twice.
+    ValueError: an unknown frame (the message gives the nearest known names), no path between the two, or the
+    same frame twice.
     """
     route = find_route(links, parent, child)
     on_the_way = [links[edge] for edge in route.edges]
@@ -477,8 +474,7 @@ def chain(
 def find_route(edges: Collection[tuple[str, str]], parent: str, child: str) -> Route:
     """Find the shortest path from one frame to another, breadth first; alphabetical among equal lengths.
 
-    Raises:
-        ValueError: as in `chain`.
+    ValueError: as in `chain`.
     """
     neighbours: dict[str, set[str]] = {}
     for target, source in edges:

@@ -155,8 +155,7 @@ def triangulate(views: Views, *, method: Method, min_views: int = 2, gate: float
         min_views: views needed, and inliers needed; at least 2.
         gate: in standard deviations of a view's image point, pixel and pose noise together.
 
-    Raises:
-        ValueError: min_views below 2, or a gate that is not above 0.
+    ValueError: min_views below 2, or a gate that is not above 0.
     """
     if min_views < 2 or not gate > 0:
         raise ValueError(f"min_views={min_views}, gate={gate}: out of range")

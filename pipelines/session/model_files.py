@@ -53,9 +53,8 @@ class Package(Protocol):
     def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
         """Read files from the package, at most one byte more than expected of each; skip absent files.
 
-        Raises:
-            OSError, tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError: it is
-                damaged, or of another kind.
+        OSError, tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError: it is
+        damaged, or of another kind.
         """
 
 
@@ -164,8 +163,7 @@ class PackagedModels:
     def verified(self) -> dict[str, Path]:
         """Return each file's path by name, after checking its SHA-256.
 
-        Raises:
-            DataError: one is missing or has other content.
+        DataError: one is missing or has other content.
         """
         for file in self.files:
             path = self.folder / file.name

@@ -479,9 +479,8 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
         create: allow a folder that does not exist yet (ingest); if the ingest fails, a new folder is removed.
         overwrite: with `create`, write also into a folder with other files in it, which stay.
 
-    Raises:
-        DataError: not a session, or with `create` something else; of a later version; cannot be written.
-        BusyError: another process holds it.
+    DataError: not a session, or with `create` something else; of a later version; cannot be written.
+    BusyError: another process holds it.
     """
     try:
         is_new = create and not folder.exists()

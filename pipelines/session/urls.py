@@ -1,17 +1,15 @@
 """Places that are named by URL: sources are fetched into the user's cache, sessions are uploaded when done.
 
 A URL is one that fsspec opens (`s3://bucket/flight/drone1.mp4`). A session at a URL is worked on in a copy on
-this machine's disk, whose files are uploaded once, at the end, under the names that they have in a session.
+this machine's disk, which is uploaded once, at the end.
 Credentials come from where the store's own library looks for them, never from a URL, and no message repeats
 what a store says.
 """
 
 import errno
-import ipaddress
 import os
 import re
 import shutil
-import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -20,7 +18,7 @@ from urllib.parse import unquote
 
 from filelock import FileLock
 
-from pipelines.session.errors import BusyError, DataError, MocapError
+from pipelines.session.errors import DataError, MocapError
 from pipelines.session.registries import need
 from pipelines.session.stages import origin_of
 from pipelines.session.storage import (
@@ -199,11 +197,11 @@ def _refuse_full_disk(folder: Path, size: int, url: str) -> None:
 
 @contextmanager
 def session_here(place: Path | str, *, create: bool = False) -> Iterator[Path]:
-    """Yield the folder of a session. One at a URL is copied here, and uploaded at the end if it has changed.
+    """Yield the folder of a session; one at a URL is copied here, and uploaded whole if it changed.
 
     After an error nothing is uploaded. What was made stays in the copy, and the same command continues.
     `create` allows a URL at which there is no session yet. BusyError if another process of this machine works
-    on it, or somebody else has uploaded meanwhile.
+    on it.
     """
     url = url_of(place)
     if url is None:
@@ -212,41 +210,42 @@ def session_here(place: Path | str, *, create: bool = False) -> Iterator[Path]:
     folder = _cache() / "sessions" / _short(url) / url.rpartition("/")[2]
     note = folder.parent.with_suffix(".json")
     with _own_disk(folder):
-        folder.parent.parent.mkdir(parents=True, exist_ok=True)
+        note.parent.mkdir(parents=True, exist_ok=True)
     with held(folder.parent.with_suffix(".lock"), url):
         with _own_disk(folder):
-            files, version = _session_at(url)
-            if not files and not create:
-                remedy = "make one with `mocap ingest -o` and this URL"
-                raise DataError(url, "is not a session", remedy, code="not-a-session")
-            known = _noted(note)
-            # An upload that was cut short has changed the store, and the copy is what was to be there.
-            if not folder.exists() or (known.get("version") != version and not known.get("uploading")):
+            before = None  # what an earlier command left has to be uploaded
+            if not folder.exists():
+                files = _session_at(url)
                 if files:
                     _fetch(url, files, folder)
+                elif create:
+                    folder.parent.mkdir(exist_ok=True)
                 else:
-                    remove_tree(folder.parent)
-                    folder.parent.mkdir()
-                write_json(note, {"url": url, "version": version, "files": _digests(folder)})
+                    remedy = "make one with `mocap ingest -o` and this URL"
+                    raise DataError(url, "is not a session", remedy, code="not-a-session")
+                before = _digests(folder)
+            write_json(note, {"url": url})
         yield folder
         with _own_disk(folder):
-            _upload(url, folder, note)
+            digests = _digests(folder)
+            if "session.json" in digests and digests != before:
+                _asked(url, lambda store, path: _replace(store, path, folder, list(digests)))
             remove_tree(note)
             remove_tree(folder.parent)
 
 
 def holds_session(url: str) -> bool:
     """Return True if a session lies at a URL; DataError if the store cannot be read."""
-    return bool(_session_at(url)[0])
+    return bool(_session_at(url))
 
 
-def _session_at(url: str) -> tuple[dict[str, tuple[str, int]], str]:
-    """List the files of a session in a store, with a version; none if there is no session."""
+def _session_at(url: str) -> dict[str, tuple[str, int]]:
+    """List the files of a session in a store; none if there is no session."""
     try:
-        files, version = _asked(url, _files_at, missing=FileNotFoundError)
+        files, _ = _asked(url, _files_at, missing=FileNotFoundError)
     except FileNotFoundError:
-        return {}, ""
-    return (files, version) if "session.json" in files else ({}, "")
+        return {}
+    return files if "session.json" in files else {}
 
 
 def _digests(folder: Path) -> dict[str, str]:
@@ -256,28 +255,11 @@ def _digests(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): sha256_of(path) for path in sorted(paths)}
 
 
-def _upload(url: str, folder: Path, note: Path) -> None:
-    """Upload what has changed of a copy of a session, and remove in the store what is gone.
-
-    BusyError if somebody else has uploaded since. After a DataError the copy stays; the same command
-    continues.
-    """
-    known, files = _noted(note), _digests(folder)
-    before: dict[str, str] = known.get("files", {})
-    if "session.json" not in files or files == before:
-        return
-    if not known.get("uploading") and _session_at(url)[1] != known["version"]:
-        raise BusyError(f"{url} was written by somebody else meanwhile; run the command again")
-    write_json(note, {**known, "uploading": True})
-    changed = [name for name, digest in files.items() if before.get(name) != digest or known.get("uploading")]
-
-    def send(store: Any, path: str) -> None:
-        store.put([str(folder / name) for name in changed], [f"{path}/{name}" for name in changed])
-        gone = [f"{path}/{name}" for name in before if name not in files]
-        if gone:
-            store.rm(gone)
-
-    _asked(url, send)
+def _replace(store: Any, path: str, folder: Path, names: list[str]) -> None:
+    """Replace what lies at a path of a store by files of a folder."""
+    if store.exists(path):
+        store.rm(path, recursive=True)
+    store.put([str(folder / name) for name in names], [f"{path}/{name}" for name in names])
 
 
 @contextmanager
@@ -326,8 +308,6 @@ def _opened(url: str) -> tuple[Any, str]:
     options: dict[str, Any] = {"use_listings_cache": False}
     if scheme == "file":
         options["auto_mkdir"] = True
-    if scheme.startswith("http"):
-        options["get_client"] = _public_client
     try:
         store, path = url_to_fs(url, **options)
     except ImportError as error:
@@ -339,46 +319,15 @@ def _opened(url: str) -> tuple[Any, str]:
     return store, path
 
 
-def is_public(address: str) -> bool:
-    """Return True for an address that belongs to the Internet, not to this machine or a private network."""
-    ip = ipaddress.ip_address(address)
-    return ip.is_global and not ip.is_multicast
-
-
-class _PrivateAddressError(OSError):
-    """A web server that a flight.yaml names is not on the public Internet."""
-
-
-async def _public_client(**options: Any) -> Any:
-    """Make a web client that connects to public addresses alone, also after a redirection."""
-    import aiohttp  # s3fs brings it
-
-    def connect(address: tuple[Any, ...]) -> socket.socket:
-        family, kind, protocol, _, place = address
-        if not is_public(place[0].partition("%")[0]):
-            raise _PrivateAddressError
-        return socket.socket(family, kind, protocol)
-
-    return aiohttp.ClientSession(connector=aiohttp.TCPConnector(socket_factory=connect), **options)
-
-
 def _asked(url: str, call: Callable[[Any, str], T], *, missing: type[Exception] | None = None) -> T:
-    """Call a function with the store and the path of a URL; errors become one line without the store's words.
-
-    `missing` is raised for an object that does not exist, instead of a DataError.
-    """
+    """Call a function with the store and the path of a URL; an error becomes one line of ours."""
     store, path = _opened(url)
     try:
         return call(store, path)
     except MocapError:
         raise
     except Exception as error:
-        chain = list(_chain(error))
-        names = {type(each).__name__ for each in chain}
-        if any(isinstance(each, _PrivateAddressError) for each in chain):
-            problem = "leads to an address of this machine or of a private network"
-            remedy = "fetch the file yourself, and give its path"
-            raise DataError(url, problem, remedy, code="url-refused") from None
+        names = {type(each).__name__ for each in _chain(error)}
         if isinstance(error, OSError) and error.errno in _FULL:
             raise
         if isinstance(error, FileNotFoundError | NotADirectoryError):

@@ -36,9 +36,8 @@ def read_yaml_model(
         shape: a description of the file's form, for the message if the file is no mapping.
         made: how one is made, for the message if the file is another one.
 
-    Raises:
-        DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
-            every problem that was found.
+    DataError: the file is missing, no YAML, or does not keep to the schema; the message holds every problem
+    that was found.
     """
     how = f" ({made})" if made else ""
     raw = plain_yaml(path, read_text(path, most_bytes=MAX_FILE_BYTES))
@@ -106,10 +105,7 @@ def plain_yaml(path: Path, text: str) -> object:
 
 
 def _refuse_impossible_values(path: Path, value: object) -> None:
-    """Refuse integers beyond any float, and texts with characters that no file name can hold.
-
-    Such characters are zero bytes and lone surrogates. Python cannot print integers of thousands of digits.
-    """
+    """Refuse integers beyond any float, and texts with characters that no file name can hold."""
     seen: set[int] = set()  # an aliased value is one object, however often it is used
     waiting: list[tuple[object, tuple[object, ...]]] = [(value, ())]
     while waiting:

@@ -214,8 +214,7 @@ class FlightCameras:
     ) -> Intrinsics:
         """Return the intrinsics of a camera, fitted to the size of its pictures.
 
-        Raises:
-            DataError: missing, for pictures of another shape, or too small for the keypoints.
+        DataError: missing, for pictures of another shape, or too small for the keypoints.
         """
         source = camera.intrinsics
         place = f"{self._manifest}: cameras.{name}.intrinsics"
@@ -294,11 +293,7 @@ def _made_ns(path: Path) -> int | None:
 
 
 def _with_size(intrinsics: Intrinsics, size: tuple[int, int] | None, source: Path) -> Intrinsics:
-    """Give intrinsics of a calibration without a size that of the pictures, if they can belong together.
-
-    Raises:
-        DataError: the size of the pictures is not known, or their middle is far from the principal point.
-    """
+    """Give intrinsics of a calibration without a size that of the pictures, if they can belong together."""
     if size is None:
         problem = "states no picture size, and no video does"
         raise DataError(source, problem, "add the size to the calibration", code="wrong-size")
@@ -332,10 +327,7 @@ def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
 
 
 def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: Detections) -> None:
-    """Refuse a calibration for pictures of another size, if too many keypoints lie outside its picture.
-
-    Keypoints are weighted by confidence: those that a detector extrapolates beyond the border have little.
-    """
+    """Refuse a calibration for pictures of another size, if too many keypoints lie outside its picture."""
     found = ~np.isnan(detections.xy[..., 0])
     xy, weight = detections.xy[found], np.maximum(detections.confidence[found], 0.0)
     if not len(xy):

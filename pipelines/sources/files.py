@@ -92,9 +92,8 @@ class FlightFiles:
     def refuse_other_options(self) -> None:
         """Recognise every file.
 
-        Raises:
-            DataError: a file does not exist, is of no kind that belongs where it stands, or has options or
-                a topic that such a file does not take.
+        DataError: a file does not exist, is of no kind that belongs where it stands, or has options or a
+        topic that such a file does not take.
         """
         parts: list[tuple[str, str, FileSource | None]] = []
         for name, camera in self._flight.cameras.items():
@@ -160,8 +159,7 @@ class FlightFiles:
     def true_joints(self, source: TruthSource) -> JointMotion:
         """Read the true joints; drop and count positions too far from the others to be true.
 
-        Raises:
-            DataError: the file cannot be used, its axes are unknown, or no position is left.
+        DataError: the file cannot be used, its axes are unknown, or no position is left.
         """
         path = self.path(source.file)
         reader = recognise(path, JointFormat, "file of true joints", name=source.format)
@@ -191,11 +189,7 @@ class FlightFiles:
     def _refuse_wrong_unit(
         path: Path, motion: JointMotion, reader: JointFormat, source: TruthSource, axes: str | None
     ) -> None:
-        """Refuse true joints that are no person's in the unit of their file, but are in another one.
-
-        Raises:
-            DataError: the joints have the size of a person in another unit alone.
-        """
+        """Refuse true joints that are no person's in the unit of their file, but are in another one."""
         low_m, high_m = BODY_SIZE_M
         size_m = _body_size_m(motion)
         if np.isnan(size_m) or low_m <= size_m <= high_m:
@@ -211,11 +205,7 @@ class FlightFiles:
 
 
 def _of_subject(path: Path, motion: JointMotion, subject: str | None) -> JointMotion:
-    """Keep the joints of one subject, whose name stands before a colon in the names of its joints.
-
-    Raises:
-        DataError: several subjects and none is stated, or no joint is of the stated one.
-    """
+    """Keep the joints of one subject, whose name stands before a colon in the names of its joints."""
     parted = [joint.rpartition(":") for joint in motion.joints]
     subjects = list(dict.fromkeys(name for name, colon, _ in parted if colon))
     if subject is None and len(subjects) < 2:
@@ -296,8 +286,7 @@ def hash_sources(flight: Manifest, base: Path, progress: Progress) -> dict[str, 
 def fetch_sources(flight: Manifest, base: Path, progress: Progress) -> None:
     """Fetch the files that a manifest states by URL, where the copies in the cache are not as in the store.
 
-    Raises:
-        DataError: a store cannot be read, or holds no such file.
+    DataError: a store cannot be read, or holds no such file.
     """
     urls = [url for path in flight.files if (url := source_url(base, path))]
     if urls:
@@ -310,8 +299,7 @@ def fetch_sources(flight: Manifest, base: Path, progress: Progress) -> None:
 def source_stamps(flight: Manifest, base: Path) -> dict[str, str]:
     """Return the stamp of every file that is read, by the manifest's path.
 
-    Raises:
-        DataError: one of them is missing or cannot be read.
+    DataError: one of them is missing or cannot be read.
     """
     stamps = {
         path: [file_stamp(file) for file in _source_files(located(base, path))] for path in flight.files
@@ -322,8 +310,7 @@ def source_stamps(flight: Manifest, base: Path) -> dict[str, str]:
 def refuse_written(flight: Manifest, base: Path, stamps: Mapping[str, str]) -> None:
     """Refuse sources that changed since they had these stamps, so that the hash fits what was read.
 
-    Raises:
-        DataError: a source changed, or is missing.
+    DataError: a source changed, or is missing.
     """
     for path, stamp in source_stamps(flight, base).items():
         if stamp != stamps[path]:

@@ -37,8 +37,7 @@ def without_zeros(detections: Detections) -> Detections:
 def in_pixels(detections: Detections, intrinsics: Intrinsics, source: str) -> Detections:
     """Turn coordinates that are shares of the picture (0 to 1) into pixels; count them as adjusted.
 
-    Raises:
-        DataError: the coordinates count from the middle of the picture.
+    DataError: the coordinates count from the middle of the picture.
     """
     known = detections.xy[np.isfinite(detections.xy)]
     if not len(known) or np.abs(known).max() > _MAX_SHARE:

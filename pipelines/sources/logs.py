@@ -97,8 +97,7 @@ class FlightLog:
     def choose(self, kind: Kind, topic: str | None) -> str:
         """Return the topic that is named, or the only one of its kind.
 
-        Raises:
-            DataError: no such topic, one of another kind, or several candidates.
+        DataError: no such topic, one of another kind, or several candidates.
         """
         there = [known.name for known in self.recording.topics if kind_of(known) == kind]
         return self.choose_among(there, _NOUNS[kind], topic)
@@ -189,8 +188,7 @@ class FlightLogs:
     def open(self, log: str) -> Iterator[FlightLog]:
         """Open a recording for one reading.
 
-        Raises:
-            DataError: a file is missing, damaged beyond use, or no log.
+        DataError: a file is missing, damaged beyond use, or no log.
         """
         paths = tuple(self.paths(log))
         recording: Log | None = self._kept.pop(paths, None)
@@ -221,8 +219,7 @@ class FlightLogs:
     ) -> Trajectory:
         """Read poses in the log's own world and axes, at world times.
 
-        Raises:
-            DataError: no such topic or frame, several candidates, or nothing usable.
+        DataError: no such topic or frame, several candidates, or nothing usable.
         """
         with self.open(log) as opened:
             recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
@@ -277,8 +274,7 @@ class FlightLogs:
     def intrinsics(self, log: str, topic: str | None) -> Intrinsics:
         """Return the intrinsics of a topic of camera infos; messages that are not calibrated are left out.
 
-        Raises:
-            DataError: no such topic, or none of it is calibrated, or its calibration changes in flight.
+        DataError: no such topic, or none of it is calibrated, or its calibration changes in flight.
         """
         found: dict[Intrinsics, str] = {}
         count = 0
@@ -308,8 +304,7 @@ class FlightLogs:
     def frames(self, log: str, topic: str | None) -> Frames:
         """Read the times at which the pictures of a topic were taken, at world times.
 
-        Raises:
-            DataError: no such topic, or no picture in it.
+        DataError: no such topic, or no picture in it.
         """
         with self.open(log) as opened:
             name = opened.choose("pictures", topic)
@@ -331,8 +326,7 @@ class FlightLogs:
     def picture_size(self, log: str, topic: str | None) -> tuple[int, int] | None:
         """Return width and height of a topic's pictures, from the first readable one; None without any.
 
-        Raises:
-            DataError: no such topic.
+        DataError: no such topic.
         """
         with self.open(log) as opened:
             name = opened.choose("pictures", topic)
@@ -360,9 +354,8 @@ def maps_of_log(
 ) -> LoggedMaps:
     """Read the maps of a topic, in ENU axes at world times.
 
-    Raises:
-        DataError: no such topic, several candidates, no readable map, or a map in a frame that the
-            log does not connect with its world.
+    DataError: no such topic, several candidates, no readable map, or a map in a frame that the log does not
+    connect with its world.
     """
     log, options = stated.file, LoggedMap.model_validate(stated.options)
     with logs.open(log) as opened:

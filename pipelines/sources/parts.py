@@ -97,10 +97,7 @@ def camera_entry(
 ) -> CameraEntry:
     """Describe a camera for session.json; note doubts about its poses, and losses, one line each.
 
-    `axes` are those that its poses are in, and those of its gimbal's angles.
-
-    Raises:
-        DataError: no frame has a pose.
+    `axes` are those that its poses are in, and those of its gimbal's angles. DataError: no frame has a pose.
     """
     frames = data.frames
     entry = CameraEntry(
@@ -265,8 +262,7 @@ def span_words(first_ns: int, last_ns: int) -> str:
 def refuse_no_overlap(source: Path | str, t_ns: Int64, entries: Mapping[str, CameraEntry]) -> None:
     """Refuse data that share no time with the pictures.
 
-    Raises:
-        DataError: all times [N] are before or after the pictures of all cameras.
+    DataError: all times [N] are before or after the pictures of all cameras.
     """
     first, last = span_of_pictures(entries)
     if t_ns[0] > last or t_ns[-1] < first:

@@ -38,8 +38,7 @@ class CameraPictures(Protocol):
 def open_pictures(session: Path, description: Description, camera: str) -> Iterator[CameraPictures]:
     """Open the pictures that a session was made from; check before and after that they did not change.
 
-    Raises:
-        DataError: they are missing, differ from those that were ingested, or cannot be read.
+    DataError: they are missing, differ from those that were ingested, or cannot be read.
     """
     media = _media(description, camera)
     refuse_changed_pictures(session, description, [camera])
@@ -60,10 +59,8 @@ def refuse_changed_pictures(session: Path, description: Description, cameras: It
     """Refuse pictures that differ from those that were ingested.
 
     A file with the size and the time of change that ingest noted is taken to be the same. The content of any
-    other file is hashed, so copies pass. Missing files pass too; opening them fails later.
-
-    Raises:
-        DataError: a file has other content than the one that was ingested.
+    other file is hashed, so copies pass. Missing files pass too; opening them fails later. DataError: a file
+    has other content than the one that was ingested.
     """
     noted = noted_stamps(session, description.sources)
     for camera in cameras:
@@ -95,8 +92,7 @@ def _media(description: Description, camera: str) -> MediaEntry:
 class LoggedPictures:
     """Pictures of a topic, numbered as in ingest; reading forward is cheap, reading backward restarts.
 
-    Raises:
-        DataError: the log cannot be opened, or the encoding of its pictures is unknown.
+    DataError: the log cannot be opened, or the encoding of its pictures is unknown.
     """
 
     def __init__(self, paths: list[Path], topic: str, stamps: str) -> None:

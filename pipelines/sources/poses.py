@@ -143,8 +143,7 @@ class FlightPoses:
             camera: its description.
             frames: times of its pictures.
 
-        Raises:
-            DataError: nothing usable, or the manifest does not state the camera's mount on the body.
+        DataError: nothing usable, or the manifest does not state the camera's mount on the body.
         """
         pose = camera.pose
         if self.is_still(camera):
@@ -216,8 +215,7 @@ class FlightPoses:
     def refuse_unfit(self) -> None:
         """Refuse poses, mounts and gimbals that do not go together, for the kind of file that each one is.
 
-        Raises:
-            DataError: the camera cannot be meant so.
+        DataError: the camera cannot be meant so.
         """
         for name, camera in self._flight.cameras.items():
             place = f"{self._manifest}: cameras.{name}"
@@ -332,10 +330,7 @@ class FlightPoses:
         return position, quaternion, lost
 
     def _stated_angles(self, name: str, gimbal: GimbalSource | None) -> AttitudeTrack | None:
-        """Return the attitude of a gimbal by the source that the manifest names, in our axes at world times.
-
-        None if it names none: the angles are those of the drone's own log that gives the pose.
-        """
+        """Return the attitude of a gimbal by the source that the manifest names, in our axes at world times."""
         if gimbal is None or gimbal.is_of_pose:
             return None
         relative_to = gimbal.relative_to or "world"
@@ -356,11 +351,7 @@ class FlightPoses:
         return AttitudeTrack(topic, logged.t_ns, turned, relative_to, dropped=lost)
 
     def _angles_alone(self, name: str, gimbal: GimbalSource) -> AttitudeTrack:
-        """Read the camera's attitudes from a log whose positions are not used.
-
-        Raises:
-            DataError: there are none, or nothing places them in time.
-        """
+        """Read the camera's attitudes from a log whose positions are not used."""
         stated = gimbal.file
         path, place = self._one_file(stated), f"{self._manifest}: cameras.{name}.gimbal"
         reader = self._files.format_of("gimbal", gimbal)
@@ -400,11 +391,7 @@ class FlightPoses:
         return next((axes for axes in stated if axes), self._flight.world.frame)
 
     def _local(self, source: Path | str, trajectory: Trajectory) -> Trajectory:
-        """Return the trajectory in the world, out of the CRS of a map projection if one is stated.
-
-        Raises:
-            DataError: the coordinates are projected and no CRS is stated, or it is another.
-        """
+        """Return the trajectory in the world, out of the CRS of a map projection if one is stated."""
         origin = self.origin()
         if self._projection is not None and origin is not None:
             trajectory = self._projection.trajectory(source, trajectory, origin.place)
@@ -422,9 +409,7 @@ class FlightPoses:
         """Return a map in the world; `crs` is the stated one of its coordinates, else its own counts.
 
         A stated CRS that puts the map elsewhere than its own is used, and is a doubt in `map_doubts`.
-
-        Raises:
-            DataError: as for poses; also if a CRS is stated and the world's origin on Earth is not known.
+        DataError: as for poses; also if a CRS is stated and the world's origin on Earth is not known.
         """
         origin = self.origin()
         if self._upright != Placement():
@@ -655,11 +640,7 @@ class FlightPoses:
         return enu_from_geodetic(latitude, longitude, height, origin.place), LEVEL
 
     def _points(self, name: str, log: str, track: PositionTrack) -> Trajectory:
-        """Return positions without a rotation in the world, as a trajectory; its rotation has no meaning.
-
-        Raises:
-            DataError: the world's origin on Earth is unknown.
-        """
+        """Return positions without a rotation in the world, as a trajectory; its rotation has no meaning."""
         if self.origin() is None:
             problem = f"{name}: {log} says where it was on Earth, and no camera does"
             remedy = "write world: {origin: {latitude_deg: ..., longitude_deg: ..., altitude_m: ...}}"
@@ -673,15 +654,7 @@ class FlightPoses:
     def _joined_trajectory(
         self, name: str, camera: CameraSources, angles: AttitudeTrack | None
     ) -> Trajectory:
-        """Compute world_from_camera over time from a drone's own log, and the stated angles of its gimbal.
-
-        The stamps are those of positions or of attitudes, whichever have the higher rate. The others are
-        interpolated, never across a gap.
-
-        Raises:
-            DataError: the log cannot be used, does not give the camera's rotation, or its parts share
-                no time.
-        """
+        """Compute world_from_camera over time from a drone's own log, and the stated angles of its gimbal."""
         stated = camera.pose.file
         telemetry = self._read(camera.pose)
         for note in telemetry.notes:
@@ -776,11 +749,7 @@ class FlightPoses:
 
 
 def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: GimbalSource) -> AttitudeTrack:
-    """Return logged angles of a gimbal relative to what the manifest names, by default what the log means.
-
-    Raises:
-        DataError: the log's angles cannot be meant so.
-    """
+    """Return logged angles of a gimbal relative to what the manifest names, by default what the log means."""
     meant = gimbal.relative_to or "world"
     if gimbal.relative_to is None or (meant == track.relative_to and meant not in track.stated):
         return track

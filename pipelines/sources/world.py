@@ -159,8 +159,7 @@ def refuse_projected(source: Path | str, position: Float, origin: Place, crs: st
         origin: the world's.
         crs: name of the CRS that placed them in the world, if one did.
 
-    Raises:
-        DataError: the median position is more than 100 km from the origin.
+    DataError: the median position is more than 100 km from the origin.
     """
     across = position[np.isfinite(position[:, :2]).all(axis=1), :2]
     if not len(across):
@@ -251,8 +250,7 @@ def _crs(name: str) -> Any | None:
 class Projection:
     """One CRS, of positions x east (or longitude), y north (or latitude) and height.
 
-    Raises:
-        DataError: pyproj is missing, or the CRS is unknown or no projected or geographic one.
+    DataError: pyproj is missing, or the CRS is unknown or no projected or geographic one.
     """
 
     def __init__(self, name: str, place: str) -> None:
@@ -279,8 +277,7 @@ class Projection:
     def first_place(self, source: Path | str, position: Float) -> Place:
         """Return the place on Earth of the first position [N, 3].
 
-        Raises:
-            DataError: it lies outside the CRS.
+        DataError: it lies outside the CRS.
         """
         latitude, longitude, height = self._geodetic(source, position[:1])[0].tolist()
         return Place(latitude, longitude, height)
@@ -288,8 +285,7 @@ class Projection:
     def points(self, source: Path | str, position: Float, origin: Place) -> Float:
         """Convert positions [..., 3] to metres east, north and up of the origin; NaN stays NaN.
 
-        Raises:
-            DataError: none of them lies inside the CRS.
+        DataError: none of them lies inside the CRS.
         """
         flat = position.reshape(-1, 3)
         latitude, longitude, height = self._geodetic(source, flat).T
