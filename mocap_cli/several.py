@@ -19,8 +19,7 @@ Command = Callable[..., dict[str, Any] | None]
 def expanded(paths: Iterable[str | Path]) -> list[Path]:
     """Expand the patterns among paths that the shell did not expand; return each path once.
 
-    Raises:
-        DataError: nothing matches a pattern.
+    DataError: nothing matches a pattern.
     """
     found: dict[Path, None] = {}
     for text in map(str, paths):

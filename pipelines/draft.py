@@ -538,12 +538,12 @@ def _followed_points(path: Path) -> TrackedPoints:
     spans, begins, ends = [], [], []
     first = 0
     while (last := int(np.searchsorted(pts_ns, pts_ns[first] + STRETCH_NS))) < len(pts_ns):
-        rows = [slice(*np.searchsorted(tracks.picture, (k, k + 1))) for k in (first, last)]
-        _, begin, end = np.intersect1d(*(tracks.point[each] for each in rows), return_indices=True)
+        one, other = (slice(*np.searchsorted(tracks.picture, (k, k + 1))) for k in (first, last))
+        _, begin, end = np.intersect1d(tracks.point[one], tracks.point[other], return_indices=True)
         if len(begin) >= MIN_POINTS_OF_A_STRETCH:
             spans.append((first, last))
-            begins.append(rays[rows[0]][begin])
-            ends.append(rays[rows[1]][end])
+            begins.append(rays[one][begin])
+            ends.append(rays[other][end])
         first = last
     pictures = np.array(spans, np.int64).reshape(-1, 2)
     nothing = np.zeros((0, 2))

@@ -11,10 +11,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.logs.messages import Stamps, all_samples
+from pipelines.formats.logs.messages import Source, Stamps, all_samples
 from pipelines.formats.logs.trajectories import (
     Gathered,
-    Source,
     attitudes_of,
     chained,
     logged_poses,

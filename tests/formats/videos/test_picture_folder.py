@@ -10,14 +10,10 @@ import pytest
 from PIL import Image
 
 from pipelines.formats.videos import picture_folder
-from pipelines.formats.videos.picture_folder import (
-    UNTIMED,
-    FolderPictures,
-    Tags,
-    picture_times,
-)
+from pipelines.formats.videos.picture_folder import FolderPictures, Tags, picture_times
 from pipelines.geometry.poses import rotate
 from pipelines.session.recognition import recognise
+from pipelines.session.records import UNTIMED
 from pipelines.session.registries import TelemetryChoice, VideoFormat
 from tests.commands.runner import succeeds
 

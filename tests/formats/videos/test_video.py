@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from pipelines.formats.videos import video
-from pipelines.formats.videos.picture_folder import UNTIMED
 from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames, index_video
 from pipelines.geometry.arrays import Picture
 from pipelines.session.recognition import recognise
+from pipelines.session.records import UNTIMED
 from pipelines.session.registries import VideoFormat
 from tests.formats.refusals import refuses
 from tests.real_data import real_data
