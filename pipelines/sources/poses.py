@@ -330,7 +330,7 @@ class FlightPoses:
         return position, quaternion, lost
 
     def _stated_angles(self, name: str, gimbal: GimbalSource | None) -> AttitudeTrack | None:
-        """Return the attitude of a gimbal by the source that the manifest names, in our axes at world times."""
+        """Return the attitude of a gimbal by the source that the manifest names; None for the pose's own."""
         if gimbal is None or gimbal.is_of_pose:
             return None
         relative_to = gimbal.relative_to or "world"
