@@ -1,4 +1,4 @@
-"""Hook of MkDocs: write equations as MathML, which browsers draw by themselves, without a script or a network."""
+"""Hook of MkDocs: write equations as MathML, which browsers draw without a script or a network."""
 
 from __future__ import annotations
 
