@@ -431,7 +431,7 @@ def _replay_settings(stated: Stated) -> ReplanSettings:
     Raises:
         DataError: a variable or a value is wrong.
     """
-    names = set(SETTINGS) - {"radius_m", "zones"}
+    names = set(SETTINGS) - {"radius_m"}
     unknown = [name for name in stated if name not in {*_OF_SESSION, *names}]
     if unknown:
         raise DataError(

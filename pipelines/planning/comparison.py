@@ -5,7 +5,7 @@ stretches of the flight for figures that depend on the flight's course.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
@@ -146,7 +146,6 @@ def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, A
         "flown_poses": flight.poses_source,
         "pose_noise_from": flight.noise_source,
         "maps": len(scene.fields),
-        "zones": [asdict(zone) for zone in scene.config.zones],
         "trials": settings.trials,
         "seed": settings.seed,
         "intervals": {"level": LEVEL, "errors_over": "trials", "flights_over_stretches_of_s": STRETCH_S},
@@ -416,7 +415,6 @@ def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) ->
         "collision": "collides with an obstacle",
         "clearance": f"comes within {config.drone_radius_m:g} m of an obstacle",
         "actor": f"comes within {config.actor_distance_m:g} m of the actor",
-        "zone": "enters a no-fly zone",
         "separation": f"has two drones within {config.separation_m:g} m of each other",
         "speed": f"flies faster than {config.speed_mps:g} m/s",
         "acceleration": f"accelerates by more than {config.acceleration_mps2:g} m/s^2",

@@ -3,18 +3,16 @@
 import difflib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from pipelines.session.errors import DataError
 
 # Drones plan one after the other, so that more would not keep the rates.
 MOST_DRONES = 16
-# A smaller polygon is a line or a point after rounding, and bars nothing.
-MIN_ZONE_AREA_M2 = 1e-6
 
 Positive = Annotated[float, Field(gt=0, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, strict=True)]
@@ -115,67 +113,6 @@ class PlannerTuning:
 
 
 @dataclass(frozen=True)
-class Zone:
-    """No-fly zone: an upright prism that drones must not enter. Nothing is hidden by it."""
-
-    polygon_m: tuple[tuple[float, ...], ...]  # corners (east, north) of the world, at least three
-    low_m: float | None = None  # None: open to below
-    high_m: float | None = None
-    name: str = ""
-
-
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Point = tuple[Number, Number, Number]
-
-
-class _StatedZone(BaseModel):
-    """A zone as users write it: `polygon` with `heights`, or `box` with two opposite corners."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    name: str = ""
-    polygon: Annotated[list[tuple[Number, Number]], Field(min_length=3)] | None = None
-    heights: tuple[Number | None, Number | None] = (None, None)
-    box: tuple[Point, Point] | None = None
-
-    def zone(self) -> Zone:
-        """Return the prism."""
-        if (self.polygon is None) == (self.box is None):
-            raise ValueError("must have either `polygon` and `heights`, or `box`")
-        corners, (low_m, high_m) = list(self.polygon or ()), self.heights
-        if self.box is not None:
-            (x0, x1), (y0, y1), (low_m, high_m) = (sorted(ends) for ends in zip(*self.box, strict=True))
-            corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-        corners = corners[:-1] if corners[0] == corners[-1] else corners
-        if low_m is not None and high_m is not None and low_m >= high_m:
-            raise ValueError(f"its lowest point {low_m:g} must be below its highest {high_m:g}")
-        after = (*corners[1:], corners[0])
-        if any(one == other for one, other in zip(corners, after, strict=True)):
-            raise ValueError("two corners that follow each other are the same")
-        area_m2 = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(corners, after, strict=True)) / 2.0
-        if len(corners) < 3 or abs(area_m2) < MIN_ZONE_AREA_M2:
-            raise ValueError("its corners enclose nothing")
-        return Zone(tuple(corners), low_m, high_m, self.name)
-
-
-def _zones(value: object) -> object:
-    if not isinstance(value, list | tuple):
-        raise ValueError("must be a list of zones")
-    zones = []
-    for k, stated in enumerate(value):
-        try:
-            zone = stated if isinstance(stated, Zone) else _StatedZone.model_validate(stated).zone()
-        except ValidationError as error:
-            found = error.errors()[0]
-            place = ".".join(str(part) for part in found["loc"])
-            raise ValueError(f"zone {k + 1}: {place!r} {found['input']!r}: {found['msg']}") from None
-        except ValueError as error:
-            raise ValueError(f"zone {k + 1}: {error}") from None
-        zones.append(zone if zone.name else replace(zone, name=f"zone {k + 1}"))
-    return tuple(zones)
-
-
-@dataclass(frozen=True)
 class PlannerConfig:
     """Settings of every arm. Values that come from a user go through `planner_config`, which checks them."""
 
@@ -207,8 +144,6 @@ class PlannerConfig:
     drone_radius_m: NotNegative = 0.5
     # A drone keeps this distance from everybody.
     actor_distance_m: NotNegative = 3.0
-    # Drones must not fly in these prisms.
-    zones: Annotated[tuple[Zone, ...], BeforeValidator(_zones)] = ()
     # A drone accelerates by no more than this.
     acceleration_mps2: Positive = 4.0
     # A drone flies no faster than this.
@@ -275,7 +210,7 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
     except ValidationError as error:
         for found in error.errors():
             place = ".".join(str(part) for part in found["loc"])
-            problems.append(f"{place}: {found['msg'].removeprefix('Value error, ')}")
+            problems.append(f"{place}: {found['msg']}")
     if problems:
         raise DataError(source, "; ".join(problems), remedy, code="bad-value")
     return config

@@ -5,7 +5,7 @@ The kernels have no threads and no fastmath: the same numbers give the same byte
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.compilation import cached, helper
-from pipelines.planning.config import Zone
 from pipelines.session.records import Occupancy
 
 # A point is at most half a diagonal (in voxels) from its voxel's centre. It is at most a whole one from the
@@ -34,17 +33,12 @@ OCCUPIED = 0.5
 NOWHERE_M = 1e3
 
 
-NO_ZONES: Float = np.zeros((0, 7))
-"""Edges of no zone, see `zone_edges`."""
-
-
 class Grid(NamedTuple):
-    """A signed distance field and no-fly zones, as the kernels take them."""
+    """A signed distance field, as the kernels take it."""
 
     distance_m: NDArray[np.float32]  # [X, Y, Z], at least two voxels along each axis
     origin: Float  # [3] m, the corner of voxel (0, 0, 0)
     resolution_m: float
-    zones: Float = NO_ZONES  # [E, 7], see `zone_edges`; they bar drones, not sight
 
 
 class Sight(NamedTuple):
@@ -88,55 +82,6 @@ def interpolate(grid: Grid, x: float, y: float, z: float) -> tuple[float, float,
     gx = (high - low) * du
     gy = ((a01 - a00) * (1.0 - u) + (a11 - a10) * u) * dv
     gz = ((b00 * (1.0 - v) + b01 * v) * (1.0 - u) + (b10 * (1.0 - v) + b11 * v) * u) * dw
-    return value, gx, gy, gz
-
-
-@helper
-def zone_distance(zones: Float, x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Compute the signed distance to the nearest zone, negative inside, and its gradient; inf without any.
-
-    `zones` are those of `zone_edges`. The distance is exact.
-    """
-    value, gx, gy, gz = math.inf, 0.0, 0.0, 0.0
-    first = 0
-    while first < zones.shape[0]:
-        end = int(zones[first, 6])
-        square, ex, ey, inside = math.inf, 0.0, 0.0, False
-        for e in range(first, end):
-            x0, y0, wx, wy = zones[e, 0], zones[e, 1], zones[e, 2] - zones[e, 0], zones[e, 3] - zones[e, 1]
-            u = min(max(((x - x0) * wx + (y - y0) * wy) / (wx * wx + wy * wy), 0.0), 1.0)
-            dx, dy = x - x0 - u * wx, y - y0 - u * wy
-            if dx * dx + dy * dy < square:
-                square, ex, ey = dx * dx + dy * dy, dx, dy
-            if (y0 > y) != (y0 + wy > y) and x < x0 + (y - y0) * wx / wy:
-                inside = not inside
-        level = math.sqrt(square)
-        over, under = z - zones[first, 5], zones[first, 4] - z
-        up, way = max(over, under), 1.0 if over >= under else -1.0
-        ex, ey = (ex / level, ey / level) if level > 0.0 else (0.0, 0.0)
-        if inside:
-            level, ex, ey = -level, -ex, -ey
-        if level > 0.0 and up > 0.0:
-            distance = math.sqrt(level * level + up * up)
-            nx, ny, nz = ex * level / distance, ey * level / distance, way * up / distance
-        elif level >= up:
-            distance, nx, ny, nz = level, ex, ey, 0.0
-        else:
-            distance, nx, ny, nz = up, 0.0, 0.0, way
-        if distance < value:
-            value, gx, gy, gz = distance, nx, ny, nz
-        first = end
-    return value, gx, gy, gz
-
-
-@helper
-def barred(grid: Grid, x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Compute the distance to what drones must keep from, map and zones, and its gradient."""
-    value, gx, gy, gz = interpolate(grid, x, y, z)
-    if grid.zones.shape[0]:
-        zone, zx, zy, zz = zone_distance(grid.zones, x, y, z)
-        if zone < value:
-            return zone, zx, zy, zz
     return value, gx, gy, gz
 
 
@@ -239,16 +184,9 @@ def occupied_samples(
 def sample(grid: Grid, points: Float, distance: Float, gradient: Float) -> None:
     """Compute distances [P] and gradients [P, 3] at points [P, 3], written into the last two."""
     for p in range(points.shape[0]):
-        value, gx, gy, gz = barred(grid, points[p, 0], points[p, 1], points[p, 2])
+        value, gx, gy, gz = interpolate(grid, points[p, 0], points[p, 1], points[p, 2])
         distance[p] = value
         gradient[p, 0], gradient[p, 1], gradient[p, 2] = gx, gy, gz
-
-
-@cached
-def _zone_distances(zones: Float, points: Float, distance: Float) -> None:
-    """Compute distances [P] of points [P, 3] to zones, written into the last one."""
-    for p in range(points.shape[0]):
-        distance[p] = zone_distance(zones, points[p, 0], points[p, 1], points[p, 2])[0]
 
 
 @cached
@@ -292,14 +230,6 @@ class DistanceField:
         fill_bricks(self.grid, bricks)
         return Sight(bricks, (wide, deep, high))
 
-    def barring(self, zones: Float) -> "DistanceField":
-        """Return the field with these no-fly zones (`zone_edges`) in place of its own."""
-        if zones is self.grid.zones or (not len(zones) and not len(self.grid.zones)):
-            return self
-        other = replace(self, grid=self.grid._replace(zones=zones))
-        other.__dict__["sight"] = self.sight  # zones bar drones, not sight
-        return other
-
     @property
     def has_obstacles(self) -> bool:
         """True if anything is occupied."""
@@ -313,7 +243,7 @@ class DistanceField:
         return np.asarray(inside.all(axis=-1), dtype=np.bool_)
 
     def sample(self, points: Float) -> tuple[Float, Float]:
-        """Compute distances [...] to what drones keep from, map and zones, and their gradients [..., 3].
+        """Compute distances [...] to obstacles, and their gradients [..., 3].
 
         Points are [..., 3], metres, world. The gradient is the exact derivative of the trilinear value, zero
         along axes on which the point is outside the grid. Points must be finite.
@@ -387,29 +317,6 @@ def _distances(inside: NDArray[np.bool_], resolution_m: float) -> Iterator[tuple
 def open_space() -> DistanceField:
     """Return the field of a world without known obstacles."""
     return DistanceField(Grid(np.full((2, 2, 2), NOWHERE_M, dtype=np.float32), np.zeros(3), 1.0))
-
-
-def zone_edges(zones: Sequence[Zone]) -> Float:
-    """Lay out zones for the kernels: one row [7] for each edge of a polygon, zone after zone.
-
-    A row holds both ends (east, north), the lowest and the highest point, all in m, and the number of the row
-    after the zone's last one.
-    """
-    rows: list[list[float]] = []
-    for zone in zones:
-        end = len(rows) + len(zone.polygon_m)
-        low = -math.inf if zone.low_m is None else zone.low_m
-        high = math.inf if zone.high_m is None else zone.high_m
-        after = (*zone.polygon_m[1:], zone.polygon_m[0])
-        rows += [[*one, *other, low, high, end] for one, other in zip(zone.polygon_m, after, strict=True)]
-    return np.array(rows, dtype=np.float64) if rows else NO_ZONES
-
-
-def zone_distances(zones: Float, points: Float) -> Float:
-    """Compute signed distances [...] in metres of points [..., 3] to the nearest zone; inf without any."""
-    distance = np.empty(points.shape[:-1])
-    _zone_distances(zones, _flat(points), distance.reshape(-1))
-    return distance
 
 
 MapsInTurn = Sequence[tuple[slice, DistanceField]]

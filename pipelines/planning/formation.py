@@ -20,7 +20,7 @@ from pipelines.planning.distance_field import (
     DistanceField,
     Grid,
     Sight,
-    barred,
+    interpolate,
     look,
     nearest,
     occupied_samples,
@@ -199,10 +199,9 @@ def _look_at_slots(
             longest_m = max(longest_m, rules[s, i, 10])
     clear = math.ceil(2.0 * eps_obs_m / side_m + 1.0)  # from this leap on the nearest obstacle costs nothing
     per_m = 1.0 / side_m
-    has_zones = grid.zones.shape[0] > 0
     for t in range(times):
         spare_m = nearest(grid, actor[t, 0], actor[t, 1], actor[t, 2]) - DIAGONAL * side_m
-        if not has_zones and spare_m > longest_m + eps_obs_m + (DIAGONAL + ROUNDING) * side_m:
+        if spare_m > longest_m + eps_obs_m + (DIAGONAL + ROUNDING) * side_m:
             continue
         free_m = spare_m + (0.5 - ROUNDING) * side_m  # about the actor
         ax = (actor[t, 0] - grid.origin[0]) / side_m
@@ -216,8 +215,8 @@ def _look_at_slots(
                 rule, count = rules[s, i], counts[s, i]
                 x, y, z = offsets[s, i]
                 is_occupied, leap = look(sight, ax + x * per_m, ay + y * per_m, az + z * per_m)
-                if has_zones or is_occupied or leap < clear:
-                    distance = barred(grid, actor[t, 0] + x, actor[t, 1] + y, actor[t, 2] + z)[0]
+                if is_occupied or leap < clear:
+                    distance = interpolate(grid, actor[t, 0] + x, actor[t, 1] + y, actor[t, 2] + z)[0]
                     obstacle[t, s, i] = min(max(1.0 - distance / eps_obs_m, 0.0), 1.0)
                 first = max(int((free_m - start_m) * rule[9] - 0.5), 0)
                 end = count if is_occupied else count - leap

@@ -1,4 +1,4 @@
-"""Guard that keeps replayed drones out of obstacles and zones, away from each other and from the actor.
+"""Guard that keeps replayed drones out of obstacles, away from each other and from the actor.
 
 Invariant: every drone has a committed motion that ends at rest, keeps `drone_radius_m` from the map and
 `separation_m` from the committed motions of all others. A new plan is flown only if following it until the
@@ -20,7 +20,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import DistanceField, Grid, barred, zone_distances
+from pipelines.planning.distance_field import DistanceField, Grid, interpolate
 from pipelines.planning.forecast import ActorFilter, PeopleFilter
 from pipelines.planning.local import (
     POSITION,
@@ -49,8 +49,6 @@ ACCELERATION_SHARE = 0.75
 ACTOR_AHEAD_S = 2.0
 # A way out is nearly always within this window, and larger ones cost the cube of their size.
 FIRST_WINDOW_M = 4.0
-# A drone that leaves a zone and meets the next one so many times stands between zones without a gap.
-MAX_ZONES_IN_A_ROW = 8
 
 
 class FlownMotion(StrEnum):
@@ -280,15 +278,8 @@ def wanted_clearance_m(config: PlannerConfig, grid: Grid) -> float:
 
 
 def nearest_free(field: DistanceField, point: Float, wanted_m: float) -> Float | None:
-    """Find the nearest place [3] at least `wanted_m` from obstacles and zones; None without one.
-
-    It is the centre of a voxel, or for a drone in a zone a point straight out of it if that is free.
-    """
+    """Find the nearest centre [3] of a voxel at least `wanted_m` from obstacles; None without one."""
     grid = field.grid
-    if zone_distances(grid.zones, point) < wanted_m:
-        out = _out_of_zones(field, point, wanted_m)
-        if out is not None:
-            return out
     size = np.array(grid.distance_m.shape)
     middle = np.floor((point - grid.origin) / grid.resolution_m).astype(np.int64)
     reach = math.ceil(FIRST_WINDOW_M / grid.resolution_m)
@@ -298,8 +289,6 @@ def nearest_free(field: DistanceField, point: Float, wanted_m: float) -> Float |
         free = np.argwhere(part >= wanted_m)
         if len(free):
             centres = grid.origin + grid.resolution_m * (low + free + 0.5)
-            centres = centres[zone_distances(grid.zones, centres) >= wanted_m]
-        if len(free) and len(centres):
             away = np.linalg.norm(centres - point, axis=1)
             # Outside of the window voxels may be nearer than in its corners.
             if away.min() <= reach * grid.resolution_m or ((low == 0).all() and (high == size).all()):
@@ -310,17 +299,6 @@ def nearest_free(field: DistanceField, point: Float, wanted_m: float) -> Float |
         reach *= 2
 
 
-def _out_of_zones(field: DistanceField, point: Float, wanted_m: float) -> Float | None:
-    """Go straight away from the nearest barrier, and from those it leads to; None if that is in vain."""
-    place = point.copy()
-    for _ in range(MAX_ZONES_IN_A_ROW):
-        distance, gradient = field.sample(place)
-        if distance >= wanted_m:
-            return place
-        place = place + (wanted_m - distance + INSIDE_M) * gradient
-    return place if field.sample(place)[0] >= wanted_m else None
-
-
 @helper
 def _least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> float:
     """Compute the least distance to obstacles along a motion [K + 1, 4, 3] up to a row."""
@@ -328,13 +306,13 @@ def _least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> f
     for k in range(last + 1):
         x, y, z = states[k, 0, 0], states[k, 0, 1], states[k, 0, 2]
         if k == last:
-            return float(min(least, barred(grid, x, y, z)[0]))
+            return float(min(least, interpolate(grid, x, y, z)[0]))
         dx, dy, dz = states[k + 1, 0, 0] - x, states[k + 1, 0, 1] - y, states[k + 1, 0, 2] - z
         moved = math.sqrt(dx * dx + dy * dy + dz * dz)
         pieces = max(math.ceil(period_s / CHECK_PERIOD_S), math.ceil(2.0 * moved / grid.resolution_m), 1)
         for piece in range(pieces):
             u = piece / pieces
-            least = min(least, barred(grid, x + u * dx, y + u * dy, z + u * dz)[0])
+            least = min(least, interpolate(grid, x + u * dx, y + u * dy, z + u * dz)[0])
     return float(least)
 
 
@@ -374,7 +352,7 @@ def _distances_now(grid: Grid, place: Float, others: Float, people: Float) -> tu
         drones_m = min(drones_m, _apart(others[other, 0], place))
     for person in range(people.shape[0]):
         people_m = min(people_m, _apart(people[person, 0], place))
-    return barred(grid, place[0], place[1], place[2])[0], drones_m, people_m
+    return interpolate(grid, place[0], place[1], place[2])[0], drones_m, people_m
 
 
 _NONE = (0.0, 0.0, 0.0)

@@ -29,7 +29,6 @@ from pipelines.planning.distance_field import (
     DIAGONAL,
     DistanceField,
     Grid,
-    barred,
     interpolate,
     nearest,
 )
@@ -382,7 +381,7 @@ def _total(
         vy = (path[after, 1] - path[i + 2, 1]) / width
         vz = (path[after, 2] - path[i + 2, 2]) / width
         speed = math.sqrt(vx * vx + vy * vy + vz * vz + w.speed_floor_mps * w.speed_floor_mps)
-        d, dx, dy, dz = barred(grid, q[0], q[1], q[2])
+        d, dx, dy, dz = interpolate(grid, q[0], q[1], q[2])
         c, slope = _hinge(d, w.eps_obs_m)
         sight, sx, sy, sz = _sight_cost(grid, q, actor[i], w)
         terms[2] += c * speed * w.step_s

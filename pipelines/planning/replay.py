@@ -27,7 +27,6 @@ from pipelines.planning.distance_field import (
     looked,
     open_space,
     visible,
-    zone_edges,
 )
 from pipelines.planning.forecast import ActorFilter, Forecast, PeopleFilter, positions_at
 from pipelines.planning.formation import (
@@ -269,8 +268,7 @@ def replay(
     maps = sorted(fields, key=lambda field: field.from_ns)
     replay_ns = tracking_times(t_ns[first:last], config)
     map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")
-    zones = zone_edges(config.zones)
-    fields_known = [field.barring(zones) for field in (open_space(), *maps)]
+    fields_known = [open_space(), *maps]
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
 
     weight = np.array(weights, dtype=np.float64)

@@ -19,7 +19,6 @@ from pipelines.planning.distance_field import (
     Unknown,
     distance_field,
     in_turn,
-    zone_edges,
 )
 from pipelines.planning.forecast import positions_at
 from pipelines.planning.formation import (
@@ -526,7 +525,7 @@ class ReplayScene:
     def start_slots_inside(self) -> int:
         """Count the slots of the start that are within the drones' radius of an obstacle, or in it."""
         (_, first), *_ = self.maps_at(self.t_ns[:1])
-        clearance_m = first.barring(zone_edges(self.config.zones)).sample(self._first_slots()[:, 0])[0]
+        clearance_m = first.sample(self._first_slots()[:, 0])[0]
         return int((clearance_m < self.config.drone_radius_m).sum())
 
 
@@ -632,7 +631,7 @@ def _doubts(scene: ReplayScene) -> list[str]:
     if inside:
         doubts.append(
             f"{inside} of {scene.drones} drones start within {scene.config.drone_radius_m:g} m of an obstacle"
-            " or a no-fly zone and leave by the shortest way: choose another yaw_deg, radius_m or tilt_deg"
+            " and leave by the shortest way: choose another yaw_deg, radius_m or tilt_deg"
         )
     doubts += scene.config.out_of_reach()
     if scene.flight.skeleton is None:

@@ -14,8 +14,6 @@ from pipelines.planning.distance_field import (
     MapsInTurn,
     looked,
     visible,
-    zone_distances,
-    zone_edges,
 )
 from pipelines.planning.formation import RANGE, TILT, YAW, slot_of, wrapped
 
@@ -184,7 +182,6 @@ def score(
     seen = seen_actor(position, actor, maps, config)[None] if seen is None else seen
     near_m = np.linalg.norm(position - people[:, None], axis=-1).min(axis=0)
     clearance = looked(maps, lambda field, rows: field.sample(position[:, rows])[0], axis=1)
-    zone_m = zone_distances(zone_edges(config.zones), position)
     pairs = list(combinations(range(len(position)), 2))
     apart = np.array([np.linalg.norm(position[i] - position[j], axis=-1) for i, j in pairs])
     turned = np.array([wrapped(slots[j, :, YAW] - slots[i, :, YAW]) for i, j in pairs])
@@ -196,7 +193,6 @@ def score(
         "collision": _episodes(clearance <= 0.0),
         "clearance": _episodes(clearance < config.drone_radius_m),
         "actor": _episodes(near_m < config.actor_distance_m),
-        "zone": _episodes(zone_m < 0.0),
         "separation": _episodes(apart < config.separation_m) if pairs else 0,
         **{name: _episodes(motion[name] > limit * LIMIT_ROUNDING) for name, limit in limits.items()},
     }
@@ -210,7 +206,6 @@ def score(
         "energy_kj": _energy_j(t_s, position) / 1e3,
         "min_actor_distance_m": float(near_m.min()),
         "min_clearance_m": float(clearance.min()) if _has_obstacles(maps) else None,
-        "min_zone_distance_m": float(zone_m.min()) if config.zones else None,
         "min_separation_m": float(apart.min()) if pairs else None,
         "max_speed_mps": float(motion["speed"].max()),
         "max_acceleration_mps2": float(motion["acceleration"].max()),

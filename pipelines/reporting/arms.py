@@ -26,7 +26,6 @@ from pipelines.reporting.chart import (
     Mark,
     Note,
     Panel,
-    Polygon,
     Shades,
     axis_label,
     bounds,
@@ -41,7 +40,6 @@ from pipelines.reporting.wording import (
     Column,
     Table,
     fixed,
-    listing,
     percent,
     plural,
     quantity,
@@ -205,7 +203,6 @@ class Replan:
     setting: str  # a sentence about the comparison
     tables: tuple[Table, ...]
     notes: tuple[str, ...]
-    zones: Mapping[str, Float]  # no-fly zones by name: [K, 2] east, north
 
 
 def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Replan:
@@ -223,7 +220,6 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
     if content.map is not None and arms:
         low, high = bounds_of(arms)
         around = map_around(content.map, low - MAP_MARGIN_M, high + MAP_MARGIN_M)
-    stated = [section({"zone": zone}, "zone") for zone in items(metrics, "zones")]
     return Replan(
         arms=arms,
         around=around,
@@ -231,7 +227,6 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
         setting=_setting(metrics),
         tables=tuple(_tables(metrics)),
         notes=tuple(str(note) for note in items(metrics, "notes")),
-        zones={text(zone, "name"): np.array(items(zone, "polygon_m"), dtype=np.float64) for zone in stated},
     )
 
 
@@ -501,7 +496,6 @@ def draw_from_above(replan: Replan) -> Figure:
         if ground is not None and levels and min(ground.above_m.shape) >= 2:
             east, north = ground.east_m - origin[0], ground.north_m - origin[1]
             marks.append(Shades(east, north, ground.above_m, levels, "above" if k == 0 else ""))
-        marks += [Polygon(corners - origin, "no-fly zone") for corners in replan.zones.values()]
         marks += _from_above(arm, origin)
         x_label = axis_label("east", origin[0]) if k + columns >= len(arms) else ""
         y_label = axis_label("north", origin[1]) if k % columns == 0 else ""
@@ -518,8 +512,6 @@ def draw_from_above(replan: Replan) -> Figure:
         caption += (
             f" Shades: height of the map above the ground at {quantity(replan.around.ground_m, 'm', 2)}."
         )
-    if replan.zones:
-        caption += f" Hatched: {plural(len(replan.zones), 'no-fly zone')} ({listing(replan.zones)})."
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     size = 0.75 + len(rows) * (height_in + 0.25)
     return Figure("arms-top", "The arms from above", caption, rows, size, share_y=True)

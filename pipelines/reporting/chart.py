@@ -189,15 +189,6 @@ class Shades:
 
 
 @dataclass(frozen=True)
-class Polygon:
-    """A hatched area with corners [K, 2]."""
-
-    corners: Float
-    name: str = ""
-    legend: bool = True
-
-
-@dataclass(frozen=True)
 class Note:
     """Words at a place."""
 
@@ -213,7 +204,7 @@ class Image:
     picture: Picture
 
 
-Mark = Line | Points | Bars | Area | Shades | Polygon | Note | Image
+Mark = Line | Points | Bars | Area | Shades | Note | Image
 
 
 @dataclass(frozen=True)
@@ -311,9 +302,6 @@ def _rows_of(panel: Panel) -> Iterator[dict[str, object]]:
         elif isinstance(mark, Shades):
             for (i, j), value in np.ndenumerate(mark.values):
                 yield start | {"x": mark.x[i], "y": mark.y[j], "value": value}
-        elif isinstance(mark, Polygon):
-            for x, y in mark.corners:
-                yield start | {"x": x, "y": y}
         else:
             ends: Any = mark.ends if isinstance(mark, Points) else ()
             if isinstance(mark, Line) and mark.low is not None and mark.high is not None:
@@ -464,7 +452,7 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
         corners = np.repeat(mark.edges, 2)[1:-1]
         low, high = np.repeat(mark.low, 2), np.repeat(mark.high, 2)
         axes.fill_between(corners, low, high, color=mark.colour, linewidth=0, label=label)
-    elif isinstance(mark, Shades):
+    else:
         for k, level in enumerate(mark.levels):
             opacity = 1 - (1 - SHADE_OPACITY) ** (k + 1)
             axes.contourf(
@@ -484,14 +472,6 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
                 linewidth=0,
                 label=f"{mark.name} {level:g} m" if label else None,
             )
-    else:
-        style = {
-            "facecolor": "none",
-            "edgecolor": STATUS_COLOURS["rejected"],
-            "hatch": "////",
-            "linewidth": 0.9,
-        }
-        axes.fill(*mark.corners.T, label=label, zorder=2, **style)
 
 
 @contextmanager

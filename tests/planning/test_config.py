@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.planning.config import SETTINGS, PlannerConfig, Zone, planner_config
+from pipelines.planning.config import SETTINGS, PlannerConfig, planner_config
 from pipelines.session.errors import DataError
 
 
@@ -30,14 +30,6 @@ def test_what_is_not_mentioned_keeps_its_default() -> None:
         ({"l_occ": -1}, "l_occ"),
         ({"tilt_deg": 88}, "tilt_deg"),
         ({"tuning": {}}, "tuning"),
-        ({"zones": {"box": []}}, "zones"),
-        ({"zones": [{"name": "roof"}]}, "zone 1"),
-        ({"zones": [{"box": [[0, 0, 0], [5, 5, 0]]}]}, "zone 1"),
-        ({"zones": [{"box": [[0, 0, 0], [5, 5]]}]}, "zone 1"),
-        ({"zones": [{"polygon": [[0, 0], [5, 5]]}]}, "zone 1"),
-        ({"zones": [{"polygon": [[0, 0], [5, 5], [2, 2]]}]}, "zone 1"),
-        ({"zones": [{"polygon": [[0, 0], [5, 5], [0, "x"]]}]}, "'x'"),
-        ({"zones": [{"polygon": [[0, 0], [5, 5], [0, 5]], "hight": 3}]}, "'hight'"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_by_name(values: dict[str, object], named: str) -> None:
@@ -46,15 +38,6 @@ def test_what_cannot_be_meant_is_refused_by_name(values: dict[str, object], name
     assert error.value.source == "weights.yaml"
     assert named in str(error.value)
     assert "unheard_of" in str(error.value)  # all problems in one message
-
-
-def test_zones_are_polygons_with_heights_or_boxes() -> None:
-    polygon = {"name": "roof", "polygon": [[0, 0], [4, 0], [0, 3], [0, 0]], "heights": [None, 9]}
-    zones = planner_config({"zones": [polygon, {"box": [[5, 5, 3], [1, 7, 0]]}]}).zones
-    assert zones == (
-        Zone(((0.0, 0.0), (4.0, 0.0), (0.0, 3.0)), None, 9.0, "roof"),  # a closed polygon is opened
-        Zone(((1.0, 5.0), (5.0, 5.0), (5.0, 7.0), (1.0, 7.0)), 0.0, 3.0, "zone 2"),
-    )
 
 
 def test_a_yaw_rate_that_reaches_no_cell_is_warned_of() -> None:

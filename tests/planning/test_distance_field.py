@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
 
-from pipelines.planning.config import Zone
 from pipelines.planning.distance_field import (
     distance_field,
     in_turn,
-    visible,
-    zone_distances,
-    zone_edges,
 )
 from pipelines.session.records import Occupancy
 
@@ -61,49 +56,6 @@ def test_unknown_is_free_or_occupied_as_asked() -> None:
     blocked = distance_field(slab(unknown_above=True), unknown="occupied")
     assert blocked.sample(point)[0] == pytest.approx(-1.0, abs=1e-5)
     assert blocked.from_ns == 7
-
-
-YARD = Zone(((0.0, 0.0), (6.0, 0.0), (6.0, 2.0), (2.0, 2.0), (2.0, 6.0), (0.0, 6.0)), -1.0, 3.0)  # an L
-MAST = Zone(((20.0, 0.0), (21.0, 0.0), (21.0, 1.0), (20.0, 1.0)))  # without a top
-
-
-def test_zones_are_as_far_as_their_nearest_point() -> None:
-    """Distances from outside equal those to a dense sample of the L; inside, to the nearest wall or lid."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-2, -2, -2], [8, 8, 4], (300, 3))
-    spaced = [np.linspace(*ends, 61) for ends in ((0, 6), (0, 6), (-1, 3))]
-    solid = np.stack(np.meshgrid(*spaced, indexing="ij"), axis=-1).reshape(-1, 3)
-    solid = solid[(solid[:, 0] <= 2) | (solid[:, 1] <= 2)]
-    found = zone_distances(zone_edges([YARD]), points)
-    outside = found > 0
-    sampled = np.asarray(cKDTree(solid).query(points)[0])
-    assert 50 < outside.sum() < 280
-    assert found[outside] == pytest.approx(sampled[outside], abs=0.1 * np.sqrt(3) / 2)
-    assert (sampled[~outside] < 0.1).all()
-    assert zone_distances(zone_edges([YARD]), np.array([1.0, 4.5, 0.5])) == pytest.approx(-1.0)
-    assert zone_distances(zone_edges([YARD]), np.array([1.0, 1.0, 2.8])) == pytest.approx(-0.2)
-    assert zone_distances(zone_edges([YARD, MAST]), np.array([22.0, 0.5, 900.0])) == pytest.approx(1.0)
-    assert zone_distances(zone_edges([]), np.zeros((2, 3))).min() == np.inf
-
-
-def test_zones_bar_drones_but_not_sight() -> None:
-    free = distance_field(slab())
-    zones = zone_edges([Zone(((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)), 2.0, 3.0)])
-    field = free.barring(zones)
-    points = np.random.default_rng(1).uniform([-1.9, -1.9, 1.6], [1.9, 1.9, 3.8], (200, 3))
-    barred, gradient = field.sample(points)
-    assert (barred == np.minimum(free.sample(points)[0], zone_distances(zones, points))).all()
-    assert (barred < 0).any()
-    step = 1e-5
-    for axis in range(3):
-        ahead, behind = points.copy(), points.copy()
-        ahead[:, axis] += step
-        behind[:, axis] -= step
-        slope = (field.sample(ahead)[0] - field.sample(behind)[0]) / (2 * step)
-        assert np.mean(np.abs(slope - gradient[:, axis]) < 1e-3) > 0.97  # but for edges between faces
-    camera, actor = np.array([1.8, 0.0, 2.5]), np.array([-1.8, 0.0, 2.5])  # right through the zone
-    assert visible(field, camera, actor, start_m=0.0)
-    assert field.barring(zone_edges([])).sample(points)[0] == pytest.approx(free.sample(points)[0])
 
 
 def test_each_map_holds_from_its_own_time_on() -> None:

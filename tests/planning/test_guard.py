@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
-from pipelines.planning.arms import ADAPTIVE, FIXED
-from pipelines.planning.config import PlannerConfig, Zone
+from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import (
     DistanceField,
     distance_field,
     open_space,
-    zone_distances,
-    zone_edges,
 )
 from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.guard import FlownMotion, Guard, least_distances, wanted_clearance_m
 from pipelines.planning.local import DronePlan
-from pipelines.planning.replay import Start, replay
-from pipelines.planning.scores import score
 from pipelines.session.records import Occupancy
-from tests.planning.worlds import walker
 from tests.synthetic.worlds import fly, world_of
 
 CONFIG = PlannerConfig()
@@ -152,28 +144,6 @@ def test_a_drone_in_the_way_of_somebody_who_walks_gives_way() -> None:
             guard.fly(1)
     assert nearest >= CONFIG.actor_distance_m
     assert guard.counts[FlownMotion.GAVE_WAY] + guard.counts[FlownMotion.CLIMBED] > 0
-
-
-def test_no_drone_flies_into_a_zone() -> None:
-    """Both arms keep their radius from zones and see through them; without zones, `fixed` flies through."""
-    stamps, hips = walker(25.0)
-    post = ((9.0, 4.0), (12.0, 4.0), (12.0, 12.0), (9.0, 12.0))
-    zones = (Zone(post, None, 12.0), Zone(((14.0, -9.0), (22.0, -9.0), (18.0, -4.0)), 0.0))
-    edges = zone_edges(zones)
-    for arm in (FIXED, ADAPTIVE):
-        barred = replay(arm, stamps, hips, [], Start(2, np.pi / 4), config=replace(CONFIG, zones=zones))
-        figures = score(barred.t_s, barred.position, barred.actor, open_space(), replace(CONFIG, zones=zones))
-        assert zone_distances(edges, barred.position).min() >= CONFIG.drone_radius_m
-        assert sum(figures["limit_violations"].values()) == 0  # type: ignore[attr-defined]
-        assert figures["occluded_share"] == 0.0
-        assert figures["min_clearance_m"] is None
-        if arm is FIXED:
-            open_way = replay(arm, stamps, hips, [], Start(2, np.pi / 4), config=CONFIG)
-            assert zone_distances(edges, open_way.position).min() < 0
-            unaware = score(
-                open_way.t_s, open_way.position, open_way.actor, open_space(), replace(CONFIG, zones=zones)
-            )
-            assert unaware["limit_violations"]["zone"] > 0  # type: ignore[index]
 
 
 @pytest.mark.slow

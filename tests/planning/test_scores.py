@@ -34,7 +34,7 @@ def test_a_still_formation_in_the_open() -> None:
     assert figures["undetermined_share"] == 0
     assert figures["max_speed_mps"] == pytest.approx(0)
     assert figures["limit_violations"] == dict.fromkeys(
-        ("speed", "acceleration", "jerk", "separation", "collision", "clearance", "actor", "zone"), 0
+        ("speed", "acceleration", "jerk", "separation", "collision", "clearance", "actor"), 0
     )
     assert figures["min_separation_m"] == pytest.approx(10 * np.cos(np.radians(30)) * np.sqrt(2))
     # cos gamma = cos^2 30 cos 90 + sin^2 30 = 1/4; the detector's errors are those at 30 deg.

@@ -16,14 +16,13 @@ import pandas as pd
 import pytest
 
 from pipelines.reporting import chart, figures
-from pipelines.reporting.arms import draw_arms, summarise_replan
 from pipelines.reporting.chart import MARK, Figure, refuse_foreign, write_figures
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.page import draw_session
 from pipelines.session.errors import DataError
 
 from .comparisons import make_comparison
-from .conftest import ASIDE_PX, CAMERAS, JOINTS, OFFSET_M, RATE_HZ, START_NS
+from .conftest import ASIDE_PX, CAMERAS, JOINTS, OFFSET_M, RATE_HZ
 
 WIDTH_PX = 180 / 25.4 * 300
 
@@ -79,17 +78,6 @@ def test_numbers_of_arms_are_those_of_the_comparison(drawn: Mapping[str, Figure]
 def test_descriptions_state_the_numbers_of_the_data(drawn: Mapping[str, Figure]) -> None:
     assert "left wrist 45" in drawn["joints"].description
     assert "fixed 15.0 to 25.0" in drawn["arms-time"].description
-
-
-def test_no_fly_zones_are_hatched_and_named() -> None:
-    content = make_comparison()
-    zone = {"name": "school", "polygon_m": [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]], "low_m": None, "high_m": 9.0}
-    with_zone, bare = (
-        draw_arms(summarise_replan(replace(content, metrics=content.metrics | zones), START_NS, 2))[0]
-        for zones in ({"zones": [zone]}, {})
-    )
-    assert "school" in with_zone.caption
-    assert with_zone.svg.count("<pattern") > bare.svg.count("<pattern")
 
 
 def test_the_skeleton_lies_over_the_pictures(drawn: Mapping[str, Figure]) -> None:
