@@ -29,15 +29,13 @@ def study_command(
     \b
     mocap study tilt_deg=0:60:15 -o tilt/
     mocap study robots=2,3,4,5 noise=none,high scenario.yaml -o robots/
-    mocap study noise=white,bias,drift robots=3 trials=40 method=dlt,robust -o noise/
     mocap study range_m=8,10,12 arm=adaptive,joint flight.session -o ranges/
 
     Without a session, ideal cameras film a person who walks on a circle, or the first one of a scenario, and
     every method reconstructs the same data. Variables: tilt_deg, robots (the number of drones), method, and
-    noise: a level (none, low: 0.1 m and 0.5 deg per axis, medium: 0.3, 1, high: 0.5, 2), a kind (white, bias,
-    body-bias, drift, gauss-markov, or as in bias@high), or models as in --pose-noise, between semicolons.
-    With a single value: keypoints (model, exact), seconds, rate_hz, trials, seed, pixel_noise (px),
-    min_confidence.
+    noise: a level (none, low: 0.1 m and 0.5 deg per axis, medium: 0.3, 1, high: 0.5, 2) or models as in
+    --pose-noise, between semicolons. With a single value: keypoints (model, exact), seconds, rate_hz, trials,
+    seed.
 
     On a session, planner arms fly again against the log. Variables: arm, range_m, tilt_deg, robots, every
     setting of the planner. With a single value: config (PLANNER.yaml), pose_noise, trials, seed.

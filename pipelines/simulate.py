@@ -281,10 +281,10 @@ def _film_block(
     progress: Progress,
     folder: Path,
 ) -> None:
-    stamps, lens, shot = drone.at_frames.t_ns, drone.intrinsics, flight.scenario.lens
+    stamps, lens, shot = drone.at_frames.t_ns, drone.intrinsics, flight.scenario.drones.camera
     frames = range(first, min(first + _BLOCK, len(stamps)))
     offsets_s, weights = exposed_moments(
-        lens.height, exposure_s=(shot.exposure_ms or 0.0) / 1e3, readout_s=lens.readout_s
+        lens.height, exposure_s=shot.exposure_ms / 1e3, readout_s=lens.readout_s
     )
     t_ns = (stamps[frames.start : frames.stop, None] + np.rint(1e9 * offsets_s).astype(np.int64)).ravel()
     camera, motions = drone.at(t_ns), [each.moving(t_ns / 1e9) for each in flight.people]
@@ -314,7 +314,7 @@ def _film_block(
         since_first[frames.start : frames.stop],
         width=lens.width,
         height=lens.height,
-        bits_per_s=round(1e6 * (shot.bitrate_mbps or 0.0)) or None,
+        bits_per_s=round(1e6 * shot.bitrate_mbps) or None,
     )
 
 

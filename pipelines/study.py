@@ -294,13 +294,7 @@ def _measure_condition(
         sightings = exact
         if settings.keypoints == "model":
             sightings = model_keypoints(filmed, cameras, exact, seed=settings.seed, trial=trial)
-        views = views_of(
-            *(filmed, cameras, sightings, models),
-            seed=settings.seed,
-            trial=trial,
-            pixel_sigma=settings.pixel_noise,
-            min_confidence=settings.min_confidence,
-        )
+        views = views_of(*(filmed, cameras, sightings, models), seed=settings.seed, trial=trial)
         points, fell_back = {}, {}
         for method in settings.methods:
             points[method], doubt = _reconstructed(method, views, filmed, models)

@@ -19,7 +19,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import intervals
 from pipelines.reporting.chart import CAMERAS, LEVELS, Figure, Mark, Note, Panel, Points, write_drawing
 from pipelines.reporting.content import StudyContent
-from pipelines.reporting.wording import Column, Table, fixed, plural, quantity
+from pipelines.reporting.wording import Column, Table, plural
 
 Row = dict[str, Any]
 
@@ -72,7 +72,6 @@ _COLUMNS = {
     "violations": "violations",
 }
 _SHOWN = (METRICS["mpjpe_mm"], METRICS["reconstructed_share"])  # tables on a session's page
-_BEST = ("auto", "robust", "midpoint", "dlt")  # the sentence is about the first one available
 
 
 def estimates(rows: Sequence[Row], axis: str) -> list[dict[str, Any]]:
@@ -258,8 +257,9 @@ def study_blocks(study: StudyContent, figure: Figure) -> list[str | Table | Figu
     metrics = study.metrics
     made = f"Simulated: {setting(metrics)}. {study.command}; metrics.json {study.digest}"
     shown = [each for each in tables(metrics) if metrics["kind"] == "session" or each.title in _SHOWN]
+    verdict = metrics.get("verdict", "")
     return [
-        what_it_shows(metrics),
+        *([f"{verdict[0].upper()}{verdict[1:]}."] if verdict else []),
         made,
         figure,
         *(_as_table(f"{figure.key}-{k}", of) for k, of in enumerate(shown)),
@@ -357,32 +357,3 @@ def _draw_session(key: str, metrics: Mapping[str, Any]) -> Figure:
         " Filled: no other combination is better or equal in error, way and range together."
     )
     return Figure(key, f"Error against way, by {', '.join(metrics['varied'])}", caption, [[panel]], 4.2)
-
-
-def what_it_shows(metrics: Mapping[str, Any]) -> str:
-    """Describe the best combination, or the least and the largest error of the best method."""
-    if metrics["kind"] == "session":
-        verdict = metrics["verdict"]
-        return f"{verdict[0].upper()}{verdict[1:]}."
-    measured = [cell for cell in metrics["cells"] if cell["metrics"]["mpjpe_mm"]]
-    method = min((cell["method"] for cell in measured), key=_BEST.index)
-    own = sorted(
-        (cell for cell in measured if cell["method"] == method),
-        key=lambda cell: float(cell["metrics"]["mpjpe_mm"]["mean"]),
-    )
-    least, most = (f"{_mm(cell)} ({_condition(metrics, cell)})" for cell in (own[0], own[-1]))
-    return f"{method[0].upper()}{method[1:]} errs least {least}, and most {most}."
-
-
-def _condition(metrics: Mapping[str, Any], cell: Mapping[str, Any]) -> str:
-    varied = [metrics["axis"], *(name for name in _names(metrics) if name != metrics["axis"])]
-    words = {"tilt_deg": "tilt {:g} deg", "robots": "{} drones", "noise": "pose noise {}"}
-    return ", ".join(words[name].format(cell[name]) for name in varied)
-
-
-def _mm(cell: Mapping[str, Any]) -> str:
-    found = cell["metrics"]["mpjpe_mm"]
-    digits = 0 if found["mean"] >= 100 else 1
-    low, high = found["interval"] or (None, None)
-    interval = f" [{fixed(low, digits)}, {fixed(high, digits)}]" if found["interval"] else ""
-    return f"{quantity(found['mean'], 'mm', digits)}{interval}"

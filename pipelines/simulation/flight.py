@@ -165,7 +165,7 @@ def fly_scenario(
     estimates = [_estimated(each, k, scenario, t_s) for k, each in enumerate(set_up.people)]
     actor_ns, actor = estimates[0]
     paths = _paths(scenario, t_s, followed.moving(t_s).root, actor_ns / 1e9, actor, world, planner)
-    lens = _usable(scenario.lens.intrinsics())
+    lens = _usable(scenario.drones.camera.intrinsics())
     drones = [_drone(scenario, lens, paths, index, noise, span_s) for index in range(scenario.drones.count)]
 
     t_ns = np.unique(np.concatenate([drone.at_frames.t_ns for drone in drones]))

@@ -202,7 +202,7 @@ def _logged_people(flight: SimulatedFlight) -> list[str]:
 
 def _shot(flight: SimulatedFlight) -> list[str]:
     """Write a comment on exposure, readout and bit rate; none where all are off."""
-    lens = flight.scenario.lens
+    lens = flight.scenario.drones.camera
     parts = [
         f"exposure {lens.exposure_ms:g} ms" if lens.exposure_ms else "",
         f"readout {lens.readout_ms:g} ms" if lens.readout_ms else "",

@@ -9,15 +9,13 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import (
     AfterValidator,
     Field,
-    SerializerFunctionWrapHandler,
     field_validator,
-    model_serializer,
     model_validator,
 )
 
@@ -26,7 +24,7 @@ from pipelines.session.yaml_files import read_yaml_model
 from pipelines.session.yaml_models import SecondsAsNs, YamlModel
 
 # Files with a larger number come from a later version.
-SCHEMA = 2
+SCHEMA = 1
 # A larger map would take hundreds of megabytes.
 _MOST_VOXELS = 20_000_000
 _MOST_ACTORS, _LONGEST_NAME = 16, 50
@@ -40,14 +38,7 @@ Place = Annotated[list[Annotated[float, Field(ge=-10_000, le=10_000)]], Field(mi
 Seconds = Annotated[float, Field(gt=0, le=3600)]
 Metres = Annotated[float, Field(gt=0, le=1000)]
 
-EXPOSURE_MS = 2.0
-"""Exposure unasked in schema 2: 1/500 s, between the 1/240 s and less of daylight."""
-READOUT_MS = 20.0
-"""Readout unasked in schema 2. OpenDroneMap lists 19 ms (DJI Mavic Mini at 16:9) to 33 ms (Phantom 4)."""
-DISTORTION = [-0.132, 0.111, 0.0, 0.0, -0.016]
-"""Distortion unasked in schema 2: a DJI Phantom 3 Advanced (94 degrees) in OpenAthena's table of cameras."""
-BITS_PER_PIXEL = 0.3
-"""Bit rate unasked in schema 2. DJI's drones record 0.24 (4K at 60 Hz, 120 Mbit/s) to 0.40 (30 Hz, 100)."""
+# Flights that were simulated before these existed keep their hashes.
 _SHOT = ("exposure_ms", "distortion", "readout_ms", "bitrate_mbps")
 
 
@@ -284,15 +275,14 @@ class Lens(YamlModel):
     rate_hz: float = Field(30.0, ge=1, le=240)
     dropped_share: float = Field(0.0, ge=0, lt=0.5)  # frames that the recorder lost
     shutters: Literal["free", "synchronised"] = "free"
-    # Unstated: off in schema 1, a drone's ordinary values in schema 2 (`Scenario.lens`); 0 and [] are off.
-    exposure_ms: float | None = Field(None, ge=0, le=50)
-    distortion: Annotated[list[float], Field(max_length=8)] | None = None  # as `radtan` in flight.yaml
-    readout_ms: float | None = Field(None, ge=0, le=100)  # from the first row to the last
-    bitrate_mbps: float | None = Field(None, ge=0, le=1000)  # 0: constant quality
+    exposure_ms: float = Field(0.0, ge=0, le=50)
+    distortion: Annotated[list[float], Field(max_length=8)] = []  # as `radtan` in flight.yaml
+    readout_ms: float = Field(0.0, ge=0, le=100)  # from the first row to the last
+    bitrate_mbps: float = Field(0.0, ge=0, le=1000)  # 0: constant quality
 
     @field_validator("distortion")
     @classmethod
-    def _has_a_model(cls, value: list[float] | None) -> list[float] | None:
+    def _has_a_model(cls, value: list[float]) -> list[float]:
         if value and len(value) not in COEFFICIENT_COUNTS["radtan"]:
             raise ValueError(f"has {len(value)} coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6]] are 4, 5 or 8")
         return value
@@ -301,7 +291,7 @@ class Lens(YamlModel):
     def _shutter_is_fast_enough(self) -> Lens:
         period_ms = 1000 / self.rate_hz
         for name in ("exposure_ms", "readout_ms"):
-            if (getattr(self, name) or 0.0) > period_ms:
+            if getattr(self, name) > period_ms:
                 raise ValueError(
                     f"{name}: {getattr(self, name):g} ms do not fit between pictures {period_ms:.3g} ms apart"
                 )
@@ -322,15 +312,9 @@ class Lens(YamlModel):
             (self.width - 1) / 2,
             (self.height - 1) / 2,
             "radtan" if self.distortion else "none",
-            tuple(self.distortion or ()),
-            (self.readout_ms or 0.0) / 1e3,
+            tuple(self.distortion),
+            self.readout_ms / 1e3,
         )
-
-    @model_serializer(mode="wrap")
-    def _as_stated(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what schema 1 did not have, so that its scenarios keep the hashes of their flights."""
-        values: dict[str, Any] = handler(self)
-        return {name: value for name, value in values.items() if not (name in _SHOT and value is None)}
 
 
 class Drones(YamlModel):
@@ -365,7 +349,7 @@ class Scenario(YamlModel):
     """A flight to be simulated."""
 
     one_of = ("actor", "actors")
-    schema_version: Literal[1, 2] = Field(alias="schema")
+    schema_version: Literal[1] = Field(alias="schema")
     name: str = Field("", max_length=1000)
     seed: int = Field(1, ge=0, lt=2**32)
     duration_s: Seconds
@@ -375,24 +359,6 @@ class Scenario(YamlModel):
     world: WorldSettings = WorldSettings()
     drones: Drones = Drones()
     keypoints: DetectorErrors = DetectorErrors()
-
-    @property
-    def lens(self) -> Lens:
-        """The camera with exposure, distortion, readout and bit rate as they are filmed; 0 and [] are off."""
-        stated = self.drones.camera
-        usual: dict[str, Any] = {"exposure_ms": 0.0, "distortion": [], "readout_ms": 0.0, "bitrate_mbps": 0.0}
-        if self.schema_version > 1:
-            period_ms = 1000 / stated.rate_hz
-            pixels_per_s = stated.width * stated.height * stated.rate_hz
-            usual = {
-                "exposure_ms": min(EXPOSURE_MS, period_ms),
-                "distortion": DISTORTION,
-                "readout_ms": min(READOUT_MS, period_ms),
-                "bitrate_mbps": BITS_PER_PIXEL * pixels_per_s / 1e6,
-            }
-        return stated.model_copy(
-            update={name: value for name, value in usual.items() if getattr(stated, name) is None}
-        )
 
     @model_validator(mode="after")
     def _has_stamps(self) -> Scenario:
@@ -430,6 +396,8 @@ class Scenario(YamlModel):
         """
         unused: dict[str, bool | set[str]] = {"actor" if self.actors else "actors": True}
         stated = self.model_dump(mode="json", exclude={**unused, "keypoints": {"detector"}})
+        camera = stated["drones"]["camera"]
+        stated["drones"]["camera"] = {key: camera[key] for key in camera if key not in _SHOT or camera[key]}
         if self.actors:
             stated["actors"] = list(stated["actors"].items())
         return stated
@@ -447,6 +415,6 @@ def read_scenario(path: Path) -> Scenario:
         Scenario,
         "scenario",
         newest=SCHEMA,
-        shape="a mapping with `schema: 2` and `actor:` or `actors:`",
+        shape="a mapping with `schema: 1` and `actor:` or `actors:`",
     )
     return scenario if scenario.name else scenario.model_copy(update={"name": path.stem})

@@ -7,8 +7,6 @@ camera i has the same random numbers in every formation and for every size of th
 between formations are not due to chance. Stage `film` measures the arms of a comparison in the same way.
 """
 
-import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
@@ -129,7 +127,7 @@ def walk_of(performer: Performer, scenario: Scenario, seconds: float, rate_hz: f
         person.keypoints(motion),
         _smoothed(performer.moving, t_s),
     )
-    lens = replace(scenario.lens.intrinsics(), readout_s=0.0)
+    lens = replace(scenario.drones.camera.intrinsics(), readout_s=0.0)
     return Walk(t_ns, person, height_m, motion, joints, aim, lens, scenario.keypoints)
 
 
@@ -207,8 +205,6 @@ def views_of(
     *,
     seed: int,
     trial: int,
-    pixel_sigma: float = PIXEL_SIGMA,
-    min_confidence: float = MIN_CONFIDENCE,
 ) -> Views:
     """Return the input of triangulation: keypoints, logged poses, sigmas; T * J rows, joints fastest.
 
@@ -225,7 +221,7 @@ def views_of(
         rotation[:, camera] = matrix_from_quaternion(turned)
         sigma[:, camera] = sum_sigma(noise, elapsed_s, *rates(of.t_ns, *true))
     rays = undistort(sightings.xy, seen_by.lens)
-    trusted = np.where(sightings.confidence >= min_confidence, sightings.confidence, 0.0)
+    trusted = np.where(sightings.confidence >= MIN_CONFIDENCE, sightings.confidence, 0.0)
     return Views(
         rays=np.moveaxis(rays, 0, 2).reshape(times * joints, cameras, 2),
         weight=np.moveaxis(trusted, 0, 2).reshape(times * joints, cameras),
@@ -233,7 +229,7 @@ def views_of(
         position=position,
         rotation=rotation,
         focal=np.full(cameras, (seen_by.lens.fx + seen_by.lens.fy) / 2),
-        pixel_sigma=np.full(cameras, pixel_sigma),
+        pixel_sigma=np.full(cameras, PIXEL_SIGMA),
         pose_sigma=sigma,
     )
 
@@ -338,13 +334,9 @@ KNOWN = (
     "rate_hz",
     "trials",
     "seed",
-    "pixel_noise",
-    "min_confidence",
 )
 """Variables of a study of a walk."""
 
-# Errors of a satellite receiver and a compass stay alike for about this time.
-_CORRELATION_S = 10.0
 # The refinement falls back to `robust` with fewer pictures, so that its row would be that of `robust`.
 _MIN_TIMES_FOR_AUTO = 20
 
@@ -367,7 +359,7 @@ class StudiedNoise:
 
 @dataclass(frozen=True)
 class WalkStudy:
-    """Settings of a study of a walk. `walk_study` makes it and checks the values."""
+    """Settings of a study of a walk, checked by `walk_study`."""
 
     axis: Axis  # that a figure has along its horizontal axis, and that the ratio compares
     tilts_deg: tuple[float, ...]
@@ -379,8 +371,6 @@ class WalkStudy:
     rate_hz: float
     trials: int
     seed: int
-    pixel_noise: float = PIXEL_SIGMA  # standard deviation of a good keypoint for triangulation, px
-    min_confidence: float = MIN_CONFIDENCE
 
 
 def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
@@ -388,8 +378,7 @@ def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
 
     Args:
         stated: variable (of `KNOWN`) to its values, as users write them. `noise` has names of `LEVELS` (white
-            noise), kinds of noise of the same mean size (`white`, `bias`, `body-bias`, `drift`,
-            `gauss-markov`; of medium size, or as in `bias@high`), or models as `--pose-noise` has them.
+            noise), or models as `--pose-noise` has them.
 
     Raises:
         DataError: an unknown name, a value given twice, or a number out of range.
@@ -415,7 +404,9 @@ def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
             code="bad-value",
         )
     axis = _axis(stated)
-    noise = [studied_noise(text, seconds) for text in values.get("noise", tuple(LEVELS))]
+    noise = [
+        StudiedNoise(text, _white(text) if text in LEVELS else text) for text in values.get("noise", LEVELS)
+    ]
     _refuse_twice("noise", [each.label for each in noise])
     for each in noise:
         each.models()
@@ -430,8 +421,6 @@ def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
         float(rate_hz),
         int(_single(values, "trials", 1, 10_000, 10)),
         int(_single(values, "seed", 0, 2**32 - 1, 0)),
-        _single(values, "pixel_noise", 0.01, 1000, PIXEL_SIGMA),
-        _single(values, "min_confidence", 0, 1, MIN_CONFIDENCE),
     )
 
 
@@ -444,38 +433,6 @@ def _axis(stated: Mapping[str, Sequence[str]]) -> Axis:
     if "noise" in stated:
         return "noise"
     return "robots" if "robots" in stated and "tilt_deg" not in stated else "tilt_deg"
-
-
-def studied_noise(text: str, seconds: float) -> StudiedNoise:
-    """Return the noise of a level, of a kind with the mean size of a level, or of a model."""
-    if text in LEVELS:
-        return StudiedNoise(text, _white(text))
-    kind, _, level = text.partition("@")
-    if not re.fullmatch(r"[a-z-]+", kind) or (level and level not in LEVELS):
-        return StudiedNoise(text, text)
-    position_m, rotation_deg = LEVELS[level or "medium"]
-    size = f"position_m={position_m:g},rotation_deg={rotation_deg:g}"
-    # The mean square of a random walk over its length is half its last variance.
-    per_sqrt_s = 1 / math.sqrt(seconds / 2)
-    drift = (
-        f"drift:position_m_per_sqrt_s={position_m * per_sqrt_s:.4g},"
-        f"rotation_deg_per_sqrt_s={rotation_deg * per_sqrt_s:.4g}"
-    )
-    kinds = {
-        "white": f"white:{size}",
-        "bias": f"bias:{size}",
-        "body-bias": f"bias:{size},frame=body",
-        "drift": drift,
-        "gauss-markov": f"gauss-markov:{size},correlation_s={_CORRELATION_S:g}",
-    }
-    if kind not in kinds:
-        raise DataError(
-            f"noise={text}",
-            "is neither a level, a kind nor a model of noise",
-            f"there are the levels {', '.join(LEVELS)} and the kinds {', '.join(kinds)}",
-            code="no-such-name",
-        )
-    return StudiedNoise(text, "" if level == "none" else kinds[kind])
 
 
 def _white(level: str) -> str:

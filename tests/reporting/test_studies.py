@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
 from pipelines.reporting.content import StudyContent
-from pipelines.reporting.studies import METRICS, draw_study, study_blocks, tables, what_it_shows
+from pipelines.reporting.studies import METRICS, draw_study, study_blocks, tables
 from pipelines.reporting.wording import Table
 
-from .reading import numbers
 from .test_figures import numbers_of
 
 
@@ -44,10 +41,6 @@ def test_a_study_of_tilt_tells_its_ends_under_the_strongest_noise() -> None:
         for method in ("dlt", "robust")
     ]
     metrics = metrics_of("tilt_deg", cells)
-    said = what_it_shows(metrics)
-    assert numbers(said) == [30.0, 28.0, 32.0, 0, 1600, 1598, 1602, 60]
-    assert "high" in said
-    assert "Robust" in said
     errors, shares = tables(metrics)[0], tables(metrics)[5]
     assert (errors.names, errors.header) == (2, ["noise", "method", "0 deg", "60 deg"])
     assert errors.rows[-1] == ["high", "robust", "800.0 [798.0, 802.0]", "1600.0 [1598.0, 1602.0]"]
@@ -71,20 +64,6 @@ def test_a_study_of_two_variables_has_a_line_for_each_value_of_the_second() -> N
     assert table.header == ["noise", "robots", "method", "0 deg", "30 deg"]
     assert [row[:3] for row in table.rows] == [["none", "2", "dlt"], ["none", "3", "dlt"]]
     assert [row[3].split()[0] for row in table.rows] == ["60.0", "90.0"]
-
-
-def test_a_study_of_one_condition_or_of_kinds_of_noise() -> None:
-    alone = metrics_of("robots", [cell(32.06, robots=5)])
-    assert numbers(what_it_shows(alone))[:4] == [32.1, 30.1, 34.1, 5]
-    kinds = [cell(k, noise=noise, noise_model=noise) for noise, k in (("drift", 410), ("bias", 380))]
-    assert numbers(what_it_shows(metrics_of("noise", kinds))) == [380, 378, 382, 410, 408, 412]
-
-
-def test_a_method_that_measured_nothing_is_not_spoken_of() -> None:
-    cells = [cell(None, method="robust"), cell(40.0, method="dlt")]
-    assert "robust" not in what_it_shows(metrics_of("robots", cells))
-    with pytest.raises(ValueError, match=r"empty|iterable"):
-        what_it_shows(metrics_of("robots", cells[:1]))
 
 
 def test_a_study_of_a_session_shows_the_tradeoff() -> None:
