@@ -92,19 +92,17 @@ def check_size(source: Path | str, shape: Sequence[float], resolution_m: float, 
     )
 
 
-def describe_grid(
-    resolution_m: float, origin: Float, shape: Sequence[int], *, occupied: int, free: int
-) -> dict[str, object]:
+def describe_map(occupancy: Occupancy) -> dict[str, object]:
     """Describe a voxel map for `mocap info`: its box, and the number of voxels in each state."""
-    corner = origin + np.asarray(shape) * resolution_m
+    held, corner = HeldMap.of(occupancy), occupancy.origin
     return {
-        "resolution_m": resolution_m,
-        "size_voxels": [int(side) for side in shape],
-        "box_min_m": [round(v, 4) for v in origin.tolist()],
-        "box_max_m": [round(v, 4) for v in corner.tolist()],
-        "occupied_voxels": occupied,
-        "free_voxels": free,
-        "unknown_voxels": math.prod(int(side) for side in shape) - occupied - free,
+        "resolution_m": occupancy.resolution_m,
+        "size_voxels": [*held.shape],
+        "box_min_m": [round(v, 4) for v in corner.tolist()],
+        "box_max_m": [round(v, 4) for v in (corner + np.array(held.shape) * occupancy.resolution_m).tolist()],
+        "occupied_voxels": held.occupied,
+        "free_voxels": held.free,
+        "unknown_voxels": occupancy.probability.size - held.occupied - held.free,
     }
 
 
@@ -182,16 +180,6 @@ def read_grid(path: Path) -> Occupancy:
         raise DataError(
             path, f"is no readable npz ({str(error)[:200]})", _WRITE_AGAIN, code="damaged"
         ) from error
-
-
-def describe_stored(path: Path) -> dict[str, object]:
-    """Describe a stored map for `mocap info`: box, voxels and their states; errors as of `read_grid`."""
-    stored = read_grid(path)
-    held = HeldMap.of(stored)
-    box = describe_grid(
-        stored.resolution_m, stored.origin, held.shape, occupied=held.occupied, free=held.free
-    )
-    return {**box, "from_ns": stored.from_ns}
 
 
 def _read(path: Path, archive: zipfile.ZipFile) -> Occupancy:

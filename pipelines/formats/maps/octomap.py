@@ -20,9 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes, read_bytes, split_header
-from pipelines.geometry.arrays import Bool, Bytes, Float32, Int32, Int64
+from pipelines.formats.maps.voxel_grids import MapFile
+from pipelines.geometry.arrays import Bytes, Float32, Int32, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.maps import check_resolution, check_size, describe_grid
+from pipelines.session.maps import check_resolution, check_size
 from pipelines.session.records import Occupancy
 
 # OctoMap's trees always have this many levels.
@@ -52,16 +53,6 @@ class Leaves:
     log_odds: Float32  # [L] ln(p / (1 - p))
     nodes: int
 
-    @property
-    def occupied(self) -> Bool:
-        """[L] True for leaves of a probability of at least one half (OctoMap's threshold)."""
-        return self.log_odds >= 0
-
-    def voxels(self, chosen: Bool) -> int:
-        """Count the finest voxels that the chosen leaves stand for."""
-        counts = np.bincount(self.depth[chosen], minlength=DEPTH + 1).tolist()
-        return sum(count * 8 ** (DEPTH - depth) for depth, count in enumerate(counts))
-
     def extent(self) -> tuple[Int64, Int64]:
         """Return the lowest and highest corner of all leaves, in finest voxels from the world's origin."""
         key = self.key.astype(np.int64)
@@ -77,7 +68,7 @@ class _OctomapHeader:
     nodes: int | None
 
 
-class OctomapFormat:
+class OctomapFormat(MapFile):
     """Reader into the tree's own voxels, or into voxels 2, 4, 8, ... times as wide if the user states so.
 
     A wider voxel has the largest probability of the known leaves within it: an obstacle is never lost.
@@ -91,27 +82,6 @@ class OctomapFormat:
         """Return True if the file begins like OctoMap's files."""
         head = first_bytes(path, 64, suffixes=self.suffixes)
         return head.startswith((_BINARY, _FULL)) or _is_legacy(head)
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe header, nodes, leaves, voxels and boxes; the grid itself is not built."""
-        header, leaves = _read(path)
-        occupied = leaves.occupied
-        low, high = leaves.extent()
-        return {
-            "kind": header.kind,
-            "id": header.id,
-            "nodes": leaves.nodes,
-            "leaves": len(leaves.depth),
-            "occupied_leaves": int(occupied.sum()),
-            "free_leaves": int((~occupied).sum()),
-            **describe_grid(
-                header.resolution_m,
-                low.astype(np.float64) * header.resolution_m,
-                (high - low).tolist(),
-                occupied=leaves.voxels(occupied),
-                free=leaves.voxels(~occupied),
-            ),
-        }
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
         """Read the whole tree into a grid of its box."""

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.formats.common.files import leads_out, numbers, read_head, read_yaml
-from pipelines.formats.maps.voxel_grids import extruded
+from pipelines.formats.maps.voxel_grids import MapFile, extruded
 from pipelines.geometry.arrays import Bool, Float, Float32
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution
@@ -47,7 +47,6 @@ _MEND = "correct the YAML file"
 @dataclass(frozen=True)
 class _FloorPlan:
     image: Path
-    stated_image: str
     mode: str
     negate: bool
     resolution_m: float
@@ -57,7 +56,7 @@ class _FloorPlan:
     free_thresh: float
 
 
-class RosMap:
+class RosMap(MapFile):
     """Reader into voxels of the plan's own resolution, or of a stated one.
 
     A plan that is turned (yaw), or read at another resolution, is sampled so densely that every pixel is
@@ -78,39 +77,19 @@ class RosMap:
         """Return the files that the YAML refers to, because they too determine the map."""
         return [_read_plan(path).image]
 
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe the YAML's values, and pixels by state."""
-        plan = _read_plan(path)
-        pixels = _probabilities(path, plan)
-        summary: dict[str, object] = {"image": plan.image.name}
-        if plan.image.name != plan.stated_image:
-            summary["image named (absent)"] = plan.stated_image
-        occupied, free = int((pixels >= 0.5).sum()), int((pixels < 0.5).sum())
-        summary |= {
-            "width": pixels.shape[0],
-            "height": pixels.shape[1],
-            "mode": plan.mode,
-            "origin": [*plan.origin, plan.yaw],
-            "occupied_pixels": occupied,
-            "free_pixels": free,
-            "unknown_pixels": pixels.size - occupied - free,
-            "extruded_m": HEIGHT_M,
-        }
-        return summary
-
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
         """Read, turn and extrude the plan; the grid's axes are the world's."""
         plan = _read_plan(path)
-        side = plan.resolution_m if resolution_m is None else check_resolution(path, resolution_m)
-        return _grid(path, plan, _probabilities(path, plan), side)
-
-
-def _grid(path: Path, plan: _FloorPlan, pixels: Float32, side_m: float) -> Occupancy:
-    position = np.array([*plan.origin, 0.0])
-    turned = np.array([0.0, 0.0, math.sin(plan.yaw / 2), math.cos(plan.yaw / 2)])
-    return extruded(
-        str(path), pixels, plan.resolution_m, (position, turned), side_m=side_m, height_m=HEIGHT_M
-    )
+        side_m = plan.resolution_m if resolution_m is None else check_resolution(path, resolution_m)
+        turned = np.array([0.0, 0.0, math.sin(plan.yaw / 2), math.cos(plan.yaw / 2)])
+        return extruded(
+            str(path),
+            _probabilities(path, plan),
+            plan.resolution_m,
+            (np.array([*plan.origin, 0.0]), turned),
+            side_m=side_m,
+            height_m=HEIGHT_M,
+        )
 
 
 def _read_plan(path: Path) -> _FloorPlan:
@@ -148,7 +127,6 @@ def _read_plan(path: Path) -> _FloorPlan:
         raise DataError(path, f"image is {str(image)[:40]!r}", "it must name a PGM or PNG file")
     return _FloorPlan(
         image=_find_image(path, image),
-        stated_image=image,
         mode=str(mode),
         negate=bool(values["negate"]),
         resolution_m=check_resolution(path, resolution),

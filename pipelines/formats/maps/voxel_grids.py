@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import math
 import zipfile
+from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bytes, Float, Float32, Int64
+from pipelines.geometry.arrays import Float, Float32, Int64
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
 from pipelines.session.maps import (
     MapSizeError,
     check_resolution,
     check_size,
-    describe_grid,
-    describe_stored,
+    describe_map,
     read_grid,
 )
 from pipelines.session.records import Occupancy
@@ -39,6 +36,23 @@ Pose = tuple[Float, Float]
 _UPSIDE_DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # its own inverse; NED to ENU and back
 # So many values of a turned grid are sampled at a time, which bounds the memory.
 _SLAB_VALUES = 1 << 22
+
+
+class MapFile(ABC):
+    """Base of the readers of maps: they are described alike."""
+
+    @abstractmethod
+    def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
+        """Read the map, as `registries.MapFormat` says."""
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe box and voxels at the resolution that is read by default, and losses."""
+        try:
+            grid = self.read_map(path)
+        except MapSizeError as error:
+            return {"voxels": f"{error.problem}; {error.remedy}"}
+        named = {} if grid.crs is None else {"crs": grid.crs}
+        return describe_map(grid) | named | {f"dropped: {cause}": n for cause, n in grid.dropped.items()}
 
 
 class VoxelSet:
@@ -114,87 +128,6 @@ class VoxelSet:
         grid[*(index - self._low).T] = 1.0
         origin = (self._low + self._first).astype(np.float64) * self._side
         return Occupancy(grid, origin, self._side, at_ns, dropped=dict(+self.dropped))
-
-
-def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) -> Occupancy:
-    """Make the voxels of points [N, 3] m, of 0.2 m by default; what cannot be used is counted."""
-    voxels = VoxelSet(source, resolution_m)
-    voxels.add(points)
-    return voxels.occupancy()
-
-
-def describe_points(source: Path | str, points: Float) -> dict[str, object]:
-    """Describe points, their box and centre, and their map at 0.2 m."""
-    finite = points[np.isfinite(points).all(axis=1)]
-    facts: dict[str, object] = {"points": len(points), "finite_points": len(finite)}
-    if len(finite):
-        box = {"points_box_min_m": finite.min(axis=0), "points_box_max_m": finite.max(axis=0)}
-        box["centroid_m"] = finite.mean(axis=0)
-        facts |= {name: [round(v, 4) for v in at.tolist()] for name, at in box.items()}
-    try:
-        grid = occupancy_of(source, points, None)
-    except MapSizeError:
-        many = f"too many at {DEFAULT_RESOLUTION_M:g} m: crop stray points or state resolution_m"
-        return {**facts, "voxels": many}
-    facts |= {f"dropped: {cause}": count for cause, count in grid.dropped.items()}
-    occupied = int(np.count_nonzero(grid.probability == 1))
-    shape = grid.probability.shape
-    return facts | describe_grid(grid.resolution_m, grid.origin, shape, occupied=occupied, free=0)
-
-
-def packed_points(
-    path: Path, body: Bytes, count: int, columns: dict[str, tuple[str, int]], stride: int
-) -> Float:
-    """Extract points [N, 3] from binary records of `stride` bytes; more may follow the last.
-
-    `columns` gives numpy type and offset within a record for each of x, y and z.
-    """
-    check_count(path, count, len(body) // stride)
-    names = ("x", "y", "z")
-    record = np.dtype(
-        {
-            "names": names,
-            "formats": [columns[name][0] for name in names],
-            "offsets": [columns[name][1] for name in names],
-            "itemsize": stride,
-        }
-    )
-    rows = body[: count * stride].view(record)
-    return joined([rows[name] for name in names])
-
-
-def joined(columns: Sequence[NDArray[Any]]) -> Float:
-    """Stack columns of any numeric type, [N, len(columns)]."""
-    with np.errstate(invalid="ignore"):  # signalling NaNs of damaged floats warn; they are counted later
-        return np.stack([column.astype(np.float64) for column in columns], axis=1)
-
-
-def written_points(path: Path, body: Bytes, skipped: int, count: int, columns: tuple[int, int, int]) -> Float:
-    """Parse points [N, 3] from rows of text, behind `skipped` rows of other elements.
-
-    `columns` are the indices of x, y and z in a row, `count` is the number of points in the header.
-    """
-    lines = (line.strip() for line in body.tobytes().decode("latin-1").split("\n"))
-    rows = [line for line in lines if line][skipped:]
-    check_count(path, count, len(rows))
-    try:
-        points = np.loadtxt(rows[:count], dtype=np.float64, comments=None, usecols=columns, ndmin=2)
-    except (ValueError, OverflowError) as error:  # the latter for columns of an absurd number
-        raise DataError(
-            path, f"a row of points is damaged ({str(error)[:100]})", "export it again", code="damaged"
-        ) from error
-    return points
-
-
-def check_count(path: Path, stated: int, there: int) -> None:
-    """Refuse a cloud with fewer points than its header states (DataError)."""
-    if stated > there:
-        raise DataError(
-            path,
-            f"breaks off: {there} of {stated} points are there",
-            "copy it again or export it again",
-            code="damaged",
-        )
 
 
 def placed(
@@ -350,7 +283,7 @@ def _looked_up(grid: Occupancy, world_from_plane: Float, x: Float, y: Float) -> 
     return found
 
 
-class GridNpz:
+class GridNpz(MapFile):
     """Reader of a dense grid in its own voxels."""
 
     name = "npz"
@@ -367,10 +300,6 @@ class GridNpz:
         except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
             return False
         return "origin.npy" in names and bool(names & {"probability.npy", "occupancy.npy"})
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe box, voxels and their states; the arrays are read part by part."""
-        return describe_stored(path)
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
         """Read the grid as it is."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pipelines.formats.logs import maps as log_maps
 from pipelines.formats.logs.maps import cloud_points
 from pipelines.formats.maps import octomap
-from pipelines.formats.maps.voxel_grids import occupancy_of
+from pipelines.formats.maps.voxel_grids import VoxelSet
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import LogSource, Manifest, MapSource, Placement
 from pipelines.session.records import Occupancy
@@ -142,6 +142,12 @@ def test_damaged_and_empty_maps_are_counted(tmp_path: Path) -> None:
 # --- the log's world -----------------------------------------------------------------------------------
 
 
+def voxels_of(points: NDArray[np.float64]) -> Occupancy:
+    voxels = VoxelSet("cloud", None)
+    voxels.add(points)
+    return voxels.occupancy()
+
+
 def occupied_centres(one: Occupancy) -> NDArray[np.float64]:
     index = np.argwhere(one.probability >= 0.5)
     return one.origin + (index + 0.5) * one.resolution_m
@@ -201,7 +207,7 @@ POINTS = np.array(
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_cloud_is_that_of_a_file(tmp_path: Path, container: Container) -> None:
     found = Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0)], container=container)
-    expected = occupancy_of("cloud", POINTS.astype(np.float32).astype(np.float64), None)
+    expected = voxels_of(POINTS.astype(np.float32).astype(np.float64))
     same(found.only, expected)
     assert list(found.dropped.values()) == [1]
 
@@ -241,7 +247,7 @@ def test_clouds_add_up_and_nothing_is_known_before_it_was_seen(
     entries = [cloud_entry(cloud_fields(c, kind="f8"), T0 + k * SECOND) for k, c in enumerate(clouds)]
     found = Read(tmp_path, entries)
     assert [(one.from_ns - T0) // SECOND for one in found.maps] == list(range(7))
-    whole = occupancy_of("all", np.concatenate(clouds), None)
+    whole = voxels_of(np.concatenate(clouds))
     same(found.maps[-1], whole)
     for k, one in enumerate(found.maps):
         index = np.floor((np.concatenate(clouds[: k + 1]) - one.origin) / 0.2 + 1e-9).astype(int)

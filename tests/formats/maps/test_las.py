@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import MapFormat, need
-from tests.formats.refusals import refuses
 
 READER: MapFormat = point_files.LAS
 # Two voxels of 0.5 m beside each other and one above, in UTM 32 north.
@@ -45,7 +43,6 @@ def test_points_become_voxels_where_they_are(tmp_path: Path, suffix: str) -> Non
     assert np.argwhere(grid.probability == 1).tolist() == [[0, 0, 0], [0, 0, 1], [1, 0, 0]]
     assert np.isnan(grid.probability[1, 0, 1])
     assert grid.crs is None
-    assert READER.describe(path)["finite_points"] == 4
 
 
 def test_noise_and_withheld_points_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -71,22 +68,8 @@ def test_a_cut_file_gives_the_points_that_it_holds(tmp_path: Path, suffix: str, 
     content = path.read_bytes()
     path.write_bytes(content[: len(content) * 3 // 4])
     try:
-        facts = READER.describe(path)
+        found = READER.read_map(path)
     except DataError:
         assert suffix == ".laz"
         return
-    kept, cut = facts["finite_points"], facts["dropped: points cut off"]
-    assert isinstance(kept, int)
-    assert isinstance(cut, int)
-    assert kept + cut == 200_000
-    assert kept >= least * 200_000
-
-
-def test_a_decompressor_that_ends_its_process_ends_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write(tmp_path / "cloud.laz")
-    script = "import os; os.abort()"
-    monkeypatch.setattr(point_files, "_decompressor", lambda *_: [sys.executable, "-c", script])
-    with refuses(path):
-        READER.read_map(path, resolution_m=0.5)
+    assert 0 < found.dropped["points cut off"] <= (1 - least) * 200_000
