@@ -19,6 +19,7 @@ from pipelines.formats.calibrations.camera_matrices import (
     unstated_size,
 )
 from pipelines.formats.common.files import numbers, read_head, read_yaml
+from pipelines.formats.common.refusals import bad_value, damaged, empty
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
@@ -119,9 +120,9 @@ def _ros_matrix(path: Path, name: str, value: object) -> Float:
     rows, columns = block.get("rows"), block.get("cols")
     # isinstance takes `true` for an integer, so compare the type itself.
     if type(rows) is not int or type(columns) is not int or min(rows, columns) < 0:
-        raise DataError(path, f"{name} states no rows and cols", _WRITE_AGAIN)
+        raise damaged(path, f"{name} states no rows and cols")
     if rows * columns != len(cells):
-        raise DataError(path, f"{name} is {rows} x {columns} but has {len(cells)} numbers", _WRITE_AGAIN)
+        raise damaged(path, f"{name} is {rows} x {columns} but has {len(cells)} numbers")
     return cells.reshape(rows, columns) if len(cells) else cells.reshape(0, 0)
 
 
@@ -145,7 +146,7 @@ def _rows(path: Path, key: str, rows: list[list[str]]) -> Float:
     try:
         return np.array([[float(cell) for cell in row] for row in rows])
     except ValueError as error:  # a word among the numbers, or rows of unequal length
-        raise DataError(path, f"{key} is no table of numbers", _WRITE_AGAIN, code="bad-value") from error
+        raise bad_value(path, f"{key} is no table of numbers") from error
 
 
 CAMERA_INFO = CalibrationFile(
@@ -182,7 +183,7 @@ class Storage:
         self._cv2 = cv2
         text = read_text(path)
         if len(text) > _LARGEST or _depth(text) > _DEEPEST:
-            raise DataError(path, "is too large or nested too deeply", _WRITE_AGAIN)
+            raise damaged(path, "is too large or nested too deeply")
         try:
             # From memory: OpenCV's own file access fails on some names, and unpacks archives.
             self._file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -192,9 +193,9 @@ class Storage:
             cv2.error,
             SystemError,
         ) as error:  # the latter is how the binding reports a failed constructor
-            raise DataError(path, "OpenCV cannot parse it", "it may be truncated; write it again") from error
+            raise damaged(path, "OpenCV cannot parse it") from error
         if not whole:
-            raise DataError(path, "is empty", _WRITE_AGAIN, code="empty")
+            raise empty(path, "is empty")
 
     def text(self, key: str) -> str:
         """Return a string; empty if there is none."""
@@ -232,12 +233,11 @@ class Storage:
         rows, columns = (node.getNode(side).real() for side in ("rows", "cols"))
         cells = node.getNode("data").size()
         if not 0 < cells <= _MOST_CELLS or rows * columns != cells:
-            problem = f"{key} is {rows:g} x {columns:g} but has {cells} numbers"
-            raise DataError(self._path, problem, "write it again")
+            raise damaged(self._path, f"{key} is {rows:g} x {columns:g} but has {cells} numbers")
         try:
             return np.asarray(node.mat(), dtype=np.float64).reshape(int(rows), int(columns))
         except (self._cv2.error, TypeError, ValueError) as error:
-            raise DataError(self._path, f"{key} is not a matrix of numbers", "write it again") from error
+            raise damaged(self._path, f"{key} is not a matrix of numbers") from error
 
 
 def _stored_camera(
@@ -297,7 +297,7 @@ def _read_opencv(path: Path) -> Cameras:
     size = storage.vector("image_size") or [width, storage.number("image_height", "image_Height", "height")]
     matrix, distortion = storage.matrix(*_MATRIX), storage.matrix(*_DISTORTION)
     if matrix is None or distortion is None:
-        raise DataError(path, "has no camera_matrix or no distortion_coefficients", "add them")
+        raise damaged(path, "has no camera_matrix or no distortion_coefficients")
     fisheye = bool(storage.number("fisheye_model")) or storage.text("distortion_model").lower() in _FISHEYE
     camera = _stored_camera(path, name, size, matrix, distortion.ravel().tolist(), fisheye=fisheye)
     return {name: _with_pose(path, name, storage, camera, ("R", "rvec"), ("T", "tvec"))}
@@ -324,13 +324,13 @@ def _read_easymocap(path: Path) -> Cameras:
     for name in lenses.texts("names"):
         matrix, distortion = lenses.matrix(f"K_{name}"), lenses.matrix(f"dist_{name}")
         if matrix is None or distortion is None:
-            raise DataError(ways[0], f"has no K_{name} or no dist_{name}", "calibrate again")
+            raise damaged(ways[0], f"has no K_{name} or no dist_{name}")
         size = [lenses.number(f"{side}_{name}") for side in "WH"]
         camera = _stored_camera(ways[0], name, size, matrix, distortion.ravel().tolist())
         keys = (f"Rot_{name}", f"R_{name}"), (f"T_{name}",)
         found[name] = _with_pose(ways[1], name, places, camera, *keys) if places else camera
     if not found:
-        raise DataError(path, "names no camera", "calibrate again", code="empty")
+        raise empty(path, "names no camera")
     return found
 
 
@@ -475,11 +475,11 @@ def _tables(path: Path) -> dict[str, dict[str, object]]:
     """Return all tables; those in `cameras`, as in today's caliscope, as older ones name them: cam_0."""
     text = read_text(path)
     if any(piece.count(".") > _MOST_DOTS for piece in re.split(r"[=,{\n]", text)):
-        raise DataError(path, f"has a key of more than {_MOST_DOTS} parts", "write it again")
+        raise damaged(path, f"has a key of more than {_MOST_DOTS} parts")
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DataError(path, f"is not TOML ({error})", "it may be truncated; write it again") from error
+        raise damaged(path, f"is not TOML ({error})") from error
     tables = {key: value for key, value in content.items() if isinstance(value, dict)}
     nested = tables.get("cameras", {})
     if "matrix" in nested:  # one camera of that name
@@ -558,7 +558,7 @@ def _kalibr_camera(path: Path, name: str, block: object) -> CalibratedCamera:
             f"camera {name} has {counts[0]} intrinsics and {counts[1]} distortion coefficients"
             f" instead of 4 and {_DISTORTIONS[distortion]} (pinhole, {distortion})"
         )
-        raise DataError(path, problem, _WRITE_AGAIN, code="damaged")
+        raise damaged(path, problem)
     lens = intrinsics(
         path,
         name,

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.common.refusals import damaged
 from pipelines.geometry.arrays import DistortionModel, Float, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
@@ -71,7 +72,7 @@ def build_intrinsics(
     try:
         return Intrinsics(width, height, fx, fy, cx, cy, model, coefficients)
     except ValueError as error:
-        raise DataError(source, f"camera {camera}: {error}", "correct the calibration") from error
+        raise damaged(source, f"camera {camera}: {error}") from error
 
 
 def invert_pose(source: Path, camera: str, quaternion_xyzw: Float, translation: Float) -> tuple[Float, Float]:

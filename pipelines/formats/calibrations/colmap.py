@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.calibrations.camera_matrices import build_intrinsics, describe_cameras, invert_pose
+from pipelines.formats.common.refusals import damaged
 from pipelines.geometry.arrays import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
@@ -137,7 +138,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         problem += f" ({answer['error']})"
     except (subprocess.SubprocessError, ValueError, LookupError):
         pass
-    raise DataError(path, problem, "copy it or export it again")
+    raise damaged(path, problem)
 
 
 def _read_here(path: Path, memory: int) -> dict[str, Any]:

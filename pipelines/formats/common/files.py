@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.common.refusals import bad_value, damaged
 from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
 from pipelines.session.storage import as_data_error, is_special, plain_text, read_text, refuse_special
@@ -57,7 +58,7 @@ def split_header(path: Path, content: bytes, last: str) -> tuple[list[list[str]]
         start = end + 1
         if words and words[0] == last:
             return lines, np.frombuffer(content, np.uint8)[start:]
-    raise DataError(path, f"its header has no line {last!r}", "export the file again")
+    raise damaged(path, f"its header has no line {last!r}")
 
 
 def read_yaml(path: Path) -> dict[str, object]:
@@ -72,7 +73,7 @@ def read_yaml(path: Path) -> dict[str, object]:
         text = "#" + text
     value = plain_yaml(path, text)
     if not isinstance(value, dict):
-        raise DataError(path, "is no YAML mapping of names to values", "write it again")
+        raise damaged(path, "is no YAML mapping of names to values")
     return {str(key): item for key, item in value.items()}
 
 
@@ -81,7 +82,7 @@ def numbers(source: Path, name: str, value: object) -> Float:
     if not isinstance(value, list) or not all(
         isinstance(cell, int | float) and not isinstance(cell, bool) for cell in value
     ):
-        raise DataError(source, f"{name} is no list of numbers", "write it again", code="bad-value")
+        raise bad_value(source, f"{name} is no list of numbers")
     return np.array(value, dtype=np.float64)
 
 

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.common.files import first_bytes
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.drone_logs.telemetry_rows import (
     Boots,
     DroneLog,
     attitude_track,
-    damaged,
     find_boots,
     fit_gps_time,
     fixes_track,

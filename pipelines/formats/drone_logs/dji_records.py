@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
+from pipelines.formats.common.refusals import empty
 from pipelines.formats.drone_logs.dji_subtitles import (
     DjiRows,
     any_finite,
@@ -296,9 +297,7 @@ def _read(path: Path) -> _Record:
     except OSError as error:
         raise as_data_error(error, path) from error
     if not clocks:
-        raise DataError(
-            path, f"holds no rows ({damaged} damaged)", "export the flight record again", code="empty"
-        )
+        raise empty(path, f"holds no rows ({damaged} damaged)")
     blank = np.full(len(clocks), np.nan)
     names = (*_NUMBERS, *_LENGTHS, "elapsed", "altitude")
     columns = {

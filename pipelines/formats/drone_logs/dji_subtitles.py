@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
+from pipelines.formats.common.refusals import empty
 from pipelines.formats.common.rows import longest_rising
 from pipelines.formats.drone_logs.telemetry_rows import (
     DroneLog,
@@ -257,12 +258,7 @@ def read_subtitles(path: Path) -> Subtitles:
         ) from error
     subtitles = parse_subtitles(text)
     if not subtitles.texts:
-        raise DataError(
-            path,
-            "holds no subtitles" if text.strip() else "is empty",
-            "copy it from the drone again",
-            code="empty",
-        )
+        raise empty(path, "holds no subtitles" if text.strip() else "is empty")
     return subtitles
 
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.drone_logs.telemetry_rows import (
     DroneLog,
     attitude_track,
@@ -179,8 +180,7 @@ def _packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
                 if found:
                     return
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        problem = f"cannot be read ({str(error)[:100]})"
-        raise DataError(path, problem, "copy it from the camera again") from error
+        raise damaged(path, f"cannot be read ({str(error)[:100]})") from error
 
 
 def _read(path: Path) -> _Track:

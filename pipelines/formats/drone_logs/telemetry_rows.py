@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.common.rows import NORM_TOLERANCE, describe_times, kept_rows
 from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64, Place, RelativeTo
 from pipelines.geometry.clocks import fit_clock
@@ -21,7 +22,6 @@ from pipelines.geometry.poses import (
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, Height, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice
-from pipelines.session.storage import code_of
 
 # Late messages scatter GPS times by less.
 _UNEVEN_S = 0.5
@@ -365,21 +365,13 @@ def refuse_marks(path: Path, *marks: bytes, most: int | None = None) -> None:
     with path.open("rb") as file:
         found = sum(block.count(mark) for block in iter(partial(file.read, 1 << 20), b"") for mark in marks)
     if found > most:
-        raise DataError(path, f"has {found} beginnings of messages in {size} bytes", "copy it again")
+        raise damaged(path, f"has {found} beginnings of messages in {size} bytes")
 
 
 # A parser tries so many marks in a second.
 _FEW_MARKS = 100_000
 # No message of an autopilot takes fewer bytes.
 _SMALLEST_MESSAGE = 8
-
-
-def damaged(path: Path, error: Exception) -> DataError:
-    """Make the error of a log that its parser cannot read, by any kind of exception."""
-    if isinstance(error, OSError):
-        return DataError(path, f"cannot be read ({error.strerror})", "check the path", code=code_of(error))
-    problem = " ".join(str(error).split())[:100] or type(error).__name__
-    return DataError(path, f"is damaged ({problem})", "download it from the autopilot again", code="damaged")
 
 
 def describe_fit(fit: ClockFit) -> str:

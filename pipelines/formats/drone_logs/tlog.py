@@ -21,10 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.drone_logs.telemetry_rows import (
     Boots,
     DroneLog,
-    damaged,
     find_boots,
     fit_gps_time,
     of_angles,

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.drone_logs.telemetry_rows import (
     DroneLog,
     attitude_track,
-    damaged,
     fit_gps_time,
     fixes_track,
     on_gps_time,
@@ -374,7 +374,6 @@ def read_topics(path: Path, wanted: Collection[str]) -> list[UlogTopic]:
 
 def _refuse_bombs(path: Path) -> None:
     """Refuse definitions that expand without end: nested arrays may mean billions of fields."""
-    again = "download it from the autopilot again"
     formats: dict[str, list[tuple[str, str]]] = {}  # type and count of each field, by the name of the message
     try:
         with path.open("rb") as file:
@@ -399,7 +398,7 @@ def _refuse_bombs(path: Path) -> None:
         if depth <= 20 and name not in sizes:
             sizes[name] = sum(int(n or 1) * size_of(inner, depth + 1) for inner, n in formats[name])
         if depth > 20 or sizes[name] > _MOST_FIELDS:
-            raise DataError(path, f"defines {name} with more than {_MOST_FIELDS} fields, or by itself", again)
+            raise damaged(path, f"defines {name} with more than {_MOST_FIELDS} fields, or by itself")
         return sizes[name]
 
     for name in formats:

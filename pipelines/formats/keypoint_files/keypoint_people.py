@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_bytes, read_head
+from pipelines.formats.common.refusals import damaged, empty
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS, Skeleton, get_skeleton, joint_called, skeleton_with
@@ -40,12 +41,12 @@ def load_json(path: Path) -> object:
     """Read a JSON file; NaN and Infinity are accepted, as Python writes them."""
     content = read_bytes(path)
     if not content.strip():
-        raise DataError(path, "is empty", "export the keypoints again", code="empty")
+        raise empty(path, "is empty")
     try:
         parsed: object = json.loads(content)
     except (ValueError, RecursionError) as error:
         reason = "is nested too deeply" if isinstance(error, RecursionError) else f"is not JSON ({error})"
-        raise DataError(path, reason, "it may be truncated; export the keypoints again") from error
+        raise damaged(path, reason) from error
     return parsed
 
 
@@ -106,11 +107,11 @@ def is_alphapose_entry(entry: dict[str, object]) -> bool:
 def objects(content: object, where: object, what: str) -> Iterator[tuple[str, dict[str, object]]]:
     """Yield each entry of a list of JSON objects, with its name for messages."""
     if not isinstance(content, list):
-        raise DataError(str(where), f"the {what} are not a list", "check the file's format")
+        raise damaged(str(where), f"the {what} are not a list")
     for index, entry in enumerate(content):
         name = f"{where}, {what} [{index}]"
         if not isinstance(entry, dict):
-            raise DataError(name, "is not a JSON object", "check the file's format")
+            raise damaged(name, "is not a JSON object")
         yield name, entry
 
 
@@ -119,7 +120,7 @@ def numbers(values: object, where: str) -> Float:
     try:
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(where, "keypoints are not plain numbers", "check the file's format") from error
+        raise damaged(where, "keypoints are not plain numbers") from error
 
 
 def triples(values: object, where: str) -> Float:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.keypoint_files.keypoint_people import (
     Gathering,
     KeypointFile,
@@ -302,7 +303,7 @@ def _people_in(people: Gathering, rows: list[list[str]], first: int, everybody: 
             cells = [float(cell or "nan") if cell[:1] in "-.0123456789" else np.nan for cell in row]
         except ValueError as error:
             if k < last:
-                raise DataError(people.path, f"line {k + 1}: {error}", "export it again") from error
+                raise damaged(people.path, f"line {k + 1}: {error}") from error
             people.dropped["truncated last line"] += 1
             return
         yield row, [

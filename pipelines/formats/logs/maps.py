@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.logs.message_decoders import OCTOMAP
 from pipelines.formats.logs.messages import FAULTS, Stamps, bytes_of, nanoseconds
 from pipelines.formats.maps.octomap import leaves_of, occupancy_from
@@ -44,7 +45,6 @@ PLACELESS = "map messages at whose time no transform is known"
 EMPTY = "empty maps"
 LATE = "maps without a later stamp"
 NOT_KEPT = "maps between those that are kept"
-_RECORD_AGAIN = "check what wrote the log"
 
 # Types that coordinates can have, by the numbers of sensor_msgs/PointField.
 _FLOAT_TYPES = {7: "f4", 8: "f8"}
@@ -98,7 +98,7 @@ def frame_of(message: Message, source: str) -> str:
     try:
         return str(message.value.header.frame_id).lstrip("/")
     except AttributeError as error:
-        raise DataError(source, f"its messages lack the field {error.name!r}", _RECORD_AGAIN) from error
+        raise damaged(source, f"its messages lack the field {error.name!r}") from error
 
 
 class Losses:
@@ -148,9 +148,7 @@ def evenly(count: int, most: int) -> list[int]:
 def _time_of(message: Message, about: MapTopic) -> int:
     """Return the stamp to use."""
     if (frame := frame_of(message, about.source)) != about.frame:
-        raise DataError(
-            about.source, f"lies in frame {frame!r}, the messages before in {about.frame!r}", _RECORD_AGAIN
-        )
+        raise damaged(about.source, f"lies in frame {frame!r}, the messages before in {about.frame!r}")
     stamp_ns = nanoseconds(message.value.header.stamp) if about.stamps == "header" else 0
     return stamp_ns or message.receive_ns
 
@@ -241,8 +239,7 @@ def _one_line(about: MapTopic) -> Iterator[None]:
     try:
         yield
     except FAULTS as error:
-        problem = f"a message cannot be read ({str(error)[:100]})"
-        raise DataError(about.source, problem, _RECORD_AGAIN, code="damaged") from error
+        raise damaged(about.source, f"a message cannot be read ({str(error)[:100]})") from error
 
 
 def _made_again(
@@ -287,7 +284,7 @@ def _plan(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
     width, height = int(info.width), int(info.height)
     cells = bytes_of(value.data).view(np.int8)
     if len(cells) != width * height:
-        raise DataError(source, f"holds {len(cells)} of {width} x {height} cells", _RECORD_AGAIN)
+        raise damaged(source, f"holds {len(cells)} of {width} x {height} cells")
     if ((cells < -1) | (cells > 100)).any():
         worst = int(cells[(cells < -1) | (cells > 100)][0])
         raise DataError(source, f"holds a cell of {worst}", "-1 is unknown, else 0 to 100 percent")
@@ -315,7 +312,7 @@ def _origin(stated: Any, source: str) -> Pose:
     if norm == 0:
         return position, np.array([0.0, 0.0, 0.0, 1.0])
     if not np.isfinite(position).all() or not abs(norm - 1) < 0.1:
-        raise DataError(source, f"its origin is no pose ({[*position, *quaternion]})", _RECORD_AGAIN)
+        raise damaged(source, f"its origin is no pose ({[*position, *quaternion]})")
     return position, quaternion / norm
 
 
@@ -371,12 +368,7 @@ def cloud_points(value: Any, source: str) -> Float:
     row_bytes = int(value.row_step) or width * stride
     data = bytes_of(value.data)
     if row_bytes < width * stride or len(data) < row_bytes * height:
-        raise DataError(
-            source,
-            f"a cloud breaks off: {len(data)} bytes for {width} x {height} points",
-            _RECORD_AGAIN,
-            code="damaged",
-        )
+        raise damaged(source, f"a cloud breaks off: {len(data)} bytes for {width} x {height} points")
     # Fields that lie beyond the point are a ValueError here. Rows may be padded, and values unaligned.
     names, formats, offsets = zip(*columns, strict=True)
     layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": stride})

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.camera_matrices import intrinsics
+from pipelines.formats.common.refusals import damaged
 from pipelines.geometry.arrays import Float, Int64, Intrinsics
 from pipelines.geometry.clocks import ClockStep, find_steps, fit_clock, without_steps
 from pipelines.session.errors import DataError
@@ -107,9 +108,7 @@ def unreadable(message: Message, source: Source, error: Exception) -> DataError:
     problem = f"cannot be read ({error})"
     if isinstance(error, AttributeError):
         problem = f"lacks the field {error.name!r}"
-    return DataError(
-        source, f"topic {topic.name}: a message of type {topic.type} {problem}", "check what wrote the log"
-    )
+    return damaged(source, f"topic {topic.name}: a message of type {topic.type} {problem}")
 
 
 # --- poses, transforms, gimbal angles ------------------------------------------------------------------

@@ -21,6 +21,7 @@ from typing import IO
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.logs.message_decoders import Schema, decoder, inflate
 from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
@@ -122,9 +123,7 @@ class LogPart(ABC):
         """
         types = len({channel.schema for channel in self.channels.values()})
         if types > _MOST_TYPES:
-            raise DataError(
-                self.path, f"defines {types} types of messages", "no drone has so many; copy the log again"
-            )
+            raise damaged(self.path, f"defines {types} types of messages")
         named = np.isin(table.channel, list(self.channels))
         if strangers := int(np.count_nonzero(~named)):
             self.lost[UNNAMED] += strangers
@@ -139,9 +138,7 @@ class LogPart(ABC):
         """Refuse a damaged file without any readable message; an undamaged file may be empty."""
         if self.lost and not len(self.table.stamp_ns):
             causes = ", ".join(f"{cause}: {count}" for cause, count in sorted(self.lost.items()))
-            raise DataError(
-                self.path, f"holds no message that can be read ({causes})", "copy it again from the drone"
-            )
+            raise damaged(self.path, f"holds no message that can be read ({causes})")
 
     def lose(self, rows: Int64, cause: str) -> None:
         """Note why messages could not be read; a second reading counts them once only."""
@@ -285,7 +282,7 @@ class ChunkedPart(LogPart):
         self._bare += bare
         if self._bare > max(_BARE, self.file_size // _BARE_SIZE):
             problem = f"holds {self._bare} chunks without an index or empty indices in {self.file_size} bytes"
-            raise DataError(self.path, problem, RECORD_AGAIN)
+            raise damaged(self.path, problem)
 
     def _note_end(self, end: int, closed: bool) -> None:
         if not closed:
@@ -326,7 +323,7 @@ class ChunkedPart(LogPart):
         """Refuse a file whose chunks inflate beyond reason; none is inflated to more than it states."""
         sizes = [chunk.size for chunk in self.chunks if chunk.size <= CHUNK_LIMIT]
         if sum(sizes) > inflated_limit(self.file_size):
-            raise DataError(self.path, f"inflates from {self.file_size} to {sum(sizes)} bytes", RECORD_AGAIN)
+            raise damaged(self.path, f"inflates from {self.file_size} to {sum(sizes)} bytes")
 
     def _inflated(self, chunk: Chunk) -> memoryview | None:
         if max(chunk.size, chunk.length) > CHUNK_LIMIT:
@@ -515,7 +512,7 @@ def open_file(path: Path) -> tuple[IO[bytes], int]:
     try:
         size = path.stat().st_size
         if not size:
-            raise DataError(path, "is empty (0 bytes)", "copy it again from the drone")
+            raise damaged(path, "is empty (0 bytes)")
         file = path.open("rb")
     except OSError as error:
         raise as_data_error(error, path) from None

@@ -23,6 +23,7 @@ from typing import Any
 import apsw
 import numpy as np
 
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.logs.mcap_log import McapPart
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import (
@@ -204,7 +205,7 @@ def _contents(path: Path) -> _BagFiles:
         found.lost[MISSING_FILES] = missing
     files = [file for file in found.files if file.is_file()] or _storage_files(path)
     if not files:
-        raise DataError(path, "is a bag without its .db3 or .mcap files", "copy the whole folder again")
+        raise damaged(path, "is a bag without its .db3 or .mcap files")
     return replace(found, files=files)
 
 

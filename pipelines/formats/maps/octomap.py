@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes, read_bytes, split_header
+from pipelines.formats.common.refusals import bad_value, damaged
 from pipelines.formats.maps.voxel_grids import MapFile
 from pipelines.geometry.arrays import Bytes, Float32, Int32, Int64
 from pipelines.session.errors import DataError
@@ -41,7 +42,6 @@ _LEGACY = struct.Struct("<idI")
 # The oldest .bt files begin with this number.
 _LEGACY_TYPE = 3
 _RECORD_BYTES = {"OcTree": 5, "ColorOcTree": 8}  # of a node in a .ot
-_COPY_AGAIN = "copy or export it again"
 
 
 @dataclass(frozen=True)
@@ -161,9 +161,7 @@ def full_leaves(source: Path | str, payload: Bytes, record_bytes: int) -> Leaves
     log_odds = np.ascontiguousarray(records[node, :4]).view("<f4")[:, 0]
     if not np.isfinite(log_odds).all():
         bad = int((~np.isfinite(log_odds)).sum())
-        raise DataError(
-            source, f"{bad} leaves have log odds that are not finite", _COPY_AGAIN, code="bad-value"
-        )
+        raise bad_value(source, f"{bad} leaves have log odds that are not finite")
     return Leaves(key, depth, log_odds, nodes=used)
 
 
@@ -173,7 +171,7 @@ def _read(path: Path) -> tuple[_OctomapHeader, Leaves]:
     check_resolution(path, header.resolution_m)
     leaves = leaves_of(path, payload, is_binary=header.kind != "ot", tree=header.id)
     if header.nodes is not None and header.nodes != leaves.nodes:
-        raise DataError(path, f"has {leaves.nodes} nodes where its header states {header.nodes}", _COPY_AGAIN)
+        raise damaged(path, f"has {leaves.nodes} nodes where its header states {header.nodes}")
     if not len(leaves.depth):
         raise DataError(path, "is an empty map: nothing in it is known", "leave `map:` out", code="empty")
     return header, leaves
@@ -195,11 +193,9 @@ def _split(path: Path, content: bytes) -> tuple[_OctomapHeader, Bytes]:
         resolution_m = float(values["res"])
         nodes = int(values["size"]) if "size" in values else None
     except KeyError as error:
-        raise DataError(path, "its header states no res", _COPY_AGAIN) from error
+        raise damaged(path, "its header states no res") from error
     except ValueError as error:
-        raise DataError(
-            path, f"its header cannot be read ({str(error)[:100]})", _COPY_AGAIN, code="damaged"
-        ) from error
+        raise damaged(path, f"its header cannot be read ({str(error)[:100]})") from error
     kind = "bt" if content.startswith(_BINARY) else "ot"
     return _OctomapHeader(kind, values.get("id", "OcTree"), resolution_m, nodes), payload
 
@@ -212,16 +208,12 @@ def _check_walk(source: Path | str, used: int, unit_bytes: int, payload_bytes: i
     from pipelines.formats.maps.octree import BREAKS_OFF, TOO_DEEP
 
     if used == BREAKS_OFF:
-        raise DataError(
-            source, f"its tree breaks off after {payload_bytes} bytes", _COPY_AGAIN, code="damaged"
-        )
+        raise damaged(source, f"its tree breaks off after {payload_bytes} bytes")
     if used == TOO_DEEP:
-        raise DataError(
-            source, f"its tree is damaged: deeper than {DEPTH} levels", _COPY_AGAIN, code="damaged"
-        )
+        raise damaged(source, f"its tree is damaged: deeper than {DEPTH} levels")
     if used * unit_bytes != payload_bytes:
         extra = payload_bytes - used * unit_bytes
-        raise DataError(source, f"has {extra} bytes beyond its tree", _COPY_AGAIN, code="damaged")
+        raise damaged(source, f"has {extra} bytes beyond its tree")
 
 
 def _log_odds(probability: float) -> float:

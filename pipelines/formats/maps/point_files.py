@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.common.files import first_bytes, read_bytes, split_header
+from pipelines.formats.common.refusals import damaged, empty
 from pipelines.formats.maps.voxel_grids import MapFile, VoxelSet
 from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import install_command, need
 
-_AGAIN = "copy it again, or export it again"
 _SIZES = struct.Struct("<II")
 MOST_EXPANSION = 88
 """Largest ratio of output to input (264 bytes for 3); a file that states more is refused."""
@@ -48,12 +48,12 @@ class CloudFile(MapFile):
 
 
 def _bad_header(path: Path, problem: object) -> DataError:
-    return DataError(path, f"its header cannot be read ({str(problem)[:100]})", _AGAIN, code="damaged")
+    return damaged(path, f"its header cannot be read ({str(problem)[:100]})")
 
 
 def _refuse_cut(path: Path, stated: int, there: int) -> None:
     if stated > there:
-        raise DataError(path, f"breaks off: {there} of {stated} points are there", _AGAIN, code="damaged")
+        raise damaged(path, f"breaks off: {there} of {stated} points are there")
 
 
 def _records(path: Path, body: Bytes, count: int, record: np.dtype[Any]) -> NDArray[Any]:
@@ -76,8 +76,7 @@ def _written(path: Path, body: Bytes, skipped: int, count: int, columns: Sequenc
     try:
         return np.loadtxt(rows[:count], dtype=np.float64, comments=None, usecols=columns, ndmin=2)
     except (ValueError, OverflowError) as error:  # the latter for columns of an absurd number
-        problem = f"a row of points is damaged ({str(error)[:100]})"
-        raise DataError(path, problem, _AGAIN, code="damaged") from error
+        raise damaged(path, f"a row of points is damaged ({str(error)[:100]})") from error
 
 
 # --- PCD: fields in any order and of any type -----------------------------------------------------------
@@ -130,8 +129,7 @@ def _decompressed(path: Path, body: Bytes, wanted: int) -> Bytes:
     packed = body[_SIZES.size :][:packed_size]
     values = np.zeros(size if size == wanted <= MOST_EXPANSION * len(packed) else 0, dtype=np.uint8)
     if len(packed) < packed_size or not len(values) or decompress(packed, values) != size:
-        problem = f"its compressed points are damaged: {len(packed)} bytes for {wanted}"
-        raise DataError(path, problem, _AGAIN, code="damaged")
+        raise damaged(path, f"its compressed points are damaged: {len(packed)} bytes for {wanted}")
     return values
 
 
@@ -173,7 +171,7 @@ def read_ply(path: Path) -> Float:
     encoding, elements = _ply_header(path, lines)
     names = [name for name, _, _ in elements]
     if "vertex" not in names:
-        raise DataError(path, "has no vertices", _AGAIN, code="empty")
+        raise empty(path, "has no vertices")
     earlier, (_, count, properties) = elements[: names.index("vertex")], elements[names.index("vertex")]
     if not {"x", "y", "z"} <= properties.keys() or "list" in properties.values() or not count:
         stated = " ".join(properties)[:100]
@@ -267,16 +265,15 @@ def _header(path: Path) -> Any:
     size = path.stat().st_size
     first_point = int.from_bytes(head[96:100], "little")
     if len(head) < 227 or first_point > size:
-        raise DataError(path, f"is cut off within its header ({size} bytes)", _AGAIN, code="damaged")
+        raise damaged(path, f"is cut off within its header ({size} bytes)")
     if first_point < 227 or sum(counts) * _RECORD > size:
         problem = f"states {sum(counts)} records and points from byte {first_point} on, in {size} bytes"
-        raise DataError(path, problem, _AGAIN, code="damaged")
+        raise damaged(path, problem)
     try:
         with path.open("rb") as file:
             return laspy.LasHeader.read_from(file, read_evlrs=True)
     except Exception as error:  # laspy raises whatever it meets in a damaged header
-        problem = f"laspy cannot read it ({str(error)[:100]})"
-        raise DataError(path, problem, _AGAIN, code="damaged") from error
+        raise damaged(path, f"laspy cannot read it ({str(error)[:100]})") from error
 
 
 def _add_points(path: Path, header: Any, voxels: VoxelSet) -> dict[str, int]:
@@ -306,9 +303,7 @@ def _add_points(path: Path, header: Any, voxels: VoxelSet) -> dict[str, int]:
         raise
     except BaseException as error:  # panics of the decompressor have the base of all exceptions
         if not read:
-            raise DataError(
-                path, f"laspy cannot read it ({str(error)[:100]})", _AGAIN, code="damaged"
-            ) from error
+            raise damaged(path, f"laspy cannot read it ({str(error)[:100]})") from error
     lost["points cut off"] = stated - read
     return dict(+lost)
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.formats.common.files import leads_out, numbers, read_head, read_yaml
+from pipelines.formats.common.refusals import bad_value, damaged
 from pipelines.formats.maps.voxel_grids import MapFile, extruded
 from pipelines.geometry.arrays import Bool, Float, Float32
 from pipelines.session.errors import DataError
@@ -41,7 +42,6 @@ _MODES = ("trinary", "scale", "raw")
 _SUFFIXES = (".pgm", ".png")
 # White in each of Pillow's modes without colours.
 _GREYS = {"1": 1, "L": 255, "I": 65535, "I;16": 65535, "I;16B": 65535}
-_MEND = "correct the YAML file"
 
 
 @dataclass(frozen=True)
@@ -111,14 +111,9 @@ def _read_plan(path: Path) -> _FloorPlan:
     ).tolist()
     mode, image = values.get("mode", "trinary"), values["image"]
     if len(origin) != 3 or not np.abs(origin).max() < 1e9:  # also true for NaN
-        raise DataError(path, f"origin is {origin.tolist()} instead of x, y, yaw", _MEND, code="bad-value")
+        raise bad_value(path, f"origin is {origin.tolist()} instead of x, y, yaw")
     if not 0 <= free <= occupied <= 1:
-        raise DataError(
-            path,
-            f"free_thresh {free:g} and occupied_thresh {occupied:g} are not 0..1",
-            _MEND,
-            code="bad-value",
-        )
+        raise bad_value(path, f"free_thresh {free:g} and occupied_thresh {occupied:g} are not 0..1")
     if mode not in _MODES:
         raise DataError(path, f"mode is {str(mode)[:40]!r}", f"known are {', '.join(_MODES)}")
     if values["negate"] not in (0, 1):
@@ -192,8 +187,7 @@ def _picture(image: Path) -> tuple[Float, Bool]:
             image, "is no PGM or PNG picture", "convert it to one of them", code="wrong-kind"
         ) from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        problem = f"cannot be read as a picture ({str(error)[:100]})"
-        raise DataError(image, problem, "copy it again, or save it again", code="damaged") from error
+        raise damaged(image, f"cannot be read as a picture ({str(error)[:100]})") from error
 
 
 @contextmanager

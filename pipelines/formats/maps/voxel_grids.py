@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.common.refusals import empty
 from pipelines.geometry.arrays import Float, Float32, Int64
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
@@ -120,7 +121,7 @@ class VoxelSet:
             DataError: there is no point.
         """
         if self._first is None:
-            raise DataError(self._source, "holds no point that is finite", "export it again", code="empty")
+            raise empty(self._source, "holds no point that is finite")
         keys = self._keys[self._since_ns <= at_ns]
         mask = (1 << _BITS) - 1
         index = np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _REACH

@@ -38,6 +38,7 @@ import numpy as np
 
 from pipelines.formats.common.exporting import people_of
 from pipelines.formats.common.files import read_head
+from pipelines.formats.common.refusals import bad_value, damaged, empty
 from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.poses import (
@@ -273,12 +274,12 @@ def _read(path: Path) -> _BvhFile:
     if not head.lstrip().startswith("HIERARCHY"):
         raise DataError(path, "is no BVH file", "its first word must be HIERARCHY", code="wrong-kind")
     if not marker:
-        raise DataError(path, "ends before its line MOTION", _EXPORT_AGAIN, code="damaged")
+        raise damaged(path, "ends before its line MOTION")
     bones = _bones(path, head.replace("{", " { ").replace("}", " } ").split()[1:])
     lines = tail.split("\n", maxsplit=3) + [""] * 3
     frames, frame_time_s = _stated(path, lines[1], "Frames:"), _stated(path, lines[2], "Frame Time:")
     if not 0 < frame_time_s <= _LONGEST_S:
-        raise DataError(path, f"states a frame time of {frame_time_s:g} s", "correct it", code="bad-value")
+        raise bad_value(path, f"states a frame time of {frame_time_s:g} s")
     values = _numbers(path, lines[3], sum(len(bone.channels) for bone in bones), head.count("\n") + 5)
     if len(values) != frames:
         problem = f"states {frames:g} frames but holds {len(values)}"
@@ -331,7 +332,7 @@ def _bones(path: Path, words: list[str]) -> list[_FileBone]:
 
 
 def _damaged(path: Path, problem: str) -> DataError:
-    return DataError(path, problem, _EXPORT_AGAIN, code="damaged")
+    return damaged(path, problem)
 
 
 def _offset(path: Path, words: list[str]) -> Float:
@@ -350,14 +351,13 @@ def _stated(path: Path, line: str, key: str) -> float:
     try:
         return float(words[1]) if len(words) == 2 and not words[0].strip() else float("none")
     except ValueError:
-        problem = f"has {line.strip()[:60]!r} where `{key}` and a number belong"
-        raise DataError(path, problem, _EXPORT_AGAIN, code="bad-value") from None
+        raise bad_value(path, f"has {line.strip()[:60]!r} where `{key}` and a number belong") from None
 
 
 def _numbers(path: Path, body: str, channels: int, first_line: int) -> Float:
     """Parse the frames [T, channels]."""
     if not channels or not body.strip():
-        raise DataError(path, "holds no frames or no channels", _EXPORT_AGAIN, code="empty")
+        raise empty(path, "holds no frames or no channels")
     rows: list[Float] = []
     for number, line in enumerate(body.split("\n"), start=first_line):
         if words := line.split():
@@ -366,8 +366,7 @@ def _numbers(path: Path, body: str, channels: int, first_line: int) -> Float:
             except ValueError:
                 row = np.full(channels, np.nan)
             if len(row) != channels or not (np.abs(row) < _LARGEST).all():
-                problem = f"line {number} does not hold {channels} numbers below {_LARGEST:g}"
-                raise DataError(path, problem, _EXPORT_AGAIN, code="damaged")
+                raise damaged(path, f"line {number} does not hold {channels} numbers below {_LARGEST:g}")
             rows.append(row)
     return np.array(rows)
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from pipelines.formats.common.exporting import people_of
 from pipelines.formats.common.files import first_bytes
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.skeletons.joint_files import (
     METRES,
     EvenMotion,
@@ -61,7 +62,6 @@ _MOST_EVENTS = 255
 # Names in gait laboratories' programs.
 _EVENTS = {"heel_strike": "Foot Strike", "toe_off": "Foot Off"}
 _SCREEN_UP = {"+Z": "z-up", "+Y": "y-up"}
-_EXPORT_AGAIN = "export it again"
 
 
 class C3dFormat:
@@ -101,9 +101,7 @@ def _open(path: Path) -> Any:
     try:
         return ezc3d.c3d(str(path))
     except (OSError, ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
-        raise DataError(
-            path, f"is no readable C3D ({str(error)[:120]})", _EXPORT_AGAIN, code="damaged"
-        ) from error
+        raise damaged(path, f"is no readable C3D ({str(error)[:120]})") from error
 
 
 def _check_layout(path: Path) -> None:
@@ -120,7 +118,7 @@ def _check_layout(path: Path) -> None:
     except OSError as error:
         raise as_data_error(error, path) from error
     if len(head) < _BLOCK or head[1] != _MAGIC or len(section) < 4:
-        raise DataError(path, "is no readable C3D (it ends in its header)", _EXPORT_AGAIN, code="damaged")
+        raise damaged(path, "is no readable C3D (it ends in its header)")
     processor = section[3]
     order = ">" if processor == _MIPS else "<"
     points, analogs, first, last = struct.unpack_from(f"{order}4H", head, 2)
@@ -133,12 +131,9 @@ def _check_layout(path: Path) -> None:
         frames = min(frames, struct.unpack(f"{order}H", stated[1])[0])
     needed = (start - 1) * _BLOCK + frames * (4 * points + analogs) * (4 if is_float else 2)
     if size < needed:
-        problem = f"is no readable C3D (it holds {size} of the {needed} bytes of its header)"
-        raise DataError(path, problem, _EXPORT_AGAIN, code="damaged")
+        raise damaged(path, f"is no readable C3D (it holds {size} of the {needed} bytes of its header)")
     if not _is_chain(section, order):
-        raise DataError(
-            path, "is no readable C3D (its parameters are damaged)", _EXPORT_AGAIN, code="damaged"
-        )
+        raise damaged(path, "is no readable C3D (its parameters are damaged)")
 
 
 def _is_chain(section: bytes, order: str) -> bool:
@@ -178,7 +173,7 @@ def _motion(path: Path, contents: Any, *, unit: str | None, axes: str | None) ->
     residual = np.asarray(contents["data"]["meta_points"]["residuals"], np.float64)[0]
     frames = _frames(contents)
     if not points.shape[1] or not frames:
-        raise DataError(path, "holds no points", _EXPORT_AGAIN)
+        raise damaged(path, "holds no points")
     xyz = np.where(residual < 0, np.nan, points[:3]).transpose(2, 1, 0)
     if frames > len(xyz):
         xyz = np.concatenate([xyz, _beyond(path, contents, len(xyz), frames)])
@@ -217,9 +212,7 @@ def _beyond(path: Path, contents: Any, read: int, frames: int) -> Float:
     start = (int(first) - 1) * _BLOCK + read * points * 16
     values = np.fromfile(path, "<f4", count=(frames - read) * points * 4, offset=start)
     if len(values) < (frames - read) * points * 4:
-        raise DataError(
-            path, f"breaks off before the last of its {frames} frames", _EXPORT_AGAIN, code="damaged"
-        )
+        raise damaged(path, f"breaks off before the last of its {frames} frames")
     rows = values.reshape(frames - read, points, 4).astype(np.float64)
     return np.where(rows[..., 3:] < 0, np.nan, rows[..., :3])
 
@@ -247,12 +240,12 @@ def _times(path: Path, contents: Any, frames: int) -> Int64:
         try:
             start, span = int(first), int(last) - int(first)
         except ValueError as error:
-            raise DataError(path, "its MOCAP:FIRST_T_NS is no number", _EXPORT_AGAIN) from error
+            raise damaged(path, "its MOCAP:FIRST_T_NS is no number") from error
         step_ns = span / max(frames - 1, 1)
         since: Int64 = np.rint(np.arange(frames) * step_ns).astype(np.int64)
         return np.asarray(start + since, np.int64)
     if not rate or not 0 < rate < 1e6:
-        raise DataError(path, f"states a rate of {rate} Hz", _EXPORT_AGAIN)
+        raise damaged(path, f"states a rate of {rate} Hz")
     number = contents["header"]["points"]["first_frame"]
     start = number if 0 <= number < _MOST_FIRST_FRAME else 0
     times: Int64 = np.rint((start + np.arange(frames)) * (1e9 / rate)).astype(np.int64)

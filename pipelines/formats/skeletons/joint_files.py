@@ -14,6 +14,7 @@ import numpy as np
 
 from pipelines.formats.common.exporting import note_no_skeleton, safe_file_name, tracks_of
 from pipelines.formats.common.files import read_head
+from pipelines.formats.common.refusals import damaged
 from pipelines.formats.common.rows import (
     Heading,
     TextTable,
@@ -291,7 +292,7 @@ def _stamps(path: Path, heading: Heading, table: TextTable) -> Int64:
     column = table.text["stamp"]
     stamps, readable = parse_stamps(path, column, heading.unit, unit_stated=heading.unit_stated)
     if not readable.all():
-        raise DataError(path, f"{np.count_nonzero(~readable)} rows have no readable time", "correct them")
+        raise damaged(path, f"{np.count_nonzero(~readable)} rows have no readable time")
     return stamps
 
 

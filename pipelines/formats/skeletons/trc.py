@@ -17,6 +17,7 @@ import numpy as np
 
 from pipelines.formats.common.exporting import people_of
 from pipelines.formats.common.files import read_head
+from pipelines.formats.common.refusals import bad_value, damaged, empty
 from pipelines.formats.common.rows import format_seconds, median_step_ns, parse_stamps
 from pipelines.formats.skeletons.joint_files import (
     METRES,
@@ -77,9 +78,7 @@ class TrcFormat:
         t_ns, readable = parse_stamps(path, times)
         if not readable.all() or (np.diff(t_ns) <= 0).any():
             bad = np.flatnonzero(~readable | (np.diff(t_ns, prepend=t_ns[0] - 1) <= 0))
-            raise DataError(
-                path, f"the time of row {bad[0] + 1} ({times[bad[0]]!r}) does not increase", "export it again"
-            )
+            raise damaged(path, f"the time of row {bad[0] + 1} ({times[bad[0]]!r}) does not increase")
         position = to_metres_z_up(path, values, unit, axes or "y-up")
         return JointMotion(t_ns=t_ns, joints=joint_names(header.markers), position=position[:, None])
 
@@ -93,9 +92,7 @@ def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
     markers = tuple(cell.strip() for cell in lines[3].split("\t")[2:] if cell.strip())
     columns = len(lines[4].split())
     if not markers or columns != 3 * len(markers):
-        raise DataError(
-            path, f"names {len(markers)} markers above {columns} columns of coordinates", "export it again"
-        )
+        raise damaged(path, f"names {len(markers)} markers above {columns} columns of coordinates")
     twice = sorted(marker for marker, count in Counter(markers).items() if count > 1)
     if twice:
         raise DataError(
@@ -120,15 +117,14 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
         if len(cells) == 3 * markers + 3 and not cells[-1].strip():
             cells.pop()  # many writers end their lines with a tab
         if len(cells) != 3 * markers + 2:
-            problem = f"line {number} has {len(cells)} cells instead of {3 * markers + 2}"
-            raise DataError(path, problem, "export it again", code="bad-value")
+            raise bad_value(path, f"line {number} has {len(cells)} cells instead of {3 * markers + 2}")
         try:
             values.append([float(cell) if cell.strip() else np.nan for cell in cells[2:]])
         except ValueError as error:
-            raise DataError(path, f"line {number}: {error}", "export it again") from error
+            raise damaged(path, f"line {number}: {error}") from error
         times.append(cells[1])
     if not times:
-        raise DataError(path, "holds no frames", "export it again", code="empty")
+        raise empty(path, "holds no frames")
     return times, np.array(values).reshape(len(times), markers, 3)
 
 

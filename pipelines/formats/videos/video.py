@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
+from pipelines.formats.common.refusals import damaged, empty
 from pipelines.formats.common.rows import describe_times
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
@@ -395,17 +396,16 @@ def _scan(path: Path) -> _Scan:
         problem = "its frames bear no time stamps" if whole else "holds no frames"
         if lost:
             problem = f"is cut off before its first frame ends ({len(lost)} are lost)"
-        raise DataError(path, problem, "copy it from the camera again, or export it as MP4")
+        raise damaged(path, problem)
     ticks = np.sort(np.array([pts for pts, _ in sure], dtype=np.int64))
     furthest_s = max(abs(int(ticks[0])), abs(int(ticks[-1]))) * tick_s
     if tick_s <= 0 or furthest_s > _LATEST_S:
-        raise DataError(path, f"stamps its frames up to {float(furthest_s):.3g} s", "its header is damaged")
+        raise damaged(path, f"stamps its frames up to {float(furthest_s):.3g} s")
     shown_s = float((int(ticks[-1]) - int(ticks[0])) * tick_s)
     # With ticks of a second the edit list, in ticks of its own, ends before most frames.
     hidden = tick_s >= 1 and 2 * len(ticks) < listed
     if hidden or shown_s < _SHORTEST_S * (len(ticks) - 1):
-        problem = f"shows {len(ticks)} of its {listed} frames within {shown_s:.3g} s"
-        raise DataError(path, problem, "its time scale is damaged: copy it again, or export it as MP4")
+        raise damaged(path, f"shows {len(ticks)} of its {listed} frames within {shown_s:.3g} s")
     counts = {
         "cut off": len(lost) + len(stamped) - len(sure),
         "no stamp": len(whole) - len(stamped),
@@ -543,11 +543,7 @@ def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
     stream = max(known, key=lambda s: s.width * s.height)
     if stream.width * stream.height > _MOST_PIXELS:
         container.close()
-        raise DataError(
-            path,
-            f"states pictures of {stream.width} x {stream.height} px",
-            "its header is damaged: copy it again",
-        )
+        raise damaged(path, f"states pictures of {stream.width} x {stream.height} px")
     stream.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
     # Not frame by frame: then the output for a damaged frame would depend on the number of processors.
     stream.thread_type = "SLICE"
@@ -580,7 +576,7 @@ def _kind(path: Path) -> str:
             path, f"cannot be read ({error.strerror})", "check the path", code=code_of(error)
         ) from error
     if not size:
-        raise DataError(path, "is empty", "copy it from the camera again", code="empty")
+        raise empty(path, "is empty")
     if kind is None:
         raise DataError(
             path,
