@@ -244,7 +244,7 @@ def manifest_keys() -> tuple[str, ...]:
     """Return the keys of flight.yaml with the model that declares each; options beside a file count."""
     from pydantic import BaseModel
 
-    from pipelines.session import manifest, source_options
+    from pipelines.session import manifest
     from pipelines.session.yaml_models import YamlModel
 
     def named(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -253,9 +253,8 @@ def manifest_keys() -> tuple[str, ...]:
         for argument in typing.get_args(annotation):
             yield from named(argument)
 
-    options = [value for value in vars(source_options).values() if isinstance(value, type)]
+    options = [value for value in vars(manifest).values() if isinstance(value, type)]
     waiting: list[type[BaseModel]] = [model for model in options if issubclass(model, YamlModel)]
-    waiting.append(manifest.Manifest)
     models: list[type[BaseModel]] = []
     while waiting:
         model = waiting.pop()

@@ -29,8 +29,7 @@ from pydantic import BaseModel
 from pipelines.planning.config import PlannerConfig
 from pipelines.session import camera_poses, registries, tables
 from pipelines.session.description import DOUBT_CODES
-from pipelines.session.manifest import FileSource, Manifest
-from pipelines.session.source_options import option_models
+from pipelines.session.manifest import FileSource, Manifest, option_models
 
 DOCS = Path(__file__).parent
 PAGES = (DOCS.parent / "README.md", *sorted(DOCS.glob("*.md")))

@@ -44,7 +44,6 @@ from pipelines.session.records import Detections
 from pipelines.session.registries import (
     Detector,
     KeypointNetworks,
-    advice_on,
     find_detector,
     hashes_of_models,
 )
@@ -196,7 +195,7 @@ def detect(
     joints = list(read_json(folders[0] / "counts.json")["joints"])
     rows = {name: list(work.span(name)) for name in media}
     warnings = _lost_pictures(counts)
-    for note in (f"keypoints detected by {chosen.title}", *advice_on(chosen), *warnings):
+    for note in (f"keypoints detected by {chosen.title}", *warnings):
         progress.note(note)
     return run.publish(
         counts={"detector": chosen.title, "joints": joints, "cameras": counts, "rows": rows},

@@ -30,7 +30,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.people import LoggedActor, logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
-from pipelines.session.registries import Detector, advice_on, find_detector, hashes_of_models
+from pipelines.session.registries import Detector, find_detector, hashes_of_models
 from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import SIMULATION_MARK, hash_of, jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import REPLAN, TRUTH, motion_table, read_table, write_table
@@ -203,8 +203,6 @@ def film(
         write_json(run.folder / "metrics.json", figures)
         counts = {name: len(arm.t_ns) for name, arm in arms.items()}
         record = run.publish(counts={"moments": counts, "detector": detector.title})
-        for note in advice_on(detector):
-            progress.note(note)
     return FilmResult(folder, record, figures, skipped=False)
 
 

@@ -201,7 +201,6 @@ class BlazePoseDetector:
     person_models: PackagedModels  # one file
     landmark_models: PackagedModels  # its last file is the landmark network
     measured: Measured
-    advice: str | None = None
 
     def models(self) -> dict[str, Path | None]:
         """Return the files of both networks: name to path, None where missing."""
@@ -240,8 +239,6 @@ DETECTOR = BlazePoseDetector(
     PERSON_MODELS,
     BLAZEPOSE_MODELS,
     Measured(sample_mpjpe_mm=34.4, person_ms=17.0),
-    advice="`--detector blazepose-heavy` errs an eighth less and takes three times as long "
-    "(`mocap models fetch blazepose-heavy`, which needs npm)",
 )
 HEAVY = BlazePoseDetector(
     "blazepose-heavy",

@@ -146,21 +146,14 @@ def each_map(session: Path) -> Iterator[Occupancy]:
 
 
 def write_grid(path: Path, occupancy: Occupancy) -> None:
-    """Write one map as npz; equal maps give equal bytes (numpy's own savez writes the time of day)."""
-    members: dict[str, NDArray[Any]] = {
-        "probability": np.ascontiguousarray(occupancy.probability, dtype=np.float32),
-        "origin": np.asarray(occupancy.origin, dtype=np.float64),
-        "resolution_m": np.asarray(occupancy.resolution_m, dtype=np.float64),
-        "from_ns": np.asarray(occupancy.from_ns, dtype=np.int64),
-    }
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, array in members.items():
-            info = zipfile.ZipInfo(f"{name}.npy")  # its date is 1980-01-01
-            info.compress_type = zipfile.ZIP_DEFLATED
-            info.create_system = 3  # the same on every system
-            info.external_attr = 0o644 << 16
-            with archive.open(info, "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, array, version=(1, 0), allow_pickle=False)
+    """Write one map as npz; equal maps give equal bytes."""
+    np.savez_compressed(
+        path,
+        probability=np.ascontiguousarray(occupancy.probability, dtype=np.float32),
+        origin=np.asarray(occupancy.origin, dtype=np.float64),
+        resolution_m=np.float64(occupancy.resolution_m),
+        from_ns=np.int64(occupancy.from_ns),
+    )
 
 
 def read_grid(path: Path) -> Occupancy:

@@ -17,7 +17,6 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from pipelines.session.errors import DataError
 from pipelines.session.storage import as_data_error, make_folder, sha256_of, write_whole
@@ -37,94 +36,52 @@ class ModelFile:
         return self.member.rpartition("/")[2]
 
 
-class Package(Protocol):
-    """Pinned version of a published package that ships model files."""
-
-    name: str
-    version: str
-    noun: str  # its kind of file
-
-    def download(self, folder: Path) -> subprocess.CompletedProcess[str]:
-        """Let the package's own program download it into a folder; OSError if that is not installed."""
-
-    def reason(self, done: subprocess.CompletedProcess[str]) -> str:
-        """Return why the program failed, in its own words."""
-
-    def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
-        """Read files from the package, at most one byte more than expected of each; skip absent files.
-
-        OSError, tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError: it is
-        damaged, or of another kind.
-        """
-
-
-@dataclass
+@dataclass(frozen=True)
 class Wheel:
-    """A wheel, which pip downloads."""
+    """A wheel, which pip downloads; any machine can open it."""
 
     name: str
     version: str
-    tags: tuple[str, str, str]  # Python, ABI and platform of the wheel to take; any machine can open it
-    noun: str = "wheel"
+    tags: tuple[str, str, str]  # Python, ABI and platform of the wheel to take
+    noun = "wheel"
 
-    def download(self, folder: Path) -> subprocess.CompletedProcess[str]:
-        """Download it with pip."""
+    @property
+    def command(self) -> list[str]:
+        """The command that downloads it into the working folder."""
         python, abi, platform = self.tags
-        return _ran(
-            [
-                *(sys.executable, "-m", "pip", "download", "--quiet", "--no-input", "--no-deps"),
-                # Two attempts: without a network the user should not wait a minute for the error.
-                *("--disable-pip-version-check", "--retries", "1", "--only-binary", ":all:"),
-                *("--implementation", "cp", "--python-version", python, "--abi", abi),
-                *("--platform", platform, f"{self.name}=={self.version}"),
-            ],
-            folder,
-        )
-
-    def reason(self, done: subprocess.CompletedProcess[str]) -> str:
-        """Return pip's last line."""
-        lines = done.stderr.strip().splitlines() or [f"pip exited with {done.returncode}"]
-        return lines[-1].removeprefix("ERROR: ")
+        return [
+            *(sys.executable, "-m", "pip", "download", "--quiet", "--no-input", "--no-deps"),
+            # Two attempts: without a network the user should not wait a minute for the error.
+            *("--disable-pip-version-check", "--retries", "1", "--only-binary", ":all:"),
+            *("--implementation", "cp", "--python-version", python, "--abi", abi),
+            *("--platform", platform, f"{self.name}=={self.version}"),
+        ]
 
     def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
-        """Read files out of it; see `Package.read`."""
-        contents = {}
+        """Read files from it, at most one byte more than expected of each; skip absent files."""
         with zipfile.ZipFile(archive) as wheel:
-            there = set(wheel.namelist())
-            for file in (file for file in files if file.member in there):
-                with wheel.open(file.member) as member:
-                    contents[file] = member.read(file.size + 1)
-        return contents
+            there = [file for file in files if file.member in wheel.namelist()]
+            return {file: wheel.open(file.member).read(file.size + 1) for file in there}
 
 
-@dataclass
+@dataclass(frozen=True)
 class NpmPackage:
     """A tarball, which npm downloads."""
 
     name: str
     version: str
-    noun: str = "tarball"
+    noun = "tarball"
 
-    def download(self, folder: Path) -> subprocess.CompletedProcess[str]:
-        """Download it with npm, which writes where it is run, and heeds the settings of a project there."""
-        return _ran(
-            [
-                *(shutil.which("npm") or "npm", "pack", f"{self.name}@{self.version}", "--ignore-scripts"),
-                # Two attempts, as with pip.
-                *("--loglevel", "error", "--fetch-retries", "1", "--fetch-retry-mintimeout", "1000"),
-            ],
-            folder,
-        )
-
-    def reason(self, done: subprocess.CompletedProcess[str]) -> str:
-        """Return the code and the first sentence of npm's error, without proxy advice and the trace."""
-        lines = re.findall(r"^npm (?:error|ERR!) +(.+)$", done.stderr, re.MULTILINE)
-        code = [line for line in lines if line.startswith("code ")][:1]
-        sentence = [line for line in lines if line.split()[0] not in ("code", "syscall", "errno")][:1]
-        return ": ".join(code + sentence) or f"npm exited with {done.returncode}"
+    @property
+    def command(self) -> list[str]:
+        """The command that downloads it into the working folder, whose settings npm heeds."""
+        return [
+            *(shutil.which("npm") or "npm", "pack", f"{self.name}@{self.version}", "--ignore-scripts"),
+            *("--loglevel", "error", "--fetch-retries", "1", "--fetch-retry-mintimeout", "1000"),
+        ]
 
     def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
-        """Read files out of it; see `Package.read`."""
+        """Read files from it; see `Wheel.read`."""
         by_member = {file.member: file for file in files}
         contents: dict[ModelFile, bytes] = {}
         with tarfile.open(archive, "r|gz") as tarball:
@@ -134,6 +91,10 @@ class NpmPackage:
                 if file is not None and stream is not None:
                     contents[file] = stream.read(file.size + 1)
         return contents
+
+
+Package = Wheel | NpmPackage
+"""Pinned version of a published package that ships model files."""
 
 
 @dataclass(frozen=True)
@@ -194,10 +155,15 @@ class PackagedModels:
     def _downloaded(self, folder: Path) -> Path:
         package = self.package
         try:
-            done = package.download(folder)
+            done = subprocess.run(  # noqa: S603  # our own arguments, no shell
+                package.command, cwd=folder, capture_output=True, text=True, errors="replace", check=False
+            )
             if done.returncode == 0 and (found := sorted(folder.iterdir())):
                 return found[0]
-            reason = package.reason(done)
+            # npm's codes and its error numbers say less than the sentence after them.
+            said = r"(?m)^(?:ERROR:|npm (?:error|ERR!)) +(?!code |syscall |errno )(.+)$"
+            errors = re.findall(said, done.stderr)
+            reason = (errors or [f"it exited with {done.returncode}"])[0]
         except OSError as error:
             reason = f"{error.filename} is not installed"
         raise DataError(
@@ -247,9 +213,3 @@ class PackagedModels:
 def find_file(folder: Path, name: str) -> Path | None:
     """Find the first file of that name at any depth of a folder; None if there is none."""
     return next(iter(sorted(folder.rglob(name))), None)
-
-
-def _ran(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(  # noqa: S603  # our own arguments, no shell
-        command, cwd=folder, capture_output=True, text=True, errors="replace", check=False
-    )

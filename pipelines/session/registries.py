@@ -251,10 +251,6 @@ class MeasuredDetector(Detector, Protocol):
     def measured(self) -> Measured:
         """The accuracy and the time of the detector."""
 
-    @property
-    def advice(self) -> str | None:
-        """One line on a more accurate detector, printed when this one runs; None without one."""
-
 
 @runtime_checkable
 class DetectorFamily(Protocol):
@@ -380,12 +376,6 @@ def find_export(text: str) -> Export:
 def _refuse_argument(text: str, name: str, colon: str) -> None:
     if colon:
         raise DataError(text, f"{name} takes nothing behind its name", f"write {name}", code="bad-option")
-
-
-def advice_on(detector: Detector) -> list[str]:
-    """Return the detector's line on a more accurate detector, or an empty list."""
-    known = isinstance(detector, MeasuredDetector) and detector.advice
-    return [known] if known else []
 
 
 def hashes_of_models(detector: Detector) -> dict[str, str]:

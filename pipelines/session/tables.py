@@ -133,14 +133,13 @@ def join_tables(path: Path, parts: Iterable[pd.DataFrame], schema: pa.Schema) ->
 
 @contextmanager
 def _opened(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file; DataError if it is damaged, or a small file of many equal rows."""
+    """Open a Parquet file; DataError if it is damaged."""
     import pyarrow.parquet as pq
 
     refuse_special(path)
     try:
         with path.open("rb") as file:
             opened = pq.ParquetFile(file)
-            _refuse_bomb(path, opened.metadata)
             yield opened
     except (FileNotFoundError, PermissionError) as error:
         raise as_data_error(error, path) from error
@@ -167,7 +166,7 @@ def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], p
 def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
     """Read a table with the columns of `schema` (more are kept).
 
-    DataError: missing, not a Parquet file, truncated, columns are missing, or it holds absurd numbers.
+    DataError: missing, not a Parquet file, truncated, or columns are missing.
     """
     with _opened(path) as opened:
         return _frame_of(path, opened.read(), schema)
@@ -226,52 +225,18 @@ def _parts(path: Path, schema: pa.Schema) -> Iterator[pd.DataFrame]:
 
 
 def _frame_of(path: Path, table: pa.Table, schema: pa.Schema) -> pd.DataFrame:
-    """Check the columns and numbers of a table that was read."""
+    """Check the columns of a table that was read."""
     missing = [name for name in schema.names if name not in table.column_names]
     if missing:
         problem = f"lacks the columns {', '.join(missing)}"
         raise DataError(path, problem, "run the stage again with --force", code="missing-column")
     frame: pd.DataFrame = table.to_pandas()
-    _refuse_absurd_numbers(path, frame, schema.names)
     return frame
-
-
-def _refuse_absurd_numbers(path: Path, frame: pd.DataFrame, names: Sequence[str]) -> None:
-    """Refuse numbers that no stage writes, before they overflow in a later step; NaN is missing."""
-    if list(names) == POSES.names and (np.diff(frame["t_ns"].to_numpy()) <= 0).any():
-        raise DataError(path, "holds times that do not increase", _AGAIN)
-    for name in names:
-        if frame[name].dtype.kind in "if" and len(frame):
-            values = frame[name].to_numpy()
-            largest = LATEST_NS if name.endswith("_ns") else MAX_NUMBER
-            wrong = (values > largest) | (values < -largest)
-            if name not in (*_POSITION, *_QUATERNION):
-                wrong &= np.isfinite(values)
-            if wrong.any():
-                row = int(np.argmax(wrong))
-                raise DataError(path, f"holds {values[row]:g} as {name} in row {row}", _AGAIN)
-
-
-def _refuse_bomb(path: Path, metadata: Any) -> None:
-    """Refuse a table that takes far more memory than its file, before it is read."""
-    groups = [metadata.row_group(k).total_byte_size for k in range(metadata.num_row_groups)]
-    size = max(metadata.num_rows * metadata.num_columns * BYTES_PER_CELL, sum(groups))
-    if size > max(MAX_BYTES_OF_ANY_TABLE, MAX_EXPANSION * path.stat().st_size):
-        problem = f"holds {metadata.num_rows} rows, {size} bytes, in a file of {path.stat().st_size}"
-        raise DataError(path, problem, _AGAIN)
 
 
 _AGAIN = "run the stage that wrote it again with --force"
 # A batch of so many rows of the widest table has 20 MB.
 ROWS_PER_BATCH = 1 << 16
-# Products of several such numbers still fit a float; no stage writes larger ones.
-MAX_NUMBER = 1e15
-LATEST_NS = 2**62 - 1
-"""The latest time; differences of two such times fit int64."""
-# A number of a table takes so many bytes in memory.
-BYTES_PER_CELL = 8
-# A table of any content may have 256 MB. A larger one of real data is at most 100 times its file.
-MAX_BYTES_OF_ANY_TABLE, MAX_EXPANSION = 1 << 28, 100
 _POSITION = ["x", "y", "z"]
 _QUATERNION = ["qx", "qy", "qz", "qw"]
 

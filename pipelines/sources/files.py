@@ -12,7 +12,16 @@ from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.formats.skeletons.joint_files import joint_names
 from pipelines.formats.videos.frame_times import FrameTimesFormat
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import CameraSources, FileSource, KeypointSource, Manifest, TruthSource
+from pipelines.session.manifest import (
+    CameraOfCalibration,
+    CameraSources,
+    DetectorOutput,
+    FileSource,
+    KeypointSource,
+    Manifest,
+    TruthSource,
+    options_of,
+)
 from pipelines.session.progress import Progress
 from pipelines.session.recognition import recognise, recognise_any
 from pipelines.session.records import CalibratedCamera, Detections, JointMotion, VideoIndex
@@ -29,7 +38,6 @@ from pipelines.session.registries import (
     TriggerFormat,
     VideoFormat,
 )
-from pipelines.session.source_options import CameraOfCalibration, DetectorOutput, options_of
 from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
 from pipelines.session.urls import fetched, located, named, source_url
 from pipelines.session.yaml_models import YamlModel

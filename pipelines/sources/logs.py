@@ -44,11 +44,10 @@ from pipelines.formats.logs.trajectories import (
 from pipelines.geometry.arrays import Int64, Intrinsics
 from pipelines.geometry.clocks import ClockStep, find_steps, without_steps
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, LogSource, Manifest, MapSource
+from pipelines.session.manifest import Axes, LoggedMap, LogSource, Manifest, MapSource
 from pipelines.session.recognition import recognise
 from pipelines.session.records import IntrinsicsSample, Message, Occupancy, PictureSample, Trajectory
 from pipelines.session.registries import Log, LogFormat
-from pipelines.session.source_options import LoggedMap
 from pipelines.session.urls import located
 from pipelines.sources.world import in_enu, in_world, world_times
 

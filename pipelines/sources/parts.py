@@ -36,7 +36,7 @@ from pipelines.session.tables import (
     write_table,
 )
 from pipelines.session.urls import named
-from pipelines.sources.world import doubts_of_speed, doubts_of_stillness, losses, mounted
+from pipelines.sources.world import losses, mounted
 
 # A video that covers less of its pose log may have lost its end.
 MIN_COVERED_SHARE = 0.9
@@ -169,8 +169,6 @@ def _poses_entry(
                 f" {interpolation.max_gap_s:g} s gaps and {interpolation.max_extrapolation_s:g} s"
                 " at the ends)"
             )
-        for doubt in (*doubts_of_speed(trajectory), *doubts_of_stillness(trajectory)):
-            note(f"{name}: {doubt}")
         span, covered = int(np.ptp(trajectory.t_ns)) / 1e9, int(np.ptp(frames_t_ns)) / 1e9
         if covered < MIN_COVERED_SHARE * span and span - covered > MIN_UNCOVERED_S:
             note(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses")

@@ -37,8 +37,11 @@ from pipelines.session.manifest import (
     ActorSource,
     Axes,
     CameraSources,
+    FiledPose,
     FrameTimes,
     GimbalSource,
+    LoggedAngles,
+    LoggedPose,
     Manifest,
     Mount,
     Placement,
@@ -55,7 +58,6 @@ from pipelines.session.registries import (
     TrajectoryFormat,
     TriggerFormat,
 )
-from pipelines.session.source_options import FiledPose, LoggedAngles, LoggedPose
 from pipelines.session.urls import located
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs

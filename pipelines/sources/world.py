@@ -24,19 +24,10 @@ from pipelines.geometry.poses import (
     rotate,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, LogClock, Mount, Placement, PoseSource, Up, WorldAxes
+from pipelines.session.manifest import Axes, FiledPose, LogClock, Mount, Placement, PoseSource, Up, WorldAxes
 from pipelines.session.records import Occupancy, Trajectory
 from pipelines.session.registries import need
-from pipelines.session.source_options import FiledPose
 
-# No camera that films a person flies faster.
-MAX_SPEED_MPS = 100.0
-
-# A hovering drone may log the same pose for a moment: frozen is what stays so longer.
-FROZEN_S = 1.0
-
-# A slow log repeats a pose a few times: frozen are at least so many messages.
-FROZEN_POSES = 10
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 
@@ -176,41 +167,6 @@ def refuse_projected(source: Path | str, position: Float, origin: Place, crs: st
         problem = f"lies about x {x_m:.0f} m, y {y_m:.0f} m (UTM or another map projection), {away}"
         remedy = "state the CRS, world: {crs: EPSG:32632} or map: {crs: ...}; or give metres from that origin"
         raise DataError(source, problem, remedy, code="place-unknown")
-
-
-def doubts_of_speed(trajectory: Trajectory) -> list[str]:
-    """Report poses that jump further than anything flies, in one line or none."""
-    step_s = np.diff(trajectory.t_ns) / 1e9
-    speed = np.linalg.norm(np.diff(trajectory.position, axis=0), axis=1) / step_s
-    too_fast = speed > MAX_SPEED_MPS
-    if not too_fast.any():
-        return []
-    first_s = int(trajectory.t_ns[np.argmax(too_fast)] - trajectory.t_ns[0]) / 1e9
-    return [
-        f"its poses jump {int(too_fast.sum())} times, by up to {speed.max():.3g} m/s"
-        f" (first after {first_s:.2f} s)"
-    ]
-
-
-def doubts_of_stillness(trajectory: Trajectory) -> list[str]:
-    """Report poses that otherwise change but are bit-identical for over a second, in one line or none.
-
-    No drone is so still, so its estimator may have frozen. The poses stay in use, because identical poses
-    are no proof: a camera on the ground is as still in a log without noise.
-    """
-    pose = np.concatenate([trajectory.position, trajectory.quaternion_xyzw], axis=1)
-    changes = np.flatnonzero((np.diff(pose, axis=0) != 0).any(axis=1))
-    first, last = np.append(0, changes + 1), np.append(changes, len(pose) - 1)
-    lasts_s = (trajectory.t_ns[last] - trajectory.t_ns[first]) / 1e9
-    count = last - first + 1
-    frozen = (lasts_s > FROZEN_S) & (count >= FROZEN_POSES)
-    if not frozen.any() or len(first) == 1:
-        return []
-    after_s = int(trajectory.t_ns[first[np.argmax(frozen)]] - trajectory.t_ns[0]) / 1e9
-    return [
-        f"its poses stand still {frozen.sum()} times, for up to {lasts_s.max():.3g} s ({count[frozen].sum()}"
-        f" poses in all, first after {after_s:.2f} s): was its estimator frozen?"
-    ]
 
 
 def losses(dropped: dict[str, int]) -> str:

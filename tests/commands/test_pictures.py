@@ -6,11 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pandas as pd
 
-from pipelines.formats.videos.video import VideoReader
 from tests.commands.runner import mocap, refused, succeeds
 from tests.synthetic.flights import START_NS, SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import write_logged_flight
@@ -102,34 +100,6 @@ def test_overlays_on_pictures_of_a_log(tmp_path: Path) -> None:
     succeeds("report", session)
     page = session / "report" / "index.html"
     assert "UklGR" in page.read_text(encoding="utf-8")
-
-
-def test_a_letterboxed_video_gets_the_intrinsics_of_what_lies_between_its_bars(tmp_path: Path) -> None:
-    calibrated = {"width": 640, "height": 480, "fx": 500.0, "fy": 510.0, "cx": 310.0, "cy": 250.0}
-    point = np.array([1.2, -0.6, 4.0])
-    x, y = (calibrated[f"f{axis}"] * point[k] / 4 + calibrated[f"c{axis}"] for k, axis in enumerate("xy"))
-    rows, columns = np.mgrid[:480, :640]
-    seen = np.where(np.hypot(columns - x, rows - y) < 40, 255, 90).astype(np.uint8)
-    small = cv2.resize(seen, (240, 180), interpolation=cv2.INTER_AREA)
-    picture = np.repeat(np.pad(small, ((0, 0), (40, 40)))[..., None], 3, axis=2)
-    flight = with_videos(tmp_path)
-    write_video(tmp_path / "drone1.mp4", even_ticks(HALF_SECOND), draw=lambda _: picture)
-    camera = flight.settings["cameras"]["drone1"]
-    del camera["keypoints"]
-    camera["intrinsics"] = calibrated
-    flight.save()
-    succeeds("ingest", flight.manifest)
-    stored = session_json(tmp_path)
-    lens = stored["cameras"]["drone1"]["intrinsics"]
-    assert [lens[key] for key in ("width", "height", "fx", "fy")] == [320, 180, 187.5, 191.25]
-    with VideoReader(tmp_path / "drone1.mp4") as reader:
-        shown = reader.read(0)
-    assert shown is not None
-    bright = np.argwhere(shown[..., 1] > 170)
-    # 94 px of edge, each coded with an error of a pixel at most: a tenth of that in the mean.
-    expected = [lens[f"f{axis}"] * point[k] / 4 + lens[f"c{axis}"] for k, axis in enumerate("xy")]
-    np.testing.assert_allclose(bright.mean(axis=0)[::-1], expected, atol=0.1)
-    assert any("drone1" in line and "240 x 180" in line for line in stored["warnings"])
 
 
 def test_video_without_keypoints_is_ingested_and_reconstruct_says_what_is_missing(tmp_path: Path) -> None:

@@ -19,14 +19,9 @@ from pathlib import Path
 
 import lz4.frame
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from backports import zstd
 from ruamel.yaml import YAML
 
-from pipelines.ingest import ingest
-from pipelines.reconstruct import reconstruct
-from tests.commands.runner import as_if_written
 from tests.formats.calibrations import test_anipose_toml
 from tests.formats.maps import test_octomap
 from tests.synthetic import drone_logs, video_tracks, videos
@@ -574,75 +569,6 @@ def _skeletons() -> Iterator[_Input]:
         "<bbBBhbB7BB4B", 2, 1, 65, 65, 500, 4, 7, *[255] * 7, 0, 0, 0, 0, 0
     )
     yield "C3D: an array of 255^7", "c3d", "a.c3d", bytes(dimensions)
-
-
-# --- tables of sessions ----------------------------------------
-
-_SKELETON, _POSES, _KEYPOINTS = (
-    "reconstruct/skeleton.parquet",
-    "cameras/drone1/poses.parquet",
-    "cameras/drone1/keypoints.parquet",
-)
-
-
-def _session(table: str, change: Callable[[Path], object]) -> Writer:
-    """Write a session with a changed table, which its stage then claims to have written."""
-
-    def write(folder: Path) -> None:
-        made = write_flight(folder / "f", cameras=2, seconds=0.3)
-        session = folder / "a.session"
-        ingest(made.manifest, session)
-        if table.startswith("reconstruct"):
-            reconstruct(session)
-        change(session / table)
-        as_if_written(session, table, "reconstruct" if table.startswith("reconstruct") else "ingest")
-
-    return write
-
-
-@_kind("sessions: large tables", "", "a.session")
-def _parquet() -> Iterator[_Input]:
-    def repeated(rows: int) -> Callable[[Path], object]:
-        """Repeat the first row, which takes a few bytes for any number of rows."""
-
-        def change(path: Path) -> None:
-            first = pq.read_table(path).slice(0, 1)
-            part = pa.concat_tables([first]).take(np.zeros(10**6, np.int64))
-            with pq.ParquetWriter(path, first.schema, compression="zstd", use_dictionary=True) as writer:
-                for _ in range(rows // 10**6):
-                    writer.write_table(part, row_group_size=10**6)
-
-        return change
-
-    def wide(path: Path) -> None:
-        table = pq.read_table(path)
-        for k in range(5000):
-            table = table.append_column(f"c{k}", pa.nulls(len(table)))
-        pq.write_table(table, path)
-
-    for name, table in (("poses", _POSES), ("keypoints", _KEYPOINTS), ("joints", _SKELETON)):
-        yield f"50,000,000 equal {name}", _session(table, repeated(50_000_000))
-    yield "5,000 columns", _session(_POSES, wide)
-
-
-@_kind("sessions: absurd numbers", "", "a.session")
-def _sessions() -> Iterator[_Input]:
-    def changed(table: str, column: str, value: float) -> Writer:
-        def change(path: Path) -> None:
-            content = pq.read_table(path)
-            place = content.column_names.index(column)
-            field = content.schema.field(place)
-            values = content.column(column).to_numpy().copy()
-            values[len(values) // 2] = value
-            pq.write_table(content.set_column(place, field, pa.array(values, field.type)), path)
-
-        return _session(table, change)
-
-    for value in (1e308,):
-        yield f"a joint at {value:g} m", changed(_SKELETON, "x", value)
-        yield f"a camera at {value:g} m", changed(_POSES, "x", value)
-        yield f"a keypoint at {value:g} px", changed(_KEYPOINTS, "x", value)
-    yield "a stamp of 2^62 ns", changed(_SKELETON, "t_ns", 2**62)
 
 
 # --- maps ----------------------------------------

