@@ -28,15 +28,6 @@ def models_command(context: click.Context, as_json: bool) -> None:
         _list(as_json)
 
 
-@models_command.command("list")
-@json_option
-@click.pass_context
-def list_command(context: click.Context, as_json: bool) -> None:
-    """List the keypoint detectors and whether their files are here, as `mocap models` does."""
-    above = context.parent.params if context.parent else {}
-    _list(as_json or bool(above.get("as_json")))
-
-
 def _list(as_json: bool) -> None:
     """Print the registered detectors with their files, and the families for users' own models."""
     from pipelines.session.registries import DETECTORS, DetectorFamily
