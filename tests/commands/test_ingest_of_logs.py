@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,9 +13,7 @@ from pipelines.formats.logs.recordings import OpenLog
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
-from pipelines.session.records import Trajectory
 from pipelines.sources.logs import FlightLogs
-from pipelines.sources.world import doubts_of_stillness
 from tests.synthetic.logged_flights import write_logged_flight
 from tests.synthetic.logs import Entry, write_log
 from tests.synthetic.recorder_logs import CONTAINERS, RECORDER, in_a_process, ingested, timed, write
@@ -96,21 +93,6 @@ def test_losses_count_for_the_topic_that_lost_them(tmp_path: Path) -> None:
                 logs.frames(path.name, "/picture")
             trajectory = logs.trajectory(path.name, "/pose", None, None, max_gap_ns=10**9)
             assert trajectory.dropped == {}
-
-
-def test_a_frozen_estimator_is_distinguished_from_a_camera_at_rest() -> None:
-    """Use 100 Hz for ten seconds; x stands still from 2 to 4.5 s and, too short to count, from 6 to 6.9 s."""
-    k = np.arange(1000)
-    x = np.where(k < 200, k, np.where(k < 451, 200, np.where(k < 600, k, np.where(k < 691, 600, k)))) / 100.0
-    position = np.stack([x, np.zeros(1000), np.full(1000, 5.0)], axis=1)
-    turn = np.tile([0.0, 0.0, 0.0, 1.0], (1000, 1))
-    t_ns = 1_700_000_000_000_000_000 + 10_000_000 * k
-    (doubt,) = doubts_of_stillness(Trajectory(t_ns, position, turn))
-    assert re.search(r" 1 .* 2\.5 s \(251 .* 2\.00 s\)", doubt)
-    turning = turn + np.stack([k * 1e-9, 0 * k, 0 * k, 0 * k], axis=1)  # a gimbal turns on
-    assert doubts_of_stillness(Trajectory(t_ns, position, turning)) == []
-    assert doubts_of_stillness(Trajectory(t_ns, np.ones((1000, 3)), turn)) == []  # at rest throughout
-    assert doubts_of_stillness(Trajectory(t_ns[::99], position[::99], turn[::99])) == []  # three messages
 
 
 @pytest.mark.slow
