@@ -21,10 +21,13 @@ from pipelines.detect import Following, cameras_to_follow, detect, hints_from, h
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.triangulation import STATUS, Method, Triangulation, Views
-from pipelines.keypoints.association import Association, associate
-from pipelines.keypoints.calibration import measured_for, read_calibration
-from pipelines.keypoints.no_people import Ground, Surroundings, level_of
-from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
+from pipelines.keypoints.association import Association, Ground, Surroundings, associate, level_of
+from pipelines.keypoints.corrections import (
+    measured_for,
+    read_calibration,
+    swaps_across_views,
+    undo_swaps_of_tracks,
+)
 from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
 from pipelines.reconstruction.clocks import (

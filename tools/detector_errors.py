@@ -25,9 +25,9 @@ from scipy.optimize import isotonic_regression
 from pipelines.detect import detect
 from pipelines.geometry.arrays import Float
 from pipelines.ingest import ingest
-from pipelines.keypoints.calibration import ANY_JOINT as ANY_GROUP
-from pipelines.keypoints.calibration import COLUMNS as CALIBRATED
-from pipelines.keypoints.calibration import file_of
+from pipelines.keypoints.corrections import ANY_JOINT as ANY_GROUP
+from pipelines.keypoints.corrections import COLUMNS as CALIBRATED
+from pipelines.keypoints.corrections import file_of
 from pipelines.session.people import get_skeleton
 from pipelines.session.registries import find_detector
 from pipelines.session.stages import locked

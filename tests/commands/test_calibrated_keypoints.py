@@ -24,7 +24,7 @@ def test_keypoints_of_little_worth_are_used_and_drawn(
     measured = tmp_path / "measured.csv"
     head = "# made by: a test\n# probability that a joint is near\njoints,confidence,probability,count\n"
     measured.write_text(f"{head}*,0.5,0.9,100\nwrist,0.5,0.1,100\n", encoding="utf-8")
-    for place in ("pipelines.keypoints.calibration", "pipelines.reconstruct"):
+    for place in ("pipelines.keypoints.corrections", "pipelines.reconstruct"):
         monkeypatch.setattr(f"{place}.measured_for", lambda _: measured)
     session = tmp_path / "flight.session"
     ingest(write_spotted_flight(tmp_path, 6), session)

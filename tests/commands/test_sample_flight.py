@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.keypoints.calibration import measured_for
+from pipelines.keypoints.corrections import measured_for
 from pipelines.session.people import true_joints_at
 from pipelines.session.storage import read_json, sha256_of
 from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table

@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.keypoints.association import Association, associate, without_common_errors
+from pipelines.keypoints.association import Association, Surroundings, associate, without_common_errors
 from pipelines.keypoints.bodies import SightLines, find_bodies
-from pipelines.keypoints.no_people import Surroundings
 
 Int64 = NDArray[np.int64]
 Path = Callable[[Float], Float]  # seconds [T] to places on the ground [T, 2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.keypoints.calibration import measured_for, read_calibration
+from pipelines.keypoints.corrections import measured_for, read_calibration
 
 
 @pytest.mark.parametrize("detector", ["blazepose", "blazepose-heavy"])

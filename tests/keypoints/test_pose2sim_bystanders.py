@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.keypoints.association import associate
-from pipelines.keypoints.no_people import Surroundings
+from pipelines.keypoints.association import Surroundings, associate
 from tests.real_data import real_data
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import look_at
-from pipelines.keypoints.swaps import exchange, mirrored_pairs, undo_swaps
+from pipelines.keypoints.corrections import exchange, mirrored_pairs, undo_swaps
 from pipelines.simulation.detector_errors import see
 from tests.synthetic.flights import LENS
 from tests.synthetic.walk import COCO17, walk

@@ -8,7 +8,7 @@ import pytest
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.poses import look_at, matrix_from_quaternion
-from pipelines.keypoints.swaps import Pair, mirrored_pairs, swaps_across_views
+from pipelines.keypoints.corrections import Pair, mirrored_pairs, swaps_across_views
 from pipelines.reconstruction.observations import on_sides
 from pipelines.simulation.detector_errors import see
 from tests.synthetic.flights import LENS
