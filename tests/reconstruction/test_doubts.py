@@ -466,10 +466,7 @@ def test_a_world_of_another_scale_is_named_with_its_scale(flight: Described, fac
 
 
 def test_limbs_that_cross_are_doubted_without_a_cause(flight: Described) -> None:
-    def legs_crossed(pixels: Float, _: int) -> Float:
-        return renamed(pixels, "knee", "ankle")
-
-    first = doubts_of(mistaken(flight, with_keypoints(legs_crossed)))[0]
+    first = doubts_of(mistaken(flight, with_keypoints(renamed("knee", "ankle"))))[0]
     assert (first["code"], first["remedy"]) == ("body", "")
     assert first["evidence"]["sigmas"] > 10
 

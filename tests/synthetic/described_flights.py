@@ -10,7 +10,8 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -86,109 +87,8 @@ class Flight:
     noise: str = "{white: {position_m: 0.02, rotation_deg: 0.2}, bias: {position_m: 0.05, rotation_deg: 0.3}}"
 
 
-_NOISY = "{white: {position_m: 0.1, rotation_deg: 0.5}, bias: {position_m: 0.2, rotation_deg: 0.7}}"
-FLIGHTS = [
-    Flight(
-        "kick3",
-        3,
-        "[walk: {distance_m: 3}, kick: {foot: right, run_up_m: 2}]",
-        "{radius_m: 10, tilt_deg: 15, yaw_deg: 20}",
-        1,
-        True,
-        True,
-        True,
-    ),
-    Flight(
-        "walk2",
-        2,
-        "[walk: {distance_m: 7, turn_deg: 60}]",
-        "{radius_m: 9, tilt_deg: 20, yaw_deg: 70, yaw_rate_deg_per_s: 6}",
-        2,
-        False,
-        True,
-        True,
-        body="{sex: female, height_m: 1.66}",
-    ),
-    Flight(
-        "jog2",
-        2,
-        "[jog: {distance_m: 14, turn_deg: -40, speed_mps: 2.6}]",
-        "{radius_m: 10, tilt_deg: 12, yaw_deg: 150}",
-        3,
-        True,
-        False,
-        False,
-        start="[-7, 0]",
-    ),
-    Flight(
-        "crouch3",
-        3,
-        "[crouch: {seconds: 2, depth: 0.7}, turn: {deg: 90}, walk: {distance_m: 3}]",
-        "{radius_m: 8, tilt_deg: 25, yaw_deg: 210, yaw_rate_deg_per_s: -8}",
-        4,
-        False,
-        False,
-        True,
-        noise=_NOISY,
-    ),
-    Flight(
-        "reach3",
-        3,
-        "[walk: {distance_m: 4, turn_deg: -50}, reach: {side: right, height_m: 1.9}]",
-        "{radius_m: 9, tilt_deg: 18, yaw_deg: 300, yaw_rate_deg_per_s: 5}",
-        11,
-        True,
-        False,
-        True,
-        body="{sex: female, height_m: 1.72}",
-    ),
-]
-KEPT_ASIDE = [
-    Flight(
-        "turn3",
-        3,
-        "[walk: {distance_m: 3, turn_deg: 40}, turn: {deg: -90}, walk: {distance_m: 3}]",
-        "{radius_m: 9, tilt_deg: 20, yaw_deg: 170, yaw_rate_deg_per_s: -6}",
-        15,
-        True,
-        False,
-        True,
-        body="{sex: female, height_m: 1.72}",
-    ),
-    Flight(
-        "kick2",
-        2,
-        "[kick: {foot: left, run_up_m: 3}, walk: {distance_m: 2}]",
-        "{radius_m: 8, tilt_deg: 14, yaw_deg: 40}",
-        12,
-        True,
-        True,
-        False,
-        heading=120,
-    ),
-    Flight(
-        "walk2b",
-        2,
-        "[walk: {distance_m: 4}, turn: {deg: 120}, walk: {distance_m: 3}]",
-        "{radius_m: 11, tilt_deg: 22, yaw_deg: 260, yaw_rate_deg_per_s: 7}",
-        13,
-        False,
-        False,
-        True,
-        noise=_NOISY,
-    ),
-    Flight(
-        "jog3",
-        3,
-        "[jog: {distance_m: 15, turn_deg: 70, speed_mps: 2.8}]",
-        "{radius_m: 10, tilt_deg: 10, yaw_deg: 95}",
-        14,
-        False,
-        True,
-        False,
-        start="[-6, -4]",
-    ),
-]
+_TABLES: dict[str, Any] = YAML(typ="safe").load(Path(__file__).with_suffix(".yaml"))
+FLIGHTS, KEPT_ASIDE = ([Flight(**stated) for stated in _TABLES[half]] for half in ("tuned", "kept_aside"))
 DOWN_DEG = 15.0
 LEVER = [0.1, 0.0, -0.05]
 
@@ -214,21 +114,7 @@ class Described:
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
         scenario = self.folder / "scenario_in.yaml"
-        fields = {
-            name: getattr(self.flight, name)
-            for name in (
-                "seconds",
-                "seed",
-                "body",
-                "start",
-                "heading",
-                "motion",
-                "drones",
-                "formation",
-                "noise",
-            )
-        }
-        scenario.write_text(_SCENARIO.format(**fields), encoding="utf-8")
+        scenario.write_text(_SCENARIO.format(**asdict(self.flight)), encoding="utf-8")
         simulate(scenario, self.folder / "made", video=False)
         ingest(self.folder / "made" / "flight.yaml", self.folder / "first.session")
 
@@ -343,15 +229,7 @@ def of_poses(change: Callable[[Pose], Pose], only: str | None = None) -> Change:
 
 
 def turned(axis: str, degrees: float) -> Float:
-    half = np.radians(degrees) / 2
-    return np.array(
-        [
-            np.sin(half) * (axis == "x"),
-            np.sin(half) * (axis == "y"),
-            np.sin(half) * (axis == "z"),
-            np.cos(half),
-        ]
-    )
+    return quaternion_from_rotation_vector(np.radians(degrees) * np.eye(3)["xyz".index(axis)])
 
 
 def of_mounts(turn: Float, only: str | None = None) -> Change:
@@ -488,79 +366,31 @@ def body_as_camera(mistaken: Mistaken) -> None:
 
 @dataclass(frozen=True)
 class Mistake:
+    """A mistake, the codes of doubts that name it, and the error that it grows.
+
+    Attributes:
+        of_a_pair: the error of two drones of which nothing says which one is where its log says.
+        without_actor: the error where nothing logs the person, and the world's place is lost.
+    """
+
     name: str
     codes: tuple[str, ...]
     change: Change
     fits: Callable[[Flight], bool] = lambda _: True
-    compared: Callable[[Flight], str] = lambda _: "mpjpe_mm"  # another error where the world's place is lost
+    of_a_pair: str = "mpjpe_mm"
+    without_actor: str = "mpjpe_mm"
+
+    def compared(self, flight: Flight) -> str:
+        if flight.actor:
+            return "mpjpe_mm"
+        return self.of_a_pair if flight.drones == 2 and not flight.map else self.without_actor
 
 
-def _mistakes() -> list[Mistake]:
-    one = "drone1"
-    still = np.zeros(3)
-
-    def carried(flight: Flight) -> bool:
-        return flight.carried
-
-    def own(flight: Flight) -> bool:
-        return not flight.carried
-
-    def unplaced_pair(flight: Flight) -> bool:
-        """Test if nothing says which of two drones is where its log says."""
-        return flight.drones == 2 and not flight.actor and not flight.map
-
-    return [
-        Mistake("videos swapped", ("videos_swapped",), swapped),
-        Mistake("videos cycled", ("videos_swapped",), cycled, lambda flight: flight.drones > 2),
-        Mistake("focal x2, all", ("intrinsics",), of_cameras(focal(2.0))),
-        Mistake("focal x1/2, all", ("intrinsics",), of_cameras(focal(0.5))),
-        Mistake("focal x1.4, one", ("intrinsics",), of_cameras(focal(1.4), one)),
-        Mistake("upside down, all", ("mount",), of_mounts(turned("z", 180))),
-        Mistake("rolled by 90, one", ("mount",), of_mounts(turned("z", 90), one)),
-        Mistake("tilt's sign, all", ("mount",), of_mounts(turned("x", 2 * DOWN_DEG))),
-        Mistake("looks left, all", ("mount", "pose"), looks_left),
-        Mistake("pictures mirrored", ("mirrored",), with_keypoints(_both)),
-        Mistake("x mirrored", ("mirrored",), with_keypoints(mirrored)),
-        Mistake("names mirrored", ("mirrored",), with_keypoints(lambda pixels, _: pixels[COCO_SWAPPED])),
-        Mistake("clock 0.3 s, one", ("clock",), of_cameras(clock(0.3), one)),
-        Mistake("clock 0.5 s, all", ("clock",), of_cameras(clock(0.5))),
-        Mistake("25 for 30 Hz, all", ("frame_rate",), of_cameras(rate(25))),
-        Mistake("25 for 30 Hz, one", ("frame_rate",), of_cameras(rate(25), one)),
-        Mistake(
-            "origin 3 m, one",
-            ("origin",),
-            moved(np.array([2.4, -1.8, 0]), one),
-            compared=lambda flight: "root_mpjpe_mm" if unplaced_pair(flight) else "mpjpe_mm",
-        ),
-        Mistake(
-            "north 20 deg, one",
-            ("origin",),
-            of_poses(lambda pose: compose((still, turned("z", 20)), pose), one),
-            compared=lambda flight: "pa_mpjpe_mm" if unplaced_pair(flight) else "mpjpe_mm",
-        ),
-        Mistake("heading 8 deg, one", ("pose",), of_poses(heading(8), one)),
-        Mistake(
-            "own origins",
-            ("origin",),
-            own_origins,
-            compared=lambda flight: "mpjpe_mm" if flight.actor else "root_mpjpe_mm",
-        ),
-        Mistake("another's topic", ("pose",), same_topic),
-        Mistake("camera_from_world", ("convention",), of_poses(lambda pose: invert(*pose))),
-        Mistake("w x y z", ("convention",), of_poses(lambda pose: (pose[0], np.roll(pose[1], 1, axis=-1)))),
-        Mistake("camera as body", ("convention",), camera_as_body, carried),
-        Mistake("body as camera", ("convention",), body_as_camera, own),
-        Mistake("NED as ENU, body", ("axes",), of_poses(as_ned), carried),
-        Mistake("NED as ENU", ("axes",), of_poses(ned_of_camera), own),
-        Mistake("z alone", ("axes",), of_poses(lambda pose: (pose[0] * [1, 1, -1], pose[1]))),
-        Mistake("feet", ("unit",), of_poses(lambda pose: (pose[0] / 0.3048, pose[1]))),
-        Mistake("millimetres", ("unit",), of_poses(lambda pose: (pose[0] * 1000, pose[1]))),
-        Mistake("centimetres", ("unit",), of_poses(lambda pose: (pose[0] * 100, pose[1]))),
-        Mistake("half-size keypoints", ("keypoints_size",), with_keypoints(lambda px, _: px * [0.5, 0.5, 1])),
-    ]
+def scaled(factor: float | list[int], only: str | None = None) -> Change:
+    return of_poses(lambda pose: (pose[0] * factor, pose[1]), only)
 
 
-def moved(shift: Float, only: str) -> Change:
+def moved(shift: list[float], only: str | None = None) -> Change:
     return of_poses(lambda pose: (pose[0] + shift, pose[1]), only)
 
 
@@ -568,7 +398,12 @@ def heading(degrees: float) -> Callable[[Pose], Pose]:
     return lambda pose: (pose[0], multiply(turned("z", degrees), pose[1]))
 
 
-MISTAKES = _mistakes()
+def real_part_first(pose: Pose) -> Pose:
+    return pose[0], np.roll(pose[1], 1, axis=-1)
+
+
+def half_size(pixels: Float, _: int) -> Float:
+    return pixels * [0.5, 0.5, 1]
 
 
 def fixed_gimbal(pitch_deg: float, relative_to: str) -> Change:
@@ -592,77 +427,76 @@ def with_white_errors(pose: Pose) -> Pose:
     return position + draw.normal(0, 0.3, position.shape), erring
 
 
-def renamed(pixels: Float, *parts: str) -> Float:
+def renamed(*parts: str) -> Callable[[Float, int], Float]:
     """Exchange left and right in the names of some joints of COCO."""
     order = [
         COCO_SWAPPED[index] if name.partition("_")[2] in parts else index
         for index, name in enumerate(SKELETONS["coco17"].joints)
     ]
-    return pixels[order]
+    return lambda pixels, _: pixels[order]
 
 
-def _less_usual() -> list[Mistake]:
-    one = "drone1"
-
-    def carried(flight: Flight) -> bool:
-        return flight.carried
-
-    def x_and_y(pose: Pose) -> Pose:
-        return pose[0][:, [1, 0, 2]], pose[1]
-
-    def of_all(degrees: float) -> Change:
-        return of_poses(heading(degrees))
-
-    return [
-        Mistake("y from below", ("mirrored",), with_keypoints(from_below)),
-        Mistake("pictures mirrored, one", ("mirrored",), with_keypoints(_both, one)),
-        Mistake("x mirrored, one", ("mirrored",), with_keypoints(mirrored, one)),
-        Mistake(
-            "half-size keypoints, one",
-            ("keypoints_size",),
-            with_keypoints(lambda px, _: px * [0.5, 0.5, 1], one),
-        ),
-        Mistake(
-            "names: knees, ankles",
-            ("mirrored", "body"),
-            with_keypoints(lambda px, _: renamed(px, "knee", "ankle")),
-        ),
-        Mistake(
-            "names: elbows, wrists",
-            ("mirrored", "body"),
-            with_keypoints(lambda px, _: renamed(px, "elbow", "wrist")),
-        ),
-        Mistake(
-            "names: legs",
-            ("mirrored", "body"),
-            with_keypoints(lambda px, _: renamed(px, "hip", "knee", "ankle")),
-        ),
-        Mistake("gimbal: of world", ("gimbal",), fixed_gimbal(-DOWN_DEG, "world"), carried),
-        Mistake("gimbal: pitch's sign", ("gimbal", "mount"), fixed_gimbal(DOWN_DEG, "body"), carried),
-        Mistake("errors 0.3 m, 2 deg, not stated", ("noise",), of_poses(with_white_errors)),
-        Mistake(
-            "poses backwards, one", ("pose",), of_poses(lambda pose: (pose[0][::-1], pose[1][::-1]), one)
-        ),
-        Mistake("x and y exchanged", ("axes",), of_poses(x_and_y)),
-        Mistake("all headings 90 deg", ("pose", "axes", "mount"), of_all(90)),
-        Mistake("all headings -30 deg", ("pose",), of_all(-30)),
-        Mistake("feet, one", ("unit", "origin"), of_poses(lambda pose: (pose[0] / 0.3048, pose[1]), one)),
-        Mistake(
-            "w x y z, one",
-            ("convention", "pose"),
-            of_poses(lambda pose: (pose[0], np.roll(pose[1], 1, axis=-1)), one),
-        ),
-        Mistake(
-            "height 5 m off, all",
-            ("origin", "actor", "ground"),
-            of_poses(lambda pose: (pose[0] + [0, 0, 5], pose[1])),
-        ),
-        Mistake("clock -1.2 s, one", ("clock",), of_cameras(clock(-1.2), one)),
-        Mistake("60 for 30 Hz, all", ("frame_rate",), of_cameras(rate(60))),
-    ]
-
-
-LESS_USUAL = _less_usual()
+_CARRIED = attrgetter("carried")
+_ONE, _ROOT = "drone1", "root_mpjpe_mm"
+_NORTH = of_poses(lambda pose: compose((np.zeros(3), turned("z", 20)), pose), _ONE)
+_NAMES = with_keypoints(lambda pixels, _: pixels[COCO_SWAPPED])
+MISTAKES = [
+    Mistake("videos swapped", ("videos_swapped",), swapped),
+    Mistake("videos cycled", ("videos_swapped",), cycled, lambda flight: flight.drones > 2),
+    Mistake("focal x2, all", ("intrinsics",), of_cameras(focal(2.0))),
+    Mistake("focal x1/2, all", ("intrinsics",), of_cameras(focal(0.5))),
+    Mistake("focal x1.4, one", ("intrinsics",), of_cameras(focal(1.4), _ONE)),
+    Mistake("upside down, all", ("mount",), of_mounts(turned("z", 180))),
+    Mistake("rolled by 90, one", ("mount",), of_mounts(turned("z", 90), _ONE)),
+    Mistake("tilt's sign, all", ("mount",), of_mounts(turned("x", 2 * DOWN_DEG))),
+    Mistake("looks left, all", ("mount", "pose"), looks_left),
+    Mistake("pictures mirrored", ("mirrored",), with_keypoints(_both)),
+    Mistake("x mirrored", ("mirrored",), with_keypoints(mirrored)),
+    Mistake("names mirrored", ("mirrored",), _NAMES),
+    Mistake("clock 0.3 s, one", ("clock",), of_cameras(clock(0.3), _ONE)),
+    Mistake("clock 0.5 s, all", ("clock",), of_cameras(clock(0.5))),
+    Mistake("25 for 30 Hz, all", ("frame_rate",), of_cameras(rate(25))),
+    Mistake("25 for 30 Hz, one", ("frame_rate",), of_cameras(rate(25), _ONE)),
+    Mistake("origin 3 m, one", ("origin",), moved([2.4, -1.8, 0], _ONE), of_a_pair=_ROOT),
+    Mistake("north 20 deg, one", ("origin",), _NORTH, of_a_pair="pa_mpjpe_mm"),
+    Mistake("heading 8 deg, one", ("pose",), of_poses(heading(8), _ONE)),
+    Mistake("own origins", ("origin",), own_origins, of_a_pair=_ROOT, without_actor=_ROOT),
+    Mistake("another's topic", ("pose",), same_topic),
+    Mistake("camera_from_world", ("convention",), of_poses(lambda pose: invert(*pose))),
+    Mistake("w x y z", ("convention",), of_poses(real_part_first)),
+    Mistake("camera as body", ("convention",), camera_as_body, _CARRIED),
+    Mistake("body as camera", ("convention",), body_as_camera, lambda flight: not flight.carried),
+    Mistake("NED as ENU, body", ("axes",), of_poses(as_ned), _CARRIED),
+    Mistake("NED as ENU", ("axes",), of_poses(ned_of_camera), lambda flight: not flight.carried),
+    Mistake("z alone", ("axes",), scaled([1, 1, -1])),
+    Mistake("feet", ("unit",), scaled(1 / 0.3048)),
+    Mistake("millimetres", ("unit",), scaled(1000)),
+    Mistake("centimetres", ("unit",), scaled(100)),
+    Mistake("half-size keypoints", ("keypoints_size",), with_keypoints(half_size)),
+]
+_X_AND_Y = of_poses(lambda pose: (pose[0][:, [1, 0, 2]], pose[1]))
+_BACKWARDS = of_poses(lambda pose: (pose[0][::-1], pose[1][::-1]), _ONE)
+LESS_USUAL = [
+    Mistake("y from below", ("mirrored",), with_keypoints(from_below)),
+    Mistake("pictures mirrored, one", ("mirrored",), with_keypoints(_both, _ONE)),
+    Mistake("x mirrored, one", ("mirrored",), with_keypoints(mirrored, _ONE)),
+    Mistake("half-size keypoints, one", ("keypoints_size",), with_keypoints(half_size, _ONE)),
+    Mistake("names: knees, ankles", ("mirrored", "body"), with_keypoints(renamed("knee", "ankle"))),
+    Mistake("names: elbows, wrists", ("mirrored", "body"), with_keypoints(renamed("elbow", "wrist"))),
+    Mistake("names: legs", ("mirrored", "body"), with_keypoints(renamed("hip", "knee", "ankle"))),
+    Mistake("gimbal: of world", ("gimbal",), fixed_gimbal(-DOWN_DEG, "world"), _CARRIED),
+    Mistake("gimbal: pitch's sign", ("gimbal", "mount"), fixed_gimbal(DOWN_DEG, "body"), _CARRIED),
+    Mistake("errors 0.3 m, 2 deg, not stated", ("noise",), of_poses(with_white_errors)),
+    Mistake("poses backwards, one", ("pose",), _BACKWARDS),
+    Mistake("x and y exchanged", ("axes",), _X_AND_Y),
+    Mistake("all headings 90 deg", ("pose", "axes", "mount"), of_poses(heading(90))),
+    Mistake("all headings -30 deg", ("pose",), of_poses(heading(-30))),
+    Mistake("feet, one", ("unit", "origin"), scaled(1 / 0.3048, _ONE)),
+    Mistake("w x y z, one", ("convention", "pose"), of_poses(real_part_first, _ONE)),
+    Mistake("height 5 m off, all", ("origin", "actor", "ground"), moved([0, 0, 5])),
+    Mistake("clock -1.2 s, one", ("clock",), of_cameras(clock(-1.2), _ONE)),
+    Mistake("60 for 30 Hz, all", ("frame_rate",), of_cameras(rate(60))),
+]
 
 
 # --- measuring ---------------------------------------------------------------------------------------------
@@ -740,108 +574,44 @@ def right_flight(seed: int) -> Flight:
     )
 
 
-# Angles (deg) by which bones turn about z, y and x; y is up, z ahead, and at rest the arms point aside.
-_ARMS_DOWN: dict[str, tuple[float, ...]] = {"LeftArm": (-75, 0, 0), "RightArm": (75, 0, 0)}
-_STAR: dict[str, tuple[float, ...]] = {
-    "LeftArm": (60, 0, 0),
-    "RightArm": (-60, 0, 0),
-    "LeftUpLeg": (35, 0, 0),
-    "RightUpLeg": (-35, 0, 0),
-}
-_BONES = (  # name, the bone it hangs on, offset from it in cm
-    ("Hips", None, (0, 0, 0)),
-    ("Spine", "Hips", (0, 12, 0)),
-    ("Chest", "Spine", (0, 22, 0)),
-    ("Neck", "Chest", (0, 20, 0)),
-    ("Head", "Neck", (0, 10, 2)),
-    *(
-        bone
-        for side, sign in (("Left", 1), ("Right", -1))
-        for bone in (
-            (f"{side}Arm", "Chest", (18 * sign, 16, 0)),
-            (f"{side}ForeArm", f"{side}Arm", (28 * sign, 0, 0)),
-            (f"{side}Hand", f"{side}ForeArm", (25 * sign, 0, 0)),
-            (f"{side}UpLeg", "Hips", (9 * sign, -6, 0)),
-            (f"{side}Leg", f"{side}UpLeg", (0, -42, 0)),
-            (f"{side}Foot", f"{side}Leg", (0, -42, 0)),
-            (f"{side}ToeBase", f"{side}Foot", (0, -6, 14)),
-        )
-    ),
-)
-_Key = tuple[float, tuple[float, float, float], tuple[float, float, float], dict[str, tuple[float, ...]]]
-# Time (s), place (cm) and turn (deg, about z, y, x) of the hips, and of bones.
-ACROBATICS: dict[str, tuple[_Key, ...]] = {
-    "lies down and gets up": (
-        (0, (0, 96, 0), (0, 0, 0), _ARMS_DOWN),
-        (1.5, (0, 14, 60), (0, 0, -90), _ARMS_DOWN),
-        (4.0, (0, 14, 60), (0, 0, -90), _STAR),
-        (6, (0, 96, 0), (0, 0, 0), _ARMS_DOWN),
-    ),
-    "lies on the back": (
-        (0, (0, 14, 0), (0, 0, -90), _ARMS_DOWN),
-        (2, (0, 14, 0), (0, 0, -90), _STAR),
-        (4, (0, 14, 0), (0, 0, -90), _ARMS_DOWN),
-        (6, (0, 14, 0), (0, 0, -90), _STAR),
-    ),
-    "lies on the face": (
-        (0, (0, 14, 0), (0, 0, 90), _ARMS_DOWN),
-        (3, (0, 14, 0), (0, 0, 90), _STAR),
-        (6, (0, 14, 0), (0, 0, 90), _ARMS_DOWN),
-    ),
-    "lies on the side": (
-        (0, (0, 20, 0), (90, 0, 0), _ARMS_DOWN),
-        (3, (0, 20, 0), (90, 0, 0), _STAR),
-        (6, (0, 20, 0), (90, 0, 0), _ARMS_DOWN),
-    ),
-    "turns cartwheels": (
-        (0, (0, 96, 0), (0, 0, 0), _ARMS_DOWN),
-        (0.8, (0, 90, 0), (0, 0, 0), _STAR),
-        (2.3, (-220, 90, 0), (360, 0, 0), _STAR),
-        (3.2, (-230, 90, 0), (360, 0, 0), _STAR),
-        (4.7, (-450, 90, 0), (720, 0, 0), _STAR),
-        (6, (-450, 96, 0), (720, 0, 0), _ARMS_DOWN),
-    ),
-}
-
-
-def write_bvh(keys: tuple[_Key, ...], path: Path, rate_hz: int = 60) -> None:
-    """Write a motion as BVH, cm and y up, with angles that are linear between its keys."""
+def write_bvh(motion: str, path: Path, rate_hz: int = 60) -> None:
+    """Write a motion of the table as BVH, cm and y up, with angles that are linear between its keys."""
     lines: list[str] = ["HIERARCHY"]
-
-    def bone(name: str, offset: tuple[int, int, int], depth: int) -> None:
-        indent = "  " * depth
-        channels = "6 Xposition Yposition Zposition" if depth == 0 else "3"
-        lines.extend([f"{indent}{'JOINT' if depth else 'ROOT'} {name}", indent + "{"])
-        lines.append(f"{indent}  OFFSET {offset[0]} {offset[1]} {offset[2]}")
-        lines.append(f"{indent}  CHANNELS {channels} Zrotation Yrotation Xrotation")
-        order.append(name)
-        children = [each for each in _BONES if each[1] == name]
-        for child, _, its_offset in children:
-            bone(child, its_offset, depth + 1)
-        if not children:
-            lines.extend([f"{indent}  End Site", indent + "  {", f"{indent}    OFFSET 0 5 0", indent + "  }"])
-        lines.append(indent + "}")
-
     order: list[str] = []
-    bone("Hips", (0, 0, 0), 0)
-    times = [key[0] for key in keys]
-    rows = [
-        [*key[1], *key[2], *(v for name in order[1:] for v in key[3].get(name, (0, 0, 0)))] for key in keys
-    ]
+
+    def write_bone(name: str, depth: int) -> None:
+        x, y, z = _TABLES["bones"][name][1]
+        channels = "3" if depth else "6 Xposition Yposition Zposition"
+        lines.extend([f"{'JOINT' if depth else 'ROOT'} {name}", "{", f"OFFSET {x} {y} {z}"])
+        lines.append(f"CHANNELS {channels} Zrotation Yrotation Xrotation")
+        order.append(name)
+        children = [child for child, (parent, _) in _TABLES["bones"].items() if parent == name]
+        for child in children:
+            write_bone(child, depth + 1)
+        if not children:
+            lines.extend(["End Site", "{", "OFFSET 0 5 0", "}"])
+        lines.append("}")
+
+    write_bone("Hips", 0)
+    times, rows = [], []
+    for time_s, place, turn, held in _TABLES["acrobatics"][motion]:
+        times.append(time_s)
+        limbs = [_TABLES["holds"][held].get(name, (0, 0, 0)) for name in order[1:]]
+        rows.append(np.concatenate([place, turn, *limbs]))
     at = np.arange(0, times[-1] + 0.5 / rate_hz, 1 / rate_hz)
-    columns = [np.interp(at, times, column) for column in zip(*rows, strict=True)]
+    columns = [np.interp(at, times, column) for column in np.transpose(rows)]
     lines += ["MOTION", f"Frames: {len(at)}", f"Frame Time: {1 / rate_hz:.6f}"]
-    lines += [" ".join(f"{value:.4f}" for value in row) for row in zip(*columns, strict=True)]
+    lines += [" ".join(f"{value:.4f}" for value in row) for row in np.transpose(columns)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def acrobatic_flight(seed: int, folder: Path) -> Flight:
     """Draw a right flight as `right_flight` does, of somebody who lies or turns cartwheels."""
-    names = list(ACROBATICS)
-    motion = names[seed % len(names)]
+    motions = list(_TABLES["acrobatics"])
+    motion = motions[seed % len(motions)]
     path = (folder / f"{motion.replace(' ', '_')}.bvh").resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    write_bvh(ACROBATICS[motion], path)
+    write_bvh(motion, path)
     return replace(right_flight(seed), name=f"acrobat{seed}", motion=f"{{bvh: {path}}}")
 
 
