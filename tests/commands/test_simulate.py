@@ -345,13 +345,6 @@ def test_hostile_scenarios_get_one_line(tmp_path: Path, case: str) -> None:
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scenario.yaml"]
 
 
-ROLLING = EXACT.replace(
-    "camera: {shutters: synchronised}",
-    "formation: {radius_m: 5, yaw_rate_deg_per_s: 20}\n"
-    "  camera: {readout_ms: 30, distortion: [-0.132, 0.111, 0, 0, -0.016]}",
-)
-
-
 def test_what_the_camera_does_is_stated_where_it_is_read(tmp_path: Path) -> None:
     distortion = [-0.132, 0.111, 0.0, 0.0, -0.016]
     shot = f"rate_hz: 30, exposure_ms: 2, distortion: {distortion}, readout_ms: 20, bitrate_mbps: 0.5"

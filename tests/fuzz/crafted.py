@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import bz2
 import json
-import shutil
 import sqlite3
 import struct
 import zipfile
@@ -20,10 +19,8 @@ from pathlib import Path
 import lz4.frame
 import numpy as np
 from backports import zstd
-from ruamel.yaml import YAML
 
 from tests.formats.calibrations import test_anipose_toml
-from tests.formats.maps import test_octomap
 from tests.synthetic import drone_logs, video_tracks, videos
 from tests.synthetic.flights import write_flight
 
@@ -127,12 +124,9 @@ _STRING = _schema(1, "std_msgs/msg/String", b"string data")
 
 @_kind("MCAP: many channels", "mcap", "a.mcap")
 def _mcap_channels() -> Iterator[_Input]:
-    n = 60_000
-    topics = b"".join(_channel(k, 1, f"/topic{k}") for k in range(n))
-    yield "60,000 topics", _mcap(_STRING, topics)
-    messages = b"".join(_message(k, k) for k in range(n))
-    yield "60,000 topics with a message each", _mcap(_STRING, topics, messages)
-    inside = _STRING + topics + messages
+    topics = b"".join(_channel(k, 1, f"/topic{k}") for k in range(60_000))
+    inside = _STRING + topics + b"".join(_message(k, k) for k in range(60_000))
+    yield "60,000 topics with a message each", _mcap(inside)
     yield "60,000 topics in a chunk", _mcap(_chunk(inside, size=len(inside)))
 
 
@@ -142,8 +136,6 @@ def _mcap_bombs() -> Iterator[_Input]:
         large = press(bytes(1000 * MB))
         yield f"{name}, 1,000 MB of zeros", _mcap(_chunk(large, name, 1000 * MB))
         yield f"{name}, states 2^63", _mcap(_chunk(large, name, 2**63))
-        body = _STRING + _channel(1, 1, "/a") + _message(1, 1, bytes(900 * MB))
-        yield f"{name}, one message of 900 MB", _mcap(_chunk(press(body), name, len(body)))
         some = press(bytes(60 * MB))
         yield f"{name}, 400 times 60 MB", _mcap(*[_chunk(some, name, 60 * MB)] * 400)
 
@@ -155,7 +147,6 @@ def _mcap_indices() -> Iterator[_Input]:
     rows = [(1, len(head))] * 1_000_000
     yield "300,000 empty chunks", _mcap(*[_chunk(b"")] * 300_000)
     yield ("1,000,000 rows for one message", _mcap(_chunk(body, size=len(body)), _index(1, rows)))
-    yield "500,000 unknown records", _mcap(head, _op(99, b"") * 500_000, _message(1, 1))
     yield "a record of 2^63 bytes", _mcap(head, struct.pack("<BQ", 5, 2**63), closed=False)
 
 
@@ -169,16 +160,12 @@ def _definitions() -> Iterator[_Input]:
         )
 
     rule = "\n" + "=" * 80 + "\nMSG: a/"
-    yield "100,000 fields", log("\n".join(f"float64 x{k}" for k in range(100_000)))
     deep = "B0 x" + "".join(f"{rule}B{k}\nB{k + 1} x" for k in range(2000)) + f"{rule}B2000\nfloat64 x"
     yield "2,000 types deep", log(deep)
     wide = "B0[10] x" + "".join(f"{rule}B{k}\nB{k + 1}[10] x" for k in range(12)) + f"{rule}B12\nfloat64 x"
     yield "arrays of arrays, 10^13 numbers", log(wide)
-    yield "an array of 10^12", log("float64[1000000000000] x")
     yield "a type within itself", log("A x")
     yield "a sequence of 2^32 - 1", log("float64[] x", b"\xff\xff\xff\xff" + bytes(8))
-    bomb = _mcap(_STRING, _channel(1, 1, "/a"), _message(1, 1, zstd.compress(bytes(1000 * MB))))
-    yield "a compressed message of 1,000 MB", bomb
 
 
 @_kind("messages: JSON and protobuf", "mcap", "a.mcap")
@@ -191,7 +178,6 @@ def _other_messages() -> Iterator[_Input]:
     yield "JSON with an integer of 100,000 digits", log(b'{"a": ' + b"9" * 100_000 + b"}")
     schema = b'{"a":' * 50_000 + b"{}" + b"}" * 50_000
     yield "a JSON schema 50,000 deep", log(b"{}", schema=schema)
-    yield "a protobuf schema of zeros", log(b"", "protobuf", bytes(MB))
     deep = b""
     for _ in range(5000):
         deep = b"\x1a" + _varint(len(deep)) + deep
@@ -253,8 +239,6 @@ def _bag_index(number: int, rows: bytes) -> bytes:
 def _bag_bombs() -> Iterator[_Input]:
     large = bz2.compress(bytes(1000 * MB))
     yield "bz2, 1,000 MB of zeros", _bag(_bag_chunk(large, "bz2", 1000 * MB))
-    some = bz2.compress(bytes(60 * MB))
-    yield "bz2, 100 times 60 MB", _bag(_bag_chunk(some, "bz2", 60 * MB) * 100)
     frames = lz4.frame.compress(bytes(1000)) * 100_000
     yield "lz4, 100,000 frames", _bag(_bag_chunk(frames, "lz4", 100_000_000))
 
@@ -267,16 +251,10 @@ def _bag_records() -> Iterator[_Input]:
     small = bz2.compress(_bag_topic(0, "/a") + _bag_message(0))
     both = _bag_chunk(small, "bz2", len(_bag_topic(0, "/a") + _bag_message(0)))
     yield "50,000 chunks of a message", _bag(both * 50_000, chunks=50_000)
-    topics = b"".join(_bag_topic(k, f"/t{k}") for k in range(60_000))
-    yield "60,000 topics", _bag(topics)
     content = _bag_topic(0, "/a") + _bag_message(0)
     place = struct.pack("<III", 0, 0, len(_bag_topic(0, "/a")))
     rows = _bag_index(0, place * 1_000_000)
     yield "1,000,000 rows for one message", _bag(_bag_chunk(content), rows, chunks=1)
-    fields = struct.pack("<I", 2) + b"a="
-    header = fields * (MB // 6)
-    record = (struct.pack("<I", len(header)) + header + bytes(4)) * 20
-    yield "headers of 170,000 fields", _bag(record)
 
 
 @_kind("ROS 2: databases", "ros2", "a.db3")
@@ -285,7 +263,6 @@ def _databases() -> Iterator[_Input]:
         "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,"
         " offered_qos_profiles TEXT)"
     )
-    plain = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
     named = "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr', '')"
 
     def database(*statements: str) -> Writer:
@@ -298,17 +275,6 @@ def _databases() -> Iterator[_Input]:
 
         return write
 
-    many = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 60000)"
-    yield (
-        "60,000 topics",
-        database(
-            topics,
-            plain,
-            "INSERT INTO topics "  # noqa: S608  # of constants
-            + many
-            + " SELECT i, '/t' || i, 'std_msgs/msg/String', 'cdr', '' FROM n",
-        ),
-    )
     endless = (
         "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
         " SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"
@@ -316,16 +282,6 @@ def _databases() -> Iterator[_Input]:
     yield "a view without end", database(topics, named, endless)
     zeros = "SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, zeroblob(999000000) AS data"
     yield "a view of 1 GB", database(topics, named, f"CREATE VIEW messages AS {zeros}")
-    generated = plain.replace("data BLOB", "data BLOB AS (zeroblob(900000000))")
-    yield (
-        "generated columns of 900 MB",
-        database(
-            topics,
-            generated,
-            named,
-            "INSERT INTO messages(id, topic_id, timestamp) VALUES (1, 1, 1), (2, 1, 2)",
-        ),
-    )
 
 
 @_kind("ROS 2: folders", "ros2", "bag")
@@ -340,17 +296,11 @@ def _bag_folders() -> Iterator[_Input]:
 
         return write
 
-    def stated(names: Iterable[str]) -> str:
-        listed = "".join(f"    - {name}\n" for name in names)
-        return f"rosbag2_bagfile_information:\n  message_count: 1\n  relative_file_paths:\n{listed}"
-
     log = _mcap(_STRING, _channel(1, 1, "/a"), _message(1, 1))
     yield "metadata of aliases", bag(_laughs(), a__mcap=log)
-    yield "metadata nested deep", bag("[" * 100_000, a__mcap=log)
     bomb = zstd.compress(bytes(4000 * MB))
-    yield "a zstd file of 4 GB", bag(stated(["a.db3.zstd"]), a__db3__zstd=bomb)
-    nested = zstd.compress(zstd.compress(log))
-    yield "zstd in zstd", bag(stated(["a.mcap.zstd.zstd"]), a__mcap__zstd__zstd=nested)
+    stated = "rosbag2_bagfile_information:\n  message_count: 1\n  relative_file_paths: [a.db3.zstd]\n"
+    yield "a zstd file of 4 GB", bag(stated, a__db3__zstd=bomb)
 
 
 # --- YAML, TOML, XML ----------------------------------------
@@ -381,29 +331,6 @@ def _yaml_calibrations() -> Iterator[_Input]:
     ]
     yield "merges of merges", head + "\n".join(keys)
     yield "nested 100,000 deep", head + "a: " + "[" * 100_000
-    tags = "".join(f"%TAG !t{k}! tag:x,{k}:\n" for k in range(20_000))
-    yield "20,000 tags", tags + "---\n" + head
-    yield "%50,000 questions", head + "? " * 50_000
-
-
-@_kind("YAML: flights", "", "flight.yaml")
-def _yaml_flights() -> Iterator[_Input]:
-    def flight(change: Callable[[str], str]) -> Writer:
-        def write(folder: Path) -> None:
-            made = write_flight(folder, cameras=1, seconds=0.2)
-            made.manifest.write_text(change(made.manifest.read_text(encoding="utf-8")), encoding="utf-8")
-
-        return write
-
-    def cameras(text: str, count: int) -> str:
-        raw = YAML(typ="safe", pure=True).load(text)
-        one = next(iter(raw["cameras"].values()))
-        raw["cameras"] = {f"drone{k}": one for k in range(count)}
-        return json.dumps(raw)
-
-    yield "10,000 cameras", flight(lambda text: cameras(text, 10_000))
-    yield "aliases of aliases", flight(lambda text: text + _laughs())
-    yield "nested 100,000 deep", flight(lambda text: text + "a: " + "{a: " * 100_000)
 
 
 @_kind("TOML, INI: calibrations", "anipose", "calib.toml")
@@ -413,27 +340,8 @@ def _toml() -> Iterator[_Input]:
 
     yield "10,000 cameras", cameras(10_000)
     yield "nested 100,000 deep", cameras(1) + "a = " + "[" * 100_000
-    yield (
-        "an INI of 200,000 keys",
-        "camera_info",
-        "left.ini",
-        "[image]\n" + "".join(f"k{k}\n1\n" for k in range(200_000)),
-    )
-
-
-@_kind("XML", "opencv", "calib.xml")
-def _xml() -> Iterator[_Input]:
-    head = '<?xml version="1.0"?>'
-    cv = f"{head}<opencv_storage><camera_matrix>"
-    yield "nested 50,000 deep, OpenCV", cv + "<a>" * 50_000
-    matrix = '<?xml version="1.0"?><opencv_storage><camera_matrix type_id="opencv-matrix">'
-    yield (
-        "a matrix of 2^31 rows, OpenCV",
-        (
-            f"{matrix}<rows>2147483647</rows><cols>2147483647</cols><dt>d</dt><data>1</data></camera_matrix>"
-            "</opencv_storage>"
-        ),
-    )
+    keys = "".join(f"k{k}\n1\n" for k in range(200_000))
+    yield "an INI of 200,000 keys", "camera_info", "left.ini", "[image]\n" + keys
 
 
 # --- keypoints ----------------------------------------
@@ -452,11 +360,8 @@ def _frame_numbers() -> Iterator[_Input]:
         return write
 
     for number in (5_000_000, 2**62 - 1):
-        yield f"the only frame is {number:,}", "", "flight.yaml", flight([person(f"{number}.jpg")])
         both = [person("0.jpg"), person(f"{number}.jpg")]
         yield f"frames 0 and {number:,}", "", "flight.yaml", flight(both)
-    yield "frame 5,000,000 alone, read", "alphapose", "a.json", json.dumps([person("5000000.jpg")])
-    yield "frame -5,000,000", json.dumps([person(-5_000_000)])
     yield "frame 1e300", json.dumps([person(1e300)])
 
 
@@ -468,38 +373,14 @@ def _keypoint_json() -> Iterator[_Input]:
     yield "nested 1,000,000 deep", "[" * 1_000_000
     yield "a key of 20 MB", "coco", "a.json", f'[{{"{"x" * 20 * MB}": 1}}]'
     yield "2,000,000 empty lists", "mmpose", "a.json", '{"instance_info": [' + "[]," * 2_000_000 + "[]]}"
-    deep: object = 1.0
-    for _ in range(60):
-        deep = [deep]
-    yield (
-        "keypoints of 60 dimensions",
-        "coco",
-        "a.json",
-        json.dumps([person | {"image_id": 1, "keypoints": deep}]),
-    )
 
-    def folder_of(files: int, content: str) -> Writer:
-        def write(folder: Path) -> None:
-            (folder / "drone").mkdir()
-            for k in range(files):
-                (folder / "drone" / f"a_{k:012d}_keypoints.json").write_text(content, encoding="utf-8")
+    def folder(place: Path) -> None:
+        (place / "drone").mkdir()
+        for k in range(10_000):
+            path = place / "drone" / f"a_{k:012d}_keypoints.json"
+            path.write_text('{"version": 1.3, "people": []}', encoding="utf-8")
 
-        return write
-
-    yield (
-        "10,000 files without people",
-        "openpose",
-        "drone",
-        folder_of(10_000, '{"version": 1.3, "people": []}'),
-    )
-    yield (
-        "one file, 30,000 people",
-        "openpose",
-        "drone",
-        folder_of(
-            1, json.dumps({"version": 1.3, "people": [{"pose_keypoints_2d": [1.0, 2.0, 0.5] * 25}] * 30_000})
-        ),
-    )
+    yield "10,000 files without people", "openpose", "drone", folder
 
 
 # --- text tables ----------------------------------------
@@ -515,17 +396,11 @@ def _tables() -> Iterator[_Input]:
     ):
         separator = "," if name == "csv" else " "
         yield f"{name}: a line of 30 MB", name, entry, good + (f"1{separator}") * (15 * MB)
-        yield f"{name}: a number of 1,000,000 digits", name, entry, good + "9" * 1_000_000 + good[1:]
     yield "csv: 200,000 columns", "csv", "poses.csv", ",".join(f"c{k}" for k in range(200_000)) + "\n"
-    yield "csv: an open quote over 20 MB", "csv", "poses.csv", 't_ns,x\n1,"' + "a\n" * (10 * MB)
     joints = "t_ns,person,joint,x,y,z\n"
     many = "".join(f"{k},0,joint{k},0,0,0\n" for k in range(20_000))
     yield "joints: 20,000 joints at 20,000 times", joints + many
     yield "frame times: frame 10^15", "frame_times", "f.csv", f"frame,t_ns\n0,1\n{10**15},2\n"
-    wide = ",".join(
-        ["time(millisecond)", "datetime(utc)", "latitude", "longitude"] + [f"c{k}" for k in range(10**5)]
-    )
-    yield "DJI record: 100,000 columns", "dji_record", "a.csv", wide + "\n1,2024-01-01 00:00:00,1,2\n"
 
 
 @_kind("skeletons: BVH", "bvh", "a.bvh")
@@ -537,22 +412,14 @@ def _bvh() -> Iterator[_Input]:
     n = 50_000
     deep = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\n" for k in range(n)) + "}\n" * (n + 1)
     yield "nested 50,000 deep", motion(root + deep, 3)
-    yield ("10^9 frames stated", motion(root + "}\n", 3).replace("Frames: 1", "Frames: 1000000000"))
-    yield (
-        "an offset of 1e308",
-        motion(root + "JOINT a\n{\nOFFSET 1e308 0 0\nJOINT b\n{\nOFFSET 1e308 1e308 0\n}\n}\n}\n", 3),
-    )
-    yield "one line of 500,000 braces", motion(root + "{" * 500_000 + "}" * 500_001, 3)
+    yield "10^9 frames stated", motion(root + "}\n", 3).replace("Frames: 1", "Frames: 1000000000")
 
 
-@_kind("skeletons: C3D, TRC, AMC", "trc", "a.trc")
+@_kind("skeletons: C3D, TRC", "trc", "a.trc")
 def _skeletons() -> Iterator[_Input]:
     head = "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n"
-    for markers in (10**9, 2**62):
-        text = f"{head}60\t60\t1\t{markers}\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t0.0\t1\t2\t3\n"
-        yield f"TRC: {markers:,} markers stated", text
-    rate = f"{head}1e-300\t1e308\t1\t1\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t1e308\t1\t2\t3\n"
-    yield "TRC: a time of 1e308", rate
+    text = f"{head}60\t60\t1\t{2**62}\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t0.0\t1\t2\t3\n"
+    yield "TRC: 2^62 markers stated", text
     c3d = bytearray(512 * 2)
     c3d[:2] = b"\x02\x50"
     struct.pack_into(
@@ -564,11 +431,6 @@ def _skeletons() -> Iterator[_Input]:
     looped = bytearray(c3d)
     looped[516:524] = struct.pack("<bbBBhbb", 5, 1, 65, 65, 0, 0, 0)
     yield "C3D: a parameter that leads to itself", "c3d", "a.c3d", bytes(looped)
-    dimensions = bytearray(c3d)
-    dimensions[516 : 516 + 20] = struct.pack(
-        "<bbBBhbB7BB4B", 2, 1, 65, 65, 500, 4, 7, *[255] * 7, 0, 0, 0, 0, 0
-    )
-    yield "C3D: an array of 255^7", "c3d", "a.c3d", bytes(dimensions)
 
 
 # --- maps ----------------------------------------
@@ -582,21 +444,14 @@ def _clouds() -> Iterator[_Input]:
     )
     yield "PCD: 10^12 points", pcd.format(n=10**12, data="binary").encode() + bytes(120)
     lzf = struct.pack("<II", 3 * 4_000_000, 264 * 4_000_000) + b"\xe0\xff\x00" * 4_000_000
-    yield ("PCD: LZF to 1 GB", pcd.format(n=88_000_000, data="binary_compressed").encode() + lzf)
-    count = pcd.replace("COUNT 1 1 1", "COUNT 1 1 1000000000000")
-    yield "PCD: a count of 10^12", count.format(n=1, data="ascii") + "1 2 3\n"
+    yield "PCD: LZF to 1 GB", pcd.format(n=88_000_000, data="binary_compressed").encode() + lzf
     far = "\n".join(["0 0 0", "1e308 0 0", "-1e308 1e308 1e38"])
     yield "PCD: points at 1e308", pcd.format(n=3, data="ascii") + far
-    box = "\n".join(["0 0 0", "9000 9000 9000"])
-    yield "PCD: two points 9 km apart", pcd.format(n=2, data="ascii") + box
-    ply = "ply\nformat {kind} 1.0\nelement vertex {n}\nproperty float x\nproperty float y\nproperty float z\n"
-    yield (
-        "PLY: 10^15 points",
-        "ply",
-        "a.ply",
-        ply.format(kind="binary_little_endian", n=10**15) + "end_header\n",
-    )
-    lists = ply.format(kind="binary_little_endian", n=1) + "property list uint uint a\nend_header\n"
+    ply = "ply\nformat binary_little_endian 1.0\nelement vertex {n}\n"
+    ply += "".join(f"property float {axis}\n" for axis in "xyz")
+    many = ply.format(n=10**15) + "end_header\n"
+    yield "PLY: 10^15 points", "ply", "a.ply", many
+    lists = ply.format(n=1) + "property list uint uint a\nend_header\n"
     yield "PLY: a list of 2^32 - 1", "ply", "a.ply", lists.encode() + bytes(12) + b"\xff" * 4
     las = bytearray(227 + 40)
     las[:4] = b"LASF"
@@ -609,11 +464,11 @@ def _clouds() -> Iterator[_Input]:
 
 @_kind("maps: grids", "ros_map", "map.yaml")
 def _grids() -> Iterator[_Input]:
-    def npz(shape: str, data: bytes = b"", kind: str = "<f4", level: int = 9) -> bytes:
+    def npz(shape: str, data: bytes = b"") -> bytes:
         file = BytesIO()
-        header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}"
+        header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}"
         header = header.ljust((len(header) + 10) // 64 * 64 + 53) + "\n"
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=level) as archive:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
             with archive.open("probability.npy", "w", force_zip64=True) as member:
                 member.write(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header.encode())
                 member.write(data)
@@ -625,7 +480,6 @@ def _grids() -> Iterator[_Input]:
 
     yield "npz: 1,000 MB of zeros", "npz", "site.npz", npz("(250, 1000, 1000)", bytes(1000 * 10**6))
     yield "npz: 2^60 voxels stated", "npz", "site.npz", npz(f"({2**20}, {2**20}, {2**20})")
-    yield "npz: objects", "npz", "site.npz", npz("(1, 1, 1)", b"cos\nsystem\n(S'true'\ntR.", "|O")
     yield "npz: a header nested deep", "npz", "site.npz", npz("(" * 3000 + ")" * 3000)
 
     def ros(about: str, name: str, picture: bytes) -> Writer:
@@ -635,13 +489,11 @@ def _grids() -> Iterator[_Input]:
 
         return write
 
-    about = "resolution: {r}\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
-    usual = about.format(r=0.05)
-    yield ("map.yaml: 2^31 pixels wide", ros(usual, "a.pgm", b"P5\n2147483647 2147483647\n255\n\0"))
-    yield ("map.yaml: voxels of 1e-300 m", ros(about.format(r=1e-300), "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"))
-    yield "map.yaml: the picture is a device", ros(usual, "/dev/zero", b"")
-    turned = usual.replace("[0, 0, 0]", "[1e308, -1e308, 0.7]")
-    yield ("map.yaml: an origin of 1e308", ros(turned, "a.pgm", b"P5\n2 2\n255\n\0\0\0\0"))
+    about = "resolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    yield "map.yaml: 2^31 pixels wide", ros(about, "a.pgm", b"P5\n2147483647 2147483647\n255\n\0")
+    tiny = about.replace("0.05", "1e-300")
+    yield "map.yaml: voxels of 1e-300 m", ros(tiny, "a.pgm", b"P5\n2 2\n255\n\0\0\0\0")
+    yield "map.yaml: the picture is a device", ros(about, "/dev/zero", b"")
 
 
 def _png(width: int, height: int) -> bytes:
@@ -657,154 +509,89 @@ def _png(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", data) + part(b"IEND", b"")
 
 
-@_kind("maps: OctoMap", "octomap", "a.bt")
-def _octomaps() -> Iterator[_Input]:
-    tree = test_octomap.at([7] * 13, [3.5, None, -2.0, [3.5, None] * 4, *[None] * 4])
-    good = test_octomap.file_of(tree)
-    for resolution in ("1e-300", "nan"):
-        changed = b"\n".join(
-            b"res " + resolution.encode() if line.startswith(b"res ") else line for line in good.split(b"\n")
-        )
-        yield f"voxels of {resolution} m", changed
-    head, _, _ = good.partition(b"data\n")
-    full = struct.pack("<H", 0xFFFF)
-    yield "only inner nodes", head + b"data\n" + full * 2_000_000
-
-
-# --- calibrations in binary, pictures, videos ----------------------------------------
-
-
-@_kind("COLMAP", "colmap", "model")
-def _colmap() -> Iterator[_Input]:
-    def model(cameras: bytes, images: bytes = bytes(8), **others: bytes) -> Writer:
-        def write(folder: Path) -> None:
-            place = folder / "model"
-            place.mkdir()
-            (place / "cameras.bin").write_bytes(cameras)
-            (place / "images.bin").write_bytes(images)
-            (place / "points3D.bin").write_bytes(others.get("points", bytes(8)))
-
-        return write
-
-    camera = struct.pack("<QIiQQddd", 1, 1, 0, 640, 480, 500.0, 320.0, 240.0)
-    image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1)
-    yield "2^64 - 1 cameras", model(struct.pack("<Q", 2**64 - 1) + camera[8:])
-    yield ("2^64 - 1 images", model(camera, struct.pack("<Q", 2**64 - 1) + image + b"a\0" + bytes(8)))
-    yield ("a name without an end", model(camera, struct.pack("<Q", 1) + image + b"a" * (20 * MB)))
+# --- pictures, videos ----------------------------------------
 
 
 @_kind("pictures", "pictures", "film")
 def _pictures() -> Iterator[_Input]:
-    def film(content: Callable[[int], bytes], count: int = 3, suffix: str = "png") -> Writer:
+    def film(content: bytes, suffix: str = "png") -> Writer:
         def write(folder: Path) -> None:
             (folder / "film").mkdir()
-            for k in range(count):
-                (folder / "film" / f"{k:06d}.{suffix}").write_bytes(content(k))
+            for k in range(3):
+                (folder / "film" / f"{k:06d}.{suffix}").write_bytes(content)
 
         return write
 
-    large = _png(30_000, 30_000)
-    yield "PNG of 900,000,000 pixels", film(lambda _: large)
-    small = _png(16, 16)
-    yield "10,000 pictures", film(lambda _: small, 10_000)
-    first = _png(16, 16)
-    lied = bytearray(first)
+    yield "PNG of 900,000,000 pixels", film(_png(30_000, 30_000))
+    lied = bytearray(_png(16, 16))
     struct.pack_into(">II", lied, 16, 2**31 - 1, 2**31 - 1)
     struct.pack_into(">I", lied, 29, zlib.crc32(bytes(lied[12:29])))
-    yield "PNG that states 2^31 - 1", film(lambda _: bytes(lied))
+    yield "PNG that states 2^31 - 1", film(bytes(lied))
 
     def jpeg(tags: bytes) -> bytes:
         exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + tags
         return b"\xff\xd8\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + b"\xff\xd9"
 
     looped = struct.pack("<H", 1) + struct.pack("<HHII", 0x8769, 4, 1, 8) + struct.pack("<I", 8)
-    yield "EXIF that leads to itself", "picture_tags", "film", film(lambda _: jpeg(looped), suffix="jpg")
+    yield "EXIF that leads to itself", "picture_tags", "film", film(jpeg(looped), suffix="jpg")
     counted = struct.pack("<H", 1) + struct.pack("<HHII", 0x0132, 2, 2**32 - 1, 0) + bytes(4)
-    yield "EXIF of 2^32 - 1 letters", "picture_tags", "film", film(lambda _: jpeg(counted), suffix="jpg")
-
-
-def _box(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", 8 + len(content)) + kind + content
+    yield "EXIF of 2^32 - 1 letters", "picture_tags", "film", film(jpeg(counted), suffix="jpg")
 
 
 @_kind("videos: boxes", "video", "a.mp4")
 def _boxes() -> Iterator[_Input]:
-    def changed(change: Callable[[bytearray], object], suffix: str = "mp4") -> Writer:
+    def changed(kind: bytes, offset: int, value: int) -> Writer:
         def write(folder: Path) -> None:
-            path = videos.write_video(folder / f"a.{suffix}", videos.even_ticks(15))
+            path = videos.write_video(folder / "a.mp4", videos.even_ticks(15))
             content = bytearray(path.read_bytes())
-            change(content)
-            path.write_bytes(content)
-
-        return write
-
-    def number(kind: bytes, offset: int, value: int) -> Callable[[bytearray], object]:
-        def change(content: bytearray) -> None:
             place = content.find(kind)
             while place >= 0:
                 struct.pack_into(">I", content, place + 4 + offset, value)
                 place = content.find(kind, place + 4)
+            path.write_bytes(content)
 
-        return change
+        return write
 
     for scale in (0, 1, 2**31 - 1, 2**31, 2**32 - 1):
-        yield f"mdhd: a time scale of {scale}", changed(number(b"mdhd", 12, scale))
-        yield f"mvhd: a time scale of {scale}", changed(number(b"mvhd", 12, scale))
+        yield f"mdhd: a time scale of {scale}", changed(b"mdhd", 12, scale)
     for kind, offset in ((b"stts", 4), (b"stsz", 8), (b"stsc", 4), (b"stco", 4), (b"ctts", 4), (b"elst", 4)):
-        yield f"{kind.decode()}: 2^32 - 1 entries", changed(number(kind, offset, 2**32 - 1))
-    yield "stts: a step of 2^32 - 1", changed(number(b"stts", 12, 2**32 - 1))
-    yield "stts: 2^31 - 1 pictures", changed(number(b"stts", 8, 2**31 - 1))
-    yield "tkhd: 2^31 wide", changed(number(b"tkhd", 76, 2**31 - 1))
-    deep = _box(b"ftyp", b"isom\0\0\0\0")
+        yield f"{kind.decode()}: 2^32 - 1 entries", changed(kind, offset, 2**32 - 1)
+    yield "stts: a step of 2^32 - 1", changed(b"stts", 12, 2**32 - 1)
+    yield "stts: 2^31 - 1 pictures", changed(b"stts", 8, 2**31 - 1)
+    yield "tkhd: 2^31 wide", changed(b"tkhd", 76, 2**31 - 1)
+    head = struct.pack(">I", 16) + b"ftypisom\0\0\0\0"
     nested = b""
     for _ in range(20_000):
         nested = struct.pack(">I", 8 + len(nested)) + b"moov" + nested if len(nested) < 60_000 else nested
-    yield "boxes nested deep", deep + nested
-    yield "200,000 empty boxes", deep + _box(b"free", b"") * 200_000
-    yield "a box of no length", deep + bytes(4) + b"moov" + bytes(100)
+    yield "boxes nested deep", head + nested
+    yield "200,000 empty boxes", head + b"\0\0\0\x08free" * 200_000
+    yield "a box of no length", head + bytes(4) + b"moov" + bytes(100)
 
 
 # --- telemetry ----------------------------------------
-
-
-def _drone(folder: Path) -> drone_logs.DroneTruth:
-    truth = drone_logs.drone_of(write_flight(folder / "f", cameras=1, seconds=0.3, clean=True), 0)
-    shutil.rmtree(folder / "f")
-    return truth
 
 
 @_kind("PX4 logs", "ulog", "a.ulg")
 def _ulogs() -> Iterator[_Input]:
     head = b"ULog\x01\x12\x35\x01" + bytes(8)
 
-    def log(*formats: str, rest: bytes = b"") -> bytes:
-        return head + b"".join(drone_logs.ulog_record("F", text.encode()) for text in formats) + rest
+    def log(*formats: str) -> bytes:
+        return head + b"".join(drone_logs.ulog_record("F", text.encode()) for text in formats)
 
-    nested = [f"t{k}:t{k + 1}[10] a;" for k in range(12)]
-    yield "arrays of arrays", log("t12:float a;", *nested)
-    yield "a type within itself", log("a:a x;")
     yield "a chain of 5,000 types", log(*(f"t{k}:t{k + 1} a;" for k in range(5000)))
     topic = log("a:uint64_t timestamp;float x;")
     subscribed = b"".join(drone_logs.ulog_record("A", struct.pack("<BH", 0, k) + b"a") for k in range(60_000))
     yield "60,000 subscriptions", topic + subscribed
     rows = drone_logs.ulog_record("D", struct.pack("<HQf", 0, 1, 2.0)) * 1_000_000
     yield "1,000,000 equal rows", topic + drone_logs.ulog_record("A", bytes(3) + b"a") + rows
-    yield "an array of 999,999,999", log("a:uint64_t timestamp;float[999999999] x;")
 
 
 @_kind("other telemetry", "dji", "a.SRT")
 def _telemetry() -> Iterator[_Input]:
-    def dataflash(definitions: int, rows: bytes) -> bytes:
-        made = b"".join(
-            b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", k % 120 + 1, 3, b"A%03d" % (k % 1000), b"", b"")
-            for k in range(definitions)
-        )
-        return made + rows
-
-    own = b"\xa3\x95\x80" + struct.pack(
-        "<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"
-    )
-    yield "ArduPilot: 200,000 definitions", "ardupilot", "a.bin", own + dataflash(200_000, b"")
+    rows = [(128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")]
+    rows += [(k % 120 + 1, 3, b"A%03d" % (k % 1000), b"", b"") for k in range(200_000)]
+    definitions = b"".join(b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", *row) for row in rows)
+    yield "ArduPilot: 200,000 definitions", "ardupilot", "a.bin", definitions
     packet = struct.pack(">Q", 1_700_000_000_000_000) + b"\xfe\x00\x00\x01\x01\x00\x00\x00"
     yield "MAVLink: 1,000,000 empty packets", "tlog", "a.tlog", packet * 1_000_000
     yield "MAVLink: 20 MB of marks", "tlog", "a.tlog", packet + b"\xfe" * (20 * MB)
@@ -813,8 +600,7 @@ def _telemetry() -> Iterator[_Input]:
     cues = "".join(cue.format(k=k, a=k % 1000, b=k % 1000 + 1) for k in range(200_000))
     yield "SRT: 200,000 cues that go back", cues
     one = cue.format(k=1, a=0, b=33)
-    yield ("SRT: 1,000,000 brackets", one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[" * 1_000_000)
-    yield "SRT: a latitude of 1e308", (one + one).replace("1.0]", "1e308]")
+    yield "SRT: 1,000,000 brackets", one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[" * 1_000_000
 
 
 @_kind("telemetry in videos", "gopro", "a.mp4")
@@ -831,7 +617,5 @@ def _tracks() -> Iterator[_Input]:
     yield "GPMF: nested 7,000 deep", gpmf(deep)
     empty = item(b"DEVC", b"\0", 1, 60_000, item(b"STRM", b"\0", 0, 0, b"") * 7500)
     yield "GPMF: 7,500 empty streams", gpmf(empty)
-    rows = item(b"GPS5", b"l", 20, 65_535, b"")
-    yield "GPMF: more rows than bytes", gpmf(item(b"DEVC", b"\0", 1, len(rows), rows))
     types = item(b"TYPE", b"c", 1, 60, b"l[99999999]" * 5) + item(b"SYST", b"?", 255, 1, bytes(255))
     yield "GPMF: a type of 10^8 numbers", gpmf(item(b"DEVC", b"\0", 1, len(types), types))

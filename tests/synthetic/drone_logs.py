@@ -6,7 +6,7 @@ Written by the published formats with `struct` alone, without the libraries that
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -53,18 +53,17 @@ class DroneTruth:
         return since_boot
 
 
-def drone_of(flight: SyntheticFlight, k: int, *, tilted: bool = True) -> DroneTruth:
+def drone_of(flight: SyntheticFlight, k: int) -> DroneTruth:
     """Simulate the drone that carries camera k below it on a gimbal, at LEVER_ARM of its body.
 
-    The body heads elsewhere than the camera and, if it is tilted, pitches and rolls as it flies. Angles are
-    taken from where things point, not by the formulas of the readers.
+    The body heads elsewhere than the camera, pitched and rolled. Angles are taken from where things point,
+    not by the formulas of the readers.
     """
     yaw = 0.4 + 0.8 * k + 0.3 * (flight.t_ns - flight.t_ns[0]) / 1e9
     still = np.zeros_like(yaw)
     body = quaternion_from_rotation_vector(np.stack([still, still, yaw], axis=1))
-    if tilted:
-        lean = np.broadcast_to([0.05, -0.08, 0.0], (len(yaw), 3))
-        body = multiply(body, quaternion_from_rotation_vector(lean))
+    lean = np.broadcast_to([0.05, -0.08, 0.0], (len(yaw), 3))
+    body = multiply(body, quaternion_from_rotation_vector(lean))
     enu = flight.camera_position[k] - rotate(body, LEVER_ARM)
     places = [place_at(row, HOME) for row in enu]
     axes = matrix_from_quaternion(flight.camera_quaternion[k])
@@ -94,24 +93,16 @@ def angles_of(ahead: Float, right: Float) -> Float:
 # --- DJI's subtitles -----------------------------------------------------------------------------------
 
 
-def write_srt(
-    path: Path,
-    truth: DroneTruth,
-    *,
-    gimbal: bool = True,
-    clock: bool = True,
-    decimals: int = 9,
-    newline: str = "\n",
-) -> Path:
-    """Write subtitles of each frame in the form since 2018, by default with more decimals than drones."""
+def write_srt(path: Path, truth: DroneTruth, *, gimbal: bool = True, newline: str = "\n") -> Path:
+    """Write subtitles of each frame in the form since 2018, with more decimals than drones."""
     blocks = []
     for row, stamp_ns in enumerate(truth.t_ns.tolist()):
         since = (stamp_ns - int(truth.t_ns[0])) // 1_000_000
         shown = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=stamp_ns // 1000)
         yaw, pitch, roll = truth.gimbal_ypr_deg[row]
         said = [
-            f"[latitude: {truth.latitude_deg[row]:.{decimals}f}]",
-            f"[longitude: {truth.longitude_deg[row]:.{decimals}f}]",
+            f"[latitude: {truth.latitude_deg[row]:.9f}]",
+            f"[longitude: {truth.longitude_deg[row]:.9f}]",
             f"[rel_alt: {truth.enu[row, 2]:.6f} abs_alt: {truth.altitude_m[row]:.6f}]",
         ]
         if gimbal:
@@ -120,10 +111,7 @@ def write_srt(
             str(row + 1),
             f"{_timecode(since)} --> {_timecode(since + 33)}",
             f'<font size="28">FrameCnt: {row + 1}, DiffTime: 33ms',
-            *(
-                [f"{shown:%Y-%m-%d %H:%M:%S},{shown.microsecond // 1000:03d},{shown.microsecond % 1000:03d}"]
-                * clock
-            ),
+            f"{shown:%Y-%m-%d %H:%M:%S},{shown.microsecond // 1000:03d},{shown.microsecond % 1000:03d}",
             f"[iso: 100] [shutter: 1/80.0] [fnum: 280] [color_md : default] {' '.join(said)} </font>",
             "",
         ]
@@ -193,20 +181,14 @@ def write_dataflash(
     *,
     kinds: Sequence[str] = ("GPS", "POS", "ATT", "XKF1", "ORGN", "MNT", "CAM"),
     yaw_from_north: bool = True,
-    drift_ppm: float = 0.0,
 ) -> Path:
-    """Write a log of ArduCopter; the autopilot's clock is slow against GPS time by `drift_ppm`."""
+    """Write a log of ArduCopter."""
     log = [definition(name) for name in ("FMT", *kinds)]
     if "ORGN" in kinds:
-        place = (
-            round(HOME.latitude_deg * 1e7),
-            round(HOME.longitude_deg * 1e7),
-            round(HOME.altitude_m * 100),
-        )
+        place = [round(v) for v in (HOME.latitude_deg * 1e7, HOME.longitude_deg * 1e7, HOME.altitude_m * 100)]
         log += [dataflash("ORGN", BOOT_NS // 1000, 1, 0, 0, 0), dataflash("ORGN", BOOT_NS // 1000, 0, *place)]
     for row, stamp_ns in enumerate(truth.t_ns.tolist()):
-        since_ns = stamp_ns - int(truth.t_ns[0])
-        us = int(truth.boot_us[row]) - round(since_ns * drift_ppm * 1e-9)
+        us = int(truth.boot_us[row])
         week, ms = divmod(stamp_ns // 1_000_000 + GPS_LEAP_S * 1000 - 315_964_800_000, 7 * 86_400_000)
         lat, lng = round(truth.latitude_deg[row] * 1e7), round(truth.longitude_deg[row] * 1e7)
         alt_cm = round(truth.altitude_m[row] * 100)
@@ -280,10 +262,7 @@ def write_tlog(
         east, north, up = truth.enu[row].tolist()
         gimbal = _wxyz(*truth.gimbal_ypr_deg[row])
         messages: list[tuple[str, tuple[Any, ...]]] = [
-            (
-                "SYSTEM_TIME",
-                ((int(truth.t_ns[row]) // 1000 + ms * 1000 - us) * gps_time, ms),
-            ),
+            ("SYSTEM_TIME", ((int(truth.t_ns[row]) // 1000 + ms * 1000 - us) * gps_time, ms)),
             ("GLOBAL_POSITION_INT", (ms, lat, lon, alt, round(up * 1000), 0, 0, 0, 0)),
             ("LOCAL_POSITION_NED", (ms, north, east, -up, 0, 0, 0)),
             ("GPS_GLOBAL_ORIGIN", place),
@@ -293,9 +272,8 @@ def write_tlog(
         if version == 2:
             messages.append(("GIMBAL_DEVICE_ATTITUDE_STATUS", (ms, *gimbal, 0, 0, 0, 0, 64, 0, 0)))
         for name, values in messages:
-            log.append(
-                mavlink(name, *values, stamp_ns=stamp_ns, system=system, sequence=len(log), version=version)
-            )
+            about: Any = {"stamp_ns": stamp_ns, "system": system, "version": version}
+            log.append(mavlink(name, *values, sequence=len(log), **about))
     path.write_bytes(b"".join(log))
     return path
 
@@ -350,13 +328,10 @@ def ulog_record(kind: str, body: bytes) -> bytes:
     return struct.pack("<HB", len(body), ord(kind)) + body
 
 
-def write_ulog(
-    path: Path, rows: Sequence[tuple[str, int, tuple[Any, ...]]], *, formats: Mapping[str, str] | None = None
-) -> Path:
+def write_ulog(path: Path, rows: Sequence[tuple[str, int, tuple[Any, ...]]]) -> Path:
     """Write a log of rows (topic, instance, fields in the order of ULOG), stamps in us since boot."""
     log = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", BOOT_NS // 1000), ulog_record("B", bytes(40))]
-    stated = formats or {name: fields for name, (fields, _) in ULOG.items()}
-    log += [ulog_record("F", f"{name}:{fields}".encode()) for name, fields in stated.items()]
+    log += [ulog_record("F", f"{name}:{fields}".encode()) for name, (fields, _) in ULOG.items()]
     numbers = {key: number for number, key in enumerate(dict.fromkeys(row[:2] for row in rows))}
     for (name, instance), number in numbers.items():
         log.append(ulog_record("A", struct.pack("<BH", instance, number) + name.encode()))
@@ -395,15 +370,9 @@ def ulog_rows(
     return rows
 
 
-def _wxyz(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, ...]:
+def _wxyz(*yaw_pitch_roll_deg: float) -> tuple[float, ...]:
     """Compute the quaternion of yaw, pitch, roll by the textbook formula (Diebel 2006, eq. 290), w first."""
-    (cy, sy), (cp, sp), (cr, sr) = (
-        (np.cos(np.radians(angle) / 2), np.sin(np.radians(angle) / 2))
-        for angle in (yaw_deg, pitch_deg, roll_deg)
-    )
-    return (
-        float(cr * cp * cy + sr * sp * sy),
-        float(sr * cp * cy - cr * sp * sy),
-        float(cr * sp * cy + sr * cp * sy),
-        float(cr * cp * sy - sr * sp * cy),
-    )
+    half = np.radians(yaw_pitch_roll_deg) / 2
+    (cy, cp, cr), (sy, sp, sr) = np.cos(half).tolist(), np.sin(half).tolist()
+    w, x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
+    return w, x, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy

@@ -73,7 +73,6 @@ def write_flight(
     clean: bool = False,
     static: bool = False,
     bystander: bool = False,
-    keypoint_noise: KeypointNoise = USUAL_KEYPOINTS,
     pose_noise: Mapping[str, Mapping[str, float | str]] = USUAL_POSES,
     keypoint_format: str = "alphapose",
     pose_format: str = "tum",
@@ -93,14 +92,13 @@ def write_flight(
             the interpolation of poses, 3 micrometres.
         static: the cameras stand still, and their poses come from a calibration in Pose2Sim's format.
         bystander: a second person walks through the pictures, and is listed first in every frame.
-        keypoint_noise: noise of the detector, unless clean.
         pose_noise: noise of the logs as stated in flight.yaml, unless clean; static cameras: a bias alone.
         keypoint_format: alphapose, coco or openpose (with COCO's joints).
         pose_format: tum or csv.
         seed: seed of all noise.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    detector = CLEAN_KEYPOINTS if clean else keypoint_noise
+    detector = CLEAN_KEYPOINTS if clean else USUAL_KEYPOINTS
     noise = [] if clean else noise_models("the tests", pose_noise)
     names = [f"drone{k + 1}" for k in range(cameras)]
     t_ns = _stamps(round(seconds * fps), fps, START_NS)

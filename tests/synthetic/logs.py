@@ -93,9 +93,8 @@ def write_ros2(
     storage: Literal["sqlite3", "mcap"] = "sqlite3",
     compression: Literal["none", "message", "file", "storage"] = "none",
     metadata: bool = True,
-    definitions: bool = True,
 ) -> Path:
-    """Write a ROS 2 bag; without `definitions` as ROS 2 up to Humble does (sqlite3)."""
+    """Write a ROS 2 bag."""
     writer = Ros2Writer(folder, version=9, storage_plugin=getattr(StoragePlugin, storage.upper()))
     if compression != "none":
         writer.set_compression(getattr(CompressionMode, compression.upper()), CompressionFormat.ZSTD)
@@ -109,13 +108,6 @@ def write_ros2(
             writer.write(connections[entry.topic], entry.stamp_ns, data)
     if not metadata:
         (folder / "metadata.yaml").unlink()
-    if not definitions:
-        import sqlite3
-
-        database = sqlite3.connect(next(folder.glob("*.db3")))
-        with database:
-            database.execute("DROP TABLE message_definitions")
-        database.close()
     return folder
 
 

@@ -33,9 +33,7 @@ Pose = tuple[tuple[float, ...], tuple[float, ...]]
 AT_REST: Pose = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def octomap_entry(
-    file: bytes, stamp_ns: int, *, frame: str = "map", topic: str = "/octomap", received_ns: int | None = None
-) -> Entry:
+def octomap_entry(file: bytes, stamp_ns: int, *, frame: str = "map", topic: str = "/octomap") -> Entry:
     """Build the message with the content of a .bt or .ot file: its data without its header."""
     head, _, body = file.partition(b"\ndata\n")
     values = dict(re.findall(rb"(?m)^(id|res) (\S+)$", head))
@@ -46,7 +44,7 @@ def octomap_entry(
         "resolution": float(values[b"res"]),
         "data": np.frombuffer(body, np.int8),
     }
-    return Entry(topic, OCTOMAP, stamp_ns if received_ns is None else received_ns, fields)
+    return Entry(topic, OCTOMAP, stamp_ns, fields)
 
 
 def as_bt(occupancy: Occupancy, folder: Path) -> bytes:
@@ -65,7 +63,6 @@ def grid_entry(
     cells: NDArray[np.int8],
     stamp_ns: int,
     *,
-    cell_m: float = 0.5,
     origin: Pose = AT_REST,
     frame: str = "map",
     topic: str = "/map",
@@ -73,7 +70,7 @@ def grid_entry(
     """Build the message of a floor plan of cells [X, Y]."""
     position, quaternion = origin
     info = {
-        "resolution": cell_m,
+        "resolution": 0.5,
         "width": cells.shape[0],
         "height": cells.shape[1],
         "origin": {

@@ -13,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -81,12 +80,6 @@ def with_rosbags(log: Path) -> int:
     """Read the bytes of every message with rosbags; return the count of messages with content."""
     with AnyReader([log]) as reader:
         return sum(len(data) > 0 for _, _, data in reader.messages())
-
-
-def with_mcap(log: Path) -> int:
-    """Read the bytes of every message with mcap; return the count of messages with content."""
-    with next(log.glob("*.mcap")).open("rb") as file:
-        return sum(len(message.data) > 0 for _, _, message in make_reader(file).iter_messages())
 
 
 def decoded(log: Path) -> int:

@@ -49,7 +49,6 @@ def write_video(
     ticks: Sequence[int],
     *,
     codec: str = "libx264",
-    tick_s: Fraction = TICK_S,
     key_every: int = 12,
     b_frames: int = 2,
     turned_deg: int = 0,
@@ -60,9 +59,8 @@ def write_video(
 
     Args:
         path: the file.
-        ticks: strictly increasing stamps.
+        ticks: strictly increasing stamps, in TICK_S.
         codec: FFmpeg's name of the encoder.
-        tick_s: the unit of the stamps.
         key_every: frames from one key frame to the next.
         b_frames: number of consecutive frames that refer to later ones.
         turned_deg: counter-clockwise rotation that the container states.
@@ -77,7 +75,7 @@ def write_video(
         assert isinstance(stream, av.VideoStream)
         stream.height, stream.width = draw(0).shape[:2]
         stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-        stream.time_base = stream.codec_context.time_base = tick_s
+        stream.time_base = stream.codec_context.time_base = TICK_S
         options = {"g": str(key_every), "bf": str(b_frames)}
         if codec == "libx264":
             options |= {"preset": "ultrafast", "sc_threshold": "0"}
@@ -87,20 +85,7 @@ def write_video(
         container.start_encoding()  # also without a frame
         for number, pts in enumerate(ticks):
             frame = av.VideoFrame.from_ndarray(draw(number), format="bgr24")
-            frame.pts, frame.time_base = pts, tick_s
+            frame.pts, frame.time_base = pts, TICK_S
             container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
-
-
-def write_sound(path: Path) -> Path:
-    """Write a tenth of a second of silence, without a picture."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("aac", rate=48_000)
-        frame = av.AudioFrame(format="fltp", layout="mono", samples=4800)
-        frame.sample_rate, frame.pts = 48_000, 0
-        for plane in frame.planes:
-            plane.update(bytes(plane.buffer_size))
-        container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     return path

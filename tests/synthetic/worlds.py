@@ -289,11 +289,6 @@ def _finely(position: Float) -> Float:
     return np.concatenate([between.reshape(len(position), -1, 3), position[:, -1:]], axis=1)
 
 
-def is_safe(row: dict[str, Any]) -> bool:
-    """Return True if every drone kept its radius from all surfaces, and all limits."""
-    return min(row["clearance_m"], row["ground_m"]) >= _CONFIG.drone_radius_m and not row["limits"]
-
-
 def flown(seeds: Iterable[int], workers: int, arms: Sequence[str]) -> Iterable[dict[str, Any]]:
     """Fly some worlds; yield their flights in the order of their seeds."""
     if workers == 1:
