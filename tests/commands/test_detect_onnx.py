@@ -58,6 +58,7 @@ def test_what_cannot_be_run_is_refused_in_one_line(tmp_path: Path) -> None:
     assert "write onnx:MODEL.onnx" in refused(
         "reconstruct", session, "--method", "robust", "--detector", "onnx"
     )
+    assert "blazepose" in refused("reconstruct", session, "--method", "robust", "--detector", "magic")
     assert "takes nothing behind" in refused(
         "reconstruct", session, "--method", "robust", "--detector", "blazepose:x"
     )

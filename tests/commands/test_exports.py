@@ -18,7 +18,7 @@ from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.geometry.joint_angles import ANGLES
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
-from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
+from tests.commands.runner import content, mocap, refused, succeeds
 from tests.commands.test_overlay import filmed_flight, session_of
 from tests.formats.skeletons.test_trc import opensim
 from tests.synthetic.flights import START_NS, write_flight
@@ -107,7 +107,7 @@ def test_what_a_killed_export_left_goes_and_a_second_one_at_once_is_refused(
     before = content(target)
     (target / ".writing").mkdir()
     with FileLock(target / ".writing" / "lock"):
-        line = refusal(mocap_process("export", filmed, "--to", "trc", "-o", target))
+        line = refused("export", filmed, "--to", "trc", "-o", target)
     assert str(target) in line
     assert "process" in line
     assert content(target).items() >= before.items()

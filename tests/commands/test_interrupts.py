@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from pipelines.session.stages import locked
-from tests.commands.runner import mocap_process, refusal, succeeds
+from tests.commands.runner import refused, succeeds
 from tests.synthetic.flights import write_flight
 
 
-@pytest.mark.slow
 def test_second_writer_says_so(tmp_path: Path) -> None:
     flight = write_flight(tmp_path)
     session = tmp_path / "flight.session"
@@ -23,5 +20,5 @@ def test_second_writer_says_so(tmp_path: Path) -> None:
             ("reconstruct", session),
             ("report", session),
         ):
-            assert f"process {holder};" in refusal(mocap_process(*arguments))
+            assert f"process {holder};" in refused(*arguments)
     succeeds("reconstruct", session, "--method", "robust")

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from tests.commands.runner import content, mocap, refused, succeeds
+from tests.commands.runner import mocap, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
 METHODS = ("dlt", "midpoint", "robust")
@@ -60,19 +60,6 @@ def test_flight_without_noise_is_reconstructed_below_half_a_millimetre(
         assert result["mpjpe_mm"] < 0.5
         assert result["reconstructed_share"] == 1.0
         assert result["reprojection_px"]["median"] < 0.05
-
-
-def test_same_bytes_twice_and_with_one_or_two_workers(tmp_path: Path) -> None:
-    sessions = []
-    for place, workers in (("first", "1"), ("second", "2")):
-        flight = write_flight(tmp_path / place, cameras=3, bystander=True, seconds=0.5)
-        session = tmp_path / place / "flight.session"
-        succeeds("ingest", flight.manifest)
-        succeeds("reconstruct", session, "--method", "robust", "--workers", workers)
-        succeeds("report", session)
-        sessions.append(content(session))
-    assert sessions[0] == sessions[1]
-    assert {"session.json", "reconstruct/skeleton.parquet", "report/index.html"} <= set(sessions[0])
 
 
 def test_bystander_whom_one_camera_misses_is_not_the_actor(tmp_path: Path) -> None:

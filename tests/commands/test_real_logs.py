@@ -124,23 +124,6 @@ def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
     assert "CylinderCameraModel" in refused("ingest", path)
 
 
-@pytest.mark.parametrize("name", ["maps/octomap_geb079.bt", "maps/octomap_ecmrv4_withfree.ot"])
-def test_real_octomaps(tmp_path: Path, name: str) -> None:
-    expected = facts(name)
-    log = "logs/ros1/husky_gps_imu_odom.bag"
-    first_s = facts(log)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
-    path = write_flight(
-        tmp_path, {"file": str(real_data(log)), "of": "body"}, start_s=first_s + 1, map=str(real_data(name))
-    )
-    succeeds("ingest", path)
-    stored = session_of(path)["map"]
-    assert stored["resolution_m"] == expected["resolution"]
-    assert stored["occupied"] == expected["occupied_voxels_at_finest"]
-    assert stored["free"] == expected["free_voxels_at_finest"]
-    first = tmp_path / "flight.session" / "map" / "0.npz"
-    assert first.exists()
-
-
 @pytest.mark.parametrize(
     "name",
     [

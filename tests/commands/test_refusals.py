@@ -8,7 +8,7 @@ import re
 import shutil
 import signal
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -317,28 +317,47 @@ def test_text_that_no_name_of_a_file_can_hold(flight: SyntheticFlight, escape: s
 HUGE = "0x" + "f" * 5000  # Python refuses to print it
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "place"),
-    [
-        ("fps: 30", 'fps: "1e99999999"', "frame_times.fps"),
-        ("start: 1700000000.0", 'start: "1e999980"', "frame_times.start"),
-        ("schema: 1", f"schema: {HUGE}", "schema"),
-        ("schema: 1", f"schema: 1\n? [{HUGE}]\n: 1", "an integer of about 6000 digits"),
-        ("file: k.json", f"file: k.json, first_frame: {10**30}", "keypoints.first_frame"),
-    ],
-)
-def test_numbers_beyond_all_bounds(tmp_path: Path, old: str, new: str, place: str) -> None:
+NUMBERS = [
+    ("fps: 30", 'fps: "1e99999999"', "frame_times.fps"),
+    ("start: 1700000000.0", 'start: "1e999980"', "frame_times.start"),
+    ("schema: 1", f"schema: {HUGE}", "schema"),
+    ("schema: 1", f"schema: 1\n? [{HUGE}]\n: 1", "an integer of about 6000 digits"),
+    ("file: k.json", f"file: k.json, first_frame: {10**30}", "keypoints.first_frame"),
+]
+
+
+def test_numbers_beyond_all_bounds(tmp_path: Path) -> None:
     text = (
         "schema: 1\ncameras: {d: {frame_times: {start: 1700000000.0, fps: 30}, pose: {file: a.tum},"
         " intrinsics: i.yaml, keypoints: {file: k.json}}}\n"
     )
-    assert old in text
-    path = tmp_path / "flight.yaml"
-    path.write_text(text.replace(old, new), encoding="utf-8")
+    paths = [tmp_path / f"{number}.yaml" for number in range(len(NUMBERS))]
+    for path, (old, new, _) in zip(paths, NUMBERS, strict=True):
+        path.write_text(text.replace(old, new), encoding="utf-8")
     # In a process of its own: an endless computation must not block the other tests.
-    assert place in refusal(mocap_process("ingest", path, timeout=60))
+    done = mocap_process("ingest", *paths, timeout=60)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    for path, (_, _, place) in zip(paths, NUMBERS, strict=True):
+        (line,) = [line for line in done.stderr.splitlines() if line.startswith(f"mocap: {path}: ")]
+        assert place in line
 
 
+@pytest.fixture
+def no_waiting() -> Iterator[None]:
+    """Fail a test that waits for a minute."""
+
+    def waited(*_: object) -> None:
+        pytest.fail("waited for a pipe")
+
+    before = signal.signal(signal.SIGALRM, waited)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("no_waiting")
 def test_pipes_and_sockets_are_refused_and_not_waited_for(flight: SyntheticFlight, tmp_path: Path) -> None:
     folder = tmp_path / "pipes"
     folder.mkdir()
@@ -346,31 +365,20 @@ def test_pipes_and_sockets_are_refused_and_not_waited_for(flight: SyntheticFligh
         pipe = folder / f"pipe{suffix}"
         os.mkfifo(pipe)
         for command in commands:
-            said = refusal(mocap_process(command, pipe, timeout=60))
-            assert re.search(rf"/{pipe.name}: .*\bpipe\b", said)
+            assert re.search(rf"/{pipe.name}: .*\bpipe\b", refused(command, pipe))
     flight.settings["cameras"]["drone1"]["pose"]["file"] = "pipes/pipe.csv"
     flight.save()
-    said = refusal(mocap_process("ingest", flight.manifest, timeout=60))
-    assert "pipe.csv: is a pipe" in said
+    assert "pipe.csv: is a pipe" in refused("ingest", flight.manifest)
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(os.path.relpath(folder / "s.srt"))  # names of sockets are short
         assert "s.srt: is a pipe, a socket " in refused("info", folder / "s.srt")
     assert refused("info", "/dev/null").startswith("mocap: /dev/null: is a pipe")
 
 
+@pytest.mark.usefixtures("no_waiting")
 def test_no_format_opens_a_pipe(tmp_path: Path) -> None:
     suffixes = sorted({suffix for format_ in FORMATS.all() for suffix in getattr(format_, "suffixes", ())})
     pipes = [tmp_path / f"pipe{suffix}" for suffix in suffixes]
     for pipe in pipes:
         os.mkfifo(pipe)
-
-    def waited(*_: object) -> None:
-        pytest.fail("waited for a pipe")
-
-    before = signal.signal(signal.SIGALRM, waited)
-    signal.alarm(60)
-    try:
-        assert not [pipe for pipe in pipes if any(each.recognises(pipe) for each in FORMATS.all())]
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+    assert not [pipe for pipe in pipes if any(each.recognises(pipe) for each in FORMATS.all())]

@@ -11,6 +11,8 @@ from tests.commands.runner import content, mocap, refused, succeeds
 from tests.commands.test_init import write_lenses
 from tests.synthetic.flights import write_flight
 
+WHOLE = True
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -34,6 +36,19 @@ def test_a_folder_goes_to_a_verdict_and_the_same_command_changes_nothing(folder:
     last = succeeds("run", folder).splitlines()[-1]
     assert last.startswith("next: mocap ")
     assert content(Path(result["session"])) == before
+
+
+def test_same_bytes_twice_and_with_one_or_two_workers(tmp_path: Path) -> None:
+    sessions = []
+    for place, workers in (("first", "1"), ("second", "2")):
+        flight = write_flight(tmp_path / place, cameras=3, bystander=True, seconds=0.5)
+        session = tmp_path / place / "flight.session"
+        succeeds("ingest", flight.manifest)
+        succeeds("reconstruct", session, "--method", "robust", "--workers", workers)
+        succeeds("report", session)
+        sessions.append(content(session))
+    assert sessions[0] == sessions[1]
+    assert {"session.json", "reconstruct/skeleton.parquet", "report/index.html"} <= set(sessions[0])
 
 
 def test_what_only_the_user_knows_stops_it_with_the_draft_beside_the_data(tmp_path: Path) -> None:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import signal
-import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +19,7 @@ from pipelines.formats.videos import video
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.session.errors import DataError
 from pipelines.simulate import simulate
-from tests.commands.runner import MOCAP, content, refused, succeeds
+from tests.commands.runner import content, mocap, refused, succeeds
 from tests.real_data import real_data
 
 EXACT = """
@@ -125,7 +122,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(small: Path, tm
 
 @pytest.mark.slow
 def test_videos_have_the_frames_that_were_kept_and_workers_do_not_matter(tmp_path: Path) -> None:
-    text = SMALL.replace("duration_s: 2", "duration_s: 1").replace("width: 320, height: 180", SMALLEST)
+    text = SMALL.replace("duration_s: 2", "duration_s: 0.5").replace("width: 320, height: 180", SMALLEST)
     flights = []
     for workers in ("1", "2"):
         (tmp_path / workers).mkdir()
@@ -137,7 +134,7 @@ def test_videos_have_the_frames_that_were_kept_and_workers_do_not_matter(tmp_pat
     assert logs[0] == logs[1]
 
     summary = json.loads((flights[0].parent / "simulation.json").read_text())
-    assert summary["frames"]["drone1"] < 30  # some were dropped
+    assert summary["frames"]["drone1"] < 15  # some were dropped
     stated: dict[str, Any] = json.loads(succeeds("ingest", flights[0], "--json"))
     camera = stated["cameras"]["drone2"]
     assert camera["frames"]["count"] == summary["frames"]["drone2"]
@@ -239,22 +236,23 @@ def test_a_flight_that_is_there_is_not_made_again(tmp_path: Path) -> None:
     assert "--overwrite" in line
 
 
-@pytest.mark.slow
-def test_an_interrupted_rendering_goes_on_where_it_was(tmp_path: Path) -> None:
-    text = SMALL.replace("duration_s: 2", "duration_s: 3")  # two parts
-    text = text.replace("width: 320, height: 180", SMALLEST)
-    text = text.replace("count: 2", "count: 1").replace("[0, 0.12]", "[0]")
-    path = scenario(tmp_path, text)
+def test_an_interrupted_rendering_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = SMALL.replace("duration_s: 2", "duration_s: 0.6").replace("width: 320, height: 180", SMALLEST)
+    path = scenario(tmp_path, text.replace("count: 2", "count: 1").replace("[0, 0.12]", "[0]"))
     output, parts = tmp_path / "flight", tmp_path / ".flight.making"
-    command = [MOCAP, "simulate", str(path), "-o", str(output), "--workers", "1"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
-        while not list(parts.glob("*/drone1-0/part.mp4")):
-            assert process.poll() is None, process.communicate()
-            time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate()
-    assert process.returncode == 130
-    assert "Traceback" not in errors
+    command = ("simulate", path, "-o", output, "--workers", "1")
+
+    def interrupted(part: Path, *arguments: Any, **options: Any) -> None:
+        if list(parts.glob("*/drone1-0/part.mp4")):
+            raise KeyboardInterrupt
+        write_h264(part, *arguments, **options)
+
+    monkeypatch.setattr("pipelines.simulate._BLOCK", 10)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipelines.simulate.write_h264", interrupted)
+        assert mocap(*command).returncode == 130
     assert not output.exists()
     # Black pictures in the place of the finished part show that it is not made again.
     (kept,) = parts.glob("*/drone1-0/part.mp4")
@@ -262,14 +260,12 @@ def test_an_interrupted_rendering_goes_on_where_it_was(tmp_path: Path) -> None:
     black = (np.zeros((72, 128, 3), np.uint8) for _ in stamps)
     write_h264(kept, black, stamps, width=128, height=72)
 
-    succeeds(*command[1:])
+    succeeds(*command)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flight", "scenario.yaml"]
     with av.open(str(output / "drone1.mp4")) as container:
         brightness = [frame.to_ndarray(format="gray").mean() for frame in container.decode(video=0)]
     assert max(brightness[: len(stamps)]) < 20 < min(brightness[len(stamps) :])
-    summary = json.loads(succeeds("ingest", output / "flight.yaml", "--json"))
-    stated = json.loads((output / "simulation.json").read_text())["frames"]
-    assert summary["cameras"]["drone1"]["frames"]["count"] == stated["drone1"]
+    assert len(brightness) == json.loads((output / "simulation.json").read_text())["frames"]["drone1"]
 
 
 @pytest.mark.slow

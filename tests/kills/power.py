@@ -2,7 +2,7 @@
 
 A trace is recorded while a command runs in this process. The whole folder is compared before and after
 each call that renames, removes, makes or syncs something, so that what libraries in C write is seen as well.
-From a trace follow the states of the disk that a loss of power may leave after each of its steps:
+From a trace follow the states of the disk that a loss of power may leave at each of its moments:
 
 - Changes of entries of folders reach the disk in their order, as a journal keeps them. Those before the last
   sync of a file or folder are there; of the others, any number of the first.
@@ -17,8 +17,9 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial, wraps
+from itertools import count as numbers_from
 from pathlib import Path
 from threading import RLock
 from typing import Any
@@ -33,69 +34,25 @@ from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 from tests.kills.killing import SCENARIO, kept
 from tests.synthetic.flights import write_flight
 
-Key = tuple[int, str]  # node of a folder, and a name in it
-
-ROOT = 0  # node of the recorded folder
-
-
-@dataclass(frozen=True)
-class Entry:
-    """Change of entries of folders: a node comes, goes, or is renamed."""
-
-    node: int
-    gone: Key | None
-    come: Key | None
-    is_folder: bool
+Disk = Mapping[str, bytes | None]
+"""Contents of files by relative path; None for a folder. Folders stand before what they hold."""
 
 
 @dataclass(frozen=True)
-class Content:
-    """New content of a file."""
+class Moment:
+    """A folder at one moment.
 
-    node: int
-    content: bytes
+    Attributes:
+        entries: numbers of files by relative path; None for a folder.
+        last: contents of all files until now, by number.
+        synced: contents at the last sync, of those files that were ever synced.
+        certain: True for the moment after a sync, which makes all entries last.
+    """
 
-
-@dataclass(frozen=True)
-class Synced:
-    """Sync of a file or a folder."""
-
-    node: int
-
-
-Step = Entry | Content | Synced
-
-
-@dataclass
-class Trace:
-    """Steps by which a folder changed, after those that made it as it was at first."""
-
-    steps: list[Step] = field(default_factory=list)
-    first: int = 0  # number of steps that made it as it was at first
-
-
-@dataclass(frozen=True)
-class Disk:
-    """State of a folder: nodes of all entries, and contents of files."""
-
-    entries: Mapping[Key, int]
-    contents: Mapping[int, bytes]  # of files only
-
-    def write(self, folder: Path) -> None:
-        """Write the state into an empty folder; what no entry leads to is lost."""
-        inside: dict[int, list[tuple[str, int]]] = {}
-        for (parent, name), node in self.entries.items():
-            inside.setdefault(parent, []).append((name, node))
-
-        def write(node: int, place: Path) -> None:
-            for name, child in inside.get(node, []):
-                if child in self.contents:
-                    (place / name).write_bytes(self.contents[child])
-                else:
-                    (place / name).mkdir()
-                    write(child, place / name)
-
-        write(ROOT, folder)
+    entries: Mapping[str, int | None]
+    last: Mapping[int, bytes]
+    synced: Mapping[int, bytes]
+    certain: bool = False
 
 
 # --- recording -----------------------------------------------------------------------------------------
@@ -108,23 +65,20 @@ class Recorder:
     """Comparison of a folder with what it was, before and after each call that changes or syncs entries.
 
     Args:
-        folder: the folder.
+        folder: the folder; what is in it at first is on the disk.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.trace = Trace()
+        self.trace = [Moment({}, {}, {})]
         self._folder = folder
-        self._nodes: dict[int, int] = {}  # by inode
-        self._entries: dict[Key, int] = {}
-        self._contents: dict[int, bytes] = {}
-        self._count = ROOT
+        self._numbers: dict[int, int] = {}  # of files, by inode
+        self._next = numbers_from()
         self._lock = RLock()
-        self._look()
-        self.trace.steps += [Synced(node) for node in [ROOT, *self._nodes.values()]]
-        self.trace.first = len(self.trace.steps)
+        self._look(at_once=True)
+        self.trace = [replace(self.trace[-1], synced=self.trace[-1].last, certain=True)]
 
     @contextmanager
-    def recording(self) -> Iterator[Trace]:
+    def recording(self) -> Iterator[list[Moment]]:
         """Record what happens meanwhile."""
         with ExitStack() as stack:
             for name in _CHANGING:
@@ -141,127 +95,100 @@ class Recorder:
                 self._look()
                 result = call(*arguments, **options)
                 if syncs:
-                    inode = os.fstat(arguments[0]).st_ino
-                    if inode == self._folder.stat().st_ino:
-                        self.trace.steps.append(Synced(ROOT))
-                    elif inode in self._nodes:
-                        self.trace.steps.append(Synced(self._nodes[inode]))
+                    self._sync(os.fstat(arguments[0]).st_ino)
                 else:
-                    self._look()
+                    self._look(at_once=True)
                 return result
 
         return called
 
-    def _look(self) -> None:
-        """Append the steps that lead from the folder as it was at the last look to what it is now."""
-        found: list[tuple[tuple[int, str], int, Path, bool]] = []  # inode of the folder, name; inode
+    def _sync(self, inode: int) -> None:
+        now, number = self.trace[-1], self._numbers.get(inode)
+        folders = [self._folder, *(self._folder / name for name, of in now.entries.items() if of is None)]
+        if number is not None:
+            now = replace(now, synced={**now.synced, number: now.last[number]})
+        elif inode not in {folder.stat().st_ino for folder in folders}:
+            return
+        self.trace.append(replace(now, certain=True))
 
-        def walk(folder: Path, inode: int) -> None:
-            with os.scandir(folder) as entries:
-                for entry in sorted(entries, key=lambda entry: entry.name):
-                    assert not entry.is_symlink(), entry.path
-                    own = entry.stat(follow_symlinks=False).st_ino
-                    found.append(((inode, entry.name), own, Path(entry.path), entry.is_dir()))
-                    if entry.is_dir():
-                        walk(Path(entry.path), own)
-
-        walk(self._folder, -1)
-        there = {inode for _, inode, _, _ in found}
-        nodes = {inode: node for inode, node in self._nodes.items() if inode in there}
-        places = {node: key for key, node in self._entries.items()}
-        steps: list[Step] = []
-        entries: dict[Key, int] = {}
-        came: list[tuple[Key, int, bool]] = []
-        for (parent, name), inode, _, is_folder in found:
-            if inode not in nodes:
-                self._count += 1
-                nodes[inode] = self._count
-            key = (ROOT if parent == -1 else nodes[parent], name)
-            entries[key] = nodes[inode]
-            if self._entries.get(key) != nodes[inode]:
-                came.append((key, nodes[inode], is_folder))
-        renamed = {node for _, node, _ in came if node in places}
-        gone = [key for key, node in self._entries.items() if node not in renamed and key not in entries]
-        for key in reversed(gone):
-            node = self._entries[key]
-            steps.append(Entry(node, key, None, node not in self._contents))
-        contents: dict[int, bytes] = {}
-        for _, inode, path, is_folder in found:
-            node = nodes[inode]
-            if not is_folder:
-                contents[node] = path.read_bytes()
-                if self._contents.get(node) != contents[node]:
-                    steps.append(Content(node, contents[node]))
-        steps += [Entry(node, places.get(node), key, is_folder) for key, node, is_folder in came]
-        self.trace.steps += steps
-        self._nodes, self._entries, self._contents = nodes, entries, contents
+    def _look(self, *, at_once: bool = False) -> None:
+        """Append the moments that lead to what the folder is now; new entries one by one, or all at once."""
+        before = self.trace[-1]
+        found = {
+            path.relative_to(self._folder).as_posix(): (path, path.is_dir(), path.stat().st_ino)
+            for path in sorted(self._folder.rglob("*"))
+        }
+        there = {inode for _, _, inode in found.values()}
+        self._numbers = {inode: number for inode, number in self._numbers.items() if inode in there}
+        entries: dict[str, int | None] = {}
+        last = dict(before.last)
+        for name, (path, is_folder, inode) in found.items():
+            if is_folder:
+                entries[name] = None
+                continue
+            if inode not in self._numbers:
+                self._numbers[inode] = next(self._next)
+            entries[name] = self._numbers[inode]
+            last[self._numbers[inode]] = path.read_bytes()
+        if (entries, last) == (before.entries, before.last):
+            return
+        so_far = {name: of for name, of in before.entries.items() if name in entries}
+        for name in [] if at_once else [name for name in entries if name not in so_far]:
+            so_far[name] = entries[name]
+            self.trace.append(Moment(dict(so_far), last, before.synced))
+        self.trace.append(Moment(entries, last, before.synced))
 
 
 # --- what may be left ----------------------------------------------------------------------------------
 
 
-def losses(trace: Trace, choice: np.random.Generator, *, moments: int) -> Iterator[tuple[int, Disk]]:
-    """Yield states that a loss of power after some steps may leave, with the number of steps before it.
+def losses(
+    trace: Sequence[Moment], choice: np.random.Generator, *, moments: int
+) -> Iterator[tuple[int, Disk]]:
+    """Yield states that a loss of power after some moments may leave, with the number of the moment.
 
-    The same state is yielded once for one number of steps.
+    The same state is yielded once for one moment.
 
     Args:
-        trace: all steps.
+        trace: all moments.
         choice: chooses what is left of unsynced files, and how many changes of entries.
-        moments: the most moments; the last step is always one of them.
+        moments: the most moments; the last one is always one of them.
     """
-    last = len(trace.steps)
-    counts = trace.first + choice.permutation(last - trace.first)[: moments - 1]
-    for count in sorted({*counts.tolist(), last}):
-        steps = trace.steps[:count]
-        certain = max((k for k, step in enumerate(steps) if isinstance(step, Synced)), default=0)
-        written = {certain, count, int(choice.integers(certain, count + 1))}
+    last = len(trace) - 1
+    for count in sorted({*choice.permutation(last)[: moments - 1].tolist(), last}):
+        certain = max(k for k, moment in enumerate(trace[: count + 1]) if moment.certain)
+        ends = sorted({certain, count, int(choice.integers(certain, count + 1))})
         seen = set()
-        states = [(end, choice if number else None) for number, end in enumerate(sorted(written))]
-        for end, torn in [*states, (count, choice)]:
-            disk = Disk(_entries_after(steps[:end]), _left(steps, torn))
-            mark = hash((frozenset(disk.entries.items()), frozenset(disk.contents.items())))
-            if mark not in seen:
+        for end, torn in [*((end, number > 0) for number, end in enumerate(ends)), (count, True)]:
+            left = _left(trace[count], choice if torn else None)
+            disk = {name: None if of is None else left[of] for name, of in trace[end].entries.items()}
+            if (mark := hash(frozenset(disk.items()))) not in seen:
                 seen.add(mark)
                 yield count, disk
 
 
-def _entries_after(steps: Sequence[Step]) -> dict[Key, int]:
-    found: dict[Key, int] = {}
-    for step in steps:
-        if isinstance(step, Entry):
-            if step.gone is not None:
-                found.pop(step.gone, None)
-            if step.come is not None:
-                found[step.come] = step.node
-    return found
-
-
-def _left(steps: Sequence[Step], choice: np.random.Generator | None) -> dict[int, bytes]:
+def _left(moment: Moment, choice: np.random.Generator | None) -> dict[int, bytes]:
     """Return what is left of every file: as of its last sync, or with a choice any of what may be left."""
-    synced: dict[int, bytes] = {}
-    last: dict[int, bytes] = {}
-    for step in steps:
-        if isinstance(step, Entry) and not step.is_folder:
-            last.setdefault(step.node, b"")
-            synced.setdefault(step.node, b"")
-        elif isinstance(step, Content):
-            last[step.node] = step.content
-            synced.setdefault(step.node, b"")
-        elif isinstance(step, Synced) and step.node in last:
-            synced[step.node] = last[step.node]
-    if choice is None:
-        return synced
-    return {
-        node: content if synced[node] == content else _torn(synced[node], content, choice)
-        for node, content in last.items()
-    }
+    found = {}
+    for number, content in moment.last.items():
+        old = moment.synced.get(number, b"")
+        found[number] = old if choice is None or old == content else _torn(old, content, choice)
+    return found
 
 
 def _torn(old: bytes, new: bytes, choice: np.random.Generator) -> bytes:
     """Return an old content, a new one, or something between."""
     cut = int(choice.integers(len(new) + 1))
     return (old, new, new[:cut], new[:cut] + bytes(len(new) - cut), b"")[int(choice.integers(5))]
+
+
+def write_disk(disk: Disk, folder: Path) -> None:
+    """Write a state into an empty folder."""
+    for name, content in disk.items():
+        if content is None:
+            (folder / name).mkdir()
+        else:
+            (folder / name).write_bytes(content)
 
 
 # --- commands ------------------------------------------------------------------------------------------
@@ -325,16 +252,16 @@ def replay(folder: Path, case: Case, *, moments: int, again: int, seed: int) -> 
     assert before != after
     states = list(losses(trace, choice, moments=moments))
     chosen = set(choice.permutation(len(states))[:again].tolist())
-    troubles, steps = [], len(trace.steps) - trace.first
+    troubles, last = [], len(trace) - 1
     for number, (count, disk) in enumerate(states):
         shutil.rmtree(folder)
         folder.mkdir()
-        disk.write(folder)
-        possible = [after] if count == len(trace.steps) else [before, after]
+        write_disk(disk, folder)
+        possible = [after] if count == last else [before, after]
         trouble = _damage(case, possible) or (_trouble_again(case, expected) if number in chosen else "")
         if trouble:
-            troubles.append(f"after {count - trace.first} of {steps} steps: {trouble}")
-    return Lost(case.name, steps, len(states), len(chosen), troubles)
+            troubles.append(f"after {count} of {last} steps: {trouble}")
+    return Lost(case.name, last, len(states), len(chosen), troubles)
 
 
 def _damage(case: Case, possible: Sequence[Mapping[str, str]]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.session.storage import make_folder, write_whole
-from tests.kills.power import ROOT, Recorder, cases_on, losses, replay
+from tests.kills.power import Recorder, cases_on, losses, replay
 
 MOMENTS, SEED = 10, 5
 
@@ -24,13 +24,12 @@ def left_of(folder: Path, write: Callable[[Path], object]) -> tuple[set[bytes | 
     with recorder.recording() as trace:
         write(path)
     states = [
-        (count, disk.contents[disk.entries[ROOT, "a"]] if (ROOT, "a") in disk.entries else None)
+        (count, disk.get("a"))
         for seed in range(100)
         for count, disk in losses(trace, np.random.default_rng(seed), moments=100)
     ]
-    return {content for _, content in states}, {
-        content for count, content in states if count == len(trace.steps)
-    }
+    last = len(trace) - 1
+    return {content for _, content in states}, {content for count, content in states if count == last}
 
 
 def test_only_what_was_synced_is_there_after_a_loss_of_power(tmp_path: Path) -> None:
@@ -61,11 +60,11 @@ def test_a_folder_is_there_once_the_one_around_it_is_synced(tmp_path: Path, sync
     with recorder.recording() as trace:
         make_folder(inner) if synced else inner.mkdir(parents=True)
     ends = [
-        set(disk.entries.values())
+        set(disk)
         for count, disk in losses(trace, np.random.default_rng(SEED), moments=10)
-        if count == len(trace.steps)
+        if count == len(trace) - 1
     ]
-    assert (ends == [{1, 2}]) is synced
+    assert (ends == [{"outer", "outer/inner"}]) is synced
 
 
 def test_a_loss_of_power_leaves_one_version_or_the_other(tmp_path: Path) -> None:
