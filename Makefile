@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 
-.PHONY: setup demo pictures test check lint house bench results fuzz wheel docs sample lock clean
+.PHONY: setup demo pictures test check lint house bench results fuzz wheel release docs sample lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -75,6 +75,14 @@ fuzz: setup
 # The wheel in an empty environment.
 wheel:
 	.ci/wheel
+
+# A wheel and an sdist in dist/, checked as the package index checks them.
+release:
+	rm -rf dist build/lib build/release
+	$(PYTHON) -m venv build/release
+	build/release/bin/python -m pip install --quiet --disable-pip-version-check build twine
+	build/release/bin/python -m build --quiet --outdir dist
+	build/release/bin/python -m twine check --strict dist/*
 
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir build/site
