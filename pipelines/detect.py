@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DETECT = Stage("detect", revision=5)
+DEFAULT_DETECTOR = "blazepose"
 
 BACKGROUND = Stage("background", revision=1)
 
@@ -112,7 +113,7 @@ def cameras_to_detect(description: Description) -> dict[str, MediaEntry]:
 def detect(
     session: WritableSession,
     *,
-    detector: str = "blazepose",
+    detector: str = DEFAULT_DETECTOR,
     people: int = 1,
     every: int = 1,
     start_s: float | None = None,
@@ -148,10 +149,12 @@ def detect(
     progress = progress or Silent()
     description = read_description(session.folder)
     media = cameras_to_detect(description)
+    chosen = find_detector(detector)
     if not media:
+        if detector != DEFAULT_DETECTOR:
+            progress.note(f"--detector {detector} has no use: every camera has keypoints, or no pictures")
         return None
     refuse_changed_pictures(session.folder, description, media)
-    chosen = find_detector(detector)
     settings = {
         "detector": chosen.name,
         "people": "one" if people == 1 else "several",

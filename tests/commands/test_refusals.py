@@ -258,6 +258,14 @@ def test_keypoints_outside_the_calibrated_picture(flight: SyntheticFlight) -> No
     assert "image_size: [W, H]" in line
 
 
+def test_a_detector_that_is_none_is_refused_and_one_without_pictures_is_of_no_use(tmp_path: Path) -> None:
+    session = write_flight(tmp_path, cameras=2, seconds=0.2).manifest.with_suffix(".session")
+    succeeds("ingest", session.with_suffix(".yaml"))
+    assert "blazepose" in refused("reconstruct", session, "--detector", "yolo", code="no-such-name")
+    done = mocap("reconstruct", session, "--method", "dlt", "--detector", "blazepose-heavy")
+    assert "--detector blazepose-heavy" in done.stderr
+
+
 def test_when_nothing_is_reconstructed_the_gate_is_named(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=2, seconds=0.5)
     # Both cameras are said to be in one place: no two viewing lines differ.
